@@ -1,0 +1,32 @@
+# make demo: the main job on the embedded abdomen.  make test: everything that must hold.
+
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+OUT ?= out/demo
+
+.PHONY: demo test lint install meshes clean
+
+demo: install
+	$(BIN)/python run_twin.py demo --out $(OUT)
+
+test: install lint
+	$(BIN)/pytest -q
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+install: $(VENV)/installed
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[test]'
+	touch $@
+
+meshes: install
+	$(BIN)/python -m twin.phantoms --out meshes
+
+clean:
+	rm -rf $(VENV) build out

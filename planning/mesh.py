@@ -1,0 +1,63 @@
+"""A triangle mesh as the planner holds it: checked, read-only, in mm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vertices = NDArray[np.float64]
+Faces = NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh:
+    """Vertices and triangles of one surface. Whoever holds one may trust that the guard has passed it.
+
+    Attributes:
+        vertices: Shape (n, 3), float64, mm.
+        faces: Shape (m, 3), int32, indices into ``vertices``.
+    """
+
+    vertices: Vertices
+    faces: Faces
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("vertices", np.float64), ("faces", np.int32)):
+            array = np.array(getattr(self, name), dtype=dtype, order="C")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @cached_property
+    def triangles(self) -> NDArray[np.float64]:
+        """Corner coordinates, shape (m, 3, 3), mm."""
+        triangles = self.vertices[self.faces]
+        triangles.setflags(write=False)
+        return triangles
+
+    @cached_property
+    def closed(self) -> bool:
+        """Whether there is an inside: every edge of welded vertices has an even number of triangles."""
+        keys = (self.vertices + 0.0).view(np.dtype((np.void, 24))).reshape(-1)  # + 0.0 makes -0.0 equal to 0.0
+        _, welded = np.unique(keys, return_inverse=True)
+        a, b, c = welded[self.faces].T.astype(np.int64)
+        proper = (a != b) & (b != c) & (c != a)
+        ends = np.stack([np.concatenate([a, b, c]), np.concatenate([b, c, a])])[:, np.tile(proper, 3)]
+        edges = np.sort(ends.min(axis=0) * len(keys) + ends.max(axis=0))
+        starts = np.flatnonzero(np.r_[True, edges[1:] != edges[:-1], True])
+        return bool(proper.any() and np.all(np.diff(starts) % 2 == 0))
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner of the axis-aligned box, shape (2, 3), mm."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    def transformed(self, T_b_a: NDArray[np.float64]) -> TriangleMesh:
+        """The same surface in frame b.
+
+        Args:
+            T_b_a: Shape (4, 4), maps coordinates of this mesh's frame a to frame b, mm.
+        """
+        return TriangleMesh(self.vertices @ T_b_a[:3, :3].T + T_b_a[:3, 3], self.faces)
