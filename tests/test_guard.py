@@ -1,0 +1,213 @@
+"""The gate before compiled code: what it refuses, by name, and what it returns."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from planning.errors import InputError
+from planning.formats.guard import (
+    MAX_COORDINATE_MM,
+    MAX_DIAGONAL_MM,
+    MIN_DIAGONAL_MM,
+    ROTATION_TOLERANCE,
+    guard_mesh,
+    guard_points,
+    guard_transform,
+)
+from planning.formats.spaces import Space, Unit, parse_space, parse_unit, to_lps
+
+SQUARE = [[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [10.0, 10.0, 0.0], [0.0, 10.0, 0.0]]
+TWO = [[0, 1, 2], [0, 2, 3]]
+
+
+def with_value(value: float) -> list[list[float]]:
+    """The square with one coordinate replaced."""
+    return [*SQUARE[:3], [value, 10.0, 0.0]]
+
+
+def rigid(**changes: float) -> np.ndarray:
+    """A rigid transform with single entries replaced, such as m03=5.0 for row 0, column 3."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
+    T[:3, 3] = [1.0, 2.0, 3.0]
+    for name, value in changes.items():
+        T[int(name[1]), int(name[2])] = value
+    return T
+
+
+def test_a_good_mesh_comes_back_as_it_was_and_read_only() -> None:
+    """Values and order stay; types become float64 and int32; nobody can write into the result."""
+    mesh = guard_mesh(SQUARE, TWO, where="square")
+    assert mesh.vertices.dtype == np.float64 and mesh.faces.dtype == np.int32
+    assert mesh.vertices.tolist() == SQUARE and mesh.faces.tolist() == TWO
+    with pytest.raises(ValueError, match="read-only"):
+        mesh.vertices[0, 0] = 1.0
+
+
+def test_the_guard_does_not_hold_on_to_the_callers_array() -> None:
+    """Writing into the input afterwards changes nothing that was guarded."""
+    vertices = np.array(SQUARE)
+    mesh = guard_mesh(vertices, TWO, where="square")
+    vertices[0, 0] = np.nan
+    assert np.isfinite(mesh.vertices).all()
+
+
+def test_unused_vertices_are_left_out_so_that_bounds_are_those_of_the_surface() -> None:
+    """A vertex that no triangle uses does not widen the box; the triangles keep their corners and order."""
+    mesh = guard_mesh([[-50.0, 0.0, 0.0], *SQUARE], np.array(TWO) + 1, where="square")
+    assert mesh.bounds.tolist() == [[0.0, 0.0, 0.0], [10.0, 10.0, 0.0]]
+    assert np.array_equal(mesh.triangles, np.array(SQUARE)[TWO])
+
+
+def test_triangles_without_area_are_kept() -> None:
+    """A degenerate triangle beside a good one is part of the surface and stays."""
+    mesh = guard_mesh(SQUARE, [*TWO, [1, 1, 2]], where="square")
+    assert len(mesh.faces) == 3
+
+
+def test_indices_may_come_as_whole_floats() -> None:
+    """Some loaders give indices as floats; whole ones are taken as they are."""
+    assert guard_mesh(SQUARE, np.array(TWO, dtype=float), where="square").faces.tolist() == TWO
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "says"),
+    [
+        pytest.param([], TWO, "no vertex", id="no-vertex"),
+        pytest.param(SQUARE, [], "no triangle", id="no-triangle"),
+        pytest.param(SQUARE, np.zeros((0, 3), dtype=int), "no triangle", id="no-triangle-with-shape"),
+        pytest.param(with_value(np.nan), TWO, r"vertex 3 is not finite.*nan", id="nan-vertex"),
+        pytest.param(with_value(-np.inf), TWO, r"vertex 3 is not finite.*inf", id="infinite-vertex"),
+        pytest.param([*SQUARE, [np.nan] * 3], TWO, "vertex 4 is not finite", id="nan-in-an-unused-vertex"),
+        pytest.param(SQUARE, [[0, 1, 4]], r"triangle 0 uses vertex 4.*0 to 3", id="index-too-high"),
+        pytest.param(SQUARE, [[0, 1, 2], [0, -1, 2]], "triangle 1 uses vertex -1", id="index-negative"),
+        pytest.param(SQUARE, [[0, 1, 2**40]], "out of range", id="index-beyond-int32"),
+        pytest.param(SQUARE, [[0, 1, 2**32]], "out of range", id="index-that-int32-would-wrap-to-0"),
+        pytest.param(SQUARE, [[0, 1, 1.5]], "not a whole number", id="index-with-a-fraction"),
+        pytest.param(SQUARE, [[0, 1, np.nan]], "not a whole number", id="index-nan"),
+        pytest.param(SQUARE, [[0, 1, np.inf]], "out of range", id="index-infinite"),
+        pytest.param(SQUARE, [["0", "1", "2"]], "not a whole number", id="index-of-text"),
+        pytest.param(SQUARE, [[0, 1, 2, 3]], "shape", id="quads"),
+        pytest.param(SQUARE, [[0, 1, 2], [0, 1]], "ragged", id="faces-ragged"),
+        pytest.param([[0.0, 0.0], [1.0, 1.0]], TWO, "shape", id="vertices-in-2d"),
+        pytest.param([[0.0, 0.0, 0.0], [1.0]], TWO, "ragged", id="vertices-ragged"),
+        pytest.param([["a", "b", "c"]], TWO, "type", id="vertices-of-text"),
+        pytest.param(np.array(SQUARE) * 1j, TWO, "type complex", id="vertices-complex"),
+        pytest.param(np.array(SQUARE) / 1000, TWO, "looks like metres", id="metres-declared-as-mm"),
+        pytest.param(np.array(SQUARE) * 1000, TWO, "looks like mm declared", id="mm-declared-as-m"),
+        pytest.param(np.array(SQUARE) * 0 + 7, TWO, "all corners in one place", id="a-single-point"),
+        pytest.param(np.array(SQUARE) + 1e6, TWO, "from the origin", id="far-from-the-origin"),
+        pytest.param(np.array(SQUARE) * 1e300, TWO, "from the origin", id="near-the-largest-float"),
+        pytest.param([[0, 0, 0], [1, 1, 1], [9, 9, 9]], [[0, 1, 2]], "none of the 1 tri", id="all-on-a-line"),
+        pytest.param(SQUARE, [[0, 0, 1], [2, 2, 2]], "none of the 2 triangles has an area", id="no-area"),
+    ],
+)
+def test_a_bad_mesh_is_refused_by_name(vertices: ArrayLike, faces: ArrayLike, says: str) -> None:
+    """Each fault gives one line that names the place, the fault and what is allowed."""
+    with pytest.raises(InputError, match=says) as caught:
+        guard_mesh(vertices, faces, where="liver.stl")
+    assert str(caught.value).startswith("liver.stl: ") and "allowed:" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_limits_of_size_are_the_stated_ones() -> None:
+    """Just inside each limit passes, just outside does not."""
+    unit = np.array(SQUARE) / np.linalg.norm([10.0, 10.0])
+    for inside, outside in ((MIN_DIAGONAL_MM, -1), (MAX_DIAGONAL_MM, 1)):
+        guard_mesh(unit * inside * (1 - outside * 1e-9), TWO, where="x")
+        with pytest.raises(InputError, match="diagonal"):
+            guard_mesh(unit * inside * (1 + outside * 1e-9), TWO, where="x")
+    guard_mesh(np.array(SQUARE) - [0, 0, MAX_COORDINATE_MM], TWO, where="x")
+    with pytest.raises(InputError, match="origin"):
+        guard_mesh(np.array(SQUARE) - [0, 0, MAX_COORDINATE_MM + 0.1], TWO, where="x")
+
+
+def test_a_rigid_transform_passes_unchanged_and_read_only() -> None:
+    """The numbers are not touched, and nobody can touch them afterwards."""
+    T = guard_transform(rigid(), where="registration")
+    assert np.array_equal(T, rigid())
+    with pytest.raises(ValueError, match="read-only"):
+        T[0, 0] = 0.0
+
+
+@pytest.mark.parametrize(
+    ("T", "says"),
+    [
+        pytest.param(np.eye(3), "shape", id="3x3"),
+        pytest.param([[1, 0], [0]], "ragged", id="ragged"),
+        pytest.param(np.full((4, 4), "1"), "type", id="text"),
+        pytest.param(rigid(m03=np.nan), "not finite", id="nan"),
+        pytest.param(rigid(m12=np.inf), "not finite", id="infinite"),
+        pytest.param(np.zeros((4, 4)), "last row", id="zero"),
+        pytest.param(np.diag([0.0, 0.0, 0.0, 1.0]), "not a rotation", id="zero-rotation"),
+        pytest.param(rigid(m30=0.1), "last row", id="projective"),
+        pytest.param(rigid(m33=2.0), "last row", id="scaled-by-the-last-entry"),
+        pytest.param(np.diag([-1.0, 1.0, 1.0, 1.0]), "mirrored", id="mirrored"),
+        pytest.param(np.diag([-1000.0, 1000.0, 1000.0, 1.0]), "mirrored", id="mirrored-and-scaled"),
+        pytest.param(np.diag([1000.0, 1000.0, 1000.0, 1.0]), "not a rotation", id="metres-to-mm"),
+        pytest.param(np.diag([2.0, 0.5, 1.0, 1.0]), "not a rotation", id="sheared-with-determinant-1"),
+        pytest.param(rigid(m03=2e5), "moves by", id="far-away"),
+    ],
+)
+def test_a_bad_transform_is_refused_by_name(T: ArrayLike, says: str) -> None:
+    """A transform that is not rigid never passes, and is never repaired."""
+    with pytest.raises(InputError, match=says):
+        guard_transform(T, where="registration")
+
+
+def test_a_rotation_may_be_off_by_the_digits_of_a_file_and_no_more() -> None:
+    """Six written digits pass; an error of several tolerances does not."""
+    guard_transform(np.round(rigid(), 6), where="x")
+    with pytest.raises(InputError, match="not a rotation"):
+        guard_transform(rigid() @ np.diag([1 + 3 * ROTATION_TOLERANCE, 1, 1, 1]), where="x")
+
+
+@given(st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3))
+def test_every_rotation_passes_and_every_mirrored_one_does_not(rotvec: list[float]) -> None:
+    """The sign of the determinant decides, whatever the axis and angle."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(rotvec).as_matrix()
+    guard_transform(T, where="x")
+    with pytest.raises(InputError, match="mirrored"):
+        guard_transform(T @ np.diag([1.0, 1.0, -1.0, 1.0]), where="x")
+
+
+@pytest.mark.parametrize(
+    ("points", "names", "says"),
+    [
+        pytest.param([], [], "no point", id="empty"),
+        pytest.param([[0, 0, 0]], ["A", "B"], "2 names for 1 points", id="more-names-than-points"),
+        pytest.param([[0, 0, 0], [1, 1, 1]], ["A", "A"], "'A' is used 2 times", id="name-twice"),
+        pytest.param([[0, 0, 0]], ["  "], "point 1 has an empty name", id="blank-name"),
+        pytest.param([[0, 0, 0]], ["A\nB"], r"name 'A\\nB'", id="name-with-a-line-end"),
+        pytest.param([[0, 0, 0], [0, np.nan, 0]], ["A", "B"], "point 'B' is not finite", id="nan"),
+        pytest.param([[0, 0, 3e5]], ["A"], "point 'A' lies at", id="far"),
+        pytest.param([[0, 0]], ["A"], "shape", id="two-coordinates"),
+    ],
+)
+def test_bad_points_are_refused_by_name(points: ArrayLike, names: list[str], says: str) -> None:
+    """The error names the point by its own name where it has one."""
+    with pytest.raises(InputError, match=says):
+        guard_points(points, names, where="markers.csv")
+
+
+def test_ras_differs_from_lps_in_two_signs_and_local_is_its_own() -> None:
+    """Right-anterior becomes left-posterior by sign; applied twice it is the identity; local stays."""
+    points = np.array([[1.0, 2.0, 3.0]])
+    assert to_lps(points, Space.RAS).tolist() == [[-1.0, -2.0, 3.0]]
+    assert np.array_equal(to_lps(to_lps(points, Space.RAS), Space.RAS), points)
+    for space in (Space.LPS, Space.LOCAL):
+        assert np.array_equal(to_lps(points, space), points)
+
+
+def test_units_and_spaces_are_parsed_or_refused_with_the_list() -> None:
+    """An unknown one is refused with everything that is allowed."""
+    assert [parse_unit(text, where="x").mm for text in ("mm", "cm", " m ")] == [1.0, 10.0, 1000.0]
+    assert parse_space("ras", where="x") is Space.RAS and parse_unit("m", where="x") is Unit.M
+    with pytest.raises(InputError, match="unknown unit of length 'inch'; allowed: mm, cm, m"):
+        parse_unit("inch", where="x")
+    with pytest.raises(InputError, match="unknown space 'RPS'; allowed: LPS, RAS, local"):
+        parse_space("RPS", where="x")

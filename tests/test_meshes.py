@@ -1,0 +1,658 @@
+"""Mesh files: whole ones give every triangle, broken ones give one clear line, never a smaller mesh."""
+
+import base64
+import json
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from planning.errors import InputError
+from planning.formats.guard import guard_mesh
+from planning.formats.meshes import mesh_warnings, read_mesh
+from planning.formats.spaces import Space, Unit
+from planning.mesh import TriangleMesh
+
+BALL = trimesh.creation.icosphere(1, 30.0)
+BALL.apply_translation([5.0, -7.0, 11.0])
+VH_MALE = Path(__file__).parents[2] / "shared" / "data" / "hubmap_vh_male"
+
+
+def read(folder: Path, suffix: str, data: bytes, unit: Unit = Unit.MM, space: Space = Space.LPS) -> TriangleMesh:
+    """The mesh in the given bytes, through a file."""
+    path = folder / f"mesh{suffix}"
+    path.write_bytes(data)
+    return read_mesh(path, unit=unit, space=space, where=path.name)
+
+
+def same_triangles(mesh: TriangleMesh, corners: np.ndarray, tolerance: float = 1e-5) -> bool:
+    """Whether the mesh has these triangles (m, 3, 3) in this order."""
+    return mesh.triangles.shape == corners.shape and np.abs(mesh.triangles - corners).max() < tolerance
+
+
+# ---- whole files of each kind, and how they are written ------------------------------------------------------------
+
+
+def ply_mixed(vertices: np.ndarray, faces: list[list[int]], order: str = "<") -> bytes:
+    """A binary PLY with polygons of any size, a scalar beside the list, and an element that nobody needs."""
+    name = {"<": "little", ">": "big"}[order]
+    header = f"""ply\nformat binary_{name}_endian 1.0\ncomment made for a test\nelement vertex {len(vertices)}
+property double x\nproperty double y\nproperty double z\nproperty uchar red\nelement face {len(faces)}
+property uchar quality\nproperty list uchar int vertex_indices\nelement other 2\nproperty short s\nend_header\n"""
+    rows = [struct.pack(f"{order}3dB", *row, 7) for row in vertices]
+    rows += [struct.pack(f"{order}BB{len(face)}i", 9, len(face), *face) for face in faces]
+    return header.encode() + b"".join(rows) + struct.pack(f"{order}2h", 1, 2)
+
+
+def glb(document: dict[str, Any], binary: bytes) -> bytes:
+    """A GLB file with the given JSON and binary chunk."""
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    binary += bytes(-len(binary) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+TRIANGLE = np.array([[0, 0, 0], [10, 0, 0], [0, 20, 0]], dtype="<f4")
+
+
+def gltf_document(**changes: Any) -> dict[str, Any]:
+    """One triangle with indices, moved by (1, 2, 3); keyword arguments replace members."""
+    document = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "translation": [1, 2, 3]}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5123, "count": 3, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 36},
+            {"buffer": 0, "byteOffset": 36, "byteLength": 6},
+        ],
+        "buffers": [{"byteLength": 42}],
+    }
+    return document | changes
+
+
+GLTF_BINARY = TRIANGLE.tobytes() + np.array([0, 1, 2], dtype="<u2").tobytes()
+
+
+def vtk_binary(array: np.ndarray, compressed: bool, header: str = "<u4") -> list[bytes]:
+    """Header and body of a VTK array, which base64 encodes apart when it is compressed."""
+    raw = array.tobytes()
+    if not compressed:
+        return [np.array([len(raw)], header).tobytes() + raw]
+    block = 64
+    blocks = [raw[i : i + block] for i in range(0, len(raw), block)]
+    packed = [zlib.compress(each) for each in blocks]
+    sizes = [len(blocks), block, len(raw) % block, *(len(each) for each in packed)]
+    return [np.array(sizes, header).tobytes(), b"".join(packed)]
+
+
+def vtp(
+    points: np.ndarray,
+    polygons: list[list[int]],
+    form: str = "ascii",
+    *,
+    compressed: bool = False,
+    header: str = "UInt32",
+    pieces: int = 1,
+    **changes: str,
+) -> bytes:
+    """A VTP file; ``form`` is ascii, binary, raw or base64; keyword arguments replace whole attribute texts."""
+    connectivity = np.array([i for polygon in polygons for i in polygon], dtype="<i8")
+    offsets = np.cumsum([len(polygon) for polygon in polygons]).astype("<i8")
+    appended = b""
+
+    def array(name: str, kind: str, values: np.ndarray, extra: str = "") -> str:
+        nonlocal appended
+        head = f'<DataArray type="{kind}" Name="{name}" {extra}'
+        if form == "ascii":
+            return f'{head} format="ascii">{" ".join(map(str, values.reshape(-1).tolist()))}</DataArray>'
+        parts = vtk_binary(values, compressed, {"UInt32": "<u4", "UInt64": "<u8"}[header])
+        if form == "binary":
+            return f'{head} format="binary">\n{b"".join(map(base64.b64encode, parts)).decode()}\n</DataArray>'
+        offset = len(appended)
+        appended += b"".join(map(base64.b64encode, parts)) if form == "base64" else b"".join(parts)
+        return f'{head} format="appended" offset="{offset}"/>'
+
+    piece = f"""<Piece NumberOfPoints="{changes.get("n_points", str(len(points)))}"
+NumberOfStrips="{changes.get("n_strips", "0")}" NumberOfPolys="{changes.get("n_polys", str(len(polygons)))}">
+<PointData>{array("scalar", "Float64", points[:, 0])}</PointData>
+<Points>{array("Points", "Float64", points.astype("<f8"), 'NumberOfComponents="3"')}</Points>
+<Polys>{array("connectivity", "Int64", connectivity)}{array("offsets", "Int64", offsets)}</Polys></Piece>"""
+    compressor = 'compressor="vtkZLibDataCompressor"' if compressed else ""
+    text = f"""<?xml version="1.0"?>\n<!-- a comment -->
+<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="{header}" {compressor}>
+<PolyData>{piece * pieces}</PolyData>"""
+    if not appended:
+        return text.encode() + b"</VTKFile>\n"
+    kind = "raw" if form == "raw" else "base64"
+    section = f'<AppendedData encoding="{kind}">\n _'.encode() + appended + b"\n</AppendedData>"
+    return text.encode() + section + b"</VTKFile>\n"
+
+
+FACES = BALL.faces.tolist()
+WHOLE: dict[str, tuple[str, bytes]] = {
+    "stl-binary": (".stl", BALL.export(file_type="stl")),
+    "stl-ascii": (".stl", BALL.export(file_type="stl_ascii").encode()),
+    "obj": (".obj", BALL.export(file_type="obj", digits=17).encode()),
+    "ply-binary": (".ply", BALL.export(file_type="ply")),
+    "ply-ascii": (".ply", trimesh.exchange.ply.export_ply(BALL, encoding="ascii")),
+    "ply-little": (".ply", ply_mixed(BALL.vertices, FACES)),
+    "ply-big": (".ply", ply_mixed(BALL.vertices, FACES, ">")),
+    "glb": (".glb", BALL.export(file_type="glb")),
+    "vtp-ascii": (".vtp", vtp(BALL.vertices, FACES)),
+    "vtp-binary": (".vtp", vtp(BALL.vertices, FACES, "binary")),
+    "vtp-binary-zlib": (".vtp", vtp(BALL.vertices, FACES, "binary", compressed=True, header="UInt64")),
+    "vtp-raw": (".VTP", vtp(BALL.vertices, FACES, "raw", header="UInt64")),
+    "vtp-raw-zlib": (".vtp", vtp(BALL.vertices, FACES, "raw", compressed=True)),
+    "vtp-base64": (".vtp", vtp(BALL.vertices, FACES, "base64")),
+    "vtp-base64-zlib": (".vtp", vtp(BALL.vertices, FACES, "base64", compressed=True)),
+}
+
+
+@pytest.mark.parametrize("kind", WHOLE)
+def test_a_whole_file_gives_every_triangle_in_its_order(tmp_path: Path, kind: str) -> None:
+    """All forms of one ball give its triangles, closed, facing outward, with nothing to warn of."""
+    mesh = read(tmp_path, *WHOLE[kind])
+    assert same_triangles(mesh, BALL.triangles)
+    assert mesh.closed and mesh_warnings(mesh, "ball") == ()
+
+
+@pytest.mark.parametrize("kind", ["stl-binary", "stl-ascii", "obj", "ply-binary", "ply-ascii", "glb"])
+def test_whole_files_read_as_trimesh_reads_them(tmp_path: Path, kind: str) -> None:
+    """On files that are whole, an independent loader finds the same triangles."""
+    suffix, data = WHOLE[kind]
+    path = tmp_path / f"mesh{suffix}"
+    path.write_bytes(data)
+    assert same_triangles(read(tmp_path, suffix, data), trimesh.load_mesh(path, process=False).triangles)
+
+
+def test_unit_and_space_are_the_declared_ones(tmp_path: Path) -> None:
+    """Metres in RAS become mm in LPS: times 1000, x and y negated, still facing outward."""
+    data = (BALL.copy().apply_scale(0.001)).export(file_type="stl")
+    mesh = read(tmp_path, ".stl", data, Unit.M, Space.RAS)
+    assert same_triangles(mesh, BALL.triangles * [-1, -1, 1], 1e-4)
+    assert mesh_warnings(mesh, "ball") == ()
+    with pytest.raises(InputError, match=r"looks like metres declared as mm"):
+        read(tmp_path, ".stl", data, Unit.MM)
+    with pytest.raises(InputError, match=r"looks like mm declared as cm or m"):
+        read(tmp_path, *WHOLE["obj"], Unit.M)
+
+
+PENTAGON = np.array([[0, 0, 0], [10, 0, 0], [15, 10, 0], [5, 20, 0], [-5, 10, 0], [0, 0, 9]], dtype=float)
+POLYGONS = [[0, 1, 2, 3, 4], [0, 1, 5], [1, 2, 3, 5]]
+FAN = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 1, 5], [1, 2, 3], [1, 3, 5]]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "data"),
+    [
+        pytest.param(".ply", ply_mixed(PENTAGON, POLYGONS), id="ply-little"),
+        pytest.param(".ply", ply_mixed(PENTAGON, POLYGONS, ">"), id="ply-big"),
+        pytest.param(".vtp", vtp(PENTAGON, POLYGONS, "raw"), id="vtp"),
+        pytest.param(
+            ".obj",
+            "".join(f"v {x} {y} {z}\n" for x, y, z in PENTAGON).encode()
+            + b"".join(b"f " + b" ".join(b"%d//1" % (i + 1) for i in p) + b"\n" for p in POLYGONS),
+            id="obj",
+        ),
+    ],
+)
+def test_polygons_become_fans(tmp_path: Path, suffix: str, data: bytes) -> None:
+    """Polygons of 3, 4 and 5 corners in one file: count - 2 triangles each, from the first corner."""
+    assert same_triangles(read(tmp_path, suffix, data), PENTAGON[FAN])
+
+
+def test_relative_obj_indices_count_back_from_their_own_line(tmp_path: Path) -> None:
+    """Two faces written after their own vertices lie in different planes (a general loader puts both in one)."""
+    text = "".join(f"v 0 0 {z}\nv 9 0 {z}\nv 0 9 {z}\nf -3 -2 \\\n-1\n" for z in (0, 5))
+    assert read(tmp_path, ".obj", text.encode()).triangles[:, :, 2].tolist() == [[0.0] * 3, [5.0] * 3]
+
+
+def test_obj_normals_colours_groups_and_materials_are_passed_over(tmp_path: Path) -> None:
+    """Lines that hold no surface change nothing, and a material library is never opened."""
+    text = """mtllib /etc/passwd\no a\nv 0 0 0 0.5 0.5 0.5\nv 9 0 0 1\nv 0 9 0 # corner\nvn 0 0 1\nvt 0 0
+g one\nusemtl x\ns off\nf 1/1/1 2/1/1 3/1/1\nl 1 2\n# Faces: 1\n"""
+    assert len(read(tmp_path, ".obj", text.encode()).faces) == 1
+
+
+VTK_CUBE = (
+    """<?xml version="1.0"?>
+<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64"
+ compressor="vtkZLibDataCompressor">
+<PolyData>
+<Piece NumberOfPoints="8" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0" NumberOfPolys="6">
+<Points>
+<DataArray type="Float32" Name="Points" NumberOfComponents="3" format="appended" offset="0"/>
+</Points>
+<Verts>
+<DataArray type="Int64" Name="connectivity" format="appended" offset="112"/>
+<DataArray type="Int64" Name="offsets" format="appended" offset="144"/>
+</Verts>
+<Lines>
+<DataArray type="Int64" Name="connectivity" format="appended" offset="176"/>
+<DataArray type="Int64" Name="offsets" format="appended" offset="208"/>
+</Lines>
+<Strips>
+<DataArray type="Int64" Name="connectivity" format="appended" offset="240"/>
+<DataArray type="Int64" Name="offsets" format="appended" offset="272"/>
+</Strips>
+<Polys>
+<DataArray type="Int64" Name="connectivity" format="appended" offset="304"/>
+<DataArray type="Int64" Name="offsets" format="appended" offset="476"/>
+</Polys>
+</Piece>
+</PolyData>
+<AppendedData encoding="base64">
+   _"""
+    "AgAAAAAAAABAAAAAAAAAACAAAAAAAAAAFgAAAAAAAAAUAAAAAAAAAA==eJyzOiu83wqB7dHY6Hx0tfYAcY0akXicszorvN/qrLA9"
+    "GoaLAQDHsAvJAAAAAAAAAABAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAABAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAABAAAAAAAAAAAAA"
+    "AAAAAAAAAAAAAAAAAABAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAABAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAABAAAAAAAAAAAAAAAAA"
+    "AAAAAwAAAAAAAABAAAAAAAAAAAAAAAAAAAAAGwAAAAAAAAAaAAAAAAAAABoAAAAAAAAAeJxjYIAARijNCqVZGFABjM8OpZmhNAAC"
+    "8AAZeJxjYYAAVijNBqXZoTQzGh8mzwSlAQYIACl4nGNkgAAmKM0GpVkZUAEzmjpGKA0AA0gAFQ==AQAAAAAAAABAAAAAAAAAADAA"
+    "AAAAAAAAGAAAAAAAAAA=eJxjYYAADijNA6UFoLQIlJaA0gAHMABV"
+    """
+</AppendedData>
+</VTKFile>
+"""
+)
+"""A cube of six squares as VTK 9.7.2 writes it: base64 appended, blocks of 64 bytes in zlib, sizes of 64 bits."""
+
+
+def test_a_file_that_vtk_wrote_reads(tmp_path: Path) -> None:
+    """Six squares of half the side 1/sqrt(3) become twelve triangles of a closed cube, facing outward."""
+    mesh = read(tmp_path, ".vtp", VTK_CUBE.encode())
+    assert len(mesh.faces) == 12 and mesh.closed and mesh_warnings(mesh, "cube") == ()
+    assert mesh.bounds == pytest.approx(np.array([[-1.0] * 3, [1.0] * 3]) / np.sqrt(3.0), abs=1e-7)
+
+
+def test_several_vtp_pieces_become_one_surface(tmp_path: Path) -> None:
+    """Pieces are joined with their indices moved."""
+    mesh = read(tmp_path, ".vtp", vtp(PENTAGON, POLYGONS, pieces=2))
+    assert same_triangles(mesh, np.concatenate([PENTAGON[FAN]] * 2))
+
+
+def test_gltf_nodes_place_their_meshes(tmp_path: Path) -> None:
+    """A mesh used twice: once moved by its parent, once turned, scaled and mirrored, where the winding turns too."""
+    nodes = [
+        {"children": [1, 2], "translation": [100, 0, 0]},
+        {"mesh": 0, "rotation": [0, 0, np.sqrt(0.5), np.sqrt(0.5)]},
+        {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, 0, 0, 0, 7, 1]},
+    ]
+    mesh = read(tmp_path, ".glb", glb(gltf_document(nodes=nodes), GLTF_BINARY))
+    turned = [[100, 0, 0], [100, 10, 0], [80, 0, 0]]
+    mirrored = [[100, 20, 7], [110, 0, 7], [100, 0, 7]]
+    assert same_triangles(mesh, np.array([turned, mirrored], dtype=float))
+
+
+def test_gltf_buffers_may_be_inline_or_beside_the_file(tmp_path: Path) -> None:
+    """The same triangle from base64, and from a file of the same folder."""
+    expected = (TRIANGLE + np.float32([1, 2, 3]))[None].astype(float)
+    inline = "data:application/octet-stream;base64," + base64.b64encode(GLTF_BINARY).decode()
+    (tmp_path / "a b.bin").write_bytes(GLTF_BINARY)
+    for uri in (inline, "a%20b.bin"):
+        document = gltf_document(buffers=[{"byteLength": 42, "uri": uri}])
+        assert same_triangles(read(tmp_path, ".gltf", json.dumps(document).encode()), expected)
+
+
+def test_gltf_interleaved_positions_without_indices(tmp_path: Path) -> None:
+    """Positions with a stride of 16 bytes and no indices are three corners per triangle."""
+    rows = np.concatenate([TRIANGLE, np.full((3, 1), 99, "<f4")], axis=1).tobytes()
+    document = gltf_document(
+        meshes=[{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        bufferViews=[{"buffer": 0, "byteLength": 48, "byteStride": 16}],
+        buffers=[{"byteLength": 48}],
+    )
+    mesh = read(tmp_path, ".glb", glb(document, rows))
+    assert same_triangles(mesh, (TRIANGLE + np.float32([1, 2, 3]))[None].astype(float))
+
+
+# ---- broken files --------------------------------------------------------------------------------------------------
+
+STL = WHOLE["stl-binary"][1]
+ASCII_STL = WHOLE["stl-ascii"][1]
+OBJ = WHOLE["obj"][1]
+PLY = WHOLE["ply-binary"][1]
+ASCII_PLY = WHOLE["ply-ascii"][1]
+GLB = WHOLE["glb"][1]
+VTP = WHOLE["vtp-ascii"][1]
+RAW_VTP = WHOLE["vtp-raw"][1]
+NOISE = np.random.default_rng(7).integers(0, 256, 5000, dtype=np.uint8).tobytes()
+NAN, INF = struct.pack("<f", np.nan), struct.pack("<f", np.inf)
+
+
+def patched(data: bytes, position: int, new: bytes) -> bytes:
+    """The same bytes with some replaced."""
+    return data[:position] + new + data[position + len(new) :]
+
+
+def replaced(data: bytes, old: bytes, new: bytes) -> bytes:
+    """The same bytes with the first occurrence of ``old`` replaced, which must be there."""
+    assert old in data
+    return data.replace(old, new, 1)
+
+
+def broken_glb(**changes: Any) -> bytes:
+    """One triangle as GLB, with members of the document replaced."""
+    return glb(gltf_document(**changes), GLTF_BINARY)
+
+
+def primitive(**changes: Any) -> list[dict[str, Any]]:
+    """Meshes with one primitive, changed."""
+    return [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1} | changes]}]
+
+
+def accessors(index: int, **changes: Any) -> list[dict[str, Any]]:
+    """The accessors of the triangle, one of them changed."""
+    both = gltf_document()["accessors"]
+    both[index] |= changes
+    return both
+
+
+def ply_text(body: str, vertices: int = 3, faces: int = 1, extra: str = "") -> bytes:
+    """An ASCII PLY with a given body."""
+    return f"""ply\nformat ascii 1.0\nelement vertex {vertices}\nproperty float x\nproperty float y\nproperty float z
+element face {faces}\nproperty list uchar int vertex_indices\n{extra}end_header\n{body}""".encode()
+
+
+CORNERS = "0 0 0\n9 0 0\n0 9 0\n"
+OBJ_CORNERS = b"v 0 0 0\nv 9 0 0\nv 0 9 0\n"
+BROKEN = [
+    ("any-empty-file", ".stl", b"", r"file of 0 bytes"),
+    ("any-unknown-ending", ".step", STL, r"unknown mesh format '.step'.*\.stl, \.obj"),
+    ("stl-header-cut", ".stl", STL[:50], r"shorter than its header"),
+    ("stl-cut-in-the-middle", ".stl", STL[: len(STL) // 2], r"states 80 triangles.*4084 bytes.*has 2042"),
+    ("stl-one-byte-missing", ".stl", STL[:-1], r"has 4083"),
+    ("stl-trailing-bytes", ".stl", STL + b"\0\0", r"has 4086"),
+    ("stl-count-too-low", ".stl", patched(STL, 80, struct.pack("<I", 79)), r"states 79"),
+    ("stl-count-4-billion", ".stl", patched(STL, 80, b"\xff" * 4), r"states 4294967295 triangles"),
+    ("stl-count-zero", ".stl", patched(STL, 80, b"\0" * 4)[:84], r"states 0 triangles"),
+    ("stl-nan-vertex", ".stl", patched(STL, 84 + 12, NAN), r"vertex 0 is not finite"),
+    ("stl-infinite-vertex", ".stl", patched(STL, 84 + 62, INF), r"vertex 3 is not finite"),
+    ("stl-all-zero", ".stl", patched(STL, 84, bytes(len(STL) - 84)), r"all corners in one place"),
+    ("stl-binary-garbage", ".stl", NOISE, r"header states \d+ triangles"),
+    ("stl-text-garbage", ".stl", b"lorem ipsum " * 40, r"header states \d+ triangles"),
+    ("stl-that-is-a-picture", ".stl", b"\x89PNG\r\n\x1a\n" + NOISE, r"header states"),
+    ("stl-ascii-cut", ".stl", ASCII_STL[: len(ASCII_STL) // 2], r"the file is cut"),
+    ("stl-ascii-without-end", ".stl", replaced(ASCII_STL, b"endsolid", b""), r"the file is cut"),
+    ("stl-ascii-cut-but-closed", ".stl", ASCII_STL[:5000] + b"\nendsolid\n", r"facet \d+ is not complete|instead of"),
+    ("stl-ascii-misspelt", ".stl", replaced(ASCII_STL, b"vertex", b"vertx"), r"facet 0: 'vertx' instead of 'vertex'"),
+    ("stl-ascii-facet-without-end", ".stl", replaced(ASCII_STL, b"endfacet", b""), r"facet 0: 'facet' instead of"),
+    ("stl-ascii-number-broken", ".stl", replaced(ASCII_STL, b"vertex ", b"vertex 1,5x"), r"a coordinate is no number"),
+    ("stl-ascii-4-corners", ".stl", replaced(ASCII_STL, b"vertex ", b"vertex 0 0 0\nvertex "), r"facet 0: 'vertex' in"),
+    ("stl-ascii-nan", ".stl", replaced(ASCII_STL, b"vertex -10.771933363574009", b"vertex nan"), r"0 is not finite"),
+    ("stl-ascii-no-facet", ".stl", b"solid x facet\nendsolid x\n", r"no facet"),
+    ("stl-ascii-two-solids", ".stl", ASCII_STL * 2, r"several solids"),
+    ("stl-ascii-endless-word", ".stl", replaced(ASCII_STL, b"normal", b"n" * 5000), r"'n{20}' instead of 'normal'"),
+    ("ply-endless-word", ".ply", ply_text("0 " * 8 + "9" * 5000 + "\n3 0 1 2\n"), r"a word of 5000 characters"),
+    ("stl-ascii-not-utf8", ".stl", replaced(ASCII_STL, b"loop", b"\xff\xfe"), r"byte \d+ is not text"),
+    ("obj-last-line-cut", ".obj", OBJ_CORNERS + b"f 1 2 3", r"no line end"),
+    ("obj-face-list-cut", ".obj", OBJ[: OBJ.index(b"\nf ") + 1], r"no face"),
+    ("obj-faces-cut", ".obj", OBJ[: OBJ.index(b"\n", OBJ.index(b"\nf ") + 99) + 1], r"vertices that no face uses"),
+    ("obj-fewer-than-counted", ".obj", OBJ_CORNERS + b"# Faces: 2\nf 1 2 3\n", r"count 2 faces, 1 are there"),
+    ("obj-index-too-high", ".obj", OBJ_CORNERS + b"f 1 2 4\n", r"line 4: face uses vertex 4 of 3"),
+    ("obj-index-zero", ".obj", OBJ_CORNERS + b"f 0 1 2\n", r"face uses vertex 0"),
+    ("obj-index-too-negative", ".obj", OBJ_CORNERS + b"f -4 1 2\n", r"face uses vertex -4"),
+    ("obj-index-no-number", ".obj", OBJ_CORNERS + b"f 1 2 x\n", r"face corner 'x'"),
+    ("obj-index-endless", ".obj", OBJ_CORNERS + b"f 1 2 " + b"9" * 5000 + b"\n", r"face corner '999"),
+    ("obj-two-corners", ".obj", OBJ_CORNERS + b"f 1 2\n", r"face 0 has 2 corners"),
+    ("obj-nan-vertex", ".obj", b"v nan 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n", r"vertex 0 is not finite"),
+    ("obj-overflowing-number", ".obj", b"v 1e999 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n", r"not finite"),
+    ("obj-two-coordinates", ".obj", b"v 1 2\n", r"line 1: vertex of 2 numbers"),
+    ("obj-decimal-comma", ".obj", b"v 1,5 2 3\n", r"line 1: vertex '1,5 2 3'"),
+    ("obj-only-vertices", ".obj", OBJ_CORNERS, r"no face"),
+    ("obj-text-garbage", ".obj", b"lorem ipsum\n", r"line 1: line starts with 'lorem'"),
+    ("obj-binary-garbage", ".obj", NOISE, r"is not text"),
+    ("obj-free-form-surface", ".obj", OBJ_CORNERS + b"surf 0 1 0 1 1 2 3\n", r"line starts with 'surf'"),
+    ("ply-cut-in-the-middle", ".ply", PLY[: len(PLY) // 2], r"face take at least|ends inside"),
+    ("ply-one-byte-missing", ".ply", PLY[:-1], r"ends inside|take at least"),
+    ("ply-header-cut", ".ply", PLY[:60], r"no complete header"),
+    ("ply-trailing-bytes", ".ply", PLY + b"xyz", r"3 bytes after the stated data"),
+    ("ply-count-too-low", ".ply", replaced(PLY, b"face 80", b"face 79"), r"13 bytes after"),
+    ("ply-count-too-high", ".ply", replaced(PLY, b"face 80", b"face 81"), r"ends inside|take at least"),
+    ("ply-count-huge", ".ply", replaced(PLY, b"vertex 42", b"vertex 4294967295"), r"4294967295 x vertex take at"),
+    ("ply-count-beyond-reason", ".ply", replaced(PLY, b"vertex 42", b"vertex " + b"9" * 40), r"header line"),
+    ("ply-no-face", ".ply", ply_text(CORNERS, faces=0), r"no face"),
+    ("ply-only-points", ".ply", replaced(ply_text(CORNERS, faces=0), b"face", b"edge"), r"none face"),
+    ("ply-index-too-high", ".ply", ply_text(CORNERS + "3 0 1 3\n"), r"uses vertex 3"),
+    ("ply-index-negative", ".ply", ply_text(CORNERS + "3 0 1 -1\n"), r"uses vertex -1"),
+    ("ply-index-fraction", ".ply", ply_text(CORNERS + "3 0 1 1.5\n"), r"not a whole number"),
+    ("ply-two-corners", ".ply", ply_text(CORNERS + "2 0 1\n"), r"has 2 corners"),
+    ("ply-negative-corners", ".ply", ply_text(CORNERS + "-3 0 1 2\n"), r"of length -3"),
+    ("ply-nan", ".ply", ply_text("nan 0 0\n9 0 0\n0 9 0\n3 0 1 2\n"), r"vertex 0 is not finite"),
+    ("ply-word", ".ply", ply_text("zero 0 0\n9 0 0\n0 9 0\n3 0 1 2\n"), r"holds no number"),
+    ("ply-ascii-cut", ".ply", ASCII_PLY[: len(ASCII_PLY) // 2], r"no line end|take at least|ends inside"),
+    ("ply-ascii-last-line-missing", ".ply", ASCII_PLY.rstrip()[:-9] + b"\n", r"ends inside|take at least"),
+    ("ply-strips", ".ply", ply_text(CORNERS + "3 0 1 2\n3 0 1 2\n", extra="element tristrips 1\nproperty list int int"
+     " vertex_indices\n"), r"triangle strips"),
+    ("ply-no-z", ".ply", replaced(ply_text(CORNERS + "3 0 1 2\n"), b"float z", b"float w"), r"without x, y and z"),
+    ("ply-unknown-type", ".ply", replaced(PLY, b"float x", b"quad x"), r"property type 'quad'"),
+    ("ply-unknown-format", ".ply", replaced(PLY, b"binary_little_endian", b"zipped"), r"format \['zipped'\]"),
+    ("ply-garbage", ".ply", NOISE, r"no complete header"),
+    ("glb-cut-in-the-middle", ".glb", GLB[: len(GLB) // 2], r"header states \d+ bytes, but the file has"),
+    ("glb-header-cut", ".glb", GLB[:16], r"not a GLB file"),
+    ("glb-trailing-bytes", ".glb", GLB + b"\0" * 4, r"header states"),
+    ("glb-chunk-too-long", ".glb", patched(GLB, 12, b"\xff\xff\xff\x7f"), r"beyond the file's end"),
+    ("glb-version-1", ".glb", patched(GLB, 4, b"\1"), r"not a GLB file of version 2"),
+    ("glb-garbage", ".glb", NOISE, r"not a GLB file"),
+    ("glb-json-broken", ".glb", patched(GLB, 20, b"x"), r"JSON cannot be read"),
+    ("glb-json-nested-without-end", ".glb", glb({}, b"").replace(b"{}", b"[["), r"JSON cannot be read"),
+    ("glb-json-of-another-kind", ".glb", glb({"a": 1}, b""), r"'asset': Field required"),
+    ("glb-no-mesh", ".glb", broken_glb(nodes=[{}], meshes=[]), r"no mesh"),
+    ("glb-mesh-without-node", ".glb", broken_glb(nodes=[{}]), r"mesh 0 is placed by no node"),
+    ("glb-mesh-outside-of-scene", ".glb", broken_glb(scenes=[{"nodes": []}]), r"node 0 holds a mesh but is not"),
+    ("glb-node-cycle", ".glb", broken_glb(nodes=[{"mesh": 0, "children": [0]}]), r"node 0 is missing, or reached"),
+    ("glb-node-missing", ".glb", broken_glb(scenes=[{"nodes": [0, 5]}]), r"node 5 is missing"),
+    ("glb-two-scenes", ".glb", broken_glb(scene=None, scenes=[{}, {}]), r"2 scenes and none"),
+    ("glb-zero-scale", ".glb", broken_glb(nodes=[{"mesh": 0, "scale": [1, 1, 0]}]), r"determinant 0"),
+    ("glb-nan-matrix", ".glb", broken_glb(nodes=[{"mesh": 0, "matrix": [float("nan")] * 16}]), r"finite"),
+    ("glb-index-out-of-range", ".glb", glb(gltf_document(), GLTF_BINARY[:-2] + b"\3\0"), r"index 3 out of range"),
+    ("glb-nan-vertex", ".glb", glb(gltf_document(), NAN + GLTF_BINARY[4:]), r"vertex 0 is not finite"),
+    ("glb-accessor-too-long", ".glb", broken_glb(accessors=accessors(0, count=4)), r"accessor 0 takes 48 bytes"),
+    ("glb-accessor-huge", ".glb", broken_glb(accessors=accessors(1, count=2**39)), r"at most 20000000"),
+    ("glb-accessor-sparse", ".glb", broken_glb(accessors=accessors(0, sparse={})), r"accessor 0 is sparse"),
+    ("glb-accessor-missing", ".glb", broken_glb(meshes=primitive(indices=9)), r"accessor 9 of 2"),
+    ("glb-indices-of-floats", ".glb", broken_glb(accessors=accessors(1, componentType=5126)), r"indices of type 5126"),
+    ("glb-positions-of-2", ".glb", broken_glb(accessors=accessors(0, type="VEC2")), r"POSITION of type 5126 VEC2"),
+    ("glb-view-beyond-buffer", ".glb", broken_glb(buffers=[{"byteLength": 40}]), r"bufferView 1 ends at byte 42"),
+    ("glb-buffer-beyond-file", ".glb", broken_glb(buffers=[{"byteLength": 99}]), r"buffer 0 states 99 bytes"),
+    ("glb-lines", ".glb", broken_glb(meshes=primitive(mode=1)), r"primitive mode 1"),
+    ("glb-strip", ".glb", broken_glb(meshes=primitive(mode=5)), r"primitive mode 5"),
+    ("glb-without-position", ".glb", broken_glb(meshes=primitive(attributes={})), r"no POSITION"),
+    ("glb-morph-targets", ".glb", broken_glb(meshes=primitive(targets=[{"POSITION": 0}])), r"morph targets"),
+    ("glb-skinned", ".glb", broken_glb(nodes=[{"mesh": 0, "skin": 0}]), r"bent by a skin"),
+    ("glb-draco", ".glb", broken_glb(extensionsRequired=["KHR_draco_mesh_compression"]), r"needs the extension"),
+    ("glb-reads-other-files", ".glb", broken_glb(buffers=[{"byteLength": 42, "uri": "x.bin"}]), r"buffer address"),
+    ("vtp-cut-in-the-middle", ".vtp", VTP[: len(VTP) // 2], r"XML cannot be read"),
+    ("vtp-raw-cut", ".vtp", RAW_VTP[: len(RAW_VTP) * 3 // 4], r"the file is cut"),
+    ("vtp-raw-bytes-missing", ".vtp", RAW_VTP[:-300] + RAW_VTP[-40:], r"array data end at byte|array of \d+ bytes"),
+    ("vtp-garbage", ".vtp", NOISE, r"XML cannot be read"),
+    ("vtp-other-xml", ".vtp", b"<svg/>", r"svg of type None"),
+    ("vtp-other-vtk", ".vtp", replaced(VTP, b'"PolyData"', b'"ImageData"'), r"VTKFile of type ImageData"),
+    ("vtp-no-polygon", ".vtp", vtp(PENTAGON, POLYGONS, n_polys="0"), r"no polygon"),
+    ("vtp-strips", ".vtp", vtp(PENTAGON, POLYGONS, n_strips="2"), r"triangle strips"),
+    ("vtp-points-too-many", ".vtp", vtp(PENTAGON, POLYGONS, n_points="7"), r"18 numbers instead of 21"),
+    ("vtp-points-huge", ".vtp", vtp(PENTAGON, POLYGONS, n_points="99999999999"), r"99999999999 points"),
+    ("vtp-polygons-too-many", ".vtp", vtp(PENTAGON, POLYGONS, "raw", n_polys="4"), r"array of 24 bytes instead of 32"),
+    ("vtp-points-negative", ".vtp", vtp(PENTAGON, POLYGONS, n_points="-6"), r"NumberOfPoints is '-6'"),
+    ("vtp-index-too-high", ".vtp", vtp(PENTAGON, [[0, 1, 6]]), r"vertex indices 0 to 6"),
+    ("vtp-index-negative", ".vtp", vtp(PENTAGON, [[0, 1, -1]]), r"vertex indices -1 to 1"),
+    ("vtp-two-corners", ".vtp", vtp(PENTAGON, [[0, 1, 2], [0, 1]]), r"offsets do not rise"),
+    ("vtp-nan", ".vtp", vtp(PENTAGON * np.nan, POLYGONS), r"vertex 0 is not finite"),
+    ("vtp-word", ".vtp", replaced(vtp(PENTAGON, POLYGONS), b"15.0 10.0", b"wide 1"), r"no number of type float64"),
+    ("vtp-two-components", ".vtp", replaced(VTP, b'Components="3"', b'Components="2"'), r"2 components"),
+    ("vtp-float-indices", ".vtp", replaced(VTP, b'"Int64" Name="conn', b'"Float64" Name="conn'), r"of type float64"),
+    ("vtp-no-connectivity", ".vtp", replaced(VTP, b"connectivity", b"something"), r"0 arrays Polys"),
+    ("vtp-unknown-order", ".vtp", replaced(VTP, b"LittleEndian", b"MiddleEndian"), r"byte_order 'MiddleEndian'"),
+    ("vtp-offset-beyond", ".vtp", replaced(RAW_VTP, b'offset="0"', b'offset="9"').replace(
+        b'Float64" Name="Points" NumberOfComponents="3" format="appended" offset="', b'Float64" Name="Points" '
+        b'NumberOfComponents="3" format="appended" offset="99999'), r"offset '99999\d+'"),
+    ("vtp-lz4", ".vtp", replaced(WHOLE["vtp-raw-zlib"][1], b"vtkZLib", b"vtkLZ4"), r"compressor 'vtkLZ4Data"),
+    ("vtp-base64-damaged", ".vtp", replaced(WHOLE["vtp-base64"][1], b" _", b" _@@"), r"base64 data is damaged"),
+    ("vtp-zlib-damaged", ".vtp", WHOLE["vtp-raw-zlib"][1].replace(b"x\x9c", b"x\x9d"), r"block is damaged"),
+    ("vtp-entities", ".vtp", replaced(VTP, b"<VTKFile", b'<!DOCTYPE x [<!ENTITY a "b">]><VTKFile'), r"document type"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("suffix", "data", "says"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN])
+def test_a_broken_file_is_refused_in_one_line(tmp_path: Path, suffix: str, data: bytes, says: str) -> None:
+    """One line that names the file, the place and what is allowed."""
+    with pytest.raises(InputError, match=says) as caught:
+        read(tmp_path, suffix, data)
+    assert str(caught.value).startswith(f"mesh{suffix}") and "; allowed: " in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_and_a_directory_are_refused(tmp_path: Path) -> None:
+    """What is not a file is named as such, by its path."""
+    with pytest.raises(InputError, match=r"liver\.stl: no such file"):
+        read_mesh(tmp_path / "liver.stl", unit=Unit.MM, space=Space.LPS)
+    (tmp_path / "folder.stl").mkdir()
+    with pytest.raises(InputError, match="not a file but a directory"):
+        read_mesh(tmp_path / "folder.stl", unit=Unit.MM, space=Space.LPS)
+    with pytest.raises(InputError, match=r"cannot be read|no such file"):
+        read_mesh(tmp_path / "a\0b.stl", unit=Unit.MM, space=Space.LPS)
+
+
+@pytest.mark.parametrize(
+    "uri", ["../secret.bin", "/etc/passwd", "file:///etc/passwd", "http://x/y.bin", "link.bin", "a\0"]
+)
+def test_gltf_buffers_outside_of_the_folder_are_not_opened(tmp_path: Path, uri: str) -> None:
+    """Neither a path upwards, nor an absolute one, nor an address, nor a link that leads out."""
+    (tmp_path / "secret.bin").write_bytes(GLTF_BINARY)
+    folder = tmp_path / "case"
+    folder.mkdir()
+    (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
+    document = gltf_document(buffers=[{"byteLength": 42, "uri": uri}])
+    with pytest.raises(InputError, match=r"outside of the folder|buffer address|cannot be read"):
+        read(folder, ".gltf", json.dumps(document).encode())
+
+
+def test_a_mesh_placed_too_often_is_refused_before_it_is_built(tmp_path: Path) -> None:
+    """A small file with a million places for one long accessor is refused by arithmetic."""
+    nodes = [{"mesh": 0}] * 1000
+    long = accessors(1, count=3 * 30_000)
+    document = gltf_document(nodes=nodes, scenes=[{"nodes": list(range(1000))}], accessors=long)
+    with pytest.raises(InputError, match="30000000 triangles"):
+        read(tmp_path, ".glb", glb(document, GLTF_BINARY))
+
+
+# ---- any bytes -----------------------------------------------------------------------------------------------------
+
+ANY_BYTES = settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
+)
+
+
+def mesh_or_refusal(folder: Path, suffix: str, data: bytes) -> TriangleMesh | None:
+    """What reading gives: a mesh for which the guard holds, or None for a refusal; anything else fails the test."""
+    try:
+        mesh = read(folder, suffix, data)
+    except InputError:
+        return None
+    guard_mesh(mesh.vertices, mesh.faces, where="again")
+    return mesh
+
+
+@pytest.mark.parametrize("kind", WHOLE)
+@ANY_BYTES
+@given(data=st.data())
+def test_a_cut_file_never_gives_fewer_triangles(tmp_path: Path, kind: str, data: st.DataObject) -> None:
+    """Cut anywhere: refused, or nothing was lost. An OBJ cut at a line end is the exception, tested below."""
+    suffix, whole = WHOLE[kind]
+    cut = whole[: data.draw(st.integers(0, len(whole) - 1))]
+    if kind == "obj" and cut.endswith(b"\n"):
+        cut = cut[:-1]
+    mesh = mesh_or_refusal(tmp_path, suffix, cut)
+    assert mesh is None or same_triangles(mesh, BALL.triangles)
+
+
+@pytest.mark.parametrize("kind", WHOLE)
+@ANY_BYTES
+@given(data=st.data())
+def test_changed_bytes_give_a_refusal_or_a_guarded_mesh(tmp_path: Path, kind: str, data: st.DataObject) -> None:
+    """Up to four changed runs of bytes: no other exception, no mesh that the guard would refuse."""
+    suffix, whole = WHOLE[kind]
+    for _ in range(data.draw(st.integers(1, 4))):
+        position = data.draw(st.integers(0, min(len(whole), 2500)))
+        new = data.draw(st.binary(max_size=4) | st.sampled_from([b"-1", b"9" * 9, b"nan", b"1e9", b"\n", b"\xff" * 4]))
+        whole = whole[:position] + new + whole[position + data.draw(st.integers(0, 4)) :]
+    mesh_or_refusal(tmp_path, suffix, whole)
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".glb", ".gltf", ".vtp"])
+@ANY_BYTES
+@given(data=st.binary(max_size=200))
+def test_random_bytes_are_refused(tmp_path: Path, suffix: str, data: bytes) -> None:
+    """Two hundred random bytes are no mesh of any kind."""
+    assert mesh_or_refusal(tmp_path, suffix, data) is None
+
+
+def test_an_obj_cut_at_a_line_end_is_open_where_it_is_not_refused(tmp_path: Path) -> None:
+    """OBJ has no counts: cut between face lines, a ball is refused or at least is told to be open."""
+    lines = OBJ.splitlines(keepends=True)
+    seen = set()
+    for n_lines in range(len(lines) - 40, len(lines)):
+        mesh = mesh_or_refusal(tmp_path, ".obj", b"".join(lines[:n_lines]))
+        seen.add(mesh is None)
+        if mesh is not None:
+            cut = len(mesh.faces) < len(BALL.faces)
+            assert cut == any("open mesh" in warning for warning in mesh_warnings(mesh, "ball"))
+    assert False in seen
+
+
+# ---- warnings and real data ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        pytest.param(lambda faces: faces[1:], "open mesh: inside or outside cannot be known", id="open"),
+        pytest.param(lambda faces: faces[:, ::-1], "inverted normals", id="inverted"),
+        pytest.param(lambda f: np.vstack([f, [[0, 0, 1]]]), "1 of 81 triangles have no area", id="no-area"),
+    ],
+)
+def test_unusual_meshes_work_with_a_warning(change: Callable[[np.ndarray], np.ndarray], says: str) -> None:
+    """Common in real anatomy: they pass, and exactly one sentence says what cannot be known."""
+    mesh = guard_mesh(BALL.vertices, change(BALL.faces), where="ball")
+    (warning,) = mesh_warnings(mesh, "liver")
+    assert warning.startswith("liver: ") and says in warning
+
+
+needs_vh_male = pytest.mark.skipif(not VH_MALE.is_dir(), reason="the hubmap_vh_male set is not on this machine")
+
+
+@needs_vh_male
+def test_the_visible_human_skin_is_whole_and_watertight() -> None:
+    """107,334 triangles, closed, 96.2 litres, facing outward."""
+    mesh = read_mesh(VH_MALE / "VH_M_Skin.v1.1.glb", unit=Unit.M, space=Space.LOCAL)
+    assert len(mesh.faces) == 107_334 and mesh.closed and mesh_warnings(mesh, "skin") == ()
+    litres = np.linalg.det(mesh.triangles).sum() / 6.0 / 1e6
+    assert litres == pytest.approx(96.22, abs=0.01)
+
+
+@needs_vh_male
+def test_all_visible_human_organs_read_as_trimesh_reads_them() -> None:
+    """Same number of triangles, same set of triangle centres with all node transforms applied, to 0.01 mm."""
+    paths = sorted(VH_MALE.glob("*.glb"))
+    assert len(paths) == 12
+    for path in paths:
+        mesh = read_mesh(path, unit=Unit.M, space=Space.LOCAL)
+        other = trimesh.load_scene(path, process=False, skip_materials=True).to_mesh()
+        assert len(mesh.faces) == len(other.faces), path.name
+        ours, theirs = mesh.triangles.mean(axis=1), other.triangles.mean(axis=1) * 1000.0
+        distance, _ = cKDTree(ours).query(theirs)
+        assert distance.max() < 0.01, path.name

@@ -1,0 +1,141 @@
+"""Names of labels, and the rules that patterns give them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from planning.errors import InputError
+from planning.formats.labelmaps import LabelMap
+from planning.formats.naming import LabelRule, RuleKind, names_for, select
+from planning.formats.totalsegmentator import V1, V2
+
+REAL = Path(__file__).parents[1] / ".." / "shared" / "data" / "totalseg_abdomen_3mm"
+NAMES = {1: "liver", 2: "rib_left_7", 3: "rib_left_8", 4: "lung_lower_lobe_left", 5: "aorta"}
+
+
+def map_with(names: dict[int, str] | None) -> LabelMap:
+    """A label map of nothing but its names."""
+    return LabelMap(np.ones((2, 2, 2), dtype=np.int32), np.eye(4), names, Path("a.seg.nrrd"))
+
+
+def chosen(present: tuple[int, ...] = (1, 2, 3, 4, 5), **rules: Any) -> dict[str, tuple[str, float]]:
+    """Name to kind and margin."""
+    given = {"avoid": {"rib_*": 1.0, "aorta": 5.0}, "traverse": ["lung_*"], "target": ["liver"], **rules}
+    selection = select(NAMES, present, where="case.toml", **given)
+    return {rule.name: (str(rule.kind), rule.margin_mm) for rule in selection.rules}
+
+
+def test_tables_have_their_sizes_and_the_versions_differ() -> None:
+    """104 and 117 classes with distinct names; the aorta is 7 or 52."""
+    assert (len(V1), len(V2)) == (104, 117)
+    assert len(set(V1.values())) == 104
+    assert len(set(V2.values())) == 117
+    assert (V1[7], V1[104], V2[52], V2[117]) == ("aorta", "urinary_bladder", "aorta", "costal_cartilages")
+    with pytest.raises(TypeError):
+        V1[7] = "liver"  # type: ignore[index]
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason=f"the real CT is not at {REAL}")
+@pytest.mark.parametrize(("table", "name"), [(V1, "labels_v1_normal.json"), (V2, "labels_v2_fast.json")])
+def test_tables_agree_with_the_real_label_maps(table: dict[int, str], name: str) -> None:
+    """Each name that comes with the data is the table's."""
+    named = json.loads((REAL / name).read_text())
+    assert {int(label): text for label, text in named.items()} == {int(label): table[int(label)] for label in named}
+
+
+def test_namings_by_name_by_file_and_by_the_map_itself(tmp_path: Path) -> None:
+    """All four ways to name labels."""
+    (tmp_path / "names.csv").write_text('id,name\n1,liver\n\n7,"vein, portal"\n', encoding="utf-8")
+    assert names_for("totalsegmentator-v1", tmp_path, map_with(None))[7] == "aorta"
+    assert names_for("totalsegmentator-v2", tmp_path, map_with(None))[52] == "aorta"
+    assert names_for("names.csv", tmp_path, map_with(None)) == {1: "liver", 7: "vein, portal"}
+    assert names_for(None, tmp_path, map_with({3: "x"})) == {3: "x"}
+    assert names_for("seg.nrrd", tmp_path, map_with({3: "x"})) == {3: "x"}
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        (b"", "header"),
+        (b"label,name\n1,a\n", "header"),
+        (b"id,name\n", "no label"),
+        (b"id,name\n0,a\n", "line 2"),
+        (b"id,name\n-1,a\n", "line 2"),
+        (b"id,name\n1.5,a\n", "line 2"),
+        (b"id,name\n1,a,b\n", "line 2"),
+        (b"id,name\n1,a\n1,b\n", "line 3.*stands twice"),
+        (b"id,name\n1,a\n2,a\n", "both named 'a'"),
+        (b"id,name\n1,\n", "empty name"),
+        (b"id,name\n1,\xff\n", "no CSV text"),
+        (b'id,name\n1,"a\n', "no CSV text"),
+    ],
+)
+def test_broken_name_tables_are_refused(tmp_path: Path, content: bytes, match: str) -> None:
+    """By line where there is one."""
+    (tmp_path / "names.csv").write_bytes(content)
+    with pytest.raises(InputError, match=match):
+        names_for("names.csv", tmp_path, map_with(None))
+
+
+def test_unknown_namings_are_refused_with_the_nearest(tmp_path: Path) -> None:
+    """A misspelt naming, a missing CSV, a map without names, and a map that names two labels alike."""
+    with pytest.raises(InputError, match="nearest: totalsegmentator-v2"):
+        names_for("totalsegmentator_v2", tmp_path, map_with(None))
+    with pytest.raises(InputError, match="cannot be read"):
+        names_for("none.csv", tmp_path, map_with(None))
+    with pytest.raises(InputError, match="holds no names"):
+        names_for(None, tmp_path, map_with(None))
+    with pytest.raises(InputError, match="both named"):
+        names_for(None, tmp_path, map_with({1: "a", 2: "a"}))
+
+
+def test_patterns_give_every_label_its_rule() -> None:
+    """Kinds and margins come from the pattern that matches; the largest margin of several holds."""
+    assert chosen() == {
+        "liver": ("target", 0.0),
+        "rib_left_7": ("avoid", 1.0),
+        "rib_left_8": ("avoid", 1.0),
+        "lung_lower_lobe_left": ("traverse", 0.0),
+        "aorta": ("avoid", 5.0),
+    }
+    assert chosen(avoid={"rib_*": 1.0, "aorta": 5.0, "*_7": 3.0})["rib_left_7"] == ("avoid", 3.0)
+    assert chosen(avoid={"*_7": 3.0, "rib_*": 1.0, "aorta": 5.0})["rib_left_7"] == ("avoid", 3.0)
+    first = select(NAMES, [5], avoid={"aorta": 2}, where="case.toml").rules
+    assert first == (LabelRule(5, "aorta", RuleKind.AVOID, 2.0, "aorta"),)
+
+
+def test_a_label_that_no_rule_names_is_an_error_that_lists_all_such() -> None:
+    """What is present and not spoken of is never silently free."""
+    with pytest.raises(InputError, match="present: rib_left_7, rib_left_8, aorta"):
+        chosen(avoid={})
+    with pytest.raises(InputError, match="labels without a name: 9"):
+        chosen(present=(1, 9))
+
+
+@pytest.mark.parametrize("rules", [{"ignore": ["rib_left_7"]}, {"traverse": ["lung_*", "aort?"]}, {"target": ["*"]}])
+def test_a_label_of_two_kinds_is_an_error(rules: dict[str, list[str]]) -> None:
+    """Whatever the margins, two kinds for one label contradict each other."""
+    with pytest.raises(InputError, match="is named by .* and by"):
+        chosen(**rules)
+    with pytest.raises(InputError, match="is named by"):
+        select(NAMES, [5], avoid={"aorta": 0.0}, ignore=["aorta"], where="case.toml")
+
+
+def test_a_pattern_that_names_nothing_is_an_error_or_a_warning() -> None:
+    """Unknown to the naming: refused with the nearest names. Known but not in this map: a warning."""
+    with pytest.raises(InputError, match=r"'aotra\*' matches no name.*aorta"):
+        chosen(avoid={"rib_*": 1.0, "aotra*": 5.0})
+    selection = select(NAMES, [5], avoid={"aorta": 0.0}, ignore=["lung_*"], where="case.toml")
+    assert selection.warnings == ("case.toml: ignore pattern 'lung_*' matches no label present",)
+
+
+@pytest.mark.parametrize("margin", [-1.0, float("nan"), float("inf")])
+def test_margins_are_finite_and_not_negative(margin: float) -> None:
+    """A margin below zero would let a needle in."""
+    with pytest.raises(InputError, match="margin"):
+        chosen(avoid={"rib_*": margin, "aorta": 5.0})

@@ -1,0 +1,281 @@
+"""Named points: CSV and Slicer files, their unit and space, and every way in which they can be wrong."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from planning.errors import InputError
+from planning.formats.guard import guard_points
+from planning.formats.points import NamedPoints, read_points, write_points
+from planning.formats.spaces import Space, Unit
+
+CHEN_2019 = Path(__file__).parents[2] / "shared" / "data" / "chen2019"
+CSV = "name,x_mm,y_mm,z_mm\nA,10,20,147\nB,110,120.5,-1e2\n"
+FCSV = """# Markups fiducial file version = 4.11
+# CoordinateSystem = LPS
+# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID
+vtkMRMLMarkupsFiducialNode_0,10,20,147,0,0,0,1,1,1,0,A,,
+vtkMRMLMarkupsFiducialNode_1,110,120.5,-100,0,0,0,1,1,1,0,"B",,
+"""
+POINTS = [[10.0, 20.0, 147.0], [110.0, 120.5, -100.0]]
+
+
+def markups(*, points: list[dict[str, Any]] | None = None, **changes: Any) -> str:
+    """A Slicer markups file of A and B; keyword arguments replace members, None removes them."""
+    both = [
+        {"id": str(i), "label": label, "position": position, "positionStatus": "defined", "orientation": [1.0] * 9}
+        for i, (label, position) in enumerate(zip("AB", POINTS, strict=True))
+    ]
+    markup = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "locked": True}
+    markup |= {"controlPoints": both if points is None else points} | changes
+    kept = {key: value for key, value in markup.items() if value is not None}
+    return json.dumps({"@schema": "markups-schema-v1.0.3.json#", "markups": [kept]})
+
+
+def read(folder: Path, ending: str, data: str | bytes, **options: Any) -> NamedPoints:
+    """The points in the given text, through a file."""
+    path = folder / f"markers{ending}"
+    path.write_bytes(data.encode() if isinstance(data, str) else data)
+    return read_points(path, where=path.name, **options)
+
+
+@pytest.mark.parametrize(
+    ("ending", "text"),
+    [
+        pytest.param(".csv", CSV, id="csv"),
+        pytest.param(".CSV", CSV, id="csv-in-capitals"),
+        pytest.param(".csv", "\ufeff" + CSV.replace("\n", "\r\n"), id="csv-of-a-spreadsheet"),
+        pytest.param(".csv", CSV.rstrip() + "\n\n,,,\n", id="csv-with-empty-lines"),
+        pytest.param(".csv", "z_cm, name ,x_cm,y_cm\n14.7, A ,1,2\n-10,B,11,12.05\n", id="csv-in-cm-in-any-order"),
+        pytest.param(".csv", "name,x_m,y_m,z_m\nA,.01,.02,.147\nB,.11,.1205,-.1\n", id="csv-in-m"),
+        pytest.param(".mrk.json", markups(), id="markups"),
+        pytest.param(".mrk.json", markups(coordinateSystem="1"), id="markups-system-1-as-text"),
+        pytest.param(".mrk.json", markups(coordinateSystem=1), id="markups-system-1"),
+        pytest.param(".mrk.json", markups(coordinateUnits=["mm", "UCUM", "millimeter"]), id="markups-coded-unit"),
+        pytest.param(".fcsv", FCSV, id="fcsv"),
+        pytest.param(".fcsv", FCSV.replace("LPS", "1"), id="fcsv-system-1"),
+    ],
+)
+def test_every_form_gives_the_same_points_in_lps(tmp_path: Path, ending: str, text: str) -> None:
+    """Names in the file's order, coordinates in mm, read-only, in LPS."""
+    found = read(tmp_path, ending, text, default_space=Space.LPS)
+    assert found.names == ("A", "B") and found.space is Space.LPS and found.kinds is None
+    assert found.points == pytest.approx(np.array(POINTS), abs=1e-12)
+    with pytest.raises(ValueError, match="read-only"):
+        found.points[0, 0] = 0.0
+
+
+@pytest.mark.parametrize(
+    ("ending", "text"),
+    [
+        pytest.param(".csv", CSV, id="csv-in-the-space-of-its-case"),
+        pytest.param(".mrk.json", markups(coordinateSystem="RAS"), id="markups"),
+        pytest.param(".mrk.json", markups(coordinateSystem=0), id="markups-system-0"),
+        pytest.param(".fcsv", FCSV.replace("LPS", "RAS"), id="fcsv"),
+        pytest.param(".fcsv", FCSV.replace("LPS", "0"), id="fcsv-system-0"),
+    ],
+)
+def test_ras_becomes_lps(tmp_path: Path, ending: str, text: str) -> None:
+    """Right-anterior coordinates arrive with x and y negated, and say LPS."""
+    found = read(tmp_path, ending, text, default_space=Space.RAS)
+    assert found.space is Space.LPS
+    assert found.points == pytest.approx(np.array(POINTS) * [-1, -1, 1], abs=1e-12)
+
+
+def test_a_slicer_file_speaks_for_itself(tmp_path: Path) -> None:
+    """Its own space counts more than the case's, since both are then turned to LPS."""
+    text = markups(coordinateSystem="RAS", coordinateUnits="cm")
+    found = read(tmp_path, ".mrk.json", text, default_space=Space.LPS, default_unit=Unit.M)
+    assert found.points == pytest.approx(np.array(POINTS) * [-10, -10, 10], abs=1e-12)
+
+
+@pytest.mark.parametrize("space", [None, Space.LOCAL])
+def test_points_of_no_patient_keep_their_coordinates(tmp_path: Path, space: Space | None) -> None:
+    """A robot's base has no patient space, and a local frame is its own."""
+    found = read(tmp_path, ".csv", CSV, default_space=space)
+    assert found.space is space and found.points.tolist() == POINTS
+
+
+def test_a_missing_unit_may_be_declared(tmp_path: Path) -> None:
+    """Older Slicer files and plain x,y,z headers have no unit; the caller may then say it."""
+    plain = CSV.replace("_mm", "")
+    for ending, text in ((".csv", plain), (".mrk.json", markups(coordinateUnits=None))):
+        found = read(tmp_path, ending, text, default_unit=Unit.CM)
+        assert found.points == pytest.approx(np.array(POINTS) * 10, abs=1e-12)
+
+
+def test_kinds_are_kept(tmp_path: Path) -> None:
+    """A column kind tells markers from lesions."""
+    found = read(tmp_path, ".csv", "name,kind,x_mm,y_mm,z_mm\nA,marker,1,2,3\nL,lesion,4,5,6\n")
+    assert found.kinds == ("marker", "lesion")
+
+
+@pytest.mark.skipif(not CHEN_2019.is_dir(), reason="the chen2019 set is not on this machine")
+def test_the_papers_markers_and_lesions_read() -> None:
+    """Table 1 of Chen 2019: five markers, three lesions."""
+    found = read_points(CHEN_2019 / "markers_ct.csv", default_space=Space.LOCAL)
+    assert "".join(found.names) == "ABCDELMH" and found.kinds is not None and found.kinds.count("lesion") == 3
+    assert found.points[6].tolist() == [50.0, 130.0, 63.0]
+
+
+# ---- broken files --------------------------------------------------------------------------------------------------
+
+
+def one_point(**changes: Any) -> str:
+    """A markups file of one point; keyword arguments replace its members, None removes them."""
+    point = {"label": "A", "position": [1.0, 2.0, 3.0], "positionStatus": "defined"} | changes
+    return markups(points=[{key: value for key, value in point.items() if value is not None}])
+
+
+HEADER = "name,x_mm,y_mm,z_mm\n"
+BROKEN: list[tuple[str, str, str | bytes, str]] = [
+    ("any-empty", ".csv", "", r"file of 0 bytes"),
+    ("any-unknown-ending", ".json", markups(), r"unknown point file 'markers\.json'; allowed: \.csv, \.mrk\.json"),
+    ("csv-only-white-space", ".csv", " \n\n", r"no line"),
+    ("csv-only-header", ".csv", HEADER, r"no point"),
+    ("csv-no-header", ".csv", "A,1,2,3\n", r"header: column 'A'"),
+    ("csv-no-unit", ".csv", CSV.replace("_mm", ""), r"no unit of length; allowed: x_mm"),
+    ("csv-unknown-unit", ".csv", CSV.replace("_mm", "_inch"), r"header: unknown unit of length 'inch'.*mm, cm, m"),
+    ("csv-mixed-units", ".csv", CSV.replace("x_mm", "x_m"), r"mixed units \['m', 'mm'\]"),
+    ("csv-unknown-column", ".csv", "name,x_mm,y_mm,z_mm,weight\nA,1,2,3,4\n", r"column 'weight'"),
+    ("csv-column-twice", ".csv", "name,x_mm,x_mm,z_mm\nA,1,2,3\n", r"columns \["),
+    ("csv-axis-in-two-units", ".csv", "name,x_mm,x_m,y_mm,z_mm\nA,1,1,2,3\n", r"columns \["),
+    ("csv-no-z", ".csv", "name,x_mm,y_mm\nA,1,2\n", r"columns \["),
+    ("csv-no-name", ".csv", "x_mm,y_mm,z_mm\n1,2,3\n", r"columns \["),
+    ("csv-semicolons", ".csv", CSV.replace(",", ";"), r"column 'name;x_mm"),
+    ("csv-too-few-fields", ".csv", CSV + "C,1,2\n", r"line 4: 3 fields instead of 4"),
+    ("csv-too-many-fields", ".csv", HEADER + "A,1,2,3,4\n", r"line 2: 5 fields instead of 4"),
+    ("csv-decimal-comma", ".csv", HEADER + "A,1,5,2,5,3,5\n", r"line 2: 7 fields"),
+    ("csv-quoted-decimal-comma", ".csv", HEADER + 'A,"1,5",2,3\n', r"line 2: '1,5' is not a number"),
+    ("csv-word", ".csv", HEADER + "A,1,2,3\nB,1,two,3\n", r"line 3: 'two' is not a number"),
+    ("csv-no-number", ".csv", HEADER + "A,1,,3\n", r"line 2: '' is not a number"),
+    ("csv-underscore", ".csv", HEADER + "A,1_0,2,3\n", r"line 2: '1_0' is not a number"),
+    ("csv-nan", ".csv", HEADER + "A,1,nan,3\n", r"line 2: 'nan' is not finite"),
+    ("csv-infinite", ".csv", HEADER + "A,1,2,-inf\n", r"line 2: '-inf' is not finite"),
+    ("csv-overflow", ".csv", HEADER + "A,1,2,1e999\n", r"line 2: '1e999' is not finite"),
+    ("csv-overflow-by-unit", ".csv", "name,x_m,y_m,z_m\nA,1e308,2,3\n", r"point 'A' is not finite"),
+    ("csv-far-away", ".csv", HEADER + "A,1,2,1e6\n", r"point 'A' lies at"),
+    ("csv-mm-said-to-be-m", ".csv", CSV.replace("_mm", "_m"), r"point 'A' lies at \[10000.0.*within 100000 mm"),
+    ("csv-empty-name", ".csv", HEADER + " ,1,2,3\n", r"line 2: empty name"),
+    ("csv-name-twice", ".csv", HEADER + "A,1,2,3\nA,4,5,6\n", r"the name 'A' is used 2 times"),
+    ("csv-open-quote", ".csv", HEADER + '"A,1,2,3\n', r"line 2: unexpected end"),
+    ("csv-not-utf8", ".csv", HEADER.encode() + b"\xe4,1,2,3\n", r"byte 20 is not text"),
+    ("csv-of-an-image", ".csv", b"\x89PNG\r\n\x1a\n\0\0", r"is not text"),
+    ("csv-with-nul", ".csv", HEADER + "A\0,1,2,3\n", r"name 'A\\x00'|NUL"),
+    ("markups-cut", ".mrk.json", markups()[:200], r"JSON cannot be read"),
+    ("markups-nested-without-end", ".mrk.json", "[" * 100_000, r"JSON cannot be read"),
+    ("markups-key-twice", ".mrk.json", markups().replace('"locked"', '"coordinateSystem"'), r"a key stands twice"),
+    ("markups-of-another-kind", ".mrk.json", "[1, 2]", r"not exactly one entry"),
+    ("markups-two-lists", ".mrk.json", '{"markups": [{}, {}]}', r"not exactly one entry"),
+    ("markups-curve", ".mrk.json", markups(type="Curve"), r"markup of type 'Curve'"),
+    ("markups-no-points", ".mrk.json", markups(points=[]), r"no control point"),
+    ("markups-no-space", ".mrk.json", markups(coordinateSystem=None), r"coordinate system 'None'.*LPS or RAS"),
+    ("markups-unknown-space", ".mrk.json", markups(coordinateSystem="IJK"), r"coordinate system 'IJK'"),
+    ("markups-space-2", ".mrk.json", markups(coordinateSystem=2), r"coordinate system '2'"),
+    ("markups-space-true", ".mrk.json", markups(coordinateSystem=True), r"coordinate system 'True'"),
+    ("markups-no-unit", ".mrk.json", markups(coordinateUnits=None), r"no unit of length"),
+    ("markups-unknown-unit", ".mrk.json", markups(coordinateUnits=["[in_i]", "UCUM"]), r"unit of length '\[in_i\]'"),
+    ("markups-unit-of-numbers", ".mrk.json", markups(coordinateUnits=3), r"coordinateUnits '3'"),
+    ("markups-no-label", ".mrk.json", one_point(label=None), r"control point 1: label 'None'"),
+    ("markups-empty-label", ".mrk.json", one_point(label=" "), r"control point 1: label ' '"),
+    ("markups-half-a-letter", ".mrk.json", one_point(label="\ud800"), r"name '\\ud800'"),
+    ("markups-label-twice", ".mrk.json", markups().replace('"B"', '"A"'), r"the name 'A' is used 2 times"),
+    ("markups-undefined", ".mrk.json", one_point(positionStatus="undefined"), r"positionStatus is 'undefined'"),
+    ("markups-preview", ".mrk.json", one_point(positionStatus="preview"), r"positionStatus is 'preview'"),
+    ("markups-no-position", ".mrk.json", one_point(position=None), r"control point 1: position 'None'"),
+    ("markups-two-numbers", ".mrk.json", one_point(position=[1, 2]), r"position '\[1, 2\]'"),
+    ("markups-text-numbers", ".mrk.json", one_point(position=["1", 2, 3]), r"allowed: three numbers"),
+    ("markups-nan", ".mrk.json", one_point(position=[float("nan"), 2, 3]), r"control point 1: 'nan' is not finite"),
+    ("markups-point-no-object", ".mrk.json", markups(points=[3]), r"control point 1: label"),  # type: ignore[list-item]  # the fault
+    ("fcsv-no-space", ".fcsv", FCSV.replace("# CoordinateSystem = LPS\n", ""), r"coordinate system 'None'"),
+    ("fcsv-unknown-space", ".fcsv", FCSV.replace("LPS", "2"), r"coordinate system '2'"),
+    ("fcsv-no-columns", ".fcsv", FCSV.replace("# columns", "# c"), r"columns \[\]"),
+    ("fcsv-no-point", ".fcsv", "\n".join(FCSV.splitlines()[:3]), r"no point"),
+    ("fcsv-line-cut", ".fcsv", FCSV[:-20], r"line 5: \d+ fields instead of 14|unexpected end"),
+    ("fcsv-nan", ".fcsv", FCSV.replace("147", "nan"), r"line 4: 'nan' is not finite"),
+]
+
+
+@pytest.mark.parametrize(("ending", "data", "says"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN])
+def test_a_broken_file_is_refused_in_one_line(tmp_path: Path, ending: str, data: str | bytes, says: str) -> None:
+    """One line that names the file, the line or point, and what is allowed."""
+    with pytest.raises(InputError, match=says) as caught:
+        read(tmp_path, ending, data, default_space=Space.LPS)
+    assert str(caught.value).startswith(f"markers{ending}") and "; allowed: " in str(caught.value)
+    assert "\n" not in str(caught.value)
+    str(caught.value).encode("utf-8")  # can be printed
+
+
+def test_a_patient_space_contradicts_a_local_frame(tmp_path: Path) -> None:
+    """A Slicer file in LPS cannot give points of a carton's own frame."""
+    with pytest.raises(InputError, match="points in LPS, but the case has a local frame"):
+        read(tmp_path, ".mrk.json", markups(), default_space=Space.LOCAL)
+
+
+def test_a_missing_file_and_a_directory_are_refused(tmp_path: Path) -> None:
+    """What is not a file is named as such, by its path."""
+    with pytest.raises(InputError, match=r"markers\.csv: no such file"):
+        read_points(tmp_path / "markers.csv")
+    (tmp_path / "folder.csv").mkdir()
+    with pytest.raises(InputError, match="not a file but a directory"):
+        read_points(tmp_path / "folder.csv")
+
+
+names = st.lists(
+    st.text(st.characters(categories=["L", "N", "P"]), min_size=1, max_size=8), min_size=1, max_size=6, unique=True
+)
+THROUGH_FILES = settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
+)
+
+
+@THROUGH_FILES
+@given(names=names, data=st.data())
+def test_written_points_read_back_exactly(tmp_path: Path, names: list[str], data: st.DataObject) -> None:
+    """Any names (with commas and quotes), kinds and coordinates return bit for bit; nothing is left over."""
+    number = st.floats(-1e5, 1e5)
+    rows = data.draw(st.lists(st.tuples(number, number, number), min_size=len(names), max_size=len(names)))
+    kinds = tuple(names) if data.draw(st.booleans()) else None
+    points = NamedPoints(tuple(names), guard_points(rows, names, where="test"), Space.LOCAL, kinds)
+    write_points(tmp_path / "out.csv", points)
+    found = read_points(tmp_path / "out.csv", default_space=Space.LOCAL)
+    assert found.names == points.names and found.kinds == kinds
+    assert np.array_equal(found.points, points.points)
+    assert [path.name for path in tmp_path.iterdir()] == ["out.csv"]
+
+
+def test_points_that_cannot_be_written_leave_nothing_behind(tmp_path: Path) -> None:
+    """A missing folder, or a folder in the file's place, is an input error; no part of a file stays."""
+    points = read(tmp_path, ".csv", CSV)
+    (tmp_path / "folder.csv").mkdir()
+    before = sorted(tmp_path.iterdir())
+    for path in (tmp_path / "missing" / "out.csv", tmp_path / "folder.csv"):
+        with pytest.raises(InputError, match="cannot be written"):
+            write_points(path, points)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("ending", "whole"), [(".csv", CSV), (".mrk.json", markups()), (".fcsv", FCSV)], ids=["csv", "markups", "fcsv"]
+)
+@THROUGH_FILES
+@given(data=st.data())
+def test_changed_bytes_give_a_refusal_or_guarded_points(
+    tmp_path: Path, ending: str, whole: str, data: st.DataObject
+) -> None:
+    """Changed, cut or inserted bytes: an InputError or points for which the guard holds, nothing else."""
+    raw = whole.encode()
+    for _ in range(data.draw(st.integers(1, 4))):
+        position = data.draw(st.integers(0, len(raw)))
+        new = data.draw(st.binary(max_size=4) | st.sampled_from([b"nan", b"1e999", b"\n", b'"', b"null", b"[", b"\0"]))
+        raw = raw[:position] + new + raw[position + data.draw(st.integers(0, 9)) :]
+    try:
+        found = read(tmp_path, ending, raw)
+    except InputError:
+        return
+    guard_points(found.points, found.names, where="again")

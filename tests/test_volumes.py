@@ -1,0 +1,371 @@
+"""Volumes: where voxels lie in LPS, and that no damaged or hostile file gets through."""
+
+from __future__ import annotations
+
+import gzip
+import itertools
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from planning.errors import InputError
+from planning.formats.orientation import canonical
+from planning.formats.volumes import read_volume
+
+SHAPE = (4, 5, 6)
+VALUES = np.arange(120, dtype="<i2").reshape(SHAPE)
+SFORM = np.array([[2.0, 0, 0, 10], [0, 3.0, 0, 20], [0, 0, 4.0, 30]])
+NRRD_LINES = (
+    "NRRD0004",
+    "type: short",
+    "dimension: 3",
+    "space: left-posterior-superior",
+    "sizes: 4 5 6",
+    "space directions: (2,0,0) (0,3,0) (0,0,4)",
+    "kinds: domain domain domain",
+    "endian: little",
+    "encoding: raw",
+    "space origin: (-10,-20,30)",
+)
+
+
+def nifti_bytes(
+    *,
+    dim: tuple[int, ...] = (3, *SHAPE, 1, 1, 1, 1),
+    datatype: tuple[int, int] = (4, 16),
+    pixdim: tuple[float, ...] = (1, 2, 3, 4, 0, 0, 0, 0),
+    sform: Any = SFORM,
+    codes: tuple[int, int] = (0, 1),
+    quaternion: tuple[float, ...] = (0, 0, 0),
+    qoffset: tuple[float, ...] = (10, 20, 30),
+    units: int = 2,
+    vox_offset: float = 352.0,
+    slope: float = 0.0,
+    magic: bytes = b"n+1\0",
+    order: str = "<",
+    data: bytes | None = None,
+) -> bytes:
+    """A single-file NIfTI-1; ``codes`` are those of qform and sform."""
+    head = bytearray(352)
+    struct.pack_into(order + "i", head, 0, 348)
+    struct.pack_into(order + "8h", head, 40, *dim)
+    struct.pack_into(order + "2h", head, 70, *datatype)
+    struct.pack_into(order + "8f", head, 76, *pixdim)
+    struct.pack_into(order + "2f", head, 108, vox_offset, slope)
+    head[123] = units
+    struct.pack_into(order + "2h", head, 252, *codes)
+    struct.pack_into(order + "6f", head, 256, *quaternion, *qoffset)
+    struct.pack_into(order + "12f", head, 280, *np.ravel(sform))
+    head[344:348] = magic
+    return bytes(head) + (VALUES.astype(order + "i2").tobytes(order="F") if data is None else data)
+
+
+def nrrd_bytes(*changes: tuple[str, str | None], data: bytes | None = None) -> bytes:
+    """A NRRD with lines replaced, added (unknown start) or dropped (None)."""
+    lines = list(NRRD_LINES)
+    for start, line in changes:
+        found = next((i for i, old in enumerate(lines) if old.startswith(start)), len(lines))
+        lines[found : found + 1] = [] if line is None else [line]
+    return ("\n".join(lines) + "\n\n").encode() + (VALUES.tobytes(order="F") if data is None else data)
+
+
+def write(folder: Path, name: str, content: bytes) -> Path:
+    """The path of a new file."""
+    path = folder / name
+    path.write_bytes(content)
+    return path
+
+
+def place(T: np.ndarray, *index: float) -> list[float]:
+    """Where a voxel's centre lies."""
+    return list((T @ [*index, 1.0])[:3])
+
+
+def test_nifti_sform_is_turned_from_ras_to_lps(tmp_path: Path) -> None:
+    """Voxel (1, 2, 3) at RAS (12, 26, 42) lies at LPS (-12, -26, 42), and keeps its value."""
+    volume = read_volume(write(tmp_path, "a.nii", nifti_bytes()))
+    assert place(volume.T_ct_index, 1, 2, 3) == [-12.0, -26.0, 42.0]
+    assert np.array_equal(volume.values, VALUES)
+    assert not volume.values.flags.writeable
+    assert not volume.T_ct_index.flags.writeable
+
+
+def test_nifti_qform_with_a_quarter_turn_and_a_flip(tmp_path: Path) -> None:
+    """A quarter turn about z takes i to RAS +y and j to -x; qfac -1 takes k to -z."""
+    half = 0.5**0.5
+    content = nifti_bytes(codes=(1, 0), quaternion=(0, 0, half), pixdim=(-1, 2, 3, 4, 0, 0, 0, 0))
+    volume = read_volume(write(tmp_path, "a.nii", content))
+    assert np.allclose(place(volume.T_ct_index, 1, 1, 1), [-(10 - 3), -(20 + 2), 30 - 4], atol=1e-5)
+    assert np.linalg.det(volume.T_ct_index) < 0
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("compressed", [False, True])
+def test_byte_order_and_compression_do_not_matter(tmp_path: Path, order: str, compressed: bool) -> None:
+    """Little and big endian, plain and gzipped, hold the same volume."""
+    content = nifti_bytes(order=order)
+    path = write(tmp_path, "a.nii.gz", gzip.compress(content)) if compressed else write(tmp_path, "a.nii", content)
+    volume = read_volume(path)
+    assert np.array_equal(volume.values, VALUES)
+    assert place(volume.T_ct_index, 0, 0, 0) == [-10.0, -20.0, 30.0]
+
+
+@pytest.mark.parametrize(("units", "scale"), [(0, 1.0), (1, 0.001), (2, 1.0), (3, 1000.0)])
+def test_units_of_a_nifti_become_mm(tmp_path: Path, units: int, scale: float) -> None:
+    """Metre and micrometre are converted, an unknown unit is taken as mm."""
+    pixdim = (1, 2 * scale, 3 * scale, 4 * scale, 0, 0, 0, 0)
+    volume = read_volume(write(tmp_path, "a.nii", nifti_bytes(units=units, sform=SFORM * scale, pixdim=pixdim)))
+    assert np.allclose(place(volume.T_ct_index, 1, 2, 3), [-12, -26, 42], atol=1e-4)
+
+
+def test_both_affines_may_be_given_if_they_agree(tmp_path: Path) -> None:
+    """sform and qform that say the same are accepted, whichever SimpleITK takes."""
+    for codes in ((1, 1), (1, 2), (2, 1)):
+        volume = read_volume(write(tmp_path, "a.nii", nifti_bytes(codes=codes)))
+        assert place(volume.T_ct_index, 1, 2, 3) == [-12.0, -26.0, 42.0]
+
+
+@pytest.mark.parametrize(
+    ("space", "expected"),
+    [
+        ("left-posterior-superior", [-8.0, -14.0, 42.0]),
+        ("right-anterior-superior", [8.0, 14.0, 42.0]),
+        ("left-anterior-superior", [-8.0, 14.0, 42.0]),
+    ],
+)
+def test_nrrd_says_its_space(tmp_path: Path, space: str, expected: list[float]) -> None:
+    """Voxel (1, 2, 3) of the same numbers in each of the patient spaces, in LPS."""
+    volume = read_volume(write(tmp_path, "a.nrrd", nrrd_bytes(("space:", f"space: {space}"))))
+    assert place(volume.T_ct_index, 1, 2, 3) == expected
+    assert np.array_equal(volume.values, VALUES)
+
+
+def test_nrrd_encodings_and_detached_data(tmp_path: Path) -> None:
+    """raw, gzip and ascii data, attached or beside the header, hold the same volume."""
+    raw = VALUES.tobytes(order="F")
+    text = " ".join(map(str, VALUES.ravel(order="F"))).encode()
+    write(tmp_path, "a.raw", raw)
+    write(tmp_path, "a.raw.gz", gzip.compress(raw))
+    cases = {
+        "gzip.nrrd": nrrd_bytes(("encoding", "encoding: gzip"), data=gzip.compress(raw)),
+        "ascii.nrrd": nrrd_bytes(("encoding", "encoding: ascii"), data=text),
+        "raw.nhdr": nrrd_bytes(("data file", "data file: a.raw"), data=b""),
+        "gzip.nhdr": nrrd_bytes(("data file", "data file: a.raw.gz"), ("encoding", "encoding: gzip"), data=b""),
+    }
+    for name, content in cases.items():
+        assert np.array_equal(read_volume(write(tmp_path, name, content)).values, VALUES), name
+
+
+def test_files_that_simpleitk_writes_come_back(tmp_path: Path) -> None:
+    """An oblique image written by SimpleITK in either format is where SimpleITK put it."""
+    image = sitk.GetImageFromArray(np.ascontiguousarray(VALUES.transpose(2, 1, 0)))
+    angle = 0.3
+    c, s = np.cos(angle), np.sin(angle)
+    image.SetDirection([c, -s, 0, s, c, 0, 0, 0, -1])
+    image.SetSpacing([0.7, 0.8, 2.5])
+    image.SetOrigin([-101.5, 33.0, 812.25])
+    for name in ("a.nii", "a.nii.gz", "a.nrrd", "a.nhdr"):
+        sitk.WriteImage(image, str(tmp_path / name), useCompression=name != "a.nii")
+        volume = read_volume(tmp_path / name)
+        assert np.array_equal(volume.values, VALUES)
+        for index in itertools.product((0, 3), (0, 4), (0, 5)):
+            expected = image.TransformIndexToPhysicalPoint(index)
+            assert np.allclose(place(volume.T_ct_index, *index), expected, atol=1e-3)
+
+
+def test_canonical_order_is_right_handed_and_keeps_places() -> None:
+    """Every voxel keeps its value and its place, for all 48 axis orders and flips of an oblique affine."""
+    T = np.eye(4)
+    T[:3, :3] = np.array([[0.8, 0.0, -0.6], [0.36, 0.8, 0.48], [0.48, -0.6, 0.64]]) * [1.0, 2.0, 3.0]
+    for order, flips in itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)):
+        stored, T_stored = restored(VALUES, T, order, flips)
+        oriented = canonical(stored, T_stored)
+        assert np.array_equal(oriented.values, VALUES)
+        assert np.allclose(oriented.T_ct_index, T, atol=1e-12)
+
+
+def restored(values: np.ndarray, T: np.ndarray, order: tuple[int, ...], flips: tuple[int, ...]) -> tuple[Any, Any]:
+    """The same volume, stored with its axes in another order and direction."""
+    T_new = np.zeros((4, 4))
+    T_new[3, 3] = 1
+    for new, old in enumerate(order):
+        T_new[old, new] = flips[new]
+        T_new[old, 3] = 0 if flips[new] == 1 else values.shape[old] - 1
+    return values.transpose(order)[tuple(slice(None, None, f) for f in flips)], T @ T_new
+
+
+NAN = float("nan")
+WHOLE = nifti_bytes()
+PACKED = gzip.compress(WHOLE)
+Q = {"codes": (1, 0)}
+BAD_NIFTI: dict[str, tuple[str, bytes, str]] = {
+    "empty": ("a.nii", b"", "ends inside the header"),
+    "cut in the header": ("a.nii", WHOLE[:200], "ends inside the header"),
+    "cut in the data": ("a.nii", WHOLE[:-1], "cut short"),
+    "data missing": ("a.nii", WHOLE[:352], "cut short"),
+    "too long": ("a.nii", WHOLE + b"\0", "longer than its header"),
+    "gz cut": ("a.nii.gz", PACKED[:-12], "damaged or cut short|not a readable gzip"),
+    "gz cut in the data only": ("a.nii.gz", gzip.compress(WHOLE[:-1]), "cut short"),
+    "gz with a wrong checksum": ("a.nii.gz", PACKED[:-8] + b"\1\2\3\4" + PACKED[-4:], "CRC"),
+    "gz bomb": ("a.nii.gz", gzip.compress(WHOLE + bytes(50_000_000)), "longer than its header"),
+    "gz that is plain": ("a.nii.gz", WHOLE, "not a readable gzip"),
+    "plain that is gz": ("a.nii", PACKED, "ends inside the header|no NIfTI-1 header"),
+    "garbage": ("a.nii", bytes(range(256)) * 4, "no NIfTI-1 header"),
+    "wrong magic": ("a.nii", nifti_bytes(magic=b"ni1\0"), "no NIfTI-1 header"),
+    "terabytes": ("a.nii", nifti_bytes(dim=(3, 32767, 32767, 32767, 1, 1, 1, 1), data=b""), "voxels"),
+    "gigabytes in a tiny gz": (
+        "a.nii.gz",
+        gzip.compress(nifti_bytes(dim=(3, 900, 900, 900, 1, 1, 1, 1))),
+        "cannot hold",
+    ),
+    "negative size": ("a.nii", nifti_bytes(dim=(3, -4, 5, 6, 1, 1, 1, 1)), "size"),
+    "zero size": ("a.nii", nifti_bytes(dim=(3, 0, 5, 6, 1, 1, 1, 1)), "size"),
+    "4D": ("a.nii", nifti_bytes(dim=(4, 4, 5, 3, 2, 1, 1, 1)), "4 dimensions"),
+    "colour": ("a.nii", nifti_bytes(datatype=(128, 24)), "datatype 128"),
+    "bits contradict the type": ("a.nii", nifti_bytes(datatype=(4, 32)), "datatype 4"),
+    "NaN affine": ("a.nii", nifti_bytes(sform=SFORM * NAN), "NaN"),
+    "infinite affine": ("a.nii", nifti_bytes(sform=np.full((3, 4), np.inf)), "NaN or infinity"),
+    "zero affine": ("a.nii", nifti_bytes(sform=SFORM * 0), "zero or singular"),
+    "parallel axes": ("a.nii", nifti_bytes(sform=[[2, 3, 0, 0], [0, 0, 0, 0], [0, 0, 4, 0]]), "singular"),
+    "sheared affine": ("a.nii", nifti_bytes(sform=[[2, 0.03, 0, 0], [0, 3, 0, 0], [0, 0, 4, 0]]), "sheared"),
+    "huge affine": ("a.nii", nifti_bytes(sform=SFORM * 1e37), "pixdim|spacing"),
+    "far origin": ("a.nii", nifti_bytes(sform=np.add(SFORM, [0, 0, 0, 1e8])), "origin"),
+    "affines disagree": ("a.nii", nifti_bytes(codes=(1, 1), qoffset=(10, 20, 31)), "apart"),
+    "no affine": ("a.nii", nifti_bytes(codes=(0, 0)), "does not say its space"),
+    "quaternion too long": ("a.nii", nifti_bytes(codes=(1, 0), quaternion=(1, 1, 0)), "quaternion"),
+    "NaN quaternion": ("a.nii", nifti_bytes(codes=(1, 0), quaternion=(NAN, 0, 0)), "quaternion"),
+    "negative pixdim": ("a.nii", nifti_bytes(pixdim=(1, -2, 3, 4, 0, 0, 0, 0), codes=(1, 0)), "pixdim"),
+    "pixdim against sform": ("a.nii", nifti_bytes(pixdim=(1, 2, 3, 5, 0, 0, 0, 0)), "pixdim says"),
+    "metres called mm": (
+        "a.nii",
+        nifti_bytes(sform=SFORM / 1000, pixdim=(1, 0.002, 0.003, 0.004, 0, 0, 0, 0)),
+        "spacing",
+    ),
+    "unknown unit": ("a.nii", nifti_bytes(units=5), "unit code"),
+    "offset inside the header": ("a.nii", nifti_bytes(vox_offset=0), "vox_offset"),
+    "NaN offset": ("a.nii", nifti_bytes(vox_offset=NAN), "vox_offset"),
+    "offset past the end": ("a.nii", nifti_bytes(vox_offset=1e9), "cut short"),
+    "NaN slope": ("a.nii", nifti_bytes(slope=NAN), "scl_slope"),
+    "NaN voxel": (
+        "a.nii",
+        nifti_bytes(datatype=(16, 32), data=np.full(120, NAN, dtype="<f4").tobytes()),
+        "voxel is NaN",
+    ),
+}
+SIZED = ("sizes", "sizes: 30000 30000 30000")
+FOUR_D = (("dimension", "dimension: 4"), ("sizes", "sizes: 2 4 5 3"))
+BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
+    "empty": ("a.nrrd", b"", "no NRRD header"),
+    "garbage": ("a.nrrd", b"\xff\xfe" * 600, "no NRRD header"),
+    "wrong magic": ("a.nrrd", nrrd_bytes().replace(b"NRRD0004", b"NRRD0009"), "no NRRD header"),
+    "not text": ("a.nrrd", nrrd_bytes(("kinds", "kinds: \u00e9")).replace(b"\xc3\xa9", b"\xff"), "not text"),
+    "header only": ("a.nrrd", "\n".join(NRRD_LINES).encode(), "ends inside the header"),
+    "cut data": ("a.nrrd", nrrd_bytes(data=bytes(239)), "cut short"),
+    "too much data": ("a.nrrd", nrrd_bytes(data=bytes(241)), "longer than its header"),
+    "terabytes": ("a.nrrd", nrrd_bytes(SIZED), "voxels"),
+    "gz cut": (
+        "a.nrrd",
+        nrrd_bytes(("encoding", "encoding: gzip"), data=gzip.compress(bytes(range(240)))[:-9]),
+        "cut short",
+    ),
+    "gz bomb": (
+        "a.nrrd",
+        nrrd_bytes(("encoding", "encoding: gzip"), data=gzip.compress(bytes(30_000_000))),
+        "longer than its header",
+    ),
+    "points at another folder": ("a.nhdr", nrrd_bytes(("data", "data file: ../a.raw"), data=b""), "data file"),
+    "points at the host": ("a.nhdr", nrrd_bytes(("data", "data file: /etc/passwd"), data=b""), "data file"),
+    "points nowhere": ("a.nhdr", nrrd_bytes(("data", "data file: b.raw"), data=b""), "does not exist"),
+    "points at itself": ("a.nhdr", nrrd_bytes(("data", "datafile: a.nhdr"), data=b""), "header itself"),
+    "a list of files": ("a.nhdr", nrrd_bytes(("data", "data file: LIST"), data=b"/etc/passwd\n"), "data file"),
+    "a pattern of files": ("a.nhdr", nrrd_bytes(("data", "data file: a%d.raw 1 6 1"), data=b""), "data file"),
+    "an attached file that points": ("a.nrrd", nrrd_bytes(("data", "Data File: /etc/passwd")), "data file"),
+    "layers of segments": ("a.seg.nrrd", nrrd_bytes(*FOUR_D), "overlap"),
+    "no space": ("a.nrrd", nrrd_bytes(("space:", None)), "no field 'space'"),
+    "scanner space": ("a.nrrd", nrrd_bytes(("space:", "space: scanner-xyz")), "not patient space"),
+    "no origin": ("a.nrrd", nrrd_bytes(("space origin", None)), "no field 'spaceorigin'"),
+    "NaN direction": (
+        "a.nrrd",
+        nrrd_bytes(("space directions", "space directions: (nan,0,0) (0,3,0) (0,0,4)")),
+        "NaN",
+    ),
+    "no direction": ("a.nrrd", nrrd_bytes(("space directions", "space directions: none (0,3,0) (0,0,4)")), "none"),
+    "sheared": ("a.nrrd", nrrd_bytes(("space directions", "space directions: (2,0,0) (1,3,0) (0,0,4)")), "shear"),
+    "in metres": ("a.nrrd", nrrd_bytes(("space units", 'space units: "m" "m" "m"')), "spaceunits"),
+    "unknown field": ("a.nrrd", nrrd_bytes(("surprise", "surprise: 1")), "unknown header line"),
+    "field twice": ("a.nrrd", nrrd_bytes(("x", "Sizes: 4 5 6")), "stands twice"),
+    "no byte order": ("a.nrrd", nrrd_bytes(("endian", None)), "byte order"),
+    "skips": ("a.nrrd", nrrd_bytes(("byte skip", "byte skip: -1")), "byteskip"),
+    "bzip2": ("a.nrrd", nrrd_bytes(("encoding", "encoding: bzip2")), "encoding"),
+    "words as ascii": ("a.nrrd", nrrd_bytes(("encoding", "encoding: ascii"), data=b"one " * 120), "numbers"),
+    "too few numbers": ("a.nrrd", nrrd_bytes(("encoding", "encoding: ascii"), data=b"1 " * 119), "cut short"),
+    "block type": ("a.nrrd", nrrd_bytes(("type", "type: block")), "type"),
+}
+
+
+@pytest.mark.parametrize("case", [*BAD_NIFTI.values(), *BAD_NRRD.values()], ids=[*BAD_NIFTI, *BAD_NRRD])
+def test_damaged_and_hostile_files_are_refused_by_name(tmp_path: Path, case: tuple[str, bytes, str]) -> None:
+    """Each is an ``InputError`` that names the file and what is wrong."""
+    name, content, match = case
+    with pytest.raises(InputError, match=match) as caught:
+        read_volume(write(tmp_path, name, content))
+    assert name in str(caught.value)
+
+
+def test_paths_that_are_no_volume_files(tmp_path: Path) -> None:
+    """A folder, nothing at all, and an unknown ending are refused."""
+    (tmp_path / "folder.nii").mkdir()
+    with pytest.raises(InputError, match="is a folder"):
+        read_volume(tmp_path / "folder.nii")
+    with pytest.raises(InputError, match="does not exist"):
+        read_volume(tmp_path / "none.nii.gz")
+    with pytest.raises(InputError, match="unknown file ending"):
+        read_volume(write(tmp_path, "a.img", WHOLE))
+
+
+def test_a_link_beside_a_nrrd_may_not_lead_away(tmp_path: Path) -> None:
+    """A data file that is a link into another folder is refused."""
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.raw").symlink_to(write(tmp_path, "a.raw", VALUES.tobytes(order="F")))
+    with pytest.raises(InputError, match="link to another folder"):
+        read_volume(write(tmp_path / "in", "a.nhdr", nrrd_bytes(("data", "data file: a.raw"), data=b"")))
+
+
+def mutated(draw: Callable[[Any], Any], content: bytes, reach: int) -> bytes:
+    """The content with some of its first bytes replaced, and perhaps cut."""
+    changed = bytearray(content)
+    for position in draw(st.lists(st.integers(0, reach - 1), min_size=1, max_size=6)):
+        changed[position] = draw(st.integers(0, 255))
+    return bytes(changed[: draw(st.integers(0, len(changed)))]) if draw(st.booleans()) else bytes(changed)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.nii", WHOLE),
+        ("a.nii.gz", PACKED),
+        ("a.nrrd", nrrd_bytes()),
+        ("b.nrrd", nrrd_bytes(("encoding", "encoding: gzip"), data=gzip.compress(VALUES.tobytes(order="F")))),
+    ],
+)
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_whatever_the_bytes_only_input_errors_come_out(
+    tmp_path: Path, name: str, content: bytes, data: st.DataObject
+) -> None:
+    """A mutated file is refused or is a whole, finite volume of the size that its header says."""
+    changed = mutated(data.draw, content, min(len(content), 352))
+    try:
+        volume = read_volume(write(tmp_path, name, changed))
+    except InputError:
+        return
+    assert np.isfinite(volume.T_ct_index).all()
+    assert np.isfinite(volume.values).all()
+    assert min(volume.values.shape) >= 2
