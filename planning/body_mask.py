@@ -1,0 +1,126 @@
+"""Which voxels of a CT are the patient: without table and sheets, and solid, lungs and bowel gas included."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from planning.errors import InputError
+
+BODY_HU = -500.0
+"""Half way between air (-1000) and water (0): where a voxel is half skin, half air."""
+UNSCANNED_HU = -1500.0
+"""Nothing real is less dense than air at -1000; scanners write -2000 or -3024 where they did not look."""
+OPENING_MM = 6.0
+"""Parts thinner than twice this are not the trunk or head: table tops, sheets, tubes."""
+SAMPLING_MM = 3.0
+"""Spacing at which the opening is done: half its radius."""
+OUTSIDE_AIR_HU = -940.0
+"""Room air has -1000, inflated lung rarely less than -920: an air region that the border cuts is the room only
+if its median is below this."""
+MIN_OUTSIDE_ML = 50.0
+"""A smaller air region at the border may be bowel gas that the field of view cuts."""
+MIN_BODY_ML = 100.0
+"""Less than a tenth of a newborn's head: something else was found."""
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class BodyMask:
+    """What was found.
+
+    Attributes:
+        body: Shape (nx, ny, nz), the solid body.
+        unscanned: Same shape, voxels that the scanner did not measure.
+        warnings: What the user should know.
+    """
+
+    body: Mask
+    unscanned: Mask
+    warnings: tuple[str, ...]
+
+
+def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where: str | Path) -> BodyMask:
+    """Finds the patient in a CT.
+
+    Threshold, opening, largest component; then air that the body encloses in an axial slice is filled, and so
+    is air at the border of the volume that does not look like the room's. Filling too much is the safe side:
+    it turns "air" at the border into "unknown".
+
+    Args:
+        hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient.
+        spacing_mm: Shape (3,).
+        where: For messages.
+
+    Raises:
+        InputError: No body, an implausibly small one, or no air around it.
+    """
+    voxel_ml = float(np.prod(spacing_mm)) / 1000.0
+    dense = hu > BODY_HU
+    trunk = _largest(_opened(dense, spacing_mm))
+    if np.count_nonzero(trunk) * voxel_ml < MIN_BODY_ML:
+        what = f"no body found: {np.count_nonzero(trunk) * voxel_ml:.3g} ml above {BODY_HU:g} HU hold together"
+        raise InputError(
+            what, where=where, allowed=f"a CT in Hounsfield units with at least {MIN_BODY_ML:g} ml of body"
+        )
+    filled = filled_slices(trunk)
+    warnings: list[str] = []
+    body = _with_cut_lungs(filled, hu, voxel_ml, warnings)
+    if body.all():
+        raise InputError("no air around the body", where=where, allowed="a CT that shows the skin somewhere")
+    unscanned = hu < UNSCANNED_HU
+    if (ndimage.binary_dilation(body) & unscanned & ~body).any():
+        warnings.append("the scanner's field of view (a circle in the image) cuts the body; no skin is known there")
+    return BodyMask(body, unscanned, tuple(warnings))
+
+
+def filled_slices(mask: Mask) -> Mask:
+    """The mask with every hole filled that it encloses in a slice across axis 2."""
+    return np.stack([ndimage.binary_fill_holes(mask[:, :, k]) for k in range(mask.shape[2])], axis=2)
+
+
+def _opened(mask: Mask, spacing_mm: NDArray[np.float64]) -> Mask:
+    """What holds together with the largest part that a ball of ``OPENING_MM`` fits into, and lies near it.
+
+    The border counts as body. Fine images are sampled: where table and sheets are is a coarse question.
+    """
+    stride = np.maximum(1, (SAMPLING_MM / spacing_mm).astype(int))
+    coarse = mask[:: stride[0], :: stride[1], :: stride[2]]
+    coarse_mm = spacing_mm * stride
+    reach = np.ceil(OPENING_MM / coarse_mm).astype(int)
+    padded = np.pad(coarse, [(r, r) for r in reach], mode="edge")
+    core = ndimage.distance_transform_edt(padded, sampling=coarse_mm) > OPENING_MM
+    if not core.any():
+        return np.zeros_like(mask)
+    near = ndimage.distance_transform_edt(~_largest(core), sampling=coarse_mm) <= OPENING_MM + coarse_mm.max()
+    near = near[tuple(slice(r, -r) for r in reach)]
+    for axis, times in enumerate(stride):
+        near = np.repeat(near, times, axis=axis)
+    return np.asarray(near[tuple(slice(0, n) for n in mask.shape)] & mask)
+
+
+def _largest(mask: Mask) -> Mask:
+    labels, count = ndimage.label(mask)
+    if count == 0:
+        return mask
+    return np.asarray(labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:])))
+
+
+def _with_cut_lungs(body: Mask, hu: NDArray[np.float32], voxel_ml: float, warnings: list[str]) -> Mask:
+    """Fills air regions that are not the room: small ones, and those with the density of lung."""
+    labels, count = ndimage.label(~body)
+    if count == 0:
+        return body
+    numbers = np.arange(1, count + 1)
+    sizes_ml = np.bincount(labels.ravel())[1:] * voxel_ml
+    medians = np.asarray(ndimage.median(hu, labels, numbers))
+    inside = (sizes_ml < MIN_OUTSIDE_ML) | (medians > OUTSIDE_AIR_HU)
+    if inside.any():
+        total = sizes_ml[inside].sum()
+        warnings.append(f"{total:.1f} ml of air at the border of the volume were taken as lung or gas inside the body")
+    return np.asarray(body | np.isin(labels, numbers[inside]))

@@ -1,0 +1,227 @@
+"""The skin from a CT, a label and a mesh; where the field of view cuts the body."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from planning.errors import InputError
+from planning.formats.labelmaps import LabelMap
+from planning.formats.volumes import Volume, read_volume
+from planning.mesh import TriangleMesh
+from planning.skin import FieldOfView, Skin, skin_from_ct, skin_from_label, skin_from_mesh
+
+REAL = Path(__file__).parents[1] / ".." / "shared" / "data" / "totalseg_abdomen_3mm"
+SHAPE = (60, 56, 30)
+SPACING = np.array([3.0, 3.0, 5.0])
+RADIUS = 55.0
+CENTRE = np.array([88.5, 70.0])
+T_CT_INDEX = np.diag([*SPACING, 1.0])
+T_CT_INDEX.setflags(write=False)
+
+
+def cylinder_ct(radius: float = RADIUS, centre: np.ndarray = CENTRE) -> np.ndarray:
+    """HU of a body along z that both ends cut, with a lung cut by the top, gas, a table and a sheet.
+
+    At the edge a voxel's value is the mixture of air and tissue that its share of the body gives.
+    """
+    x, y, z = (np.indices(SHAPE).T * SPACING).T
+    distance = np.hypot(x - centre[0], y - centre[1])
+    hu = -1000.0 + 1030.0 * np.clip((radius - distance) / SPACING[0] + 0.5, 0.0, 1.0)
+    hu[(np.hypot(x - centre[0] - 20, y - centre[1]) < 18) & (z > 80)] = -850.0
+    hu[np.linalg.norm([x - centre[0] + 20, y - centre[1], z - 60], axis=0) < 12] = -1000.0
+    hu[:, 50:52, :] = 150.0
+    hu[10:50, 2, :] = -300.0
+    return hu
+
+
+def ct_of(hu: np.ndarray, T: np.ndarray = T_CT_INDEX) -> Volume:
+    """A CT without a file."""
+    return Volume(hu.astype(np.int16), T, Path("made.nii"))
+
+
+@pytest.fixture(scope="module")
+def skin() -> Skin:
+    """The skin of the cylinder."""
+    return skin_from_ct(ct_of(cylinder_ct()))
+
+
+def corners_at_z(skin: Skin, low: float, high: float) -> np.ndarray:
+    """Vertices between two heights."""
+    z = skin.mesh.vertices[:, 2]
+    return skin.mesh.vertices[(z > low) & (z < high)]
+
+
+def test_skin_of_a_cylinder_is_the_cylinder_alone(skin: Skin) -> None:
+    """Closed; every vertex between the ends within 0.5 mm of the true radius: no table, sheet, lung or gas."""
+    sides = corners_at_z(skin, 0.0, 145.0)
+    radii = np.hypot(*(sides[:, :2] - CENTRE).T)
+    assert skin.mesh.closed
+    assert len(sides) > 1000
+    assert np.abs(radii - RADIUS).max() < 0.5
+    a, b, c = skin.mesh.triangles.swapaxes(0, 1)
+    assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6 == pytest.approx(np.pi * RADIUS**2 * 150.0, rel=0.02)
+
+
+def test_ends_that_the_field_of_view_cuts_are_not_skin(skin: Skin) -> None:
+    """The caps lie on the box and are marked, the sides are not; both z faces and no other count as cut."""
+    view = skin.field_of_view
+    assert view is not None
+    assert view.cut.tolist() == [[False, False], [False, False], [True, True]]
+    assert np.allclose(view.size_mm, SPACING * SHAPE)
+    assert np.allclose(view.T_ct_box[:3, 3], -SPACING / 2)
+    centres = skin.mesh.triangles.mean(axis=1)
+    assert np.array_equal(skin.cut_faces, (centres[:, 2] < 0.0) | (centres[:, 2] > 145.0))
+    assert skin.mesh.bounds[:, 2].tolist() == pytest.approx([-2.5, 147.5])
+    assert "lower, upper face" in " ".join(skin.warnings)
+
+
+def test_skin_does_not_depend_on_how_the_ct_is_stored(skin: Skin) -> None:
+    """Axis orders and flips leave the surface, the marks and the box in place."""
+    hu = cylinder_ct()
+    for order, flips in (((2, 0, 1), (1, -1, 1)), ((1, 0, 2), (-1, -1, -1)), ((0, 1, 2), (-1, 1, 1))):
+        T_index = np.zeros((4, 4))
+        T_index[3, 3] = 1
+        for new, old in enumerate(order):
+            T_index[old, new] = flips[new]
+            T_index[old, 3] = 0 if flips[new] == 1 else hu.shape[old] - 1
+        stored = hu.transpose(order)[tuple(slice(None, None, flip) for flip in flips)]
+        other = skin_from_ct(ct_of(stored, T_CT_INDEX @ T_index))
+        assert np.array_equal(other.mesh.faces, skin.mesh.faces)
+        assert np.abs(other.mesh.vertices - skin.mesh.vertices).max() < 1e-4
+        assert np.array_equal(other.cut_faces, skin.cut_faces)
+
+
+def test_a_body_cut_at_its_side_is_marked_there() -> None:
+    """Moved out of the image to the right, the body reaches the low x face, and a ray there ends unknown."""
+    skin = skin_from_ct(ct_of(cylinder_ct(centre=np.array([30.0, 70.0]))))
+    view = skin.field_of_view
+    assert view is not None
+    assert view.cut.tolist() == [[True, False], [False, False], [True, True]]
+    centres = skin.mesh.triangles[skin.cut_faces].mean(axis=1)
+    assert np.count_nonzero(np.abs(centres[:, 0] + 1.5) < 1e-6) > 100
+    found = view.exit(np.array([30.0, 70.0, 75.0]), np.array([[-1.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, -1]]))
+    assert found.cut.tolist() == [True, False, False, True]
+    assert found.depth_mm.tolist() == pytest.approx([31.5, 148.5, 96.5, 77.5])
+
+
+def test_a_lung_that_a_side_face_cuts_stays_inside_the_body() -> None:
+    """Air with the density of lung at the border is filled, so that its wall is no skin, and a warning says so."""
+    hu = cylinder_ct(centre=np.array([30.0, 70.0]))
+    x, y, z = (np.indices(SHAPE).T * SPACING).T
+    lung = (np.hypot(x, y - 70.0) < 30) & (z > 20) & (z < 130)
+    hu[lung] = -850.0
+    skin = skin_from_ct(ct_of(hu))
+    inner = corners_at_z(skin, 25.0, 125.0)
+    assert np.all((np.abs(np.hypot(*(inner[:, :2] - [30.0, 70.0]).T) - RADIUS) < 0.6) | (inner[:, 0] < 0.0))
+    assert any("lung or gas" in warning for warning in skin.warnings)
+
+
+def test_where_the_scanner_did_not_look_there_is_no_skin() -> None:
+    """Voxels of -2000 HU beside the body: the surface there is the rim of what was measured, not skin."""
+    hu = cylinder_ct()
+    hu[:20] = -2000.0
+    skin = skin_from_ct(ct_of(hu))
+    middle = np.abs(skin.mesh.triangles.mean(axis=1)[:, 2] - 75.0) < 60.0
+    at_rim = skin.mesh.triangles.mean(axis=1)[:, 0] < 60.0
+    assert skin.cut_faces[middle & at_rim].all()
+    assert not skin.cut_faces[middle & (skin.mesh.triangles.mean(axis=1)[:, 0] > 63.0)].any()
+    assert any("circle" in warning for warning in skin.warnings)
+
+
+@pytest.mark.parametrize(
+    ("hu", "match"),
+    [
+        (np.full(SHAPE, -1000), "no body found"),
+        (np.full(SHAPE, 40), "no air around"),
+        (cylinder_ct(radius=10.0), "no body found"),
+    ],
+)
+def test_a_ct_without_a_plausible_body_is_refused(hu: np.ndarray, match: str) -> None:
+    """Air alone, tissue alone, and something far smaller than a patient."""
+    with pytest.raises(InputError, match=match):
+        skin_from_ct(ct_of(hu))
+
+
+def test_decimated_skin_keeps_its_marks(skin: Skin) -> None:
+    """Fewer triangles, still closed, and the marked area is the same within 1 %."""
+    smaller = skin_from_ct(ct_of(cylinder_ct()), max_deviation_mm=0.5)
+    assert smaller.mesh.closed
+    assert len(smaller.mesh.faces) < 0.6 * len(skin.mesh.faces)
+    areas = []
+    for each in (skin, smaller):
+        a, b, c = each.mesh.triangles[each.cut_faces].swapaxes(0, 1)
+        areas.append(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    assert areas[1] == pytest.approx(areas[0], rel=0.01)
+
+
+def test_skin_from_a_label_that_is_only_a_shell_is_solid() -> None:
+    """A ring of skin voxels becomes the outer surface alone; cut ends are marked."""
+    x, y, _ = (np.indices(SHAPE).T * SPACING).T
+    distance = np.hypot(x - CENTRE[0], y - CENTRE[1])
+    labels = ((distance < RADIUS) & (distance > RADIUS - 7)).astype(np.int32) * 4
+    labelmap = LabelMap(labels, T_CT_INDEX, None, Path("made.nii"))
+    skin = skin_from_label(labelmap, 4)
+    sides = corners_at_z(skin, 0.0, 145.0)
+    assert skin.mesh.closed
+    assert np.hypot(*(sides[:, :2] - CENTRE).T).min() > RADIUS - 4.5
+    assert skin.cut_faces.any()
+    assert skin.field_of_view is not None
+    assert skin.field_of_view.cut.tolist() == [[False, False], [False, False], [True, True]]
+    with pytest.raises(InputError, match="present: 4"):
+        skin_from_label(labelmap, 5)
+
+
+def test_skin_from_a_mesh_warns_when_it_is_open(ball: Callable[..., TriangleMesh]) -> None:
+    """A closed mesh is taken whole; of an open one the inside is not known."""
+    whole = skin_from_mesh(ball(100.0))
+    assert whole.warnings == ()
+    assert whole.field_of_view is None
+    assert not whole.cut_faces.any()
+    opened = skin_from_mesh(TriangleMesh(whole.mesh.vertices, whole.mesh.faces[1:]))
+    assert "open" in opened.warnings[0]
+
+
+def test_rays_leave_a_turned_box_where_geometry_says() -> None:
+    """A box turned by 90 degrees about z: faces, depths and an exit on an edge, which counts for both faces."""
+    T_ct_box = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]])
+    cut = np.zeros((3, 2), dtype=bool)
+    cut[0, 1] = True
+    view = FieldOfView(T_ct_box, np.array([4.0, 6.0, 8.0]), cut)
+    centre = (T_ct_box @ [2.0, 3.0, 4.0, 1.0])[:3]
+    turns = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 3, 0], [-2, 3, 0]])
+    found = view.exit(centre, turns @ T_ct_box[:3, :3].T)
+    assert found.depth_mm.tolist() == pytest.approx([2.0, 2.0, 3.0, 4.0, 13**0.5, 13**0.5])
+    assert found.cut.tolist() == [True, False, False, False, True, False]
+    with pytest.raises(InputError, match="outside the image"):
+        view.exit(np.add(centre, [0.0, 0.0, 4.1]), turns)
+    with pytest.raises(InputError, match="without direction"):
+        view.exit(centre, np.zeros((1, 3)))
+
+
+def test_exits_agree_with_small_steps(rng: np.random.Generator) -> None:
+    """A point a hair before the exit depth is in the box, a hair behind it is out."""
+    view = FieldOfView(np.eye(4), np.array([30.0, 50.0, 20.0]), np.zeros((3, 2), dtype=bool))
+    for origin in rng.uniform(0, 1, (5, 3)) * view.size_mm:
+        rays = rng.normal(size=(50, 3))
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        depths = view.exit(origin, rays).depth_mm[:, None]
+        for depth, inside in itertools.zip_longest((depths - 1e-6, depths + 1e-6), (True, False)):
+            points = origin + depth * rays
+            assert np.all(np.all((points >= 0) & (points <= view.size_mm), axis=1) == inside)
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason=f"the real CT is not at {REAL}")
+def test_skin_of_the_real_patient_is_closed_and_knows_its_four_cut_faces() -> None:
+    """Left, right, top and bottom are cut, front and back are not; the body holds a plausible 20 to 28 litres."""
+    skin = skin_from_ct(read_volume(REAL / "ct.nii.gz"))
+    assert skin.mesh.closed
+    assert skin.field_of_view is not None
+    assert skin.field_of_view.cut.tolist() == [[True, True], [False, False], [True, True]]
+    assert 0.1 < skin.cut_faces.mean() < 0.4
+    a, b, c = skin.mesh.triangles.swapaxes(0, 1)
+    assert 20e6 < np.einsum("ij,ij->", a, np.cross(b, c)) / 6 < 28e6
