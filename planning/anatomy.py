@@ -1,0 +1,221 @@
+"""The structures of a case, with roles and margins, from meshes or label maps, and the skin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from planning.case import Case
+from planning.case_file import StructureSection, StructuresSection
+from planning.clearance.containment import Side, side_of
+from planning.errors import InputError
+from planning.formats.label_surface import label_mesh
+from planning.formats.labelmaps import LabelMap, read_labelmap
+from planning.formats.meshes import mesh_warnings, read_mesh
+from planning.formats.naming import RuleKind, names_for, select
+from planning.formats.spaces import Space, parse_space, parse_unit
+from planning.formats.volumes import read_volume
+from planning.mesh import TriangleMesh
+from planning.skin import Skin, skin_from_ct, skin_from_label, skin_from_mesh
+
+Progress = Callable[[str], None]
+
+
+class Role(StrEnum):
+    """What a structure means to a needle."""
+
+    AVOID = "avoid"
+    TRAVERSE = "traverse"
+    TARGET = "target"
+    SKIN = "skin"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """A named surface with a role.
+
+    Attributes:
+        name: Unique in the case.
+        role: What it means to the needle.
+        margin_mm: The clearance that it demands, where its role demands one.
+        mesh: In the CT frame, mm.
+        source: The file it comes from, and the label in it.
+    """
+
+    name: str
+    role: Role
+    margin_mm: float
+    mesh: TriangleMesh
+    source: str
+
+    @property
+    def demands_margin(self) -> bool:
+        """Whether a needle too close to it is rejected."""
+        return self.role in {Role.AVOID, Role.UNKNOWN}
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """All structures of a case but the skin, the skin, and what could not be known."""
+
+    structures: tuple[Structure, ...]
+    skin: Skin
+    warnings: tuple[str, ...]
+
+    def structure(self, name: str) -> Structure:
+        """The structure of this name.
+
+        Raises:
+            InputError: There is none.
+        """
+        for structure in self.structures:
+            if structure.name == name:
+                return structure
+        names = ", ".join(s.name for s in self.structures)
+        raise InputError(f"no structure '{name}'", where="anatomy", allowed=names)
+
+
+def load_anatomy(case: Case, progress: Progress | None = None) -> Anatomy:
+    """Read every structure of a case, and hold the target against them.
+
+    Args:
+        case: The validated case.
+        progress: Called with the name of each structure as it is read.
+
+    Raises:
+        InputError: A file that cannot be trusted, a label that no rule names, or a target that contradicts them.
+    """
+    loader = _Loader(case, progress or (lambda _: None))
+    skin_section = next(s for s in case.structure if s.role == "skin")
+    structures = [loader.one(section) for section in case.structure if section.role != "skin"]
+    for section in case.structures:
+        structures.extend(loader.many(section))
+    skin = loader.skin(skin_section)
+    _check_names(case, structures)
+    warnings = [*loader.warnings, *skin.warnings]
+    for structure in structures:
+        warnings.extend(mesh_warnings(structure.mesh, structure.name))
+    _check_target(case, structures, skin)
+    return Anatomy(tuple(structures), skin, tuple(warnings))
+
+
+class _Loader:
+    """Reads the sources of one case, each label map once."""
+
+    def __init__(self, case: Case, progress: Progress) -> None:
+        self._case = case
+        self._progress = progress
+        self._maps: dict[str, LabelMap] = {}
+        self.warnings: list[str] = []
+
+    def one(self, section: StructureSection) -> Structure:
+        """One structure from a mesh or a label."""
+        self._progress(section.name)
+        if section.mesh is not None:
+            mesh, source = self._mesh(section), section.mesh
+        else:
+            mesh, source = self._label(section), f"{section.labelmap}:{section.label}"
+        return Structure(section.name, Role(section.role), section.margin_mm or 0.0, mesh, source)
+
+    def many(self, section: StructuresSection) -> list[Structure]:
+        """All labels of one map that the rules do not ignore."""
+        labelmap = self._map(section.labelmap)
+        names = names_for(section.naming, self._case.folder, labelmap)
+        rules = select(
+            names,
+            labelmap.labels_present(),
+            avoid=section.avoid,
+            traverse=section.traverse,
+            ignore=section.ignore,
+            target=section.target,
+            where=self._case.path,
+        )
+        self.warnings.extend(rules.warnings)
+        structures = []
+        for rule in rules.rules:
+            if rule.kind is RuleKind.IGNORE:
+                continue
+            self._progress(rule.name)
+            mesh = label_mesh(labelmap, rule.label, where=self._file(section.labelmap))
+            source = f"{section.labelmap}:{rule.label}"
+            structures.append(Structure(rule.name, Role(rule.kind.value), rule.margin_mm, mesh, source))
+        return structures
+
+    def skin(self, section: StructureSection) -> Skin:
+        """The body's surface, from whatever the case names."""
+        self._progress(section.name)
+        if section.ct is not None:
+            return skin_from_ct(read_volume(self._file(section.ct)))
+        if section.labelmap is not None and section.label is not None:
+            return skin_from_label(self._map(section.labelmap), section.label)
+        return skin_from_mesh(self._mesh(section))
+
+    def _mesh(self, section: StructureSection) -> TriangleMesh:
+        where = f"{self._case.path}: structure '{section.name}'"
+        if section.mesh is None or section.unit is None:
+            raise InputError("no mesh with a unit", where=where, allowed="mesh and unit")
+        space = parse_space(section.space or self._case.space, where=where)
+        unit = parse_unit(section.unit, where=where)
+        return read_mesh(self._file(section.mesh), unit=unit, space=space)
+
+    def _label(self, section: StructureSection) -> TriangleMesh:
+        if section.labelmap is None or section.label is None:
+            raise InputError(f"'{section.name}' has no source", where=self._case.path, allowed="mesh or labelmap")
+        return label_mesh(self._map(section.labelmap), section.label, where=self._file(section.labelmap))
+
+    def _map(self, name: str) -> LabelMap:
+        if self._case.space is Space.LOCAL:
+            raise InputError(
+                f'label map {name} in a case of space "local"', where=self._case.path, allowed='space "LPS" or "RAS"'
+            )
+        if name not in self._maps:
+            self._maps[name] = read_labelmap(self._file(name))
+        return self._maps[name]
+
+    def _file(self, name: str) -> Path:
+        return self._case.folder / name
+
+
+def _check_names(case: Case, structures: list[Structure]) -> None:
+    names = [structure.name for structure in structures]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f"structure '{twice[0]}' stands twice", where=case.path, allowed="unique names")
+    if case.target_structure not in names:
+        raise InputError(
+            f"target.structure '{case.target_structure}' is no structure of the case",
+            where=case.path,
+            allowed=", ".join(names),
+        )
+
+
+def _check_target(case: Case, structures: list[Structure], skin: Skin) -> None:
+    """A target must lie inside the skin and its own structure, and inside nothing that is to be avoided."""
+    point = ", ".join(f"{x:.1f}" for x in case.target_ct)
+    if side_of(skin.mesh, case.target_ct) is Side.OUTSIDE:
+        raise InputError(f"target ({point}) lies outside the skin", where=case.path, allowed="a point in the body")
+    for structure in structures:
+        side = side_of(structure.mesh, case.target_ct)
+        if structure.role is Role.AVOID and side is Side.INSIDE:
+            raise InputError(
+                f"target ({point}) lies inside '{structure.name}', which is to be avoided",
+                where=case.path,
+                allowed="a target outside every 'avoid' structure",
+            )
+        if structure.name != case.target_structure:
+            continue
+        if structure.role is not Role.TARGET:
+            raise InputError(
+                f"target.structure '{structure.name}' has role '{structure.role}'",
+                where=case.path,
+                allowed='role "target" for the structure that holds the target',
+            )
+        if side is Side.OUTSIDE:
+            raise InputError(
+                f"target ({point}) lies outside its structure '{structure.name}'",
+                where=case.path,
+                allowed="a point inside target.structure",
+            )

@@ -1,0 +1,261 @@
+"""A case: a validated case file, in LPS (or local) mm and radians, with the hash of every input."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import ValidationError
+
+from planning.case_file import (
+    CaseFile,
+    MountSection,
+    RankingSection,
+    RegistrationSection,
+    RehearsalSection,
+    StructureSection,
+    StructuresSection,
+)
+from planning.entry import entry_frame, view_frame
+from planning.errors import InputError
+from planning.files import sha256
+from planning.formats.points import read_points
+from planning.formats.spaces import Space, to_lps
+from planning.robot.ur import ur_model
+
+Matrix = NDArray[np.float64]
+
+AXES_PARALLEL = 0.999
+"""|cos| above which a mount's x and z axes do not span a frame (2.6 degrees)."""
+
+MAX_CASE_BYTES = 1_000_000
+"""A case file is written by hand; a larger one is something else."""
+
+
+@dataclass(frozen=True)
+class Needle:
+    """The needle on the flange; lengths in mm, from the tip."""
+
+    length_mm: float
+    shaft_mm: float
+    diameter_mm: float
+    standoff_mm: float | None
+    skin_gap_mm: float
+    holder_diameter_mm: float
+
+    @property
+    def radius_mm(self) -> float:
+        """Half the diameter."""
+        return self.diameter_mm / 2
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """The grid of directions and the limit at the skin, all in radians."""
+
+    theta: tuple[float, float]
+    beta: tuple[float, float]
+    step: float
+    max_skin_angle: float
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacle:
+    """A box in the room, axes parallel to its frame's."""
+
+    name: str
+    frame: str
+    center_mm: Matrix
+    size_mm: Matrix
+
+
+@dataclass(frozen=True, eq=False)
+class RobotSettings:
+    """The arm: model name, home configuration (rad) or None for the model's own, mount or None."""
+
+    model: str
+    home: Matrix | None
+    T_base_ct_mount: Matrix | None
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What a search, a plan and a rehearsal start from. A `Case` has been validated.
+
+    Attributes:
+        target_ct: Shape (3,), the point to reach.
+        T_ct_entry: Shape (4, 4), the entry frame, its origin on the target.
+        inputs: File name relative to the case's folder, to SHA-256, for the case file and all it names.
+    """
+
+    path: Path
+    name: str
+    space: Space
+    target_ct: Matrix
+    target_name: str
+    target_structure: str
+    needle: Needle
+    search: SearchSettings
+    ranking: RankingSection
+    T_ct_entry: Matrix
+    structure: tuple[StructureSection, ...]
+    structures: tuple[StructuresSection, ...]
+    registration: RegistrationSection | None
+    robot: RobotSettings
+    obstacles: tuple[Obstacle, ...]
+    rehearsal: RehearsalSection
+    inputs: MappingProxyType[str, str]
+
+    @property
+    def folder(self) -> Path:
+        """The folder to which every path of the case is relative."""
+        return self.path.parent
+
+    @property
+    def knows_base(self) -> bool:
+        """Whether markers or a mount tie the CT to the robot."""
+        return self.registration is not None or self.robot.T_base_ct_mount is not None
+
+
+def load_case(path: Path | str) -> Case:
+    """Read and validate a case file, or a folder that holds ``case.toml``.
+
+    Raises:
+        InputError: Anything unreadable, unknown, missing or contradictory; names the key.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "case.toml"
+    content = _validated(_parsed(path), path)
+    space = Space(content.space)
+    target = _target(content, path, space)
+    settings = content.search
+    return Case(
+        path=path,
+        name=content.name,
+        space=space,
+        target_ct=target,
+        target_name=content.target.name,
+        target_structure=content.target.structure,
+        needle=Needle(**content.needle.model_dump()),
+        search=SearchSettings(
+            theta=(np.radians(settings.theta_deg[0]), np.radians(settings.theta_deg[1])),
+            beta=(np.radians(settings.beta_deg[0]), np.radians(settings.beta_deg[1])),
+            step=np.radians(settings.step_deg),
+            max_skin_angle=np.radians(settings.max_skin_angle_deg),
+        ),
+        ranking=content.ranking,
+        T_ct_entry=view_frame(entry_frame(settings.frame, space, where=path), target),
+        structure=content.structure,
+        structures=content.structures,
+        registration=content.registration,
+        robot=_robot(content, space, path),
+        obstacles=tuple(
+            Obstacle(
+                o.name,
+                o.frame,
+                np.asarray(o.center_mm) if o.frame == "base" else to_lps(np.asarray([o.center_mm]), space)[0],
+                np.asarray(o.size_mm),
+            )
+            for o in content.obstacle
+        ),
+        rehearsal=content.rehearsal,
+        inputs=MappingProxyType(_hashes(content, path)),
+    )
+
+
+def _parsed(path: Path) -> dict[str, Any]:
+    allowed = "a TOML case file with schema = 1, or a folder with case.toml"
+    try:
+        if path.stat().st_size > MAX_CASE_BYTES:
+            raise InputError("larger than 1 MB, not a case file", where=path, allowed=allowed)
+        return tomllib.loads(path.read_bytes().decode("utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed=allowed) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"is not TOML: {error}", where=path, allowed=allowed) from error
+
+
+def _validated(data: dict[str, Any], path: Path) -> CaseFile:
+    try:
+        return CaseFile.model_validate(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in first["loc"]) or "top level"
+        said = first["msg"].removeprefix("Value error, ")
+        value = "" if isinstance(first["input"], dict | list) else f" (given: {first['input']!r:.60})"
+        raise InputError(
+            f"{place}: {said}{value}", where=path, allowed="the keys, types and ranges of docs/case.md"
+        ) from error
+
+
+def _target(content: CaseFile, path: Path, space: Space) -> Matrix:
+    target = content.target
+    if target.position_mm is not None:
+        return _read_only(to_lps(np.asarray([target.position_mm]), space)[0])
+    assert target.points is not None  # held by the schema
+    points = read_points(_existing(path, target.points, "target.points"), default_space=space)
+    if target.name not in points.names:
+        names = ", ".join(points.names)
+        raise InputError(f"target.name '{target.name}' is not in {target.points}", where=path, allowed=names)
+    return _read_only(points.points[points.names.index(target.name)].copy())
+
+
+def _robot(content: CaseFile, space: Space, path: Path) -> RobotSettings:
+    robot = content.robot
+    home = None if robot.home_deg is None else _read_only(np.radians(np.asarray(robot.home_deg)))
+    mount = None if robot.mount is None else _mount(robot.mount, space, path)
+    return RobotSettings(ur_model(robot.model).name, home, mount)
+
+
+def _mount(mount: MountSection, space: Space, path: Path) -> Matrix:
+    """T_base_ct from the base's origin and axes, as the case states them in its own space."""
+    x, z = (to_lps(np.asarray([v], dtype=float), space)[0] for v in (mount.x_axis, mount.z_axis))
+    lengths = np.linalg.norm(x), np.linalg.norm(z)
+    if min(lengths) == 0 or abs(x @ z) > AXES_PARALLEL * lengths[0] * lengths[1]:
+        raise InputError("robot.mount: x_axis and z_axis are parallel or zero", where=path, allowed="two axes")
+    z = z / lengths[1]
+    x = x - z * (x @ z)
+    x = x / np.linalg.norm(x)
+    T_ct_base = np.eye(4)
+    T_ct_base[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    T_ct_base[:3, 3] = to_lps(np.asarray([mount.position_mm]), space)[0]
+    return _read_only(np.linalg.inv(T_ct_base))
+
+
+def _hashes(content: CaseFile, path: Path) -> dict[str, str]:
+    """SHA-256 of the case file and of every file that it names."""
+    named: dict[str, str | None] = {"target.points": content.target.points}
+    for one in content.structure:
+        named[f"structure '{one.name}'"] = one.mesh or one.labelmap or one.ct
+    for number, many in enumerate(content.structures):
+        named[f"structures.{number}.labelmap"] = many.labelmap
+        if many.naming is not None and many.naming.endswith(".csv"):
+            named[f"structures.{number}.naming"] = many.naming
+    if content.registration is not None:
+        named["registration.markers_ct"] = content.registration.markers_ct
+        named["registration.markers_base"] = content.registration.markers_base
+    named["rehearsal.truth_base"] = content.rehearsal.truth_base
+    hashes = {path.name: sha256(path)}
+    for key, name in named.items():
+        if name is not None and name not in hashes:
+            hashes[name] = sha256(_existing(path, name, key))
+    return hashes
+
+
+def _existing(path: Path, name: str, key: str) -> Path:
+    file = path.parent / name
+    if not file.is_file():
+        raise InputError(f"{key}: file '{name}' is not there", where=path, allowed=f"a file in {path.parent}")
+    return file
+
+
+def _read_only(array: ArrayLike) -> Matrix:
+    frozen = np.array(array, dtype=np.float64)
+    frozen.setflags(write=False)
+    return frozen

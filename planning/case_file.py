@@ -1,0 +1,244 @@
+"""What a case file may hold: the TOML schema, version 1, key by key. See docs/case.md for the words."""
+
+from __future__ import annotations
+
+import difflib
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    AllowInfNan,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    Strict,
+    StringConstraints,
+    model_validator,
+)
+
+Number = Annotated[float, Strict(), AllowInfNan(False)]
+Positive = Annotated[Number, Field(gt=0)]
+NotNegative = Annotated[Number, Field(ge=0)]
+Vector = tuple[Number, Number, Number]
+Sextuple = tuple[Number, Number, Number, Number, Number, Number]
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=80)]
+Degrees360 = Annotated[Number, Field(ge=0, le=360)]
+Degrees180 = Annotated[Number, Field(ge=0, le=180)]
+Label = Annotated[int, Strict(), Field(ge=1, le=65535)]
+
+
+class Section(BaseModel):
+    """A table of the file: frozen, and an unknown key is an error that names the nearest valid one."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_keys(cls, data: Any) -> Any:
+        if isinstance(data, dict):
+            known = [field.alias or name for name, field in cls.model_fields.items()]
+            for key in data:
+                if key not in known:
+                    near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+                    hint = f"did you mean '{near[0]}'? " if near else ""
+                    raise ValueError(f"unknown key '{key}'; {hint}keys here: {', '.join(known)}")
+        return data
+
+
+class TargetSection(Section):
+    """The point to reach: coordinates, or a name in a file of points."""
+
+    position_mm: Vector | None = None
+    points: str | None = None
+    name: str = "target"
+    structure: Name
+
+    @model_validator(mode="after")
+    def _one_position(self) -> Self:
+        if (self.position_mm is None) == (self.points is None):
+            raise ValueError("needs either position_mm or points (a file, with the target's name), not both")
+        return self
+
+
+class NeedleSection(Section):
+    """The needle: lengths from the tip; the holder is what lies between shaft and flange."""
+
+    length_mm: Annotated[Number, Field(ge=20, le=1000)]
+    shaft_mm: Annotated[Number, Field(ge=10, le=1000)]
+    diameter_mm: Annotated[Number, Field(ge=0.1, le=20)]
+    standoff_mm: Annotated[Number, Field(ge=5, le=1000)] | None = None
+    skin_gap_mm: Annotated[Number, Field(ge=1, le=200)] = 10.0
+    holder_diameter_mm: Annotated[Number, Field(ge=1, le=200)] = 30.0
+
+    @model_validator(mode="after")
+    def _shaft_fits(self) -> Self:
+        if self.shaft_mm > self.length_mm:
+            raise ValueError(f"shaft_mm {self.shaft_mm:g} is longer than length_mm {self.length_mm:g}")
+        return self
+
+
+Anatomical = Literal["left", "right", "anterior", "posterior", "head", "feet"]
+
+
+class EntryAxes(Section):
+    """An entry frame of one's own: where its z and x axes point; y = z × x."""
+
+    z: Anatomical | Vector
+    x: Anatomical | Vector
+
+
+class SearchSection(Section):
+    """The grid of directions and the limits at the skin."""
+
+    theta_deg: tuple[Degrees180, Degrees180] = (0.0, 90.0)
+    beta_deg: tuple[Degrees360, Degrees360] = (0.0, 360.0)
+    step_deg: Annotated[Number, Field(ge=0.05, le=45)] = 1.0
+    max_skin_angle_deg: Annotated[Number, Field(gt=0, le=90)] = 60.0
+    frame: Literal["ct", "bed"] | EntryAxes | None = None
+
+    @model_validator(mode="after")
+    def _ranges_ascend(self) -> Self:
+        for key in ("theta_deg", "beta_deg"):
+            low, high = getattr(self, key)
+            if low > high:
+                raise ValueError(f"{key} [{low:g}, {high:g}] descends; it is [lowest, highest]")
+        return self
+
+
+class RankingSection(Section):
+    """Weights of the cost terms; each term lies in 0..1, see planning/ranking.py."""
+
+    clearance: NotNegative = 1.0
+    path_length: NotNegative = 0.5
+    skin_angle: NotNegative = 0.3
+    tissue: NotNegative = 0.5
+    reach: NotNegative = 0.5
+
+
+Role = Literal["avoid", "traverse", "target", "skin", "unknown"]
+
+
+class StructureSection(Section):
+    """One structure from one source."""
+
+    name: Name
+    role: Role
+    margin_mm: NotNegative | None = None
+    mesh: str | None = None
+    unit: str | None = None
+    space: str | None = None
+    labelmap: str | None = None
+    label: Label | None = None
+    ct: str | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        sources = [key for key in ("mesh", "labelmap", "ct") if getattr(self, key) is not None]
+        if len(sources) != 1:
+            raise ValueError(f"'{self.name}' needs exactly one of mesh, labelmap, ct; it has {sources or 'none'}")
+        if (self.labelmap is None) != (self.label is None):
+            raise ValueError(f"'{self.name}': labelmap and label go together")
+        if self.mesh is not None and self.unit is None:
+            raise ValueError(f'\'{self.name}\': a mesh needs unit = "mm", "cm" or "m"; no mesh file says it')
+        if self.mesh is None and (self.unit or self.space):
+            raise ValueError(f"'{self.name}': unit and space belong to a mesh; a volume says its own")
+        if self.ct is not None and self.role != "skin":
+            raise ValueError(f"'{self.name}': ct finds the body's skin only; role must be \"skin\"")
+        if self.margin_mm is not None and self.role not in {"avoid", "unknown"}:
+            raise ValueError(f'\'{self.name}\': margin_mm belongs to role "avoid", not "{self.role}"')
+        return self
+
+
+class StructuresSection(Section):
+    """Many structures of one label map, by name pattern."""
+
+    labelmap: str
+    naming: str | None = None
+    target: tuple[str, ...] = ()
+    avoid: dict[str, NotNegative] = Field(default_factory=dict)
+    traverse: tuple[str, ...] = ()
+    ignore: tuple[str, ...] = ()
+
+
+class RegistrationSection(Section):
+    """Markers seen in the CT and touched by the robot."""
+
+    method: Literal["triad", "rigid", "affine"] = "rigid"
+    markers_ct: str
+    markers_base: str
+    use: tuple[str, ...] | None = None
+    fle_mm: Positive | None = None
+
+
+class MountSection(Section):
+    """Where the robot's base stands in the CT, when no markers say it."""
+
+    position_mm: Vector
+    x_axis: Vector
+    z_axis: Vector
+
+
+class RobotSection(Section):
+    """The arm."""
+
+    model: str = "ur3"
+    home_deg: Sextuple | None = None
+    mount: MountSection | None = None
+
+
+class ObstacleSection(Section):
+    """A box in the room (table, gantry side), axes parallel to its frame's."""
+
+    name: Name
+    frame: Literal["ct", "base"]
+    center_mm: Vector
+    size_mm: tuple[Positive, Positive, Positive]
+
+
+class RehearsalSection(Section):
+    """What the twin's truth is drawn from; the planner never reads it."""
+
+    seed: Annotated[int, Strict(), Field(ge=0)] = 0
+    truth_base: str | None = None
+    fle_ct_mm: NotNegative = 0.5
+    fle_touch_mm: NotNegative = 0.1
+    joint_offset_deg: NotNegative = 0.02
+
+
+def _schema_one(value: Any) -> Any:
+    if value != 1 or isinstance(value, bool):
+        raise ValueError(f"schema {value!r} is not known; this version reads schema = 1")
+    return value
+
+
+class CaseFile(Section):
+    """The whole file."""
+
+    schema_: Annotated[int, BeforeValidator(_schema_one)] = Field(alias="schema")
+    name: Name
+    space: Literal["LPS", "RAS", "local"]
+    target: TargetSection
+    needle: NeedleSection
+    search: SearchSection = SearchSection()
+    ranking: RankingSection = RankingSection()
+    structure: tuple[StructureSection, ...] = ()
+    structures: tuple[StructuresSection, ...] = ()
+    registration: RegistrationSection | None = None
+    robot: RobotSection = RobotSection()
+    obstacle: tuple[ObstacleSection, ...] = ()
+    rehearsal: RehearsalSection = RehearsalSection()
+
+    @model_validator(mode="after")
+    def _no_contradiction(self) -> Self:
+        if self.registration is not None and self.robot.mount is not None:
+            raise ValueError("[registration] and [robot.mount] both say where the base is; keep one")
+        if self.space == "local" and self.search.frame not in {None, "ct"}:
+            raise ValueError('search.frame must be "ct" for space "local": it has no head and no front')
+        names = [s.name for s in self.structure]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"structure '{name}' stands twice; names are unique")
+        skins = [s.name for s in self.structure if s.role == "skin"]
+        if len(skins) != 1:
+            raise ValueError(f'one structure has role "skin"; here {skins or "none"}')
+        return self

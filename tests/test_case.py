@@ -1,0 +1,212 @@
+"""The case file: what it means, and every way in which it is refused with one clear line."""
+
+import hashlib
+import tomllib
+
+import numpy as np
+import pytest
+
+from planning.case import load_case
+from planning.errors import InputError
+from planning.formats.spaces import Space
+
+GOOD = """
+schema = 1
+name = "one"
+space = "LPS"
+[target]
+position_mm = [1.0, 2.0, 3.0]
+structure = "organ"
+[needle]
+length_mm = 210.0
+shaft_mm = 150.0
+diameter_mm = 1.2
+[search]
+theta_deg = [0, 60]
+step_deg = 5.0
+[[structure]]
+name = "skin"
+mesh = "skin.stl"
+unit = "mm"
+role = "skin"
+[[structure]]
+name = "organ"
+mesh = "organ.stl"
+unit = "mm"
+role = "target"
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    """A function that writes a case, with its text changed, and returns its path."""
+    for name in ("skin.stl", "organ.stl"):
+        (tmp_path / name).write_bytes(name.encode())
+
+    def make(*changes, text=GOOD):
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new, 1)
+        path = tmp_path / "case.toml"
+        path.write_text(text)
+        return path
+
+    return make
+
+
+def test_a_good_case_is_read(write):
+    """Degrees become radians, defaults are filled in, every input is hashed."""
+    case = load_case(write())
+    assert (case.name, case.space, case.target_structure) == ("one", Space.LPS, "organ")
+    np.testing.assert_array_equal(case.target_ct, [1, 2, 3])
+    assert case.search.theta == (0, pytest.approx(np.pi / 3))
+    assert case.search.max_skin_angle == pytest.approx(np.pi / 3)
+    assert case.needle.radius_mm == 0.6
+    assert case.inputs["organ.stl"] == hashlib.sha256(b"organ.stl").hexdigest()
+    assert set(case.inputs) == {"case.toml", "skin.stl", "organ.stl"}
+    assert not case.knows_base
+
+
+def test_a_folder_stands_for_its_case_file(write):
+    """A folder is read through its case.toml."""
+    assert load_case(write().parent).name == "one"
+
+
+def test_patient_space_defaults_to_the_bed_frame(write):
+    """z of the entry frame points to the patient's front, its origin is the target."""
+    T = load_case(write()).T_ct_entry
+    np.testing.assert_array_equal(T[:3, 2], [0, -1, 0])
+    np.testing.assert_array_equal(T[:3, 3], [1, 2, 3])
+
+
+def test_a_ras_case_is_turned_to_lps(write):
+    """Target and mount of a RAS case change the sign of x and y."""
+    mount = "\n[robot.mount]\nposition_mm = [10, 20, 30]\nx_axis = [1, 0, 0]\nz_axis = [0, 0, 1]\n"
+    case = load_case(write(('"LPS"', '"RAS"'), text=GOOD + mount))
+    np.testing.assert_array_equal(case.target_ct, [-1, -2, 3])
+    T_ct_base = np.linalg.inv(case.robot.T_base_ct_mount)
+    np.testing.assert_allclose(T_ct_base[:3, 3], [-10, -20, 30])
+    np.testing.assert_allclose(T_ct_base[:3, 0], [-1, 0, 0])
+    assert np.linalg.det(T_ct_base[:3, :3]) == pytest.approx(1)
+
+
+def test_a_target_may_come_from_a_file_of_points(write, tmp_path):
+    """A name in a CSV of points, in the case's space."""
+    (tmp_path / "targets.csv").write_text("name,x_mm,y_mm,z_mm\nA,4,5,6\n")
+    path = write(("position_mm = [1.0, 2.0, 3.0]", 'points = "targets.csv"\nname = "A"'))
+    np.testing.assert_array_equal(load_case(path).target_ct, [4, 5, 6])
+    path = write(("position_mm = [1.0, 2.0, 3.0]", 'points = "targets.csv"\nname = "B"'))
+    with pytest.raises(InputError, match=r"target.name 'B' is not in targets.csv; allowed: A"):
+        load_case(path)
+
+
+BAD = {
+    "unknown key": (("diameter_mm", "diamter_mm"), "unknown key 'diamter_mm'; did you mean 'diameter_mm'"),
+    "unknown section": (("[search]", "[serach]"), "unknown key 'serach'; did you mean 'search'"),
+    "wrong unit in a key": (("length_mm", "length_m"), "needle: unknown key 'length_m'; did you mean 'length_mm'"),
+    "metres under a mm key": (
+        ("length_mm = 210.0", "length_mm = 0.21"),
+        "needle.length_mm: .*greater than or equal to 20",
+    ),
+    "another schema": (("schema = 1", "schema = 2"), "schema 2 is not known"),
+    "no schema": (("schema = 1", ""), "schema: Field required"),
+    "text for a number": (
+        ("diameter_mm = 1.2", 'diameter_mm = "1.2"'),
+        "needle.diameter_mm: Input should be a valid number",
+    ),
+    "true for a number": (
+        ("diameter_mm = 1.2", "diameter_mm = true"),
+        "needle.diameter_mm: Input should be a valid number",
+    ),
+    "nan": (("diameter_mm = 1.2", "diameter_mm = nan"), "needle.diameter_mm: Input should be a finite number"),
+    "negative": (("diameter_mm = 1.2", "diameter_mm = -1.2"), "needle.diameter_mm: .*greater than or equal to 0.1"),
+    "infinite target": (
+        ("[1.0, 2.0, 3.0]", "[1.0, inf, 3.0]"),
+        "target.position_mm.1: Input should be a finite number",
+    ),
+    "two coordinates": (("[1.0, 2.0, 3.0]", "[1.0, 2.0]"), "target.position_mm.2: Field required"),
+    "no target": (("position_mm = [1.0, 2.0, 3.0]", ""), "needs either position_mm or points"),
+    "shaft longer than the needle": (
+        ("shaft_mm = 150.0", "shaft_mm = 250.0"),
+        "shaft_mm 250 is longer than length_mm 210",
+    ),
+    "descending range": (("[0, 60]", "[60, 0]"), "theta_deg .60, 0. descends"),
+    "range beyond 180": (("[0, 60]", "[0, 200]"), "search.theta_deg.1: .*less than or equal to 180"),
+    "zero step": (("step_deg = 5.0", "step_deg = 0"), "search.step_deg: .*greater than or equal to 0.05"),
+    "another space": (('"LPS"', '"LAS"'), "space: Input should be 'LPS', 'RAS' or 'local'"),
+    "bed frame in a local space": (('space = "LPS"', 'space = "local"'), 'search.frame must be "ct"'),
+    "unknown role": (('role = "target"', 'role = "avoidd"'), "structure.1.role: Input should be 'avoid'"),
+    "two skins": (('role = "target"', 'role = "skin"'), "one structure has role .skin.; here"),
+    "no skin": (('role = "skin"', 'role = "traverse"'), "one structure has role .skin.; here none"),
+    "a name twice": (('name = "skin"', 'name = "organ"'), "structure 'organ' stands twice"),
+    "two sources": (
+        ('mesh = "organ.stl"', 'mesh = "organ.stl"\nlabelmap = "seg.nii"\nlabel = 3'),
+        "exactly one of mesh",
+    ),
+    "no source": (('mesh = "organ.stl"\nunit = "mm"', ""), "exactly one of mesh, labelmap, ct; it has none"),
+    "label map without a label": (
+        ('mesh = "organ.stl"\nunit = "mm"', 'labelmap = "seg.nii"'),
+        "labelmap and label go together",
+    ),
+    "mesh without a unit": (('mesh = "organ.stl"\nunit = "mm"', 'mesh = "organ.stl"'), "a mesh needs unit"),
+    "margin on the wrong role": (('role = "target"', 'role = "target"\nmargin_mm = 3'), "margin_mm belongs to role"),
+    "missing file": (('mesh = "organ.stl"', 'mesh = "gone.stl"'), "structure 'organ': file 'gone.stl' is not there"),
+    "a name with a path": (('name = "one"', 'name = "../one"'), "name: String should match pattern"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_broken_case_is_refused_in_one_line(name, write):
+    """Each defect is named with its place and what is allowed."""
+    change, message = BAD[name]
+    text = GOOD.replace("theta_deg = [0, 60]", 'theta_deg = [0, 60]\nframe = "bed"') if "local" in name else GOOD
+    with pytest.raises(InputError, match=message) as caught:
+        load_case(write(change, text=text))
+    assert "case.toml" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert "allowed: " in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("added", "message"),
+    [
+        ('[registration]\nmarkers_ct = "a.csv"\nmarkers_base = "b.csv"', "registration.markers_ct: file 'a.csv' is not there"),
+        ('[registration]\nmarkers_ct = "skin.stl"\nmarkers_base = "skin.stl"\n[robot.mount]\nposition_mm=[0,0,0]\n'
+         'x_axis=[1,0,0]\nz_axis=[0,0,1]', "both say where the base is"),
+        ("[robot.mount]\nposition_mm=[0,0,0]\nx_axis=[0,0,2]\nz_axis=[0,0,1]", "x_axis and z_axis are parallel"),
+        ('[robot]\nhome_deg = [0, 0, 0]', "robot.home_deg.3: Field required"),
+        ('[[structures]]\nlabelmap = "gone.nii.gz"\nnaming = "totalsegmentator-v2"', "file 'gone.nii.gz' is not there"),
+    ],
+)  # fmt: skip
+def test_contradictions_with_the_robot_are_refused(added, message, write):
+    """Registration, mount and label maps are held against each other and the folder."""
+    with pytest.raises(InputError, match=message):
+        load_case(write(text=GOOD + added))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"\x00\xff\xfe binary", "is not TOML"),
+        (b"schema = ", "is not TOML"),
+        (b"", "Field required"),
+        (b"# " + b"x" * 2_000_000, "larger than 1 MB"),
+    ],
+)
+def test_what_is_no_case_file_is_refused(content, message, tmp_path):
+    """Garbage, half a file, nothing at all, far too much."""
+    path = tmp_path / "case.toml"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        load_case(path)
+
+
+def test_a_missing_case_is_refused(tmp_path):
+    """The folder without a case.toml is named."""
+    with pytest.raises(InputError, match="case.toml: cannot be read"):
+        load_case(tmp_path)
+
+
+def test_the_good_case_is_good():
+    """The text that the broken ones are made from is valid TOML with the sections of the schema."""
+    assert {"target", "needle", "search", "structure"} <= set(tomllib.loads(GOOD))
