@@ -1,0 +1,1 @@
+"""Needle to organ, every direction: the engine interface, the FCL reference, crossings and containment."""

@@ -1,0 +1,41 @@
+"""What a clearance engine answers: the one interface between the search and whoever measures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class AxisDistances:
+    """How far needle axes are from structures, mm.
+
+    Attributes:
+        distance: Shape (n, k), least distance of axis i from the surface of structure j; 0 where they meet.
+        depth: Shape (n, k), distance from the target, along the axis, of the axis point nearest to the structure;
+            where they meet, of the first meeting point.
+    """
+
+    distance: Floats
+    depth: Floats
+
+
+class ClearanceEngine(Protocol):
+    """Prepared once for a set of surfaces, asked for any target.
+
+    An engine sees surfaces only. That a needle lies wholly inside a closed surface is the caller's to find, and is
+    decided by the target alone, because every axis starts there (see `planning.clearance.measure`).
+    """
+
+    def measure(self, target_ct: Floats, outward_ct: Floats, length: float) -> AxisDistances:
+        """Exact distances of the axes from ``target_ct`` (3,) along ``outward_ct`` (n, 3), ``length`` mm long."""
+        ...
+
+    def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
+        """FCL's own word on whether a capsule of this radius about one axis (3,) touches one structure."""
+        ...

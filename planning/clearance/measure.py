@@ -1,0 +1,66 @@
+"""Clearance of every candidate to every structure, and FCL's verdict on each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.anatomy import Structure
+from planning.clearance.containment import Side, side_of
+from planning.clearance.engine import ClearanceEngine, Floats
+
+NEAR_THRESHOLD_MM = 1e-4
+"""Within this of a margin FCL's capsule collision decides: its own tolerance is 1e-6 mm."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clearances:
+    """Needle to organ, for n candidates and k structures; mm.
+
+    Attributes:
+        clearance: Shape (n, k), axis distance minus needle radius, never below minus the radius.
+        depth: Shape (n, k), where along the needle, from the target.
+        violated: Shape (n, k), the structure demands a margin and does not get it.
+    """
+
+    clearance: Floats
+    depth: Floats
+    violated: NDArray[np.bool_]
+
+
+def measure(
+    engine: ClearanceEngine,
+    structures: tuple[Structure, ...],
+    target_ct: Floats,
+    outward_ct: Floats,
+    *,
+    length: float,
+    radius: float,
+) -> Clearances:
+    """Measure all candidates.
+
+    Every axis starts at the target: where the target lies inside a closed structure, the whole axis is inside it or
+    crosses its surface, and the distance is 0 whatever the surfaces say.
+
+    Args:
+        engine: Prepared for the meshes of ``structures``, in that order.
+        structures: The k structures.
+        target_ct: Shape (3,).
+        outward_ct: Shape (n, 3), unit vectors.
+        length: Needle, tip to flange, mm.
+        radius: Needle radius, mm.
+    """
+    axes = engine.measure(target_ct, outward_ct, length)
+    distance, depth = axes.distance.copy(), axes.depth.copy()
+    violated = np.zeros(distance.shape, bool)
+    for column, structure in enumerate(structures):
+        if side_of(structure.mesh, target_ct) is Side.INSIDE:
+            distance[:, column] = depth[:, column] = 0.0
+        if structure.demands_margin:
+            limit = radius + structure.margin_mm
+            violated[:, column] = distance[:, column] < limit
+            for row in np.flatnonzero(np.abs(distance[:, column] - limit) < NEAR_THRESHOLD_MM):
+                violated[row, column] = engine.collides(column, target_ct, outward_ct[row], length, limit)
+    return Clearances(distance - radius, depth, violated)

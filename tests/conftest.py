@@ -1,0 +1,35 @@
+"""What many tests share."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from planning.mesh import TriangleMesh
+
+
+@pytest.fixture
+def rng():
+    """A seeded generator."""
+    return np.random.default_rng(20191104)
+
+
+@pytest.fixture(scope="session")
+def ball():
+    """A function: a closed, fine sphere (320 triangles for 2 subdivisions)."""
+
+    def make(radius, center=(0, 0, 0), subdivisions=3):
+        mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+        return TriangleMesh(mesh.vertices + np.asarray(center), mesh.faces)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def box():
+    """A function: a closed box of 12 triangles."""
+
+    def make(size, center=(0, 0, 0)):
+        mesh = trimesh.creation.box(extents=size)
+        return TriangleMesh(mesh.vertices + np.asarray(center), mesh.faces)
+
+    return make

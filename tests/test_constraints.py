@@ -1,0 +1,179 @@
+"""Each reason, in a scene where geometry knows the answer."""
+
+import numpy as np
+import pytest
+
+from planning.anatomy import Anatomy, Role, Structure
+from planning.case import Needle, SearchSettings
+from planning.clearance.fcl_engine import FclEngine
+from planning.clearance.measure import measure
+from planning.constraints import judge, longest_path, standoffs
+from planning.mesh import TriangleMesh
+from planning.reasons import Reason
+from planning.skin import FieldOfView, Skin, skin_from_mesh
+from planning.skin_entry import skin_paths
+
+NEEDLE = Needle(200.0, 150.0, 1.0, None, 10.0, 30.0)
+UP = np.array([[0.0, 0.0, 1.0]])
+
+
+def verdict(skin, structures=(), direction=UP, needle=NEEDLE, target=(0, 0, 0), max_angle=60.0):
+    """The first broken constraint of one direction: reason, structure, depth, amount."""
+    target = np.asarray(target, float)
+    direction = np.asarray(direction, float).reshape(-1, 3)
+    paths = skin_paths(skin, target, direction, needle.length_mm)
+    structures = tuple(structures)
+    engine = FclEngine([s.mesh for s in structures])
+    found = measure(engine, structures, target, direction, length=needle.length_mm, radius=needle.radius_mm)
+    judged = judge(paths, found, structures, needle=needle, max_skin_angle=np.radians(max_angle))
+    return str(judged.reason[0]), str(judged.structure[0]), judged.depth[0], judged.amount[0]
+
+
+def both(*meshes):
+    """One surface of several."""
+    offsets = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
+    return TriangleMesh(
+        np.concatenate([m.vertices for m in meshes]),
+        np.concatenate([m.faces + o for m, o in zip(meshes, offsets, strict=True)]),
+    )
+
+
+def test_free_path_is_safe(box):
+    """Straight out of a box, nothing near: safe."""
+    assert verdict(skin_from_mesh(box([100, 100, 100])))[0] == ""
+
+
+def test_path_length_and_angle_are_geometry(box):
+    """In a box the path to the top face is height over cosine, and the skin angle is the tilt."""
+    skin = skin_from_mesh(box([400, 400, 100]))
+    tilt = np.radians(np.array([0.0, 20, 45]))
+    directions = np.stack([np.sin(tilt), 0 * tilt, np.cos(tilt)], axis=1)
+    paths = skin_paths(skin, np.zeros(3), directions, 200.0)
+    np.testing.assert_allclose(paths.path_length, 50 / np.cos(tilt), atol=1e-9)
+    np.testing.assert_allclose(paths.entry_ct[:, 2], 50, atol=1e-9)
+
+
+def test_skin_angle_on_a_ball(ball):
+    """From the centre of a ball every path meets the skin straight on; off centre, as the sine law says."""
+    skin = skin_from_mesh(ball(100, subdivisions=5))
+    directions = np.array([[0, 0, 1.0], [1, 0, 0]])
+    centred = skin_paths(skin, np.zeros(3), directions, 300.0)
+    np.testing.assert_allclose(np.degrees(centred.skin_angle), 0, atol=0.5)
+    shifted = skin_paths(skin, np.array([0, 0, 60.0]), np.array([[1.0, 0, 0]]), 300.0)
+    assert np.degrees(shifted.skin_angle[0]) == pytest.approx(np.degrees(np.arcsin(0.6)), abs=0.5)
+
+
+def test_too_long(box):
+    """A path longer than the usable shaft is rejected with its length."""
+    assert verdict(skin_from_mesh(box([400, 400, 360])))[::3] == (Reason.TOO_LONG, pytest.approx(180))
+
+
+def test_a_fixed_standoff_limits_the_path(box):
+    """With the tip 60 mm from the target before the insertion, and 10 mm off the skin, 50 mm of path are the most."""
+    needle = Needle(200.0, 150.0, 1.0, 60.0, 10.0, 30.0)
+    assert longest_path(needle) == 50
+    assert verdict(skin_from_mesh(box([100, 100, 99])), needle=needle)[0] == ""
+    assert verdict(skin_from_mesh(box([100, 100, 101])), needle=needle)[0] == Reason.TOO_LONG
+    np.testing.assert_array_equal(standoffs(needle, np.array([20.0, 40])), 60)
+    np.testing.assert_array_equal(standoffs(NEEDLE, np.array([20.0, 40])), [30, 50])
+
+
+def test_skin_angle(ball):
+    """A flat path off centre is too oblique for 30°."""
+    found = verdict(skin_from_mesh(ball(100, subdivisions=5)), target=(0, 0, 60), direction=[1, 0, 0], max_angle=30)
+    assert found[0] == Reason.SKIN_ANGLE
+    assert found[3] == pytest.approx(36.87, abs=0.5)
+
+
+def test_reenters_skin(ball):
+    """A second body part within the needle's length is named with its depth; beyond it, it is not the needle's."""
+    arm = both(ball(50, subdivisions=4), ball(20, (0, 0, 120), 4))
+    reason, _, depth, _ = verdict(skin_from_mesh(arm))
+    assert (reason, depth) == (Reason.REENTERS_SKIN, pytest.approx(100, abs=0.2))
+    far = both(ball(50), ball(20, (0, 0, 240)))
+    assert verdict(skin_from_mesh(far))[0] == ""
+
+
+def test_too_close_names_structure_depth_and_mm(ball, box):
+    """The structure that lacks most of its margin is named."""
+    near = Structure("vessel", Role.AVOID, 5.0, ball(10, (14, 0, 30), 4), "")
+    other = Structure("rib", Role.AVOID, 1.0, ball(10, (-11, 0, 40), 4), "")
+    reason, structure, depth, amount = verdict(skin_from_mesh(box([100, 100, 100])), [other, near])
+    assert (reason, structure) == (Reason.TOO_CLOSE, "vessel")
+    assert depth == pytest.approx(30, abs=0.5)
+    assert amount == pytest.approx(14 - 10 - 0.5, abs=0.05)
+
+
+def test_margin_is_held_against_the_clearance(ball, box):
+    """Clearance 3.5: a margin of 3.4 is kept, one of 3.6 is not."""
+    for margin, expected in ((3.4, ""), (3.6, Reason.TOO_CLOSE)):
+        structure = Structure("organ", Role.AVOID, margin, ball(10, (14, 0, 30), 6), "")
+        assert verdict(skin_from_mesh(box([100, 100, 100])), [structure])[0] == expected
+
+
+def test_role_unknown_is_an_unknown_region(ball, box):
+    """A path through a structure of which nothing is known is unknown, never safe."""
+    cloud = Structure("fog", Role.UNKNOWN, 0.0, ball(10, (0, 0, 30)), "")
+    assert verdict(skin_from_mesh(box([100, 100, 100])), [cloud])[:2] == (Reason.UNKNOWN_REGION, "fog")
+
+
+def cut_skin(box, cut_high_z):
+    """A box whose top may be a cut of the field of view instead of skin."""
+    mesh = box([100, 100, 100])
+    top = np.all(mesh.triangles[:, :, 2] == 50, axis=1)
+    T = np.eye(4)
+    T[:3, 3] = [-80, -80, -80]
+    cut = np.zeros((3, 2), bool)
+    cut[2, 1] = cut_high_z
+    field = FieldOfView(T, np.array([160.0, 160, 130]), cut)
+    return Skin(mesh, top if cut_high_z else np.zeros(len(top), bool), field, ())
+
+
+def test_leaving_through_a_cut_face_is_unknown(box):
+    """Where the field of view cuts the body there is no skin: unknown, with the depth."""
+    assert verdict(cut_skin(box, True))[0] == Reason.UNKNOWN_REGION
+    assert verdict(cut_skin(box, True))[2] == pytest.approx(50)
+    assert verdict(cut_skin(box, False))[0] == ""
+
+
+def test_a_needle_that_leaves_the_image_beside_a_cut_body_is_unknown(box):
+    """Out through real skin, but then past the face at which the body was cut: what is there is not known."""
+    flat = np.array([0.7, 0, 0.5])
+    flat /= np.linalg.norm(flat)
+    reason, _, depth, _ = verdict(cut_skin(box, True), direction=flat)
+    assert reason == Reason.UNKNOWN_REGION
+    assert depth == pytest.approx(50 / flat[2])
+
+
+def test_no_skin_entry_through_a_hole(box):
+    """An open skin with its top missing has no entry there."""
+    mesh = box([100, 100, 100])
+    top = np.all(mesh.triangles[:, :, 2] == 50, axis=1)
+    opened = skin_from_mesh(TriangleMesh(mesh.vertices, mesh.faces[~top]))
+    assert opened.warnings
+    assert verdict(opened)[0] == Reason.NO_SKIN_ENTRY
+    assert verdict(opened, direction=[0, 0, -1])[0] == ""
+
+
+def test_a_ray_through_a_corner_is_judged_like_its_neighbours(box):
+    """Exactly through an edge or a corner of the skin: one entry, no false re-entry."""
+    skin = skin_from_mesh(box([100, 100, 100]))
+    for direction in ([1, 1, 1], [1, 0, 1], [1, 1, 0.5]):
+        u = np.array(direction, float) / np.linalg.norm(direction)
+        paths = skin_paths(skin, np.zeros(3), u[None], 200.0)
+        assert np.isfinite(paths.path_length[0])
+        assert np.isnan(paths.reentry_depth[0])
+        assert np.isnan(paths.unknown_depth[0])
+
+
+def test_anatomy_finds_structures_by_name(ball, box):
+    """A wrong name lists the right ones."""
+    anatomy = Anatomy((Structure("liver", Role.TARGET, 0, ball(10), ""),), skin_from_mesh(box([100, 100, 100])), ())
+    assert anatomy.structure("liver").role is Role.TARGET
+    with pytest.raises(Exception, match="no structure 'lver'.*liver"):
+        anatomy.structure("lver")
+
+
+def test_search_settings_are_radians():
+    """The case's grid speaks radians inside."""
+    assert SearchSettings((0, np.pi), (0, 1), 0.1, 1.0).theta[1] == np.pi

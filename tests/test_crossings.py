@@ -1,0 +1,91 @@
+"""Every crossing of every ray: against brute force, analytic spheres, and rays through edges and corners."""
+
+import numpy as np
+import pytest
+from oracles import ray_crossings
+
+from planning.clearance.containment import Side, side_of, winding_number
+from planning.clearance.crossings import crossings, first_crossing
+from planning.entry import grid
+from planning.mesh import TriangleMesh
+
+FULL = grid((0, np.pi), (0, 2 * np.pi), np.radians(7.3), np.eye(3)).outward_ct
+
+
+def by_ray(found, count):
+    """Depths as one list per ray."""
+    return [found.depth[found.ray == row].tolist() for row in range(count)]
+
+
+def soup(rng, count, spread, size):
+    """Unconnected random triangles."""
+    centers = rng.normal(0, spread, (count, 1, 3))
+    return TriangleMesh(
+        (centers + rng.normal(0, size, (count, 3, 3))).reshape(-1, 3), np.arange(3 * count).reshape(-1, 3)
+    )
+
+
+@pytest.mark.parametrize(("spread", "size"), [(60, 10), (60, 100), (3, 3), (500, 1)])
+def test_crossings_equal_brute_force(rng, spread, size):
+    """Small, huge, near and far triangles, seen from among them: the same depths as triangle by triangle."""
+    mesh = soup(rng, 60, spread, size)
+    directions = rng.normal(size=(150, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origin = rng.normal(0, 2, 3)
+    found = by_ray(crossings(mesh, origin, directions), len(directions))
+    for depths, direction in zip(found, directions, strict=True):
+        np.testing.assert_allclose(depths, ray_crossings(origin, direction, mesh), atol=1e-8)
+
+
+def test_from_inside_a_ball_every_ray_leaves_once(ball):
+    """From any point inside, each ray crosses the closed surface once, near the analytic sphere."""
+    mesh = ball(50, subdivisions=4)
+    for origin in ([0, 0, 0], [20, -10, 30], [0, 0, 49.0]):
+        found = crossings(mesh, np.array(origin, float), FULL)
+        assert (found.count == 1).all()
+        reached = np.linalg.norm(np.array(origin) + found.depth[:, None] * FULL[found.ray], axis=1)
+        assert (reached <= 50 + 1e-9).all()
+        assert (reached > 49.7).all()
+
+
+def test_rays_through_corners_and_edges_are_not_missed(box):
+    """From the centre of a box, rays through its corners, edge middles and face diagonals cross exactly once."""
+    corners = np.array(
+        [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
+    )
+    directions = corners / np.linalg.norm(corners, axis=1, keepdims=True)
+    found = crossings(box([2, 2, 2]), np.zeros(3), directions)
+    assert (found.count == 1).all()
+    np.testing.assert_allclose(found.depth, np.linalg.norm(corners, axis=1), atol=1e-12)
+
+
+def test_length_cuts_off(ball):
+    """Crossings beyond the length are left out; those before stay."""
+    mesh = ball(50)
+    assert (crossings(mesh, np.zeros(3), FULL, 10).count == 0).all()
+    assert (crossings(mesh, np.zeros(3), FULL, 51).count == 1).all()
+
+
+def test_first_crossing_is_the_nearest(ball):
+    """Of two nested spheres the inner one is first."""
+    both = TriangleMesh(
+        np.concatenate([ball(50).vertices, ball(20).vertices]),
+        np.concatenate([ball(50).faces, ball(20).faces + len(ball(50).vertices)]),
+    )
+    np.testing.assert_allclose(first_crossing(both, np.zeros(3), FULL, 100), 20, atol=0.3)
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_inside_and_outside(ball, flip):
+    """The winding number tells the side for both orientations."""
+    mesh = ball(50)
+    mesh = TriangleMesh(mesh.vertices, mesh.faces[:, ::-1]) if flip else mesh
+    assert side_of(mesh, np.array([49.0, 0, 0])) is Side.INSIDE
+    assert side_of(mesh, np.array([50.5, 0, 0])) is Side.OUTSIDE
+    assert winding_number(mesh, np.zeros(3)) == pytest.approx(-1 if flip else 1)
+
+
+def test_open_surfaces_have_no_side(ball):
+    """Without one triangle a sphere has no inside that could be known."""
+    mesh = ball(50)
+    assert side_of(TriangleMesh(mesh.vertices, mesh.faces[1:]), np.zeros(3)) is Side.UNKNOWN
