@@ -1,0 +1,184 @@
+"""Where the patient truly lies: from a file of true positions, drawn from marker errors, or as believed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from planning.case import Case, Needle, RobotSettings, SearchSettings, load_case
+from planning.case_file import RankingSection, RegistrationSection, RehearsalSection
+from planning.entry import view_frame
+from planning.errors import InputError
+from planning.formats.spaces import Space
+from planning.placement import load_placement
+from planning.registration import apply, fit_rigid, fit_triad, leverage
+from twin.truth import MarkerNoise, draw_truth, registration_error
+
+MESHES = Path(__file__).parents[1] / "meshes"
+MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [90, -10, 20], [20, 150, 147]])
+NAMES = ("A", "B", "C", "D", "E")
+TARGET = np.array([50.0, 130, 63])
+
+
+def pose(seed: int) -> np.ndarray:
+    """A rigid motion."""
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    T[:3, 3] = rng.uniform(-500, 500, 3)
+    return T
+
+
+def write_points(path: Path, names: tuple[str, ...], points: np.ndarray) -> None:
+    """A CSV of named points."""
+    rows = [f"{name},{x:.9f},{y:.9f},{z:.9f}" for name, (x, y, z) in zip(names, points, strict=True)]
+    path.write_text("\n".join(["name,x_mm,y_mm,z_mm", *rows]) + "\n")
+
+
+def case(folder: Path, *, markers: bool = True, method: str = "rigid", **rehearsal: object) -> Case:
+    """A case with the carton's markers; target M."""
+    registration = None
+    if markers:
+        write_points(folder / "ct.csv", NAMES, MARKERS)
+        write_points(folder / "base.csv", NAMES, apply(pose(0), MARKERS))
+        use = ("A", "B", "C") if method == "triad" else None
+        registration = RegistrationSection(method=method, markers_ct="ct.csv", markers_base="base.csv", use=use)
+    return Case(
+        path=folder / "case.toml",
+        name="box",
+        space=Space.LOCAL,
+        target_ct=TARGET,
+        target_name="M",
+        target_structure="lesion",
+        needle=Needle(210.0, 150.0, 1.2, 100.0, 10.0, 30.0),
+        search=SearchSettings((0, 1), (0, 6), 0.1, 1.0),
+        ranking=RankingSection(),
+        T_ct_entry=view_frame(np.eye(3), TARGET),
+        structure=(),
+        structures=(),
+        registration=registration,
+        robot=RobotSettings("ur3", None, None if markers else pose(0)),
+        obstacles=(),
+        rehearsal=RehearsalSection(**rehearsal),
+        inputs=MappingProxyType({}),
+    )
+
+
+def test_without_markers_truth_is_belief_and_says_so(tmp_path):
+    """A stated mount has no error to draw; the joint offsets are drawn all the same."""
+    truth = draw_truth(case(tmp_path, markers=False), pose(0))
+    np.testing.assert_array_equal(truth.T_base_ct_true, pose(0))
+    assert "belief" in truth.source
+    assert np.all(truth.joint_offsets != 0)
+
+
+def test_same_seed_same_truth_other_seed_another(tmp_path):
+    """All randomness comes from the seed, which the truth carries."""
+    one, again, other = (draw_truth(case(tmp_path, seed=seed), pose(0)) for seed in (5, 5, 6))
+    np.testing.assert_array_equal(one.T_base_ct_true, again.T_base_ct_true)
+    np.testing.assert_array_equal(one.joint_offsets, again.joint_offsets)
+    assert not np.array_equal(one.T_base_ct_true, other.T_base_ct_true)
+    assert (one.seed, other.seed) == (5, 6)
+    overridden = draw_truth(case(tmp_path, seed=6), pose(0), seed=5)
+    np.testing.assert_array_equal(overridden.T_base_ct_true, one.T_base_ct_true)
+
+
+def test_no_error_means_truth_is_belief(tmp_path):
+    """With exact markers and exact joints nothing differs."""
+    exact = case(tmp_path, fle_ct_mm=0.0, fle_touch_mm=0.0, joint_offset_deg=0.0)
+    truth = draw_truth(exact, pose(0))
+    np.testing.assert_allclose(truth.T_base_ct_true, pose(0), atol=1e-9)
+    np.testing.assert_array_equal(truth.joint_offsets, np.zeros(6))
+
+
+def test_drawn_truth_is_rigid_and_read_only(tmp_path):
+    """A proper rotation, frozen."""
+    truth = draw_truth(case(tmp_path), pose(0))
+    R = truth.T_base_ct_true[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) > 0
+    with pytest.raises(ValueError, match="read-only"):
+        truth.T_base_ct_true[0, 3] = 0.0
+
+
+@pytest.mark.parametrize(("ct_mm", "touch_mm"), [(0.5, 0.1), (0.0, 0.4)])
+def test_drawn_errors_are_those_that_fitzpatrick_expects(ct_mm, touch_mm):
+    """Root mean square distance of truth and belief at the target = FLE times the markers' leverage, within 4 %.
+
+    2000 draws leave 1.6 % (one standard deviation, three degrees of freedom at the least).
+    """
+    rng, T = np.random.default_rng(11), pose(3)
+    squares = []
+    for _ in range(2000):
+        error = registration_error(MARKERS, T, fit_rigid, MarkerNoise(ct_mm, touch_mm), rng)
+        T_true = T @ np.linalg.inv(error)
+        squares.append(np.sum((apply(T, TARGET) - apply(T_true, TARGET)) ** 2))
+    fle = np.sqrt(3 * (ct_mm**2 + touch_mm**2))
+    expected = fle * leverage(MARKERS, TARGET[None])[0]
+    assert np.sqrt(np.mean(squares)) == pytest.approx(expected, rel=0.04)
+
+
+def test_believing_the_truth_with_its_error_is_the_belief():
+    """T_believed = T_true E, by construction of the truth, for the triad as well."""
+    T = pose(4)
+    E = registration_error(MARKERS[:3], T, fit_triad, MarkerNoise(0.5, 0.1), np.random.default_rng(1))
+    np.testing.assert_allclose((T @ np.linalg.inv(E)) @ E, T, atol=1e-9)
+    assert np.linalg.norm(E - np.eye(4)) > 1e-3
+
+
+def test_triad_cases_draw_triad_errors(tmp_path):
+    """The error is that of the case's own method and markers: the same noise, another truth."""
+    rigid, triad = (draw_truth(case(tmp_path, method=method), pose(0)) for method in ("rigid", "triad"))
+    assert not np.allclose(rigid.T_base_ct_true, triad.T_base_ct_true, atol=1e-3)
+
+
+def test_file_of_true_positions_is_found_again(tmp_path):
+    """Exact positions give the exact pose, whatever the belief."""
+    write_points(tmp_path / "true.csv", (*NAMES, "M"), apply(pose(9), np.vstack([MARKERS, TARGET])))
+    truth = draw_truth(case(tmp_path, truth_base="true.csv"), pose(0))
+    np.testing.assert_allclose(truth.T_base_ct_true, pose(9), atol=1e-6)
+    assert "true.csv" in truth.source
+
+
+def test_target_lies_exactly_where_the_file_says(tmp_path):
+    """With markers that disagree by a few mm the target is still put on its own true place."""
+    wrong = apply(pose(9), MARKERS) + np.random.default_rng(2).normal(0, 2.0, MARKERS.shape)
+    place = apply(pose(9), TARGET)
+    write_points(tmp_path / "true.csv", (*NAMES, "M"), np.vstack([wrong, place]))
+    truth = draw_truth(case(tmp_path, truth_base="true.csv"), pose(0))
+    np.testing.assert_allclose(apply(truth.T_base_ct_true, TARGET), place, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "rows", "said"),
+    [(("A", "M"), (0, 5), "A, M"), (("P", "Q", "R"), (0, 1, 2), "none"), (("A", "B", "D"), (0, 0, 0), "line")],
+)
+def test_too_few_or_collinear_true_points_are_refused(tmp_path, names, rows, said):
+    """A file that cannot fix a pose is an input error that names what it has."""
+    every = apply(pose(9), np.vstack([MARKERS, TARGET]))[list(rows)] + np.arange(len(rows))[:, None] * [1.0, 2.0, 3.0]
+    write_points(tmp_path / "true.csv", names, every)
+    with pytest.raises(InputError, match=said):
+        draw_truth(case(tmp_path, truth_base="true.csv"), pose(0))
+
+
+@pytest.mark.parametrize(("lesion", "error_mm"), [("l", 2.99), ("m", 2.94), ("h", 2.99)])
+def test_papers_first_placement_gives_the_papers_error(lesion, error_mm):
+    """Belief from A-B-C, truth from what was touched in the box: the errors of Chen 2019, Table 3."""
+    carton = load_case(MESHES / "carton" / f"case_{lesion}.toml")
+    placement = load_placement(carton)
+    truth = draw_truth(carton, placement.T_base_ct)
+    error = apply(placement.T_base_ct, carton.target_ct) - apply(truth.T_base_ct_true, carton.target_ct)
+    assert np.linalg.norm(error) == pytest.approx(error_mm, abs=0.01)
+
+
+def test_embedded_abdomens_target_is_where_its_truth_says():
+    """Its markers in the CT are read with an error, its target is not: the target must not inherit that error."""
+    abdomen = load_case(MESHES / "abdomen" / "case.toml")
+    truth = draw_truth(abdomen, load_placement(abdomen).T_base_ct)
+    line = next(line for line in (MESHES / "abdomen" / "truth.csv").read_text().split() if line.startswith("target"))
+    place = np.array([float(x) for x in line.split(",")[1:]])
+    np.testing.assert_allclose(apply(truth.T_base_ct_true, abdomen.target_ct), place, atol=1e-6)

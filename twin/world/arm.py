@@ -1,0 +1,147 @@
+"""The arm in the room: loaded, driven by its joint motors, and read back."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.errors import InputError
+from planning.robot.links import T_BASE_URDFBASE
+from planning.robot.tool import Tool
+from planning.robot.ur import UrModel
+from twin.world.arm_file import write_arm_urdf
+from twin.world.engine import pybullet
+from twin.world.units import pose_to_m, pose_to_mm
+
+Floats = NDArray[np.float64]
+
+FLANGE = "tool0"
+"""The URDF's link whose frame is the controller's flange."""
+
+MAX_TORQUE_NM = MappingProxyType(
+    {
+        "ur3": (56.0, 56.0, 28.0, 12.0, 12.0, 12.0),
+        "ur5": (150.0, 150.0, 150.0, 28.0, 28.0, 28.0),
+        "ur10": (330.0, 330.0, 150.0, 56.0, 56.0, 56.0),
+    }
+)
+"""The manufacturer's joint torques; the URDF of the UR3 carries those of a UR10."""
+
+POSITION_GAIN = 0.1
+"""Share of a joint's position error that its motor takes back per step, Bullet's default: an error falls to 1/e
+in 9.5 steps (40 ms), slow enough that starts and stops leave a visible trace, as a real controller's do."""
+
+VELOCITY_GAIN = 1.0
+"""Share of a joint's speed error that its motor takes back per step."""
+
+
+class JointState(NamedTuple):
+    """What the joints do now."""
+
+    q: Floats
+    """Shape (6,), rad."""
+    speed: Floats
+    """Shape (6,), rad/s."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A loaded arm. Joint angles are the true ones of the simulated body.
+
+    Attributes:
+        client: Physics client id.
+        body: Body id.
+        joints: Indices of the six joints.
+        links: Name (as in `planning.robot.cell.BODY_NAMES`, and the flange) to index; the base is -1.
+        max_torque: Shape (6,), N m.
+    """
+
+    client: int
+    body: int
+    joints: tuple[int, ...]
+    links: MappingProxyType[str, int]
+    max_torque: tuple[float, ...]
+
+    def link_name(self, index: int) -> str:
+        """Name of a link."""
+        return next(name for name, number in self.links.items() if number == index)
+
+    def place(self, q: Floats) -> None:
+        """Put the joints at q, shape (6,), rad, at rest, without physics."""
+        for joint, angle in zip(self.joints, q.tolist(), strict=True):
+            pybullet.resetJointState(self.body, joint, angle, 0.0, physicsClientId=self.client)
+
+    def command(self, q: Floats, speed: Floats) -> None:
+        """Set the motors' goal for the next steps: angles (6,) in rad, speeds (6,) in rad/s."""
+        pybullet.setJointMotorControlArray(
+            self.body,
+            self.joints,
+            pybullet.POSITION_CONTROL,
+            targetPositions=q.tolist(),
+            targetVelocities=speed.tolist(),
+            forces=self.max_torque,
+            positionGains=[POSITION_GAIN] * 6,
+            velocityGains=[VELOCITY_GAIN] * 6,
+            physicsClientId=self.client,
+        )
+
+    def state(self) -> JointState:
+        """Angles and speeds of the joints."""
+        states = pybullet.getJointStates(self.body, self.joints, physicsClientId=self.client)
+        return JointState(np.array([s[0] for s in states]), np.array([s[1] for s in states]))
+
+    def link_pose(self, name: str) -> Floats:
+        """T_world_link of a link's URDF frame, shape (4, 4), mm."""
+        state = pybullet.getLinkState(
+            self.body, self.links[name], computeForwardKinematics=1, physicsClientId=self.client
+        )
+        return pose_to_mm(state[4], state[5])
+
+    def flange_pose(self) -> Floats:
+        """T_world_flange, shape (4, 4), mm."""
+        return self.link_pose(FLANGE)
+
+
+def load_arm(client: int, model: UrModel, tool: Tool, T_world_base: Floats | None = None) -> Arm:
+    """Load the arm with holder and needle, its base fixed.
+
+    Args:
+        client: Physics client id.
+        model: A UR3, UR5 or UR10.
+        tool: What the flange carries.
+        T_world_base: Pose of the controller's base, shape (4, 4), mm; None for the world's origin.
+
+    Raises:
+        InputError: There is no body of that model.
+    """
+    if model.name not in MAX_TORQUE_NM:
+        raise InputError(
+            f"the twin has no body of a {model.name}", where="robot.model", allowed=", ".join(MAX_TORQUE_NM)
+        )
+    T_world_urdf = T_BASE_URDFBASE if T_world_base is None else T_world_base @ T_BASE_URDFBASE
+    position, quaternion = pose_to_m(T_world_urdf)
+    with tempfile.TemporaryDirectory() as folder:
+        body = pybullet.loadURDF(
+            str(write_arm_urdf(model, tool, Path(folder))),
+            position,
+            quaternion,
+            useFixedBase=True,
+            flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+            physicsClientId=client,
+        )
+    joints, links = [], {"base": -1}
+    for index in range(pybullet.getNumJoints(body, physicsClientId=client)):
+        info = pybullet.getJointInfo(body, index, physicsClientId=client)
+        links[info[12].decode().removesuffix("_link")] = index
+        if info[2] == pybullet.JOINT_REVOLUTE:
+            joints.append(index)
+        pybullet.changeDynamics(
+            body, index, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, physicsClientId=client
+        )
+    return Arm(client, body, tuple(joints), MappingProxyType(links), MAX_TORQUE_NM[model.name])

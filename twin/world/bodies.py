@@ -1,0 +1,92 @@
+"""What else stands in the room: the patient's skin, boxes, and surfaces that are only seen."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import fast_simplification
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.mesh import TriangleMesh
+from twin.world.engine import pybullet
+from twin.world.surface_file import write_obj
+from twin.world.units import pose_to_m, to_m
+
+Floats = NDArray[np.float64]
+Rgba = tuple[float, float, float, float]
+
+MAX_PHYSICS_FACES = 20_000
+"""Surfaces with more triangles are thinned for physics and pictures; verdicts come from FCL on the full ones."""
+
+SKIN_RGBA: Rgba = (0.93, 0.78, 0.68, 1.0)
+BOX_RGBA: Rgba = (0.60, 0.63, 0.67, 1.0)
+
+CONTACT_MARGIN_M = 0.0
+"""Bullet grows concave shapes by this; contact shall begin at the surface itself."""
+
+
+def load_surface(
+    client: int,
+    mesh: TriangleMesh,
+    T_world_mesh: Floats,
+    *,
+    solid: bool,
+    rgba: Rgba = SKIN_RGBA,
+) -> int:
+    """A surface that does not move: triangle by triangle, hollows included.
+
+    Args:
+        client: Physics client id.
+        mesh: The surface, mm; thinned to `MAX_PHYSICS_FACES`.
+        T_world_mesh: Its pose, shape (4, 4), mm.
+        solid: Whether bodies collide with it, or it is only seen.
+        rgba: Colour, each 0..1.
+
+    Returns:
+        Body id.
+    """
+    position, quaternion = pose_to_m(T_world_mesh)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "surface.obj"
+        write_obj(thinned(mesh), path)
+        collision = -1
+        if solid:
+            collision = pybullet.createCollisionShape(
+                pybullet.GEOM_MESH,
+                fileName=str(path),
+                flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
+                physicsClientId=client,
+            )
+        visual = pybullet.createVisualShape(
+            pybullet.GEOM_MESH, fileName=str(path), rgbaColor=rgba, physicsClientId=client
+        )
+        body = pybullet.createMultiBody(0.0, collision, visual, position, quaternion, physicsClientId=client)
+    if solid:
+        pybullet.changeDynamics(body, -1, collisionMargin=CONTACT_MARGIN_M, physicsClientId=client)
+    return int(body)
+
+
+def load_box(client: int, size_mm: Floats, T_world_box: Floats, rgba: Rgba = BOX_RGBA) -> int:
+    """A box that does not move; size (3,) along its axes, its pose at its centre. Returns the body id."""
+    half = to_m(size_mm / 2).tolist()
+    collision = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=client)
+    visual = pybullet.createVisualShape(pybullet.GEOM_BOX, halfExtents=half, rgbaColor=rgba, physicsClientId=client)
+    position, quaternion = pose_to_m(T_world_box)
+    return int(pybullet.createMultiBody(0.0, collision, visual, position, quaternion, physicsClientId=client))
+
+
+def let_pass(client: int, body: int, link: int, other: int) -> None:
+    """Let one link go through another body (its base) without contact: the needle through the skin."""
+    pybullet.setCollisionFilterPair(body, other, link, -1, 0, physicsClientId=client)
+
+
+def thinned(mesh: TriangleMesh, max_faces: int = MAX_PHYSICS_FACES) -> TriangleMesh:
+    """The mesh itself where it is small, else a decimated one of about ``max_faces`` triangles."""
+    if len(mesh.faces) <= max_faces:
+        return mesh
+    vertices, faces = fast_simplification.simplify(
+        np.array(mesh.vertices), np.array(mesh.faces), target_count=max_faces
+    )
+    return TriangleMesh(vertices, faces)

@@ -1,0 +1,34 @@
+"""Who touches the arm, according to the physics."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from twin.world.arm import Arm
+from twin.world.engine import pybullet
+from twin.world.units import to_mm
+
+
+class Touch(NamedTuple):
+    """The deepest contact between one link and one body at one moment."""
+
+    link: str
+    """Name of the arm's link."""
+    body: int
+    """Id of the other body."""
+    depth_mm: float
+    """How far the two shapes overlap."""
+
+
+def touches(arm: Arm) -> tuple[Touch, ...]:
+    """Contacts of the last physics step, at most one for each link and body, in a fixed order.
+
+    Bullet takes the arm's links as the convex hulls of their meshes.
+    """
+    deepest: dict[tuple[int, int], float] = {}
+    for point in pybullet.getContactPoints(bodyA=arm.body, physicsClientId=arm.client):
+        other, link, distance_m = point[2], point[3], point[8]
+        if distance_m <= 0 and other != arm.body:
+            key = (link, other)
+            deepest[key] = max(deepest.get(key, 0.0), -float(to_mm(distance_m)))
+    return tuple(Touch(arm.link_name(link), other, depth) for (link, other), depth in sorted(deepest.items()))

@@ -1,0 +1,51 @@
+"""The one place where the project's millimetres become PyBullet's metres, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+Floats = NDArray[np.float64]
+
+MM_PER_M = 1000.0
+
+
+class PoseM(NamedTuple):
+    """A pose as PyBullet takes it."""
+
+    position_m: list[float]
+    """x, y, z in m."""
+    quaternion: list[float]
+    """x, y, z, w."""
+
+
+def to_m(length_mm: ArrayLike) -> Floats:
+    """Lengths or points, any shape, mm to m.
+
+    >>> to_m([1500.0, -2.0]).tolist()
+    [1.5, -0.002]
+    """
+    return np.asarray(length_mm, dtype=np.float64) / MM_PER_M
+
+
+def to_mm(length_m: ArrayLike) -> Floats:
+    """Lengths or points, any shape, m to mm."""
+    return np.asarray(length_m, dtype=np.float64) * MM_PER_M
+
+
+def pose_to_m(T_a_b: Floats) -> PoseM:
+    """A rigid pose, shape (4, 4), mm, as position in m and quaternion."""
+    quaternion = Rotation.from_matrix(T_a_b[:3, :3]).as_quat()
+    return PoseM(to_m(T_a_b[:3, 3]).tolist(), quaternion.tolist())
+
+
+def pose_to_mm(position_m: Sequence[float], quaternion: Sequence[float]) -> Floats:
+    """T_a_b, shape (4, 4), mm, of a position in m and a quaternion x, y, z, w."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    T[:3, 3] = to_mm(position_m)
+    return T
