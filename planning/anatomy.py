@@ -7,10 +7,14 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from planning.case import Case
 from planning.case_file import StructureSection, StructuresSection
 from planning.clearance.containment import Side, side_of
 from planning.errors import InputError
+from planning.formats.decimation import squared_distance
 from planning.formats.label_surface import label_mesh
 from planning.formats.labelmaps import LabelMap, read_labelmap
 from planning.formats.meshes import mesh_warnings, read_mesh
@@ -21,6 +25,9 @@ from planning.mesh import TriangleMesh
 from planning.skin import Skin, skin_from_ct, skin_from_label, skin_from_mesh
 
 Progress = Callable[[str], None]
+
+ON_SURFACE_MM = 1e-3
+"""A target this close to its structure's surface lies on it: meshes in single precision round to 1e-5 mm."""
 
 
 class Role(StrEnum):
@@ -151,7 +158,7 @@ class _Loader:
             return skin_from_ct(read_volume(self._file(section.ct)))
         if section.labelmap is not None and section.label is not None:
             return skin_from_label(self._map(section.labelmap), section.label)
-        return skin_from_mesh(self._mesh(section))
+        return skin_from_mesh(self._mesh(section), section.cut)
 
     def _mesh(self, section: StructureSection) -> TriangleMesh:
         where = f"{self._case.path}: structure '{section.name}'"
@@ -192,6 +199,10 @@ def _check_names(case: Case, structures: list[Structure]) -> None:
         )
 
 
+def _distance(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
+    return float(np.sqrt(squared_distance(point, mesh.triangles).min()))
+
+
 def _check_target(case: Case, structures: list[Structure], skin: Skin) -> None:
     """A target must lie inside the skin and its own structure, and inside nothing that is to be avoided."""
     point = ", ".join(f"{x:.1f}" for x in case.target_ct)
@@ -213,7 +224,7 @@ def _check_target(case: Case, structures: list[Structure], skin: Skin) -> None:
                 where=case.path,
                 allowed='role "target" for the structure that holds the target',
             )
-        if side is Side.OUTSIDE:
+        if side is Side.OUTSIDE and _distance(structure.mesh, case.target_ct) > ON_SURFACE_MM:
             raise InputError(
                 f"target ({point}) lies outside its structure '{structure.name}'",
                 where=case.path,

@@ -130,6 +130,7 @@ class StructureSection(Section):
     labelmap: str | None = None
     label: Label | None = None
     ct: str | None = None
+    cut: tuple[Literal["right", "left", "front", "back", "feet", "head"], ...] = ()
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -144,6 +145,8 @@ class StructureSection(Section):
             raise ValueError(f"'{self.name}': unit and space belong to a mesh; a volume says its own")
         if self.ct is not None and self.role != "skin":
             raise ValueError(f"'{self.name}': ct finds the body's skin only; role must be \"skin\"")
+        if self.cut and (self.role != "skin" or self.mesh is None):
+            raise ValueError(f"'{self.name}': cut belongs to a skin mesh; a volume shows where it cuts the body")
         if self.margin_mm is not None and self.role not in {"avoid", "unknown"}:
             raise ValueError(f'\'{self.name}\': margin_mm belongs to role "avoid", not "{self.role}"')
         return self
@@ -232,6 +235,8 @@ class CaseFile(Section):
     def _no_contradiction(self) -> Self:
         if self.registration is not None and self.robot.mount is not None:
             raise ValueError("[registration] and [robot.mount] both say where the base is; keep one")
+        if self.space == "local" and any(s.cut for s in self.structure):
+            raise ValueError('cut names sides of a patient; space "local" has none')
         if self.space == "local" and self.search.frame not in {None, "ct"}:
             raise ValueError('search.frame must be "ct" for space "local": it has no head and no front')
         names = [s.name for s in self.structure]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,15 @@ HU_LEAST = 50.0
 """Keeps every vertex at least 1/11 of a voxel away from voxel centres, so that no triangle is a sliver."""
 BOX_TOLERANCE_MM = 1e-6
 """Rounding in the position of a box face, relative to coordinates of a metre."""
+
+CUT_PLANE_MM = 0.5
+"""A triangle this close to the plane of a cut belongs to it: half a voxel of a fine scan."""
+OPEN_AIR_MM = 2000.0
+"""Beyond the sides at which a body mesh was not cut there is air, farther than any needle reaches."""
+SIDES: Mapping[str, tuple[int, int]] = MappingProxyType(
+    {"right": (0, 0), "left": (0, 1), "front": (1, 0), "back": (1, 1), "feet": (2, 0), "head": (2, 1)}
+)
+"""The patient's sides: LPS axis, and whether its low (0) or high (1) end."""
 
 Directions = NDArray[np.float64]
 
@@ -161,12 +172,37 @@ def skin_from_label(labelmap: LabelMap, label: int, *, max_deviation_mm: float |
     return _skin(np.where(body, 0.5, -0.5), found, oriented, where, max_deviation_mm)
 
 
-def skin_from_mesh(mesh: TriangleMesh) -> Skin:
-    """A mesh that is the whole skin. Of an open one it is not known what lies inside, and a warning says so."""
+def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
+    """A mesh that is the whole skin, or the skin of a body that was cut at some sides.
+
+    Args:
+        mesh: In LPS mm (or the local frame, without cuts).
+        cut: Sides at which the body was cut flat, as `SIDES` names them: there the mesh ends, and the body goes on.
+            Air beside a cut is unknown too, however far away: the box is open to all other sides.
+
+    Raises:
+        InputError: If no triangle lies in the plane where a side was cut.
+    """
     warnings = (
         () if mesh.closed else ("the skin mesh is open: what lies inside it, and where it is missing, is not known",)
     )
-    return Skin(mesh, np.zeros(len(mesh.faces), dtype=np.bool_), None, warnings)
+    if not cut:
+        return Skin(mesh, np.zeros(len(mesh.faces), dtype=np.bool_), None, warnings)
+    low, high = mesh.bounds
+    sides = np.zeros((3, 2), dtype=np.bool_)
+    cut_faces = np.zeros(len(mesh.faces), dtype=np.bool_)
+    for name in cut:
+        axis, end = SIDES[name]
+        sides[axis, end] = True
+        in_plane = np.all(np.abs(mesh.triangles[:, :, axis] - (low, high)[end][axis]) < CUT_PLANE_MM, axis=1)
+        if not in_plane.any():
+            raise InputError(f"no flat end at its {name}", where="skin mesh", allowed="a side where the body was cut")
+        cut_faces |= in_plane
+    T_ct_box = np.eye(4)
+    T_ct_box[:3, 3] = np.where(sides[:, 0], low, low - OPEN_AIR_MM)
+    size = np.where(sides[:, 1], high, high + OPEN_AIR_MM) - T_ct_box[:3, 3]
+    view = FieldOfView(T_ct_box, size, sides)
+    return Skin(mesh, cut_faces, view, warnings + _cut_warnings(view))
 
 
 def _skin(
@@ -216,8 +252,7 @@ def _at_unscanned(found: BodyMask, oriented: Oriented, centres_ct: NDArray[np.fl
 
 
 def _cut_warnings(view: FieldOfView) -> tuple[str, ...]:
-    names = (("right", "left"), ("front", "back"), ("lower", "upper"))
-    cut = [names[axis][side] for axis in range(3) for side in range(2) if view.cut[axis, side]]
+    cut = [name for name, (axis, end) in SIDES.items() if view.cut[axis, end]]
     if not cut:
         return ()
-    return (f"the field of view cuts the body at its {', '.join(cut)} face: no skin is known there",)
+    return (f"the body is cut at its {', '.join(cut)} side: no skin is known there",)

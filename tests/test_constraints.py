@@ -177,3 +177,20 @@ def test_anatomy_finds_structures_by_name(ball, box):
 def test_search_settings_are_radians():
     """The case's grid speaks radians inside."""
     assert SearchSettings((0, np.pi), (0, 1), 0.1, 1.0).theta[1] == np.pi
+
+
+def test_a_skin_mesh_may_say_where_the_body_was_cut(box):
+    """With the head side declared cut, the box's top (+z) is no skin, and air beyond it is unknown, however far."""
+    skin = skin_from_mesh(box([100, 100, 100]), ["head"])
+    assert skin.cut_faces.sum() == 2
+    assert "head" in skin.warnings[0]
+    assert verdict(skin)[0] == Reason.UNKNOWN_REGION
+    assert verdict(skin, direction=[1, 0, 0])[0] == ""
+    tilted = np.array([0.8, 0, 0.6])
+    assert verdict(skin, direction=tilted)[::2] == (Reason.UNKNOWN_REGION, pytest.approx(50 / 0.6))
+    with pytest.raises(Exception, match="no flat end at its left"):
+        ball_like = box([100, 100, 100]).transformed(TURNED)
+        skin_from_mesh(ball_like, ["left"])
+
+
+TURNED = np.array([[0.6, -0.8, 0, 0], [0.8, 0.6, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])

@@ -77,7 +77,7 @@ def test_ends_that_the_field_of_view_cuts_are_not_skin(skin: Skin) -> None:
     centres = skin.mesh.triangles.mean(axis=1)
     assert np.array_equal(skin.cut_faces, (centres[:, 2] < 0.0) | (centres[:, 2] > 145.0))
     assert skin.mesh.bounds[:, 2].tolist() == pytest.approx([-2.5, 147.5])
-    assert "lower, upper face" in " ".join(skin.warnings)
+    assert "feet, head side" in " ".join(skin.warnings)
 
 
 def test_skin_does_not_depend_on_how_the_ct_is_stored(skin: Skin) -> None:
