@@ -1,0 +1,255 @@
+"""What the arm may touch: collision answers of FCL for an arm with its needle, the patient's skin and the room.
+
+FCL sees the surfaces of triangle meshes, not their insides. Links, holder, needle and boxes are therefore solid
+convex shapes here, and two of them never hide in one another. The skin is a triangle mesh, and the arm cannot hide in
+it either: neighbouring bodies of the chain overlap (a test holds this), the base stands outside (checked once), so if
+no body meets a closed skin every body is on the base's side of it. For an open skin there is no inside, and only its
+surface counts (``patient_closed``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from types import MappingProxyType
+from typing import NamedTuple, Protocol
+
+import fcl
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.errors import InputError
+from planning.mesh import TriangleMesh
+from planning.robot.bodies import BODY_NAMES, NEVER_TESTED, Body, arm_bodies
+from planning.robot.kinematics import link_poses
+from planning.robot.links import collision_links
+from planning.robot.shapes import skin_surface, touch
+from planning.robot.sweep import SweptBodies
+from planning.robot.tool import Box, Tool
+from planning.robot.ur import UrModel
+from planning.winding import winding_number
+
+__all__ = ["BODY_NAMES", "Box", "CellChecker", "Contact", "Distances", "Nearest", "StateChecker", "Tool"]
+
+Array = NDArray[np.float64]
+
+PATIENT = "patient"
+
+
+class Contact(NamedTuple):
+    """Two bodies that touch, such as ``("forearm", "patient")``; a body of the arm first."""
+
+    body: str
+    other: str
+
+
+class Nearest(NamedTuple):
+    """The smallest distance between the arm and something else; infinite, with empty names, where there is nothing."""
+
+    mm: float
+    body: str
+    other: str
+
+
+class Distances(NamedTuple):
+    """How close the arm is, 0 where it touches."""
+
+    patient: Nearest
+    """Moving links and holder to the skin."""
+    needle: Nearest
+    """Needle to the skin: 0 while it goes in."""
+    boxes: Nearest
+    """Moving links, holder and needle to the room's boxes."""
+
+
+DISTANCE_PAIRS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {"patient": BODY_NAMES[1:-1], "needle": BODY_NAMES[-1:], "boxes": BODY_NAMES[1:]}
+)
+"""The kinds of distance, by the fields of ``Distances``, and the bodies that each is measured from."""
+
+
+class StateChecker(Protocol):
+    """Judges configurations of one arm in one scene. A faster judge takes this one's place behind these names."""
+
+    @property
+    def model(self) -> UrModel:
+        """The arm."""
+
+    @property
+    def tool(self) -> Tool:
+        """What the flange carries."""
+
+    def contact(self, q: Array, *, needle_may_touch_patient: bool) -> Contact | None:
+        """The first contact found at ``q``, shape (6,), rad; None when the arm is clear."""
+
+    def nearest(self, q: Array, pair: str, body: str | None = None) -> Nearest:
+        """One of ``DISTANCE_PAIRS`` at ``q``, shape (6,), rad; of one body alone when named."""
+
+    def distances(self, q: Array) -> Distances:
+        """All of them."""
+
+    def sweep_mm(self, q_path: Array) -> Array:
+        """Bound on every body's motion along each segment of ``q_path`` (m, 6): shape (m - 1,), mm."""
+
+    def body_sweeps_mm(self, q_path: Array) -> dict[str, Array]:
+        """The same for each moving body by name."""
+
+
+class CellChecker:
+    """FCL's verdict on configurations of one arm, tool, room and patient. Holds no state but its FCL objects.
+
+    Not for several threads at once: the FCL objects are moved for each question.
+
+    Args:
+        model: The arm; its meshes must ship (UR3, UR5, UR10).
+        tool: What the flange carries.
+        boxes: Solids of the room, base frame. The base link is not tested against them: it is bolted to one.
+        patient: The skin, base frame, mm; None for an empty room.
+        padding_mm: How much fuller the arm is for contacts with patient and boxes (not for distances, nor with itself):
+            room for what robot and registration get wrong. With 1 mm or more, free states between which no body moves
+            more than 2 mm prove that the way between them meets neither patient nor box.
+
+    Raises:
+        InputError: If the padding is negative, two boxes share a name, the patient's mesh is unusable, or the base
+            stands in the patient.
+    """
+
+    def __init__(
+        self,
+        model: UrModel,
+        tool: Tool,
+        boxes: Sequence[Box] = (),
+        patient: TriangleMesh | None = None,
+        *,
+        padding_mm: float = 0.0,
+    ) -> None:
+        if not (np.isfinite(padding_mm) and padding_mm >= 0.0):
+            raise InputError(f"padding_mm = {padding_mm}", where="cell", allowed="0 or more")
+        self.model = model
+        self.tool = tool
+        self._bodies = arm_bodies(model, tool, padding_mm)
+        self._swept = SweptBodies.of(model, tool)
+        by_name = {body.name: body for body in self._bodies}
+        pairs = [pair for pair in combinations(BODY_NAMES, 2) if pair not in NEVER_TESTED]
+        self._self_pairs = tuple((by_name[first], by_name[second]) for first, second in pairs)
+        self._boxes = _boxes(boxes)
+        self._bounds = {box.name: box.bounds for box in boxes}
+        self._patient = None if patient is None else skin_surface(patient, PATIENT)
+        self.patient_closed = patient is not None and patient.closed
+        if patient is not None:
+            self._bounds[PATIENT] = patient.bounds
+            self._refuse_base_in(patient)
+
+    def contact(self, q: Array, *, needle_may_touch_patient: bool) -> Contact | None:
+        """The first contact found, or None when the arm is clear.
+
+        Args:
+            q: Shape (6,), rad.
+            needle_may_touch_patient: True while the needle goes in. The holder may never touch.
+
+        Raises:
+            InputError: If ``q`` is not finite: FCL would call it free.
+        """
+        self._place(q)
+        for body in self._bodies[1:]:
+            may_touch = body.name == "needle" and needle_may_touch_patient
+            if self._patient is not None and not may_touch and touch(self._patient, body.full.surface):
+                return Contact(body.name, PATIENT)
+            for name, box in self._boxes.items():
+                if any(touch(box, solid) for solid in body.full.solids):
+                    return Contact(body.name, name)
+        for first, second in self._self_pairs:
+            if any(touch(a, b) for a in first.bare.solids for b in second.bare.solids):
+                return Contact(second.name, first.name)
+        return None
+
+    def nearest(self, q: Array, pair: str, body: str | None = None) -> Nearest:
+        """The smallest of one kind of distance.
+
+        Args:
+            q: Shape (6,), rad.
+            pair: One of ``DISTANCE_PAIRS``.
+            body: Only from this one of the pair's bodies.
+
+        Raises:
+            InputError: If ``q`` is not finite, or there is no such kind or body.
+        """
+        names = DISTANCE_PAIRS.get(pair, ())
+        if not names or (body is not None and body not in names):
+            where, allowed = f"distance {pair!r} of {body!r}", ", ".join(names or DISTANCE_PAIRS)
+            raise InputError("no such distance", where=where, allowed=allowed)
+        self._place(q)
+        bodies = [b for b in self._bodies if (b.name in names if body is None else b.name == body)]
+        skin = {} if self._patient is None else {PATIENT: self._patient}
+        return _nearest(bodies, self._boxes if pair == "boxes" else skin, self._bounds)
+
+    def distances(self, q: Array) -> Distances:
+        """How close the moving links and the tool are to patient and boxes.
+
+        Args:
+            q: Shape (6,), rad.
+
+        Raises:
+            InputError: If ``q`` is not finite.
+        """
+        return Distances(*(self.nearest(q, pair) for pair in DISTANCE_PAIRS))
+
+    def sweep_mm(self, q_path: Array) -> Array:
+        """Bound on every body's motion along each segment of a path.
+
+        Args:
+            q_path: Shape (m, 6), rad.
+
+        Returns:
+            Shape (m - 1,), mm; see :meth:`SweptBodies.bounds_mm`.
+        """
+        return np.asarray(self._swept.bounds_mm(q_path).max(axis=1))
+
+    def body_sweeps_mm(self, q_path: Array) -> dict[str, Array]:
+        """The same for each moving body by name; the tool counts with wrist 3 as one."""
+        bounds = self._swept.bounds_mm(q_path)
+        return {body.name: bounds[:, body.frame - 1] for body in self._bodies[1:]}
+
+    def _place(self, q: Array) -> None:
+        if not np.isfinite(q).all():
+            raise InputError(f"joint angles {q} are not finite", where="collision check", allowed="six angles in rad")
+        poses = link_poses(self.model, q)
+        for body in self._bodies[1:]:
+            body.place(poses)
+
+    def _refuse_base_in(self, patient: TriangleMesh) -> None:
+        base = self._bodies[0]
+        centre = collision_links(self.model)[0].mesh.bounds.mean(axis=0)
+        if touch(self._patient, base.bare.surface) or abs(winding_number(patient, centre)) > 0.5:
+            raise InputError("the robot's base stands in the patient", where="cell", allowed="a base outside the skin")
+
+
+def _nearest(bodies: Sequence[Body], others: Mapping[str, fcl.CollisionObject], bounds: Mapping[str, Array]) -> Nearest:
+    """The closest pair; pairs whose spheres cannot beat the best so far are passed over."""
+    pairs = []
+    for body in bodies:
+        centre = np.asarray(body.bare.surface.getTranslation())
+        for name, other in others.items():
+            low, high = bounds[name]
+            gap = float(np.linalg.norm(np.maximum(0.0, np.maximum(low - centre, centre - high))))
+            pairs.append((gap - body.radius_mm, body, name, other))
+    best = Nearest(np.inf, "", "")
+    for at_least, body, name, other in sorted(pairs, key=lambda pair: pair[0]):
+        if at_least >= best.mm:
+            break
+        shapes = (body.bare.surface,) if name == PATIENT else body.bare.solids
+        mm = min(fcl.distance(other, shape, fcl.DistanceRequest(), fcl.DistanceResult()) for shape in shapes)
+        best = min(best, Nearest(max(0.0, float(mm)), body.name, name))  # FCL says -1 for contact
+    return best
+
+
+def _boxes(boxes: Sequence[Box]) -> dict[str, fcl.CollisionObject]:
+    names = [box.name for box in boxes]
+    if len(set(names)) < len(names) or set(names) & {PATIENT, *BODY_NAMES}:
+        raise InputError(f"box names {names}", where="cell", allowed="each once, and none a body's or the patient's")
+    return {
+        box.name: fcl.CollisionObject(
+            fcl.Box(*box.size_mm), fcl.Transform(box.T_base_box[:3, :3], box.T_base_box[:3, 3])
+        )
+        for box in boxes
+    }

@@ -1,0 +1,353 @@
+"""What the arm may touch: scenes whose answer is known by geometry, and the links' own shipped meshes as oracle."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import fcl
+import numpy as np
+import pytest
+import trimesh
+
+from planning.errors import InputError
+from planning.mesh import TriangleMesh
+from planning.robot.bodies import NEVER_TESTED
+from planning.robot.cell import Box, CellChecker, Contact, Tool
+from planning.robot.kinematics import flange_pose, link_poses
+from planning.robot.links import LINK_NAMES, collision_links, visual_links
+from planning.robot.shapes import convex, surface, touch
+from planning.robot.sweep import SweptBodies
+from planning.robot.tool import HOLDER_ROOT_MM
+from planning.robot.ur import UrModel, ur_model
+from planning.winding import winding_number
+
+UR3 = ur_model("ur3")
+TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
+BENT = np.array([0.4, -1.9, 1.6, -1.2, -1.5, 0.3])
+"""A clear pose: elbow up, needle down."""
+
+
+def translation(x: float, y: float, z: float) -> np.ndarray:
+    """A 4x4 without rotation, mm."""
+    T = np.eye(4)
+    T[:3, 3] = (x, y, z)
+    return T
+
+
+def cuboid(low: np.ndarray, high: np.ndarray) -> TriangleMesh:
+    """A closed box as a triangle mesh, mm."""
+    box = trimesh.creation.box(extents=high - low)
+    return TriangleMesh(np.asarray(box.vertices) + (low + high) / 2.0, np.asarray(box.faces))
+
+
+def body_points(model: UrModel, tool: Tool, q: np.ndarray) -> dict[str, np.ndarray]:
+    """Every moving body's extreme points in the base frame, by kinematics alone, mm."""
+    poses = link_poses(model, q)
+    points = {
+        link.name: link.mesh.vertices @ poses[link.frame][:3, :3].T + poses[link.frame][:3, 3]
+        for link in collision_links(model)[1:]
+    }
+    turn = np.linspace(0.0, 2.0 * np.pi, 20_001)
+    for name, radius, span in (
+        ("holder", tool.holder_diameter_mm / 2.0, tool.holder_span_mm),
+        ("needle", tool.needle_diameter_mm / 2.0, tool.needle_span_mm),
+    ):
+        ring = radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        ends = np.concatenate([np.insert(ring, 2, z, axis=1) for z in span])
+        points[name] = ends @ poses[6][:3, :3].T + poses[6][:3, 3]
+    return points
+
+
+def clear_poses(count: int, seed: int) -> list[np.ndarray]:
+    """Random poses at which the arm does not touch itself."""
+    rng, checker, found = np.random.default_rng(seed), CellChecker(UR3, TOOL), []
+    while len(found) < count:
+        q = rng.uniform(-np.pi, np.pi, 6)
+        if checker.contact(q, needle_may_touch_patient=False) is None:
+            found.append(q)
+    return found
+
+
+@pytest.mark.parametrize("kind", ["box", "patient"])
+@pytest.mark.parametrize(("axis", "sign"), [(0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0), (2, 1.0)])
+def test_a_wall_beyond_the_outermost_point_touches_from_there_on(kind: str, axis: int, sign: float) -> None:
+    """A wall 0.01 mm beyond the arm's outermost point is free and measured so; 0.01 mm inside it touches that body."""
+    tried = 0
+    for q in clear_poses(8, seed=axis):
+        points = body_points(UR3, TOOL, q)
+        edges = {name: float((sign * cloud[:, axis]).max()) for name, cloud in points.items()}
+        outermost = max(edges, key=lambda name: edges[name])
+        edge = edges[outermost]
+        if edge < 120.0:
+            continue  # the wall would stand in the base
+        tried += 1
+        for gap in (0.01, -0.01):
+            low, high = np.full(3, -1500.0), np.full(3, 1500.0)
+            low[axis], high[axis] = sorted((sign * (edge + gap), sign * (edge + gap + 200.0)))
+            if kind == "patient":
+                checker = CellChecker(UR3, TOOL, patient=cuboid(low, high))
+            else:
+                checker = CellChecker(
+                    UR3, TOOL, [Box("patient_wall", translation(*(low + high) / 2), tuple(high - low))]
+                )
+            contact = checker.contact(q, needle_may_touch_patient=False)
+            if gap < 0.0:
+                assert contact == Contact(outermost, "patient" if kind == "patient" else "patient_wall")
+                continue
+            assert contact is None
+            distances = checker.distances(q)
+            measured = min(distances.patient, distances.needle) if kind == "patient" else distances.boxes
+            assert measured.mm == pytest.approx(gap, abs=1e-4) and measured.body == outermost
+    assert tried >= 2
+
+
+def test_padding_grows_the_arm_against_the_room_but_not_in_distances() -> None:
+    """A wall between 4 mm and the padded 5 mm away touches the padded arm; both measure the true distance."""
+    for q in clear_poses(6, seed=3):
+        edge = max(float(cloud[:, 2].max()) for cloud in body_points(UR3, TOOL, q).values())
+        roof = Box("roof", translation(0.0, 0.0, edge + 4.0 + 50.0), (4000.0, 4000.0, 100.0))
+        bare, full = (CellChecker(UR3, TOOL, [roof], padding_mm=padding) for padding in (0.0, 5.0))
+        assert bare.contact(q, needle_may_touch_patient=False) is None
+        assert full.contact(q, needle_may_touch_patient=False) is not None
+        assert full.distances(q) == bare.distances(q)
+        assert full.distances(q).boxes.mm == pytest.approx(4.0, abs=1e-4)
+    with pytest.raises(InputError, match="padding_mm"):
+        CellChecker(UR3, TOOL, padding_mm=-1.0)
+
+
+def test_a_box_at_the_elbow_touches_upper_arm_or_forearm() -> None:
+    """A box in the bend of the arm is named, with the link that meets it."""
+    elbow = link_poses(UR3, BENT)[2][:3, 3]
+    checker = CellChecker(UR3, TOOL, [Box("lamp", translation(*elbow), (60.0, 60.0, 60.0))])
+    contact = checker.contact(BENT, needle_may_touch_patient=False)
+    assert contact is not None and contact.other == "lamp" and contact.body in ("upper_arm", "forearm")
+
+
+def test_a_box_inside_a_link_and_a_link_inside_a_box_both_touch() -> None:
+    """Solids do not hide in one another, though none of their surfaces meet."""
+    middle = link_poses(UR3, BENT)[3] @ np.array([106.0, 0.0, 20.0, 1.0])
+    crumb = CellChecker(UR3, TOOL, [Box("crumb", translation(*middle[:3]), (1.0, 1.0, 1.0))])
+    assert crumb.contact(BENT, needle_may_touch_patient=False) == Contact("forearm", "crumb")
+    hall = CellChecker(UR3, TOOL, [Box("hall", translation(0.0, 0.0, 0.0), (9000.0, 9000.0, 9000.0))])
+    assert hall.contact(BENT, needle_may_touch_patient=False) == Contact("shoulder", "hall")
+    assert hall.distances(BENT).boxes.mm == 0.0
+
+
+def test_the_base_may_stand_on_its_table() -> None:
+    """The base link overlaps what it is bolted to, and nothing is said."""
+    table = Box("table", translation(0.0, 0.0, -40.0), (1000.0, 1000.0, 100.0))
+    assert CellChecker(UR3, TOOL, [table]).contact(BENT, needle_may_touch_patient=False) is None
+
+
+def test_the_needle_may_go_in_and_the_holder_may_not() -> None:
+    """With the skin across the needle the flag decides; with the skin across the holder it does not help."""
+    T = flange_pose(UR3, BENT)
+    for depth, names in ((200.0, {"needle"}), (60.0, {"holder"})):
+        at = T[:3, 3] + depth * T[:3, 2]
+        checker = CellChecker(UR3, TOOL, patient=cuboid(at - 15.0, at + 15.0))
+        contact = checker.contact(BENT, needle_may_touch_patient=False)
+        assert contact is not None and contact.other == "patient" and contact.body in names
+        allowed = checker.contact(BENT, needle_may_touch_patient=True)
+        assert (allowed is None) == (names == {"needle"})
+        distances = checker.distances(BENT)
+        assert (distances.needle.mm == 0.0) == (names == {"needle"})
+
+
+def test_an_arm_that_ends_inside_the_patient_is_found_at_its_surface() -> None:
+    """Wrist, holder and needle wholly inside a closed skin: no surface of theirs meets it, the forearm's does."""
+    inside = link_poses(UR3, BENT)[4][:3, 3]
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
+    poses = link_poses(UR3, BENT)
+    reach = max(
+        np.linalg.norm(points - inside, axis=1).max()
+        for name, points in body_points(UR3, TOOL, BENT).items()
+        if name in ("wrist_1", "wrist_2", "wrist_3", "holder", "needle")
+    )
+    radius = reach + 5.0
+    base_gap = np.linalg.norm(poses[0][:3, 3] - inside) - radius
+    assert base_gap > 0.0, "the scene must leave the base outside"
+    skin = TriangleMesh(np.asarray(ball.vertices) * radius + inside, np.asarray(ball.faces))
+    contact = CellChecker(UR3, TOOL, patient=skin).contact(BENT, needle_may_touch_patient=True)
+    assert contact is not None and contact.other == "patient" and contact.body in ("shoulder", "upper_arm", "forearm")
+
+
+@pytest.mark.parametrize("name", ["ur3", "ur5", "ur10"])
+def test_neighbouring_bodies_overlap_at_every_angle(name: str) -> None:
+    """The chain has no gap in which a skin could pass between two bodies: what makes the surface test enough."""
+    model = ur_model(name)
+    links = collision_links(model)
+    for joint in range(6):
+        pieces = [[fcl.CollisionObject(convex(piece)) for piece in link.pieces] for link in links[joint : joint + 2]]
+        for angle in np.linspace(-np.pi, np.pi, 25):
+            q = np.zeros(6)
+            q[joint] = angle
+            T = np.linalg.inv(link_poses(model, q)[joint]) @ link_poses(model, q)[joint + 1]
+            for piece in pieces[1]:
+                piece.setTransform(fcl.Transform(T[:3, :3], T[:3, 3]))
+            assert any(touch(a, b) for a in pieces[0] for b in pieces[1]), (LINK_NAMES[joint], angle)
+    wrist_3_end = links[6].mesh.bounds[1, 2]
+    assert -HOLDER_ROOT_MM < wrist_3_end <= 0.0
+    assert TOOL.needle_span_mm[0] < TOOL.holder_span_mm[1]
+
+
+@pytest.mark.parametrize("name", ["ur3", "ur5", "ur10"])
+def test_wrist_2_stays_behind_the_flange_plane(name: str) -> None:
+    """Why the tool is never tested against wrist 2: seen from the flange it ends before the holder begins."""
+    model = ur_model(name)
+    wrist_2 = collision_links(model)[5]
+    for q in np.random.default_rng(0).uniform(-np.pi, np.pi, (20, 6)):
+        poses = link_poses(model, q)
+        T_flange_link = np.linalg.inv(poses[6]) @ poses[5]
+        heights = (wrist_2.mesh.vertices @ T_flange_link[:3, :3].T + T_flange_link[:3, 3])[:, 2]
+        assert heights.max() < -HOLDER_ROOT_MM
+
+
+def test_whatever_the_shipped_meshes_meet_is_a_contact() -> None:
+    """Where two links' own meshes intersect the checker never says free, over random poses; nor is it much stricter.
+
+    At most 3 % of the poses are a contact to it in which the open meshes do not meet (hulls are fuller).
+    """
+    bare = CellChecker(UR3, Tool(2.0, 1.0, 0.1, 0.1))
+    objects = [fcl.CollisionObject(surface(link.mesh)) for link in visual_links(UR3)]
+    pairs = [p for p in combinations(range(7), 2) if (LINK_NAMES[p[0]], LINK_NAMES[p[1]]) not in NEVER_TESTED]
+    poses = np.random.default_rng(4).uniform(-np.pi, np.pi, (600, 6))
+    stricter = met = 0
+    for q in poses:
+        for item, T in zip(objects, link_poses(UR3, q), strict=True):
+            item.setTransform(fcl.Transform(T[:3, :3], T[:3, 3]))
+        meet = any(touch(objects[i], objects[j]) for i, j in pairs)
+        contact = bare.contact(q, needle_may_touch_patient=False)
+        assert not meet or contact is not None
+        stricter += contact is not None and not meet
+        met += meet
+    assert 100 < met < 300
+    assert stricter <= 0.03 * len(poses)
+
+
+def test_every_mesh_vertex_lies_in_a_convex_piece() -> None:
+    """The pieces contain the link: each shipped vertex is within 1e-6 mm of the inside of one of them."""
+    for hull, detail in zip(collision_links(UR3), visual_links(UR3), strict=True):
+        outside = np.full(len(detail.mesh.vertices), np.inf)
+        for piece in hull.pieces:
+            a, b, c = np.moveaxis(piece.triangles, 1, 0)
+            normals = np.cross(b - a, c - a)
+            sizes = np.linalg.norm(normals, axis=1)
+            planes = normals[sizes > 1e-9] / sizes[sizes > 1e-9, None]
+            heights = detail.mesh.vertices @ planes.T - np.einsum("ij,ij->i", planes, a[sizes > 1e-9])
+            outside = np.minimum(outside, heights.max(axis=1))
+        assert outside.max() < 1e-6, hull.name
+
+
+def test_folded_arms_touch_themselves_and_name_the_links() -> None:
+    """An elbow folded shut, and a needle turned back on the arm, are contacts; upright the arm is free."""
+    checker = CellChecker(UR3, TOOL)
+    upright = np.array([0.0, -np.pi / 2, 0.0, -np.pi / 2, 0.0, 0.0])
+    assert checker.contact(upright, needle_may_touch_patient=False) is None
+    folded = upright + np.array([0.0, 0.0, 3.1, 0.0, 0.0, 0.0])
+    contact = checker.contact(folded, needle_may_touch_patient=False)
+    assert contact is not None and set(contact) <= {*LINK_NAMES, "holder", "needle"}
+    long_needle = CellChecker(UR3, Tool(500.0, 490.0, 2.0, 30.0))
+    met = set()
+    for q4 in np.linspace(-np.pi, np.pi, 181):
+        for q5 in (0.0, np.pi):
+            met.add(
+                long_needle.contact(np.array([0, -1.6, 0.8, q4, np.pi / 2 + q5, 0]), needle_may_touch_patient=False)
+            )
+    assert {"needle"} <= {contact.body for contact in met if contact}
+
+
+def test_a_base_inside_or_through_the_patient_is_refused() -> None:
+    """Wholly inside, and crossing its surface."""
+    for half in (400.0, 40.0):
+        low, high = np.full(3, -half), np.full(3, half)
+        with pytest.raises(InputError, match="base stands in the patient"):
+            CellChecker(UR3, TOOL, patient=cuboid(low, high))
+
+
+def test_an_open_skin_is_known_as_open() -> None:
+    """Its surface still counts; whether something is inside cannot be known, and the flag says so."""
+    whole = cuboid(np.array([300.0, -100.0, 0.0]), np.array([500.0, 100.0, 200.0]))
+    cut = TriangleMesh(whole.vertices, whole.faces[:-1])
+    assert CellChecker(UR3, TOOL, patient=whole).patient_closed
+    assert not CellChecker(UR3, TOOL, patient=cut).patient_closed
+    assert not CellChecker(UR3, TOOL).patient_closed
+
+
+def test_winding_number_counts_the_inside() -> None:
+    """1 inside a closed surface, 0 outside, half at the mouth of half a box."""
+    box = cuboid(np.full(3, -50.0), np.full(3, 50.0))
+    assert abs(winding_number(box, np.array([10.0, 20.0, -30.0]))) == pytest.approx(1.0)
+    assert abs(winding_number(box, np.array([60.0, 0.0, 0.0]))) == pytest.approx(0.0, abs=1e-12)
+    lidless = TriangleMesh(box.vertices, box.faces[(box.triangles[:, :, 2] < 49.0).any(axis=1)])
+    assert abs(winding_number(lidless, np.zeros(3))) == pytest.approx(5.0 / 6.0)
+
+
+@pytest.mark.parametrize("q", [np.full(6, np.nan), np.array([0, 0, np.inf, 0, 0, 0])])
+def test_angles_that_are_not_finite_are_refused(q: np.ndarray) -> None:
+    """FCL would call them free."""
+    checker = CellChecker(UR3, TOOL)
+    with pytest.raises(InputError, match="not finite"):
+        checker.contact(q, needle_may_touch_patient=False)
+    with pytest.raises(InputError, match="not finite"):
+        checker.distances(q)
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        TriangleMesh(np.array([[0, 0, 0], [1, 0, 0], [0, np.nan, 0]]), np.array([[0, 1, 2]])),
+        TriangleMesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 7]])),
+        TriangleMesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, -1]])),
+        TriangleMesh(np.array([[0, 0, 0.0]]), np.empty((0, 3))),
+    ],
+    ids=["nan vertex", "index too high", "index negative", "no faces"],
+)
+def test_a_skin_that_fcl_would_misjudge_is_refused(mesh: TriangleMesh) -> None:
+    """Each of these makes FCL say free or kill the process."""
+    with pytest.raises(InputError, match="patient"):
+        CellChecker(UR3, TOOL, patient=mesh)
+
+
+def test_tools_and_boxes_that_make_no_sense_are_refused() -> None:
+    """Lengths, poses and names are checked where they are made."""
+    with pytest.raises(InputError, match="shaft_mm"):
+        Tool(100.0, 150.0, 1.0, 20.0)
+    with pytest.raises(InputError, match="needle_diameter_mm"):
+        Tool(200.0, 150.0, -1.0, 20.0)
+    with pytest.raises(InputError, match="not rigid"):
+        Box("table", np.diag([-1.0, 1.0, 1.0, 1.0]), (1.0, 1.0, 1.0))
+    with pytest.raises(InputError, match="size_mm"):
+        Box("table", np.eye(4), (1.0, 0.0, 1.0))
+    box = Box("table", translation(0, 0, -500), (1.0, 1.0, 1.0))
+    with pytest.raises(InputError, match="box names"):
+        CellChecker(UR3, TOOL, [box, box])
+    with pytest.raises(InputError, match="no such distance"):
+        CellChecker(UR3, TOOL, [box]).nearest(BENT, "ceiling")
+
+
+def test_no_body_point_leaves_the_sweep_bound() -> None:
+    """Between two configurations every point of every link and of the tool stays within half the bound of an end."""
+    swept = SweptBodies.of(UR3, TOOL)
+    rng = np.random.default_rng(8)
+    for size in (1e-3, 0.02, 0.3, 1.5):
+        for _ in range(6):
+            start = rng.uniform(-np.pi, np.pi, 6)
+            end = start + size * rng.uniform(-1.0, 1.0, 6)
+            bounds = swept.bounds_mm(np.stack([start, end]))[0]
+            ends = [body_points(UR3, TOOL, q) for q in (start, end)]
+            for share in np.linspace(0.0, 1.0, 9):
+                here = body_points(UR3, TOOL, start + share * (end - start))
+                for name, points in here.items():
+                    off = np.minimum(*(np.linalg.norm(points - other[name], axis=1) for other in ends))
+                    bound = bounds[LINK_NAMES.index(name) - 1] if name in LINK_NAMES else bounds[-1]
+                    assert off.max() <= bound / 2.0 + 1e-9, name
+
+
+def test_the_same_question_has_the_same_answer_whatever_was_asked_before() -> None:
+    """The FCL objects are moved anew each time: no hit is left over."""
+    wall = Box("wall", translation(0.0, 900.0, 0.0), (3000.0, 900.0, 3000.0))
+    checker = CellChecker(UR3, TOOL, [wall])
+    poses = np.random.default_rng(9).uniform(-np.pi, np.pi, (60, 6))
+    first = [checker.contact(q, needle_may_touch_patient=False) for q in poses]
+    again = [checker.contact(q, needle_may_touch_patient=False) for q in poses[::-1]][::-1]
+    assert first == again and {None} < set(first)

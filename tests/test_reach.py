@@ -1,0 +1,329 @@
+"""Which directions the arm reaches: the windows and shares of the specification, laws of a drive, and known scenes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from planning.errors import InputError
+from planning.mesh import TriangleMesh
+from planning.reach import MAX_SWEEP_MM, ReachRequest, assess_reach, ik_exists
+from planning.reasons import Reason
+from planning.robot.cell import Box, CellChecker, Tool
+from planning.robot.insertion import MIN_SINGULARITY, flange_poses, insertion_paths, reach_margin
+from planning.robot.kinematics import flange_pose, inverse, singularity
+from planning.robot.links import collision_links
+from planning.robot.ur import ur_model
+
+UR3 = ur_model("ur3")
+TOOL = Tool(needle_length_mm=200.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
+TARGET = np.array([360.0, 20.0, 100.0])
+STANDOFF_MM = 120.0
+
+MARKERS_CT = np.array([[10.0, 20.0, 147.0], [110.0, 120.0, 147.0], [60.0, -10.0, 80.0]])
+MARKERS_BASE = np.array([[417.67, -291.23, 534.59], [557.74, -272.83, 534.57], [423.48, -231.41, 604.06]])
+LESION_M_CT = np.array([50.0, 130.0, 63.0])
+"""Markers A, B, C and lesion M: Tables 1 and 2 of Chen 2019, mm."""
+
+WINDOWS: dict[int, list[tuple[int, int]]] = {
+    **{theta: [] for theta in range(9)},
+    9: [(243, 285)],
+    10: [(233, 295)],
+    20: [(207, 322)],
+    30: [(203, 325)],
+    40: [(204, 325)],
+    50: [(206, 322)],
+    60: [(211, 255), (273, 317)],
+    70: [(217, 253), (275, 311)],
+    80: [(226, 253), (275, 303)],
+    90: [(239, 253), (275, 289)],
+}
+"""beta, deg, that a UR3 reaches at each theta, deg: specification 1 section 2, r 150, l 401."""
+
+
+def triad(points: np.ndarray) -> np.ndarray:
+    """Chen 2019 Eq. 1-3: the frame of three markers, as a rotation."""
+    e1 = points[1] - points[0]
+    e3 = np.cross(e1, points[2] - points[0])
+    e1, e3 = e1 / np.linalg.norm(e1), e3 / np.linalg.norm(e3)
+    return np.stack([e1, np.cross(e3, e1), e3], axis=1)
+
+
+def paper_placement() -> tuple[np.ndarray, np.ndarray]:
+    """R_base_ct and lesion M in the base frame, mm: setup 1, A-B-C."""
+    R = triad(MARKERS_BASE) @ triad(MARKERS_CT).T
+    t = np.mean(MARKERS_BASE - MARKERS_CT @ R.T, axis=0)
+    return R, R @ LESION_M_CT + t
+
+
+def outward(R_base_ct: np.ndarray, theta_deg: float, beta_deg: np.ndarray) -> np.ndarray:
+    """u(theta, beta) in the base frame, (n, 3)."""
+    theta, beta = np.radians(theta_deg), np.radians(np.atleast_1d(beta_deg))
+    u = np.stack(
+        [np.sin(theta) * np.cos(beta), np.sin(theta) * np.sin(beta), np.full_like(beta, np.cos(theta))], axis=1
+    )
+    return u @ R_base_ct.T
+
+
+def runs(flags: np.ndarray) -> list[tuple[int, int]]:
+    """First and last index of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
+    return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
+
+
+def directions(count: int, seed: int) -> np.ndarray:
+    """Random unit vectors of the upper half space, (n, 3)."""
+    u = np.random.default_rng(seed).normal(size=(count, 3))
+    u[:, 2] = np.abs(u[:, 2])
+    return np.asarray(u / np.linalg.norm(u, axis=1, keepdims=True))
+
+
+def request(u: np.ndarray, standoff_mm: float = STANDOFF_MM) -> ReachRequest:
+    """A request for the target and tool of this file."""
+    return ReachRequest(TARGET, u, TOOL.needle_length_mm, standoff_mm)
+
+
+def reached(checker: CellChecker, count: int, seed: int) -> list:
+    """Some reachable answers with their requests."""
+    found = []
+    for u in directions(60, seed):
+        answer = assess_reach(checker, request(u))
+        if answer.reachable:
+            found.append((request(u), answer))
+        if len(found) == count:
+            return found
+    raise AssertionError("the scene must leave enough directions")
+
+
+@pytest.mark.parametrize("theta_deg", sorted(WINDOWS))
+def test_the_windows_of_the_papers_placement(theta_deg: int) -> None:
+    """Exactly the specification's windows with |sin q5| > .05; within 1 deg with all three singularities kept off."""
+    R, target = paper_placement()
+    u = outward(R, theta_deg, np.arange(360))
+    q = inverse(UR3, flange_poses(target, u, 551.0))
+    wrist_only = (singularity(UR3, q).wrist > 0.05).any(axis=1)
+    assert runs(wrist_only) == WINDOWS[theta_deg]
+    ours = runs(ik_exists(UR3, target, u, needle_length_mm=401.0, standoff_mm=150.0, depths_mm=(0.0,)))
+    assert len(ours) == len(WINDOWS[theta_deg])
+    assert np.abs(np.array(ours).reshape(-1) - np.array(WINDOWS[theta_deg]).reshape(-1)).max(initial=0) <= 1
+
+
+@pytest.mark.parametrize(
+    ("distance_mm", "rho", "z", "axis", "percent"),
+    [
+        (551.0, 250.0, 700.0, (0.0, 0.0, -1.0), 61),
+        (551.0, 400.0, 250.0, (-1.0, 0.0, 0.0), 68),
+        (451.0, 250.0, 150.0, (-1.0, 0.0, 0.0), 96),
+        (401.0, 250.0, 150.0, (-1.0, 0.0, 0.0), 93),
+        (300.0, 250.0, 500.0, (0.0, 0.0, -1.0), 81),
+        (300.0, 500.0, 200.0, (-1.0, 0.0, 0.0), 100),
+    ],
+)
+def test_the_shares_of_the_reach_table(
+    distance_mm: float, rho: float, z: float, axis: tuple[float, ...], percent: int
+) -> None:
+    """Share of the cap of 60 deg that a UR3 holds: within 1 point with |sin q5| > .05, as the table counts.
+
+    With the other two singularities kept off as well it stays within 3.
+    """
+    count = 4000
+    k = np.arange(count) + 0.5
+    height = 1.0 - 0.5 * k / count  # cos 60 deg = 0.5; equal area is equal height
+    turn = np.pi * (1.0 + np.sqrt(5.0)) * k
+    side = np.sqrt(1.0 - height**2)
+    cap = np.stack([side * np.cos(turn), side * np.sin(turn), height], axis=1)
+    tilt = flange_poses(np.zeros(3), -np.array(axis), 0.0)[0, :3, :3]  # z along the axis
+    target, u = np.array([rho, 0.0, z]), cap @ tilt.T
+    wrist = singularity(UR3, inverse(UR3, flange_poses(target, u, distance_mm))).wrist
+    assert 100.0 * (wrist > 0.05).any(axis=1).mean() == pytest.approx(percent, abs=1.0)
+    exists = ik_exists(UR3, target, u, needle_length_mm=distance_mm, standoff_mm=0.0, depths_mm=(0.0,))
+    assert 100.0 * exists.mean() == pytest.approx(percent, abs=3.0)
+
+
+def test_the_worked_example_of_the_paper_is_out_of_reach() -> None:
+    """The flange would stand 701.9 mm from the shoulder; the answer says so. A UR5 has eight solutions there."""
+    R, target = paper_placement()
+    u = outward(R, 10.0, np.array([45.0]))[0]
+    T = flange_poses(target, u, 551.0)[0]
+    assert T[:3, 3] == pytest.approx([623.69, -313.01, 76.70], abs=0.006)
+    assert np.linalg.norm(T[:3, 3] - UR3.shoulder_base) == pytest.approx(701.9, abs=0.05)
+    checker = CellChecker(UR3, Tool(401.0, 150.0, 1.2, 30.0))
+    answer = assess_reach(checker, ReachRequest(target, u, 401.0, 150.0))
+    assert not answer.reachable and answer.reason is Reason.UNREACHABLE and answer.depth_mm is None
+    assert "701.9 mm from the shoulder" in answer.detail and "out of the arm's reach" in answer.detail
+    assert not np.isnan(inverse(ur_model("ur5"), T)).any()
+
+
+def test_a_reachable_answer_is_a_straight_clear_drive() -> None:
+    """At every row the needle lies on its line, within limits, without contact; the tip ends on the target."""
+    T_base_table = np.eye(4)
+    T_base_table[2, 3] = -60.0
+    table = Box("table", T_base_table, (2000.0, 2000.0, 100.0))
+    checker = CellChecker(UR3, TOOL, [table])
+    for asked, answer in reached(checker, 4, seed=1):
+        depths, q = answer.insertion_depth_mm, answer.insertion_q
+        assert depths[0] == 0.0 and depths[-1] == pytest.approx(STANDOFF_MM) and (np.diff(depths) > 0).all()
+        assert answer.reason is Reason.NONE and answer.detail == ""
+        distance = TOOL.needle_length_mm + STANDOFF_MM - depths
+        expected = flange_poses(TARGET, asked.outward_base, distance, answer.roll)
+        assert np.abs(flange_pose(UR3, q) - expected).max() < 1e-9
+        tip = flange_pose(UR3, q[-1]) @ [0.0, 0.0, TOOL.needle_length_mm, 1.0]
+        assert tip[:3] == pytest.approx(TARGET, abs=1e-9)
+        assert UR3.within_limits(q).all()
+        assert (singularity(UR3, q).least() > MIN_SINGULARITY).all()
+        assert checker.sweep_mm(q).max() <= MAX_SWEEP_MM
+        assert checker.contact(q[0], needle_may_touch_patient=False) is None
+        assert all(checker.contact(row, needle_may_touch_patient=True) is None for row in q)
+        assert answer.margin == pytest.approx(reach_margin(UR3, q)) and MIN_SINGULARITY < answer.margin <= 1.0
+        with pytest.raises(ValueError, match="read-only"):
+            q[0, 0] = 0.0
+
+
+def test_in_an_empty_room_the_best_margin_wins() -> None:
+    """A branch with a higher margin than the answer's was passed over only for a contact."""
+    checker = CellChecker(UR3, Tool(200.0, 199.0, 0.1, 0.1))
+    tried = 0
+    for u in directions(12, seed=2):
+        answer = assess_reach(checker, request(u))
+        if not answer.reachable:
+            continue
+        tried += 1
+        paths = insertion_paths(UR3, TARGET, u, 320.0 - np.linspace(0.0, STANDOFF_MM, 61))
+        for path in paths[(singularity(UR3, paths).least() > MIN_SINGULARITY).all(axis=1)]:
+            if reach_margin(UR3, path) > answer.margin + 0.01:
+                assert any(checker.contact(row, needle_may_touch_patient=True) for row in path)
+    assert tried >= 2
+
+
+def test_a_drive_that_leaves_the_arms_reach_is_blocked_at_its_depth() -> None:
+    """Standoff holds and the target does not: blocked by kinematics, at a depth before which the branch exists."""
+    checker = CellChecker(UR3, Tool(200.0, 199.0, 0.1, 0.1))
+    near_base, lengths = np.array([250.0, 0.0, 100.0]), {"needle_length_mm": 200.0, "standoff_mm": STANDOFF_MM}
+    u = directions(400, seed=9)
+    begins = ik_exists(UR3, near_base, u, depths_mm=(0.0,), **lengths)
+    stuck = u[begins & ~ik_exists(UR3, near_base, u, **lengths)]
+    assert len(stuck) >= 10
+    for direction in stuck:
+        answer = assess_reach(checker, ReachRequest(near_base, direction, **lengths))
+        assert answer.reason is Reason.INSERTION_BLOCKED and 0.0 <= answer.depth_mm <= STANDOFF_MM
+        assert any(word in answer.detail for word in ("does not reach", "singularity", "jump"))
+        assert ik_exists(UR3, near_base, direction, depths_mm=(0.0, max(0.0, answer.depth_mm - 2.0)), **lengths).all()
+
+
+def test_what_kinematics_rejects_is_never_reached() -> None:
+    """A False of the batch is final: the full answer for it is a refusal by kinematics."""
+    checker = CellChecker(UR3, TOOL)
+    u = directions(120, seed=3)
+    might = ik_exists(UR3, TARGET, u, needle_length_mm=TOOL.needle_length_mm, standoff_mm=STANDOFF_MM)
+    assert 20 < might.sum() < 100
+    for direction in u[~might]:
+        answer = assess_reach(checker, request(direction))
+        assert answer.reason in (Reason.UNREACHABLE, Reason.INSERTION_BLOCKED)
+        assert "touches" not in answer.detail
+
+
+def test_batch_and_single_directions_agree() -> None:
+    """One call for many directions, or for many targets, answers as one call each."""
+    u = directions(40, seed=4)
+    targets = TARGET + np.random.default_rng(4).uniform(-80, 80, (40, 3))
+    many = ik_exists(UR3, targets, u, needle_length_mm=200.0, standoff_mm=120.0)
+    single = [
+        ik_exists(UR3, t, d, needle_length_mm=200.0, standoff_mm=120.0)[0] for t, d in zip(targets, u, strict=True)
+    ]
+    assert many.tolist() == single and 0 < many.sum() < 40
+
+
+def slab(u: np.ndarray, start_mm: float, thickness_mm: float) -> np.ndarray:
+    """T_base_box of a plate square to the needle, from ``start_mm`` outward of the target."""
+    return flange_poses(TARGET, u, start_mm + thickness_mm / 2.0)[0]
+
+
+def test_the_holder_stops_at_the_skin_where_geometry_says() -> None:
+    """Skin h above the target: the holder's end, r - depth + shaft away, meets it at depth r + shaft - h."""
+    empty = CellChecker(UR3, TOOL)
+    height, standoff = 170.0, 180.0  # the tip starts 10 mm outside the skin
+    for u in directions(60, 5):
+        if assess_reach(empty, request(u, standoff)).reachable:
+            break
+    plate = trimesh.creation.box(extents=(60.0, 60.0, 4.0), transform=slab(u, height - 4.0, 4.0))
+    skin = TriangleMesh(np.asarray(plate.vertices), np.asarray(plate.faces))
+    answer = assess_reach(CellChecker(UR3, TOOL, patient=skin), request(u, standoff))
+    assert answer.reason is Reason.INSERTION_BLOCKED and answer.detail.startswith("holder touches patient")
+    exact = standoff + TOOL.shaft_mm - height
+    assert exact - 1e-6 <= answer.depth_mm <= exact + MAX_SWEEP_MM
+
+
+def test_a_plate_across_the_needles_way_blocks_at_its_depth() -> None:
+    """A room's box is not skin: the tip meets it r - height deep, and the needle is named."""
+    empty = CellChecker(UR3, TOOL)
+    asked, _ = reached(empty, 1, seed=6)[0]
+    plate = Box("plate", slab(asked.outward_base, 40.0, 5.0), (20.0, 20.0, 5.0))
+    answer = assess_reach(CellChecker(UR3, TOOL, [plate]), asked)
+    assert answer.reason is Reason.INSERTION_BLOCKED and answer.detail.startswith("needle touches plate")
+    exact = STANDOFF_MM - 45.0
+    assert exact - 1e-6 <= answer.depth_mm <= exact + MAX_SWEEP_MM
+
+
+def test_an_obstacle_at_the_flange_is_a_collision_at_standoff() -> None:
+    """A box about the standoff flange stops every branch and roll; link and box are named."""
+    asked, _ = reached(CellChecker(UR3, TOOL), 1, seed=7)[0]
+    lamp = Box("lamp", flange_poses(TARGET, asked.outward_base, 320.0)[0], (40.0, 40.0, 40.0))
+    answer = assess_reach(CellChecker(UR3, TOOL, [lamp]), asked)
+    assert answer.reason is Reason.ARM_COLLISION and answer.depth_mm is None and not answer.reachable
+    assert "touches lamp at standoff" in answer.detail
+    assert answer.insertion_q.shape == (0, 6) and answer.branch == -1 and answer.margin == 0.0
+
+
+def test_another_roll_is_taken_where_one_meets_something() -> None:
+    """A knob where the rim of wrist 3 ends up at roll 0: that roll is passed over, and the drive holds another."""
+    asked, plain = reached(CellChecker(UR3, TOOL), 1, seed=7)[0]
+    assert plain.roll == 0.0
+    rim = collision_links(UR3)[6].mesh.vertices
+    T_flange_knob = np.eye(4)
+    T_flange_knob[:3, 3] = rim[np.argmin(rim[:, 1])]
+    at_target = flange_poses(TARGET, asked.outward_base, TOOL.needle_length_mm)[0]
+    knob = Box("knob", at_target @ T_flange_knob, (1.0, 1.0, 1.0))
+    only_roll = assess_reach(CellChecker(UR3, TOOL, [knob]), asked, n_rolls=1)
+    assert only_roll.reason is Reason.INSERTION_BLOCKED and only_roll.detail.startswith("wrist_3 touches knob")
+    answer = assess_reach(CellChecker(UR3, TOOL, [knob]), asked)
+    assert answer.reachable and answer.roll != 0.0
+    distance = TOOL.needle_length_mm + STANDOFF_MM - answer.insertion_depth_mm
+    expected = flange_poses(TARGET, asked.outward_base, distance, answer.roll)
+    assert np.abs(flange_pose(UR3, answer.insertion_q) - expected).max() < 1e-9
+
+
+def test_a_standoff_that_starts_inside_the_skin_is_a_collision() -> None:
+    """The needle must be outside the patient before the insertion."""
+    asked, _ = reached(CellChecker(UR3, TOOL), 1, seed=8)[0]
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=STANDOFF_MM + 5.0)
+    skin = TriangleMesh(np.asarray(ball.vertices) + TARGET, np.asarray(ball.faces))
+    answer = assess_reach(CellChecker(UR3, TOOL, patient=skin), asked)
+    assert answer.reason is Reason.ARM_COLLISION and "patient at standoff" in answer.detail
+
+
+@pytest.mark.parametrize("roll", np.linspace(0.0, 2 * np.pi, 5))
+def test_the_roll_is_joint_six_alone(roll: float) -> None:
+    """Turning the flange about the needle adds to q6 and moves no other joint; tip and axis stay."""
+    u = next(d for d in directions(60, 1) if ik_exists(UR3, TARGET, d, needle_length_mm=200.0, standoff_mm=120.0)[0])
+    plain, turned = (inverse(UR3, flange_poses(TARGET, u, 320.0, angle))[0] for angle in (0.0, roll))
+    assert np.array_equal(np.isnan(plain), np.isnan(turned))
+    difference = np.exp(1j * (turned - plain)[~np.isnan(plain[:, 0])])
+    assert len(difference) >= 2
+    assert np.max(np.abs(difference[:, :5] - 1.0)) < 1e-9
+    assert np.max(np.abs(difference[:, 5] - np.exp(1j * roll))) < 1e-9
+
+
+def test_requests_that_make_no_sense_are_refused() -> None:
+    """Wrong needle, a direction that is no unit vector, NaN, nothing to drive."""
+    checker, u = CellChecker(UR3, TOOL), np.array([0.0, 0.0, 1.0])
+    with pytest.raises(InputError, match=r"the tool's 200\.0"):
+        assess_reach(checker, ReachRequest(TARGET, u, 210.0, 100.0))
+    with pytest.raises(InputError, match="a unit vector"):
+        request(1.1 * u)
+    with pytest.raises(InputError, match="target_base"):
+        ReachRequest(np.array([0.0, np.nan, 0.0]), u, 200.0, 100.0)
+    with pytest.raises(InputError, match="standoff_mm"):
+        request(u, 0.0)
+    with pytest.raises(InputError, match="n_rolls"):
+        assess_reach(checker, request(u), n_rolls=0)
