@@ -1,0 +1,65 @@
+"""Many cases, one after the other or in processes of this machine; one that fails does not stop the others."""
+
+from __future__ import annotations
+
+import csv
+import multiprocessing
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from planning.errors import InputError, PlanningError
+from planning.files import atomic
+from planning.prepared import Watcher, prepare
+from planning.table import write_table
+
+COLUMNS = ("case", "exit_code", "directions", "safe", "best_theta_deg", "best_beta_deg", "seconds", "said")
+"""Columns of ``batch.csv``."""
+
+
+def run_batch(cases: Sequence[Path], out: Path, *, jobs: int, arm: bool, watcher: Watcher) -> list[dict[str, Any]]:
+    """Search every case; write ``NAME/candidates.parquet`` for each and ``batch.csv`` for all.
+
+    Args:
+        cases: Case files or folders.
+        out: Folder for the results.
+        jobs: Processes; each case runs in one.
+        arm: Whether the arm is asked too.
+        watcher: Whoever shows progress, in cases.
+
+    Returns:
+        One row per case, in the order given, with the keys `COLUMNS`; ``exit_code`` as the command line's.
+    """
+    rows: list[dict[str, Any]] = [{} for _ in cases]
+    context = multiprocessing.get_context("spawn")  # compiled libraries with threads do not survive a fork
+    with ProcessPoolExecutor(max_workers=min(jobs, max(len(cases), 1)), mp_context=context) as pool:
+        numbers = {pool.submit(search_one, case, out, arm): number for number, case in enumerate(cases)}
+        for done, future in enumerate(as_completed(numbers), start=1):
+            rows[numbers[future]] = future.result()
+            watcher.count("cases", done, len(cases))
+    with atomic(out / "batch.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)
+    return rows
+
+
+def search_one(path: Path, out: Path, arm: bool) -> dict[str, Any]:
+    """Search one case and write its table; a refusal becomes a row."""
+    row: dict[str, Any] = dict.fromkeys(COLUMNS)
+    row |= {"case": str(path), "directions": 0, "safe": 0}
+    try:
+        prepared = prepare(path, arm=arm)
+        found = prepared.search()
+    except PlanningError as error:
+        return row | {"exit_code": 2 if isinstance(error, InputError) else 3, "said": str(error)}
+    write_table(found, prepared.provenance(), out / prepared.case.name / "candidates.parquet")
+    row |= {"directions": len(found), "safe": int(found.safe.sum()), "seconds": sum(prepared.stages.seconds.values())}
+    if not found.safe.any():
+        return row | {"exit_code": 1, "said": "no safe candidate"}
+    best = int(found.ranked[0])
+    angles = {"best_theta_deg": np.degrees(found.theta[best]), "best_beta_deg": np.degrees(found.beta[best])}
+    return row | {"exit_code": 0, "said": "done"} | {key: float(value) for key, value in angles.items()}

@@ -1,0 +1,130 @@
+"""One candidate, explained in full: every constraint with its number and its limit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from planning.anatomy import Anatomy
+from planning.candidates import Candidates
+from planning.case import Case
+from planning.constraints import longest_path, standoffs
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A judged candidate with what it was judged against.
+
+    Attributes:
+        candidates: A search's result with this candidate alone.
+    """
+
+    case: Case
+    anatomy: Anatomy
+    candidates: Candidates
+
+    @property
+    def safe(self) -> bool:
+        """The verdict."""
+        return bool(self.candidates.safe[0])
+
+    @property
+    def verdict(self) -> str:
+        """``safe`` or ``rejected``."""
+        return "safe" if self.safe else "rejected"
+
+    def clearances(self) -> dict[str, float]:
+        """Structure to clearance, mm."""
+        return dict(zip(self.candidates.structures, map(float, self.candidates.clearance[0]), strict=True))
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON: mm and degrees; null where there is no number."""
+        row = self.candidates
+        return {
+            "case": self.case.name,
+            "theta_deg": float(np.degrees(row.theta[0])),
+            "beta_deg": float(np.degrees(row.beta[0])),
+            "verdict": self.verdict,
+            "reason": str(row.reason[0]),
+            "reason_structure": str(row.reason_structure[0]),
+            "reason_depth_mm": finite(row.reason_depth[0]),
+            "reason_amount": finite(row.reason_amount[0]),
+            "reason_detail": str(row.reason_detail[0]),
+            "entry_ct_mm": [finite(x) for x in row.entry_ct[0]],
+            "path_length_mm": finite(row.path_length[0]),
+            "skin_angle_deg": finite(np.degrees(row.skin_angle[0])),
+            "tissue_mm": finite(row.tissue[0]),
+            "clearance_mm": self.clearances(),
+            "reachable": None if row.reachable[0] < 0 else bool(row.reachable[0]),
+            "reach_margin": finite(row.reach_margin[0]),
+            "cost": finite(row.cost[0]),
+            "warnings": list(self.anatomy.warnings),
+        }
+
+    def text(self) -> str:
+        """The same for a person."""
+        row = self.candidates
+        head = f"theta {np.degrees(row.theta[0]):g} deg, beta {np.degrees(row.beta[0]):g} deg: {self.verdict}"
+        return "\n".join(
+            [f"case {self.case.name}", head, *self._reason(), *self._path(), *self._table(), *self._rest()]
+        )
+
+    def _reason(self) -> list[str]:
+        return [] if self.safe else ["  because " + reason_text(self.candidates, 0)]
+
+    def _path(self) -> list[str]:
+        row, needle = self.candidates, self.case.needle
+        if np.isnan(row.path_length[0]):
+            return ["  no skin entry on this path"]
+        entry = ", ".join(f"{x:.1f}" for x in row.entry_ct[0])
+        limit = np.degrees(self.case.search.max_skin_angle)
+        return [
+            f"  skin entry     ({entry}) mm in the CT frame",
+            f"  path length    {row.path_length[0]:8.2f} mm, allowed {longest_path(needle):g}",
+            f"  skin angle     {np.degrees(row.skin_angle[0]):8.2f} deg, allowed {limit:g}",
+            f"  standoff       {float(standoffs(needle, row.path_length[0])):8.2f} mm",
+            f"  tissue crossed {row.tissue[0]:8.2f} mm",
+        ]
+
+    def _table(self) -> list[str]:
+        lines = ["  structure                        role       clearance mm   margin mm"]
+        clearances = self.candidates.clearance[0]
+        for column in np.argsort(clearances, kind="stable"):
+            structure = self.anatomy.structures[column]
+            margin = f"{structure.margin_mm:11.2f}" if structure.demands_margin else "          -"
+            short = structure.demands_margin and clearances[column] < structure.margin_mm
+            lines.append(
+                f"  {structure.name:32.32s} {structure.role:8s} {clearances[column]:14.3f} {margin}"
+                + ("  too close" if short else "")
+            )
+        return lines
+
+    def _rest(self) -> list[str]:
+        asked = {-1: "not asked", 0: "no", 1: f"yes, margin {self.candidates.reach_margin[0]:.2f}"}
+        lines = [f"  arm can hold it: {asked[int(self.candidates.reachable[0])]}"]
+        return lines + [f"  warning: {warning}" for warning in self.anatomy.warnings]
+
+
+def reason_text(candidates: Candidates, row: int) -> str:
+    """Reason, structure, depth and number of a rejected candidate, in one line."""
+    parts = [str(candidates.reason[row])]
+    if candidates.reason_structure[row]:
+        parts.append(f"({candidates.reason_structure[row]})")
+    if np.isfinite(candidates.reason_depth[row]):
+        parts.append(f"at {candidates.reason_depth[row]:.1f} mm from the target")
+    if np.isfinite(candidates.reason_amount[row]):
+        parts.append(f"with {candidates.reason_amount[row]:.2f} {_unit(str(candidates.reason[row]))}")
+    if candidates.reason_detail[row]:
+        parts.append(f"- {candidates.reason_detail[row]}")
+    return " ".join(parts)
+
+
+def _unit(reason: str) -> str:
+    return {"skin_angle": "deg", "too_long": "mm of path"}.get(reason, "mm clearance")
+
+
+def finite(value: float) -> float | None:
+    """The number, or None where there is none (JSON knows no NaN)."""
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,259 @@
+"""The chosen pose and its motion, as a versioned file that is checked again by whoever loads it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.case import Case
+from planning.entry import needle_pose
+from planning.errors import InputError
+from planning.files import atomic
+from planning.formats.guard import guard_transform
+from planning.robot.kinematics import flange_pose
+from planning.robot.ur import ur_model
+from planning.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+PLAN_VERSION = 1
+"""Version of the file's layout."""
+
+POSE_TOLERANCE_MM = 0.01
+"""How far the tip of the stored joint angles may be from the stored pose: well above rounding, far below any error."""
+
+JOIN_TOLERANCE_RAD = 1e-9
+"""How far the insertion may start from where the approach ends: rounding of the time laws."""
+
+STRAIGHT_TOLERANCE_MM = 0.1
+"""How far the tip may leave the straight path during the insertion: what a UR3 repeats."""
+
+MAX_PLAN_BYTES = 50_000_000
+"""A plan is some thousand waypoints; a larger file is something else."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """One puncture, ready to be rehearsed: mm, rad, s.
+
+    Attributes:
+        case_name: The case that it was made for.
+        inputs: File name to SHA-256 of every input of that case.
+        seed: Of the approach's planner.
+        model: The arm.
+        T_base_ct: Shape (4, 4), the belief of where the patient is.
+        expected_target_error_mm: rms, from the registration; NaN for a stated mount.
+        theta: Puncture angle.
+        beta: Azimuth.
+        entry_ct: Shape (3,), skin entry.
+        target_ct: Shape (3,).
+        outward_ct: Shape (3,), unit, from the target along the needle.
+        roll: About the needle.
+        standoff_mm: Tip to target before the insertion.
+        needle_length_mm: Tip to flange.
+        approach: From home to standoff.
+        insertion: From standoff to the target.
+        clearance_mm: Per phase, the least distance that was found: ``approach`` and ``insertion`` of arm and holder
+            to patient and room, ``needle`` to the nearest structure with a margin.
+    """
+
+    case_name: str
+    inputs: Mapping[str, str]
+    seed: int
+    model: str
+    T_base_ct: Floats
+    expected_target_error_mm: float
+    theta: float
+    beta: float
+    entry_ct: Floats
+    target_ct: Floats
+    outward_ct: Floats
+    roll: float
+    standoff_mm: float
+    needle_length_mm: float
+    approach: Trajectory
+    insertion: Trajectory
+    clearance_mm: Mapping[str, float]
+
+
+def write_plan(plan: Plan, path: Path) -> None:
+    """Write a plan as JSON, whole or not at all; lengths in mm, joints in rad, times in s."""
+    document = {
+        "version": PLAN_VERSION,
+        "case": plan.case_name,
+        "inputs": dict(plan.inputs),
+        "seed": plan.seed,
+        "robot": plan.model,
+        "T_base_ct": plan.T_base_ct.tolist(),
+        "expected_target_error_mm": _or_null(plan.expected_target_error_mm),
+        "theta_deg": float(np.degrees(plan.theta)),
+        "beta_deg": float(np.degrees(plan.beta)),
+        "entry_ct_mm": plan.entry_ct.tolist(),
+        "target_ct_mm": plan.target_ct.tolist(),
+        "outward_ct": plan.outward_ct.tolist(),
+        "roll_deg": float(np.degrees(plan.roll)),
+        "standoff_mm": plan.standoff_mm,
+        "needle_length_mm": plan.needle_length_mm,
+        "approach": _trajectory_document(plan.approach),
+        "insertion": _trajectory_document(plan.insertion),
+        "clearance_mm": {phase: _or_null(value) for phase, value in plan.clearance_mm.items()},
+    }
+    with atomic(path) as temporary:
+        temporary.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_plan(path: Path) -> Plan:
+    """Read a plan and check that it is whole and agrees with itself.
+
+    Raises:
+        InputError: Not a plan, another version, missing keys, numbers that do not fit, or a pose that the stored
+            joint angles do not reach.
+    """
+    document = _document(path)
+    try:
+        plan = _plan(document, path)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+        what = f"key {error} is missing" if isinstance(error, KeyError) else f"does not fit: {error}"
+        raise InputError(what, where=path, allowed=f"a plan.json of version {PLAN_VERSION}") from error
+    check_geometry(plan, path)
+    return plan
+
+
+def check_inputs(plan: Plan, case: Case, path: Path) -> None:
+    """Refuse a plan whose case has changed since.
+
+    Raises:
+        InputError: Names the first input that differs.
+    """
+    for name in sorted(set(plan.inputs) | set(case.inputs)):
+        if plan.inputs.get(name) != case.inputs.get(name):
+            raise InputError(
+                f"input '{name}' is not the one that the plan was made from", where=path, allowed="plan again"
+            )
+
+
+def check_geometry(plan: Plan, path: Path) -> None:
+    """Refuse a plan whose motion does not do what it says: join, start at standoff, end on the target.
+
+    Raises:
+        InputError: Says which end is off, and by how much.
+    """
+    if not np.allclose(plan.approach.q[-1], plan.insertion.q[0], rtol=0, atol=JOIN_TOLERANCE_RAD):
+        raise InputError("the insertion does not start where the approach ends", where=path, allowed="joined phases")
+    _check_straight(plan, path)
+    model = ur_model(plan.model)
+    for name, q, standoff in (
+        ("standoff", plan.insertion.q[0], plan.standoff_mm),
+        ("target", plan.insertion.q[-1], 0.0),
+    ):
+        pose = needle_pose(plan.target_ct, plan.outward_ct, standoff=standoff, length=plan.needle_length_mm)
+        T_base_flange = flange_pose(model, q)
+        tip = T_base_flange[:3, 3] + plan.needle_length_mm * T_base_flange[:3, 2]
+        for what, point, wanted in (("tip", tip, pose.tip_ct), ("flange", T_base_flange[:3, 3], pose.top_ct)):
+            error = float(np.linalg.norm(point - plan.T_base_ct[:3, :3] @ wanted - plan.T_base_ct[:3, 3]))
+            if not error <= POSE_TOLERANCE_MM:
+                raise InputError(
+                    f"the {what} at {name} is {error:.3g} mm off the stored pose",
+                    where=path,
+                    allowed=f"at most {POSE_TOLERANCE_MM} mm",
+                )
+
+
+def _check_straight(plan: Plan, path: Path) -> None:
+    """Refuse an insertion whose tip leaves the straight line to the target, or turns back."""
+    poses = flange_pose(ur_model(plan.model), plan.insertion.q)
+    tips = poses[:, :3, 3] + plan.needle_length_mm * poses[:, :3, 2]
+    target, outward = (
+        plan.T_base_ct[:3, :3] @ plan.target_ct + plan.T_base_ct[:3, 3],
+        plan.T_base_ct[:3, :3] @ plan.outward_ct,
+    )
+    along = (tips - target) @ outward
+    aside = float(np.linalg.norm(tips - target - along[:, None] * outward, axis=1).max())
+    if not aside <= STRAIGHT_TOLERANCE_MM:
+        raise InputError(
+            f"the tip leaves the straight path by {aside:.3g} mm",
+            where=path,
+            allowed=f"at most {STRAIGHT_TOLERANCE_MM} mm",
+        )
+    if np.any(np.diff(along) > STRAIGHT_TOLERANCE_MM):
+        raise InputError("the insertion turns back", where=path, allowed="a motion inward")
+
+
+def _document(path: Path) -> dict[str, Any]:
+    allowed = f"a plan.json of version {PLAN_VERSION}"
+    try:
+        if path.stat().st_size > MAX_PLAN_BYTES:
+            raise InputError("larger than 50 MB, not a plan", where=path, allowed=allowed)
+        document = json.loads(path.read_bytes().decode("utf-8"), parse_constant=_refuse_constant)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed=allowed) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"is not JSON: {error}", where=path, allowed=allowed) from error
+    if not isinstance(document, dict) or document.get("version") != PLAN_VERSION:
+        version = document.get("version") if isinstance(document, dict) else None
+        raise InputError(f"version {version!r}", where=path, allowed=allowed)
+    return document
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is no number")
+
+
+def _plan(document: dict[str, Any], path: Path) -> Plan:
+    theta, beta = np.radians(_number(document["theta_deg"])), np.radians(_number(document["beta_deg"]))
+    error = document["expected_target_error_mm"]
+    return Plan(
+        case_name=str(document["case"]),
+        inputs=MappingProxyType({str(k): str(v) for k, v in document["inputs"].items()}),
+        seed=int(document["seed"]),
+        model=str(document["robot"]),
+        T_base_ct=guard_transform(document["T_base_ct"], where=f"{path}: T_base_ct"),
+        expected_target_error_mm=float("nan") if error is None else _number(error),
+        theta=float(theta),
+        beta=float(beta),
+        entry_ct=_array(document["entry_ct_mm"], (3,)),
+        target_ct=_array(document["target_ct_mm"], (3,)),
+        outward_ct=_array(document["outward_ct"], (3,)),
+        roll=float(np.radians(_number(document["roll_deg"]))),
+        standoff_mm=_number(document["standoff_mm"]),
+        needle_length_mm=_number(document["needle_length_mm"]),
+        approach=_trajectory(document["approach"]),
+        insertion=_trajectory(document["insertion"]),
+        clearance_mm=MappingProxyType(
+            {str(k): float("nan") if v is None else _number(v) for k, v in document["clearance_mm"].items()}
+        ),
+    )
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{value!r} is no number")
+    return float(value)
+
+
+def _array(value: Any, shape: tuple[int, ...]) -> Floats:
+    array = np.array(value, dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"an array of shape {array.shape} where {shape} finite numbers belong")
+    array.setflags(write=False)
+    return array
+
+
+def _trajectory(document: Any) -> Trajectory:
+    times = np.array(document["times_s"], dtype=np.float64)
+    return Trajectory(_array(times, (len(times),)), _array(document["q_rad"], (len(times), 6)))
+
+
+def _trajectory_document(trajectory: Trajectory) -> dict[str, Any]:
+    return {"times_s": trajectory.times_s.tolist(), "q_rad": trajectory.q.tolist()}
+
+
+def _or_null(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,62 @@
+"""A plan, held against its case again: same inputs, same verdict, and a motion that FCL finds free."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.approach import FINER, RESOLUTION_RAD, dense_states
+from planning.candidates import Candidates
+from planning.errors import InputError
+from planning.explain import reason_text
+from planning.plan import Plan, check_inputs
+from planning.prepared import Prepared
+from planning.robot.cell import StateChecker
+
+Floats = NDArray[np.float64]
+
+SAME_DIRECTION = 1e-6
+"""Largest difference of two unit vectors that name one direction: degrees in the file are rounded to 1e-15."""
+
+
+def check_plan(plan: Plan, prepared: Prepared, path: Path) -> Candidates:
+    """Judge a loaded plan's direction and motion anew.
+
+    Returns:
+        The candidate of the plan, judged.
+
+    Raises:
+        InputError: The inputs changed, the direction is not safe any more, or the motion touches something.
+    """
+    check_inputs(plan, prepared.case, path)
+    if prepared.reach is None or not np.array_equal(plan.T_base_ct, prepared.reach.T_base_ct):
+        raise InputError("T_base_ct is not the case's", where=path, allowed="plan again")
+    candidates = prepared.check(plan.theta, plan.beta)
+    if not np.allclose(candidates.outward_ct[0], plan.outward_ct, atol=SAME_DIRECTION):
+        raise InputError("outward_ct is not the direction of theta_deg, beta_deg", where=path, allowed="plan again")
+    if not candidates.safe[0]:
+        raise InputError(f"its direction is rejected: {reason_text(candidates, 0)}", where=path, allowed="plan again")
+    touched = motion_contact(plan, prepared.reach.checker)
+    if touched is not None:
+        raise InputError(f"its {touched}", where=path, allowed="a motion that touches nothing")
+    return candidates
+
+
+def motion_contact(plan: Plan, checker: StateChecker) -> str | None:
+    """What a plan's motion touches, in words, or None: FCL at ten times the planner's resolution."""
+    for phase, q, needle_free in (("approach", plan.approach.q, False), ("insertion", plan.insertion.q, True)):
+        contact = _contact(checker, q, needle_free)
+        if contact is not None:
+            return f"{phase} is not free: {contact}"
+    return None
+
+
+def _contact(checker: StateChecker, q_path: Floats, needle_free: bool) -> str | None:
+    """What touches what along a motion, checked as densely as when it was planned; None if nothing does."""
+    for q in dense_states(checker, q_path, RESOLUTION_RAD / FINER):
+        contact = checker.contact(q, needle_may_touch_patient=needle_free)
+        if contact is not None:
+            return f"{contact.body} touches {contact.other}"
+    return None

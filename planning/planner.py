@@ -1,0 +1,124 @@
+"""From ranked candidates to a plan: the best one that the arm can come to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from planning.approach import least_clearance, plan_approach
+from planning.candidates import Candidates
+from planning.errors import InputError, NoAnswerError
+from planning.plan import Plan
+from planning.plan_check import motion_contact
+from planning.prepared import Prepared
+from planning.reach import assess_reach
+from planning.reasons import Reason
+from planning.room import home_configuration
+from planning.search import ranked, reach_request
+from planning.trajectory import drive_smoothly, stop_and_go
+
+MAX_TRIES = 20
+"""Candidates to which an approach is sought; what none of the best twenty allows is a matter of the room."""
+
+APPROACH_SPEED = 0.5
+"""Share of the joints' speed limits on the way to the patient."""
+
+INSERTION_MM_S = 10.0
+"""Tip speed of the insertion: a needle is driven slowly, and an operator must be able to stop it."""
+
+
+class Planned(NamedTuple):
+    """A plan, and the candidates with those that no approach was found for marked."""
+
+    plan: Plan
+    candidates: Candidates
+
+
+def make_plan(prepared: Prepared, candidates: Candidates, *, seed: int) -> Planned:
+    """Plan to the best candidate for which an approach is found.
+
+    Args:
+        prepared: The case.
+        candidates: Its search result, with reach.
+        seed: Of the approach's planner.
+
+    Raises:
+        InputError: The case does not say where the arm stands.
+        NoAnswerError: No candidate is safe, or none of the best can be come to.
+    """
+    if prepared.reach is None:
+        raise InputError(
+            "the case does not say where the robot stands",
+            where=prepared.case.path,
+            allowed="[registration] with markers, or [robot.mount]",
+        )
+    last = "no candidate is safe"
+    for row in candidates.ranked[:MAX_TRIES]:
+        try:
+            plan = _plan(prepared, candidates, int(row), seed)
+        except NoAnswerError as error:
+            last = str(error)
+            candidates = _without(prepared, candidates, int(row), last)
+            continue
+        return Planned(plan, candidates)
+    raise NoAnswerError(f"no plan: {last}", counts=candidates.counts())
+
+
+def _without(prepared: Prepared, candidates: Candidates, row: int, why: str) -> Candidates:
+    """The same candidates with one marked ``approach_not_found``, ranked anew."""
+    reason, detail = candidates.reason.copy(), candidates.reason_detail.copy()
+    reason[row], detail[row] = Reason.APPROACH_NOT_FOUND.value, why
+    blank = replace(
+        candidates,
+        reason=reason,
+        reason_detail=detail,
+        cost=np.full(len(candidates), np.nan),
+        rank=np.zeros(len(candidates), np.int32),
+        pareto=np.zeros(len(candidates), bool),
+    )
+    return ranked(prepared.case, blank)
+
+
+def _plan(prepared: Prepared, candidates: Candidates, row: int, seed: int) -> Plan:
+    """The plan for one candidate; what it returns has been checked as it would be when it is loaded.
+
+    Raises:
+        NoAnswerError: No approach, or the timed motion touches something after all.
+    """
+    assert prepared.reach is not None and prepared.placement is not None  # the caller has refused this
+    case, checker = prepared.case, prepared.reach.checker
+    request = reach_request(case, candidates, row, prepared.reach.T_base_ct)
+    answer = assess_reach(checker, request)
+    approach = plan_approach(checker, home_configuration(case), answer.insertion_q[:1], seed=seed)
+    driven = least_clearance(checker, answer.insertion_q)
+    plan = Plan(
+        case_name=case.name,
+        inputs=case.inputs,
+        seed=seed,
+        model=case.robot.model,
+        T_base_ct=prepared.placement.T_base_ct,
+        expected_target_error_mm=prepared.placement.target_error_mm,
+        theta=float(candidates.theta[row]),
+        beta=float(candidates.beta[row]),
+        entry_ct=candidates.entry_ct[row],
+        target_ct=case.target_ct,
+        outward_ct=candidates.outward_ct[row],
+        roll=answer.roll,
+        standoff_mm=request.standoff_mm,
+        needle_length_mm=case.needle.length_mm,
+        approach=stop_and_go(checker.model, approach.waypoints, speed_scale=APPROACH_SPEED),
+        insertion=drive_smoothly(
+            checker.model, answer.insertion_q, answer.insertion_depth_mm, max_tip_speed_mm_s=INSERTION_MM_S
+        ),
+        clearance_mm={
+            "approach": min(approach.clearance.patient.mm, approach.clearance.boxes.mm),
+            "insertion": min(driven.patient.mm, driven.boxes.mm),
+            "needle": float(candidates.min_clearance[row]),
+        },
+    )
+    touched = motion_contact(plan, checker)
+    if touched is not None:
+        raise NoAnswerError(touched)
+    return plan

@@ -1,0 +1,117 @@
+"""A case, read and ready to be asked: its structures, its engine, and the arm in its room."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from planning.anatomy import Anatomy, load_anatomy
+from planning.candidates import Candidates
+from planning.case import Case, load_case
+from planning.clearance.engine import ClearanceEngine
+from planning.clearance.fcl_engine import FclEngine
+from planning.placement import Placement, load_placement
+from planning.room import case_checker
+from planning.search import Reach, case_directions, one_direction, search
+from planning.stages import Stages
+
+
+class Watcher(Protocol):
+    """Whoever shows progress."""
+
+    def step(self, stage: str, what: str) -> None:
+        """A stage has come to a named thing."""
+        ...
+
+    def count(self, stage: str, done: int, total: int) -> None:
+        """A stage has done so many of so many."""
+        ...
+
+
+class Silent:
+    """Shows nothing."""
+
+    def step(self, stage: str, what: str) -> None:
+        """Nothing."""
+
+    def count(self, stage: str, done: int, total: int) -> None:
+        """Nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What every question about a case needs, read once.
+
+    Attributes:
+        placement: Where the patient lies for the robot, or None when the case does not say.
+        reach: Who answers for the arm, or None without a placement.
+        stages: How long reading took; later stages are added as they happen.
+    """
+
+    case: Case
+    anatomy: Anatomy
+    placement: Placement | None
+    engine: ClearanceEngine
+    reach: Reach | None
+    watcher: Watcher
+    stages: Stages
+
+    def search(self) -> Candidates:
+        """Judge the case's whole grid."""
+        with self.stages.time("search"):
+            return search(
+                self.case,
+                self.anatomy,
+                self.engine,
+                case_directions(self.case),
+                reach=self.reach,
+                progress=partial(self.watcher.count, "arm"),
+            )
+
+    def check(self, theta: float, beta: float) -> Candidates:
+        """Judge a single direction (rad)."""
+        directions = one_direction(self.case, theta, beta)
+        return search(self.case, self.anatomy, self.engine, directions, reach=self.reach)
+
+    def provenance(self) -> dict[str, Any]:
+        """Where a result comes from: case, inputs, version, grid."""
+        return {
+            "case": self.case.name,
+            "inputs": dict(self.case.inputs),
+            "version": version("puncture-twin"),
+            "seed": self.case.rehearsal.seed,
+            "step_deg": float(np.degrees(self.case.search.step)),
+            "warnings": list(self.anatomy.warnings),
+        }
+
+
+def prepare(path: Path | str, *, arm: bool = True, watcher: Watcher | None = None) -> Prepared:
+    """Read a case and everything that it names.
+
+    Args:
+        path: Case file, or the folder that holds ``case.toml``.
+        arm: Whether the arm is asked too, where the case says where it stands.
+        watcher: Whoever shows progress.
+
+    Raises:
+        InputError: Anything in the case that cannot be used.
+    """
+    watcher = watcher or Silent()
+    stages = Stages()
+    with stages.time("case"):
+        case = load_case(path)
+        placement = load_placement(case)
+    with stages.time("anatomy"):
+        anatomy = load_anatomy(case, partial(watcher.step, "anatomy"))
+    with stages.time("trees"):
+        meshes = [structure.mesh for structure in anatomy.structures]
+        engine = FclEngine(meshes, partial(watcher.count, "directions"))
+        reach = None
+        if arm and placement is not None:
+            reach = Reach(case_checker(case, anatomy, placement.T_base_ct), placement.T_base_ct)
+    return Prepared(case, anatomy, placement, engine, reach, watcher, stages)

@@ -1,0 +1,205 @@
+"""A plan: made on the carton, written, read back, and refused when anything about it changed."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from meshes import folder
+from planning.errors import InputError, NoAnswerError
+from planning.plan import read_plan, write_plan
+from planning.plan_check import check_plan, motion_contact
+from planning.planner import make_plan
+from planning.prepared import prepare
+from planning.reasons import Reason
+from planning.robot.kinematics import flange_pose
+from planning.robot.ur import ur_model
+
+
+@pytest.fixture(scope="module")
+def carton(tmp_path_factory):
+    """The carton with a grid of 12°: few candidates, some of them reachable."""
+    here = tmp_path_factory.mktemp("carton")
+    for file in (folder() / "carton").iterdir():
+        (here / file.name).write_bytes(file.read_bytes())
+    case = here / "case_m.toml"
+    case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 12.0"))
+    return prepare(case)
+
+
+@pytest.fixture(scope="module")
+def planned(carton):
+    """Its plan, and the candidates it was chosen from."""
+    return make_plan(carton, carton.search(), seed=1)
+
+
+@pytest.fixture
+def document(planned, tmp_path):
+    """The plan's JSON, and a function that writes it changed and returns the path."""
+    path = tmp_path / "plan.json"
+    write_plan(planned.plan, path)
+    content = json.loads(path.read_text())
+
+    def change(**keys):
+        path.write_text(json.dumps(content | keys))
+        return path
+
+    return content, change
+
+
+def test_reach_is_inside_the_verdict(carton, planned):
+    """Every safe candidate can be held by the arm, and the refused ones say why."""
+    found = planned.candidates
+    assert found.safe.any()
+    assert (found.reachable[found.safe] == 1).all()
+    refused = np.isin(found.reason, [Reason.UNREACHABLE, Reason.ARM_COLLISION, Reason.INSERTION_BLOCKED])
+    assert refused.any()
+    assert (found.reachable[refused] == 0).all()
+    assert (found.reason_detail[refused] != "").all()
+    assert np.isnan(found.reach_margin[found.reachable == -1]).all()
+
+
+def test_the_plan_is_the_best_candidate(planned):
+    """θ and β are those of rank 1."""
+    best = planned.candidates.ranked[0]
+    assert planned.plan.theta == planned.candidates.theta[best]
+    assert planned.plan.beta == planned.candidates.beta[best]
+
+
+def test_the_motion_does_what_the_plan_says(carton, planned):
+    """Home first, standoff at the joint, target last, the tip straight; within speeds, and free for FCL."""
+    plan, model = planned.plan, ur_model("ur3")
+    target = plan.T_base_ct[:3, :3] @ plan.target_ct + plan.T_base_ct[:3, 3]
+    outward = plan.T_base_ct[:3, :3] @ plan.outward_ct
+    poses = flange_pose(model, plan.insertion.q)
+    tips = poses[:, :3, 3] + plan.needle_length_mm * poses[:, :3, 2]
+    along = (tips - target) @ outward
+    np.testing.assert_allclose(along[[0, -1]], [plan.standoff_mm, 0], atol=1e-3)
+    np.testing.assert_allclose(tips - target, along[:, None] * outward, atol=0.05)
+    np.testing.assert_allclose(poses[:, :3, 2], np.broadcast_to(-outward, (len(poses), 3)), atol=1e-4)
+    for part in (plan.approach, plan.insertion):
+        assert (part.max_speeds() <= model.max_speeds + 1e-9).all()
+    assert motion_contact(plan, carton.reach.checker) is None
+
+
+def test_the_same_seed_gives_the_same_plan(carton, planned):
+    """No clock decides anything."""
+    again = make_plan(carton, carton.search(), seed=1).plan
+    np.testing.assert_array_equal(again.approach.q, planned.plan.approach.q)
+    np.testing.assert_array_equal(again.insertion.q, planned.plan.insertion.q)
+
+
+def test_a_plan_reads_back_as_it_was_written(carton, planned, document):
+    """Every number survives the file; a loaded plan is checked and accepted."""
+    path = document[1]()
+    back = read_plan(path)
+    np.testing.assert_array_equal(back.approach.q, planned.plan.approach.q)
+    np.testing.assert_array_equal(back.T_base_ct, planned.plan.T_base_ct)
+    assert back.inputs == dict(carton.case.inputs)
+    assert back.theta == pytest.approx(planned.plan.theta, abs=1e-12)
+    assert check_plan(back, carton, path).safe[0]
+
+
+def _moved(trajectory, row, joint, by):
+    q = np.array(trajectory["q_rad"])
+    q[row, joint] += by
+    return {"times_s": trajectory["times_s"], "q_rad": q.tolist()}
+
+
+BROKEN = {
+    "another version": (lambda d: {"version": 7}, "version 7"),
+    "no T_base_ct": (lambda d: {"T_base_ct": None}, "T_base_ct"),
+    "a mirrored T_base_ct": (lambda d: {"T_base_ct": (np.diag([1, 1, -1, 1]) @ d["T_base_ct"]).tolist()}, "T_base_ct"),
+    "a target elsewhere": (lambda d: {"target_ct_mm": [0, 0, 0]}, "straight path|off the stored pose"),
+    "two coordinates": (lambda d: {"target_ct_mm": [0, 0]}, "does not fit"),
+    "text for a number": (lambda d: {"standoff_mm": "150"}, "is no number"),
+    "another standoff": (lambda d: {"standoff_mm": d["standoff_mm"] + 1}, "tip at standoff is 1 mm off"),
+    "a gap between the phases": (lambda d: {"approach": _moved(d["approach"], -1, 0, 0.01)}, "does not start where"),
+    "a joint off at the target": (
+        lambda d: {"insertion": _moved(d["insertion"], -1, 1, 0.01)},
+        "leaves the straight path",
+    ),
+    "a detour on the way in": (
+        lambda d: {"insertion": _moved(d["insertion"], 40, 1, 0.01)},
+        "leaves the straight path",
+    ),
+    "times that fall": (
+        lambda d: {"insertion": {**d["insertion"], "times_s": d["insertion"]["times_s"][::-1]}},
+        "times do not rise",
+    ),
+    "five joints": (
+        lambda d: {"insertion": {**d["insertion"], "q_rad": [row[:5] for row in d["insertion"]["q_rad"]]}},
+        "does not fit",
+    ),
+    "an unknown arm": (lambda d: {"robot": "ur99"}, "ur99"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_plan_that_contradicts_itself_is_refused(name, document):
+    """Whatever was changed is named."""
+    change, message = BROKEN[name]
+    content, write = document
+    with pytest.raises(InputError, match=message):
+        read_plan(write(**change(content)))
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "is not JSON"),
+        (b'{"version": 1', "is not JSON"),
+        (b'{"version": 1}', "is missing"),
+        (b"[1, 2]", "version None"),
+        (b'{"version": 1, "x": NaN}', "NaN is no number"),
+        (b"\xff\xfe\x00", "is not JSON"),
+        (b"[" * 100_000, "is not JSON"),
+    ],
+)
+def test_what_is_no_plan_is_refused(data, message, tmp_path):
+    """Garbage, half a file, deep nesting: one line."""
+    path = tmp_path / "plan.json"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=message):
+        read_plan(path)
+
+
+def test_a_plan_of_other_inputs_is_refused(carton, document):
+    """When a marker file or a mesh changed, the plan is stale."""
+    content, write = document
+    path = write(inputs=content["inputs"] | {"touch.csv": "0" * 64})
+    with pytest.raises(InputError, match=r"input 'touch.csv' is not the one"):
+        check_plan(read_plan(path), carton, path)
+
+
+def test_a_plan_for_another_patient_pose_is_refused(carton, planned):
+    """T_base_ct must be the case's own, bit for bit."""
+    moved = np.array(planned.plan.T_base_ct)
+    moved[0, 3] += 1e-6
+    with pytest.raises(InputError, match="T_base_ct is not the case's"):
+        check_plan(replace(planned.plan, T_base_ct=moved), carton, "plan.json")
+
+
+def test_an_unsafe_direction_is_refused_on_loading(carton, planned):
+    """A plan whose direction goes through bolt H is refused by the search, whatever its motion says."""
+    theta, beta = np.radians(45), np.radians(270)
+    outward_ct = carton.check(theta, beta).outward_ct[0]
+    with pytest.raises(InputError, match=r"its direction is rejected: too_close \(bolt_h\)"):
+        check_plan(replace(planned.plan, theta=theta, beta=beta, outward_ct=outward_ct), carton, "plan.json")
+
+
+def test_a_motion_through_the_patient_is_refused_on_loading(carton, planned):
+    """The approach replaced by a dive into the box: FCL sees it."""
+    plan = planned.plan
+    dive = replace(plan, approach=plan.insertion)
+    assert "approach is not free" in motion_contact(dive, carton.reach.checker)
+
+
+def test_no_safe_candidate_means_no_plan(carton):
+    """The error carries the counts of each reason."""
+    found = carton.search()
+    none = replace(found, reason=np.full(len(found), Reason.TOO_CLOSE.value), rank=np.zeros(len(found), np.int32))
+    with pytest.raises(NoAnswerError, match="no candidate is safe") as caught:
+        make_plan(carton, none, seed=0)
+    assert caught.value.counts == {"too_close": len(found)}

@@ -1,0 +1,77 @@
+"""A real abdomen: the same target judged with two label maps of one patient.
+
+The markers beside the cases are simulated: points on the CT's skin, read with ±1.5 mm (half a voxel) and touched with
+0.1 mm of noise, for a base that hangs 500 mm in front of the target.
+"""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from planning.prepared import prepare
+from planning.reasons import Reason
+
+DATA = Path(__file__).parents[2] / "shared" / "data" / "totalseg_abdomen_3mm"
+CASES = Path(__file__).parent / "real"
+
+pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="the real CT (totalseg_abdomen_3mm) is not on this machine")
+
+
+@pytest.fixture(scope="module")
+def searches(tmp_path_factory):
+    """Both cases beside the data, searched at 4° without the arm."""
+    here = tmp_path_factory.mktemp("real")
+    for file in CASES.iterdir():
+        shutil.copy(file, here)
+    for name in ("ct", "labels_v1_normal", "labels_v2_fast"):
+        (here / f"{name}.nii.gz").symlink_to(DATA / f"{name}.nii.gz")
+    for version in ("v1", "v2"):
+        path = here / f"case_{version}.toml"
+        path.write_text(path.read_text().replace("step_deg = 2.0", "step_deg = 4.0"))
+    return {version: _searched(here / f"case_{version}.toml") for version in ("v1", "v2")}
+
+
+def _searched(path):
+    prepared = prepare(path, arm=False)
+    return prepared, prepared.search()
+
+
+def test_every_structure_is_there_and_closed(searches):
+    """58 organs, vessels and bones of version 1 and 60 of version 2, beside the liver; each a closed surface."""
+    for version, count in (("v1", 59), ("v2", 61)):
+        structures = searches[version][0].anatomy.structures
+        assert len(structures) == count
+        assert all(s.mesh.closed for s in structures)
+
+
+def test_the_cut_body_is_never_safe(searches):
+    """The field of view cuts four faces of this body; paths leaving there are unknown."""
+    prepared, found = searches["v2"]
+    field = prepared.anatomy.skin.field_of_view
+    assert field.cut.sum() == 4
+    out = field.exit(prepared.case.target_ct, found.outward_ct)
+    beyond = out.cut & (out.depth_mm < prepared.case.needle.length_mm)
+    assert beyond.any()
+    assert (found.reason[beyond] == Reason.UNKNOWN_REGION).all()
+
+
+def test_some_paths_are_safe_and_keep_every_margin(searches):
+    """Each safe row keeps each margin, enters through skin, and is short and steep enough."""
+    for prepared, found in searches.values():
+        rows = found.safe
+        assert rows.sum() > 20
+        demanding = ~np.isnan(found.margins)
+        assert (found.clearance[rows][:, demanding] >= found.margins[demanding] - 1e-4).all()
+        assert (found.path_length[rows] <= prepared.case.needle.shaft_mm).all()
+        assert (found.skin_angle[rows] <= prepared.case.search.max_skin_angle).all()
+
+
+def test_two_label_maps_of_one_patient_disagree(searches, record_property):
+    """How many verdicts differ between version 1 and version 2 is reported; most must agree."""
+    verdicts = [searches[version][1].safe for version in ("v1", "v2")]
+    differ = int(np.sum(verdicts[0] != verdicts[1]))
+    record_property("verdicts that differ", f"{differ} of {len(verdicts[0])}")
+
+    assert 0 < differ < 0.2 * len(verdicts[0])

@@ -1,0 +1,158 @@
+"""The batch search on the embedded cases: rows, ranking, the table, the closest miss."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from meshes import folder
+from planning.batch import search_one
+from planning.case_file import RankingSection
+from planning.entry import outward
+from planning.prepared import prepare
+from planning.ranking import pareto_front, rank
+from planning.reasons import Reason
+from planning.search import closest_miss, organ_candidates, ranked
+from planning.table import write_table
+from planning.tissue import inside_length
+from twin.phantoms import carton_field
+
+
+@pytest.fixture(scope="module")
+def carton():
+    """The carton, lesion M, organs alone."""
+    return prepare(folder() / "carton" / "case_m.toml", arm=False)
+
+
+@pytest.fixture(scope="module")
+def found(carton):
+    """Its whole grid."""
+    return carton.search()
+
+
+def test_every_direction_has_one_row(carton, found):
+    """46 x 180 directions at 2°, each with a verdict, in the grid's order."""
+    assert len(found) == 46 * 180
+    R = carton.case.T_ct_entry[:3, :3]
+    np.testing.assert_allclose(found.outward_ct, outward(found.theta, found.beta) @ R.T, atol=1e-12)
+    assert set(found.reason) <= {reason.value for reason in Reason}
+    assert sum(found.counts().values()) == len(found)
+
+
+def test_clearances_equal_the_analytic_truth(carton, found, rng):
+    """Against the exact fields of the true bolts, sampled along the axis (Lipschitz 1): within 0.02 mm."""
+    depths = np.arange(0, carton.case.needle.length_mm, 0.01)
+    for row in rng.choice(len(found), 40, replace=False):
+        points = carton.case.target_ct + depths[:, None] * found.outward_ct[row]
+        for column, name in enumerate(found.structures):
+            truth = max(carton_field(name)(points).min(), 0) - carton.case.needle.radius_mm
+            if name != "bolt_m":  # the target lies in its end face, where mesh and field differ by rounding
+                assert found.clearance[row, column] == pytest.approx(truth, abs=0.02)
+
+
+def test_the_ranks_follow_the_cost(found):
+    """Safe rows are ranked 1..n by rising cost; rejected rows have neither."""
+    order = found.ranked
+    assert (np.diff(found.cost[order]) >= 0).all()
+    np.testing.assert_array_equal(np.sort(found.rank[found.safe]), np.arange(1, found.safe.sum() + 1))
+    assert np.isnan(found.cost[~found.safe]).all()
+    assert not found.pareto[~found.safe].any()
+    assert found.pareto[order[0]]
+
+
+def test_no_reach_is_asked_without_an_arm(found):
+    """``reachable`` is null when the arm was not asked."""
+    assert (found.reachable == -1).all()
+
+
+def test_the_table_holds_what_was_found(carton, found, tmp_path):
+    """The Parquet file has every column, in mm and degrees, and says where it comes from."""
+    path = tmp_path / "candidates.parquet"
+    write_table(found, carton.provenance(), path)
+    table = pq.read_table(path)
+    assert table.num_rows == len(found)
+    wanted = {"theta_deg", "beta_deg", "verdict", "reason", "reason_structure", "reason_depth_mm", "entry_x_mm",
+              "entry_y_mm", "entry_z_mm", "path_length_mm", "skin_angle_deg", "min_clearance_mm", "clearance_bolt_h_mm",
+              "reachable", "cost", "rank"}  # fmt: skip
+    assert wanted <= set(table.column_names)
+    np.testing.assert_allclose(table["theta_deg"].to_numpy(), np.degrees(found.theta))
+    assert table["reachable"].null_count == len(found)
+    assert table["cost"].null_count == (~found.safe).sum()
+    run = json.loads(table.schema.metadata[b"run"])
+    assert run["case"] == "carton-m"
+    assert set(run["inputs"]) == set(carton.case.inputs)
+    assert run["step_deg"] == pytest.approx(2)
+
+
+def test_when_nothing_is_safe_the_closest_miss_is_named(carton, found):
+    """With a margin that nothing keeps, the row with the least lack is found."""
+    structures = tuple(replace(s, margin_mm=60.0) for s in carton.anatomy.structures)
+    anatomy = replace(carton.anatomy, structures=structures)
+    refused = ranked(carton.case, organ_candidates(carton.case, anatomy, carton.engine, _directions(found)))
+    assert not refused.safe.any()
+    row = closest_miss(refused)
+    assert refused.reason[row] == Reason.TOO_CLOSE
+    demanding = ~np.isnan(refused.margins)
+    least = np.where(refused.reason == Reason.TOO_CLOSE, refused.clearance[:, demanding].min(axis=1), -np.inf)
+    assert refused.clearance[row, demanding].min() == least.max()
+
+
+def _directions(found):
+    from planning.entry import Directions
+
+    return Directions(found.theta, found.beta, found.outward_ct)
+
+
+def test_tissue_is_the_length_inside(carton, found, ball):
+    """Through a ball of radius 20 about a point 60 mm away: two radii where the path goes through its centre."""
+    from planning.anatomy import Role, Structure
+
+    organ = Structure("organ", Role.TRAVERSE, 0, ball(20, (0, 0, 60), 5), "")
+    up = np.array([[0, 0, 1.0], [0, 0, 1.0], [0, 0, 1.0], [1.0, 0, 0]])
+    lengths = inside_length(organ, np.zeros(3), up, np.array([100.0, 60, 30, 100]))
+    np.testing.assert_allclose(lengths, [40, 20, 0, 0], atol=0.1)
+    from_inside = inside_length(organ, np.array([0, 0, 60.0]), up[:2], np.array([100.0, 5]))
+    np.testing.assert_allclose(from_inside, [20, 5], atol=0.1)
+
+
+@given(st.lists(st.tuples(*[st.integers(0, 4)] * 3), min_size=1, max_size=40))
+@settings(max_examples=100)
+def test_the_pareto_front_is_what_the_definition_says(rows):
+    """Against the definition, pair by pair."""
+    terms = np.array(rows, float)
+    expected = [not any((other <= row).all() and (other < row).any() for other in terms) for row in terms]
+    np.testing.assert_array_equal(pareto_front(terms), expected)
+
+
+def test_each_term_of_the_cost_says_what_it_should():
+    """Hand-computed terms and cost."""
+    weights = RankingSection(clearance=1, path_length=1, skin_angle=1, tissue=1, reach=1)
+    order = rank(
+        min_clearance=np.array([5.0, 40.0]),
+        path_length=np.array([75.0, 30.0]),
+        skin_angle=np.array([0.5, 0.0]),
+        tissue=np.array([15.0, 0.0]),
+        reach_margin=np.array([0.25, np.nan]),
+        shaft=150.0,
+        max_skin_angle=1.0,
+        weights=weights,
+    )
+    np.testing.assert_allclose(order.terms, [[0.75, 0.5, 0.5, 0.1, 0.75], [0, 0.2, 0, 0, 0]])
+    np.testing.assert_allclose(order.cost, [2.6 / 5, 0.2 / 5])
+    np.testing.assert_array_equal(order.rank, [2, 1])
+    np.testing.assert_array_equal(order.pareto, [False, True])
+
+
+def test_a_batch_row_says_what_happened(tmp_path):
+    """A case that works and one that is refused: a row each, with the command line's exit code."""
+    good = search_one(folder() / "carton" / "case_m.toml", tmp_path, arm=False)
+    assert good["exit_code"] == 0
+    assert good["safe"] > 0
+    assert (tmp_path / "carton-m" / "candidates.parquet").is_file()
+    bad = search_one(tmp_path / "gone.toml", tmp_path, arm=False)
+    assert bad["exit_code"] == 2
+    assert "gone.toml" in bad["said"]
