@@ -1,0 +1,196 @@
+"""A small patient for the tests of what a person looks at: every verdict is known from θ and β alone."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import trimesh
+
+from planning.candidates import Candidates
+from planning.entry import entry_frame, grid, view_frame
+from planning.formats.spaces import Space
+from planning.mesh import TriangleMesh
+from planning.robot.kinematics import flange_pose, inverse
+from planning.robot.ur import ur_model
+from planning.trajectory import Trajectory
+
+TARGET = np.array([10.0, -20.0, 30.0])
+SKIN_RADIUS = 100.0
+STANDOFF = 130.0
+
+
+def make_case(*, space="LPS", frame=None, name="ball"):
+    """A case with a 210 mm needle; the entry frame is the space's own unless said."""
+    rotation = entry_frame(frame, Space(space))
+    needle = SimpleNamespace(
+        length_mm=210.0, shaft_mm=150.0, diameter_mm=1.2, radius_mm=0.6, skin_gap_mm=10.0, holder_diameter_mm=30.0
+    )
+    return SimpleNamespace(
+        name=name,
+        space=Space(space),
+        target_ct=TARGET,
+        target_name="lesion",
+        target_structure="liver",
+        needle=needle,
+        T_ct_entry=view_frame(rotation, TARGET),
+        obstacles=(),
+        inputs={"case.toml": "ab" * 32, "liver.ply": "cd" * 32},
+        robot=SimpleNamespace(model="ur3"),
+        rehearsal=SimpleNamespace(seed=7),
+    )
+
+
+def make_candidates(case, *, step_deg=5.0, theta_deg=(0, 90), beta_deg=(0, 360), safe=True):
+    """β 30-90: ``too_close`` (rib); θ from 70 on: ``too_long``; else safe, clearance growing with θ."""
+    limits = [tuple(np.radians(pair)) for pair in (theta_deg, beta_deg)]
+    ways = grid(*limits, np.radians(step_deg), case.T_ct_entry[:3, :3])
+    theta, beta = np.degrees(ways.theta), np.degrees(ways.beta)
+    n = len(ways)
+    reason = np.full(n, "", dtype="U20")
+    reason[theta > 69.9] = "too_long"
+    reason[(beta > 29.9) & (beta < 90.1)] = "too_close"
+    if not safe:
+        reason[reason == ""] = "skin_angle"
+    good, rib = reason == "", reason == "too_close"
+    rank = np.zeros(n, dtype=np.int32)
+    rank[good] = 1 + np.arange(good.sum())
+    clearance = np.stack([5.0 + theta / 10, np.full(n, 40.0)], axis=1)
+    return Candidates(
+        theta=ways.theta.copy(),
+        beta=ways.beta.copy(),
+        outward_ct=ways.outward_ct.copy(),
+        reason=reason,
+        reason_structure=np.where(rib, "rib_right_9", ""),
+        reason_depth=np.where(rib, 55.5, np.nan),
+        reason_amount=np.where(rib, 0.25, np.nan),
+        reason_detail=np.where(reason == "too_long", "the shaft ends at 150 mm", ""),
+        entry_ct=TARGET + SKIN_RADIUS * ways.outward_ct,
+        path_length=np.full(n, SKIN_RADIUS),
+        skin_angle=np.zeros(n),
+        structures=("rib_right_9", "aorta"),
+        margins=np.array([1.0, 5.0]),
+        clearance=clearance,
+        min_clearance=clearance.min(axis=1),
+        tissue=np.zeros(n),
+        reachable=np.where(good, 1, -1).astype(np.int8),
+        reach_margin=np.where(good, 0.5, np.nan),
+        cost=np.where(good, 0.1 * rank, np.nan),
+        rank=rank,
+        pareto=(rank > 0) & (rank < 4),
+    )
+
+
+def make_anatomy(*, warnings=()):
+    """A round skin about the target, an organ around it, a rib and a vessel."""
+    parts = (
+        ("liver", "target", 0.0, _ball(40, TARGET)),
+        ("rib_right_9", "avoid", 1.0, _ball(8, TARGET + np.array([-70, 0, 0]))),
+        ("aorta", "avoid", 5.0, _ball(10, TARGET + np.array([40, 60, 0]))),
+    )
+    structures = tuple(
+        SimpleNamespace(name=name, role=role, margin_mm=margin, mesh=mesh, closed=True, source=name)
+        for name, role, margin, mesh in parts
+    )
+    skin = SimpleNamespace(mesh=_ball(SKIN_RADIUS, TARGET, 4), cut_faces=np.zeros(0, int), field_of_view=None)
+    return SimpleNamespace(structures=structures, skin=skin, warnings=tuple(warnings))
+
+
+def make_plan(case, candidates):
+    """A motion of a UR3 along the best candidate; the approach is a straight line of joint angles."""
+    outward = candidates.outward_ct[candidates.ranked[0]]
+    T_base_ct = np.eye(4)
+    T_base_ct[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    T_base_ct[:3, 3] = [0.0, 330.0, 50.0] - T_base_ct[:3, :3] @ case.target_ct
+    q = _insertion(case, T_base_ct, outward)
+    home = np.radians([0.0, -90.0, 0.0, -90.0, 0.0, 0.0])
+    share = np.linspace(0, 1, 20)[:, None]
+    row = candidates.ranked[0]
+    return SimpleNamespace(
+        case_name=case.name,
+        inputs=case.inputs,
+        seed=7,
+        model="ur3",
+        T_base_ct=T_base_ct,
+        expected_target_error_mm=1.25,
+        theta=candidates.theta[row],
+        beta=candidates.beta[row],
+        entry_ct=candidates.entry_ct[row],
+        target_ct=case.target_ct,
+        outward_ct=outward,
+        roll=0.0,
+        standoff_mm=STANDOFF,
+        needle_length_mm=case.needle.length_mm,
+        approach=Trajectory(np.linspace(0, 1, 20), home * (1 - share) + q[0] * share),
+        insertion=Trajectory(np.linspace(0, 1, len(q)), q),
+        clearance_mm={"approach": 12.0, "insertion": 9.0, "needle": 5.0},
+    )
+
+
+def _insertion(case, T_base_ct, outward):
+    model = ur_model("ur3")
+    z = -outward
+    x = np.cross(z, [1.0, 0.2, 0.1])
+    x /= np.linalg.norm(x)
+    poses = np.tile(np.eye(4), (30, 1, 1))
+    poses[:, :3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    heights = case.needle.length_mm + np.linspace(STANDOFF, 0, 30)
+    poses[:, :3, 3] = case.target_ct + heights[:, None] * outward
+    solutions = inverse(model, T_base_ct @ poses)
+    for branch in range(solutions.shape[1]):
+        q = np.unwrap(solutions[:, branch], axis=0)
+        if np.isfinite(q).all() and np.abs(np.diff(q, axis=0)).max() < 0.3:
+            return q
+    raise AssertionError("the test's own pose is out of reach")
+
+
+def make_rehearsal(plan, *, shift=(0.6, 0.0, 0.8), total_s=2.0):
+    """The plan executed exactly, with the patient shifted (base frame, mm) from where he was believed."""
+    T_true = plan.T_base_ct.copy()
+    T_true[:3, 3] += shift
+    q = np.concatenate([plan.approach.q, plan.insertion.q])
+    flange = flange_pose(ur_model("ur3"), q)
+    T_ct_flange = np.linalg.inv(T_true) @ flange
+    tip = T_ct_flange[:, :3, 3] + plan.needle_length_mm * T_ct_flange[:, :3, 2]
+    error = tip[-1] - plan.target_ct
+    depth = float(-error @ plan.outward_ct)
+    samples = np.linspace(total_s / 2, total_s, 10)
+    return SimpleNamespace(
+        seed=7,
+        truth_source="a shift",
+        T_base_ct_true=T_true,
+        times_s=np.linspace(0, total_s, len(q)),
+        q=q,
+        q_command=q,
+        phase=np.array(["approach"] * 20 + ["insertion"] * (len(q) - 20)),
+        T_base_flange_true=flange,
+        tip_true_ct=tip,
+        clearance_times_s=samples,
+        clearance_mm={"rib_right_9": np.linspace(30, 5, 10), "aorta": np.full(10, 20.0)},
+        contacts=(SimpleNamespace(time_s=0.5, link="forearm", body="patient", depth_mm=0.4),),
+        max_joint_speed=np.full(6, 0.8),
+        speed_limits=np.full(6, np.pi),
+        tip_error_mm=float(np.linalg.norm(error)),
+        lateral_mm=float(np.linalg.norm(error + depth * plan.outward_ct)),
+        depth_mm=depth,
+        predicted_error_mm=1.25,
+    )
+
+
+def make_registration():
+    """Plain values as the main job hands them over."""
+    return {
+        "method": "rigid",
+        "residual_mm": {"A": 0.31, "B": 0.42, "C": 0.17},
+        "fre_mm": 0.345,
+        "mean_error_mm": 0.333,
+        "fle_mm": 0.5,
+        "fle_source": "stated",
+        "spread_ratio": 0.15,
+        "altitude_mm": 25.0,
+        "leverage": 2.5,
+        "flags": ["markers nearly in one line"],
+    }
+
+
+def _ball(radius, centre, subdivisions=3):
+    mesh = trimesh.creation.icosphere(subdivisions, radius)
+    return TriangleMesh(np.asarray(mesh.vertices) + centre, np.asarray(mesh.faces))

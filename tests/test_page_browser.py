@@ -1,0 +1,237 @@
+"""The page in a headless Chromium, spoken to over its debugging pipe; skipped where none is installed."""
+
+import json
+import os
+import re
+import select
+import shutil
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import report_world as world
+
+from twin.report import write_page
+from twin.report.map_view import map_view
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--enable-unsafe-swiftshader",  # WebGL in software, without the browser's warning about it
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--remote-debugging-pipe",
+    "--window-size=1300,1000",
+)
+
+PATIENCE_S = 120
+"""A slow shared machine needs some ten seconds; beyond this something hangs."""
+
+ONTO_PIPES = """
+import os, sys
+for free, pipe in zip((103, 104), sys.argv[1:3]):
+    os.dup2(int(pipe), free)  # out of the way first: the pipes may themselves be 3 or 4
+os.dup2(103, 3)
+os.dup2(104, 4)
+os.execv(sys.argv[3], sys.argv[3:])
+"""
+"""Chromium reads commands from descriptor 3 and answers on 4."""
+
+
+class Browser:
+    """One page in one browser; collects what the browser reports while commands run."""
+
+    def __init__(self, folder):
+        into, self._write = os.pipe()
+        self._read, out = os.pipe()
+        os.set_inheritable(into, True)
+        os.set_inheritable(out, True)
+        command = [sys.executable, "-c", ONTO_PIPES, str(into), str(out), CHROMIUM, *FLAGS, f"--user-data-dir={folder}"]
+        self._process = subprocess.Popen(command, pass_fds=(into, out), stderr=subprocess.DEVNULL)
+        os.close(into)
+        os.close(out)
+        self._rest, self._number, self._session, self.events = b"", 0, None, []
+
+    def __enter__(self):
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Runtime", "Log", "Network", "Page"):
+            self.call(f"{domain}.enable")
+        return self
+
+    def __exit__(self, *reason):
+        self._process.terminate()
+        self._process.wait(timeout=PATIENCE_S)
+        os.close(self._write)
+        os.close(self._read)
+
+    def call(self, method, **parameters):
+        """Send one command and wait for its answer."""
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": parameters}
+        if self._session:
+            message["sessionId"] = self._session
+        os.write(self._write, json.dumps(message).encode() + b"\0")
+        while (answer := self._next()).get("id") != self._number:
+            self.events.append(answer)
+        assert "error" not in answer, answer
+        return answer["result"]
+
+    def evaluate(self, script):
+        """The value of a JavaScript expression in the page."""
+        result = self.call("Runtime.evaluate", expression=script, returnByValue=True)
+        assert "exceptionDetails" not in result, result
+        return result["result"].get("value")
+
+    def until(self, script):
+        """Wait until an expression is true."""
+        end = time.monotonic() + PATIENCE_S
+        while not self.evaluate(script):
+            assert time.monotonic() < end, f"never true: {script}"
+            time.sleep(0.1)
+
+    def open(self, path):
+        """Load a file and wait for it."""
+        self.call("Page.navigate", url=path.as_uri())
+        while not any(event.get("method") == "Page.loadEventFired" for event in self.events):
+            self.events.append(self._next())
+
+    def _next(self):
+        while b"\0" not in self._rest:
+            assert select.select([self._read], [], [], PATIENCE_S)[0], "the browser does not answer"
+            part = os.read(self._read, 1 << 20)
+            assert part, "the browser ended"
+            self._rest += part
+        message, _, self._rest = self._rest.partition(b"\0")
+        return json.loads(message)
+
+    def complaints(self):
+        """Errors of the console and uncaught exceptions; what a driver says about speed is none."""
+        found = []
+        for event in self.events:
+            parameters = event.get("params", {})
+            if event.get("method") == "Runtime.exceptionThrown":
+                found.append(parameters["exceptionDetails"])
+            if event.get("method") == "Log.entryAdded" and parameters["entry"]["level"] == "error":
+                found.append(parameters["entry"])
+            if event.get("method") == "Runtime.consoleAPICalled" and parameters["type"] in {"error", "assert"}:
+                found.append(parameters["args"])
+        return found
+
+    def requests(self):
+        """Every address that the page asked for, but for data it carries itself."""
+        urls = [e["params"]["request"]["url"] for e in self.events if e.get("method") == "Network.requestWillBeSent"]
+        return [url for url in urls if not url.startswith(("data:", "blob:"))]
+
+
+@pytest.fixture(scope="module")
+def case():
+    """The small patient."""
+    return world.make_case()
+
+
+@pytest.fixture(scope="module")
+def candidates(case):
+    """Its verdicts."""
+    return world.make_candidates(case)
+
+
+@pytest.fixture(scope="module")
+def browser(case, candidates, tmp_path_factory):
+    """A browser that shows its page."""
+    if CHROMIUM is None:
+        pytest.skip("no chromium, chromium-browser or google-chrome on this machine")
+    folder = tmp_path_factory.mktemp("browser")
+    path = folder / "report.html"
+    plan = world.make_plan(case, candidates)
+    registration = world.make_registration()
+    write_page(case, world.make_anatomy(), candidates, plan, world.make_rehearsal(plan), registration, {}, path)
+    with Browser(folder / "profile") as browser:
+        browser.open(path)
+        yield browser
+
+
+def point_at(browser, case, candidates, theta_deg, beta_deg, *, click=False):
+    """Move the pointer to a direction on the map; returns what the page says."""
+    browser.evaluate("document.getElementById('map').scrollIntoView()")
+    box = browser.evaluate("JSON.stringify(document.getElementById('map-image').getBoundingClientRect())")
+    box = json.loads(box)
+    x, y = map_view(case, candidates).place(np.radians(theta_deg), np.radians(beta_deg))
+    at = {"x": box["x"] + (1 + x) / 2 * box["width"], "y": box["y"] + (1 - y) / 2 * box["height"]}
+    browser.call("Input.dispatchMouseEvent", type="mouseMoved", **at)
+    if click:
+        for kind in ("mousePressed", "mouseReleased"):
+            browser.call("Input.dispatchMouseEvent", type=kind, button="left", clickCount=1, **at)
+    return browser.evaluate("document.getElementById('hover').innerText")
+
+
+def test_hover_explains_a_refusal(browser, case, candidates):
+    """Over a rejected cell: angles, verdict, reason with structure, depth and mm."""
+    words = point_at(browser, case, candidates, 40, 60)
+    assert "θ 40°, β 60°" in words
+    assert "rejected" in words and "too_close" in words and "rib right 9" in words
+    assert "55.5 mm from the target" in words and re.search(r"clearance 0\.3 mm", words)
+
+
+def test_hover_shows_what_kept_the_arm(browser, case, candidates):
+    """A reason that comes with a sentence shows it."""
+    assert "the shaft ends at 150 mm" in point_at(browser, case, candidates, 80, 200)
+
+
+def test_hover_shows_a_safe_direction(browser, case, candidates):
+    """Over a safe cell: verdict, rank, clearance with the nearest structure, path."""
+    words = point_at(browser, case, candidates, 40, 220)
+    row = int(
+        np.flatnonzero(np.isclose(candidates.theta, np.radians(40)) & np.isclose(candidates.beta, np.radians(220)))[0]
+    )
+    assert "θ 40°, β 220°" in words
+    assert f"safe, rank {candidates.rank[row]}" in words
+    assert "least clearance 9.0 mm (rib right 9)" in words and "100.0 mm" in words
+
+
+def test_hover_outside_the_cap_says_nothing(browser, case, candidates):
+    """Beyond the rim there is no verdict."""
+    assert point_at(browser, case, candidates, 120, 45) == "Point at the map."
+
+
+def test_the_scene_is_drawn_and_answers_the_map(browser, case, candidates):
+    """The scene holds its meshes; a click on the map draws that direction; the buttons change the arm's pose."""
+    if browser.evaluate("document.getElementById('scene').hidden"):
+        pytest.skip("this browser has no WebGL")
+    browser.until("document.querySelector('#scene canvas') !== null")
+    names = browser.evaluate("document.getElementById('scene').data.map(t => t.name)")
+    assert {"liver", "aorta", "skin", "target", "safe region", "needle", "arm"} <= set(names)
+    point_at(browser, case, candidates, 30, 200, click=True)
+    last = "document.getElementById('scene').data.at(-1)"
+    browser.until(f"{last}.x.length === 2 && {last}.x[0] !== null")
+    line = np.array(browser.evaluate(f"[{last}.x, {last}.y, {last}.z]")).T
+    row = int(
+        np.flatnonzero(np.isclose(candidates.theta, np.radians(30)) & np.isclose(candidates.beta, np.radians(200)))[0]
+    )
+    assert np.allclose(line[0], world.TARGET)
+    assert np.allclose(line[1], world.TARGET + 210 * candidates.outward_ct[row], atol=0.01)
+    browser.evaluate("document.getElementById('pose-standoff').click()")
+    visible = (
+        "document.getElementById('scene').data.filter(t => t.meta && t.meta.pose === '{}').every(t => t.visible === {})"
+    )
+    browser.until(visible.format("standoff", "true"))
+    browser.until(visible.format("target", "false"))
+
+
+def test_the_charts_are_drawn(browser):
+    """Distance and clearance over time stand on the page."""
+    for name in ("distance", "clearance"):
+        browser.until(f"document.querySelector('#chart-{name} svg') !== null")
+
+
+def test_no_error_and_no_request(browser):
+    """After all of the above: nothing on the console, and nothing was asked for but the file itself."""
+    assert browser.complaints() == []
+    assert len(browser.requests()) == 1 and browser.requests()[0].startswith("file://")

@@ -1,0 +1,164 @@
+"""Writing on pictures with Pillow: text with a halo, the body's axes, a scale bar, a legend."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import matplotlib as mpl
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ImageDraw, ImageFont
+
+from twin.report.camera import Camera
+from twin.report.map_view import body_directions
+from twin.report.palette import Rgb
+
+INK: Rgb = (25, 27, 32)
+FAINT: Rgb = (110, 114, 122)
+WHITE: Rgb = (255, 255, 255)
+RED: Rgb = (190, 0, 20)
+
+SHORT_AXIS = 0.45
+"""Axes that appear shorter than this share of their length point at the viewer; their labels would collide."""
+
+SCALE_BARS_MM = (5, 10, 20, 50, 100, 200, 500)
+
+Anchor = Literal["lm", "rm", "mm", "la", "ra", "ma", "lb"]
+
+
+@cache
+def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans as matplotlib ships it, so that no system font is needed."""
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(str(Path(mpl.get_data_path()) / "fonts" / "ttf" / name), size)
+
+
+def write(
+    draw: ImageDraw.ImageDraw,
+    at: tuple[float, float],
+    words: str,
+    *,
+    size: int = 16,
+    bold: bool = False,
+    colour: Rgb = INK,
+    anchor: Anchor = "la",
+    halo: int = 0,
+) -> None:
+    """One line of text; ``halo`` is the width of a white rim in pixels."""
+    draw.text(at, words, fill=colour, font=font(size, bold), anchor=anchor, stroke_width=halo, stroke_fill=WHITE)
+
+
+def width_of(words: str, size: int, bold: bool = False) -> float:
+    """Width of a line of text in pixels."""
+    return float(font(size, bold).getlength(words))
+
+
+def body_axes(
+    draw: ImageDraw.ImageDraw, camera: Camera, space: str, centre: tuple[float, float], length: float, size: int = 15
+) -> None:
+    """A small cross of the body's directions as they lie in this view; the far ends are pale.
+
+    Args:
+        draw: Where to draw.
+        camera: The view.
+        space: The case's space; names the directions.
+        centre: Pixel where the axes cross.
+        length: Pixels of an axis that lies in the picture plane.
+        size: Of the words.
+    """
+    reach = length + 3.1 * size
+    disc = [centre[0] - reach, centre[1] - reach, centre[0] + reach, centre[1] + reach]
+    draw.ellipse(disc, fill=(250, 250, 252), outline=(200, 204, 210))
+    toward = camera.axes[2]
+    taken: list[tuple[float, float, float, float]] = []
+    ends = sorted(body_directions(space).items(), key=lambda item: -float(item[1] @ toward))
+    for name, vector in ends:
+        offset = np.array([vector @ camera.axes[0], -(vector @ camera.axes[1])])
+        shown = float(np.linalg.norm(offset))
+        far = vector @ toward > 0.02
+        colour = FAINT if far else INK
+        end = (centre[0] + length * offset[0], centre[1] + length * offset[1])
+        draw.line([centre, end], fill=colour, width=2 if far else 3)
+        if shown < SHORT_AXIS:
+            continue
+        out = offset / shown
+        at = end[0] + out[0] * 6, end[1] + out[1] * (size * 0.75)
+        short = name.removeprefix("patient's ")
+        anchor: Anchor = "lm" if out[0] > 0.35 else "rm" if out[0] < -0.35 else "mm"
+        for _ in range(4):  # move outward past words that already stand there
+            box = draw.textbbox(at, short, font=font(size, not far), anchor=anchor)
+            if not any(_overlap(box, other) for other in taken):
+                break
+            at = at[0] + out[0] * size * 0.6, at[1] + out[1] * size * 0.6
+        taken.append(box)
+        write(draw, at, short, size=size, bold=not far, colour=colour, anchor=anchor, halo=2)
+
+
+def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def scale_bar(
+    draw: ImageDraw.ImageDraw,
+    camera: Camera,
+    at_ct: NDArray[np.float64],
+    left: float,
+    bottom: float,
+    room: float,
+    note: str = " at the target's depth",
+) -> None:
+    """A bar of a round length, true at the depth of one point (perspective: nearer things look larger).
+
+    Args:
+        draw: Where to draw.
+        camera: The view.
+        at_ct: The point whose depth counts, shape (3,).
+        left: Pixel column where the bar begins.
+        bottom: Pixel row of the bar.
+        room: Greatest length in pixels.
+        note: What follows the length.
+    """
+    depth = float(camera.project(at_ct)[0, 2])
+    per_mm = camera.scale / depth
+    fitting = [mm for mm in SCALE_BARS_MM if mm * per_mm <= room]
+    mm = fitting[-1] if fitting else SCALE_BARS_MM[0]
+    right = left + mm * per_mm
+    draw.line([(left, bottom), (right, bottom)], fill=INK, width=4)
+    for x in (left, right):
+        draw.line([(x, bottom - 6), (x, bottom + 6)], fill=INK, width=2)
+    write(draw, (left, bottom - 22), f"{mm} mm{note}", size=14, halo=2)
+
+
+def legend(
+    draw: ImageDraw.ImageDraw, items: list[tuple[str, Rgb]], left: float, top: float, right: float, size: int = 15
+) -> float:
+    """Colour patches with names, line after line; returns the row below the last line."""
+    x, y, patch = left, top, size
+    for name, colour in items:
+        words = name.replace("_", " ")
+        need = patch + 8 + width_of(words, size) + 22
+        if x + need > right and x > left:
+            x, y = left, y + size + 11
+        draw.rectangle([x, y, x + patch, y + patch], fill=colour, outline=INK)
+        write(draw, (x + patch + 8, y + patch / 2 + 1), words, size=size, anchor="lm")
+        x += need
+    return y + size + 11
+
+
+def panel(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], title: str) -> None:
+    """A frame around a view with its title in the upper left corner."""
+    draw.rectangle(box, outline=(190, 194, 200), width=1)
+    write(draw, (box[0] + 12, box[1] + 10), title, size=16, bold=True, halo=3)
+
+
+def text_block(
+    draw: ImageDraw.ImageDraw, at: tuple[float, float], lines: list[tuple[str, str]], size: int, column: float
+) -> None:
+    """Pairs of label and value below one another; values in bold at a fixed column."""
+    x, y = at
+    for label, value in lines:
+        write(draw, (x, y), label, size=size, colour=FAINT)
+        write(draw, (x + column, y), value, size=size, bold=True)
+        y += round(size * 1.55)

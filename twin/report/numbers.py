@@ -1,0 +1,113 @@
+"""Words and numbers that both the pictures and the page print, said once."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.candidates import Candidates
+from planning.reasons import Reason
+from twin.report.map_view import step_of
+from twin.report.palette import REASON_COLOURS, REASON_WORDS, SAFE, Rgb, reason_of
+
+
+@dataclass(frozen=True)
+class ReasonCount:
+    """One line of the legend.
+
+    Attributes:
+        words: What a person reads.
+        code: The reason's code, "safe" for safe.
+        colour: Its colour.
+        count: How many directions.
+        share: Of the grid's directions, 0..1.
+        solid_angle: Of the searched solid angle, 0..1; the grid is denser near θ = 0, this is not.
+    """
+
+    words: str
+    code: str
+    colour: Rgb
+    count: int
+    share: float
+    solid_angle: float
+
+
+def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
+    """Safe first, then the reasons that occur, most frequent first."""
+    weights = solid_angles(candidates)
+    lines = []
+    for value in np.unique(candidates.reason):
+        here = candidates.reason == value
+        reason = reason_of(str(value))
+        colour = REASON_COLOURS.get(reason, SAFE)
+        share, solid = float(here.mean()), float(weights[here].sum() / weights.sum())
+        count = int(here.sum())
+        lines.append(ReasonCount(REASON_WORDS[reason], reason.value or "safe", colour, count, share, solid))
+    if not candidates.safe.any():
+        lines.append(ReasonCount(REASON_WORDS[Reason.NONE], "safe", SAFE, 0, 0.0, 0.0))
+    return tuple(sorted(lines, key=lambda line: (line.code != "safe", -line.count)))
+
+
+def solid_angles(candidates: Candidates) -> NDArray[np.float64]:
+    """The share of the sphere that each cell of the grid covers, up to a common factor, shape (n,)."""
+    half = step_of(candidates) / 2
+    low, high = np.maximum(candidates.theta - half, 0.0), np.minimum(candidates.theta + half, np.pi)
+    _, ring, sizes = np.unique(np.round(candidates.theta, 7), return_inverse=True, return_counts=True)
+    return np.asarray((np.cos(low) - np.cos(high)) / sizes[ring])
+
+
+def chosen_row(candidates: Candidates) -> int | None:
+    """The row of rank 1, None when nothing is ranked."""
+    ranked = candidates.ranked
+    return int(ranked[0]) if len(ranked) else None
+
+
+def nearest_structure(candidates: Candidates, row: int) -> tuple[str, float]:
+    """The structure with a margin that lies nearest to a candidate's needle, and its clearance in mm."""
+    demanding = np.flatnonzero(np.isfinite(candidates.margins))
+    if len(demanding) == 0:
+        return "", math.nan
+    best = demanding[np.argmin(candidates.clearance[row, demanding])]
+    return candidates.structures[best], float(candidates.clearance[row, best])
+
+
+def needle_words(case: Any) -> str:
+    """The needle in one line."""
+    n = case.needle
+    return f"needle ⌀ {n.diameter_mm:g} mm, shaft {n.shaft_mm:g} mm, tip to flange {n.length_mm:g} mm"
+
+
+def number(value: float, digits: int = 1, unit: str = "") -> str:
+    """A number for people; a dash where there is none."""
+    if not math.isfinite(value):
+        return "–"
+    text = f"{value:.{digits}f}".replace("-", "−")
+    return f"{text} {unit}" if unit else text
+
+
+def percent(share: float) -> str:
+    """A share 0..1 in percent; what is there never reads as zero."""
+    return "<0.1 %" if 0 < share < 0.0005 else f"{100 * share:.1f} %"
+
+
+def arm_words(candidates: Candidates) -> str:
+    """Whether "safe" includes the arm."""
+    if len(candidates) and np.all(candidates.reachable == -1):
+        return "the arm was not asked: “safe” speaks of the needle alone"
+    return "“safe” includes that the arm can hold and drive the needle"
+
+
+def target_words(case: Any) -> str:
+    """The target's name, and the structure that holds it where the two differ."""
+    if case.target_name in {"target", case.target_structure}:
+        return str(case.target_structure)
+    return f"{case.target_name} in {case.target_structure}"
+
+
+def demanding(anatomy: Any) -> frozenset[str]:
+    """The structures that a needle must keep away from; it may be inside the others."""
+    return frozenset(s.name for s in anatomy.structures if str(s.role) in {"avoid", "unknown"})

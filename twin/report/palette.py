@@ -1,0 +1,142 @@
+"""Colours and plain words for what the pictures and the page show.
+
+The reasons' colours follow Okabe and Ito's palette for colour-blind readers ("Color Universal Design", 2008), filled
+up with three dark tones of Paul Tol's ("Colour Schemes", SRON technical note, 2021); none of them is near the greens
+that mean safe.
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.reasons import Reason
+
+Rgb = tuple[int, int, int]
+
+SAFE_LOW: Rgb = (150, 224, 190)
+"""Safe, with the least clearance of the safe region."""
+
+SAFE_HIGH: Rgb = (0, 104, 74)
+"""Safe, with the greatest clearance."""
+
+SAFE: Rgb = (0, 158, 115)
+"""Safe, where no shade is meant: legends, the corridor in 3D."""
+
+CHOSEN: Rgb = (0, 0, 0)
+NEEDLE: Rgb = (20, 20, 24)
+HOLDER: Rgb = (70, 74, 82)
+ARM: Rgb = (173, 183, 196)
+TABLE: Rgb = (120, 110, 98)
+SKIN: Rgb = (226, 176, 148)
+TARGET_POINT: Rgb = (214, 0, 30)
+
+REASON_COLOURS = MappingProxyType(
+    {
+        Reason.NO_SKIN_ENTRY: (221, 221, 221),
+        Reason.REENTERS_SKIN: (240, 228, 66),
+        Reason.TOO_LONG: (86, 180, 233),
+        Reason.SKIN_ANGLE: (230, 159, 0),
+        Reason.TOO_CLOSE: (213, 94, 0),
+        Reason.UNKNOWN_REGION: (110, 110, 110),
+        Reason.UNREACHABLE: (0, 90, 178),
+        Reason.ARM_COLLISION: (204, 121, 167),
+        Reason.INSERTION_BLOCKED: (136, 34, 85),
+        Reason.APPROACH_NOT_FOUND: (51, 34, 136),
+    }
+)
+
+REASON_WORDS = MappingProxyType(
+    {
+        Reason.NONE: "safe",
+        Reason.NO_SKIN_ENTRY: "no skin entry",
+        Reason.REENTERS_SKIN: "leaves and re-enters the skin",
+        Reason.TOO_LONG: "path longer than the needle's shaft",
+        Reason.SKIN_ANGLE: "too oblique at the skin",
+        Reason.TOO_CLOSE: "hits a structure or its margin",
+        Reason.UNKNOWN_REGION: "unknown region (image ends)",
+        Reason.UNREACHABLE: "arm cannot reach the pose",
+        Reason.ARM_COLLISION: "arm would collide",
+        Reason.INSERTION_BLOCKED: "straight insertion not drivable",
+        Reason.APPROACH_NOT_FOUND: "no approach found",
+    }
+)
+
+ORGAN_COLOURS: tuple[Rgb, ...] = (
+    (166, 86, 70),
+    (118, 120, 196),
+    (206, 128, 60),
+    (126, 92, 150),
+    (98, 150, 190),
+    (196, 150, 120),
+    (150, 166, 90),
+    (186, 96, 130),
+    (90, 140, 140),
+    (140, 110, 80),
+)
+"""For organs without a colour of custom, in order of appearance."""
+
+CUSTOM_COLOURS: tuple[tuple[str, Rgb], ...] = (
+    ("lesion", (255, 205, 40)),
+    ("tumor", (255, 205, 40)),
+    ("tumour", (255, 205, 40)),
+    ("aorta", (205, 32, 44)),
+    ("artery", (205, 32, 44)),
+    ("portal", (122, 76, 178)),
+    ("vena", (44, 88, 190)),
+    ("vein", (44, 88, 190)),
+    ("hepatic_v", (44, 88, 190)),
+    ("ureter", (232, 220, 120)),
+    ("rib", (232, 222, 198)),
+    ("vertebra", (226, 214, 188)),
+    ("spine", (226, 214, 188)),
+    ("sacrum", (226, 214, 188)),
+    ("hip", (226, 214, 188)),
+    ("sternum", (232, 222, 198)),
+    ("skull", (232, 222, 198)),
+    ("bone", (232, 222, 198)),
+    ("costal", (214, 214, 200)),
+    ("liver", (150, 70, 56)),
+    ("kidney", (176, 92, 92)),
+    ("spleen", (140, 74, 120)),
+    ("stomach", (222, 150, 130)),
+    ("colon", (196, 146, 90)),
+    ("bowel", (206, 160, 110)),
+    ("duodenum", (206, 160, 110)),
+    ("gallbladder", (92, 150, 70)),
+    ("pancreas", (222, 184, 96)),
+    ("lung", (226, 160, 176)),
+    ("heart", (190, 60, 70)),
+)
+"""What books of anatomy use: part of a structure's name, colour; the first match counts."""
+
+
+def reason_of(value: str) -> Reason:
+    """The reason behind a value of ``Candidates.reason``."""
+    return Reason(value)
+
+
+def organ_colours(names: tuple[str, ...]) -> dict[str, Rgb]:
+    """One colour for each structure name; by custom where there is one, else by turn."""
+    colours: dict[str, Rgb] = {}
+    spare = 0
+    for name in names:
+        custom = next((colour for part, colour in CUSTOM_COLOURS if part in name.lower()), None)
+        if custom is None:
+            custom = ORGAN_COLOURS[spare % len(ORGAN_COLOURS)]
+            spare += 1
+        colours[name] = custom
+    return colours
+
+
+def safe_shades(share: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Greens for a share 0..1 of the clearance range, shape (n,) to (n, 3)."""
+    share = np.clip(np.nan_to_num(share, nan=0.0), 0.0, 1.0)[..., None]
+    return np.round(np.array(SAFE_LOW) * (1 - share) + np.array(SAFE_HIGH) * share).astype(np.uint8)
+
+
+def css(colour: Rgb) -> str:
+    """The colour as ``#rrggbb``."""
+    return "#{:02x}{:02x}{:02x}".format(*colour)
