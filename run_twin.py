@@ -1,0 +1,178 @@
+"""The command line: parses, calls, prints.
+
+Exit codes: 0 done, 1 done and the answer is no, 2 bad input, 3 the program failed.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import traceback
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from typer._click.exceptions import ClickException  # typer carries its own click and re-exports no base class
+
+from meshes import folder as meshes_folder
+from planning.batch import run_batch
+from planning.errors import InputError, NoAnswerError, PlanningError
+from planning.prepared import prepare
+from twin import main_job
+from twin.ct.chen2019 import reproduce as reproduce_chen2019
+from twin.report import words
+from twin.report.progress import ProgressDisplay
+
+OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED = 0, 1, 2, 3
+
+app = typer.Typer(add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False)
+out = Console(soft_wrap=True)
+
+CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case file, or the folder that holds case.toml.")]
+OutOption = Annotated[Path, typer.Option("--out", help="Folder for the files that are written.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, and nothing else there.")]
+ArmOption = Annotated[bool, typer.Option("--arm/--no-arm", help="Whether the arm must be able to hold a candidate.")]
+
+
+@app.callback(invoke_without_command=True)
+def _without_command(context: typer.Context) -> None:
+    """Plan a needle puncture and rehearse it. Research software, not a medical device."""
+    if context.invoked_subcommand is None:
+        demo()
+
+
+@app.command()
+def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> None:
+    """The main job on the embedded abdomen: search, plan, rehearse, report."""
+    _rehearse(meshes_folder() / "abdomen", out_dir, as_json)
+
+
+@app.command()
+def search(
+    case: CaseArgument, out_dir: OutOption = Path("out"), arm: ArmOption = True, as_json: JsonOption = False
+) -> None:
+    """Judge every entry direction of a case; write the table, the map and the page."""
+    with ProgressDisplay() as progress:
+        run = main_job.search_case(prepare(case, arm=arm, watcher=progress), out_dir)
+    _print(run.summary(), words.search_text(run), as_json)
+    if not run.candidates.safe.any():
+        raise typer.Exit(ANSWER_IS_NO)
+
+
+@app.command()
+def check(
+    case: CaseArgument,
+    theta: Annotated[float, typer.Option("--theta", min=0, max=180, help="Puncture angle, degrees.")],
+    beta: Annotated[float, typer.Option("--beta", min=0, max=360, help="Azimuth, degrees.")],
+    arm: ArmOption = True,
+    as_json: JsonOption = False,
+) -> None:
+    """Explain one candidate in full."""
+    with ProgressDisplay() as progress:
+        explained = main_job.check_candidate(prepare(case, arm=arm, watcher=progress), theta, beta)
+    _print(explained.summary(), explained.text(), as_json)
+    if not explained.safe:
+        raise typer.Exit(ANSWER_IS_NO)
+
+
+@app.command()
+def plan(case: CaseArgument, out_dir: OutOption = Path("out"), as_json: JsonOption = False) -> None:
+    """Search, choose the best candidate that the arm can come to, and write plan.json."""
+    with ProgressDisplay() as progress:
+        run = main_job.plan_case(prepare(case, watcher=progress), out_dir)
+    _print(run.summary(), words.plan_text(run), as_json)
+
+
+@app.command()
+def rehearse(
+    source: Annotated[Path, typer.Argument(metavar="CASE_OR_PLAN", help="A case, or a plan.json beside --case.")],
+    case: Annotated[Path | None, typer.Option("--case", help="The case of a plan.json.")] = None,
+    out_dir: OutOption = Path("out"),
+    as_json: JsonOption = False,
+) -> None:
+    """Execute a plan in the twin, where the truth differs from the belief, and say where the tip ended."""
+    if source.suffix == ".json":
+        if case is None:
+            raise InputError("a plan needs its case", where=source, allowed="rehearse plan.json --case CASE")
+        _rehearse(case, out_dir, as_json, plan_path=source)
+    else:
+        _rehearse(source, out_dir, as_json)
+
+
+@app.command()
+def register(case: CaseArgument, as_json: JsonOption = False) -> None:
+    """Register a case's markers; print residuals, FRE, expected TRE and weak points."""
+    report = main_job.registration_report(case)
+    _print(report, words.registration_text(report), as_json)
+
+
+@app.command()
+def batch(
+    cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case files or folders.")],
+    out_dir: OutOption = Path("out/batch"),
+    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Processes.")] = 1,
+    arm: ArmOption = True,
+    as_json: JsonOption = False,
+) -> None:
+    """Search many cases; one that fails does not stop the others."""
+    with ProgressDisplay() as progress:
+        rows = run_batch(cases, out_dir, jobs=jobs, arm=arm, watcher=progress)
+    _print({"cases": rows}, words.batch_text(rows), as_json)
+    if any(row["exit_code"] == BAD_INPUT for row in rows):
+        raise typer.Exit(BAD_INPUT)
+    if any(row["exit_code"] == ANSWER_IS_NO for row in rows):
+        raise typer.Exit(ANSWER_IS_NO)
+
+
+@app.command()
+def reproduce(
+    paper: Annotated[str, typer.Argument(metavar="chen2019", help="Which paper.")], as_json: JsonOption = False
+) -> None:
+    """Print a paper's numbers beside ours; exit 0 only if every one holds."""
+    if paper != "chen2019":
+        raise InputError(f"paper '{paper}' is not known", where="reproduce", allowed="chen2019")
+    result = reproduce_chen2019()
+    _print(words.reproduction_summary(result), words.reproduction_text(result), as_json)
+    if not result.holds:
+        raise typer.Exit(ANSWER_IS_NO)
+
+
+def _rehearse(case: Path, out_dir: Path, as_json: bool, plan_path: Path | None = None) -> None:
+    with ProgressDisplay() as progress:
+        run = main_job.rehearse_case(prepare(case, watcher=progress), out_dir, plan_path=plan_path)
+    _print(run.summary(), words.rehearsal_text(run), as_json)
+
+
+def _print(summary: dict[str, Any], text: str, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(summary, allow_nan=False))
+    else:
+        out.print(text, highlight=False, markup=False)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command; returns the exit code."""
+    try:
+        result = app(arguments, standalone_mode=False)
+    except InputError as error:
+        return _fail(str(error), BAD_INPUT)
+    except NoAnswerError as error:
+        return _fail(str(error), ANSWER_IS_NO)
+    except ClickException as error:
+        return _fail(f"command line: {error.format_message()}; allowed: see --help", BAD_INPUT)
+    except PlanningError as error:
+        return _fail(str(error), PROGRAM_FAILED)
+    except Exception:  # the last line of defence: the user gets exit code 3 and the traceback, whatever broke
+        traceback.print_exc()
+        return PROGRAM_FAILED
+    return int(result or OK)
+
+
+def _fail(line: str, code: int) -> int:
+    print(line, file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,385 @@
+"""Bad input through the command line: exit code 2, one line (what, where, what is allowed), nothing written."""
+
+import gzip
+import json
+import struct
+
+import numpy as np
+import pytest
+import SimpleITK
+import trimesh
+
+from run_twin import BAD_INPUT, main
+
+CASE = """
+schema = 1
+name = "bad"
+space = "LPS"
+[target]
+position_mm = [0.0, 0.0, 0.0]
+structure = "organ"
+[needle]
+length_mm = 210.0
+shaft_mm = 150.0
+diameter_mm = 1.2
+[search]
+theta_deg = [0, 10]
+step_deg = 10.0
+[[structure]]
+name = "skin"
+mesh = "skin.stl"
+unit = "mm"
+role = "skin"
+[[structure]]
+name = "organ"
+mesh = "organ.stl"
+unit = "mm"
+role = "target"
+[[structure]]
+name = "rib"
+mesh = "rib.stl"
+unit = "mm"
+role = "avoid"
+[[structure]]
+name = "vessel"
+labelmap = "labels.nii.gz"
+label = 3
+role = "avoid"
+[registration]
+markers_ct = "markers_ct.csv"
+markers_base = "touch.csv"
+"""
+
+MARKERS = "name,x_mm,y_mm,z_mm\nA,0,0,80\nB,50,0,75\nC,0,60,70\nD,-40,-30,72\n"
+
+
+SPREAD_MARKERS = "name,x_mm,y_mm,z_mm\nA,0,0,80\nB,50,0,20\nC,0,60,70\nD,-40,-30,-10\n"
+
+
+def ball(path, radius=10.0, center=(0, 0, 0)):
+    """A closed sphere on disk."""
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+    mesh.apply_translation(center)
+    mesh.export(path)
+
+
+def flat(path):
+    """A triangle without area."""
+    trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False).export(path)
+
+
+def inflated(path):
+    """The content of a gzip file."""
+    return gzip.decompress(path.read_bytes())
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A case in which everything is right."""
+    here = tmp_path / "case"
+    here.mkdir()
+    (here / "case.toml").write_text(CASE)
+    ball(here / "skin.stl", 90)
+    ball(here / "organ.stl", 20)
+    ball(here / "rib.stl", 5, (40, 0, 40))
+    labels = np.zeros((20, 20, 20), np.uint8)
+    labels[2:4, 2:4, 2:18] = 3
+    image = SimpleITK.GetImageFromArray(labels)
+    image.SetSpacing((2.0, 2.0, 2.0))
+    image.SetOrigin((30.0, 30.0, -20.0))
+    SimpleITK.WriteImage(image, here / "labels.nii.gz")
+    SimpleITK.WriteImage(image, here / "labels.nrrd", useCompression=False)
+    (here / "markers_ct.csv").write_text(MARKERS)
+    (here / "touch.csv").write_text(MARKERS)
+    return here
+
+
+def refused(arguments, capfd):
+    """Run a command that must be refused; returns its one line."""
+    assert main([str(argument) for argument in arguments]) == BAD_INPUT
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    lines = [line for line in captured.err.splitlines() if line.strip()]
+    assert len(lines) == 1, captured.err
+    assert "allowed: " in lines[0]
+    return lines[0]
+
+
+def test_the_good_case_is_not_refused(folder, tmp_path, capfd):
+    """What the broken ones are made from works: exit code 0, and the table is there."""
+    assert main(["search", str(folder), "--no-arm", "--out", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out" / "candidates.parquet").stat().st_size > 0
+    capfd.readouterr()
+
+
+# Each break gets the folder, and spoils one thing in it.
+
+
+def cut(name, keep):
+    """Keep only the first bytes (or that share of them)."""
+
+    def spoil(folder):
+        data = (folder / name).read_bytes()
+        (folder / name).write_bytes(data[: int(len(data) * keep) if keep < 1 else int(keep)])
+
+    return spoil
+
+
+def overwrite(name, data):
+    """Other content altogether."""
+
+    def spoil(folder):
+        (folder / name).write_bytes(data if isinstance(data, bytes) else data.encode())
+
+    return spoil
+
+
+def patch(name, offset, data):
+    """Other bytes at one place."""
+
+    def spoil(folder):
+        content = bytearray((folder / name).read_bytes())
+        content[offset : offset + len(data)] = data
+        (folder / name).write_bytes(content)
+
+    return spoil
+
+
+def patch_gz(name, offset, data):
+    """Other bytes at one place of the inflated content."""
+
+    def spoil(folder):
+        content = bytearray(gzip.decompress((folder / name).read_bytes()))
+        content[offset : offset + len(data)] = data
+        (folder / name).write_bytes(gzip.compress(bytes(content)))
+
+    return spoil
+
+
+def replace(name, old, new):
+    """Other text in one place."""
+
+    def spoil(folder):
+        text = (folder / name).read_text()
+        assert old in text
+        (folder / name).write_text(text.replace(old, new, 1))
+
+    return spoil
+
+
+def mesh_file(name, data):
+    """A mesh of another kind in place of the rib."""
+
+    def spoil(folder):
+        (folder / name).write_bytes(data if isinstance(data, bytes) else data.encode())
+        replace("case.toml", "rib.stl", name)(folder)
+
+    return spoil
+
+
+def label_file(name, spoiled=None):
+    """A label map of another name in place of the vessel's, spoiled or not."""
+
+    def spoil(folder):
+        if spoiled is not None:
+            spoiled(folder)
+        replace("case.toml", "labels.nii.gz", name)(folder)
+
+    return spoil
+
+
+def header_line(old, new):
+    """Another line in the NRRD header, which is text at the file's head."""
+
+    def spoil(folder):
+        content = (folder / "labels.nrrd").read_bytes()
+        assert old in content
+        (folder / "labels.nrrd").write_bytes(content.replace(old, new, 1))
+
+    return label_file("labels.nrrd", spoil)
+
+
+OBJ = "v 0 0 0\nv 10 0 0\nv 0 10 0\nv 0 0 10\nf 1 2 3\nf 1 2 4\n"
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n10 0 0\n0 10 0\n3 0 1 2\n"
+)
+STL_TEXT = "solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 10 0 0\nvertex 0 10 0\nendloop\nendfacet\n"
+NAN = struct.pack("<f", float("nan"))
+
+BREAKS = {
+    # the case file
+    "case: not TOML": (overwrite("case.toml", b"\x89PNG\r\n"), "case.toml: is not TOML"),
+    "case: empty": (overwrite("case.toml", ""), "case.toml"),
+    "case: unknown key": (replace("case.toml", "shaft_mm", "shaft"), "unknown key 'shaft'"),
+    "case: metres": (replace("case.toml", "length_mm = 210.0", "length_mm = 0.21"), "needle.length_mm"),
+    "case: unknown space": (replace("case.toml", '"LPS"', '"XYZ"'), "space"),
+    "case: unknown unit": (replace("case.toml", '"mm"\nrole = "skin"', '"inch"\nrole = "skin"'), "inch"),
+    "case: missing mesh": (replace("case.toml", "rib.stl", "gone.stl"), "gone.stl"),
+    "case: missing marker file": (replace("case.toml", '"touch.csv"', '"gone.csv"'), "gone.csv"),
+    "case: label that is not there": (replace("case.toml", "label = 3", "label = 4"), "4"),
+    "case: target structure that is not there": (replace("case.toml", '"organ"', '"orgn"'), "orgn"),
+    "case: unknown arm": (replace("case.toml", "[registration]", '[robot]\nmodel = "ur99"\n[registration]'), "ur99"),
+    "case: affine": (replace("case.toml", "[registration]", '[registration]\nmethod = "affine"'), "affine"),
+    # the target
+    "target outside the skin": (replace("case.toml", "[0.0, 0.0, 0.0]", "[0.0, 0.0, 300.0]"), "outside the skin"),
+    "target outside its structure": (
+        replace("case.toml", "[0.0, 0.0, 0.0]", "[0.0, 0.0, 50.0]"),
+        "outside its structure",
+    ),
+    "target inside an avoid structure": (
+        lambda folder: ball(folder / "rib.stl", 30),
+        "lies inside 'rib', which is to be avoided",
+    ),
+    # meshes
+    "stl: cut in the middle": (cut("rib.stl", 0.5), "rib.stl"),
+    "stl: cut by one byte": (lambda f: cut("rib.stl", (f / "rib.stl").stat().st_size - 1)(f), "rib.stl"),
+    "stl: header only": (cut("rib.stl", 84), "rib.stl"),
+    "stl: false count": (patch("rib.stl", 80, struct.pack("<I", 7)), "rib.stl"),
+    "stl: claims four billion": (patch("rib.stl", 80, struct.pack("<I", 0xFFFFFFFF)), "rib.stl"),
+    "stl: zero triangles": (overwrite("rib.stl", b"\0" * 84), "rib.stl"),
+    "stl: a NaN vertex": (patch("rib.stl", 84 + 12, NAN), "finite"),
+    "stl: an infinite vertex": (patch("rib.stl", 84 + 12, struct.pack("<f", np.inf)), "finite"),
+    "stl: a vertex at 1e30": (patch("rib.stl", 84 + 12, struct.pack("<f", 1e30)), "rib"),
+    "stl: empty file": (overwrite("rib.stl", b""), "rib.stl"),
+    "stl: binary garbage": (overwrite("rib.stl", bytes(range(256)) * 20), "rib.stl"),
+    "stl: text garbage": (overwrite("rib.stl", "not a mesh at all\n" * 50), "rib.stl"),
+    "stl: text without its end": (overwrite("rib.stl", STL_TEXT), "rib.stl"),
+    "stl: a folder": (lambda f: ((f / "rib.stl").unlink(), (f / "rib.stl").mkdir()), "rib.stl"),
+    "stl: in metres": (lambda f: ball(f / "rib.stl", 0.00005, (0.04, 0, 0.04)), "rib"),
+    "stl: no area": (
+        lambda f: trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False).export(f / "rib.stl"),
+        "rib",
+    ),
+    "mesh: unknown kind": (mesh_file("rib.step", "ISO-10303-21;"), "rib.step"),
+    "obj: index out of range": (mesh_file("rib.obj", OBJ + "f 1 2 99\n"), "rib.obj"),
+    "obj: index zero": (mesh_file("rib.obj", OBJ + "f 0 1 2\n"), "rib.obj"),
+    "obj: a NaN vertex": (mesh_file("rib.obj", OBJ.replace("v 10 0 0", "v nan 0 0")), "rib.obj"),
+    "obj: half a line": (mesh_file("rib.obj", OBJ[:-4]), "rib.obj"),
+    "obj: no faces": (mesh_file("rib.obj", "v 0 0 0\nv 1 0 0\n"), "rib.obj"),
+    "ply: fewer faces than promised": (mesh_file("rib.ply", PLY.replace("face 1", "face 5")), "rib.ply"),
+    "ply: index out of range": (mesh_file("rib.ply", PLY.replace("3 0 1 2", "3 0 1 7")), "rib.ply"),
+    "ply: header only": (mesh_file("rib.ply", PLY.split("0 0 0")[0]), "rib.ply"),
+    "glb: false length": (mesh_file("rib.glb", b"glTF" + struct.pack("<II", 2, 99999) + b"\0" * 40), "rib.glb"),
+    "glb: garbage": (mesh_file("rib.glb", b"glTF" + bytes(range(200))), "rib.glb"),
+    "vtp: not XML": (mesh_file("rib.vtp", "<VTKFile"), "rib.vtp"),
+    # label maps
+    "nifti: cut": (cut("labels.nii.gz", 0.6), "labels.nii.gz"),
+    "nifti: cut inside": (
+        label_file(
+            "cut.nii", lambda f: (f / "cut.nii").write_bytes(gzip.decompress((f / "labels.nii.gz").read_bytes())[:-500])
+        ),
+        "cut.nii",
+    ),
+    "nifti: garbage": (overwrite("labels.nii.gz", b"\x1f\x8b" + bytes(500)), "labels.nii.gz"),
+    "nifti: empty": (overwrite("labels.nii.gz", b""), "labels.nii.gz"),
+    "nifti: claims terabytes": (
+        patch_gz("labels.nii.gz", 42, struct.pack("<3h", 32000, 32000, 32000)),
+        "labels.nii.gz",
+    ),
+    "nifti: four dimensions": (patch_gz("labels.nii.gz", 40, struct.pack("<5h", 4, 20, 20, 20, 2)), "labels.nii.gz"),
+    "nifti: a NaN affine": (patch_gz("labels.nii.gz", 280, NAN * 12), "labels.nii.gz"),
+    "nifti: a zero affine": (patch_gz("labels.nii.gz", 280, bytes(48)), "labels.nii.gz"),
+    "nifti: no space said": (patch_gz("labels.nii.gz", 252, bytes(4)), "labels.nii.gz"),
+    "nifti: unknown type": (patch_gz("labels.nii.gz", 70, struct.pack("<h", 9999)), "labels.nii.gz"),
+    "nrrd: another file's data": (
+        header_line(b"encoding: raw", b"encoding: raw\ndata file: /etc/passwd"),
+        "labels.nrrd",
+    ),
+    "nrrd: data outside the folder": (
+        header_line(b"encoding: raw", b"encoding: raw\ndata file: ../touch.raw"),
+        "labels.nrrd",
+    ),
+    "nrrd: cut": (label_file("labels.nrrd", cut("labels.nrrd", 0.7)), "labels.nrrd"),
+    "nrrd: no space": (header_line(b"space: left-posterior-superior\n", b""), "labels.nrrd"),
+    "nrrd: sizes of terabytes": (header_line(b"sizes: 20 20 20", b"sizes: 99999 99999 99999"), "labels.nrrd"),
+    "label map: unknown kind": (label_file("labels.dcm", overwrite("labels.dcm", b"DICM")), "labels.dcm"),
+    # markers
+    "markers: empty": (overwrite("touch.csv", ""), "touch.csv"),
+    "markers: other columns": (replace("touch.csv", "x_mm,y_mm", "x,y"), "touch.csv"),
+    "markers: in metres": (replace("touch.csv", "x_mm,y_mm,z_mm", "x_m,y_m,z_m"), "slip"),
+    "markers: not a number": (replace("touch.csv", "B,50", "B,5O"), "touch.csv"),
+    "markers: NaN": (replace("touch.csv", "B,50", "B,nan"), "touch.csv"),
+    "markers: a name twice": (replace("touch.csv", "B,50", "A,50"), "A"),
+    "markers: a name missing": (replace("touch.csv", "B,50", "Z,50"), "missing on the"),
+    "markers: too few": (
+        lambda f: [overwrite(n, MARKERS[:39])(f) for n in ("touch.csv", "markers_ct.csv")],
+        "2 markers",
+    ),
+    "markers: swapped": (
+        overwrite("touch.csv", MARKERS.replace("A,", "X,").replace("B,", "A,").replace("X,", "B,")),
+        "swapped",
+    ),
+    "markers: mirrored": (
+        lambda f: [
+            overwrite("markers_ct.csv", SPREAD_MARKERS)(f),
+            overwrite("touch.csv", SPREAD_MARKERS.replace("50,0", "-50,0").replace("-40", "40"))(f),
+        ],
+        "mirrored",
+    ),
+    "markers: binary": (overwrite("touch.csv", b"\xff\xfe\x00\x01"), "touch.csv"),
+    "markers: unknown space in a markup file": (
+        lambda f: [
+            overwrite("touch.mrk.json", json.dumps({"markups": [{"type": "Fiducial", "coordinateSystem": "XYZ"}]}))(f),
+            replace("case.toml", "touch.csv", "touch.mrk.json")(f),
+        ],
+        "touch.mrk.json",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BREAKS)
+def test_a_broken_input_is_refused(name, folder, tmp_path, capfd):
+    """Whatever is broken: exit code 2, one line, no file."""
+    spoil, message = BREAKS[name]
+    spoil(folder)
+    line = refused(["search", folder, "--no-arm", "--out", tmp_path / "out"], capfd)
+    assert message in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_there_are_enough_ways_to_be_wrong():
+    """The list is as long as it must be."""
+    assert len(BREAKS) >= 60
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["check", "CASE", "--theta", "10"], "beta"),
+        (["check", "CASE", "--theta", "190", "--beta", "0"], "theta"),
+        (["check", "CASE", "--theta", "ten", "--beta", "0"], "theta"),
+        (["serach", "CASE"], "serach"),
+        (["search"], "CASE"),
+        (["reproduce", "chen2020"], "chen2020"),
+        (["plan", "CASE"], "where the robot stands"),
+        (["rehearse", "plan.json"], "a plan needs its case"),
+    ],
+)
+def test_a_wrong_command_line_is_refused(arguments, message, folder, capfd):
+    """Missing, misspelled and impossible arguments: the same exit code and form."""
+    text = (folder / "case.toml").read_text()
+    (folder / "case.toml").write_text(text[: text.index("[registration]")])
+    assert message in refused([folder if a == "CASE" else a for a in arguments], capfd)
+
+
+def test_open_and_inverted_meshes_work_with_a_warning(folder, tmp_path, capfd):
+    """Common in real anatomy: judged all the same, and what cannot be known is said."""
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=5)
+    mesh.apply_translation((40, 0, 40))
+    trimesh.Trimesh(mesh.vertices, mesh.faces[5:], process=False).export(folder / "rib.stl")
+    inverted = trimesh.creation.icosphere(subdivisions=2, radius=20)
+    trimesh.Trimesh(inverted.vertices, inverted.faces[:, ::-1], process=False).export(folder / "organ.stl")
+    assert main(["search", str(folder), "--no-arm", "--json", "--out", str(tmp_path / "out")]) == 0
+    warnings = " ".join(json.loads(capfd.readouterr().out)["warnings"])
+    assert "rib" in warnings
+    assert "inside" in warnings
+    assert "organ" in warnings
+
+
+def test_json_is_alone_on_stdout(folder, tmp_path, capfd):
+    """With --json stdout is one object and nothing else."""
+    assert main(["check", str(folder), "--theta", "5", "--beta", "0", "--no-arm", "--json"]) == 0
+    found = json.loads(capfd.readouterr().out)
+    assert found["verdict"] == "safe"
+    assert found["reachable"] is None

@@ -1,0 +1,236 @@
+"""The main job, stage by stage: search, plan, rehearse, and the files that show each."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from planning.candidates import Candidates
+from planning.case import load_case
+from planning.errors import InputError, NoAnswerError
+from planning.explain import Explanation, finite
+from planning.files import atomic
+from planning.placement import load_placement
+from planning.plan import Plan, read_plan, write_plan
+from planning.plan_check import check_plan
+from planning.planner import make_plan
+from planning.prepared import Prepared
+from planning.registration import Registration
+from planning.table import write_table
+from twin.rehearsal import Rehearsal, rehearse
+from twin.report import draw_film, draw_map, draw_scene, write_page
+from twin.truth import draw_truth
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What a command has done so far, and the files that it wrote."""
+
+    prepared: Prepared
+    candidates: Candidates
+    files: tuple[Path, ...]
+    plan: Plan | None = None
+    refusal: str = ""
+    rehearsal: Rehearsal | None = None
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON: mm and degrees."""
+        found = self.candidates
+        return {
+            **self.prepared.provenance(),
+            "directions": len(found),
+            "counts": found.counts(),
+            "best": [candidate_summary(found, int(row)) for row in found.ranked[:10]],
+            "plan": None if self.plan is None else plan_summary(self.plan),
+            "rehearsal": None if self.rehearsal is None else rehearsal_summary(self.rehearsal),
+            "seconds": {stage: round(seconds, 3) for stage, seconds in self.prepared.stages.seconds.items()},
+            "files": [str(path) for path in self.files],
+        }
+
+
+def search_case(prepared: Prepared, out: Path) -> Run:
+    """Search; write ``candidates.parquet``, ``map.png``, ``scene.png`` and ``report.html``."""
+    return _with_pictures(Run(prepared, prepared.search(), ()), out)
+
+
+def plan_case(prepared: Prepared, out: Path) -> Run:
+    """Search and plan; write ``plan.json`` too.
+
+    Raises:
+        InputError: The case does not say where the arm stands.
+        NoAnswerError: No plan; the search's files are written all the same.
+    """
+    if prepared.reach is None:
+        raise InputError(
+            "the case does not say where the robot stands, so nothing can be planned",
+            where=prepared.case.path,
+            allowed="[registration] with markers_ct and markers_base, or [robot.mount]",
+        )
+    run = _planned(Run(prepared, prepared.search(), ()), out)
+    run = _with_pictures(run, out)
+    if run.plan is None:
+        raise NoAnswerError(f"{run.refusal}; see {out / 'report.html'}", counts=run.candidates.counts())
+    return run
+
+
+def rehearse_case(prepared: Prepared, out: Path, *, plan_path: Path | None = None) -> Run:
+    """Plan (or load and check a plan), rehearse it, and write everything.
+
+    Raises:
+        InputError: A plan that does not belong to the case or does not hold any more.
+        NoAnswerError: No plan; the search's files are written all the same.
+    """
+    if plan_path is None:
+        run = _planned(Run(prepared, prepared.search(), ()), out)
+    else:
+        plan = read_plan(plan_path)
+        with prepared.stages.time("plan"):
+            candidates = check_plan(plan, prepared, plan_path)
+        run = Run(prepared, candidates, (), plan)
+    if run.plan is None:
+        _with_pictures(run, out)
+        raise NoAnswerError(f"{run.refusal}; see {out / 'report.html'}", counts=run.candidates.counts())
+    with prepared.stages.time("rehearsal"):
+        truth = draw_truth(prepared.case, run.plan.T_base_ct)
+        rehearsal = rehearse(run.plan, prepared.case, prepared.anatomy, truth)
+    run = replace(run, rehearsal=rehearsal)
+    run = _with(run, _write_json(rehearsal_summary(rehearsal), out / "rehearsal.json"))
+    with prepared.stages.time("film"):
+        film = draw_film(
+            rehearsal,
+            run.plan,
+            prepared.case,
+            prepared.anatomy,
+            out / "rehearsal.mp4",
+            progress=partial(prepared.watcher.count, "film"),
+        )
+    return _with_pictures(_with(run, film), out)
+
+
+def check_candidate(prepared: Prepared, theta_deg: float, beta_deg: float) -> Explanation:
+    """Judge one direction and explain it."""
+    found = prepared.check(np.radians(theta_deg), np.radians(beta_deg))
+    return Explanation(prepared.case, prepared.anatomy, found)
+
+
+def registration_report(path: Path) -> dict[str, Any]:
+    """Everything known about a case's registration, as plain values.
+
+    Raises:
+        InputError: The case has no markers, or they cannot be used.
+    """
+    case = load_case(path)
+    placement = load_placement(case)
+    if placement is None or placement.registration is None:
+        raise InputError("the case has no [registration]", where=case.path, allowed="markers_ct and markers_base")
+    report = registration_summary(placement.registration)
+    pose = case.target_ct + case.needle.shaft_mm * case.T_ct_entry[:3, 2]
+    along = np.linspace(case.target_ct, pose, 4)
+    report["case"] = case.name
+    report["expected_tre_target_mm"] = placement.target_error_mm
+    report["expected_tre_along_shaft_mm"] = placement.registration.expected_tre_mm(along).tolist()
+    return report
+
+
+def registration_summary(registration: Registration) -> dict[str, Any]:
+    """A registration as plain values: mm."""
+    return {
+        "method": registration.method,
+        "T_base_ct": registration.T_base_ct.tolist(),
+        "residual_mm": dict(zip(registration.markers.names, registration.residual_mm.tolist(), strict=True)),
+        "fre_mm": registration.fre_mm,
+        "mean_error_mm": registration.mean_error_mm,
+        "fle_mm": registration.fle_mm,
+        "fle_source": registration.fle_source,
+        "spread_ratio": registration.conditioning.spread_ratio,
+        "altitude_mm": registration.conditioning.altitude_mm,
+        "leverage": registration.conditioning.leverage,
+        "flags": list(registration.conditioning.flags),
+    }
+
+
+def candidate_summary(found: Candidates, row: int) -> dict[str, Any]:
+    """One ranked candidate as plain values: mm and degrees."""
+    return {
+        "rank": int(found.rank[row]),
+        "theta_deg": float(np.degrees(found.theta[row])),
+        "beta_deg": float(np.degrees(found.beta[row])),
+        "cost": finite(found.cost[row]),
+        "min_clearance_mm": finite(found.min_clearance[row]),
+        "path_length_mm": finite(found.path_length[row]),
+        "skin_angle_deg": finite(np.degrees(found.skin_angle[row])),
+        "tissue_mm": finite(found.tissue[row]),
+        "reach_margin": finite(found.reach_margin[row]),
+        "pareto": bool(found.pareto[row]),
+    }
+
+
+def plan_summary(plan: Plan) -> dict[str, Any]:
+    """A plan's main numbers as plain values."""
+    return {
+        "theta_deg": float(np.degrees(plan.theta)),
+        "beta_deg": float(np.degrees(plan.beta)),
+        "entry_ct_mm": plan.entry_ct.tolist(),
+        "standoff_mm": plan.standoff_mm,
+        "expected_target_error_mm": finite(plan.expected_target_error_mm),
+        "approach_s": float(plan.approach.times_s[-1]),
+        "insertion_s": float(plan.insertion.times_s[-1]),
+        "clearance_mm": {phase: finite(value) for phase, value in plan.clearance_mm.items()},
+    }
+
+
+def rehearsal_summary(rehearsal: Rehearsal) -> dict[str, Any]:
+    """A rehearsal's main numbers as plain values."""
+    return {
+        "seed": rehearsal.seed,
+        "tip_error_mm": rehearsal.tip_error_mm,
+        "lateral_mm": rehearsal.lateral_mm,
+        "depth_mm": rehearsal.depth_mm,
+        "predicted_error_mm": finite(rehearsal.predicted_error_mm),
+        "contacts": [f"{c.link} touches {c.body} at {c.time_s:.2f} s" for c in rehearsal.contacts],
+        "least_clearance_mm": {name: float(np.min(values)) for name, values in rehearsal.clearance_mm.items()},
+        "max_joint_speed_deg_s": np.degrees(rehearsal.max_joint_speed).tolist(),
+        "joint_speed_limit_deg_s": np.degrees(rehearsal.speed_limits).tolist(),
+    }
+
+
+def _planned(run: Run, out: Path) -> Run:
+    prepared = run.prepared
+    try:
+        with prepared.stages.time("plan"):
+            plan, candidates = make_plan(prepared, run.candidates, seed=prepared.case.rehearsal.seed)
+    except NoAnswerError as error:
+        return replace(run, refusal=str(error))
+    write_plan(plan, out / "plan.json")
+    return _with(replace(run, plan=plan, candidates=candidates), out / "plan.json")
+
+
+def _with_pictures(run: Run, out: Path) -> Run:
+    """Write the table, the pictures and the page of what is known."""
+    prepared, found = run.prepared, run.candidates
+    case, anatomy = prepared.case, prepared.anatomy
+    with prepared.stages.time("table"):
+        write_table(found, prepared.provenance(), out / "candidates.parquet")
+    with prepared.stages.time("pictures"):
+        draw_map(found, case, out / "map.png")
+        draw_scene(case, anatomy, found, run.plan, out / "scene.png")
+    run = _with(run, out / "candidates.parquet", out / "map.png", out / "scene.png", out / "report.html")
+    registration = prepared.placement.registration if prepared.placement is not None else None
+    shown = None if registration is None else registration_summary(registration)
+    write_page(case, anatomy, found, run.plan, run.rehearsal, shown, dict(prepared.stages.seconds), out / "report.html")
+    return run
+
+
+def _write_json(summary: dict[str, Any], path: Path) -> Path:
+    with atomic(path) as temporary:
+        temporary.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return path
+
+
+def _with(run: Run, *files: Path) -> Run:
+    return replace(run, files=(*run.files, *files))
