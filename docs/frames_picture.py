@@ -6,8 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Ellipse
 
-from planning.entry import entry_frame, outward
-from planning.formats.spaces import Space
+from planning.entry import outward
 
 COLORS = ("#c0392b", "#1e8449", "#1f4e8c")
 THETA, BETA = np.radians(40), np.radians(60)
@@ -62,8 +61,9 @@ def patient_panel(ax):
     ax.add_patch(Ellipse((-0.75, 0.2), 1.1, 1.0, facecolor="#d9a08a", edgecolor="none"))
     ax.add_patch(Ellipse((0, -0.62), 0.5, 0.42, facecolor="#e9e2cf", edgecolor="#b08d6a"))
     ax.plot([-2, 2], [-1.15, -1.15], color="gray", linewidth=5)
-    for x, y, text in ((0, 1.72, "front (anterior)"), (0, -1.36, "back, on the table"), (-2.05, -0.25, "patient's\nright"),
-                       (2.05, -0.25, "patient's\nleft")):  # fmt: skip
+    sides = {"front (anterior)": (0, 1.72), "back, on the table": (0, -1.36)}
+    sides |= {"patient's\nright": (-2.05, -0.25), "patient's\nleft": (2.05, -0.25)}
+    for text, (x, y) in sides.items():
         ax.text(x, y, text, ha="center", va="center", color="gray", weight="bold")
     target = np.array([-0.6, 0.25])
     ax.plot(*target, "o", color="#c0392b")
