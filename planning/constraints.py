@@ -97,7 +97,7 @@ def judge(
     give(Reason.UNKNOWN_REGION, ~np.isnan(paths.unknown_depth), skin, paths.unknown_depth)
     give(Reason.NO_SKIN_ENTRY, np.isnan(length), skin, np.nan)
     give(Reason.REENTERS_SKIN, ~np.isnan(paths.reentry_depth), skin, paths.reentry_depth)
-    give(Reason.TOO_LONG, np.asarray(length > longest_path(needle)), skin, length, length)
+    give(Reason.TOO_LONG, length > longest_path(needle), skin, length, length)
     give(Reason.SKIN_ANGLE, paths.skin_angle > max_skin_angle, skin, length, np.degrees(paths.skin_angle))
     worst = worst_violation(clearances, structures)
     names = np.array([s.name for s in structures] or [""], dtype="U80")[worst]
@@ -106,7 +106,7 @@ def judge(
     if structures:
         broken = clearances.violated.any(axis=1)
         depth, amount = clearances.depth[rows, worst], clearances.clearance[rows, worst]
-        give(Reason.UNKNOWN_REGION, broken & unknown, names, depth, amount)
+        give(Reason.UNKNOWN_REGION, np.asarray(broken & unknown), names, depth, amount)
         give(Reason.TOO_CLOSE, broken, names, depth, amount)
     return verdicts
 

@@ -34,7 +34,8 @@ def _box(obstacle: Obstacle, T_base_ct: Floats) -> Box:
     T = np.eye(4)
     T[:3, 3] = obstacle.center_mm
     T_base_box = T if obstacle.frame == "base" else T_base_ct @ T
-    return Box(obstacle.name, T_base_box, obstacle.size_mm)
+    x, y, z = obstacle.size_mm
+    return Box(obstacle.name, T_base_box, (float(x), float(y), float(z)))
 
 
 def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats) -> CellChecker:

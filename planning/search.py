@@ -118,7 +118,7 @@ def reach_request(case: Case, candidates: Candidates, row: int, T_base_ct: Float
 def with_reach(case: Case, found: Candidates, reach: Reach, progress: Progress | None = None) -> Candidates:
     """Ask the arm for every candidate that the organs allow."""
     rows = np.flatnonzero(found.safe)
-    requests = [reach_request(case, found, row, reach.T_base_ct) for row in rows]
+    requests = [reach_request(case, found, int(row), reach.T_base_ct) for row in rows]
     answers: list[ReachAnswer] = []
     for done, request in enumerate(requests, start=1):
         answers.append(assess_reach(reach.checker, request))
@@ -132,7 +132,7 @@ def with_reach(case: Case, found: Candidates, reach: Reach, progress: Progress |
         if not answer.reachable:
             reason[row], detail[row] = answer.reason.value, answer.detail
             structure[row] = "" if answer.contact is None else "/".join(answer.contact)
-            depth[row] = np.nan if answer.depth_mm is None else reach_depth(case, found, row, answer.depth_mm)
+            depth[row] = np.nan if answer.depth_mm is None else reach_depth(case, found, int(row), answer.depth_mm)
     return replace(
         found,
         reason=reason,

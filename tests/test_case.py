@@ -170,7 +170,7 @@ def test_a_broken_case_is_refused_in_one_line(name, write):
 @pytest.mark.parametrize(
     ("added", "message"),
     [
-        ('[registration]\nmarkers_ct = "a.csv"\nmarkers_base = "b.csv"', "registration.markers_ct: file 'a.csv' is not there"),
+        ('[registration]\nmarkers_ct = "a.csv"\nmarkers_base = "b.csv"', "registration.markers_ct: file 'a.csv'"),
         ('[registration]\nmarkers_ct = "skin.stl"\nmarkers_base = "skin.stl"\n[robot.mount]\nposition_mm=[0,0,0]\n'
          'x_axis=[1,0,0]\nz_axis=[0,0,1]', "both say where the base is"),
         ("[robot.mount]\nposition_mm=[0,0,0]\nx_axis=[0,0,2]\nz_axis=[0,0,1]", "x_axis and z_axis are parallel"),

@@ -60,7 +60,7 @@ def test_clearance_of_a_ball_is_known_by_geometry(ball):
 
 
 def test_a_needle_through_a_structure_is_minus_its_radius(ball):
-    """Where the axis meets the structure the clearance is minus the needle radius, at the depth of the first meeting."""
+    """Where the axis meets the structure the clearance is minus the needle radius, at the first meeting."""
     found = clearances(ball(10, (50, 3, 0), 5), [0, 0, 0], np.array([[1.0, 0, 0]]))
     assert found.clearance[0, 0] == pytest.approx(-0.6)
     assert found.depth[0, 0] == pytest.approx(50 - np.sqrt(100 - 9), abs=0.05)
