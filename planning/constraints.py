@@ -104,9 +104,9 @@ def judge(
     unknown = np.array([s.role is Role.UNKNOWN for s in structures] or [False])[worst]
     rows = np.arange(count)
     if structures:
-        broken = clearances.violated.any(axis=1)
+        broken = np.asarray(clearances.violated.any(axis=1))
         depth, amount = clearances.depth[rows, worst], clearances.clearance[rows, worst]
-        give(Reason.UNKNOWN_REGION, np.asarray(broken & unknown), names, depth, amount)
+        give(Reason.UNKNOWN_REGION, broken & unknown, names, depth, amount)
         give(Reason.TOO_CLOSE, broken, names, depth, amount)
     return verdicts
 
