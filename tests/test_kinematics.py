@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import ur_analytic_ik
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from planning.errors import InputError
@@ -162,6 +162,7 @@ def test_reach_is_missing_exactly_where_no_solution_exists() -> None:
 
 
 @given(q=st.lists(st.floats(-np.pi, np.pi), min_size=6, max_size=6).map(np.array), reference=joints)
+@example(q=np.array([0.0, 0.0, 3.1415926535897927, 0.0, 0.0, 0.0]), reference=np.zeros(6))  # rounds beyond the limit
 @settings(max_examples=60, deadline=None)
 def test_whole_turns_stay_within_limits_and_come_nearest(q: np.ndarray, reference: np.ndarray) -> None:
     """Of all the wrapped solutions the nearest to the reference is the one returned, joint by joint."""

@@ -231,7 +231,7 @@ def nearest_within_limits(model: UrModel, q: Array, q_reference: Array) -> Array
     low, high = model.joint_limits[:, 0], model.joint_limits[:, 1]
     fewest, most = np.ceil((low - q) / turn), np.floor((high - q) / turn)
     turns = np.clip(np.round((q_reference - q) / turn), fewest, most)
-    wrapped = np.where(fewest <= most, q + turn * turns, np.nan)
+    wrapped = np.where(fewest <= most, np.clip(q + turn * turns, low, high), np.nan)  # the sum may round beyond
     wrapped[np.isnan(wrapped).any(axis=-1)] = np.nan
     return wrapped
 
@@ -250,5 +250,5 @@ def wrapped_solutions(model: UrModel, q: Array) -> Array:
     choices = []
     for angle, (low, high) in zip(q, model.joint_limits, strict=True):
         turns = np.arange(math.ceil((low - angle) / turn), math.floor((high - angle) / turn) + 1)
-        choices.append(angle + turn * turns)
+        choices.append(np.clip(angle + turn * turns, low, high))  # the sum may round beyond
     return np.stack(np.meshgrid(*choices, indexing="ij"), axis=-1).reshape(-1, 6)
