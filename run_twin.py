@@ -22,7 +22,7 @@ from planning.prepared import prepare
 from twin import main_job
 from twin.ct.chen2019 import reproduce as reproduce_chen2019
 from twin.report import words
-from twin.report.progress import ProgressDisplay
+from twin.report.progress import progress_display
 
 OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED = 0, 1, 2, 3
 
@@ -53,7 +53,7 @@ def search(
     case: CaseArgument, out_dir: OutOption = Path("out"), arm: ArmOption = True, as_json: JsonOption = False
 ) -> None:
     """Judge every entry direction of a case; write the table, the map and the page."""
-    with ProgressDisplay() as progress:
+    with progress_display() as progress:
         run = main_job.search_case(prepare(case, arm=arm, watcher=progress), out_dir)
     _print(run.summary(), words.search_text(run), as_json)
     if not run.candidates.safe.any():
@@ -69,7 +69,7 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Explain one candidate in full."""
-    with ProgressDisplay() as progress:
+    with progress_display() as progress:
         explained = main_job.check_candidate(prepare(case, arm=arm, watcher=progress), theta, beta)
     _print(explained.summary(), explained.text(), as_json)
     if not explained.safe:
@@ -79,7 +79,7 @@ def check(
 @app.command()
 def plan(case: CaseArgument, out_dir: OutOption = Path("out"), as_json: JsonOption = False) -> None:
     """Search, choose the best candidate that the arm can come to, and write plan.json."""
-    with ProgressDisplay() as progress:
+    with progress_display() as progress:
         run = main_job.plan_case(prepare(case, watcher=progress), out_dir)
     _print(run.summary(), words.plan_text(run), as_json)
 
@@ -116,7 +116,7 @@ def batch(
     as_json: JsonOption = False,
 ) -> None:
     """Search many cases; one that fails does not stop the others."""
-    with ProgressDisplay() as progress:
+    with progress_display() as progress:
         rows = run_batch(cases, out_dir, jobs=jobs, arm=arm, watcher=progress)
     _print({"cases": rows}, words.batch_text(rows), as_json)
     if any(row["exit_code"] == BAD_INPUT for row in rows):
@@ -139,7 +139,7 @@ def reproduce(
 
 
 def _rehearse(case: Path, out_dir: Path, as_json: bool, plan_path: Path | None = None) -> None:
-    with ProgressDisplay() as progress:
+    with progress_display() as progress:
         run = main_job.rehearse_case(prepare(case, watcher=progress), out_dir, plan_path=plan_path)
     _print(run.summary(), words.rehearsal_text(run), as_json)
 

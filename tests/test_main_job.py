@@ -1,0 +1,183 @@
+"""The command line end to end on the carton: every file, every exit code."""
+
+import io
+import json
+import shutil
+
+import pyarrow.parquet as pq
+import pytest
+
+from meshes import folder
+from run_twin import ANSWER_IS_NO, BAD_INPUT, OK, PROGRAM_FAILED, main
+from twin.report.progress import BarDisplay, LineDisplay, progress_display
+
+
+@pytest.fixture(scope="module")
+def carton(tmp_path_factory):
+    """The carton with a grid of 12°."""
+    here = tmp_path_factory.mktemp("carton") / "case"
+    shutil.copytree(folder() / "carton", here)
+    case = here / "case_m.toml"
+    case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 12.0"))
+    return case
+
+
+@pytest.fixture(scope="module")
+def rehearsed(carton, tmp_path_factory):
+    """Rehearsed once: the folder of its files."""
+    out = tmp_path_factory.mktemp("out")
+    assert main(["rehearse", str(carton), "--out", str(out)]) == OK
+    return out
+
+
+def run(capfd, *arguments):
+    """Run with --json; returns the exit code and the one object on stdout."""
+    code = main([*map(str, arguments), "--json"])
+    out = capfd.readouterr().out
+    return code, json.loads(out) if out else None
+
+
+def test_a_rehearsal_writes_every_file(rehearsed):
+    """Table, map, scene, plan, film, numbers and page."""
+    names = {
+        "candidates.parquet",
+        "map.png",
+        "scene.png",
+        "plan.json",
+        "rehearsal.json",
+        "rehearsal.mp4",
+        "report.html",
+    }
+    assert {path.name for path in rehearsed.iterdir()} == names
+    assert all(path.stat().st_size > 0 for path in rehearsed.iterdir())
+
+
+def test_the_carton_errs_like_the_paper(rehearsed):
+    """The truth is where the robot really touched the lesion: 2-3 mm off, as Chen 2019 measured (Table 3: 2.94 mm)."""
+    found = json.loads((rehearsed / "rehearsal.json").read_text())
+    assert found["tip_error_mm"] == pytest.approx(2.94, abs=0.2)
+    assert found["tip_error_mm"] ** 2 == pytest.approx(found["lateral_mm"] ** 2 + found["depth_mm"] ** 2)
+    assert found["contacts"] == []
+    speeds = zip(found["max_joint_speed_deg_s"], found["joint_speed_limit_deg_s"], strict=True)
+    assert all(speed <= limit for speed, limit in speeds)
+
+
+def test_a_written_plan_is_rehearsed_again_with_the_same_result(carton, rehearsed, tmp_path, capfd):
+    """plan.json is checked, executed, and ends where it ended before."""
+    code, again = run(capfd, "rehearse", rehearsed / "plan.json", "--case", carton, "--out", tmp_path)
+    assert code == OK
+    before = json.loads((rehearsed / "rehearsal.json").read_text())
+    assert again["rehearsal"]["tip_error_mm"] == pytest.approx(before["tip_error_mm"], abs=1e-6)
+
+
+def test_a_plan_whose_marker_file_changed_is_refused(carton, rehearsed, tmp_path, capfd):
+    """One touched marker moved by a hundredth: the plan is stale, and nothing is written."""
+    other = tmp_path / "case"
+    shutil.copytree(carton.parent, other)
+    text = (other / "touch.csv").read_text()
+    (other / "touch.csv").write_text(text.replace("417.67", "417.68"))
+    out = tmp_path / "out"
+    assert (
+        main(["rehearse", str(rehearsed / "plan.json"), "--case", str(other / "case_m.toml"), "--out", str(out)])
+        == BAD_INPUT
+    )
+    assert "input 'touch.csv' is not the one" in capfd.readouterr().err
+    assert not out.exists()
+
+
+def test_search_prints_counts_and_writes_the_table(carton, tmp_path, capfd):
+    """The JSON's counts are the table's."""
+    code, found = run(capfd, "search", carton, "--no-arm", "--out", tmp_path)
+    assert code == OK
+    verdicts = pq.read_table(tmp_path / "candidates.parquet")["verdict"].to_pylist()
+    assert found["counts"]["safe"] == verdicts.count("safe")
+    assert found["directions"] == len(verdicts)
+    assert found["plan"] is None
+
+
+def test_nothing_safe_is_exit_code_1_with_the_closest_miss(carton, tmp_path, capfd):
+    """All bolts demand 80 mm: no candidate is safe, and the one that came closest is named with what it lacked."""
+    other = tmp_path / "case"
+    shutil.copytree(carton.parent, other)
+    text = (other / "case_m.toml").read_text()
+    (other / "case_m.toml").write_text(text.replace("margin_mm = 2.0", "margin_mm = 80.0"))
+    assert main(["search", str(other / "case_m.toml"), "--no-arm", "--out", str(tmp_path / "out")]) == ANSWER_IS_NO
+    said = capfd.readouterr().out
+    assert "no candidate is safe; closest came theta" in said
+    assert "too_close (bolt" in said
+    assert (tmp_path / "out" / "map.png").is_file()
+    assert main(["plan", str(other / "case_m.toml"), "--out", str(tmp_path / "plan")]) == ANSWER_IS_NO
+    assert "no plan: no candidate is safe" in capfd.readouterr().err
+    assert not (tmp_path / "plan" / "plan.json").exists()
+
+
+def test_check_explains_a_refusal(carton, capfd):
+    """Exit code 1, the reason with structure, depth and mm, and every constraint."""
+    assert main(["check", str(carton), "--theta", "45", "--beta", "270"]) == ANSWER_IS_NO
+    said = capfd.readouterr().out
+    assert "rejected" in said
+    assert "too_close (bolt_h) at" in said
+    assert "-1.00 mm clearance" in said
+    for line in ("skin entry", "path length", "skin angle", "standoff", "bolt_l", "arm can hold it"):
+        assert line in said
+
+
+def test_reproduce_holds(capfd):
+    """Every number of the paper, exit code 0; another paper is refused."""
+    code, found = run(capfd, "reproduce", "chen2019")
+    assert code == OK
+    assert found["holds"]
+    assert found["out_of_reach"]
+    assert len(found["rows"]) == 24
+
+
+def test_register_reports_residuals_and_expectation(carton, capfd):
+    """Mean error as in Eq. 16, no flag."""
+    code, found = run(capfd, "register", carton)
+    assert code == OK
+    assert found["mean_error_mm"] == pytest.approx(1.43, abs=0.005)
+    assert found["flags"] == []
+    assert len(found["expected_tre_along_shaft_mm"]) == 4
+
+
+def test_batch_goes_on_after_a_bad_case(carton, tmp_path, capfd):
+    """A row each; the exit code says that one was refused."""
+    out = tmp_path / "out"
+    code, found = run(capfd, "batch", carton, tmp_path / "gone.toml", "--no-arm", "--out", out)
+    assert code == BAD_INPUT
+    assert [row["exit_code"] for row in found["cases"]] == [0, 2]
+    assert (out / "carton-m" / "candidates.parquet").is_file()
+    assert len((out / "batch.csv").read_text().splitlines()) == 3
+
+
+def test_a_bug_is_exit_code_3(monkeypatch, capfd):
+    """What nobody foresaw shows its traceback and the third code."""
+    monkeypatch.setattr("run_twin.reproduce_chen2019", lambda: 1 / 0)
+    assert main(["reproduce", "chen2019"]) == PROGRAM_FAILED
+    assert "ZeroDivisionError" in capfd.readouterr().err
+
+
+def test_progress_in_a_log_is_a_line_now_and_then(monkeypatch):
+    """No bars where nobody watches: a line with rate and remaining time, at most every few seconds."""
+    stream = io.StringIO()
+    clock = iter(range(0, 1000, 3))
+    monkeypatch.setattr("twin.report.progress.time.monotonic", lambda: float(next(clock)))
+    display = progress_display(stream)
+    assert isinstance(display, LineDisplay)
+    with display:
+        for done in range(1, 9):
+            display.count("directions", done, 8)
+    lines = stream.getvalue().splitlines()
+    assert 0 < len(lines) <= 8
+    assert all("directions: " in line and "s left" in line for line in lines)
+
+
+def test_progress_on_a_terminal_is_a_bar():
+    """Bars where a person watches."""
+    stream = io.StringIO()
+    stream.isatty = lambda: True
+    with progress_display(stream) as display:
+        assert isinstance(display, BarDisplay)
+        display.step("anatomy", "liver")
+        display.count("directions", 3, 10)
+    assert "directions" in stream.getvalue()
