@@ -19,9 +19,8 @@ from meshes import folder as meshes_folder
 from planning.batch import run_batch
 from planning.errors import InputError, NoAnswerError, PlanningError
 from planning.prepared import prepare
-from twin import main_job
+from twin import main_job, words
 from twin.ct.chen2019 import reproduce as reproduce_chen2019
-from twin.report import words
 from twin.report.progress import progress_display
 
 OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED = 0, 1, 2, 3

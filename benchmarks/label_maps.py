@@ -45,9 +45,7 @@ def main() -> None:
         np.abs(one.clearance[both, one.structures.index(n)] - two.clearance[both, two.structures.index(n)])
         for n in shared
     ]
-    print(
-        f"where both are safe, clearances of {len(shared)} shared structures differ by {np.median(columns):.2f} mm (median)"
-    )
+    print(f"clearances of {len(shared)} shared structures differ by {np.median(columns):.2f} mm in the median")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from twin import chen2019_tables
 from twin.ct import chen2019
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "chen2019"
@@ -34,9 +35,9 @@ def test_a_wrong_number_does_not_hold():
 @pytest.mark.parametrize(
     ("file", "table"),
     [
-        ("markers_ct.csv", chen2019.TABLE_1),
-        ("touch_setup1.csv", chen2019.TABLE_2),
-        ("touch_setup2.csv", chen2019.TABLE_4),
+        ("markers_ct.csv", chen2019_tables.TABLE_1),
+        ("touch_setup1.csv", chen2019_tables.TABLE_2),
+        ("touch_setup2.csv", chen2019_tables.TABLE_4),
     ],
 )
 def test_our_tables_are_the_papers(file, table):

@@ -6,21 +6,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from planning.conditioning import conditioning, leverage
 from planning.errors import InputError
 from planning.formats.points import NamedPoints
 from planning.formats.spaces import Space
 from planning.registration import (
     MarkerPairs,
     apply,
-    conditioning,
     fit_affine,
     fit_rigid,
     fit_triad,
-    leverage,
     match,
     register,
 )
-from twin.ct.chen2019 import TABLE_1, TABLE_2, TABLE_4
+from twin.chen2019_tables import TABLE_1, TABLE_2, TABLE_4
 
 TARGET = np.array([50.0, 130.0, 63.0])
 MARKERS = np.array([TABLE_1[name] for name in "ABCE"], dtype=float)

@@ -9,26 +9,21 @@ and y, and that the bolts are cylinders of 4 mm radius that rise straight from t
 from __future__ import annotations
 
 import itertools
+from types import MappingProxyType
 
 import numpy as np
 
 from planning.mesh import TriangleMesh
+from twin.chen2019_tables import TABLE_1, TABLE_2
 from twin.phantoms.implicit import Array, Field
 
 __all__ = ["LESIONS_CT_MM", "MARKERS_CT_MM", "TOUCHED_BASE_MM", "carton_field", "carton_meshes"]
 
-LESIONS_CT_MM = {"L": (50.0, 150.0, 39.0), "M": (50.0, 130.0, 63.0), "H": (50.0, 120.0, 76.0)}
+LESIONS_CT_MM = MappingProxyType({name: TABLE_1[name] for name in "LMH"})
 """Table 1: the lesions, the middles of the bolts' upper ends."""
-MARKERS_CT_MM = {"A": (10.0, 20.0, 147.0), "B": (110.0, 120.0, 147.0), "C": (60.0, -10.0, 80.0)}
+MARKERS_CT_MM = MappingProxyType({name: TABLE_1[name] for name in "ABC"})
 """Table 1: the markers used in the first setup."""
-TOUCHED_BASE_MM = {
-    "A": (417.67, -291.23, 534.59),
-    "B": (557.74, -272.83, 534.57),
-    "C": (423.48, -231.41, 604.06),
-    "L": (543.02, -336.48, 641.60),
-    "M": (527.05, -324.48, 617.63),
-    "H": (519.10, -318.38, 604.58),
-}
+TOUCHED_BASE_MM = TABLE_2
 """Table 2: markers and lesions touched with the needle tip, in the robot's base frame."""
 BOX_LOW_MM, BOX_HIGH_MM = (-10.0, -10.0, -10.0), (160.0, 210.0, 147.0)
 _BOX_CELLS = (17, 22, 16)
