@@ -10,19 +10,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.cache import NO_CACHE, Cache
 from planning.case import Case
 from planning.case_file import StructureSection, StructuresSection
 from planning.clearance.containment import Side, side_of
 from planning.errors import InputError
 from planning.formats.decimation import squared_distance
-from planning.formats.label_surface import label_mesh
-from planning.formats.labelmaps import LabelMap, read_labelmap
 from planning.formats.meshes import mesh_warnings, read_mesh
 from planning.formats.naming import RuleKind, names_for, select
 from planning.formats.spaces import Space, parse_space, parse_unit
-from planning.formats.volumes import read_volume
 from planning.mesh import TriangleMesh
-from planning.skin import Skin, skin_from_ct, skin_from_label, skin_from_mesh
+from planning.skin import Skin, skin_from_mesh
+from planning.surfaces import VolumeSurfaces
 
 Progress = Callable[[str], None]
 
@@ -85,17 +84,18 @@ class Anatomy:
         raise InputError(f"no structure '{name}'", where="anatomy", allowed=names)
 
 
-def load_anatomy(case: Case, progress: Progress | None = None) -> Anatomy:
+def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO_CACHE) -> Anatomy:
     """Read every structure of a case, and hold the target against them.
 
     Args:
         case: The validated case.
         progress: Called with the name of each structure as it is read.
+        cache: Where surfaces of volumes are kept.
 
     Raises:
         InputError: A file that cannot be trusted, a label that no rule names, or a target that contradicts them.
     """
-    loader = _Loader(case, progress or (lambda _: None))
+    loader = _Loader(case, progress or (lambda _: None), cache)
     skin_section = next(s for s in case.structure if s.role == "skin")
     structures = [loader.one(section) for section in case.structure if section.role != "skin"]
     for section in case.structures:
@@ -110,12 +110,13 @@ def load_anatomy(case: Case, progress: Progress | None = None) -> Anatomy:
 
 
 class _Loader:
-    """Reads the sources of one case, each label map once."""
+    """Reads the sources of one case, each volume at most once."""
 
-    def __init__(self, case: Case, progress: Progress) -> None:
+    def __init__(self, case: Case, progress: Progress, cache: Cache) -> None:
         self._case = case
         self._progress = progress
-        self._maps: dict[str, LabelMap] = {}
+        self._cache = cache
+        self._volumes: dict[str, VolumeSurfaces] = {}
         self.warnings: list[str] = []
 
     def one(self, section: StructureSection) -> Structure:
@@ -129,11 +130,10 @@ class _Loader:
 
     def many(self, section: StructuresSection) -> list[Structure]:
         """All labels of one map that the rules do not ignore."""
-        labelmap = self._map(section.labelmap)
-        names = names_for(section.naming, self._case.folder, labelmap)
+        volume = self._labels(section.labelmap)
         rules = select(
-            names,
-            labelmap.labels_present(),
+            names_for(section.naming, self._case.folder, volume),
+            volume.labels_present(),
             avoid=section.avoid,
             traverse=section.traverse,
             ignore=section.ignore,
@@ -146,18 +146,18 @@ class _Loader:
             if rule.kind is RuleKind.IGNORE:
                 continue
             self._progress(rule.name)
-            mesh = label_mesh(labelmap, rule.label, where=self._file(section.labelmap))
             source = f"{section.labelmap}:{rule.label}"
-            structures.append(Structure(rule.name, Role(rule.kind.value), rule.margin_mm, mesh, source))
+            role = Role(rule.kind.value)
+            structures.append(Structure(rule.name, role, rule.margin_mm, volume.label(rule.label), source))
         return structures
 
     def skin(self, section: StructureSection) -> Skin:
         """The body's surface, from whatever the case names."""
         self._progress(section.name)
         if section.ct is not None:
-            return skin_from_ct(read_volume(self._file(section.ct)))
+            return self._volume(section.ct).skin_of_ct()
         if section.labelmap is not None and section.label is not None:
-            return skin_from_label(self._map(section.labelmap), section.label)
+            return self._labels(section.labelmap).skin_of_label(section.label)
         return skin_from_mesh(self._mesh(section), section.cut)
 
     def _mesh(self, section: StructureSection) -> TriangleMesh:
@@ -171,16 +171,19 @@ class _Loader:
     def _label(self, section: StructureSection) -> TriangleMesh:
         if section.labelmap is None or section.label is None:
             raise InputError(f"'{section.name}' has no source", where=self._case.path, allowed="mesh or labelmap")
-        return label_mesh(self._map(section.labelmap), section.label, where=self._file(section.labelmap))
+        return self._labels(section.labelmap).label(section.label)
 
-    def _map(self, name: str) -> LabelMap:
+    def _labels(self, name: str) -> VolumeSurfaces:
         if self._case.space is Space.LOCAL:
             raise InputError(
                 f'label map {name} in a case of space "local"', where=self._case.path, allowed='space "LPS" or "RAS"'
             )
-        if name not in self._maps:
-            self._maps[name] = read_labelmap(self._file(name))
-        return self._maps[name]
+        return self._volume(name)
+
+    def _volume(self, name: str) -> VolumeSurfaces:
+        if name not in self._volumes:
+            self._volumes[name] = VolumeSurfaces(self._file(name), self._case.inputs[name], self._cache)
+        return self._volumes[name]
 
     def _file(self, name: str) -> Path:
         return self._case.folder / name

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from planning.anatomy import Anatomy, load_anatomy
+from planning.cache import user_cache
 from planning.candidates import Candidates
 from planning.case import Case, load_case
 from planning.clearance.engine import ClearanceEngine
@@ -107,7 +108,7 @@ def prepare(path: Path | str, *, arm: bool = True, watcher: Watcher | None = Non
         case = load_case(path)
         placement = load_placement(case)
     with stages.time("anatomy"):
-        anatomy = load_anatomy(case, partial(watcher.step, "anatomy"))
+        anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), user_cache())
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.structures]
         engine = FclEngine(meshes, partial(watcher.count, "directions"))

@@ -33,3 +33,11 @@ def box():
         return TriangleMesh(mesh.vertices + np.asarray(center), mesh.faces)
 
     return make
+
+
+@pytest.fixture(autouse=True, scope="session")
+def own_cache(tmp_path_factory):
+    """Tests neither see nor fill the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PUNCTURE_TWIN_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield

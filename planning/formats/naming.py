@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Protocol
 
 from planning.errors import InputError
 from planning.formats import totalsegmentator
-from planning.formats.labelmaps import MAX_LABEL, LabelMap
+from planning.formats.labelmaps import MAX_LABEL
 
 BUILT_IN: Mapping[str, Mapping[int, str]] = {
     "totalsegmentator-v1": totalsegmentator.V1,
@@ -66,7 +67,19 @@ class Selection:
     warnings: tuple[str, ...]
 
 
-def names_for(naming: str | None, folder: Path, labelmap: LabelMap) -> dict[int, str]:
+class OwnNames(Protocol):
+    """Whatever may hold names of its own: a label map."""
+
+    @property
+    def path(self) -> Path:
+        """Its file."""
+
+    @property
+    def names(self) -> Mapping[int, str] | None:
+        """Label to name, or None."""
+
+
+def names_for(naming: str | None, folder: Path, labelmap: OwnNames) -> dict[int, str]:
     """The names of labels, by number.
 
     Args:

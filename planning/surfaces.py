@@ -1,0 +1,80 @@
+"""Surfaces made from volumes, kept in the cache: they cost seconds to make and milliseconds to read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from planning.cache import Arrays, Cache
+from planning.formats.label_surface import label_mesh
+from planning.formats.labelmaps import LabelMap, read_labelmap
+from planning.formats.volumes import read_volume
+from planning.mesh import TriangleMesh
+from planning.skin import FieldOfView, Skin, skin_from_ct, skin_from_label
+
+
+@dataclass(frozen=True)
+class VolumeSurfaces:
+    """The surfaces of one label map or CT. The file itself is read only if something is not in the cache.
+
+    Attributes:
+        path: The volume's file.
+        sha256: Of its content.
+        cache: Where surfaces are kept.
+    """
+
+    path: Path
+    sha256: str
+    cache: Cache
+
+    @cached_property
+    def labelmap(self) -> LabelMap:
+        """The label map itself."""
+        return read_labelmap(self.path)
+
+    @property
+    def names(self) -> dict[int, str] | None:
+        """The names that the file holds for its labels."""
+        return self.labelmap.names
+
+    def labels_present(self) -> tuple[int, ...]:
+        """The labels that have a voxel, ascending."""
+        stored = self._arrays("labels present", lambda: {"labels": np.array(self.labelmap.labels_present(), np.int64)})
+        return tuple(int(label) for label in stored["labels"])
+
+    def label(self, label: int) -> TriangleMesh:
+        """The surface of one label, LPS mm."""
+        stored = self._arrays(f"label {label}", lambda: _of_mesh(label_mesh(self.labelmap, label, where=self.path)))
+        return TriangleMesh(stored["vertices"], stored["faces"])
+
+    def skin_of_label(self, label: int) -> Skin:
+        """The skin of a label that is the body."""
+        return _to_skin(self._arrays(f"skin {label}", lambda: _of_skin(skin_from_label(self.labelmap, label))))
+
+    def skin_of_ct(self) -> Skin:
+        """The skin of the body found in a CT."""
+        return _to_skin(self._arrays("skin", lambda: _of_skin(skin_from_ct(read_volume(self.path)))))
+
+    def _arrays(self, what: str, make: Callable[[], Arrays]) -> Arrays:
+        return self.cache.arrays({"file": self.sha256, "what": what}, make)
+
+
+def _of_mesh(mesh: TriangleMesh) -> Arrays:
+    return {"vertices": mesh.vertices, "faces": mesh.faces}
+
+
+def _of_skin(skin: Skin) -> Arrays:
+    view = skin.field_of_view
+    box = {} if view is None else {"T_ct_box": view.T_ct_box, "size_mm": view.size_mm, "cut": view.cut}
+    warnings = np.array(skin.warnings, dtype=np.str_)
+    return {**_of_mesh(skin.mesh), **box, "cut_faces": skin.cut_faces, "warnings": warnings}
+
+
+def _to_skin(stored: Arrays) -> Skin:
+    view = FieldOfView(stored["T_ct_box"], stored["size_mm"], stored["cut"]) if "T_ct_box" in stored else None
+    mesh = TriangleMesh(stored["vertices"], stored["faces"])
+    return Skin(mesh, stored["cut_faces"], view, tuple(str(warning) for warning in stored["warnings"]))
