@@ -31,6 +31,9 @@ out = Console(soft_wrap=True)
 CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case file, or the folder that holds case.toml.")]
 OutOption = Annotated[Path, typer.Option("--out", help="Folder for the files that are written.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, and nothing else there.")]
+PicturesOption = Annotated[
+    bool, typer.Option("--pictures/--no-pictures", help="Whether to draw the map, the scene and the page.")
+]
 ArmOption = Annotated[bool, typer.Option("--arm/--no-arm", help="Whether the arm must be able to hold a candidate.")]
 
 
@@ -49,11 +52,15 @@ def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> 
 
 @app.command()
 def search(
-    case: CaseArgument, out_dir: OutOption = Path("out"), arm: ArmOption = True, as_json: JsonOption = False
+    case: CaseArgument,
+    out_dir: OutOption = Path("out"),
+    arm: ArmOption = True,
+    pictures: PicturesOption = True,
+    as_json: JsonOption = False,
 ) -> None:
-    """Judge every entry direction of a case; write the table, the map and the page."""
+    """Judge every entry direction of a case; write the table, the map, the scene and the page."""
     with progress_display() as progress:
-        run = main_job.search_case(prepare(case, arm=arm, watcher=progress), out_dir)
+        run = main_job.search_case(prepare(case, arm=arm, watcher=progress), out_dir, pictures=pictures)
     _print(run.summary(), words.search_text(run), as_json)
     if not run.candidates.safe.any():
         raise typer.Exit(ANSWER_IS_NO)

@@ -95,6 +95,13 @@ def test_search_prints_counts_and_writes_the_table(carton, tmp_path, capfd):
     assert found["plan"] is None
 
 
+def test_pictures_can_be_left_out(carton, tmp_path, capfd):
+    """The table alone, for those who only want numbers."""
+    assert main(["search", str(carton), "--no-arm", "--no-pictures", "--out", str(tmp_path)]) == OK
+    capfd.readouterr()
+    assert [path.name for path in tmp_path.iterdir()] == ["candidates.parquet"]
+
+
 def test_nothing_safe_is_exit_code_1_with_the_closest_miss(carton, tmp_path, capfd):
     """All bolts demand 80 mm: no candidate is safe, and the one that came closest is named with what it lacked."""
     other = tmp_path / "case"

@@ -53,9 +53,10 @@ class Run:
         }
 
 
-def search_case(prepared: Prepared, out: Path) -> Run:
-    """Search; write ``candidates.parquet``, ``map.png``, ``scene.png`` and ``report.html``."""
-    return _with_pictures(Run(prepared, prepared.search(), ()), out)
+def search_case(prepared: Prepared, out: Path, *, pictures: bool = True) -> Run:
+    """Search; write ``candidates.parquet`` and, if wanted, ``map.png``, ``scene.png`` and ``report.html``."""
+    run = _with_table(Run(prepared, prepared.search(), ()), out)
+    return _with_pictures(run, out) if pictures else run
 
 
 def plan_case(prepared: Prepared, out: Path) -> Run:
@@ -72,7 +73,7 @@ def plan_case(prepared: Prepared, out: Path) -> Run:
             allowed="[registration] with markers_ct and markers_base, or [robot.mount]",
         )
     run = _planned(Run(prepared, prepared.search(), ()), out)
-    run = _with_pictures(run, out)
+    run = _with_pictures(_with_table(run, out), out)
     if run.plan is None:
         raise NoAnswerError(f"{run.refusal}; see {out / 'report.html'}", counts=run.candidates.counts())
     return run
@@ -93,7 +94,7 @@ def rehearse_case(prepared: Prepared, out: Path, *, plan_path: Path | None = Non
             candidates = check_plan(plan, prepared, plan_path)
         run = Run(prepared, candidates, (), plan)
     if run.plan is None:
-        _with_pictures(run, out)
+        _with_pictures(_with_table(run, out), out)
         raise NoAnswerError(f"{run.refusal}; see {out / 'report.html'}", counts=run.candidates.counts())
     with prepared.stages.time("rehearsal"):
         truth = draw_truth(prepared.case, run.plan.T_base_ct)
@@ -109,7 +110,7 @@ def rehearse_case(prepared: Prepared, out: Path, *, plan_path: Path | None = Non
             out / "rehearsal.mp4",
             progress=partial(prepared.watcher.count, "film"),
         )
-    return _with_pictures(_with(run, film), out)
+    return _with_pictures(_with_table(_with(run, film), out), out)
 
 
 def check_candidate(prepared: Prepared, theta_deg: float, beta_deg: float) -> Explanation:
@@ -210,20 +211,27 @@ def _planned(run: Run, out: Path) -> Run:
     return _with(replace(run, plan=plan, candidates=candidates), out / "plan.json")
 
 
+def _with_table(run: Run, out: Path) -> Run:
+    path = out / "candidates.parquet"
+    with run.prepared.stages.time("table"):
+        write_table(run.candidates, run.prepared.provenance(), path)
+    return _with(run, path)
+
+
 def _with_pictures(run: Run, out: Path) -> Run:
-    """Write the table, the pictures and the page of what is known."""
+    """Draw the map, the scene and the page of what is known."""
     prepared, found = run.prepared, run.candidates
-    case, anatomy = prepared.case, prepared.anatomy
-    with prepared.stages.time("table"):
-        write_table(found, prepared.provenance(), out / "candidates.parquet")
-    with prepared.stages.time("pictures"):
+    case, anatomy, stages = prepared.case, prepared.anatomy, prepared.stages
+    with stages.time("map"):
         draw_map(found, case, out / "map.png")
+    with stages.time("scene"):
         draw_scene(case, anatomy, found, run.plan, out / "scene.png")
-    run = _with(run, out / "candidates.parquet", out / "map.png", out / "scene.png", out / "report.html")
     registration = prepared.placement.registration if prepared.placement is not None else None
     shown = None if registration is None else registration_summary(registration)
-    write_page(case, anatomy, found, run.plan, run.rehearsal, shown, dict(prepared.stages.seconds), out / "report.html")
-    return run
+    so_far = dict(stages.seconds)
+    with stages.time("page"):
+        write_page(case, anatomy, found, run.plan, run.rehearsal, shown, so_far, out / "report.html")
+    return _with(run, out / "map.png", out / "scene.png", out / "report.html")
 
 
 def _write_json(summary: dict[str, Any], path: Path) -> Path:
