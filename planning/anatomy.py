@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -20,7 +21,7 @@ from planning.formats.meshes import mesh_warnings, read_mesh
 from planning.formats.naming import RuleKind, names_for, select
 from planning.formats.spaces import Space, parse_space, parse_unit
 from planning.mesh import TriangleMesh
-from planning.skin import Skin, skin_from_mesh
+from planning.skin import Skin, flat_ends, skin_from_mesh
 from planning.surfaces import VolumeSurfaces
 
 Progress = Callable[[str], None]
@@ -158,7 +159,15 @@ class _Loader:
             return self._volume(section.ct).skin_of_ct()
         if section.labelmap is not None and section.label is not None:
             return self._labels(section.labelmap).skin_of_label(section.label)
-        return skin_from_mesh(self._mesh(section), section.cut)
+        mesh = self._mesh(section)
+        ends = () if self._case.space is Space.LOCAL or section.cut is not None else flat_ends(mesh)
+        if ends:
+            raise InputError(
+                f"skin mesh {section.mesh} ends flat at its {', '.join(ends)} side: was the body cut there?",
+                where=self._case.path,
+                allowed=f"cut = {json.dumps(ends)} where no skin is, or cut = [] if all of it is skin",
+            )
+        return skin_from_mesh(mesh, section.cut or ())
 
     def _mesh(self, section: StructureSection) -> TriangleMesh:
         where = f"{self._case.path}: structure '{section.name}'"

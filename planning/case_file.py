@@ -130,7 +130,7 @@ class StructureSection(Section):
     labelmap: str | None = None
     label: Label | None = None
     ct: str | None = None
-    cut: tuple[Literal["right", "left", "front", "back", "feet", "head"], ...] = ()
+    cut: tuple[Literal["right", "left", "front", "back", "feet", "head"], ...] | None = None
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -145,7 +145,7 @@ class StructureSection(Section):
             raise ValueError(f"'{self.name}': unit and space belong to a mesh; a volume says its own")
         if self.ct is not None and self.role != "skin":
             raise ValueError(f"'{self.name}': ct finds the body's skin only; role must be \"skin\"")
-        if self.cut and (self.role != "skin" or self.mesh is None):
+        if self.cut is not None and (self.role != "skin" or self.mesh is None):
             raise ValueError(f"'{self.name}': cut belongs to a skin mesh; a volume shows where it cuts the body")
         if self.margin_mm is not None and self.role not in {"avoid", "unknown"}:
             raise ValueError(f'\'{self.name}\': margin_mm belongs to role "avoid", not "{self.role}"')

@@ -30,6 +30,8 @@ BOX_TOLERANCE_MM = 1e-6
 
 CUT_PLANE_MM = 0.5
 """A triangle this close to the plane of a cut belongs to it: half a voxel of a fine scan."""
+FLAT_END_MM2 = 3000.0
+"""No skin is flat and square to the scanner over such an area; even a belly pressed on a table is rounder."""
 OPEN_AIR_MM = 2000.0
 """Beyond the sides at which a body mesh was not cut there is air, farther than any needle reaches."""
 SIDES: Mapping[str, tuple[int, int]] = MappingProxyType(
@@ -203,6 +205,23 @@ def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
     size = np.where(sides[:, 1], high, high + OPEN_AIR_MM) - T_ct_box[:3, 3]
     view = FieldOfView(T_ct_box, size, sides)
     return Skin(mesh, cut_faces, view, warnings + _cut_warnings(view))
+
+
+def flat_ends(mesh: TriangleMesh) -> tuple[str, ...]:
+    """The sides at which a surface ends in a plane of its bounding box, as a body does that a scan has cut.
+
+    Args:
+        mesh: In LPS mm.
+    """
+    low, high = mesh.bounds
+    corners = mesh.triangles
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    ends = []
+    for name, (axis, end) in SIDES.items():
+        in_plane = np.all(np.abs(corners[:, :, axis] - (low, high)[end][axis]) < CUT_PLANE_MM, axis=1)
+        if areas[in_plane].sum() > FLAT_END_MM2:
+            ends.append(name)
+    return tuple(ends)
 
 
 def _skin(

@@ -231,6 +231,14 @@ BREAKS = {
         lambda folder: ball(folder / "rib.stl", 30),
         "lies inside 'rib', which is to be avoided",
     ),
+    "skin: a flat end that nobody explains": (
+        lambda f: trimesh.creation.box((150, 150, 150)).export(f / "skin.stl"),
+        "ends flat at its right, left, front, back, feet, head side",
+    ),
+    "skin: cut where there is no flat end": (
+        replace("case.toml", 'mesh = "skin.stl"', 'mesh = "skin.stl"\ncut = ["head"]'),
+        "no flat end at its head",
+    ),
     # meshes
     "stl: cut in the middle": (cut("rib.stl", 0.5), "rib.stl"),
     "stl: cut by one byte": (lambda f: cut("rib.stl", (f / "rib.stl").stat().st_size - 1)(f), "rib.stl"),
