@@ -14,6 +14,9 @@ Floats = NDArray[np.float64]
 COMFORT_MM = 20.0
 """Clearance from which on more is no better: several times any registration error that a case should have."""
 
+TIE_DIGITS = 9
+"""Costs that agree to so many digits are equal: rounding must not decide a rank, nor differ between engines."""
+
 TERMS = ("clearance", "path_length", "skin_angle", "tissue", "reach")
 """The cost's terms, in the order of the columns."""
 
@@ -65,7 +68,7 @@ def rank(
     terms = np.clip(np.nan_to_num(terms, nan=1.0), 0, 1)
     factors = np.array([getattr(weights, term) for term in TERMS])
     cost = terms @ factors / max(factors.sum(), np.finfo(float).tiny)
-    order = np.argsort(cost, kind="stable")
+    order = np.argsort(np.round(cost, TIE_DIGITS), kind="stable")
     ranks = np.empty(len(cost), np.int32)
     ranks[order] = np.arange(1, len(cost) + 1)
     return Ranking(terms, cost, ranks, pareto_front(terms))
