@@ -116,11 +116,6 @@ class Case:
         """The folder to which every path of the case is relative."""
         return self.path.parent
 
-    @property
-    def knows_base(self) -> bool:
-        """Whether markers or a mount tie the CT to the robot."""
-        return self.registration is not None or self.robot.T_base_ct_mount is not None
-
 
 def load_case(path: Path | str) -> Case:
     """Read and validate a case file, or a folder that holds ``case.toml``.
@@ -128,9 +123,7 @@ def load_case(path: Path | str) -> Case:
     Raises:
         InputError: Anything unreadable, unknown, missing or contradictory; names the key.
     """
-    path = Path(path)
-    if path.is_dir():
-        path = path / "case.toml"
+    path = _case_path(Path(path))
     content = _validated(_parsed(path), path)
     space = Space(content.space)
     target = _target(content, path, space)
@@ -167,6 +160,22 @@ def load_case(path: Path | str) -> Case:
         rehearsal=content.rehearsal,
         inputs=MappingProxyType(_hashes(content, path)),
     )
+
+
+def _case_path(path: Path) -> Path:
+    """The case file itself, also of a folder.
+
+    Raises:
+        InputError: A name that the system cannot look up, or something that is no plain file.
+    """
+    allowed = "a case file, or a folder that holds case.toml"
+    try:
+        path = path / "case.toml" if path.is_dir() else path
+        if path.exists() and not path.is_file():
+            raise InputError("is no plain file", where=path, allowed=allowed)
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be looked up ({error})", where=str(path)[:80], allowed=allowed) from error
+    return path
 
 
 def _parsed(path: Path) -> dict[str, Any]:

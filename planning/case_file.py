@@ -19,12 +19,21 @@ from pydantic import (
 Number = Annotated[float, Strict(), AllowInfNan(False)]
 Positive = Annotated[Number, Field(gt=0)]
 NotNegative = Annotated[Number, Field(ge=0)]
-Vector = tuple[Number, Number, Number]
-Sextuple = tuple[Number, Number, Number, Number, Number, Number]
+Coordinate = Annotated[Number, Field(ge=-100_000, le=100_000)]
+Length = Annotated[Number, Field(gt=0, le=100_000)]
+Margin = Annotated[Number, Field(ge=0, le=1000)]
+Weight = Annotated[Number, Field(ge=0, le=1000)]
+JointDegrees = Annotated[Number, Field(ge=-360, le=360)]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+Sextuple = tuple[JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=80)]
 Degrees360 = Annotated[Number, Field(ge=0, le=360)]
 Degrees180 = Annotated[Number, Field(ge=0, le=180)]
 Label = Annotated[int, Strict(), Field(ge=1, le=65535)]
+
+
+MAX_DIRECTIONS = 1_000_000
+"""Rows of a search: a hemisphere at 0.2 degrees; 2 GB of table with 60 structures."""
 
 
 class Section(BaseModel):
@@ -97,6 +106,15 @@ class SearchSection(Section):
     frame: Literal["ct", "bed"] | EntryAxes | None = None
 
     @model_validator(mode="after")
+    def _grid_fits(self) -> Self:
+        rows = 1.0
+        for low, high in (self.theta_deg, self.beta_deg):
+            rows *= (high - low) / self.step_deg + 1
+        if rows > MAX_DIRECTIONS:
+            raise ValueError(f"step_deg {self.step_deg:g} makes {rows:,.0f} directions; {MAX_DIRECTIONS:,} at most")
+        return self
+
+    @model_validator(mode="after")
     def _ranges_ascend(self) -> Self:
         for key in ("theta_deg", "beta_deg"):
             low, high = getattr(self, key)
@@ -108,11 +126,18 @@ class SearchSection(Section):
 class RankingSection(Section):
     """Weights of the cost terms; each term lies in 0..1, see planning/ranking.py."""
 
-    clearance: NotNegative = 1.0
-    path_length: NotNegative = 0.5
-    skin_angle: NotNegative = 0.3
-    tissue: NotNegative = 0.5
-    reach: NotNegative = 0.5
+    clearance: Weight = 1.0
+    path_length: Weight = 0.5
+    skin_angle: Weight = 0.3
+    tissue: Weight = 0.5
+    reach: Weight = 0.5
+    safe_cone: Weight = 0.5
+
+    @model_validator(mode="after")
+    def _one_counts(self) -> Self:
+        if not any(getattr(self, name) > 0 for name in type(self).model_fields):
+            raise ValueError("every weight is 0; one at least is above")
+        return self
 
 
 Role = Literal["avoid", "traverse", "target", "skin", "unknown"]
@@ -123,7 +148,7 @@ class StructureSection(Section):
 
     name: Name
     role: Role
-    margin_mm: NotNegative | None = None
+    margin_mm: Margin | None = None
     mesh: str | None = None
     unit: str | None = None
     space: str | None = None
@@ -158,7 +183,7 @@ class StructuresSection(Section):
     labelmap: str
     naming: str | None = None
     target: tuple[str, ...] = ()
-    avoid: dict[str, NotNegative] = Field(default_factory=dict)
+    avoid: dict[str, Margin] = Field(default_factory=dict)
     traverse: tuple[str, ...] = ()
     ignore: tuple[str, ...] = ()
 
@@ -195,13 +220,13 @@ class ObstacleSection(Section):
     name: Name
     frame: Literal["ct", "base"]
     center_mm: Vector
-    size_mm: tuple[Positive, Positive, Positive]
+    size_mm: tuple[Length, Length, Length]
 
 
 class RehearsalSection(Section):
     """What the twin's truth is drawn from; the planner never reads it."""
 
-    seed: Annotated[int, Strict(), Field(ge=0)] = 0
+    seed: Annotated[int, Strict(), Field(ge=0, lt=2**31)] = 0
     truth_base: str | None = None
     fle_ct_mm: NotNegative = 0.5
     fle_touch_mm: NotNegative = 0.1
@@ -209,7 +234,7 @@ class RehearsalSection(Section):
 
 
 def _schema_one(value: Any) -> Any:
-    if value != 1 or isinstance(value, bool):
+    if value != 1 or not isinstance(value, int) or isinstance(value, bool):
         raise ValueError(f"schema {value!r} is not known; this version reads schema = 1")
     return value
 

@@ -39,4 +39,5 @@ class NoAnswerError(PlanningError):
 
 
 def _one_line(text: str) -> str:
-    return " ".join(text.split())
+    words = " ".join(text.split())
+    return "".join(c if c.isprintable() else "?" for c in words)

@@ -44,6 +44,7 @@ class TriangleMesh:
         _, welded = np.unique(keys, return_inverse=True)
         a, b, c = welded[self.faces].T.astype(np.int64)
         proper = (a != b) & (b != c) & (c != a)
+        proper &= _first_of_equals(np.sort(np.stack([a, b, c]), axis=0))  # one that stands twice closes nothing
         ends = np.stack([np.concatenate([a, b, c]), np.concatenate([b, c, a])])[:, np.tile(proper, 3)]
         edges = np.sort(ends.min(axis=0) * len(keys) + ends.max(axis=0))
         starts = np.flatnonzero(np.r_[True, edges[1:] != edges[:-1], True])
@@ -61,3 +62,14 @@ class TriangleMesh:
             T_b_a: Shape (4, 4), maps coordinates of this mesh's frame a to frame b, mm.
         """
         return TriangleMesh(self.vertices @ T_b_a[:3, :3].T + T_b_a[:3, 3], self.faces)
+
+
+def _first_of_equals(columns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which columns (3, m) are the first of those that are equal, shape (m,)."""
+    order = np.lexsort(columns)
+    ordered = columns[:, order]
+    fresh = np.ones(columns.shape[1], bool)
+    fresh[1:] = np.any(ordered[:, 1:] != ordered[:, :-1], axis=0)
+    first = np.empty(len(fresh), bool)
+    first[order] = fresh
+    return first

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,12 +16,19 @@ from planning.anatomy import Anatomy, load_anatomy
 from planning.cache import user_cache
 from planning.candidates import Candidates
 from planning.case import Case, load_case
+from planning.clearance.cross_check import CrossChecked, cross_check
 from planning.clearance.engine import ClearanceEngine
+from planning.clearance.fast_engine import FastEngine
 from planning.clearance.fcl_engine import FclEngine
+from planning.consistency import check_consistency
+from planning.errors import InputError
 from planning.placement import Placement, load_placement
 from planning.room import case_checker
 from planning.search import Reach, case_directions, one_direction, search
 from planning.stages import Stages
+
+ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
+"""Who measures clearance: the fast exact engine, or FCL alone as the plain reference."""
 
 
 class Watcher(Protocol):
@@ -79,6 +88,19 @@ class Prepared:
         directions = one_direction(self.case, theta, beta)
         return search(self.case, self.anatomy, self.engine, directions, reach=self.reach)
 
+    def cross_check(self, count: int) -> CrossChecked:
+        """Measure random directions of the grid again with FCL.
+
+        Raises:
+            CrossCheckError: A distance differs by more than rounding.
+        """
+        with self.stages.time("cross-check"):
+            case, outward = self.case, case_directions(self.case).outward_ct
+            meshes = tuple(structure.mesh for structure in self.anatomy.structures)
+            length, rng = case.needle.length_mm, np.random.default_rng(case.rehearsal.seed)
+            found = self.engine.measure(case.target_ct, outward, length)
+            return cross_check(found, meshes, case.target_ct, outward, length, count=count, rng=rng)
+
     def provenance(self) -> dict[str, Any]:
         """Where a result comes from: case, inputs, version, grid."""
         return {
@@ -91,17 +113,20 @@ class Prepared:
         }
 
 
-def prepare(path: Path | str, *, arm: bool = True, watcher: Watcher | None = None) -> Prepared:
+def prepare(path: Path | str, *, arm: bool = True, engine: str = "fast", watcher: Watcher | None = None) -> Prepared:
     """Read a case and everything that it names.
 
     Args:
         path: Case file, or the folder that holds ``case.toml``.
         arm: Whether the arm is asked too, where the case says where it stands.
+        engine: A name of `ENGINES`.
         watcher: Whoever shows progress.
 
     Raises:
-        InputError: Anything in the case that cannot be used.
+        InputError: Anything in the case that cannot be used, or an unknown engine.
     """
+    if engine not in ENGINES:
+        raise InputError(f"engine '{engine}' is not known", where="--engine", allowed=", ".join(ENGINES))
     watcher = watcher or Silent()
     stages = Stages()
     with stages.time("case"):
@@ -109,10 +134,11 @@ def prepare(path: Path | str, *, arm: bool = True, watcher: Watcher | None = Non
         placement = load_placement(case)
     with stages.time("anatomy"):
         anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), user_cache())
+        anatomy = replace(anatomy, warnings=(*anatomy.warnings, *check_consistency(case, anatomy, placement)))
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.structures]
-        engine = FclEngine(meshes, partial(watcher.count, "directions"))
+        measurer = ENGINES[engine](meshes, partial(watcher.count, "directions"))
         reach = None
         if arm and placement is not None:
             reach = Reach(case_checker(case, anatomy, placement.T_base_ct), placement.T_base_ct)
-    return Prepared(case, anatomy, placement, engine, reach, watcher, stages)
+    return Prepared(case, anatomy, placement, measurer, reach, watcher, stages)

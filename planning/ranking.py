@@ -1,4 +1,4 @@
-"""Which of the safe candidates to prefer: a weighted cost of five terms, and the Pareto front of the same terms."""
+"""Which of the safe candidates to prefer: a weighted cost of six terms, and the Pareto front of the same terms."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ COMFORT_MM = 20.0
 TIE_DIGITS = 9
 """Costs that agree to so many digits are equal: rounding must not decide a rank, nor differ between engines."""
 
-TERMS = ("clearance", "path_length", "skin_angle", "tissue", "reach")
+COMFORT_CONE = np.radians(5.0)
+"""Safe cone from which on more is no better: a hand-held or robotic needle is aimed within a degree or two."""
+
+TERMS = ("clearance", "path_length", "skin_angle", "tissue", "reach", "safe_cone")
 """The cost's terms, in the order of the columns."""
 
 
@@ -26,7 +29,7 @@ class Ranking:
     """The order of n safe candidates.
 
     Attributes:
-        terms: Shape (n, 5), each in 0..1, 0 is best, columns as `TERMS`.
+        terms: Shape (n, 6), each in 0..1, 0 is best, columns as `TERMS`.
         cost: Shape (n,), weighted mean of the terms.
         rank: Shape (n,), 1 is best; equal costs keep their order.
         pareto: Shape (n,), no other candidate is at least as good in every term and better in one.
@@ -45,6 +48,7 @@ def rank(
     skin_angle: Floats,
     tissue: Floats,
     reach_margin: Floats,
+    safe_cone: Floats,
     shaft: float,
     max_skin_angle: float,
     weights: RankingSection,
@@ -53,7 +57,7 @@ def rank(
 
     The terms: 1 - min(clearance, 20 mm)/20 mm to the nearest structure with a margin; path length over usable shaft;
     skin angle over the largest allowed; length through other structures over usable shaft; 1 - reach margin
-    (0 for all where reach was not asked).
+    (0 for all where reach was not asked); 1 - min(safe cone, 5 degrees)/5 degrees (0 for all without a certificate).
     """
     terms = np.stack(
         [
@@ -62,6 +66,7 @@ def rank(
             skin_angle / max_skin_angle,
             tissue / shaft,
             np.where(np.isnan(reach_margin), 0.0, 1 - reach_margin),
+            np.where(np.isnan(safe_cone), 0.0, 1 - np.clip(safe_cone, 0, COMFORT_CONE) / COMFORT_CONE),
         ],
         axis=1,
     )

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.body_mask import BODY_HU, BodyMask, body_mask, filled_slices
+from planning.creases import split_at_creases
 from planning.errors import InputError
 from planning.formats.decimation import decimated
 from planning.formats.label_surface import field_surface
@@ -185,6 +186,7 @@ def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
     Raises:
         InputError: If no triangle lies in the plane where a side was cut.
     """
+    mesh = split_at_creases(mesh)
     warnings = (
         () if mesh.closed else ("the skin mesh is open: what lies inside it, and where it is missing, is not known",)
     )

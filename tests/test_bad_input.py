@@ -63,6 +63,12 @@ def ball(path, radius=10.0, center=(0, 0, 0)):
     mesh.export(path)
 
 
+def opened(path, radius):
+    """A sphere about the target that lacks a few triangles."""
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+    trimesh.Trimesh(mesh.vertices, mesh.faces[5:], process=False).export(path)
+
+
 def flat(path):
     """A triangle without area."""
     trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False).export(path)
@@ -82,11 +88,11 @@ def folder(tmp_path):
     ball(here / "skin.stl", 90)
     ball(here / "organ.stl", 20)
     ball(here / "rib.stl", 5, (40, 0, 40))
-    labels = np.zeros((20, 20, 20), np.uint8)
-    labels[2:4, 2:4, 2:18] = 3
+    labels = np.zeros((100, 100, 100), np.uint8)
+    labels[42:58, 67:69, 67:69] = 3
     image = SimpleITK.GetImageFromArray(labels)
     image.SetSpacing((2.0, 2.0, 2.0))
-    image.SetOrigin((30.0, 30.0, -20.0))
+    image.SetOrigin((-99.0, -99.0, -99.0))
     SimpleITK.WriteImage(image, here / "labels.nii.gz")
     SimpleITK.WriteImage(image, here / "labels.nrrd", useCompression=False)
     (here / "markers_ct.csv").write_text(MARKERS)
@@ -231,6 +237,29 @@ BREAKS = {
         lambda folder: ball(folder / "rib.stl", 30),
         "lies inside 'rib', which is to be avoided",
     ),
+    "an organ beside the body": (lambda f: ball(f / "rib.stl", 5, (400, 0, 40)), "lies wholly outside the skin"),
+    "an open organ around the target": (
+        lambda f: opened(f / "rib.stl", 30),
+        "is an open mesh that goes around the target",
+    ),
+    "label map: ends inside the body": (
+        patch_gz("labels.nii.gz", 80, struct.pack("<3f", 1.0, 1.0, 1.0)),
+        "labels.nii.gz",
+    ),
+    "case: too many directions": (
+        replace("case.toml", "theta_deg = [0, 10]\nstep_deg = 10.0", "step_deg = 0.05"),
+        "directions; 1,000,000 at most",
+    ),
+    "case: a coordinate beyond any room": (replace("case.toml", "[0.0, 0.0, 0.0]", "[1e300, 0, 0]"), "100000"),
+    "case: no weight at all": (
+        replace(
+            "case.toml",
+            "[registration]",
+            "[ranking]\nclearance = 0\npath_length = 0\nskin_angle = 0\ntissue = 0\n"
+            "reach = 0\nsafe_cone = 0\n[registration]",
+        ),
+        "every weight is 0",
+    ),
     "skin: a flat end that nobody explains": (
         lambda f: trimesh.creation.box((150, 150, 150)).export(f / "skin.stl"),
         "ends flat at its right, left, front, back, feet, head side",
@@ -285,7 +314,7 @@ BREAKS = {
         patch_gz("labels.nii.gz", 42, struct.pack("<3h", 32000, 32000, 32000)),
         "labels.nii.gz",
     ),
-    "nifti: four dimensions": (patch_gz("labels.nii.gz", 40, struct.pack("<5h", 4, 20, 20, 20, 2)), "labels.nii.gz"),
+    "nifti: four dimensions": (patch_gz("labels.nii.gz", 40, struct.pack("<5h", 4, 100, 100, 100, 2)), "labels.nii.gz"),
     "nifti: a NaN affine": (patch_gz("labels.nii.gz", 280, NAN * 12), "labels.nii.gz"),
     "nifti: a zero affine": (patch_gz("labels.nii.gz", 280, bytes(48)), "labels.nii.gz"),
     "nifti: no space said": (patch_gz("labels.nii.gz", 252, bytes(4)), "labels.nii.gz"),
@@ -300,7 +329,7 @@ BREAKS = {
     ),
     "nrrd: cut": (label_file("labels.nrrd", cut("labels.nrrd", 0.7)), "labels.nrrd"),
     "nrrd: no space": (header_line(b"space: left-posterior-superior\n", b""), "labels.nrrd"),
-    "nrrd: sizes of terabytes": (header_line(b"sizes: 20 20 20", b"sizes: 99999 99999 99999"), "labels.nrrd"),
+    "nrrd: sizes of terabytes": (header_line(b"sizes: 100 100 100", b"sizes: 99999 99999 99999"), "labels.nrrd"),
     "label map: unknown kind": (label_file("labels.dcm", overwrite("labels.dcm", b"DICM")), "labels.dcm"),
     # markers
     "markers: empty": (overwrite("touch.csv", ""), "touch.csv"),

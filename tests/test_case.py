@@ -64,7 +64,7 @@ def test_a_good_case_is_read(write):
     assert case.needle.radius_mm == 0.6
     assert case.inputs["organ.stl"] == hashlib.sha256(b"organ.stl").hexdigest()
     assert set(case.inputs) == {"case.toml", "skin.stl", "organ.stl"}
-    assert not case.knows_base
+    assert case.registration is None
 
 
 def test_a_folder_stands_for_its_case_file(write):

@@ -63,6 +63,41 @@ def test_skin_angle_on_a_ball(ball):
     assert np.degrees(shifted.skin_angle[0]) == pytest.approx(np.degrees(np.arcsin(0.6)), abs=0.5)
 
 
+@pytest.mark.parametrize("welded", [True, False])
+def test_skin_angle_does_not_blend_over_an_edge(box, welded):
+    """On a box the angle is to the face that is crossed, however the file stores its corners."""
+    mesh = box([200, 200, 100])
+    if not welded:
+        mesh = TriangleMesh(mesh.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3))
+    tilt = np.radians(np.array([5.0, 20, 40, 55]))
+    for around in np.radians([0, 36, 45, 80]):
+        directions = np.stack([np.sin(tilt) * np.cos(around), np.sin(tilt) * np.sin(around), np.cos(tilt)], axis=1)
+        paths = skin_paths(skin_from_mesh(mesh), np.zeros(3), directions, 300.0)
+        np.testing.assert_allclose(paths.skin_angle, tilt, atol=1e-9)
+
+
+def test_a_smooth_skin_is_blended_even_without_shared_corners(ball):
+    """A sphere stored triangle by triangle gives the same angles as a welded one."""
+    mesh = ball(100, subdivisions=3)
+    loose = TriangleMesh(mesh.triangles.reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3))
+    directions = np.array([[1.0, 0, 0], [0.6, 0, 0.8], [0.36, 0.48, 0.8]])
+    angles = [
+        skin_paths(skin_from_mesh(m), np.array([0, 0, 60.0]), directions, 300.0).skin_angle for m in (mesh, loose)
+    ]
+    np.testing.assert_allclose(angles[0], angles[1], atol=1e-9)
+
+
+def test_a_doubled_open_skin_stays_open(ball):
+    """Every triangle of a half sphere twice: no inside, and the warning says so."""
+    mesh = ball(100)
+    half = mesh.faces[mesh.triangles[:, :, 2].min(axis=1) > 0]
+    doubled = skin_from_mesh(TriangleMesh(mesh.vertices, np.concatenate([half, half])))
+    assert not doubled.mesh.closed
+    assert doubled.warnings
+    whole = TriangleMesh(mesh.vertices, np.concatenate([mesh.faces, mesh.faces]))
+    assert whole.closed
+
+
 def test_too_long(box):
     """A path longer than the usable shaft is rejected with its length."""
     assert verdict(skin_from_mesh(box([400, 400, 360])))[::3] == (Reason.TOO_LONG, pytest.approx(180))

@@ -1,0 +1,160 @@
+"""The fast engine: exact distances of all needle axes at once, from surfaces packed once per patient."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.clearance.blocks import LANES, Blocks, pack
+from planning.clearance.engine import AxisDistances, Floats
+from planning.clearance.fcl_engine import FclEngine
+from planning.clearance.tile_search import nearest_triangle, scratch_for, search_tiles
+from planning.clearance.tiles import Tiles, bundle
+from planning.errors import InputError
+from planning.mesh import TriangleMesh
+
+Progress = Callable[[int, int], None]
+
+COORDINATE_SLACK = 1e-6
+"""Share of a coordinate by which float32 arithmetic of a few terms may err: 8 times its rounding."""
+
+NEAR_THRESHOLD_MM = 1e-4
+"""Within this of a threshold FCL's capsule collision decides: its own tolerance is 1e-6 mm."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """One surface as seen from one target: the nodes of `bounds.disc_bounds`, and the target's own distance."""
+
+    nodes: NDArray[np.float32]
+    slack: float
+    distance: float
+    nearest: int
+
+
+class FastEngine:
+    """Exact distances by bundles of directions over trees of discs; FCL where a verdict hangs on rounding.
+
+    Answers what `FclEngine` answers, to rounding of float64. Prepared once for a patient's surfaces, asked for any
+    target; FCL's own tree of a structure is built when `collides` is first called for it.
+
+    Args:
+        meshes: The k surfaces, in the CT frame, mm.
+        progress: Called with (structures done x directions, directions x structures).
+    """
+
+    def __init__(self, meshes: Sequence[TriangleMesh], progress: Progress | None = None) -> None:
+        self._meshes = tuple(meshes)
+        self._blocks = tuple(pack(mesh) for mesh in self._meshes)
+        self._judges: dict[int, FclEngine] = {}
+        self._progress = progress
+
+    def measure(self, target_ct: Floats, outward_ct: Floats, length: float) -> AxisDistances:
+        """Exact distances of n axes from all k structures; see `ClearanceEngine`."""
+        return self._search(target_ct, outward_ct, length, cap=np.inf, enough=-1.0)
+
+    def measure_capped(
+        self, target_ct: Floats, outward_ct: Floats, length: float, cap: Floats | float
+    ) -> AxisDistances:
+        """Distances that are exact below a cap and given as the cap elsewhere.
+
+        Args:
+            target_ct: Shape (3,).
+            outward_ct: Shape (n, 3), unit vectors.
+            length: Of the axes, mm.
+            cap: One number or shape (k,), mm, 0 or less where a structure does not matter; a depth at the cap is void.
+        """
+        return self._search(target_ct, outward_ct, length, cap=cap, enough=-1.0)
+
+    def nearer_than(
+        self, target_ct: Floats, outward_ct: Floats, length: float, threshold: Floats | float
+    ) -> NDArray[np.bool_]:
+        """Whether axes come nearer to structures than a threshold: the verdicts alone, shape (n, k).
+
+        Within 1e-4 mm of the threshold FCL's capsule of that radius decides. Surfaces only, as everywhere here.
+
+        Args:
+            target_ct: Shape (3,).
+            outward_ct: Shape (n, 3), unit vectors.
+            length: Of the axes, mm.
+            threshold: One number or shape (k,), mm: needle radius plus margin; -inf asks nothing of a structure.
+        """
+        thresholds = np.broadcast_to(np.asarray(threshold, dtype=np.float64), len(self._meshes))
+        cap, enough = thresholds + 2 * NEAR_THRESHOLD_MM, thresholds - NEAR_THRESHOLD_MM
+        distance = self._search(target_ct, outward_ct, length, cap=cap, enough=enough).distance
+        verdicts = distance < thresholds
+        for column in range(len(self._meshes)):
+            near = np.abs(distance[:, column] - thresholds[column]) < NEAR_THRESHOLD_MM
+            for row in np.flatnonzero(near):
+                verdicts[row, column] = self.collides(
+                    column, target_ct, outward_ct[row], length, float(thresholds[column])
+                )
+        return verdicts
+
+    def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
+        """FCL collision of a capsule with one structure; see `ClearanceEngine`."""
+        if structure not in self._judges:
+            self._judges[structure] = FclEngine([self._meshes[structure]])
+        return self._judges[structure].collides(0, target_ct, outward_ct, length, radius)
+
+    def _search(
+        self, target: Floats, outward: Floats, length: float, *, cap: Floats | float, enough: Floats | float
+    ) -> AxisDistances:
+        target = np.ascontiguousarray(target, dtype=np.float64)
+        outward = np.ascontiguousarray(outward, dtype=np.float64).reshape(-1, 3)
+        if not (np.isfinite(target).all() and np.isfinite(outward).all() and 0.0 <= length < np.inf):
+            raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
+        shape = (len(self._meshes), len(outward))
+        caps, enoughs = (np.broadcast_to(np.asarray(x, dtype=np.float64), shape[:1]) for x in (cap, enough))
+        distance, depth = np.empty(shape), np.empty(shape)
+        tiles = bundle(outward)
+        for row, blocks in enumerate(self._blocks):
+            _one_structure(blocks, tiles, target, length, caps[row], enoughs[row], distance[row], depth[row])
+            if self._progress is not None:
+                self._progress((row + 1) * len(outward), len(self._blocks) * len(outward))
+        return AxisDistances(distance.T, depth.T)
+
+
+def _one_structure(
+    blocks: Blocks,
+    tiles: Tiles,
+    target: Floats,
+    length: float,
+    cap: float,
+    enough: float,
+    distance: Floats,
+    depth: Floats,
+) -> None:
+    """Fill one structure's distances and depths, in the caller's order."""
+    if not cap > 0.0:
+        distance[:] = depth[:] = 0.0
+        return
+    placed = _placed(blocks, target)
+    if placed.distance == 0.0 or placed.distance < enough:
+        distance[:], depth[:] = min(placed.distance, cap), 0.0
+        return
+    found, at = np.empty(len(distance)), np.empty(len(distance))
+    surface = (blocks.triangles, blocks.local, blocks.base, blocks.center)
+    bundles = (tiles.outward, tiles.starts, tiles.middle, tiles.chord)
+    search_tiles(
+        surface, placed.nodes, placed.slack, target, float(length), placed.distance, placed.nearest,
+        float(cap), float(enough), bundles, scratch_for(len(placed.nodes)), LANES, found, at,
+    )  # fmt: skip
+    distance[tiles.order], depth[tiles.order] = np.sqrt(found), at
+
+
+def _placed(blocks: Blocks, target: Floats) -> _Placed:
+    """A surface as seen from a target."""
+    nodes = np.empty((10, len(blocks.center)), np.float32)
+    nodes[:3] = (blocks.center - target).T
+    nodes[3:8] = blocks.disc
+    nodes[8] = np.hypot(nodes[6], nodes[7]) * np.float32(1 + 1e-6)
+    away = np.sqrt(nodes[0] ** 2 + nodes[1] ** 2 + nodes[2] ** 2)
+    nodes[9] = (away + nodes[8]) * np.float32(1 + 1e-6)
+    slack = COORDINATE_SLACK * float(nodes[9][: len(blocks.local)].max())
+    grouped = np.ascontiguousarray(nodes.reshape(10, -1, LANES).transpose(1, 0, 2))
+    distance, nearest = nearest_triangle(blocks.triangles, grouped, blocks.base, target, slack, LANES)
+    return _Placed(grouped, slack, distance, nearest)

@@ -1,0 +1,105 @@
+"""Do the inputs fit each other? What one file alone cannot tell: a slip of space or unit, a map that ends too early."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.anatomy import Anatomy, Role
+from planning.case import Case
+from planning.errors import InputError
+from planning.formats.decimation import squared_distance
+from planning.formats.volumes import read_header
+from planning.placement import Placement
+from planning.winding import winding_number
+
+Floats = NDArray[np.float64]
+
+MARKER_ON_SKIN_MM = 30.0
+"""A skin marker's centre lies within its own height of the skin; one farther off stands on a frame, or is misread."""
+
+VOXELS_OF_SLACK = 1.0
+"""A map may end so many voxels inside the skin's box: the skin itself is found to that."""
+
+
+def check_consistency(case: Case, anatomy: Anatomy, placement: Placement | None) -> tuple[str, ...]:
+    """Hold the inputs against each other.
+
+    Returns:
+        Warnings, one sentence each.
+
+    Raises:
+        InputError: A structure wholly outside the body, an open one that seems to hold the target, or a label map that
+            ends inside the body within the needle's reach.
+    """
+    _refuse_outside(case, anatomy)
+    _refuse_open_around_target(case, anatomy)
+    _refuse_short_maps(case, anatomy)
+    return (*_marker_warnings(anatomy, placement), *_unnamed_warnings(case))
+
+
+def _refuse_outside(case: Case, anatomy: Anatomy) -> None:
+    """An organ beside the body is a slip of space or unit, and an organ that is elsewhere protects nothing."""
+    low, high = anatomy.skin.mesh.bounds
+    for structure in anatomy.structures:
+        below, above = structure.mesh.bounds
+        if np.any(below > high) or np.any(above < low):
+            raise InputError(
+                f"structure '{structure.name}' lies wholly outside the skin: a slip of space (LPS/RAS) or unit?",
+                where=case.path,
+                allowed="structures that reach into the body",
+            )
+
+
+def _refuse_open_around_target(case: Case, anatomy: Anatomy) -> None:
+    """Of an open surface the inside is not known; but one that goes more than half around the target is no way out."""
+    for structure in anatomy.structures:
+        if structure.role is not Role.AVOID or structure.mesh.closed:
+            continue
+        around = abs(winding_number(structure.mesh, case.target_ct))
+        if around > 0.5:
+            raise InputError(
+                f"'{structure.name}' is an open mesh that goes around the target (by {100 * around:.0f} %)",
+                where=case.path,
+                allowed="a closed mesh, or a target clearly outside",
+            )
+
+
+def _refuse_short_maps(case: Case, anatomy: Anatomy) -> None:
+    """Beyond a label map's box organs have no label: within the needle's reach the box must hold the body."""
+    reach = case.needle.length_mm
+    low, high = anatomy.skin.mesh.bounds
+    low, high = np.maximum(low, case.target_ct - reach), np.minimum(high, case.target_ct + reach)
+    corners = np.array([[low[0], high[0]], [low[1], high[1]], [low[2], high[2]]])
+    points = np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, 3)
+    for name in sorted({s.labelmap for s in case.structure if s.labelmap} | {s.labelmap for s in case.structures}):
+        header = read_header(case.folder / name)
+        T_index_ct = np.linalg.inv(header.T_ct_index)
+        index = points @ T_index_ct[:3, :3].T + T_index_ct[:3, 3]
+        outside = np.maximum(-0.5 - index, index - (np.array(header.shape) - 0.5)).max()
+        if outside > VOXELS_OF_SLACK:
+            raise InputError(
+                f"label map {name} ends {outside:.0f} voxels inside the body, within the needle's reach",
+                where=case.path,
+                allowed="a label map of the whole body about the target",
+            )
+
+
+def _marker_warnings(anatomy: Anatomy, placement: Placement | None) -> tuple[str, ...]:
+    if placement is None or placement.registration is None:
+        return ()
+    markers = placement.registration.markers
+    gaps = [float(np.sqrt(squared_distance(p, anatomy.skin.mesh.triangles).min())) for p in markers.points_ct]
+    far = [f"{name} ({gap:.0f} mm)" for name, gap in zip(markers.names, gaps, strict=True) if gap > MARKER_ON_SKIN_MM]
+    if not far:
+        return ()
+    return (f"markers far from the skin: {', '.join(far)}; is their file in the case's space (LPS/RAS) and unit?",)
+
+
+def _unnamed_warnings(case: Case) -> tuple[str, ...]:
+    """Single labels taken from a map: what else it holds counts as free."""
+    whole = {section.labelmap for section in case.structures}
+    single = sorted({s.labelmap for s in case.structure if s.labelmap and s.role != "skin"} - whole)
+    return tuple(
+        f"of {name} only the labels that the case names are judged; the others count as free" for name in single
+    )

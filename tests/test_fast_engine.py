@@ -1,0 +1,223 @@
+"""The fast engine against brute force and FCL: hostile meshes, targets and directions, and its three modes."""
+
+import numpy as np
+import pytest
+from oracles import ray_crossings, segment_mesh_distance
+
+from planning.clearance.fast_engine import FastEngine
+from planning.clearance.fcl_engine import FclEngine
+from planning.clearance.kd_order import kd_order
+from planning.entry import grid
+from planning.errors import InputError
+from planning.mesh import TriangleMesh
+
+LENGTH = 150.0
+TIGHT_MM = 1e-9
+"""Far above rounding of float64, far below any length that matters."""
+
+
+def units(rng, count):
+    """Random directions."""
+    directions = rng.normal(size=(count, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def soup(rng, count, spread=60.0, size=6.0):
+    """Triangles strewn about, no two joined."""
+    corners = rng.normal(0, spread, (count, 1, 3)) + rng.normal(0, size, (count, 3, 3))
+    return TriangleMesh(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))
+
+
+def slivers(rng, count):
+    """Zero-area triangles: collinear corners, two corners in one place, all three in one place."""
+    a, d = rng.normal(0, 50, (count, 3)), rng.normal(0, 8, (count, 3))
+    share = rng.uniform(-1, 2, (count, 1))
+    kinds = np.arange(count)[:, None] % 3
+    b = np.where(kinds == 2, a, a + d)
+    c = np.where(kinds == 0, a + share * d, np.where(kinds == 1, b, a))
+    return TriangleMesh(np.stack([a, b, c], axis=1).reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))
+
+
+def voxels(rng):
+    """The faces of random unit voxels, 4 mm wide: every edge and plane along an axis."""
+    filled = np.pad(rng.uniform(size=(6, 6, 6)) < 0.5, 1)
+    vertices, faces = [], []
+    for axis in range(3):
+        p, q = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
+        for corner in np.argwhere(filled != np.roll(filled, 1, axis=axis)):
+            first = len(vertices)
+            vertices += [corner, corner + p, corner + p + q, corner + q]
+            faces += [[first, first + 1, first + 2], [first, first + 2, first + 3]]
+    return TriangleMesh(4.0 * np.array(vertices, float) + [8.0, -16.0, -16.0], np.array(faces))
+
+
+def agrees(mesh, target, directions, length=LENGTH):
+    """Every distance equals the triangle-by-triangle oracle."""
+    target = np.asarray(target, float)
+    found = FastEngine([mesh]).measure(target, directions, length)
+    expected = [segment_mesh_distance(target, target + length * u, mesh) for u in directions]
+    np.testing.assert_allclose(found.distance[:, 0], expected, atol=TIGHT_MM, rtol=0)
+    return found
+
+
+def test_distance_and_depth_equal_fcl(rng, ball, box):
+    """Distances to 1e-9 mm and depths to 1e-6 mm are those of the FCL engine, structure by structure."""
+    meshes = [ball(20, (60, 0, 0)), box([30, 20, 10], (0, 50, 20)), ball(4, (5, 5, -30), 1), soup(rng, 300)]
+    directions, target = units(rng, 300), np.array([1.0, 2.0, 3.0])
+    fast, fcl = (kind(meshes).measure(target, directions, LENGTH) for kind in (FastEngine, FclEngine))
+    np.testing.assert_allclose(fast.distance, fcl.distance, atol=TIGHT_MM)
+    np.testing.assert_allclose(fast.depth, fcl.depth, atol=1e-6)
+    assert (fast.distance == 0).sum() > 20
+
+
+def test_random_triangles_equal_brute_force(rng):
+    """A soup of triangles of every size and shape, from a target amid it."""
+    agrees(soup(rng, 40, 60, 30), rng.normal(0, 20, 3), units(rng, 60))
+
+
+def test_zero_area_triangles_are_segments_and_points(rng):
+    """A triangle without area is its longest edge, or a point: neither lost nor a false hit."""
+    found = agrees(slivers(rng, 60), [1.0, 2.0, 3.0], units(rng, 60))
+    assert (found.distance > 0.01).all()
+
+
+def test_a_zero_area_triangle_in_line_with_the_target_is_no_hit(rng):
+    """Collinear corners on a line through the target, met by rounding noise on all three edges, stay where they are."""
+    for _ in range(50):
+        u = units(rng, 1)[0]
+        corners = np.array([20.0, 40.0, 55.0])[:, None] * u + rng.normal(0, 1e-15, (3, 3))
+        away = np.cross(u, units(rng, 1)[0])
+        away /= np.linalg.norm(away)
+        directions = np.stack([u, np.cos(0.3) * u + np.sin(0.3) * away])
+        found = FastEngine([TriangleMesh(corners, [[0, 1, 2]])]).measure(np.zeros(3), directions, LENGTH)
+        np.testing.assert_allclose(found.distance[:, 0], [0, 20 * np.sin(0.3)], atol=1e-9)
+
+
+def test_triangles_edge_on_to_axis_aligned_needles(rng):
+    """A voxel surface seen along its own axes: no false zero from triangles that appear as lines."""
+    axes = np.concatenate([np.eye(3), -np.eye(3), units(rng, 15)])
+    mesh = voxels(rng)
+    for target in ([0.0, 0.5, 0.25], [2.0, 0.0, 0.0], [20.0, 1.0, 2.0]):
+        agrees(TriangleMesh(mesh.vertices, mesh.faces[::7]), target, axes)
+
+
+def test_one_triangle(rng):
+    """The smallest surface, from in front, behind, beyond the top and through it."""
+    agrees(TriangleMesh([[10.0, -5, -5], [12, 7, -4], [9, 0, 8]], [[0, 1, 2]]), [0, 0, 0], units(rng, 200))
+    agrees(TriangleMesh([[160.0, -50, -50], [160, 70, -40], [155, 0, 80]], [[0, 1, 2]]), [0, 0, 0], units(rng, 200))
+
+
+def test_duplicated_vertices_and_triangles(rng, ball):
+    """A surface given twice, unwelded, is the same surface."""
+    mesh = ball(20, (50, 10, 0), 1)
+    corners = np.tile(mesh.triangles.reshape(-1, 3), (2, 1))
+    doubled = TriangleMesh(corners, np.arange(len(corners)).reshape(-1, 3))
+    directions = units(rng, 200)
+    once, twice = (FastEngine([m]).measure(np.zeros(3), directions, LENGTH).distance for m in (mesh, doubled))
+    np.testing.assert_array_equal(once, twice)
+
+
+@pytest.mark.parametrize("place", ["vertex", "edge", "face", "inside", "outside", "far", "plane"])
+def test_targets_anywhere(rng, ball, place):
+    """The target on a vertex, an edge, in a face, in a face's plane, inside, outside and far away."""
+    mesh = ball(30, (5, 5, 5), 1)
+    a, b, c = mesh.triangles[7]
+    spots = {"vertex": a, "edge": 0.3 * a + 0.7 * b, "face": (a + b + c) / 3, "inside": np.array([6.0, 1, 9])}
+    spots |= {"outside": np.array([80.0, 3, 4]), "far": np.array([4000.0, 300, 40]), "plane": 4 * a - 2 * b - c}
+    found = agrees(mesh, spots[place], units(rng, 25), 150.0 if place != "far" else 4000.0)
+    if place in ("vertex", "edge", "face"):
+        np.testing.assert_allclose(found.distance, 0, atol=TIGHT_MM)
+
+
+def test_poles_seam_and_duplicates(ball):
+    """Directions at the poles, at β = 0 and 360° and given twice: equal directions get equal answers, in any order."""
+    theta, beta = np.meshgrid(np.radians([0, 1e-7, 1, 90, 179, 180]), np.radians([0, 90, 180, 270, 360]))
+    theta, beta = theta.ravel(), beta.ravel()
+    directions = np.stack([np.sin(theta) * np.cos(beta), np.sin(theta) * np.sin(beta), np.cos(theta)], axis=1)
+    directions = np.concatenate([directions, directions[::-1]])
+    found = agrees(ball(20, (10, 30, 25), 1), [0, 0, 0], directions).distance[:, 0]
+    np.testing.assert_array_equal(found[:30], found[30:][::-1])
+
+
+def test_one_direction_and_none(ball):
+    """A single direction is answered like many; no direction gives an empty answer."""
+    engine = FastEngine([ball(20, (60, 0, 0))])
+    assert engine.measure(np.zeros(3), np.array([[1.0, 0, 0]]), LENGTH).distance[0, 0] == 0
+    assert engine.measure(np.zeros(3), np.empty((0, 3)), LENGTH).distance.shape == (0, 1)
+    assert FastEngine([]).measure(np.zeros(3), np.eye(3), LENGTH).depth.shape == (3, 0)
+
+
+def test_directions_far_apart_are_not_bundled_wrongly(rng, ball):
+    """A handful of directions all over the sphere, where one bundle's cone would be wider than a half space."""
+    for count in (2, 5, 13):
+        agrees(ball(40, (10, 0, 0), 1), [0, 0, 70.0], units(rng, count))
+
+
+def test_an_order_of_directions_changes_nothing(rng, ball):
+    """Shuffled directions get the same numbers."""
+    directions = grid((0, np.pi), (0, 2 * np.pi), np.radians(12), np.eye(3)).outward_ct
+    engine, shuffle = FastEngine([ball(20, (40, 30, 5))]), rng.permutation(len(directions))
+    found = engine.measure(np.zeros(3), directions, LENGTH).distance
+    shuffled = engine.measure(np.zeros(3), directions[shuffle], LENGTH).distance
+    np.testing.assert_allclose(shuffled, found[shuffle], atol=1e-12)
+
+
+def test_depth_is_the_first_crossing(rng, ball):
+    """Where the axis runs through a surface several times, the depth is that of the first time."""
+    mesh, target = ball(20, (60, 0, 0), 2), np.array([1.0, 2.0, 3.0])
+    directions = np.array([1.0, 0, 0]) + 0.25 * units(rng, 60)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    found = FastEngine([mesh]).measure(target, directions, LENGTH)
+    crossed = [ray_crossings(target, u, mesh) for u in directions]
+    hits = np.array([len(depths) > 0 for depths in crossed])
+    np.testing.assert_array_equal(found.distance[:, 0] == 0, hits)
+    np.testing.assert_allclose(found.depth[hits, 0], [depths[0] for depths in crossed if depths], atol=1e-9)
+
+
+def test_a_million_triangles(rng):
+    """A wavy sheet of a million triangles, against the same computed triangle by triangle near the needle's foot."""
+    n = 708
+    x, y = np.meshgrid(np.linspace(-200, 200, n), np.linspace(-200, 200, n), indexing="ij")
+    vertices = np.stack([x, y, 90 + 5 * np.sin(x / 9) * np.cos(y / 7)], axis=-1).reshape(-1, 3)
+    i = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    faces = np.concatenate([np.stack([i, i + n, i + 1], 1), np.stack([i + 1, i + n, i + n + 1], 1)])
+    directions = units(rng, 20)
+    found = FastEngine([TriangleMesh(vertices, faces)]).measure(np.zeros(3), directions, 60.0)
+    fcl = FclEngine([TriangleMesh(vertices, faces)]).measure(np.zeros(3), directions, 60.0)
+    assert len(faces) > 990_000
+    np.testing.assert_allclose(found.distance, fcl.distance, atol=TIGHT_MM)
+
+
+def test_capped_is_exact_below_the_cap_and_the_cap_elsewhere(rng, ball):
+    """A cap changes no distance below it and hides those above; caps may differ by structure."""
+    engine, directions = FastEngine([ball(20, (60, 0, 0)), ball(10, (0, 40, 0))]), units(rng, 400)
+    exact = engine.measure(np.zeros(3), directions, LENGTH).distance
+    caps = np.array([12.0, 25.0])
+    capped = engine.measure_capped(np.zeros(3), directions, LENGTH, caps).distance
+    np.testing.assert_allclose(capped, np.minimum(exact, caps), atol=1e-12)
+    assert (exact < caps).any(axis=0).all() and (exact > caps).any(axis=0).all()
+
+
+def test_verdicts_are_those_of_the_distances(rng, ball):
+    """Verdicts alone equal the comparison of the distances; a threshold of -inf asks nothing."""
+    engine, directions = FastEngine([ball(20, (60, 0, 0)), ball(10, (0, 40, 0))]), units(rng, 400)
+    exact = engine.measure(np.zeros(3), directions, LENGTH).distance
+    for thresholds in ([5.0, 0.5], [-np.inf, 31.5], [45.0, 12.0]):
+        verdicts = engine.nearer_than(np.zeros(3), directions, LENGTH, np.array(thresholds))
+        np.testing.assert_array_equal(verdicts, exact < thresholds)
+
+
+def test_a_kd_order_is_a_permutation_of_compact_runs(rng):
+    """Every point appears once, and runs of 16 are far smaller than the whole."""
+    points = rng.uniform(0, 1, (5000, 3))
+    order = kd_order(points, 16)
+    np.testing.assert_array_equal(np.sort(order), np.arange(5000))
+    runs = points[order][:4992].reshape(-1, 16, 3)
+    assert np.median(np.ptp(runs, axis=1)) < 0.2
+
+
+@pytest.mark.parametrize("target, direction", [([np.nan, 0, 0], [1.0, 0, 0]), ([0, 0, 0], [np.inf, 0, 0])])
+def test_an_axis_that_is_not_finite_is_refused(ball, target, direction):
+    """Nothing that is not a number reaches compiled code."""
+    with pytest.raises(InputError, match="finite"):
+        FastEngine([ball(20)]).measure(np.array(target), np.array([direction]), LENGTH)

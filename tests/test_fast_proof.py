@@ -1,0 +1,123 @@
+"""The fast engine judged by FCL: verdicts of capsules, on anatomy, anywhere, and within a hair of the threshold."""
+
+from pathlib import Path
+
+import fcl
+import numpy as np
+import pytest
+import trimesh
+
+import meshes
+from planning.clearance.engine import AxisDistances
+from planning.clearance.fast_engine import FastEngine
+from planning.clearance.fcl_engine import FclEngine
+from planning.mesh import TriangleMesh
+
+LENGTH = 210.0
+RADII_MM = (0.5, 3.0, 5.5)
+HUBMAP = Path(__file__).parents[2] / "shared" / "data" / "hubmap_vh_male"
+
+
+def units(rng, count):
+    """Random directions."""
+    directions = rng.normal(size=(count, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+@pytest.fixture(scope="module")
+def abdomen():
+    """Surfaces of the embedded phantom, in the vicinity of the lesion."""
+    names = ("liver", "ribs_right", "portal_vein", "hepatic_veins", "colon", "vena_cava_inferior", "lung_right", "skin")
+    loaded = [trimesh.load(meshes.folder() / f"abdomen/{name}.ply", process=False) for name in names]
+    return [TriangleMesh(mesh.vertices, mesh.faces) for mesh in loaded]
+
+
+class CountingJudge(FastEngine):
+    """A fast engine that counts how often it asks FCL."""
+
+    asked = 0
+
+    def collides(self, structure, target_ct, outward_ct, length, radius):
+        """FCL's word, counted."""
+        self.asked += 1
+        return super().collides(structure, target_ct, outward_ct, length, radius)
+
+
+def equal_fcl(surfaces, target, directions, radii=RADII_MM):
+    """Verdicts and distances against FCL for every direction, structure and radius; the distances."""
+    engine, judge = FastEngine(surfaces), FclEngine(surfaces)
+    found: AxisDistances = engine.measure(target, directions, LENGTH)
+    for radius in radii:
+        verdicts = engine.nearer_than(target, directions, LENGTH, radius)
+        for column in range(len(surfaces)):
+            judged = [judge.collides(column, target, u, LENGTH, radius) for u in directions]
+            np.testing.assert_array_equal(verdicts[:, column], judged)
+    expected = judge.measure(target, directions, LENGTH)
+    np.testing.assert_allclose(found.distance, expected.distance, atol=1e-6)
+    return found
+
+
+@pytest.mark.parametrize("place", ["lesion", "inside", "vertex", "outside"])
+def test_verdicts_on_the_abdomen_are_fcls(rng, abdomen, place):
+    """In the lesion, inside another organ, on a vertex and outside the body: no verdict differs."""
+    spots = {"lesion": np.array([-90.0, -10, 60]), "inside": abdomen[4].bounds.mean(axis=0)}
+    spots |= {"vertex": abdomen[0].vertices[1234], "outside": np.array([-230.0, -150, 80])}
+    found = equal_fcl(abdomen, spots[place], units(rng, 40))
+    if place == "vertex":
+        np.testing.assert_array_equal(found.distance[:, 0], 0)
+
+
+@pytest.mark.skipif(not HUBMAP.is_dir(), reason="the Visible Human organs (hubmap_vh_male) are not on this machine")
+def test_verdicts_on_open_many_part_organs_are_fcls(rng):
+    """Organs of the Visible Human, the heart's zero-area triangles among them: no verdict differs."""
+    surfaces = []
+    for name in ("VH_M_Heart", "VH_M_Liver", "VH_M_Pancreas"):
+        loaded = trimesh.load(HUBMAP / f"{name}.glb", force="mesh", process=False)
+        surfaces.append(TriangleMesh(np.asarray(loaded.vertices) * 1000.0, np.asarray(loaded.faces)))
+    a, b, c = np.moveaxis(surfaces[0].triangles, 1, 0)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    assert (areas < 1e-9).any()
+    for target in (surfaces[0].bounds.mean(axis=0), surfaces[1].bounds.mean(axis=0)):
+        equal_fcl(surfaces, target, units(rng, 20), radii=(3.0,))
+
+
+def test_within_a_hair_of_the_threshold_fcl_decides(rng, abdomen):
+    """With the radius at the exact distance ± 1e-3 ... 1e-7 mm FCL is asked where it must be, and its word stands."""
+    surfaces, target = abdomen[1:4], np.array([-90.0, -10, 60])
+    engine, judge, directions = CountingJudge(surfaces), FclEngine(surfaces), units(rng, 12)
+    exact = engine.measure(target, directions, LENGTH).distance
+    cases = 0
+    for row, column in np.argwhere(exact > 0.1):
+        for offset in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 0.0):
+            for sign in (-1, 1):
+                radius, before = exact[row, column] + sign * offset, engine.asked
+                one = np.full(len(surfaces), -np.inf)
+                one[column] = radius
+                verdict = engine.nearer_than(target, directions[row : row + 1], LENGTH, one)[0, column]
+                assert verdict == judge.collides(column, target, directions[row], LENGTH, radius)
+                if offset != 1e-4:  # there, rounding says on which side of the limit it lies
+                    assert engine.asked - before == (offset < 1e-4)
+                cases += 1
+    assert cases > 200
+
+
+def test_an_engine_in_which_everything_is_a_tie_asks_fcl_every_time(ball):
+    """Behind the target all axes are equally far: with that distance as threshold each verdict is FCL's own."""
+    mesh, directions = ball(10, (-50, 0, 0), 2), np.array([[1.0, 0, 0], [0.8, 0.6, 0], [0.8, -0.6, 0], [0.8, 0, 0.6]])
+    engine = CountingJudge([mesh])
+    distance = float(engine.measure(np.zeros(3), directions, LENGTH).distance[0, 0])
+    verdicts = engine.nearer_than(np.zeros(3), directions, LENGTH, distance)
+    judge = FclEngine([mesh])
+    assert engine.asked == len(directions)
+    assert verdicts[:, 0].tolist() == [judge.collides(0, np.zeros(3), u, LENGTH, distance) for u in directions]
+
+
+def test_fcl_trees_are_built_when_first_asked(ball, monkeypatch):
+    """Preparing and measuring build no FCL tree; a verdict's tie does."""
+    built = []
+    monkeypatch.setattr(fcl, "BVHModel", lambda: built.append(1) or (_ for _ in ()).throw(RuntimeError("a tree")))
+    engine = FastEngine([ball(10, (50, 0, 0), 1)])
+    engine.measure(np.zeros(3), np.eye(3), LENGTH)
+    assert not built
+    with pytest.raises(RuntimeError, match="a tree"):
+        engine.collides(0, np.zeros(3), np.eye(3)[0], LENGTH, 1.0)
