@@ -36,6 +36,8 @@ class Candidates:
         min_clearance: Shape (n,), smallest over the structures with a margin.
         tissue: Shape (n,), length of path inside structures that may be crossed.
         reachable: Shape (n,), 1 yes, 0 no, -1 not asked.
+        safe_cone: Shape (n,), by how much one may be off in any direction and still be safe for the organs, rad; NaN
+            where no certificate was asked for.
         reach_margin: Shape (n,), 0..1 distance from joint limits and singularities, NaN when not asked.
         cost: Shape (n,), NaN for rejected candidates.
         rank: Shape (n,), 1 is best, 0 for rejected candidates.
@@ -60,6 +62,7 @@ class Candidates:
     tissue: Floats
     reachable: NDArray[np.int8]
     reach_margin: Floats
+    safe_cone: Floats
     cost: Floats
     rank: NDArray[np.int32]
     pareto: NDArray[np.bool_]

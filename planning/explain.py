@@ -59,6 +59,7 @@ class Explanation:
             "clearance_mm": self.clearances(),
             "reachable": None if row.reachable[0] < 0 else bool(row.reachable[0]),
             "reach_margin": finite(row.reach_margin[0]),
+            "safe_cone_deg": finite(np.degrees(row.safe_cone[0])),
             "cost": finite(row.cost[0]),
             "warnings": list(self.anatomy.warnings),
         }

@@ -16,7 +16,7 @@ from planning.clearance.measure import measure
 from planning.constraints import judge, standoffs
 from planning.entry import Directions, direction, grid
 from planning.ranking import rank
-from planning.reach import ReachAnswer, ReachRequest, assess_reach
+from planning.reach import ReachRequest, assess_reach_all
 from planning.reasons import Reason
 from planning.robot.cell import CellChecker
 from planning.skin_entry import skin_paths
@@ -99,6 +99,7 @@ def organ_candidates(case: Case, anatomy: Anatomy, engine: ClearanceEngine, dire
         tissue=tissue_crossed(anatomy.structures, case.target_structure, case.target_ct, outward, paths.path_length),
         reachable=np.full(count, -1, np.int8),
         reach_margin=np.full(count, np.nan),
+        safe_cone=np.full(count, np.nan),
         cost=np.full(count, np.nan),
         rank=np.zeros(count, np.int32),
         pareto=np.zeros(count, bool),
@@ -119,11 +120,7 @@ def with_reach(case: Case, found: Candidates, reach: Reach, progress: Progress |
     """Ask the arm for every candidate that the organs allow."""
     rows = np.flatnonzero(found.safe)
     requests = [reach_request(case, found, int(row), reach.T_base_ct) for row in rows]
-    answers: list[ReachAnswer] = []
-    for done, request in enumerate(requests, start=1):
-        answers.append(assess_reach(reach.checker, request))
-        if progress is not None:
-            progress(done, len(requests))
+    answers = assess_reach_all(reach.checker, requests, progress)
     reason, structure, detail = found.reason.copy(), found.reason_structure.copy(), found.reason_detail.copy()
     depth, reachable, margin = found.reason_depth.copy(), found.reachable.copy(), found.reach_margin.copy()
     for row, answer in zip(rows, answers, strict=True):
@@ -159,6 +156,7 @@ def ranked(case: Case, found: Candidates) -> Candidates:
         skin_angle=found.skin_angle[rows],
         tissue=found.tissue[rows],
         reach_margin=found.reach_margin[rows],
+        safe_cone=found.safe_cone[rows],
         shaft=case.needle.shaft_mm,
         max_skin_angle=case.search.max_skin_angle,
         weights=case.ranking,

@@ -45,6 +45,7 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
         "tissue_mm": candidates.tissue,
         "reachable": pa.array(reachable, pa.bool_()),
         "reach_margin": candidates.reach_margin,
+        "safe_cone_deg": np.degrees(candidates.safe_cone),
         "cost": candidates.cost,
         "rank": candidates.rank,
         "pareto": candidates.pareto,
@@ -60,5 +61,5 @@ def _array(value: Any) -> pa.Array:
 
 def write_table(candidates: Candidates, provenance: Mapping[str, Any], path: Path) -> None:
     """Write the table as Parquet, whole or not at all."""
-    with atomic(path) as temporary:
-        pq.write_table(to_table(candidates, provenance), temporary)
+    with atomic(path) as temporary, temporary.open("wb") as stream:
+        pq.write_table(to_table(candidates, provenance), stream)

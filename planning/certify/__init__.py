@@ -1,0 +1,18 @@
+"""The map between the grid points: cells of directions that are proven safe or rejected, and the proof as a file."""
+
+from planning.certify.certificate import Certificate, read_certificate, write_certificate
+from planning.certify.certify import certify
+from planning.certify.checker import Verification, verify
+from planning.certify.cone_column import with_safe_cone
+from planning.certify.question import Question
+
+__all__ = [
+    "Certificate",
+    "Question",
+    "Verification",
+    "certify",
+    "read_certificate",
+    "verify",
+    "with_safe_cone",
+    "write_certificate",
+]

@@ -1,0 +1,71 @@
+"""Where the needles of a cone of directions leave the field of view, and how far every bound keeps from its limit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.skin import FieldOfView
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+CLEARANCE_PAD_MM = 2e-4
+"""Kept from every margin: within 1e-4 mm of one the search leaves the verdict to FCL's capsule."""
+
+DEPTH_PAD_MM = 1e-4
+"""Kept from every limit on a depth; the search calls faces of the field of view within 1e-6 mm equal."""
+
+ANGLE_PAD_RAD = 1e-7
+"""Kept from the largest skin angle: arccos near 0 rounds to 1e-8."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewBounds:
+    """The field of view over n cones.
+
+    Attributes:
+        kept: Shape (n,), no needle leaves it through a face that cuts the body.
+        left: Shape (n,), every needle leaves it through such a face.
+        depth: Shape (n,), no deeper, mm.
+    """
+
+    kept: Bools
+    left: Bools
+    depth: Floats
+
+
+def view_bounds(
+    view: FieldOfView | None, target_ct: Floats, centres: Floats, radius: Floats, length: float
+) -> ViewBounds:
+    """Bound where needles leave the field of view.
+
+    Args:
+        view: The imaged box; None says nothing, and nothing leaves it.
+        target_ct: Shape (3,), inside the box.
+        centres: Shape (n, 3), unit, CT frame.
+        radius: Shape (n,), rad.
+        length: Needle, mm.
+    """
+    count = len(centres)
+    if view is None:
+        return ViewBounds(np.ones(count, bool), np.zeros(count, bool), np.full(count, np.inf))
+    view.exit(target_ct, centres[:1])  # refuses a target outside the box
+    along = centres @ view.T_ct_box[:3, :3]
+    start = view.to_box(target_ct[None])[0]
+    toward = np.concatenate([-along, along], axis=1)  # low faces, high faces
+    height = np.maximum(np.concatenate([start, view.size_mm - start]), 0.0)
+    cut = np.concatenate([view.cut[:, 0], view.cut[:, 1]])
+    angle = np.arccos(np.clip(toward, -1, 1))
+    steepest = np.cos(np.maximum(angle - radius[:, None] - ANGLE_PAD_RAD, 0.0))
+    flattest = np.cos(np.minimum(angle + radius[:, None] + ANGLE_PAD_RAD, np.pi))
+    with np.errstate(divide="ignore", invalid="ignore"):  # a ray along a face never reaches it
+        soonest = np.where(steepest > 0, height / np.where(steepest > 0, steepest, 1.0), np.inf)
+        latest = np.where(flattest > 0, height / np.where(flattest > 0, flattest, 1.0), np.inf)
+    first_cut = np.where(cut, latest, np.inf).min(axis=1)
+    left = (first_cut < length - DEPTH_PAD_MM) & (np.where(cut, np.inf, soonest).min(axis=1) > first_cut + DEPTH_PAD_MM)
+    out = latest.min(axis=1, keepdims=True)
+    harmless = ~cut | (soonest > length + DEPTH_PAD_MM) | (soonest > out + DEPTH_PAD_MM)
+    return ViewBounds(harmless.all(axis=1), left, first_cut)

@@ -1,0 +1,183 @@
+"""Cells of a cap of directions: rectangles in (θ, β) that halve into one another, each inside a known cone.
+
+A cell is [θ0, θ1] x [β0, β1] in the entry frame. Halving tiles it without gap or overlap by construction, also at the
+poles, where a rectangle is a spherical triangle. Its cone is the cone about its middle angles through its farthest
+corner: docs/certificate.md proves that it encloses the cell.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.entry import outward
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+ROUNDING_RAD = 1e-12
+"""Added to a cell's radius: thousands of times the rounding of its corners."""
+
+WIDEST_BETA = np.pi
+"""A wider cell has no enclosing cone here: its farthest point need not be a corner."""
+
+SQUARE = 1.5
+"""A cell longer than this times its width is halved along its length only."""
+
+NEARLY = 1.25
+"""Half a square cell has 0.79 times its diameter."""
+
+OFF_CENTRE = (0.6373, 0.5719)
+"""Where in a cell (fraction of θ, fraction of β) its test ray runs: meshes are regular, so not through the middle."""
+
+SPLITS = "tbq"
+"""How a cell is halved: along θ, along β, or both (quartered)."""
+
+SQUARE_DEGREES = (180 / np.pi) ** 2
+"""Square degrees in a steradian."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """n cells of the entry frame, rad.
+
+    Attributes:
+        theta: Shape (n, 2), lowest and highest puncture angle.
+        beta: Shape (n, 2), lowest and highest azimuth.
+    """
+
+    theta: Floats
+    beta: Floats
+
+    def __len__(self) -> int:
+        return len(self.theta)
+
+    def at(self, theta_part: float, beta_part: float) -> Floats:
+        """Unit vectors of the entry frame at the same place of every cell, shape (n, 3); (0.5, 0.5) is its centre."""
+        theta = self.theta[:, 0] + theta_part * (self.theta[:, 1] - self.theta[:, 0])
+        beta = self.beta[:, 0] + beta_part * (self.beta[:, 1] - self.beta[:, 0])
+        return outward(theta, beta)
+
+    def centres(self) -> Floats:
+        """The middle of every cell, unit vectors of the entry frame, shape (n, 3)."""
+        return self.at(0.5, 0.5)
+
+    def radius(self) -> Floats:
+        """Half-angle of the cone about the centre that encloses each cell, shape (n,), rad; π where none is known."""
+        centres = self.centres()
+        far = np.maximum(*(angle_between(centres, outward(self.theta[:, end], self.beta[:, 0])) for end in (0, 1)))
+        return np.where(np.ptp(self.beta, axis=1) <= WIDEST_BETA, far + ROUNDING_RAD, np.pi)
+
+    def solid_angle(self) -> Floats:
+        """Area on the unit sphere, shape (n,), sr."""
+        middle, half = self.theta.mean(axis=1), 0.5 * np.ptp(self.theta, axis=1)
+        return np.asarray(2 * np.sin(middle) * np.sin(half) * np.ptp(self.beta, axis=1))
+
+    def splits(self, size: float = 0.0) -> NDArray[np.str_]:
+        """How each cell is best halved, letters of `SPLITS`, shape (n,).
+
+        Args:
+            size: The angular diameter that is wanted, rad: where one half is about as small, no quarters are made.
+        """
+        tall = np.ptp(self.theta, axis=1)
+        widest = np.clip(np.pi / 2, self.theta[:, 0], self.theta[:, 1])
+        wide = np.ptp(self.beta, axis=1)
+        across = wide * np.sin(widest)
+        best = np.where(tall > SQUARE * across, "t", np.where(across > SQUARE * tall, "b", "q"))
+        nearly = (best == "q") & (2 * self.radius() <= NEARLY * size)
+        best = np.where(nearly, np.where(tall >= across, "t", "b"), best)
+        return np.where(wide > WIDEST_BETA / 2, "b", best)
+
+    def take(self, rows: NDArray[np.int64] | Bools) -> Cells:
+        """Some of the cells."""
+        return Cells(self.theta[rows], self.beta[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Children:
+    """Parts of cells, and the row of the cell that each is part of, shape (n,)."""
+
+    cells: Cells
+    parent: NDArray[np.int64]
+
+
+def split(cells: Cells, letters: NDArray[np.str_]) -> Children:
+    """Halve every cell as its letter says; parts in the order of their cells, low θ first, then low β."""
+    kind = np.select([letters == "t", letters == "b"], [0, 1], 2)
+    parent = np.repeat(np.arange(len(cells)), _COUNT[kind])
+    part = np.arange(len(parent)) - np.repeat(np.cumsum(_COUNT[kind]) - _COUNT[kind], _COUNT[kind])
+    t_part, b_part = _PARTS[kind[parent], part].T
+    return Children(Cells(_part(cells.theta[parent], t_part), _part(cells.beta[parent], b_part)), parent)
+
+
+_COUNT = np.array([2, 2, 4])
+_PARTS = np.array(
+    [[[0, 2], [1, 2], [2, 2], [2, 2]], [[2, 0], [2, 1], [2, 2], [2, 2]], [[0, 0], [0, 1], [1, 0], [1, 1]]]
+)
+"""Low half 0, high half 1, or the whole 2, of θ and of β."""
+
+
+def _part(ranges: Floats, which: NDArray[np.int64]) -> Floats:
+    middle = 0.5 * (ranges[:, 0] + ranges[:, 1])
+    low = np.where(which == 1, middle, ranges[:, 0])
+    return np.stack([low, np.where(which == 0, middle, ranges[:, 1])], axis=1)
+
+
+def angle_between(a: Floats, b: Floats) -> Floats:
+    """Angle between unit vectors (..., 3), exact to rounding also where it is small."""
+    chord = np.linalg.norm(a - b, axis=-1)
+    return np.asarray(2 * np.arcsin(np.minimum(0.5 * chord, 1.0)))
+
+
+def nearest_cell(theta: Floats, beta: Floats, cells: Cells) -> Floats:
+    """Angle from each direction to the nearest of the cells, shape (n,), rad.
+
+    0 inside a cell, π where there is no cell at all.
+
+    Args:
+        theta: Shape (n,), rad.
+        beta: Shape (n,), rad.
+        cells: Where to; also ones too wide for a cone.
+    """
+    theta, beta = np.atleast_1d(np.asarray(theta, dtype=float)), np.atleast_1d(np.asarray(beta, dtype=float))
+    cone = cells.centres(), np.cos(cells.radius()), np.sin(cells.radius())
+    return np.asarray(_nearest(theta, beta, outward(theta, beta), cells.theta, cells.beta, *cone))
+
+
+@nb.njit(cache=True)
+def _nearest(theta, beta, rays, cell_theta, cell_beta, centres, cos_radius, sin_radius):  # type: ignore[no-untyped-def]  # numba infers
+    found = np.full(len(theta), np.pi)
+    for i in range(len(theta)):
+        best = -1.0  # cosine of the least angle
+        sine, cosine = np.sin(theta[i]), np.cos(theta[i])
+        for j in range(len(cell_theta)):
+            middle = rays[i, 0] * centres[j, 0] + rays[i, 1] * centres[j, 1] + rays[i, 2] * centres[j, 2]
+            across = np.sqrt(max(0.0, 1.0 - middle * middle))
+            if middle < cos_radius[j] and middle * cos_radius[j] + across * sin_radius[j] < best - 1e-12:
+                continue  # not even the cell's cone comes so near
+            aside = _outside(beta[i], cell_beta[j, 0], cell_beta[j, 1])
+            along = sine * np.cos(aside)
+            # on the meridian at this azimuth the angle's cosine is r cos(x - peak)
+            low, high = cell_theta[j, 0], cell_theta[j, 1]
+            best = max(best, along * np.sin(low) + cosine * np.cos(low), along * np.sin(high) + cosine * np.cos(high))
+            peak = np.arctan2(along, cosine)
+            if low < peak < high:
+                best = max(best, np.sqrt(along * along + cosine * cosine))
+        if best >= 1.0 - 1e-15:
+            found[i] = 0.0
+        elif len(cell_theta) > 0:
+            found[i] = np.arccos(best)
+    return found
+
+
+@nb.njit(cache=True)
+def _outside(beta, low, high):  # type: ignore[no-untyped-def]  # numba infers
+    """Angle from an azimuth to a range of azimuths, around the circle; 0 inside."""
+    turn = 2 * np.pi
+    past = (beta - low) % turn
+    if past <= high - low:
+        return 0.0
+    return min(past - (high - low), turn - past)

@@ -1,0 +1,297 @@
+"""A certified map of a cap of directions, as a value and as a versioned file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.certify.cells import SQUARE_DEGREES, Cells, nearest_cell, split
+from planning.certify.question import Question
+from planning.entry import angles
+from planning.errors import InputError
+from planning.files import atomic
+from planning.reasons import Reason
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+CERTIFICATE_VERSION = 1
+"""Version of the file's layout."""
+
+MAX_CERTIFICATE_BYTES = 500_000_000
+"""A certificate has some ten thousand cells; a larger file is something else."""
+
+CONE_ROUNDING_RAD = 1e-7
+"""Taken from a safe cone: arccos near 1 rounds to 1e-8."""
+
+CERTIFIED = (
+    "clearance to every structure with a margin",
+    "field of view and faces that cut the body",
+    "skin entry",
+    "skin re-entry within the needle's length",
+    "path length",
+    "skin angle",
+)
+"""The constraints that hold all over a safe cell."""
+
+NOT_CERTIFIED = ("reach of the arm", "approach of the arm")
+"""What a certificate says nothing about."""
+
+SAFE, REJECTED, UNDECIDED = "SRU"
+"""Letters of the leaves in the tree; lower-case letters are splits (`planning.certify.cells.SPLITS`)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """Which directions are proven safe, which are proven not to be, and which cells are too small to say.
+
+    Attributes:
+        question: What was asked.
+        size: No undecided cell has a larger angular diameter, rad.
+        tree: Level by level, a letter for each cell of the level: a split, or a leaf's verdict. The parts of a level's
+            split cells, in order, are the next level.
+        leaves: The leaves, in the order in which the tree names them.
+        verdict: Shape (n,), letter of each leaf.
+        reason: Shape (n,), for a rejected leaf the `Reason` that holds all over it, else "".
+        structure: Shape (n,), the structure of the witness, or "".
+        bound: Shape (n,), the witness: for a safe leaf the least slack over any margin (mm); for ``too_close`` the
+            largest clearance (mm), for ``too_long`` the least path length (mm), for ``skin_angle`` the least angle
+            (deg), for ``unknown_region`` the largest depth (mm); NaN where no number was needed.
+        depth: Shape (n,), for ``too_close`` how deep on the centre's axis the structure is met, mm; NaN otherwise.
+        queries: Directions for which distances were measured.
+    """
+
+    question: Question
+    size: float
+    tree: tuple[str, ...]
+    leaves: Cells
+    verdict: NDArray[np.str_]
+    reason: NDArray[np.str_]
+    structure: NDArray[np.str_]
+    bound: Floats
+    depth: Floats
+    queries: int
+
+    @cached_property
+    def areas(self) -> dict[str, float]:
+        """Verdict letter to area, square degrees."""
+        area = self.leaves.solid_angle() * SQUARE_DEGREES
+        return {letter: float(area[self.verdict == letter].sum()) for letter in (SAFE, REJECTED, UNDECIDED)}
+
+    def share(self, letter: str) -> float | None:
+        """Part of the cap's area with a verdict, 0..1; None for a cap without area."""
+        total = float(self.question.cap().solid_angle()[0]) * SQUARE_DEGREES
+        return self.areas[letter] / total if total > 0 else None
+
+    def at(self, theta: Floats, beta: Floats) -> NDArray[np.str_]:
+        """Verdict letter at directions (n,) of the entry frame, rad; "" outside the cap."""
+        found = np.full(len(theta), "", dtype="U1")
+        for letter in (UNDECIDED, REJECTED, SAFE):
+            found[self._distance(theta, beta, self.verdict == letter) == 0] = letter
+        return found
+
+    def safe_cone(self, outward_ct: Floats) -> Floats:
+        """By how much each direction may be off, in any direction, and still be proven safe; shape (n,), rad.
+
+        0 for a direction in a cell that is not safe, or outside the cap: nothing is proven there.
+
+        Args:
+            outward_ct: Shape (n, 3), unit vectors.
+        """
+        theta, beta = angles(outward_ct @ self.question.R_ct_entry)
+        free = self._distance(theta, beta, self.verdict != SAFE)
+        return np.maximum(np.minimum(free, self._to_border(theta, beta)) - CONE_ROUNDING_RAD, 0.0)
+
+    def _distance(self, theta: Floats, beta: Floats, which: NDArray[np.bool_]) -> Floats:
+        return nearest_cell(theta, beta, self.leaves.take(which))
+
+    def _to_border(self, theta: Floats, beta: Floats) -> Floats:
+        """Angle to the nearest direction outside the cap; 0 outside it."""
+        (low, high), (first, last) = self.question.theta, self.question.beta
+        outside = []
+        turn = 2 * np.pi
+        if low > 0:
+            outside.append((0.0, low, 0.0, turn))
+        if high < np.pi:
+            outside.append((high, np.pi, 0.0, turn))
+        if last - first < turn:
+            outside.append((0.0, np.pi, last, first + turn))
+        ranges = np.array(outside, float).reshape(-1, 4)
+        return nearest_cell(theta, beta, Cells(ranges[:, :2], ranges[:, 2:]))
+
+    def summary(self) -> dict[str, Any]:
+        """The main numbers as plain values; degrees, square degrees."""
+        areas, cells = (
+            self.areas,
+            {letter: int((self.verdict == letter).sum()) for letter in (SAFE, REJECTED, UNDECIDED)},
+        )
+        return {
+            "size_deg": float(np.degrees(self.size)),
+            "certified": list(CERTIFIED),
+            "not_certified": list(NOT_CERTIFIED),
+            "safe_square_deg": areas[SAFE],
+            "rejected_square_deg": areas[REJECTED],
+            "undecided_square_deg": areas[UNDECIDED],
+            "safe_share": self.share(SAFE),
+            "undecided_share": self.share(UNDECIDED),
+            "safe_cells": cells[SAFE],
+            "rejected_cells": cells[REJECTED],
+            "undecided_cells": cells[UNDECIDED],
+            "queries": self.queries,
+        }
+
+
+def leaves_of(cap: Cells, tree: tuple[str, ...], where: str | Path = "certificate") -> Cells:
+    """The leaves that a tree names, level by level; they tile the cap because halves and quarters do.
+
+    Raises:
+        InputError: The tree has a cell too many or too few, or an unknown letter.
+    """
+    theta, beta, cells = [], [], cap
+    for depth, level in enumerate(tree):
+        letters = np.array(list(level), dtype="U1")
+        if len(letters) != len(cells) or not np.isin(letters, list("tbqSRU")).all():
+            what = f"level {depth} of the tree has {len(letters)} cells or an unknown letter"
+            raise InputError(what, where=where, allowed=f"{len(cells)} of t, b, q, S, R, U")
+        inner = np.isin(letters, list("tbq"))
+        theta.append(cells.theta[~inner])
+        beta.append(cells.beta[~inner])
+        cells = split(cells.take(inner), letters[inner]).cells
+    if len(cells):
+        raise InputError(f"the tree ends with {len(cells)} cells missing", where=where, allowed="a whole tree")
+    return Cells(np.concatenate(theta), np.concatenate(beta))
+
+
+def write_certificate(certificate: Certificate, path: Path) -> None:
+    """Write a certificate as JSON, whole or not at all; lengths in mm, angles in rad where not named ``_deg``."""
+    question = certificate.question
+    document = {
+        "version": CERTIFICATE_VERSION,
+        "case": question.case_name,
+        "inputs": dict(question.inputs),
+        "target_ct_mm": question.target_ct.tolist(),
+        "R_ct_entry": question.R_ct_entry.tolist(),
+        "theta_rad": list(question.theta),
+        "beta_rad": list(question.beta),
+        "length_mm": question.length,
+        "radius_mm": question.radius,
+        "longest_path_mm": question.longest,
+        "max_skin_angle_rad": question.max_skin_angle,
+        "margins_mm": dict(zip(question.structures, question.margins.tolist(), strict=True)),
+        "size_rad": certificate.size,
+        "queries": certificate.queries,
+        "summary": certificate.summary(),
+        "tree": list(certificate.tree),
+        "witness": _witnesses(certificate),
+    }
+    with atomic(path) as temporary:
+        temporary.write_text(json.dumps(document, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _witnesses(certificate: Certificate) -> list[list[Any]]:
+    """Reason, structure, bound and depth of each leaf."""
+    numbers = np.stack([certificate.bound, certificate.depth], axis=1).tolist()
+    texts = zip(certificate.reason.tolist(), certificate.structure.tolist(), strict=True)
+    return [
+        [*text, *(round(x, 6) if np.isfinite(x) else None for x in row)]
+        for text, row in zip(texts, numbers, strict=True)
+    ]
+
+
+def read_certificate(path: Path) -> Certificate:
+    """Read a certificate and check that it is whole and agrees with itself; `checker.verify` proves it.
+
+    Raises:
+        InputError: Not a certificate, another version, missing or contradicting parts.
+    """
+    document = _document(path)
+    try:
+        certificate = _certificate(document, path)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        what = f"not a certificate: {type(error).__name__} {error}"
+        raise InputError(what, where=path, allowed="a file that search --certify wrote") from error
+    stated, counted = document.get("summary"), json.loads(json.dumps(certificate.summary()))
+    if stated != counted:
+        wrong = [key for key in counted if not isinstance(stated, dict) or stated.get(key) != counted[key]]
+        what = f"its summary does not follow from its cells ({', '.join(wrong) or 'other keys'})"
+        raise InputError(what, where=path, allowed="an unchanged certificate")
+    return certificate
+
+
+def _document(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > MAX_CERTIFICATE_BYTES:
+            raise InputError("too large", where=path, allowed=f"at most {MAX_CERTIFICATE_BYTES} bytes")
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed="a readable file") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"no JSON ({error})", where=path, allowed="a file that search --certify wrote") from error
+    if not isinstance(document, dict) or document.get("version") != CERTIFICATE_VERSION:
+        version = document.get("version") if isinstance(document, dict) else None
+        raise InputError(f"certificate version {version}", where=path, allowed=f"version {CERTIFICATE_VERSION}")
+    return document
+
+
+def _certificate(document: dict[str, Any], path: Path) -> Certificate:
+    question = Question(
+        case_name=str(document["case"]),
+        inputs={str(k): str(v) for k, v in document["inputs"].items()},
+        target_ct=_numbers(document["target_ct_mm"], (3,)),
+        R_ct_entry=_numbers(document["R_ct_entry"], (3, 3)),
+        theta=_range(document["theta_rad"]),
+        beta=_range(document["beta_rad"]),
+        length=_number(document["length_mm"]),
+        radius=_number(document["radius_mm"]),
+        longest=_number(document["longest_path_mm"]),
+        max_skin_angle=_number(document["max_skin_angle_rad"]),
+        structures=tuple(map(str, document["margins_mm"])),
+        margins=_numbers(list(document["margins_mm"].values()), (len(document["margins_mm"]),)),
+    )
+    tree = tuple(str(level) for level in document["tree"])
+    leaves = leaves_of(question.cap(), tree, path)
+    rows = document["witness"]
+    if len(rows) != len(leaves):
+        raise InputError(f"{len(rows)} witnesses for {len(leaves)} cells", where=path, allowed="one for each")
+    reasons, structures, bounds, depths = zip(*rows, strict=True)
+    return Certificate(
+        question=question,
+        size=_number(document["size_rad"]),
+        tree=tree,
+        leaves=leaves,
+        verdict=np.array([letter for level in tree for letter in level if letter in "SRU"], dtype="U1"),
+        reason=np.array([Reason(reason).value for reason in reasons], dtype="U32"),
+        structure=np.array([str(name) for name in structures], dtype="U80"),
+        bound=_numbers_or_nan(bounds),
+        depth=_numbers_or_nan(depths),
+        queries=int(document["queries"]),
+    )
+
+
+def _number(value: Any) -> float:
+    number = float(value)
+    if not np.isfinite(number):
+        raise ValueError(f"{value} is not a finite number")
+    return number
+
+
+def _numbers_or_nan(values: tuple[Any, ...]) -> Floats:
+    return np.array([np.nan if value is None else _number(value) for value in values])
+
+
+def _numbers(values: Any, shape: tuple[int, ...]) -> Floats:
+    array = np.array(values, dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"{shape} finite numbers expected")
+    return array
+
+
+def _range(values: Any) -> tuple[float, float]:
+    low, high = map(_number, values)
+    return low, high

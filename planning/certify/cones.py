@@ -1,0 +1,166 @@
+"""Which triangles matter to which cone of directions: bounding cones, and lists that shrink from cell to part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+ZONE_PAD_RAD = 1e-6
+"""Widens every triangle's zone against rounding, which near an angle of 0 is 1e-8."""
+
+
+@dataclass(frozen=True, eq=False)
+class Zones:
+    """For m triangles, the directions to which each matters: a cone about the target.
+
+    Attributes:
+        axis: Shape (m, 3), unit.
+        cosine, sine: Shape (m,), of the half-angle; (-1, 0) for all directions.
+        farthest: Shape (m,), largest distance of the triangle from the target, mm.
+        nearest: Shape (m,), a distance from the target that no point of the triangle falls short of, mm.
+    """
+
+    axis: Floats
+    cosine: Floats
+    sine: Floats
+    farthest: Floats
+    nearest: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Lists:
+    """For each of n cells the triangles that may matter to it: ``items[start[i]:start[i + 1]]``."""
+
+    start: Ints
+    items: Ints
+
+    @classmethod
+    def one(cls, items: Ints) -> Lists:
+        """A single list."""
+        return cls(np.array([0, len(items)]), items)
+
+
+def zones(corners: Floats, limit: Floats | float) -> Zones:
+    """Zones of triangles seen from the origin, grown so that a needle within ``limit`` of a triangle points into it.
+
+    Args:
+        corners: Shape (m, 3, 3), mm from the target.
+        limit: Shape (m,) or a number; 0 for the directions that meet the triangle, mm.
+    """
+    limits = np.broadcast_to(np.asarray(limit, dtype=np.float64), len(corners)).copy()
+    return Zones(*_zones(np.ascontiguousarray(corners), limits, ZONE_PAD_RAD))
+
+
+@nb.njit(cache=True)
+def _zones(corners, limits, pad):  # type: ignore[no-untyped-def]  # numba infers
+    count = len(corners)
+    axis, cosine, sine = np.zeros((count, 3)), np.full(count, -1.0), np.zeros(count)
+    farthest, nearest = np.empty(count), np.empty(count)
+    for i in range(count):
+        ax, ay, az = corners[i, 0, 0], corners[i, 0, 1], corners[i, 0, 2]
+        bx, by, bz = corners[i, 1, 0], corners[i, 1, 1], corners[i, 1, 2]
+        cx, cy, cz = corners[i, 2, 0], corners[i, 2, 1], corners[i, 2, 2]
+        la, lb, lc = _length(ax, ay, az), _length(bx, by, bz), _length(cx, cy, cz)
+        farthest[i] = max(la, lb, lc)
+        mx, my, mz = (ax + bx + cx) / 3, (ay + by + cy) / 3, (az + bz + cz) / 3
+        spread = max(_length(ax - mx, ay - my, az - mz), _length(bx - mx, by - my, bz - mz))
+        spread = max(spread, _length(cx - mx, cy - my, cz - mz))
+        nearest[i] = max(0.0, _length(mx, my, mz) - spread - 1e-9)
+        axis[i, 2] = 1.0
+        if min(la, lb, lc) <= 0.0 or nearest[i] <= limits[i]:
+            continue
+        tx, ty, tz = ax / la + bx / lb + cx / lc, ay / la + by / lb + cy / lc, az / la + bz / lb + cz / lc
+        norm = _length(tx, ty, tz)
+        if norm < 0.5:
+            continue
+        least = min((ax * tx + ay * ty + az * tz) / la, (bx * tx + by * ty + bz * tz) / lb)
+        least = min(1.0, least / norm, (cx * tx + cy * ty + cz * tz) / (lc * norm))
+        if least < 0.1:
+            continue
+        half = np.arccos(least) + np.arcsin(limits[i] / nearest[i]) + pad
+        if half < np.pi:
+            cosine[i], sine[i] = np.cos(half), np.sin(half)
+            axis[i, 0], axis[i, 1], axis[i, 2] = tx / norm, ty / norm, tz / norm
+    return axis, cosine, sine, farthest, nearest
+
+
+@nb.njit(cache=True)
+def _length(x, y, z):  # type: ignore[no-untyped-def]  # numba infers
+    return np.sqrt(x * x + y * y + z * z)
+
+
+@dataclass(frozen=True, eq=False)
+class Narrowed:
+    """Lists for cells, and for each cell and group how far from the target its triangles reach (0: none matters)."""
+
+    lists: Lists
+    reach: Floats
+
+
+def narrowed(
+    zone: Zones, group: Ints, groups: int, lists: Lists, parent: Ints, centres: Floats, radius: Floats
+) -> Narrowed:
+    """Keep of each parent's list what matters to its part.
+
+    Args:
+        zone: Of all m triangles.
+        group: Shape (m,), the structure of each, 0 to ``groups`` - 1.
+        groups: Number of structures, k.
+        lists: Of the parents.
+        parent: Shape (n,), row of each cell's parent.
+        centres: Shape (n, 3), unit.
+        radius: Shape (n,), rad, at most π/2.
+
+    Returns:
+        Lists of the n cells; reach of shape (n, k), mm.
+    """
+    start, items, reach = _narrowed(
+        zone.axis,
+        zone.cosine,
+        zone.sine,
+        zone.farthest,
+        group,
+        groups,
+        lists.start,
+        lists.items,
+        parent,
+        np.ascontiguousarray(centres),
+        np.cos(radius),
+        np.sin(radius),
+    )
+    return Narrowed(Lists(start, items), reach)
+
+
+@nb.njit(cache=True)
+def _narrowed(  # type: ignore[no-untyped-def]  # numba infers
+    axis, cosine, sine, farthest, group, groups, start, items, parent, centres, cos_radius, sin_radius
+):
+    count = len(parent)
+    out_start, reach = np.zeros(count + 1, np.int64), np.zeros((count, groups))
+    out = np.empty(max(1024, len(items)), np.int64)
+    filled = 0
+    for i in range(count):
+        x, y, z, c, s = centres[i, 0], centres[i, 1], centres[i, 2], cos_radius[i], sin_radius[i]
+        first, last = start[parent[i]], start[parent[i] + 1]
+        if filled + last - first > len(out):
+            grown = np.empty(2 * (filled + last - first), np.int64)
+            grown[:filled] = out[:filled]
+            out = grown
+        for k in range(first, last):
+            t = items[k]
+            # the angle is at most radius + half, which every angle is once that sum passes pi
+            if (
+                s * cosine[t] + c * sine[t] <= 0.0
+                or axis[t, 0] * x + axis[t, 1] * y + axis[t, 2] * z >= c * cosine[t] - s * sine[t]
+            ):
+                out[filled] = t
+                filled += 1
+                reach[i, group[t]] = max(reach[i, group[t]], farthest[t])
+        out_start[i + 1] = filled
+    return out_start, out[:filled].copy(), reach

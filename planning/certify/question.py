@@ -1,0 +1,81 @@
+"""What a certificate answers: everything but the surfaces that a verdict depends on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.anatomy import Anatomy
+from planning.case import Case
+from planning.certify.cells import Cells
+from planning.constraints import longest_path
+from planning.errors import InputError
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """What was asked: everything but the surfaces that a verdict depends on; mm and rad.
+
+    Attributes:
+        case_name: The case.
+        inputs: File name to SHA-256 of every input of that case.
+        target_ct: Shape (3,).
+        R_ct_entry: Shape (3, 3).
+        theta, beta: The cap: lowest and highest angle.
+        length: Needle, tip to flange.
+        radius: Needle radius.
+        longest: The longest path.
+        max_skin_angle: The largest angle at the skin.
+        structures: Names of the k structures that demand a margin.
+        margins: Shape (k,), their margins.
+    """
+
+    case_name: str
+    inputs: Mapping[str, str]
+    target_ct: Floats
+    R_ct_entry: Floats
+    theta: tuple[float, float]
+    beta: tuple[float, float]
+    length: float
+    radius: float
+    longest: float
+    max_skin_angle: float
+    structures: tuple[str, ...]
+    margins: Floats
+
+    def cap(self) -> Cells:
+        """The whole cap as one cell."""
+        return Cells(np.array([self.theta], float), np.array([self.beta], float))
+
+
+def question_of(
+    case: Case,
+    anatomy: Anatomy,
+    *,
+    theta: tuple[float, float] | None = None,
+    beta: tuple[float, float] | None = None,
+) -> Question:
+    """What a case asks of its certificate; see `certify`."""
+    theta, beta = theta or case.search.theta, beta or case.search.beta
+    if not (0 <= theta[0] <= theta[1] <= np.pi + 1e-12 and beta[0] <= beta[1] <= beta[0] + 2 * np.pi + 1e-12):
+        raise InputError("the cap is no range of angles", where="certify", allowed="theta 0 to 180, beta 0 to 360")
+    demanding = [s for s in anatomy.structures if s.demands_margin]
+    return Question(
+        case_name=case.name,
+        inputs=dict(case.inputs),
+        target_ct=case.target_ct,
+        R_ct_entry=case.T_ct_entry[:3, :3],
+        theta=(float(theta[0]), float(theta[1])),
+        beta=(float(beta[0]), float(beta[1])),
+        length=case.needle.length_mm,
+        radius=case.needle.radius_mm,
+        longest=longest_path(case.needle),
+        max_skin_angle=float(case.search.max_skin_angle),
+        structures=tuple(s.name for s in demanding),
+        margins=np.array([s.margin_mm for s in demanding]),
+    )

@@ -1,0 +1,244 @@
+"""What every ray of a cone meets of the skin: bounds over all crossings, and their number where it is the same for all.
+
+docs/certificate.md derives each bound; `planning.certify.checker` holds the same lemmas in plain form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.certify.cones import Lists
+from planning.certify.skin_surface import SkinSurface
+
+Floats = NDArray[np.float64]
+
+CONE_PAD_RAD = 3e-7
+"""Widens every cone: the search turns a ray that meets an edge by 1e-7, and angles round to 1e-8."""
+
+LENGTH_PAD_MM = 1e-5
+"""Widens every depth: rounding at a metre is 1e-10, and crossings within 1e-6 mm are one."""
+
+IN_DOUBT = 1e-11
+"""A test ray whose edge function is below this, relative to the edge's ends, may pass on either side."""
+
+
+@dataclass(frozen=True, eq=False)
+class SkinBounds:
+    """What holds for every ray of n cells; mm and rad.
+
+    Attributes:
+        count: Shape (n,), crossings within the needle's length, the same for all rays; -1 where that is not proven.
+        cut: Shape (n,), whether a triangle that is not skin may be met within the needle's length.
+        least_skin: Shape (n,), no skin is met at a smaller depth; inf where none is met within the range asked.
+        farthest: Shape (n,), no crossing within the needle's length is deeper.
+        least_angle, largest_angle: Shape (n,), bounds of the angle to the normal at every skin crossing that is no
+            deeper than the longest path.
+    """
+
+    count: NDArray[np.int64]
+    cut: NDArray[np.bool_]
+    least_skin: Floats
+    farthest: Floats
+    least_angle: Floats
+    largest_angle: Floats
+
+
+def skin_bounds(
+    skin: SkinSurface,
+    lists: Lists,
+    centres: Floats,
+    radius: Floats,
+    test_rays: Floats,
+    *,
+    length: float,
+    longest: float,
+) -> SkinBounds:
+    """Bound the skin's crossings over cones.
+
+    Args:
+        skin: From the target.
+        lists: Of the n cells.
+        centres: Shape (n, 3), unit.
+        radius: Shape (n,), less than π/2.
+        test_rays: Shape (n, 3), a ray inside each cell.
+        length: Needle, tip to flange, mm.
+        longest: The longest path, mm, at most ``length``.
+    """
+    n = len(centres)
+    found = SkinBounds(
+        np.full(n, -1), np.zeros(n, bool), np.full(n, np.inf), np.zeros(n), np.full(n, np.pi / 2), np.zeros(n)
+    )
+    _bound(
+        skin.corners,
+        skin.normals,
+        skin.fold,
+        skin.cut,
+        skin.zones.nearest,
+        skin.zones.farthest,
+        lists.start,
+        lists.items,
+        np.ascontiguousarray(centres),
+        radius + CONE_PAD_RAD,
+        np.ascontiguousarray(test_rays),
+        length,
+        longest,
+        (found.count, found.cut, found.least_skin, found.farthest, found.least_angle, found.largest_angle),
+    )
+    return found
+
+
+@nb.njit(cache=True)
+def _bound(  # type: ignore[no-untyped-def]  # numba infers
+    corners, normals, fold, cut, nearest, farthest, start, items, centres, radius, test_rays, length, longest, out
+):
+    count, has_cut, least_skin, deepest, least_angle, largest_angle = out
+    for i in range(len(centres)):
+        u, ray, rho = _vector(centres, i), _vector(test_rays, i), radius[i]
+        crossings, folded = 0, False
+        for k in range(start[i], start[i + 1]):
+            t = items[k]
+            a, b, c = _vector(corners[t], 0), _vector(corners[t], 1), _vector(corners[t], 2)
+            near, far = _depths(a, b, c, u, rho, nearest[t], farthest[t])
+            if near > length:
+                continue
+            da, db, dc = _edge_angle(a, b, u), _edge_angle(b, c, u), _edge_angle(c, a, u)
+            if min(da, db, dc) > rho and _pierced(a, b, c, u) != 1:
+                continue
+            folded |= far >= length
+            folded |= (fold[t, 0] and da <= rho) or (fold[t, 1] and db <= rho) or (fold[t, 2] and dc <= rho)
+            pierced = _pierced(a, b, c, ray)
+            folded |= pierced < 0
+            crossings += pierced
+            deepest[i] = max(deepest[i], far)
+            if cut[t]:
+                has_cut[i] = True
+            else:
+                least_skin[i] = min(least_skin[i], near)
+                if near <= longest:
+                    low, high = _angles(a, b, c, normals[t], u, rho)
+                    least_angle[i] = min(least_angle[i], low)
+                    largest_angle[i] = max(largest_angle[i], high)
+        count[i] = -1 if folded else crossings
+
+
+@nb.njit(cache=True)
+def _depths(a, b, c, u, rho, nearest, farthest):  # type: ignore[no-untyped-def]  # numba infers
+    """Least and largest depth at which a ray of the cone may meet the triangle."""
+    normal = _cross(_minus(b, a), _minus(c, a))
+    area = np.sqrt(_dot(normal, normal))
+    if area <= 1e-12 * farthest * farthest:
+        return nearest - LENGTH_PAD_MM, farthest + LENGTH_PAD_MM
+    height = _dot(normal, a) / area
+    cosine = _dot(normal, u) / area
+    if height < 0.0:
+        height, cosine = -height, -cosine
+    angle = np.arccos(min(1.0, max(-1.0, cosine)))
+    near, far = nearest, farthest
+    if angle - rho < np.pi / 2:
+        near = max(near, height / np.cos(max(0.0, angle - rho)))
+    if angle + rho < np.pi / 2 - 1e-3:
+        far = min(far, height / np.cos(angle + rho))
+    return near - LENGTH_PAD_MM, far + LENGTH_PAD_MM
+
+
+@nb.njit(cache=True)
+def _edge_angle(p, q, u):  # type: ignore[no-untyped-def]  # numba infers
+    """Angle between u and the nearest direction of the segment p-q, or less."""
+    np_, nq = np.sqrt(_dot(p, p)), np.sqrt(_dot(q, q))
+    if np_ == 0.0 or nq == 0.0:
+        return 0.0
+    to_ends = min(_angle(_times(p, 1 / np_), u), _angle(_times(q, 1 / nq), u))
+    normal = _cross(p, q)
+    area = np.sqrt(_dot(normal, normal))
+    if area <= 1e-9 * np_ * nq:  # seen end-on: both ends lie in one direction, or opposite ones
+        return 0.0 if _dot(p, q) < 0.0 else to_ends - 1e-8
+    if _dot(_cross(normal, p), u) >= 0.0 and _dot(_cross(q, normal), u) >= 0.0:
+        return min(to_ends, np.arcsin(min(1.0, abs(_dot(normal, u)) / area)))
+    return to_ends
+
+
+@nb.njit(cache=True)
+def _angle(a, b):  # type: ignore[no-untyped-def]  # numba infers
+    d = _minus(a, b)
+    return 2 * np.arcsin(min(1.0, 0.5 * np.sqrt(_dot(d, d))))
+
+
+@nb.njit(cache=True)
+def _pierced(a, b, c, u):  # type: ignore[no-untyped-def]  # numba infers
+    """1 where the ray along u crosses the triangle, 0 where it does not, -1 where rounding might decide."""
+    la, lb, lc = np.sqrt(_dot(a, a)), np.sqrt(_dot(b, b)), np.sqrt(_dot(c, c))
+    wa, wb, wc = _dot(u, _cross(b, c)), _dot(u, _cross(c, a)), _dot(u, _cross(a, b))
+    ea, eb, ec = IN_DOUBT * lb * lc, IN_DOUBT * lc * la, IN_DOUBT * la * lb
+    left = wa > ea or wb > eb or wc > ec
+    right = wa < -ea or wb < -eb or wc < -ec
+    if left and right:
+        return 0
+    ahead = wa * _dot(a, u) + wb * _dot(b, u) + wc * _dot(c, u)
+    if abs(wa) <= ea or abs(wb) <= eb or abs(wc) <= ec:
+        return -1
+    return 1 if (ahead > 0.0) == left else 0
+
+
+@nb.njit(cache=True)
+def _angles(a, b, c, normals, u, rho):  # type: ignore[no-untyped-def]  # numba infers
+    """Bounds of the angle, folded to 0..π/2, between a ray of the cone and the normal that is blended where it crosses.
+
+    Along a ray v the blended normal is parallel to M v, with M the sum of normal_i (p_j x p_k)^T.
+    """
+    ea, eb, ec = _cross(b, c), _cross(c, a), _cross(a, b)
+    ra, rb, rc = _vector(normals, 0), _vector(normals, 1), _vector(normals, 2)
+    middle = _sum(_times(ra, _dot(ea, u)), _times(rb, _dot(eb, u)), _times(rc, _dot(ec, u)))
+    size = np.sqrt(_dot(middle, middle))
+    total = (
+        _dot(ra, ra) * _dot(ea, ea)
+        + _dot(rb, rb) * _dot(eb, eb)
+        + _dot(rc, rc) * _dot(ec, ec)
+        + 2 * (_dot(ra, rb) * _dot(ea, eb) + _dot(rb, rc) * _dot(eb, ec) + _dot(rc, ra) * _dot(ec, ea))
+    )
+    if size <= 1e-12 * np.sqrt(_dot(ea, ea) + _dot(eb, eb) + _dot(ec, ec)):
+        return 0.0, np.pi / 2
+    q = _times(middle, 1 / size)
+    along = _sum(_times(ea, _dot(ra, q)), _times(eb, _dot(rb, q)), _times(ec, _dot(rc, q)))
+    aside = np.sqrt(max(0.0, total - _dot(along, along))) + 1e-7 * np.sqrt(_dot(ea, ea) + _dot(eb, eb) + _dot(ec, ec))
+    chord = 2 * np.sin(rho / 2)
+    rest = size - np.sqrt(_dot(along, along)) * chord
+    if rest <= 0.0:
+        return 0.0, np.pi / 2
+    spread = np.arctan2(aside * chord, rest) + rho
+    angle = np.arccos(min(1.0, abs(_dot(q, u))))
+    return max(0.0, angle - spread), min(np.pi / 2, angle + spread)
+
+
+@nb.njit(cache=True)
+def _vector(rows, i):  # type: ignore[no-untyped-def]  # numba infers
+    """A row as three numbers: arrays this small cost more to make than to use."""
+    return rows[i, 0], rows[i, 1], rows[i, 2]
+
+
+@nb.njit(cache=True)
+def _cross(a, b):  # type: ignore[no-untyped-def]  # numba infers
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@nb.njit(cache=True)
+def _dot(a, b):  # type: ignore[no-untyped-def]  # numba infers
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@nb.njit(cache=True)
+def _minus(a, b):  # type: ignore[no-untyped-def]  # numba infers
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@nb.njit(cache=True)
+def _times(a, factor):  # type: ignore[no-untyped-def]  # numba infers
+    return a[0] * factor, a[1] * factor, a[2] * factor
+
+
+@nb.njit(cache=True)
+def _sum(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
+    return a[0] + b[0] + c[0], a[1] + b[1] + c[1], a[2] + b[2] + c[2]

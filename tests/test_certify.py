@@ -1,0 +1,525 @@
+"""The certified map: cells and their cones, the bounds, whether the cells tell the truth, and the checker."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import segment_mesh_distance
+
+from meshes import folder
+from planning.anatomy import Anatomy, Role, Structure
+from planning.case_file import EntryAxes
+from planning.certify import certify, read_certificate, verify, write_certificate
+from planning.certify.bounds import view_bounds
+from planning.certify.cells import SQUARE_DEGREES, Cells, angle_between, nearest_cell, split
+from planning.certify.cones import Lists, narrowed, zones
+from planning.certify.near_organs import organ_bounds
+from planning.certify.skin_cones import skin_bounds
+from planning.certify.skin_surface import skin_surface
+from planning.clearance.fcl_engine import FclEngine
+from planning.entry import Directions, angles, entry_frame, outward
+from planning.errors import InputError
+from planning.formats.spaces import Space
+from planning.mesh import TriangleMesh
+from planning.prepared import prepare
+from planning.search import organ_candidates
+from planning.skin import FieldOfView, Skin, skin_from_mesh
+from planning.skin_entry import skin_paths
+
+REAL = Path(__file__).parent / "real"
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "totalseg_abdomen_3mm"
+
+CASES = {"abdomen": ("abdomen", 2.0), "carton": ("carton/case_m.toml", 2.0)}
+"""Case, and the size in degrees to which the tests certify it."""
+
+unit_interval = st.floats(0, 1)
+
+
+@pytest.fixture(scope="module", params=sorted(CASES))
+def certified(request):
+    """A case and its certificate."""
+    name, size = CASES[request.param]
+    prepared = prepare(folder() / name, arm=False)
+    return prepared, certify(prepared.case, prepared.anatomy, size=np.radians(size))
+
+
+@pytest.fixture(scope="module")
+def carton():
+    """The carton with its certificate at 3°."""
+    prepared = prepare(folder() / "carton" / "case_m.toml", arm=False)
+    return prepared, certify(prepared.case, prepared.anatomy, size=np.radians(3))
+
+
+def _directions(case, theta, beta):
+    return Directions(theta, beta, outward(theta, beta) @ case.T_ct_entry[:3, :3].T)
+
+
+def _judged(prepared, anatomy, directions):
+    """The search's verdicts, with FCL."""
+    engine = FclEngine([structure.mesh for structure in anatomy.structures])
+    return organ_candidates(prepared.case, anatomy, engine, directions)
+
+
+def _thrown_into(cells, rows, rng):
+    """A random direction inside each of some cells: θ and β."""
+    return tuple(rng.uniform(ranges[rows, 0], ranges[rows, 1]) for ranges in (cells.theta, cells.beta))
+
+
+# cells
+
+
+@given(st.lists(unit_interval, min_size=4, max_size=4), st.lists(unit_interval, min_size=2, max_size=2))
+@settings(max_examples=300)
+def test_a_cone_encloses_its_cell(corners, inside):
+    """Any direction of a cell, also at a pole, is within the cell's radius of its centre."""
+    theta = np.sort(np.pi * np.array(corners[:2]))
+    beta = 2 * np.pi * corners[2] + np.array([0, np.pi * corners[3]])
+    cell = Cells(theta[None], beta[None])
+    direction = outward(theta[0] + inside[0] * np.ptp(theta), beta[0] + inside[1] * np.ptp(beta))
+    assert angle_between(cell.centres()[0], direction) <= cell.radius()[0]
+
+
+def test_a_cell_too_wide_for_a_cone_has_none():
+    """More than half a circle of azimuth: nothing is claimed of its radius but π."""
+    assert Cells(np.array([[0, 1.0]]), np.array([[0, 3.2]])).radius()[0] == np.pi
+
+
+@pytest.mark.parametrize("theta", [(0, np.pi), (0, np.pi / 2), (0.3, 0.31), (3.0, np.pi)])
+def test_halves_and_quarters_tile_their_cell(theta, rng):
+    """Areas add up to the cap's, and every random direction lies in exactly one part."""
+    cells = Cells(np.array([theta], float), np.array([[0, 2 * np.pi]]))
+    area = cells.solid_angle()[0]
+    for _ in range(6):
+        cells = split(cells, cells.splits()).cells
+    assert cells.solid_angle().sum() == pytest.approx(area, rel=1e-12)
+    t, b = rng.uniform(*theta, 500), rng.uniform(0, 2 * np.pi, 500)
+    within = (cells.theta[:, :1] < t) & (t < cells.theta[:, 1:]) & (cells.beta[:, :1] < b) & (b < cells.beta[:, 1:])
+    np.testing.assert_array_equal(within.sum(axis=0), 1)
+
+
+def test_the_whole_sphere_has_its_area():
+    """41,253 square degrees."""
+    sphere = Cells(np.array([[0, np.pi]]), np.array([[0, 2 * np.pi]]))
+    assert sphere.solid_angle()[0] * SQUARE_DEGREES == pytest.approx(41252.96, abs=0.01)
+
+
+def test_the_nearest_cell_is_as_near_as_sampling_says(rng):
+    """Against a dense sample of the cell's directions: never farther, and nearer by less than the sample's spacing."""
+    for _ in range(40):
+        theta, beta = np.sort(rng.uniform(0, np.pi, 2)), rng.uniform(0, 6) + np.array([0, rng.uniform(0, 5)])
+        at = rng.uniform(0, np.pi), rng.uniform(0, 2 * np.pi)
+        found = nearest_cell(np.array([at[0]]), np.array([at[1]]), Cells(theta[None], beta[None]))[0]
+        grid = np.meshgrid(np.linspace(*theta, 150), np.linspace(*beta, 200))
+        sampled = angle_between(outward(*grid), outward(*at)).min()
+        assert sampled - 0.04 <= found <= sampled + 1e-9
+
+
+# bounds
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=50)
+def test_distances_stay_within_their_bounds(seed):
+    """A few random triangles, an axis, and the same axis turned by up to the radius: brute force never contradicts."""
+    rng = np.random.default_rng(seed)
+    corners = rng.normal(0, 40, (6, 1, 3)) + rng.normal(0, 8, (6, 3, 3))
+    mesh = TriangleMesh(corners.reshape(-1, 3), np.arange(18).reshape(6, 3))
+    length, limit, rho = 90.0, rng.uniform(0.1, 8), 10 ** rng.uniform(-3, -0.7)
+    u = outward(rng.uniform(0, np.pi), rng.uniform(0, 6.3))
+    cone, group = (u[None], np.array([rho])), np.zeros(6, np.int64)
+    near = narrowed(zones(corners, limit), group, 1, Lists.one(np.arange(6)), np.zeros(1, np.int64), *cone)
+    found = organ_bounds(
+        corners.reshape(6, 9), group, np.array([limit]), near.lists, np.zeros(1, np.int64), near.reach, *cone,
+        length=length, pad=0.0,
+    )  # fmt: skip
+    for _ in range(10):
+        v = _turned(u, rho, rng)
+        true = segment_mesh_distance(np.zeros(3), length * v, mesh)
+        assert true <= found.largest[0] + 1e-6
+        if found.slack[0] >= 0:  # otherwise nothing is claimed
+            assert true >= limit - 1e-6
+
+
+def _turned(u, rho, rng):
+    """A random direction up to rho away from u; often exactly rho."""
+    aside = np.cross(u, rng.normal(size=3))
+    by = rho * rng.choice([rng.uniform(), 1.0])
+    return np.cos(by) * u + np.sin(by) * aside / np.linalg.norm(aside)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=80)
+def test_the_field_of_view_bounds_hold(seed):
+    """Every ray of a cone exits as the cone's bound says, cut faces at random."""
+    rng = np.random.default_rng(seed)
+    view = FieldOfView(np.eye(4), rng.uniform(20, 100, 3), rng.random((3, 2)) < 0.5)
+    target, u = rng.uniform(0.05, 0.95, 3) * view.size_mm, outward(rng.uniform(0, np.pi), rng.uniform(0, 6.3))
+    rho, length = 10 ** rng.uniform(-3, -0.2), rng.uniform(20, 150)
+    found = view_bounds(view, target, u[None], np.array([rho]), length)
+    out = view.exit(target, np.array([_turned(u, rho, rng) for _ in range(200)]))
+    leaves = out.cut & (out.depth_mm < length)
+    assert not (found.kept[0] and leaves.any())
+    assert leaves.all() or not found.left[0]
+
+
+@pytest.mark.parametrize("shape", ["ball", "box", "bumpy"])
+def test_the_skin_bounds_hold(shape, ball, box, rng):
+    """Count, depth and angle of every ray of a cone stay within the cone's bounds, on smooth, flat and folded skins."""
+    mesh = {
+        "ball": lambda: ball(60, (5, 8, -3)),
+        "box": lambda: box((120, 90, 70), (4, 6, 9)),
+        "bumpy": lambda: _bumpy(ball(60, (3, 2, 1), 4)),
+    }[shape]()
+    skin = skin_from_mesh(mesh)
+    surface = skin_surface(skin, np.zeros(3))
+    everything = Lists.one(np.arange(len(mesh.faces)))
+    length, longest = 75.0, 70.0
+    proven = 0
+    for _ in range(150):
+        u, rho = outward(rng.uniform(0, np.pi), rng.uniform(0, 6.3)), 10 ** rng.uniform(-3, -0.8)
+        cone = u[None], np.array([rho])
+        found = skin_bounds(surface, everything, *cone, _turned(u, rho, rng)[None], length=length, longest=longest)
+        rays = np.array([_turned(u, rho, rng) for _ in range(60)])
+        paths = skin_paths(skin, np.zeros(3), rays, length)
+        hit = paths.path_length <= longest
+        assert (paths.path_length[hit] >= found.least_skin[0] - 1e-9).all()
+        assert (paths.skin_angle[hit] >= found.least_angle[0] - 1e-9).all()
+        assert (paths.skin_angle[hit] <= found.largest_angle[0] + 1e-9).all()
+        if found.count[0] >= 0:
+            proven += 1
+            within = paths.path_length <= length
+            assert (within == (found.count[0] >= 1)).all()
+            assert (~np.isnan(paths.reentry_depth) == (found.count[0] >= 2)).all()
+            assert (paths.path_length[within] <= found.farthest[0] + 1e-9).all()
+    assert proven > 30
+
+
+def _bumpy(mesh):
+    """A sphere whose radius swings so much that rays leave and enter it again."""
+    swing = 1 + 0.25 * np.sin(mesh.vertices / 8).prod(axis=1, keepdims=True)
+    stretched = mesh.vertices * swing
+    stretched[:, 0] += 0.02 * stretched[:, 1] ** 2
+    return TriangleMesh(stretched, mesh.faces)
+
+
+# the certified map
+
+
+def test_random_directions_never_contradict(certified, rng):
+    """Directions thrown into the cells and at the cap: the search, with FCL, agrees with every certified one."""
+    prepared, found = certified
+    case = prepared.case
+    rows = rng.integers(0, len(found.leaves), 1500)
+    theta, beta = _thrown_into(found.leaves, rows, rng)
+    theta = np.concatenate([theta, np.arccos(rng.uniform(0, 1, 1000))])
+    beta = np.concatenate([beta, rng.uniform(0, 2 * np.pi, 1000)])
+    letters = found.at(theta, beta)
+    judged = _judged(prepared, prepared.anatomy, _directions(case, theta, beta))
+    assert judged.safe[letters == "S"].all()
+    assert not judged.safe[letters == "R"].any()
+    assert min((letters == "S").sum(), (letters == "R").sum()) > 300
+
+
+def test_nearly_all_of_the_cap_is_decided(certified):
+    """Areas add up to the cap; no undecided cell is larger than asked; few are undecided, and not all is rejected."""
+    _, found = certified
+    assert sum(found.areas.values()) == pytest.approx(20626.48, rel=1e-6)
+    assert (2 * found.leaves.radius()[found.verdict == "U"] <= found.size).all()
+    assert found.share("U") < 0.15
+    assert found.share("S") > 0.15
+    assert found.share("R") > 0.15
+
+
+def test_the_safe_cone_is_safe(certified, rng):
+    """Directions anywhere within a candidate's safe cone, also at its rim, are safe."""
+    prepared, found = certified
+    rows = rng.choice(np.flatnonzero(found.verdict == "S"), 30, replace=False)
+    R = prepared.case.T_ct_entry[:3, :3]
+    centres = found.leaves.take(rows).centres() @ R.T
+    cones = found.safe_cone(centres)
+    assert (cones > 0).all()
+    around = np.concatenate(
+        [[_turned(u, 0.999 * cone, rng) for _ in range(20)] for u, cone in zip(centres, cones, strict=True)]
+    )
+    theta, beta = angles(around @ R)
+    assert (found.at(theta, beta) == "S").all()
+    judged = _judged(prepared, prepared.anatomy, _directions(prepared.case, theta, beta))
+    assert judged.safe.all()
+
+
+def test_there_is_no_safe_cone_where_nothing_is_proven(certified):
+    """0 in undecided and rejected cells, outside the cap, and at its border."""
+    prepared, found = certified
+    R = prepared.case.T_ct_entry[:3, :3]
+    rows = np.flatnonzero(found.verdict != "S")[:200]
+    assert (found.safe_cone(found.leaves.take(rows).centres() @ R.T) == 0).all()
+    assert found.safe_cone(-R[:, 2][None])[0] == 0
+    assert (found.at(np.array([3.0]), np.array([1.0])) == "")[0]
+
+
+def test_fewer_queries_than_the_dense_grid(carton):
+    """At half a degree distances are asked for less than a tenth of the directions of a grid of that spacing."""
+    prepared, _ = carton
+    found = certify(prepared.case, prepared.anatomy, size=np.radians(0.5))
+    assert found.queries < 0.1 * 720 * 181
+    assert found.share("U") < 0.01
+
+
+def test_the_checker_proves_every_cell(certified):
+    """The plain checker comes to the same verdicts, cell by cell."""
+    prepared, found = certified
+    checked = verify(found, prepared.case, prepared.anatomy)
+    assert (checked.safe, checked.rejected, checked.undecided) == tuple(
+        int((found.verdict == letter).sum()) for letter in "SRU"
+    )
+
+
+def test_a_file_gives_the_same_certificate(carton, tmp_path):
+    """Written and read: the same cells, verdicts and witnesses."""
+    _, found = carton
+    write_certificate(found, tmp_path / "c.json")
+    read = read_certificate(tmp_path / "c.json")
+    for name in ("theta", "beta"):
+        np.testing.assert_array_equal(getattr(read.leaves, name), getattr(found.leaves, name))
+    for name in ("verdict", "reason", "structure"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(found, name))
+    np.testing.assert_allclose(read.bound, found.bound, atol=1e-6)
+    assert read.summary() == found.summary()
+
+
+def _tampered(found, tmp_path, change):
+    path = tmp_path / "c.json"
+    write_certificate(found, path)
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+    return path
+
+
+def _swap(document, old, new):
+    for depth, level in enumerate(document["tree"]):
+        if old in level:
+            document["tree"][depth] = level.replace(old, new, 1)
+            return
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda d: _swap(d, "R", "S"), "summary"),
+        (lambda d: _swap(d, "S", ""), "cells or an unknown letter"),
+        (lambda d: d["tree"].pop(), "cells missing"),
+        (lambda d: _swap(d, "S", "X"), "unknown letter"),
+        (lambda d: d["witness"].pop(), "witnesses"),
+        (lambda d: d.update(version=99), "version"),
+        (lambda d: d.pop("tree"), "tree"),
+        (lambda d: d.update(size_rad=float("nan")), "finite"),
+        (lambda d: d["witness"].__setitem__(0, ["because", "", None, None]), "because"),
+    ],
+)
+def test_a_file_that_contradicts_itself_is_refused(carton, tmp_path, change, says):
+    """A flipped or missing cell, a missing part, another version: one line."""
+    path = _tampered(carton[1], tmp_path, change)
+    with pytest.raises(InputError, match=says) as caught:
+        read_certificate(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "null", "\x00\x01"])
+def test_no_certificate_is_refused(tmp_path, content):
+    """Empty, broken or other JSON."""
+    path = tmp_path / "c.json"
+    path.write_text(content)
+    with pytest.raises(InputError):
+        read_certificate(path)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_certificate(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize(("old", "new"), [("R", "S"), ("U", "S"), ("S", "R"), ("U", "R")])
+def test_a_flipped_cell_is_refused_even_with_a_matching_summary(carton, old, new):
+    """The checker proves claims; it does not trust the file's own arithmetic."""
+    prepared, found = carton
+    verdict, reason, structure = found.verdict.copy(), found.reason.copy(), found.structure.copy()
+    row = int(np.flatnonzero(verdict == old)[-1])
+    verdict[row] = new
+    reason[row], structure[row] = ("too_close", found.question.structures[0]) if new == "R" else ("", "")
+    tree, letters = [], iter(verdict)
+    for level in found.tree:
+        tree.append("".join(letter if letter.islower() else str(next(letters)) for letter in level))
+    forged = replace(found, tree=tuple(tree), verdict=verdict, reason=reason, structure=structure)
+    with pytest.raises(InputError, match=f"cell {row} .* is not proven"):
+        verify(forged, prepared.case, prepared.anatomy)
+
+
+@pytest.mark.parametrize("reason", ["too_long", "unknown_region", "reenters_skin", "skin_angle", "no_skin_entry"])
+def test_a_false_reason_is_refused(carton, reason):
+    """A cell that is too close does not break another constraint."""
+    prepared, found = carton
+    row = int(np.flatnonzero(found.reason == "too_close")[-1])
+    reasons = found.reason.copy()
+    reasons[row] = reason
+    with pytest.raises(InputError, match=reason):
+        verify(replace(found, reason=reasons), prepared.case, prepared.anatomy)
+
+
+def test_a_large_undecided_cell_is_refused(carton):
+    """A certificate may not claim a smaller size than it has."""
+    prepared, found = carton
+    with pytest.raises(InputError, match="small"):
+        verify(replace(found, size=found.size / 3), prepared.case, prepared.anatomy)
+
+
+def test_other_inputs_are_refused(carton):
+    """Another hash, needle, target, margin or case: the certificate was made for something else."""
+    prepared, found = carton
+    case, anatomy = prepared.case, prepared.anatomy
+    others = [
+        replace(case, inputs={**case.inputs, "skin.ply": "0" * 64}),
+        replace(case, name="other"),
+        replace(case, needle=replace(case.needle, diameter_mm=2.1)),
+        replace(case, target_ct=case.target_ct + [0, 0, 0.01]),
+    ]
+    for other in others:
+        with pytest.raises(InputError, match="certificate"):
+            verify(found, other, anatomy)
+    thicker = tuple(replace(s, margin_mm=s.margin_mm + 0.1) for s in anatomy.structures)
+    with pytest.raises(InputError, match="margins"):
+        verify(found, case, replace(anatomy, structures=thicker))
+
+
+# caps at the edge of sense
+
+
+@pytest.mark.parametrize(
+    ("theta", "beta"),
+    [
+        ((0.4, 0.4), (0, 2 * np.pi)),
+        ((0.2, 0.5), (1.0, 1.0)),
+        ((0.7, 0.7), (2.0, 2.0)),
+        ((0, 0), (0, 0)),
+        ((np.pi, np.pi), (0, 1)),
+    ],
+)
+def test_a_cap_without_area_is_certified_too(carton, theta, beta):
+    """An arc, a point and a pole: certified without an area to share, and the search agrees."""
+    prepared, _ = carton
+    found = certify(prepared.case, prepared.anatomy, size=np.radians(1), theta=theta, beta=beta)
+    assert found.share("S") is None
+    assert found.areas["S"] == 0
+    centres = found.leaves.centres() @ prepared.case.T_ct_entry[:3, :3].T
+    middle = Directions(found.leaves.theta.mean(axis=1), found.leaves.beta.mean(axis=1), centres)
+    judged = _judged(prepared, prepared.anatomy, middle)
+    assert judged.safe[found.verdict == "S"].all()
+    assert not judged.safe[found.verdict == "R"].any()
+    assert len(found.leaves) == 1 or (found.verdict != "U").any()  # a pole may run through a vertex
+    verify(found, prepared.case, prepared.anatomy)
+
+
+def test_the_whole_sphere_is_certified(carton, rng):
+    """θ to 180°: both poles, and the carton's bottom."""
+    prepared, _ = carton
+    found = certify(prepared.case, prepared.anatomy, size=np.radians(4), theta=(0, np.pi))
+    assert sum(found.areas.values()) == pytest.approx(41252.96, rel=1e-6)
+    theta, beta = _thrown_into(found.leaves, rng.integers(0, len(found.leaves), 600), rng)
+    judged = _judged(prepared, prepared.anatomy, _directions(prepared.case, theta, beta))
+    letters = found.at(theta, beta)
+    assert judged.safe[letters == "S"].all()
+    assert not judged.safe[letters == "R"].any()
+
+
+@pytest.mark.parametrize(
+    ("theta", "beta", "size"), [((1, 0), None, 1), ((0, 4), None, 1), (None, (0, 7), 1), (None, None, 1e-9)]
+)
+def test_a_cap_or_size_that_makes_no_sense_is_refused(carton, theta, beta, size):
+    """Descending or too wide ranges, and a size below what rounding allows."""
+    prepared, _ = carton
+    with pytest.raises(InputError):
+        certify(prepared.case, prepared.anatomy, size=size, theta=theta, beta=beta)
+
+
+def test_when_nothing_is_safe_the_map_proves_it(carton):
+    """With a margin that nothing keeps every cell is rejected, and the checker agrees."""
+    prepared, _ = carton
+    structures = tuple(replace(s, margin_mm=60.0) for s in prepared.anatomy.structures)
+    anatomy = replace(prepared.anatomy, structures=structures)
+    found = certify(prepared.case, anatomy, size=np.radians(4))
+    assert found.areas["S"] == 0
+    assert found.share("R") == pytest.approx(1)
+    verify(found, prepared.case, anatomy)
+
+
+def test_a_target_inside_an_organ_to_avoid_is_rejected_at_once(carton, ball):
+    """Wholly inside is a hit, whatever the surface says; one cell, no query."""
+    prepared, _ = carton
+    around = Structure("around", Role.UNKNOWN, 0.0, ball(900, prepared.case.target_ct), "")
+    anatomy = Anatomy((around,), prepared.anatomy.skin, ())
+    found = certify(prepared.case, anatomy, size=0.1)
+    assert found.tree == ("R",)
+    assert found.queries == 0
+    assert found.structure[0] == "around"
+    verify(found, prepared.case, anatomy)
+
+
+def test_without_organs_the_skin_alone_decides(carton):
+    """No structure with a margin: no query, and still a map."""
+    prepared, _ = carton
+    anatomy = Anatomy((), prepared.anatomy.skin, ())
+    found = certify(prepared.case, anatomy, size=np.radians(3))
+    assert found.queries == 0
+    assert found.share("S") > 0.5
+    verify(found, prepared.case, anatomy)
+
+
+def test_an_open_skin_is_only_certified_where_it_stands(carton, rng):
+    """With a hole in it, directions through the hole are never certified safe, and nothing contradicts the search."""
+    prepared, _ = carton
+    mesh = prepared.anatomy.skin.mesh
+    keep = np.ones(len(mesh.faces), bool)
+    keep[rng.choice(len(mesh.faces), 12, replace=False)] = False
+    skin = Skin(TriangleMesh(mesh.vertices, mesh.faces[keep]), np.zeros(keep.sum(), bool), None, ())
+    anatomy = replace(prepared.anatomy, skin=skin)
+    found = certify(prepared.case, anatomy, size=np.radians(2))
+    theta, beta = np.arccos(rng.uniform(0, 1, 3000)), rng.uniform(0, 2 * np.pi, 3000)
+    judged = _judged(prepared, anatomy, _directions(prepared.case, theta, beta))
+    letters = found.at(theta, beta)
+    assert judged.safe[letters == "S"].all()
+    assert not judged.safe[letters == "R"].any()
+
+
+def test_the_frame_of_the_map_may_be_any(carton, rng):
+    """In a tilted entry frame the same direction has the same verdict, or none."""
+    prepared, found = carton
+    tilted = np.eye(4)
+    tilted[:3, :3] = entry_frame(EntryAxes(z=(0.3, -0.2, 0.9), x=(1.0, 0.1, 0.0)), Space.LOCAL)
+    tilted[:3, 3] = prepared.case.target_ct
+    case = replace(prepared.case, T_ct_entry=tilted)
+    other = certify(case, prepared.anatomy, size=np.radians(3))
+    directions = outward(np.arccos(rng.uniform(0.6, 1, 3000)), rng.uniform(0, 6.28, 3000))
+    first = found.at(*angles(directions @ prepared.case.T_ct_entry[:3, :3]))
+    second = other.at(*angles(directions @ tilted[:3, :3]))
+    assert not (((first == "S") & (second == "R")) | ((first == "R") & (second == "S"))).any()
+    assert (first == second).mean() > 0.7
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the real CT (totalseg_abdomen_3mm) is not on this machine")
+def test_the_real_ct_never_contradicts(rng, tmp_path):
+    """A part of the real CT's cap: random directions agree with the search."""
+    for file in REAL.iterdir():
+        shutil.copy(file, tmp_path)
+    for name in ("ct", "labels_v1_normal", "labels_v2_fast"):
+        (tmp_path / f"{name}.nii.gz").symlink_to(DATA / f"{name}.nii.gz")
+    prepared = prepare(tmp_path / "case_v2.toml", arm=False)
+    case = prepared.case
+    cap = {"theta": (np.radians(20), np.radians(60)), "beta": (np.radians(40), np.radians(140))}
+    found = certify(case, prepared.anatomy, size=np.radians(2), **cap)
+    theta, beta = _thrown_into(found.leaves, rng.integers(0, len(found.leaves), 500), rng)
+    judged = _judged(prepared, prepared.anatomy, _directions(case, theta, beta))
+    letters = found.at(theta, beta)
+    assert judged.safe[letters == "S"].all()
+    assert not judged.safe[letters == "R"].any()
