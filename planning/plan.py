@@ -35,6 +35,18 @@ JOIN_TOLERANCE_RAD = 1e-9
 STRAIGHT_TOLERANCE_MM = 0.1
 """How far the tip may leave the straight path during the insertion: what a UR3 repeats."""
 
+BETWEEN_RAD = 0.002
+"""Joint step at which an insertion is looked at between its rows: up to 1.3 mm at the tip, bent by far less."""
+
+MAX_BETWEEN = 2000
+"""Points between two rows, at most: more than a whole turn needs."""
+
+INSERTION_MM_S = 10.0
+"""Tip speed of the insertion: a needle is driven slowly, and an operator must be able to stop it."""
+
+SPEED_ROUNDING = 1e-3
+"""A time law that just keeps a speed may exceed it by its sampling."""
+
 MAX_PLAN_BYTES = 50_000_000
 """A plan is some thousand waypoints; a larger file is something else."""
 
@@ -148,6 +160,7 @@ def check_geometry(plan: Plan, path: Path) -> None:
     if not np.allclose(plan.approach.q[-1], plan.insertion.q[0], rtol=0, atol=JOIN_TOLERANCE_RAD):
         raise InputError("the insertion does not start where the approach ends", where=path, allowed="joined phases")
     _check_straight(plan, path)
+    _check_speeds(plan, path)
     model = ur_model(plan.model)
     for name, q, standoff in (
         ("standoff", plan.insertion.q[0], plan.standoff_mm),
@@ -167,23 +180,61 @@ def check_geometry(plan: Plan, path: Path) -> None:
 
 
 def _check_straight(plan: Plan, path: Path) -> None:
-    """Refuse an insertion whose tip leaves the straight line to the target, or turns back."""
-    poses = flange_pose(ur_model(plan.model), plan.insertion.q)
+    """Refuse an insertion that leaves the straight line, tilts the needle, goes too deep or turns back.
+
+    Between two stored rows the joints turn evenly, so the motion is looked at there too.
+    """
+    model = ur_model(plan.model)
+    poses = flange_pose(model, _between(plan.insertion.q))
+    forward = poses[:, :3, 2]
+    tips = poses[:, :3, 3] + plan.needle_length_mm * forward
+    R, t = plan.T_base_ct[:3, :3], plan.T_base_ct[:3, 3]
+    outward, from_target = R @ plan.outward_ct, tips - (R @ plan.target_ct + t)
+    along = from_target @ outward
+    aside = np.linalg.norm(from_target - along[:, None] * outward, axis=1).max()
+    swing = plan.needle_length_mm * np.linalg.norm(forward + outward, axis=1).max()
+    back = np.max(along - np.minimum.accumulate(along))
+    deep = max(-along.min(), along.max() - plan.standoff_mm)
+    for what, amount in (
+        ("tip leaves the straight path", aside),
+        ("flange end of the needle swings out", swing),
+        ("insertion turns back", back),
+        ("insertion goes beyond standoff and target", deep),
+    ):
+        if not amount <= STRAIGHT_TOLERANCE_MM:
+            allowed = f"at most {STRAIGHT_TOLERANCE_MM} mm"
+            raise InputError(f"the {what} by {amount:.3g} mm", where=path, allowed=allowed)
+
+
+def _between(q: Floats) -> Floats:
+    """The rows of a joint path and points between them, no more than `BETWEEN_RAD` apart in any joint."""
+    counts = np.ceil(np.abs(np.diff(q, axis=0)).max(axis=1) / BETWEEN_RAD).astype(int).clip(1, MAX_BETWEEN)
+    steps = [a + (b - a) * (np.arange(n) / n)[:, None] for a, b, n in zip(q[:-1], q[1:], counts, strict=True)]
+    return np.concatenate([*steps, q[-1:]])
+
+
+def _check_speeds(plan: Plan, path: Path) -> None:
+    """Refuse joint limits, joint speeds or a tip speed beyond what a plan may have."""
+    model = ur_model(plan.model)
+    for phase, part in (("approach", plan.approach), ("insertion", plan.insertion)):
+        if not model.within_limits(part.q).all():
+            raise InputError(
+                f"the {phase} leaves the joint limits", where=path, allowed="angles within the arm's limits"
+            )
+        fastest = float((part.max_speeds() / model.max_speeds).max())
+        if not fastest <= 1 + SPEED_ROUNDING:
+            raise InputError(
+                f"the {phase} is {fastest:.3g} times as fast as a joint can turn",
+                where=path,
+                allowed="the arm's speeds",
+            )
+    poses = flange_pose(model, plan.insertion.q)
     tips = poses[:, :3, 3] + plan.needle_length_mm * poses[:, :3, 2]
-    target, outward = (
-        plan.T_base_ct[:3, :3] @ plan.target_ct + plan.T_base_ct[:3, 3],
-        plan.T_base_ct[:3, :3] @ plan.outward_ct,
-    )
-    along = (tips - target) @ outward
-    aside = float(np.linalg.norm(tips - target - along[:, None] * outward, axis=1).max())
-    if not aside <= STRAIGHT_TOLERANCE_MM:
+    speed = float((np.linalg.norm(np.diff(tips, axis=0), axis=1) / np.diff(plan.insertion.times_s)).max(initial=0.0))
+    if not speed <= INSERTION_MM_S * (1 + SPEED_ROUNDING):
         raise InputError(
-            f"the tip leaves the straight path by {aside:.3g} mm",
-            where=path,
-            allowed=f"at most {STRAIGHT_TOLERANCE_MM} mm",
+            f"the insertion drives the tip at {speed:.3g} mm/s", where=path, allowed=f"at most {INSERTION_MM_S:g} mm/s"
         )
-    if np.any(np.diff(along) > STRAIGHT_TOLERANCE_MM):
-        raise InputError("the insertion turns back", where=path, allowed="a motion inward")
 
 
 def _document(path: Path) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 from planning.approach import least_clearance, plan_approach
 from planning.candidates import Candidates
 from planning.errors import InputError, NoAnswerError
-from planning.plan import Plan
+from planning.plan import INSERTION_MM_S, Plan
 from planning.plan_check import motion_contact
 from planning.prepared import Prepared
 from planning.reach import assess_reach
@@ -24,9 +24,6 @@ MAX_TRIES = 20
 
 APPROACH_SPEED = 0.5
 """Share of the joints' speed limits on the way to the patient."""
-
-INSERTION_MM_S = 10.0
-"""Tip speed of the insertion: a needle is driven slowly, and an operator must be able to stop it."""
 
 
 class Planned(NamedTuple):

@@ -13,7 +13,7 @@ from planning.plan_check import check_plan, motion_contact
 from planning.planner import make_plan
 from planning.prepared import prepare
 from planning.reasons import Reason
-from planning.robot.kinematics import flange_pose
+from planning.robot.kinematics import flange_pose, inverse, nearest_within_limits
 from planning.robot.ur import ur_model
 
 
@@ -107,6 +107,38 @@ def _moved(trajectory, row, joint, by):
     return {"times_s": trajectory["times_s"], "q_rad": q.tolist()}
 
 
+def _with_rows(document, change):
+    """The insertion with other rows, evenly in time."""
+    rows = change(document["insertion"]["q_rad"])
+    return {"insertion": {"times_s": [0.5 * i for i in range(len(rows))], "q_rad": rows}}
+
+
+def _two_rows(document):
+    """The first and the last row of the insertion alone: straight in joint space, not for the tip."""
+    rows = document["insertion"]["q_rad"]
+    return {"insertion": {"times_s": [0.0, 60.0], "q_rad": [rows[0], rows[-1]]}}
+
+
+def _shifted(document, q, depth):
+    """There and back: joints that put the tip so far (mm) along the needle's outward direction, small steps."""
+    model, q = ur_model("ur3"), np.array(q)
+    outward = np.array(document["T_base_ct"])[:3, :3] @ np.array(document["outward_ct"])
+    T_start = flange_pose(model, q)
+    rows = []
+    for along in [*np.linspace(0, depth, 60)[1:], *np.linspace(depth, 0, 700)[1:]]:
+        T = T_start.copy()
+        T[:3, 3] += along * outward
+        q = nearest_within_limits(model, nearest_branch(inverse(model, T[None])[0], q), q)
+        rows.append(q.tolist())
+    return rows
+
+
+def nearest_branch(branches, q):
+    """The solution that is nearest to a configuration, whole turns aside."""
+    gap = np.abs((branches - q + np.pi) % (2 * np.pi) - np.pi).sum(axis=1)
+    return branches[np.nanargmin(gap)]
+
+
 BROKEN = {
     "another version": (lambda d: {"version": 7}, "version 7"),
     "no T_base_ct": (lambda d: {"T_base_ct": None}, "T_base_ct"),
@@ -123,6 +155,19 @@ BROKEN = {
     "a detour on the way in": (
         lambda d: {"insertion": _moved(d["insertion"], 40, 1, 0.01)},
         "leaves the straight path",
+    ),
+    "a dive past the target": (
+        lambda d: _with_rows(d, lambda rows: [*rows, *_shifted(d, rows[-1], -30.0)]),
+        "goes beyond standoff and target by 30|turns back by 30",
+    ),
+    "only the two ends of the insertion": (lambda d: _two_rows(d), "leaves the straight path by|swings out"),
+    "a thousand times as fast": (
+        lambda d: {"approach": {**d["approach"], "times_s": [t / 1000 for t in d["approach"]["times_s"]]}},
+        "times as fast as a joint can turn",
+    ),
+    "an insertion at ten times the speed": (
+        lambda d: {"insertion": {**d["insertion"], "times_s": [t / 10 for t in d["insertion"]["times_s"]]}},
+        "drives the tip at .* mm/s",
     ),
     "times that fall": (
         lambda d: {"insertion": {**d["insertion"], "times_s": d["insertion"]["times_s"][::-1]}},
@@ -179,6 +224,22 @@ def test_a_plan_for_another_patient_pose_is_refused(carton, planned):
     moved[0, 3] += 1e-6
     with pytest.raises(InputError, match="T_base_ct is not the case's"):
         check_plan(replace(planned.plan, T_base_ct=moved), carton, "plan.json")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("case_name", "another"),
+        ("entry_ct", np.array([0.0, 0, 147])),
+        ("expected_target_error_mm", 0.0),
+        ("clearance_mm", {"needle": 99.0}),
+        ("standoff_mm", 149.0),
+    ],
+)
+def test_a_plan_that_flatters_itself_is_refused(carton, planned, key, value):
+    """Numbers that people read are computed again, and a plan that states others is refused."""
+    with pytest.raises(InputError, match="the case gives"):
+        check_plan(replace(planned.plan, **{key: value}), carton, "plan.json")
 
 
 def test_an_unsafe_direction_is_refused_on_loading(carton, planned):
