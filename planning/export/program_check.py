@@ -1,0 +1,127 @@
+"""Whether a program that was read back is the plan's motion, and within the arm's limits."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.errors import InputError
+from planning.export.limits import check_positions, check_rates, check_trajectory
+from planning.export.motion import ANGLE_TOLERANCE_RAD
+from planning.export.program import Program, program_of, straight_move, stream_times, tip_poses, waypoint_rows
+from planning.plan import POSE_TOLERANCE_MM, STRAIGHT_TOLERANCE_MM, Plan
+from planning.robot.kinematics import flange_pose
+from planning.robot.ur import UrModel, ur_model
+from planning.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+SAME_BRANCH_RAD = 0.01
+"""How far the joints of the straight move may end from the plan's: a hundredth of the way to another branch."""
+
+SAME_RATE = 1e-6
+"""How far, as a share, a printed speed may be from the plan's: a speed of 1e-6 rad/s still has six digits."""
+
+TURN_TOLERANCE_RAD = 1e-3
+"""How far the straight move's orientation may be from the plan's: 0.2 mm over 200 mm of needle."""
+
+
+def check_program(program: Program, plan: Plan, blends_mm: Array | None = None, *, where: Path) -> None:
+    """Refuse a program that is not the plan's motion, or that breaks a limit.
+
+    Args:
+        program: As it was read back.
+        plan: What was exported.
+        blends_mm: The radii that were found free, as for :func:`program_of`.
+        where: The plan's file.
+
+    Raises:
+        InputError: Says what differs or which limit is broken.
+    """
+    model = ur_model(plan.model)
+    for name, read, planned in (
+        ("start", program.start_q, plan.approach.q[0]),
+        ("standoff", program.standoff_q, plan.insertion.q[0]),
+        ("target", program.target_q, plan.insertion.q[-1]),
+    ):
+        _check_same(read, planned, f"the {name}", where)
+    wanted = program_of(plan, blends_mm)
+    if not (
+        len(program.moves) == len(wanted.moves)
+        and np.allclose(_rates(program), _rates(wanted), rtol=SAME_RATE, atol=0.0)
+    ):
+        raise InputError(
+            "a speed, an acceleration or a radius does not read back", where=where, allowed="the plan's, above 1e-6"
+        )
+    _check_approach(program, plan, model, where)
+    _check_insertion(program, plan, model, where)
+
+
+def _rates(program: Program) -> Array:
+    """Everything that a program prints beside angles and poses; 1 + mm for radii, which may be 0."""
+    moves = [(move.speed, move.acceleration, 1.0 + move.blend_mm) for move in program.moves]
+    return np.array([program.tcp_mm, program.insertion_mm_s, program.insertion_mm_s2, *np.ravel(moves)])
+
+
+def _check_approach(program: Program, plan: Plan, model: UrModel, where: Path) -> None:
+    if len(program.stream_q):
+        times = stream_times(len(program.stream_q))
+        streamed = Trajectory(times, np.concatenate([program.start_q[None], program.stream_q]))
+        _check_same(streamed.q, plan.approach.at(times), "the streamed approach", where)
+        check_trajectory(model, streamed, time_resolution_s=0.0, what="approach", where=where)
+        return
+    path = np.stack([program.start_q, *(move.q for move in program.moves)])
+    check_positions(model, path, what="approach", where=where)
+    _check_same(path, plan.approach.q[waypoint_rows(plan)], "the approach", where)
+    for (start, end), move in zip(pairwise(path), program.moves, strict=True):
+        share = np.abs(end - start) / np.abs(end - start).max()
+        rates = share[None] * move.speed, share[None] * move.acceleration
+        check_rates(model, *rates, what="approach", where=where)
+    if program.moves and program.moves[-1].blend_mm != 0.0:
+        raise InputError("the approach does not stop at its end", where=where, allowed="a last blend of 0")
+
+
+def _check_insertion(program: Program, plan: Plan, model: UrModel, where: Path) -> None:
+    tips = tip_poses(plan)
+    for name, read, planned in (
+        ("standoff", program.T_base_standoff, tips[0]),
+        ("target", program.T_base_target, tips[-1]),
+    ):
+        off, turned = _pose_difference(read, planned)
+        if not (off <= POSE_TOLERANCE_MM and turned <= TURN_TOLERANCE_RAD):
+            raise InputError(f"the {name} pose is {off:.3g} mm off", where=where, allowed=f"{POSE_TOLERANCE_MM} mm")
+    turned = _pose_difference(program.T_base_standoff, program.T_base_target)[1]
+    if not turned <= TURN_TOLERANCE_RAD:
+        raise InputError(f"the needle turns by {turned:.3g} rad on its way", where=where, allowed="a straight way")
+    driven = straight_move(model, program)
+    ends = np.abs(driven.q[[0, -1]] - np.stack([program.standoff_q, program.target_q])).max()
+    if not ends <= SAME_BRANCH_RAD:
+        raise InputError(f"the straight move ends {ends:.3g} rad off", where=where, allowed="the plan's own branch")
+    worst = _farthest_mm(flange_pose(model, driven.q)[:, :3, 3], flange_pose(model, plan.insertion.q)[:, :3, 3])
+    if not worst <= STRAIGHT_TOLERANCE_MM:
+        raise InputError(f"the straight move is {worst:.3g} mm off the plan's way", where=where, allowed="the plan")
+    check_trajectory(model, driven, time_resolution_s=0.0, what="insertion", where=where)
+
+
+def _farthest_mm(points: Array, line: Array) -> float:
+    """The farthest that points (m, 3) stand from the straight line through the ends of another way (k, 3)."""
+    unit = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
+    worst = 0.0
+    for way in (points, line):
+        away = way - line[0]
+        worst = max(worst, float(np.linalg.norm(away - (away @ unit)[:, None] * unit, axis=1).max()))
+    return worst
+
+
+def _pose_difference(T_a: Array, T_b: Array) -> tuple[float, float]:
+    turned = math.acos(float(np.clip((np.trace(T_a[:3, :3].T @ T_b[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
+    return float(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3])), turned
+
+
+def _check_same(read: Array, planned: Array, what: str, where: Path) -> None:
+    if read.shape != planned.shape or not np.abs(read - planned).max() <= ANGLE_TOLERANCE_RAD:
+        raise InputError(f"{what} does not read back as the plan's", where=where, allowed="the plan's angles")

@@ -1,0 +1,159 @@
+"""The plan as two ``trajectory_msgs/JointTrajectory`` messages in YAML, one for each phase."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.errors import InputError
+from planning.export.corners import corner_rows, rests_at
+from planning.export.limits import check_rates
+from planning.export.motion import SampledMotion
+from planning.export.text import heading
+from planning.plan import Plan
+from planning.robot.links import JOINT_NAMES
+from planning.robot.ur import UrModel, ur_model
+from planning.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+NANOSECONDS = 1_000_000_000
+
+LONGEST_S = 2**31 - 1
+"""``sec`` is a signed 32-bit integer."""
+
+TIME_RESOLUTION_S = 1.0 / NANOSECONDS
+
+MONOTONE = 3.0
+"""A cubic between two samples stays between them if its end slopes are at most this many times the chord's (Fritsch
+and Carlson, "Monotone piecewise cubic interpolation", 1980)."""
+
+NOTES = (
+    "two trajectory_msgs/JointTrajectory: send 'approach', wait for the operator at standoff, then send 'insertion'",
+    "joint angles are the same for ROS and for the controller; base_link of ur_description is the controller's base",
+    "turned by 180 deg about z, which matters to Cartesian poses only: there are none here, and frame_id is empty",
+    "the controller must stand at the first positions before the approach is sent: check it",
+)
+
+_POINT = re.compile(
+    r"    - \{positions: \[(.+)\], velocities: \[(.+)\], time_from_start: \{sec: (\d+), nanosec: (\d+)\}\}"
+)
+
+
+def ros2_text(plan: Plan, *, case_checked: bool) -> str:
+    """One YAML mapping with the messages ``approach`` and ``insertion``."""
+    lines = heading(plan, NOTES, case_checked=case_checked)
+    for phase in SampledMotion._fields:
+        lines += [f"{phase}:", *_message(ur_model(plan.model), getattr(plan, phase))]
+    return "\n".join(lines) + "\n"
+
+
+def _message(model: UrModel, trajectory: Trajectory) -> list[str]:
+    lines = [
+        "  header: {stamp: {sec: 0, nanosec: 0}, frame_id: ''}",
+        f"  joint_names: [{', '.join(JOINT_NAMES)}]",
+        "  points:",
+    ]
+    for time, q, speeds in zip(trajectory.times_s, trajectory.q, velocities(model, trajectory), strict=True):
+        sec, nanosec = divmod(round(float(time) * NANOSECONDS), NANOSECONDS)
+        lines.append(
+            f"    - {{positions: {_floats(q)}, velocities: {_floats(speeds)}, "
+            f"time_from_start: {{sec: {sec}, nanosec: {nanosec}}}}}"
+        )
+    return lines
+
+
+def _floats(row: Array) -> str:
+    """Exact floats, each with a point: YAML 1.1 takes ``1e-05`` for a word and ``3`` for an integer."""
+    texts = [repr(value) for value in row.tolist()]
+    return f"[{', '.join(t if '.' in t else t.replace('e', '.0e') for t in texts)}]"
+
+
+def velocities(model: UrModel, trajectory: Trajectory) -> Array:
+    """Speeds at the samples, by differences: 0 at the ends, where the arm rests, and where a joint turns back.
+
+    Of three parabolas through a sample and two neighbours (both before, one on each side, both after) at least two have
+    the motion's own slope when its acceleration changes at samples only, and not at two in a row: the middle one of the
+    three slopes is taken. It is held within what keeps a cubic through the samples between its neighbours.
+
+    Args:
+        model: The arm.
+        trajectory: The samples.
+
+    Returns:
+        Shape (m, 6), rad/s.
+    """
+    speeds = np.zeros_like(trajectory.q)
+    if len(speeds) < 3:
+        return speeds
+    steps = np.diff(trajectory.times_s)[:, None]
+    slopes = np.diff(trajectory.q, axis=0) / steps
+    before, after = slopes[:-1], slopes[1:]
+    most = MONOTONE * np.minimum(np.abs(before), np.abs(after))
+    speeds[1:-1] = np.where(before * after > 0.0, np.clip(_middle_slope(slopes, steps), -most, most), 0.0)
+    corners = corner_rows(trajectory.q)[1:-1]
+    if rests_at(model, trajectory, corners):
+        speeds[corners] = 0.0
+    return speeds
+
+
+def _middle_slope(slopes: Array, steps: Array) -> Array:
+    """The middle one of three parabolas' slopes at each inner sample.
+
+    Args:
+        slopes: Shape (m - 1, 6), between the samples.
+        steps: Shape (m - 1, 1), s.
+
+    Returns:
+        Shape (m - 2, 6).
+    """
+    bends = np.diff(slopes, axis=0) / (steps[1:] + steps[:-1])
+    around = slopes[:-1] + steps[:-1] * bends
+    behind, ahead = around.copy(), around.copy()
+    behind[1:] = slopes[1:-1] + steps[1:-1] * bends[:-1]
+    ahead[:-1] = slopes[1:-1] - steps[1:-1] * bends[1:]
+    return np.median(np.stack([behind, around, ahead]), axis=0)
+
+
+def read_ros2(text: str, model: UrModel, *, where: Path) -> SampledMotion:
+    """Read the messages back, line by line as they are written; speeds are held against the limits.
+
+    Raises:
+        InputError: Any line that is not one of this layout's, other joints, or points that are no motion.
+    """
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    parts: dict[str, Trajectory] = {}
+    for phase in SampledMotion._fields:
+        if lines[:1] != [f"{phase}:"] or lines[2:4] != [f"  joint_names: [{', '.join(JOINT_NAMES)}]", "  points:"]:
+            raise InputError(f"no message '{phase}' of the six joints", where=where, allowed="approach, insertion")
+        lines = lines[4:]
+        points = []
+        while lines and (match := _POINT.fullmatch(lines[0])):
+            points.append(match.groups())
+            lines = lines[1:]
+        parts[phase] = _trajectory(points, model, phase, where)
+    if lines:
+        raise InputError(f"line {lines[0]!r:.80}", where=where, allowed="points of two messages")
+    return SampledMotion(**parts)
+
+
+def _trajectory(points: list[tuple[str, ...]], model: UrModel, phase: str, where: Path) -> Trajectory:
+    try:
+        return _parsed(points, model, phase, where)
+    except ValueError as error:
+        raise InputError(f"{phase}: {error}", where=where, allowed="six positions and velocities a point") from error
+
+
+def _parsed(points: list[tuple[str, ...]], model: UrModel, phase: str, where: Path) -> Trajectory:
+    times = np.array([int(sec) + int(nanosec) / NANOSECONDS for _, _, sec, nanosec in points])
+    if len(times) and times[-1] > LONGEST_S:
+        raise InputError(f"{phase} of {times[-1]:.3g} s", where=where, allowed=f"at most {LONGEST_S} s")
+    if len(times) == 0 or times[0] != 0.0 or (np.diff(times) <= 0.0).any():
+        what = f"{phase}: two samples within a nanosecond, or none at time 0"
+        raise InputError(what, where=where, allowed="times that rise from 0 by whole nanoseconds")
+    q, speeds = (np.array([[float(x) for x in point[k].split(",")] for point in points]).reshape(-1, 6) for k in (0, 1))
+    check_rates(model, speeds, np.zeros((1, 6)), what=f"{phase} velocities", where=where)
+    return Trajectory(times, q)

@@ -1,0 +1,44 @@
+"""Words and numbers in exported files: nothing that a plan names can leave its comment or its string."""
+
+from __future__ import annotations
+
+import string
+from collections.abc import Iterable
+from importlib.metadata import version
+
+from planning.plan import PLAN_VERSION, Plan
+
+PLAIN = frozenset(string.ascii_letters + string.digits + " ._-+:/()")
+"""What may stand in a comment or a string of any of the formats: nothing that ends, escapes or nests one."""
+
+LONGEST = 200
+"""Characters of one name; a longer one is cut."""
+
+
+def plain_text(text: str) -> str:
+    """A name with every character outside ``PLAIN`` turned into an underscore, cut at ``LONGEST``.
+
+    >>> plain_text('liver"); halt #')
+    'liver_)_ halt _'
+    """
+    return "".join(character if character in PLAIN else "_" for character in text[:LONGEST])
+
+
+def heading(plan: Plan, notes: Iterable[str], *, case_checked: bool) -> list[str]:
+    """Comment lines that say what a file is, what it was made from, and how to read it.
+
+    Args:
+        plan: The plan that the file holds.
+        case_checked: Whether the plan was held against its case when it was exported.
+        notes: Further lines.
+    """
+    lines = [
+        "research software, not a medical device",
+        f"made by puncture-twin {version('puncture-twin')} from a plan of version {PLAN_VERSION}, seed {plan.seed}",
+        f"case: {plain_text(plan.case_name)}",
+        *(f"input: {plain_text(name)} sha256 {plain_text(plan.inputs[name])}" for name in sorted(plan.inputs)),
+        f"robot: {plain_text(plan.model)}",
+        "this plan was " + ("checked against its case again" if case_checked else "NOT checked against its case again"),
+        *notes,
+    ]
+    return [f"# {line}" for line in lines]

@@ -1,0 +1,207 @@
+"""A program in URScript: written, and read back. The one language here that speaks metres.
+
+It looks before it moves: the arm must stand at the plan's start, and the controller's own kinematics must put the
+needle where the plan does. It stops at the standoff, sets the tip on the planned line, and waits for the operator.
+The text is one function and nothing else, not even a comment before it: a controller runs what it gets on its socket
+as soon as that is whole, and a second piece would replace the first.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from planning.errors import InputError
+from planning.export.program import STREAM_S, JointMove, Program
+from planning.export.text import heading
+from planning.plan import Plan
+
+Array = NDArray[np.float64]
+
+M_PER_MM = 1e-3
+
+DIGITS = 12
+"""After the point: 1e-12 rad and 1e-9 mm. Never an exponent, which not every controller reads."""
+
+START_TOLERANCE_RAD = 0.002
+"""How far each joint may be from a planned one: 0.1 deg, 2 mm at a metre; a controller stops closer than that."""
+
+KINEMATICS_TOLERANCE_RAD = 0.02
+"""How far the controller's own joints for the target may be from the plan's: the calibration of one arm moves them by
+some thousandths, another model of the family or another TCP by much more."""
+
+STANDOFF_TOLERANCE_M = 0.002
+"""How far the controller may say that the tip is from the standoff: its calibration against the model's lengths."""
+
+ALIGN_M_S = 0.005
+"""Tip speed of the correction by that distance."""
+
+_NUMBER = r"-?\d+\.\d+"
+_LIST = rf"\[{_NUMBER}(?:, {_NUMBER}){{5}}\]"
+_MOVEJ = re.compile(rf"  movej\(({_LIST}), a=({_NUMBER}), v=({_NUMBER}), r=({_NUMBER})\)")
+_SERVOJ = re.compile(rf"  servoj\(({_LIST}), 0, 0, {_NUMBER}, 0.1, 300\)")
+_SETTLE = "  movej(standoff_q, a=0.1, v=0.05)"
+_VALUE = re.compile(rf"  (start_q|standoff_q|target_q|standoff_m|target_m|tcp_m) = (p?{_LIST})")
+_INSERTION = re.compile(rf"  movel\(target_m, a=({_NUMBER}), v=({_NUMBER})\)")
+_WAIT = '  popup("Needle at standoff. Continue inserts it.", title="Insertion", blocking=True)'
+
+_FUNCTIONS = """\
+  def far_from(wanted_q, tolerance):
+    local actual_q = get_actual_joint_positions()
+    local i = 0
+    while i < 6:
+      if norm(actual_q[i] - wanted_q[i]) > tolerance:
+        return True
+      end
+      i = i + 1
+    end
+    return False
+  end
+
+  def differ_but_for_turns(first_q, second_q, tolerance):
+    local i = 0
+    while i < 6:
+      if 2.0 * norm(sin((first_q[i] - second_q[i]) / 2.0)) > tolerance:
+        return True
+      end
+      i = i + 1
+    end
+    return False
+  end
+
+  def refuse(message):
+    popup(message, title="Refused", error=True, blocking=True)
+    halt
+  end
+"""
+
+
+def urscript_text(program: Program, plan: Plan, *, case_checked: bool) -> str:
+    """The program as URScript: radians, metres, the controller's base frame."""
+    blended = any(move.blend_mm > 0.0 for move in program.moves)
+    notes = [
+        "units: metres and radians; poses in the controller's base frame; TCP at the needle tip",
+        "corners of the approach: " + ("rounded where the plan's case shows them free" if blended else "not rounded"),
+        "not set here: payload, safety limits, forces. The arm stops for no tissue and no person.",
+    ]
+    lines = ["def puncture():", *(f"  {line}" for line in heading(plan, notes, case_checked=case_checked))]
+    lines += [*_values(program), "", *_FUNCTIONS.splitlines(), ""]
+    lines += [*_checks(), "", *_approach(program), "", *_insertion(program), "end"]
+    return "\n".join(lines) + "\n"
+
+
+def _values(program: Program) -> list[str]:
+    return [
+        f"  tcp_m = p{_list([0.0, 0.0, program.tcp_mm * M_PER_MM, 0.0, 0.0, 0.0])}",
+        f"  start_q = {_list(program.start_q)}",
+        f"  standoff_q = {_list(program.standoff_q)}",
+        f"  target_q = {_list(program.target_q)}",
+        f"  standoff_m = p{_list(_pose_m(program.T_base_standoff))}",
+        f"  target_m = p{_list(_pose_m(program.T_base_target))}",
+    ]
+
+
+def _checks() -> list[str]:
+    return [
+        "  set_tcp(tcp_m)",
+        f"  if far_from(start_q, {START_TOLERANCE_RAD}):",
+        '    refuse("The arm does not stand at the start of the plan.")',
+        "  end",
+        f"  if differ_but_for_turns(get_inverse_kin(target_m, target_q), target_q, {KINEMATICS_TOLERANCE_RAD}):",
+        '    refuse("This arm or its TCP is not the one of the plan.")',
+        "  end",
+    ]
+
+
+def _approach(program: Program) -> list[str]:
+    lines = [
+        f"  movej({_list(move.q)}, a={_number(move.acceleration)}, v={_number(move.speed)}, "
+        f"r={_number(move.blend_mm * M_PER_MM)})"
+        for move in program.moves
+    ]
+    lines += [f"  servoj({_list(q)}, 0, 0, {_number(STREAM_S)}, 0.1, 300)" for q in program.stream_q]
+    return [*lines, *(["  stopj(1.4)", _SETTLE] if len(program.stream_q) else [])]
+
+
+def _insertion(program: Program) -> list[str]:
+    acceleration = _number(program.insertion_mm_s2 * M_PER_MM)
+    return [
+        f"  if far_from(standoff_q, {START_TOLERANCE_RAD}):",
+        '    refuse("The arm did not come to the standoff.")',
+        "  end",
+        f"  if point_dist(get_actual_tcp_pose(), standoff_m) > {STANDOFF_TOLERANCE_M}:",
+        '    refuse("The controller puts the needle elsewhere than the plan.")',
+        "  end",
+        f"  movel(standoff_m, a={acceleration}, v={_number(ALIGN_M_S)})",
+        "  held_q = get_actual_joint_positions()",
+        _WAIT,
+        f"  if far_from(held_q, {START_TOLERANCE_RAD}):",
+        '    refuse("The arm moved while it waited.")',
+        "  end",
+        f"  movel(target_m, a={acceleration}, v={_number(program.insertion_mm_s * M_PER_MM)})",
+        f"  stopl({acceleration})",
+    ]
+
+
+def read_urscript(text: str, *, where: Path) -> Program:
+    """Read a program back, as it is written here.
+
+    Raises:
+        InputError: A value or a move is missing or stands twice, or the insertion does not wait for the operator.
+    """
+    lines = text.splitlines()
+    values = {match[1]: _floats(match[2]) for line in lines if (match := _VALUE.fullmatch(line))}
+    moves = [match for line in lines if (match := _MOVEJ.fullmatch(line))]
+    streamed = [match for line in lines if (match := _SERVOJ.fullmatch(line))]
+    driven = [(at, match) for at, line in enumerate(lines) if (match := _INSERTION.fullmatch(line))]
+    others = sum(line.lstrip().startswith(("movej", "movel", "movep", "movec", "servo", "speed")) for line in lines)
+    settles = lines.count(_SETTLE) if streamed else 0
+    waits = [at for at, line in enumerate(lines) if line == _WAIT]
+    if len(values) != 6 or len(driven) != 1 or others != len(moves) + len(streamed) + 2 + settles:
+        raise InputError("the program does not read back", where=where, allowed="known moves and one insertion")
+    at, insertion = driven[0]
+    last = max((n for n, line in enumerate(lines) if line.startswith(("  movej", "  servoj"))), default=-1)
+    if len(waits) != 1 or not last < waits[0] < at:
+        raise InputError("the insertion does not wait for the operator", where=where, allowed="a wait before it")
+    return Program(
+        tcp_mm=float(values["tcp_m"][2]) / M_PER_MM,
+        start_q=values["start_q"],
+        moves=tuple(JointMove(_floats(m[1]), float(m[3]), float(m[2]), float(m[4]) / M_PER_MM) for m in moves),
+        stream_q=np.array([_floats(match[1]) for match in streamed]).reshape(-1, 6),
+        T_base_standoff=_pose_mm(values["standoff_m"]),
+        T_base_target=_pose_mm(values["target_m"]),
+        standoff_q=values["standoff_q"],
+        target_q=values["target_q"],
+        insertion_mm_s=float(insertion[2]) / M_PER_MM,
+        insertion_mm_s2=float(insertion[1]) / M_PER_MM,
+    )
+
+
+def _number(value: float) -> str:
+    """Fixed point, no negative zero."""
+    text = f"{value:.{DIGITS}f}"
+    return text.lstrip("-") if float(text) == 0.0 else text
+
+
+def _list(values: Array | list[float]) -> str:
+    return f"[{', '.join(_number(float(value)) for value in values)}]"
+
+
+def _floats(text: str) -> Array:
+    return np.array([float(value) for value in text.strip("p[]").split(",")])
+
+
+def _pose_m(T: Array) -> Array:
+    """A pose as the controller writes it: position in metres, then the rotation vector in rad."""
+    return np.concatenate([T[:3, 3] * M_PER_MM, Rotation.from_matrix(T[:3, :3]).as_rotvec()])
+
+
+def _pose_mm(pose_m: Array) -> Array:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(pose_m[3:]).as_matrix()
+    T[:3, 3] = pose_m[:3] / M_PER_MM
+    return T
