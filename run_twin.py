@@ -18,6 +18,8 @@ from typer._click.exceptions import ClickException  # typer carries its own clic
 from meshes import folder as meshes_folder
 from planning.batch import run_batch
 from planning.errors import InputError, NoAnswerError, PlanningError
+from planning.export import FORMATS
+from planning.files import check_writable
 from planning.prepared import prepare
 from twin import main_job, words
 from twin.ct.chen2019 import reproduce as reproduce_chen2019
@@ -29,8 +31,11 @@ app = typer.Typer(add_completion=False, no_args_is_help=False, pretty_exceptions
 out = Console(soft_wrap=True)
 
 CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case file, or the folder that holds case.toml.")]
-OutOption = Annotated[Path, typer.Option("--out", help="Folder for the files that are written.")]
+OutOption = Annotated[
+    Path, typer.Option("--out", help="Folder for the files that are written.", callback=check_writable)
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, and nothing else there.")]
+EngineOption = Annotated[str, typer.Option("--engine", help="Who measures clearance: fast, or fcl, the reference.")]
 PicturesOption = Annotated[
     bool, typer.Option("--pictures/--no-pictures", help="Whether to draw the map, the scene and the page.")
 ]
@@ -56,14 +61,34 @@ def search(
     out_dir: OutOption = Path("out"),
     arm: ArmOption = True,
     pictures: PicturesOption = True,
+    engine: EngineOption = "fast",
+    check_again: Annotated[int, typer.Option("--cross-check", min=0, help="Directions that FCL measures again.")] = 0,
+    certified: Annotated[bool, typer.Option("--certify", help="Judge the angles between the grid points too.")] = False,
+    certify_size: Annotated[float, typer.Option(min=0.05, max=10, help="Smallest cell of --certify, degrees.")] = 0.25,
     as_json: JsonOption = False,
 ) -> None:
     """Judge every entry direction of a case; write the table, the map, the scene and the page."""
     with progress_display() as progress:
-        run = main_job.search_case(prepare(case, arm=arm, watcher=progress), out_dir, pictures=pictures)
+        prepared = prepare(case, arm=arm, engine=engine, watcher=progress)
+        checked = prepared.cross_check(check_again) if check_again else None
+        run = main_job.search_case(
+            prepared, out_dir, pictures=pictures, checked=checked, certify_deg=certify_size if certified else None
+        )
     _print(run.summary(), words.search_text(run), as_json)
     if not run.candidates.safe.any():
         raise typer.Exit(ANSWER_IS_NO)
+
+
+@app.command()
+def verify(
+    certificate: Annotated[Path, typer.Argument(metavar="CERTIFICATE", help="What search --certify wrote.")],
+    case: Annotated[Path, typer.Option("--case", help="The case that it certifies.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Prove every cell of a certificate again, with a plain checker that shares none of the fast code."""
+    with progress_display() as progress:
+        report = main_job.verify_certificate(certificate, prepare(case, arm=False, watcher=progress))
+    _print(report, words.certificate_text(report), as_json)
 
 
 @app.command()
@@ -107,6 +132,24 @@ def rehearse(
 
 
 @app.command()
+def export(
+    plan: Annotated[Path, typer.Argument(metavar="PLAN", help="A plan.json.")],
+    format_name: Annotated[str, typer.Option("--format", metavar="urscript|ros2|csv", help="For which robot.")],
+    case: Annotated[Path | None, typer.Option("--case", help="The plan's case: check the plan again.")] = None,
+    out_dir: OutOption = Path("out"),
+    as_json: JsonOption = False,
+) -> None:
+    """Write a plan for a robot, read back and within the arm's limits. Research software, not a medical device."""
+    if format_name not in FORMATS:
+        raise InputError(f"format '{format_name}' is not known", where="--format", allowed=", ".join(FORMATS))
+    with progress_display() as progress:
+        prepared = None if case is None else prepare(case, watcher=progress)
+        done = main_job.export(plan, format_name, out_dir, prepared)
+    summary = {"format": format_name, "notes": list(done.notes), "case_checked": case is not None}
+    _print({**summary, "files": [str(done.path)]}, words.export_text(done, case is not None), as_json)
+
+
+@app.command()
 def register(case: CaseArgument, as_json: JsonOption = False) -> None:
     """Register a case's markers; print residuals, FRE, expected TRE and weak points."""
     report = main_job.registration_report(case)
@@ -125,10 +168,9 @@ def batch(
     with progress_display() as progress:
         rows = run_batch(cases, out_dir, jobs=jobs, arm=arm, watcher=progress)
     _print({"cases": rows}, words.batch_text(rows), as_json)
-    if any(row["exit_code"] == BAD_INPUT for row in rows):
-        raise typer.Exit(BAD_INPUT)
-    if any(row["exit_code"] == ANSWER_IS_NO for row in rows):
-        raise typer.Exit(ANSWER_IS_NO)
+    for code in (PROGRAM_FAILED, BAD_INPUT, ANSWER_IS_NO):
+        if any(row["exit_code"] == code for row in rows):
+            raise typer.Exit(code)
 
 
 @app.command()
@@ -146,7 +188,11 @@ def reproduce(
 
 def _rehearse(case: Path, out_dir: Path, as_json: bool, plan_path: Path | None = None) -> None:
     with progress_display() as progress:
-        run = main_job.rehearse_case(prepare(case, watcher=progress), out_dir, plan_path=plan_path)
+        prepared = prepare(case, watcher=progress)
+        if plan_path is None:
+            run = main_job.rehearse_case(prepared, out_dir)
+        else:
+            run = main_job.rehearse_plan(prepared, plan_path, out_dir)
     _print(run.summary(), words.rehearsal_text(run), as_json)
 
 

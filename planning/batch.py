@@ -16,12 +16,23 @@ from planning.files import atomic
 from planning.prepared import Watcher, prepare
 from planning.table import write_table
 
-COLUMNS = ("case", "exit_code", "directions", "safe", "best_theta_deg", "best_beta_deg", "seconds", "said")
+COLUMNS = (
+    "case",
+    "name",
+    "folder",
+    "exit_code",
+    "directions",
+    "safe",
+    "best_theta_deg",
+    "best_beta_deg",
+    "seconds",
+    "said",
+)
 """Columns of ``batch.csv``."""
 
 
 def run_batch(cases: Sequence[Path], out: Path, *, jobs: int, arm: bool, watcher: Watcher) -> list[dict[str, Any]]:
-    """Search every case; write ``NAME/candidates.parquet`` for each and ``batch.csv`` for all.
+    """Search every case; write ``0001/candidates.parquet`` and so on, and ``batch.csv`` for all.
 
     Args:
         cases: Case files or folders.
@@ -34,11 +45,16 @@ def run_batch(cases: Sequence[Path], out: Path, *, jobs: int, arm: bool, watcher
         One row per case, in the order given, with the keys `COLUMNS`; ``exit_code`` as the command line's.
     """
     rows: list[dict[str, Any]] = [{} for _ in cases]
+    folders = [f"{number:04d}" for number in range(1, len(cases) + 1)]
     context = multiprocessing.get_context("spawn")  # compiled libraries with threads do not survive a fork
     with ProcessPoolExecutor(max_workers=min(jobs, max(len(cases), 1)), mp_context=context) as pool:
-        numbers = {pool.submit(search_one, case, out, arm): number for number, case in enumerate(cases)}
+        numbers = {
+            pool.submit(search_one, case, out / folder, arm): number
+            for number, (case, folder) in enumerate(zip(cases, folders, strict=True))
+        }
         for done, future in enumerate(as_completed(numbers), start=1):
-            rows[numbers[future]] = future.result()
+            number, failed = numbers[future], future.exception()
+            rows[number] = future.result() if failed is None else _failed(cases[number], failed)
             watcher.count("cases", done, len(cases))
     with atomic(out / "batch.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, COLUMNS)
@@ -47,17 +63,25 @@ def run_batch(cases: Sequence[Path], out: Path, *, jobs: int, arm: bool, watcher
     return rows
 
 
+def _failed(path: Path, error: BaseException) -> dict[str, Any]:
+    """The row of a case at which the program itself failed."""
+    row: dict[str, Any] = dict.fromkeys(COLUMNS)
+    said = f"{type(error).__name__}: {error}"
+    return row | {"case": str(path), "directions": 0, "safe": 0, "exit_code": 3, "said": " ".join(said.split())}
+
+
 def search_one(path: Path, out: Path, arm: bool) -> dict[str, Any]:
     """Search one case and write its table; a refusal becomes a row."""
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
-    row |= {"case": str(path), "directions": 0, "safe": 0}
+    row |= {"case": str(path), "folder": out.name, "directions": 0, "safe": 0}
     try:
         prepared = prepare(path, arm=arm)
         found = prepared.search()
     except PlanningError as error:
         return row | {"exit_code": 2 if isinstance(error, InputError) else 3, "said": str(error)}
-    write_table(found, prepared.provenance(), out / prepared.case.name / "candidates.parquet")
-    row |= {"directions": len(found), "safe": int(found.safe.sum()), "seconds": sum(prepared.stages.seconds.values())}
+    write_table(found, prepared.provenance(), out / "candidates.parquet")
+    row |= {"name": prepared.case.name, "directions": len(found), "safe": int(found.safe.sum())}
+    row["seconds"] = sum(prepared.stages.seconds.values())
     if not found.safe.any():
         return row | {"exit_code": 1, "said": "no safe candidate"}
     best = int(found.ranked[0])

@@ -11,6 +11,19 @@ from pathlib import Path
 
 from planning.errors import InputError
 
+OUTPUT_NAMES = (
+    "candidates.parquet",
+    "certificate.json",
+    "map.png",
+    "scene.png",
+    "report.html",
+    "plan.json",
+    "rehearsal.json",
+    "rehearsal.mp4",
+    "batch.csv",
+)
+"""The files that commands write into their output folder."""
+
 
 def sha256(path: Path) -> str:
     """Hexadecimal SHA-256 of a file's bytes.
@@ -38,3 +51,32 @@ def atomic(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def check_writable(folder: Path) -> Path:
+    """Refuse a folder into which nothing can be written, before any work is done; nothing is created.
+
+    Raises:
+        InputError: The name cannot be used, something else stands there, or it may not be written to.
+    """
+    allowed = "a folder that may be written to, or the name of a new one"
+    try:
+        str(folder).encode("utf-8")
+        nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists() or place.is_symlink())
+        usable = nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK) and _room_for_names(nearest, folder)
+    except (OSError, ValueError) as error:
+        raise InputError(f"output folder cannot be used ({error})", where=_shown(folder), allowed=allowed) from error
+    if not usable:
+        raise InputError("output folder cannot be written to", where=_shown(folder), allowed=allowed)
+    return folder
+
+
+def _room_for_names(nearest: Path, folder: Path) -> bool:
+    """Whether every part of the name fits the file system, and no folder of a file's name is in the way."""
+    longest = os.pathconf(nearest, "PC_NAME_MAX")
+    names = all(len(part.encode()) <= longest for part in folder.parts)
+    return names and not any((folder / name).is_dir() for name in OUTPUT_NAMES)
+
+
+def _shown(path: Path) -> str:
+    return str(path).encode("utf-8", "replace").decode("utf-8")[:200]

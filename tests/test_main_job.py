@@ -153,7 +153,7 @@ def test_batch_goes_on_after_a_bad_case(carton, tmp_path, capfd):
     code, found = run(capfd, "batch", carton, tmp_path / "gone.toml", "--no-arm", "--out", out)
     assert code == BAD_INPUT
     assert [row["exit_code"] for row in found["cases"]] == [0, 2]
-    assert (out / "carton-m" / "candidates.parquet").is_file()
+    assert (out / "0001" / "candidates.parquet").is_file()
     assert len((out / "batch.csv").read_text().splitlines()) == 3
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,11 @@ import numpy as np
 
 from planning.candidates import Candidates
 from planning.case import load_case
+from planning.certify import Certificate, certify, read_certificate, verify, with_safe_cone, write_certificate
+from planning.clearance.cross_check import CrossChecked
 from planning.errors import InputError, NoAnswerError
 from planning.explain import Explanation, finite
+from planning.export import Exported, export_plan
 from planning.files import atomic
 from planning.placement import load_placement
 from planning.plan import Plan, read_plan, write_plan
@@ -37,6 +40,8 @@ class Run:
     plan: Plan | None = None
     refusal: str = ""
     rehearsal: Rehearsal | None = None
+    checked: CrossChecked | None = None
+    certificate: Certificate | None = None
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees."""
@@ -48,14 +53,26 @@ class Run:
             "best": [candidate_summary(found, int(row)) for row in found.ranked[:10]],
             "plan": None if self.plan is None else plan_summary(self.plan),
             "rehearsal": None if self.rehearsal is None else rehearsal_summary(self.rehearsal),
+            "cross_check": None if self.checked is None else asdict(self.checked),
+            "certificate": None if self.certificate is None else self.certificate.summary(),
             "seconds": {stage: round(seconds, 3) for stage, seconds in self.prepared.stages.seconds.items()},
             "files": [str(path) for path in self.files],
         }
 
 
-def search_case(prepared: Prepared, out: Path, *, pictures: bool = True) -> Run:
-    """Search; write ``candidates.parquet`` and, if wanted, ``map.png``, ``scene.png`` and ``report.html``."""
-    run = _with_table(Run(prepared, prepared.search(), ()), out)
+def search_case(
+    prepared: Prepared,
+    out: Path,
+    *,
+    pictures: bool = True,
+    checked: CrossChecked | None = None,
+    certify_deg: float | None = None,
+) -> Run:
+    """Search; write ``candidates.parquet`` and, if wanted, the certificate, the pictures and the page."""
+    run = Run(prepared, prepared.search(), (), checked=checked)
+    if certify_deg is not None:
+        run = _certified(run, certify_deg, out)
+    run = _with_table(run, out)
     return _with_pictures(run, out) if pictures else run
 
 
@@ -66,41 +83,57 @@ def plan_case(prepared: Prepared, out: Path) -> Run:
         InputError: The case does not say where the arm stands.
         NoAnswerError: No plan; the search's files are written all the same.
     """
+    return _with_pictures(_searched_and_planned(prepared, out), out)
+
+
+def rehearse_case(prepared: Prepared, out: Path) -> Run:
+    """Plan, rehearse the plan, and write everything.
+
+    Raises:
+        InputError: The case does not say where the arm stands.
+        NoAnswerError: No plan; the search's files are written all the same.
+    """
+    return _with_pictures(_rehearsed(_searched_and_planned(prepared, out), out), out)
+
+
+def _searched_and_planned(prepared: Prepared, out: Path) -> Run:
     if prepared.reach is None:
         raise InputError(
             "the case does not say where the robot stands, so nothing can be planned",
             where=prepared.case.path,
             allowed="[registration] with markers_ct and markers_base, or [robot.mount]",
         )
-    run = _planned(Run(prepared, prepared.search(), ()), out)
-    run = _with_pictures(_with_table(run, out), out)
+    _remove_stale(out)
+    run = _with_table(_planned(Run(prepared, prepared.search(), ()), out), out)
     if run.plan is None:
+        _with_pictures(run, out)
         raise NoAnswerError(f"{run.refusal}; see {out / 'report.html'}", counts=run.candidates.counts())
     return run
 
 
-def rehearse_case(prepared: Prepared, out: Path, *, plan_path: Path | None = None) -> Run:
-    """Plan (or load and check a plan), rehearse it, and write everything.
+def rehearse_plan(prepared: Prepared, plan_path: Path, out: Path) -> Run:
+    """Load a plan, check it again, rehearse it; write the rehearsal's files and the scene, but no map of one direction.
 
     Raises:
         InputError: A plan that does not belong to the case or does not hold any more.
-        NoAnswerError: No plan; the search's files are written all the same.
     """
-    if plan_path is None:
-        run = _planned(Run(prepared, prepared.search(), ()), out)
-    else:
-        plan = read_plan(plan_path)
-        with prepared.stages.time("plan"):
-            candidates = check_plan(plan, prepared, plan_path)
-        run = Run(prepared, candidates, (), plan)
-    if run.plan is None:
-        _with_pictures(_with_table(run, out), out)
-        raise NoAnswerError(f"{run.refusal}; see {out / 'report.html'}", counts=run.candidates.counts())
+    plan = read_plan(plan_path)
+    with prepared.stages.time("plan"):
+        candidates = check_plan(plan, prepared, plan_path)
+    run = _rehearsed(Run(prepared, candidates, (), plan), out)
+    with prepared.stages.time("scene"):
+        draw_scene(prepared.case, prepared.anatomy, candidates, plan, out / "scene.png")
+    return _with(run, out / "scene.png")
+
+
+def _rehearsed(run: Run, out: Path) -> Run:
+    """Execute the run's plan where the truth differs, write the numbers and the film."""
+    assert run.plan is not None
+    prepared = run.prepared
     with prepared.stages.time("rehearsal"):
         truth = draw_truth(prepared.case, run.plan.T_base_ct)
         rehearsal = rehearse(run.plan, prepared.case, prepared.anatomy, truth)
-    run = replace(run, rehearsal=rehearsal)
-    run = _with(run, _write_json(rehearsal_summary(rehearsal), out / "rehearsal.json"))
+    run = _with(replace(run, rehearsal=rehearsal), _write_json(rehearsal_summary(rehearsal), out / "rehearsal.json"))
     with prepared.stages.time("film"):
         film = draw_film(
             rehearsal,
@@ -110,7 +143,27 @@ def rehearse_case(prepared: Prepared, out: Path, *, plan_path: Path | None = Non
             out / "rehearsal.mp4",
             progress=partial(prepared.watcher.count, "film"),
         )
-    return _with_pictures(_with_table(_with(run, film), out), out)
+    return _with(run, film)
+
+
+def _remove_stale(out: Path) -> None:
+    """What an earlier run planned and rehearsed must not stand beside a new search that may end without a plan."""
+    for name in ("plan.json", "rehearsal.json", "rehearsal.mp4"):
+        (out / name).unlink(missing_ok=True)
+
+
+def export(plan_path: Path, format_name: str, out: Path, prepared: Prepared | None) -> Exported:
+    """Write a plan for a robot; with its case, after it has been checked again, and with rounded corners where free.
+
+    Raises:
+        InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
+    """
+    plan = read_plan(plan_path)
+    if prepared is None:
+        return export_plan(plan, format_name, out, source=plan_path)
+    check_plan(plan, prepared, plan_path)
+    assert prepared.reach is not None  # the check has refused this
+    return export_plan(plan, format_name, out, source=plan_path, checker=prepared.reach.checker)
 
 
 def check_candidate(prepared: Prepared, theta_deg: float, beta_deg: float) -> Explanation:
@@ -167,6 +220,7 @@ def candidate_summary(found: Candidates, row: int) -> dict[str, Any]:
         "skin_angle_deg": finite(np.degrees(found.skin_angle[row])),
         "tissue_mm": finite(found.tissue[row]),
         "reach_margin": finite(found.reach_margin[row]),
+        "safe_cone_deg": finite(np.degrees(found.safe_cone[row])),
         "pareto": bool(found.pareto[row]),
     }
 
@@ -198,6 +252,28 @@ def rehearsal_summary(rehearsal: Rehearsal) -> dict[str, Any]:
         "max_joint_speed_deg_s": np.degrees(rehearsal.max_joint_speed).tolist(),
         "joint_speed_limit_deg_s": np.degrees(rehearsal.speed_limits).tolist(),
     }
+
+
+def verify_certificate(path: Path, prepared: Prepared) -> dict[str, Any]:
+    """Prove every cell of a certificate again, by the plain checker.
+
+    Raises:
+        InputError: Not a certificate, not of this case, or a cell whose verdict does not follow.
+    """
+    certificate = read_certificate(path)
+    done = verify(certificate, prepared.case, prepared.anatomy, partial(prepared.watcher.count, "cells"))
+    return {"certificate": str(path), **certificate.summary(), "verified": asdict(done)}
+
+
+def _certified(run: Run, size_deg: float, out: Path) -> Run:
+    """Certify the cap to a cell size, and rank again with the safe cones."""
+    prepared = run.prepared
+    with prepared.stages.time("certify"):
+        certificate = certify(prepared.case, prepared.anatomy, size=float(np.radians(size_deg)))
+    with prepared.stages.time("safe cones"):
+        found = with_safe_cone(prepared.case, run.candidates, certificate)
+    write_certificate(certificate, out / "certificate.json")
+    return _with(replace(run, candidates=found, certificate=certificate), out / "certificate.json")
 
 
 def _planned(run: Run, out: Path) -> Run:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from planning.explain import reason_text
+from planning.export import Exported
 from planning.search import closest_miss
 from twin.ct.chen2019 import Reproduction
 from twin.main_job import Run, plan_summary, rehearsal_summary
@@ -55,6 +56,35 @@ def _rehearsal(run: Run) -> list[str]:
         f"  least clearance of the true needle to what it must avoid: {nearest[1]:.2f} mm, {nearest[0]}",
         f"  arm contacts: {'; '.join(done['contacts']) or 'none'}",
     ]
+
+
+def certificate_lines(summary: dict[str, Any]) -> list[str]:
+    """What a certificate says of the cap."""
+    return [
+        f"certified to {summary['size_deg']:g} deg: safe {summary['safe_square_deg']:.1f} square degrees"
+        f" ({100 * summary['safe_share']:.1f} % of the cap), undecided {100 * summary['undecided_share']:.2f} %,"
+        f" {summary['queries']} exact queries",
+        f"  not certified: {', '.join(summary['not_certified'])}",
+    ]
+
+
+def certificate_text(report: dict[str, Any]) -> str:
+    """What the plain checker proved."""
+    done = report["verified"]
+    return "\n".join(
+        [
+            f"{report['certificate']}: every cell holds",
+            f"  {done['safe']} safe and {done['rejected']} rejected cells proven again, {done['undecided']} undecided",
+            *certificate_lines(report),
+        ]
+    )
+
+
+def export_text(done: Exported, case_checked: bool) -> str:
+    """What was written, and what whoever runs it should know."""
+    checked = "" if case_checked else "the plan was not held against its case again: name it with --case"
+    notes = [note for note in (*done.notes, checked) if note]
+    return "\n".join([f"{done.format_name}: {done.path}", *(f"  {note}" for note in notes)])
 
 
 def registration_text(report: dict[str, Any]) -> str:
@@ -121,10 +151,12 @@ def reproduction_summary(result: Reproduction) -> dict[str, Any]:
 def _best(run: Run) -> list[str]:
     lines = ["rank  theta   beta   cost  clearance  path  angle  reach  (deg, mm)"]
     for best in run.summary()["best"]:
+        cone = "" if best["safe_cone_deg"] is None else f"  safe cone {best['safe_cone_deg']:.1f}"
         reach = "    -" if best["reach_margin"] is None else f"{best['reach_margin']:5.2f}"
         lines.append(
             f"{best['rank']:4d} {best['theta_deg']:6.1f} {best['beta_deg']:6.1f} {best['cost']:6.3f} "
             f"{best['min_clearance_mm']:10.2f} {best['path_length_mm']:5.0f} {best['skin_angle_deg']:6.1f}  {reach}"
+            + cone
             + ("  Pareto" if best["pareto"] else "")
         )
     return lines
@@ -141,5 +173,13 @@ def _nothing_safe(run: Run) -> list[str]:
 
 def _footer(run: Run) -> list[str]:
     lines = [f"warning: {warning}" for warning in run.prepared.anatomy.warnings]
+    if run.certificate is not None:
+        lines += certificate_lines(run.certificate.summary())
+    if run.checked is not None:
+        checked = run.checked
+        lines.append(
+            f"cross-check: FCL measured {checked.directions} directions again; {checked.pairs} distances agree,"
+            f" largest difference {checked.largest_mm:.1e} mm"
+        )
     stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in run.prepared.stages.seconds.items())
     return [*lines, f"seconds: {stages}", "look at:", *(f"  {path}" for path in run.files)]
