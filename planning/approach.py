@@ -146,8 +146,8 @@ def dense_states(checker: StateChecker, waypoints: Array, step_rad: float) -> Ar
 
 def first_contact(checker: StateChecker, q_path: Array) -> Contact | None:
     """The first contact along states (m, 6), the needle being outside the patient; None if all are free."""
-    contacts = (checker.contact(q, needle_may_touch_patient=False) for q in q_path)
-    return next((contact for contact in contacts if contact is not None), None)
+    met = checker.first_contact(q_path, needle_may_touch_patient=False)
+    return None if met is None else met.contact
 
 
 def least_clearance(checker: StateChecker, q_path: Array) -> Distances:

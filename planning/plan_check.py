@@ -15,7 +15,7 @@ from planning.errors import InputError
 from planning.explain import reason_text
 from planning.plan import Plan, check_inputs
 from planning.prepared import Prepared
-from planning.robot.cell import StateChecker
+from planning.robot.cell import CellChecker
 
 Floats = NDArray[np.float64]
 
@@ -73,7 +73,7 @@ def _check_labels(plan: Plan, prepared: Prepared, candidates: Candidates, path: 
             raise InputError(f"{name} is {said}, the case gives {known}", where=path, allowed="plan again")
 
 
-def motion_contact(plan: Plan, checker: StateChecker) -> str | None:
+def motion_contact(plan: Plan, checker: CellChecker) -> str | None:
     """What a plan's motion touches, in words, or None: FCL at ten times the planner's resolution."""
     for phase, q, needle_free in (("approach", plan.approach.q, False), ("insertion", plan.insertion.q, True)):
         contact = _contact(checker, q, needle_free)
@@ -82,10 +82,10 @@ def motion_contact(plan: Plan, checker: StateChecker) -> str | None:
     return None
 
 
-def _contact(checker: StateChecker, q_path: Floats, needle_free: bool) -> str | None:
+def _contact(checker: CellChecker, q_path: Floats, needle_free: bool) -> str | None:
     """What touches what along a motion, checked as densely as when it was planned; None if nothing does."""
     for q in dense_states(checker, q_path, RESOLUTION_RAD / FINER):
-        contact = checker.contact(q, needle_may_touch_patient=needle_free)
+        contact = CellChecker.contact(checker, q, needle_may_touch_patient=needle_free)  # FCL alone, no bounds
         if contact is not None:
             return f"{contact.body} touches {contact.other}"
     return None

@@ -6,27 +6,34 @@ Retraction is the same motion backwards, so what may be driven in may be driven 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from planning.errors import InputError
+from planning.reach_answer import ReachAnswer, ReachRequest
 from planning.reasons import Reason
 from planning.robot.cell import Contact, StateChecker
 from planning.robot.insertion import (
     MIN_SINGULARITY,
+    NeedleLine,
     away_from_singularities,
+    branch_way,
+    every_way,
     first_stop,
+    flange_at,
     flange_poses,
-    insertion_paths,
+    needle_lines,
     reach_margin,
+    survey,
     why_unreachable,
 )
-from planning.robot.kinematics import N_BRANCHES, inverse, nearest_within_limits
+from planning.robot.kinematics import N_BRANCHES, inverse
 from planning.robot.ur import UrModel
+
+__all__ = ["MAX_SWEEP_MM", "ReachAnswer", "ReachRequest", "assess_reach", "assess_reach_all", "ik_exists"]
 
 Array = NDArray[np.float64]
 
@@ -37,87 +44,28 @@ was checked."""
 SAME_LENGTH_MM = 1e-6
 """Two statements of one needle's length may differ by this much: rounding."""
 
-SAME_UNIT = 1e-9
-"""How far a direction's length may be from 1."""
+MARGIN_DIGITS = 9
+"""Margins that agree to this many digits are equal, so that rounding does not choose between mirrored branches."""
+
+CHUNK = 64
+"""Requests between two reports of progress."""
 
 ROLL_BODY = "wrist_3"
 """The only body that turns with the roll and is not round about the needle: other contacts hold for every roll."""
 
 
-@dataclass(frozen=True, eq=False)
-class ReachRequest:
-    """One direction to reach along.
-
-    Attributes:
-        target_base: Shape (3,), mm: the lesion, base frame.
-        outward_base: Shape (3,), unit: from the target out of the body, base frame.
-        needle_length_mm: Flange to tip.
-        standoff_mm: Tip to target before the insertion starts.
-
-    Raises:
-        InputError: If something is not finite, the direction not a unit vector, or a length not positive.
-    """
-
-    target_base: Array
-    outward_base: Array
-    needle_length_mm: float
-    standoff_mm: float
-
-    def __post_init__(self) -> None:
-        for name in ("target_base", "outward_base"):
-            array = np.array(getattr(self, name), dtype=np.float64)
-            if array.shape != (3,) or not np.isfinite(array).all():
-                raise InputError(f"{name} = {array}", where="reach request", allowed="three finite numbers")
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
-        if abs(float(np.linalg.norm(self.outward_base)) - 1.0) > SAME_UNIT:
-            raise InputError(f"outward_base = {self.outward_base}", where="reach request", allowed="a unit vector")
-        for name in ("needle_length_mm", "standoff_mm"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise InputError(f"{name} = {getattr(self, name)}", where="reach request", allowed="finite and above 0")
-
-
-@dataclass(frozen=True, eq=False)
-class ReachAnswer:
-    """Whether and how the arm reaches along one direction.
-
-    Attributes:
-        reachable: The verdict.
-        reason: ``NONE``, ``UNREACHABLE``, ``ARM_COLLISION`` (at standoff) or ``INSERTION_BLOCKED``.
-        depth_mm: How far the needle was driven from standoff when it was blocked; None for other reasons.
-        detail: One sentence for people: what touched what, or what was missing; empty when reachable.
-        contact: What touched what, where that was the reason.
-        roll: Turn about the needle against :func:`flange_poses`' zero, rad; NaN when not reachable.
-        branch: Index among the eight branches of ``inverse``; -1 when not reachable.
-        insertion_q: Shape (m, 6), rad: standoff first, tip on the target last; empty when not reachable.
-        insertion_depth_mm: Shape (m,), mm driven from standoff at each row.
-        margin: 0..1, the least over the insertion of: each joint's distance to its limits over a quarter turn, and the
-            three singularity terms. 0 when not reachable.
-    """
-
-    reachable: bool
-    reason: Reason
-    depth_mm: float | None
-    detail: str
-    contact: Contact | None
-    roll: float
-    branch: int
-    insertion_q: Array
-    insertion_depth_mm: Array
-    margin: float
-
-    def __post_init__(self) -> None:
-        self.insertion_q.setflags(write=False)
-        self.insertion_depth_mm.setflags(write=False)
-
-
 class _Drive(NamedTuple):
     """A motion from standoff to target on one branch at one roll."""
 
+    line: NeedleLine
     branch: int
     roll: float
-    q: Array
-    margin: float
+    turn: Array
+    """Shape (6,), rad: what to add to the branch's way at roll 0, the roll and whole turns."""
+
+    def along(self, model: UrModel, request: ReachRequest, depths_mm: Array) -> Array:
+        """The motion at some depths, shape (m, 6), rad."""
+        return branch_way(model, self.line, _distances(request, depths_mm), self.branch, self.turn)
 
 
 class _Blocked(NamedTuple):
@@ -187,29 +135,77 @@ def assess_reach(
     Raises:
         InputError: If the request's needle is not the checker's, or a number makes no sense.
     """
-    if abs(request.needle_length_mm - checker.tool.needle_length_mm) > SAME_LENGTH_MM:
-        allowed = f"the tool's {checker.tool.needle_length_mm}"
-        raise InputError(f"needle_length_mm = {request.needle_length_mm}", where="reach request", allowed=allowed)
+    return _answers(checker, [request], n_rolls, step_mm)[0]
+
+
+def assess_reach_all(
+    checker: StateChecker,
+    requests: Sequence[ReachRequest],
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    n_rolls: int = 8,
+    step_mm: float = MAX_SWEEP_MM,
+) -> list[ReachAnswer]:
+    """The answers of :func:`assess_reach` to many requests: kinematics for all of them, then contacts one by one.
+
+    Args:
+        checker: Judges contacts, in the base frame.
+        requests: The directions.
+        progress: Called with (answered, to answer).
+        n_rolls: See :func:`assess_reach`.
+        step_mm: The same.
+
+    Raises:
+        InputError: The same.
+    """
+    answers: list[ReachAnswer] = []
+    for start in range(0, len(requests), CHUNK):
+        answers += _answers(checker, requests[start : start + CHUNK], n_rolls, step_mm)
+        if progress is not None:
+            progress(len(answers), len(requests))
+    return answers
+
+
+def _answers(
+    checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int, step_mm: float
+) -> list[ReachAnswer]:
+    for request in requests:
+        if abs(request.needle_length_mm - checker.tool.needle_length_mm) > SAME_LENGTH_MM:
+            allowed = f"the tool's {checker.tool.needle_length_mm}"
+            raise InputError(f"needle_length_mm = {request.needle_length_mm}", where="reach request", allowed=allowed)
     if n_rolls < 1 or not step_mm > 0.0:
         raise InputError(f"n_rolls = {n_rolls}, step_mm = {step_mm}", where="reach", allowed="both above 0")
-    model = checker.model
-    depths = _depths(request, step_mm)
-    paths = _paths(model, request, depths)
+    depths = [_depths(request, step_mm) for request in requests]
+    rolls = 2.0 * math.pi * np.arange(n_rolls) / n_rolls
+    targets = np.array([request.target_base for request in requests])
+    outwards = np.array([request.outward_base for request in requests])
+    distances = [_distances(request, depth) for request, depth in zip(requests, depths, strict=True)]
+    lines = needle_lines(targets, outwards)
+    found = survey(checker.model, lines, distances, depths, rolls)
+    answers = []
+    for request, line, depth, stop_at, margins, turns in zip(requests, lines, depths, *found, strict=True):
+        if not np.isnan(margins).all():
+            drives = _drives(line, margins, turns, rolls)
+            answers.append(_first_clear(checker, request, depth, drives))
+        else:
+            answers.append(_why_none(checker.model, request, line, depth, stop_at))
+    return answers
+
+
+def _why_none(
+    model: UrModel, request: ReachRequest, line: NeedleLine, depths: Array, stop_at: NDArray[np.int64]
+) -> ReachAnswer:
+    """The refusal of a direction along which kinematics allows no motion."""
+    if (stop_at < 0).any():
+        return _refusal(Reason.UNREACHABLE, None, "every roll and branch leaves the joint limits")
+    distances = _distances(request, depths)
+    paths = every_way(model, line, distances)
     holds = away_from_singularities(model, paths[:, 0])
     if not holds.any():
-        distance = request.needle_length_mm + request.standoff_mm
-        why = why_unreachable(model, flange_poses(request.target_base, request.outward_base, distance)[0])
+        why = why_unreachable(model, flange_at(line, distances[0]))
         return _refusal(Reason.UNREACHABLE, None, why)
-    stops = [first_stop(model, path, depths) for path in paths]
-    drivable = [branch for branch, stop in enumerate(stops) if stop is None]
-    rolls = 2.0 * math.pi * np.arange(n_rolls) / n_rolls
-    drives = [drive for i in drivable for roll in rolls if (drive := _drive(model, i, float(roll), paths[i]))]
-    if drives:
-        return _first_clear(checker, request, depths, sorted(drives, key=lambda drive: -drive.margin))
-    if drivable:
-        return _refusal(Reason.UNREACHABLE, None, "every roll and branch leaves the joint limits")
-    begun = (stop for stop, holds_standoff in zip(stops, holds, strict=True) if stop and holds_standoff)
-    deepest = max(begun, key=lambda stop: stop.depth_mm)
+    stops = [first_stop(model, path, depths) for path in paths[holds]]
+    deepest = max((stop for stop in stops if stop), key=lambda stop: stop.depth_mm)
     return _refusal(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail)
 
 
@@ -217,24 +213,21 @@ def _depths(request: ReachRequest, step_mm: float) -> Array:
     return np.linspace(0.0, request.standoff_mm, math.ceil(request.standoff_mm / step_mm) + 1)
 
 
-def _paths(model: UrModel, request: ReachRequest, depths_mm: Array) -> Array:
-    """Every branch's way at roll 0, shape (8, m, 6)."""
-    distance = request.needle_length_mm + request.standoff_mm - depths_mm
-    return insertion_paths(model, request.target_base, request.outward_base, distance)
+def _distances(request: ReachRequest, depths_mm: Array) -> Array:
+    """Target to flange at each depth, mm."""
+    return request.needle_length_mm + request.standoff_mm - depths_mm
 
 
-def _drive(model: UrModel, branch: int, roll: float, path: Array) -> _Drive | None:
-    """The branch's motion at one roll, turned as far from the joint limits as whole turns allow; None if outside."""
-    q = path.copy()
-    q[:, 5] += roll
-    middle = q[len(q) // 2]
-    q += nearest_within_limits(model, middle, model.joint_limits.mean(axis=1)) - middle
-    if not model.within_limits(q).all():
-        return None
-    return _Drive(branch, roll, q, reach_margin(model, q))
+def _drives(line: NeedleLine, margins: Array, turns: Array, rolls: Array) -> Iterator[_Drive]:
+    """The motions that kinematics allows, the best margin first; of equals the first branch, then the first roll."""
+    branches, rolled = np.nonzero(~np.isnan(margins))
+    order = np.argsort(-np.round(margins[branches, rolled], MARGIN_DIGITS), kind="stable")
+    for i in order:
+        branch, roll = int(branches[i]), int(rolled[i])
+        yield _Drive(line, branch, float(rolls[roll]), turns[branch, roll])
 
 
-def _first_clear(checker: StateChecker, request: ReachRequest, depths: Array, drives: Sequence[_Drive]) -> ReachAnswer:
+def _first_clear(checker: StateChecker, request: ReachRequest, depths: Array, drives: Iterable[_Drive]) -> ReachAnswer:
     """The first of several motions that touches nothing; else a refusal with the one that came farthest."""
     blocks: list[_Blocked] = []
     hopeless: set[int] = set()
@@ -255,33 +248,33 @@ def _first_clear(checker: StateChecker, request: ReachRequest, depths: Array, dr
 
 def _try(checker: StateChecker, request: ReachRequest, drive: _Drive, depths: Array) -> _Tried:
     """Check one motion for contacts, standoff first."""
-    contact = checker.contact(drive.q[0], needle_may_touch_patient=False)
+    model = checker.model
+    standoff = drive.along(model, request, depths[:1])
+    contact = checker.contact(standoff[0], needle_may_touch_patient=False)
     if contact is not None:
         detail = f"{contact.body} touches {contact.other} at standoff"
         block = _Blocked(0.0, detail, ROLL_BODY not in contact, at_standoff=True, contact=contact)
-        return _Tried(drive.q, depths, block)
+        return _Tried(standoff, depths[:1], block)
     q, depths = _refined(checker, request, drive, depths)
-    stop = first_stop(checker.model, q, depths)
+    stop = first_stop(model, q, depths)
     if stop is not None:
         return _Tried(q, depths, _Blocked(stop.depth_mm, stop.detail))
-    if not checker.model.within_limits(q).all():
+    if reach_margin(model, q) < 0.0:
         return _Tried(q, depths, _Blocked(0.0, "a joint leaves its limits on the way", at_any_roll=False))
-    for row, depth in zip(q, depths, strict=True):
-        contact = checker.contact(row, needle_may_touch_patient=True)
-        if contact is not None:
-            detail = f"{contact.body} touches {contact.other} {depth:.1f} mm after the standoff"
-            return _Tried(q, depths, _Blocked(float(depth), detail, ROLL_BODY not in contact, contact=contact))
-    return _Tried(q, depths, None)
+    met = checker.first_contact(q, needle_may_touch_patient=True)
+    if met is None:
+        return _Tried(q, depths, None)
+    depth, contact = float(depths[met.at]), met.contact
+    detail = f"{contact.body} touches {contact.other} {depth:.1f} mm after the standoff"
+    return _Tried(q, depths, _Blocked(depth, detail, ROLL_BODY not in contact, contact=contact))
 
 
 def _refined(checker: StateChecker, request: ReachRequest, drive: _Drive, depths: Array) -> tuple[Array, Array]:
     """The motion sampled so that no body moves more than ``MAX_SWEEP_MM`` from sample to sample, and its depths."""
-    q = drive.q
+    q = drive.along(checker.model, request, depths)
     while (worst := checker.sweep_mm(q).max()) > MAX_SWEEP_MM:
         depths = np.linspace(0.0, request.standoff_mm, math.ceil((len(depths) - 1) * worst / MAX_SWEEP_MM) + 1)
-        path = _paths(checker.model, request, depths)[drive.branch]
-        path[:, 5] += drive.roll
-        q = path + np.round((drive.q[0] - path[0]) / (2.0 * math.pi)) * 2.0 * math.pi
+        q = drive.along(checker.model, request, depths)
         if np.isnan(q).any():
             break  # the caller finds where
     return q, depths

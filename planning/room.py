@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from planning.anatomy import Anatomy
 from planning.case import Case, Obstacle
-from planning.robot.cell import CellChecker
+from planning.robot.fast_checker import FastChecker
 from planning.robot.tool import Box, Tool
 from planning.robot.ur import ur_model
 
@@ -38,11 +38,11 @@ def _box(obstacle: Obstacle, T_base_ct: Floats) -> Box:
     return Box(obstacle.name, T_base_box, (float(x), float(y), float(z)))
 
 
-def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats) -> CellChecker:
+def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats) -> FastChecker:
     """The collision checker of the case's room, with the patient where ``T_base_ct`` says."""
     patient = anatomy.skin.mesh.transformed(T_base_ct)
     boxes = case_boxes(case, T_base_ct)
-    return CellChecker(ur_model(case.robot.model), case_tool(case), boxes, patient, padding_mm=ARM_PADDING_MM)
+    return FastChecker(ur_model(case.robot.model), case_tool(case), boxes, patient, padding_mm=ARM_PADDING_MM)
 
 
 def home_configuration(case: Case) -> Floats:

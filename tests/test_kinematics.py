@@ -72,7 +72,9 @@ def test_forward_kinematics_agrees_with_the_oracle(name: str) -> None:
         assert np.abs(in_mm(oracle.forward_kinematics(*q)) - flange_pose(ur_model(name), q)).max() < EXACT
 
 
-@pytest.mark.parametrize(("name", "count"), [("ur3", 2000), ("ur3e", 300), ("ur5", 300), ("ur10e", 300)])
+@pytest.mark.parametrize(
+    ("name", "count"), [("ur3", 2000), ("ur3e", 300), ("ur5", 300), ("ur5e", 300), ("ur10", 300), ("ur10e", 300)]
+)
 def test_nothing_is_missed_against_the_oracle(name: str, count: int) -> None:
     """Every solution of ur-analytic-ik is one of our eight, on reachable and unreachable poses alike."""
     model, oracle = ur_model(name), getattr(ur_analytic_ik, name)
@@ -134,12 +136,20 @@ def test_the_three_singularities_are_all_there_are(name: str, q: np.ndarray) -> 
         ([0.3, -1.0, 1.2, 0.4, 0.0, 0.7], "wrist"),
         ([0.3, -1.0, 1.2, 0.4, np.pi, 0.7], "wrist"),
         ([0.3, -1.0, 0.0, 0.4, 0.9, 0.7], "elbow"),
+        ([0.3, -np.pi / 2 - 0.2, 0.4, np.nan, 0.9, 0.7], "shoulder"),
     ],
 )
 def test_singular_configurations_are_named_and_still_solved(q: list[float], name: str) -> None:
-    """At an aligned wrist or a stretched elbow the distance is 0 and the solutions still return the pose."""
+    """The distance is 0, it is named, and the solutions still return the pose.
+
+    The shoulder's: the wrist stands above axis 1, with q4 from a2 cos q2 + a3 cos q23 + d5 sin q234 = 0.
+    """
     model = ur_model("ur3")
+    if name == "shoulder":
+        q23 = q[1] + q[2]
+        q[3] = np.arcsin(-(model.a2 * np.cos(q[1]) + model.a3 * np.cos(q23)) / model.d5) - q23
     assert getattr(singularity(model, np.array(q)), name) < 1e-12
+    assert singularity(model, np.array(q)).nearest == name
     T = flange_pose(model, np.array(q))
     solutions = inverse(model, T)[0]
     found = solutions[~np.isnan(solutions[:, 0])]

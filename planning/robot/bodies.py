@@ -11,6 +11,7 @@ import fcl
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.robot.enclosures import prism
 from planning.robot.links import LINK_NAMES, Link, collision_links, joined
 from planning.robot.shapes import convex, padded, surface
 from planning.robot.tool import Tool
@@ -44,6 +45,8 @@ class Shape(NamedTuple):
 
     solids: tuple[fcl.CollisionObject, ...]
     surface: fcl.CollisionObject
+    hulls: tuple[Array, ...]
+    """For each solid, corners (n, 3), mm, of a convex hull that contains it, in the frame of the shapes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +69,14 @@ class Body:
     full: Shape
     radius_mm: float
 
-    def place(self, poses: Array) -> None:
-        """Move the shapes to where ``link_poses`` (7, 4, 4) has the body's frame."""
+    def pose(self, poses: Array) -> fcl.Transform:
+        """Where ``link_poses`` (7, 4, 4) has the body's shapes."""
         T = poses[self.frame] @ self.T_frame_body
-        transform = fcl.Transform(T[:3, :3], T[:3, 3])
+        return fcl.Transform(T[:3, :3], T[:3, 3])
+
+    def place(self, poses: Array) -> None:
+        """Move the shapes to where ``link_poses`` (7, 4, 4) has them."""
+        transform = self.pose(poses)
         for shape in (self.bare,) if self.full is self.bare else (self.bare, self.full):
             for item in (*shape.solids, shape.surface):
                 item.setTransform(transform)
@@ -102,7 +109,8 @@ def _link_body(link: Link, padding_mm: float) -> Body:
 def _link_shape(link: Link, padding_mm: float) -> Shape:
     pieces = [padded(piece, padding_mm) for piece in link.pieces]
     solids = tuple(fcl.CollisionObject(convex(piece)) for piece in pieces)
-    return Shape(solids, fcl.CollisionObject(surface(joined(pieces))))
+    hulls = tuple(np.asarray(piece.vertices) for piece in pieces)
+    return Shape(solids, fcl.CollisionObject(surface(joined(pieces))), hulls)
 
 
 def _round_body(name: str, diameter_mm: float, span_mm: tuple[float, float], padding_mm: float) -> Body:
@@ -116,4 +124,4 @@ def _round_body(name: str, diameter_mm: float, span_mm: tuple[float, float], pad
 
 def _cylinder(radius_mm: float, length_mm: float) -> Shape:
     solid = fcl.CollisionObject(fcl.Cylinder(radius_mm, length_mm))
-    return Shape((solid,), solid)
+    return Shape((solid,), solid, (prism(radius_mm, length_mm),))

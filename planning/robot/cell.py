@@ -9,10 +9,9 @@ surface counts (``patient_closed``).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import combinations
-from types import MappingProxyType
-from typing import NamedTuple, Protocol
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations, product
+from typing import NamedTuple
 
 import fcl
 import numpy as np
@@ -24,75 +23,52 @@ from planning.robot.bodies import BODY_NAMES, NEVER_TESTED, Body, arm_bodies
 from planning.robot.kinematics import link_poses
 from planning.robot.links import collision_links
 from planning.robot.shapes import skin_surface, touch
+from planning.robot.state_checker import (
+    DISTANCE_PAIRS,
+    NEEDLE_IN_PATIENT,
+    PATIENT,
+    Contact,
+    Distances,
+    Met,
+    Nearest,
+    StateChecker,
+)
 from planning.robot.sweep import SweptBodies
 from planning.robot.tool import Box, Tool
 from planning.robot.ur import UrModel
 from planning.winding import winding_number
 
-__all__ = ["BODY_NAMES", "Box", "CellChecker", "Contact", "Distances", "Nearest", "StateChecker", "Tool"]
+__all__ = [
+    "BODY_NAMES",
+    "DISTANCE_PAIRS",
+    "NEEDLE_IN_PATIENT",
+    "Box",
+    "CellChecker",
+    "Check",
+    "Contact",
+    "Distances",
+    "Met",
+    "Nearest",
+    "StateChecker",
+    "Tool",
+]
 
 Array = NDArray[np.float64]
 
-PATIENT = "patient"
 
+class Check(NamedTuple):
+    """One question to FCL: do two shapes touch."""
 
-class Contact(NamedTuple):
-    """Two bodies that touch, such as ``("forearm", "patient")``; a body of the arm first."""
-
-    body: str
-    other: str
-
-
-class Nearest(NamedTuple):
-    """The smallest distance between the arm and something else; infinite, with empty names, where there is nothing."""
-
-    mm: float
-    body: str
-    other: str
-
-
-class Distances(NamedTuple):
-    """How close the arm is, 0 where it touches."""
-
-    patient: Nearest
-    """Moving links and holder to the skin."""
-    needle: Nearest
-    """Needle to the skin: 0 while it goes in."""
-    boxes: Nearest
-    """Moving links, holder and needle to the room's boxes."""
-
-
-DISTANCE_PAIRS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {"patient": BODY_NAMES[1:-1], "needle": BODY_NAMES[-1:], "boxes": BODY_NAMES[1:]}
-)
-"""The kinds of distance, by the fields of ``Distances``, and the bodies that each is measured from."""
-
-
-class StateChecker(Protocol):
-    """Judges configurations of one arm in one scene. A faster judge takes this one's place behind these names."""
-
-    @property
-    def model(self) -> UrModel:
-        """The arm."""
-
-    @property
-    def tool(self) -> Tool:
-        """What the flange carries."""
-
-    def contact(self, q: Array, *, needle_may_touch_patient: bool) -> Contact | None:
-        """The first contact found at ``q``, shape (6,), rad; None when the arm is clear."""
-
-    def nearest(self, q: Array, pair: str, body: str | None = None) -> Nearest:
-        """One of ``DISTANCE_PAIRS`` at ``q``, shape (6,), rad; of one body alone when named."""
-
-    def distances(self, q: Array) -> Distances:
-        """All of them."""
-
-    def sweep_mm(self, q_path: Array) -> Array:
-        """Bound on every body's motion along each segment of ``q_path`` (m, 6): shape (m - 1,), mm."""
-
-    def body_sweeps_mm(self, q_path: Array) -> dict[str, Array]:
-        """The same for each moving body by name."""
+    contact: Contact
+    """What it means if they do."""
+    first: fcl.CollisionObject
+    """The skin, a box, or a piece of a body."""
+    second: fcl.CollisionObject
+    first_body: Body | None
+    """The body that ``first`` moves with; None for skin and boxes."""
+    second_body: Body
+    hulls: tuple[Array | None, Array] | None
+    """Corners that enclose either, in the frames of their shapes; None for a box, and for the pair with the skin."""
 
 
 class CellChecker:
@@ -129,9 +105,6 @@ class CellChecker:
         self.tool = tool
         self._bodies = arm_bodies(model, tool, padding_mm)
         self._swept = SweptBodies.of(model, tool)
-        by_name = {body.name: body for body in self._bodies}
-        pairs = [pair for pair in combinations(BODY_NAMES, 2) if pair not in NEVER_TESTED]
-        self._self_pairs = tuple((by_name[first], by_name[second]) for first, second in pairs)
         self._boxes = _boxes(boxes)
         self._bounds = {box.name: box.bounds for box in boxes}
         self._patient = None if patient is None else skin_surface(patient, PATIENT)
@@ -139,6 +112,7 @@ class CellChecker:
         if patient is not None:
             self._bounds[PATIENT] = patient.bounds
             self._refuse_base_in(patient)
+        self._checks = tuple(self._room_checks()) + tuple(self._self_checks())
 
     def contact(self, q: Array, *, needle_may_touch_patient: bool) -> Contact | None:
         """The first contact found, or None when the arm is clear.
@@ -151,16 +125,26 @@ class CellChecker:
             InputError: If ``q`` is not finite: FCL would call it free.
         """
         self._place(q)
-        for body in self._bodies[1:]:
-            may_touch = body.name == "needle" and needle_may_touch_patient
-            if self._patient is not None and not may_touch and touch(self._patient, body.full.surface):
-                return Contact(body.name, PATIENT)
-            for name, box in self._boxes.items():
-                if any(touch(box, solid) for solid in body.full.solids):
-                    return Contact(body.name, name)
-        for first, second in self._self_pairs:
-            if any(touch(a, b) for a in first.bare.solids for b in second.bare.solids):
-                return Contact(second.name, first.name)
+        for check in self._checks:
+            allowed = needle_may_touch_patient and check.contact == NEEDLE_IN_PATIENT
+            if not allowed and touch(check.first, check.second):
+                return check.contact
+        return None
+
+    def first_contact(self, q_path: Array, *, needle_may_touch_patient: bool) -> Met | None:
+        """The first state of a path with a contact, and the contact; None when all are clear.
+
+        Args:
+            q_path: Shape (m, 6), rad.
+            needle_may_touch_patient: See :meth:`contact`.
+
+        Raises:
+            InputError: If a state is not finite.
+        """
+        for index, q in enumerate(q_path):
+            contact = self.contact(q, needle_may_touch_patient=needle_may_touch_patient)
+            if contact is not None:
+                return Met(index, contact)
         return None
 
     def nearest(self, q: Array, pair: str, body: str | None = None) -> Nearest:
@@ -210,9 +194,26 @@ class CellChecker:
         bounds = self._swept.bounds_mm(q_path)
         return {body.name: bounds[:, body.frame - 1] for body in self._bodies[1:]}
 
+    def _room_checks(self) -> Iterator[Check]:
+        """Every moving body against the patient, then the boxes."""
+        for body in self._bodies[1:]:
+            if self._patient is not None:
+                yield Check(Contact(body.name, PATIENT), self._patient, body.full.surface, None, body, None)
+            for name, box in self._boxes.items():
+                for solid, hull in zip(body.full.solids, body.full.hulls, strict=True):
+                    yield Check(Contact(body.name, name), box, solid, None, body, (None, hull))
+
+    def _self_checks(self) -> Iterator[Check]:
+        """Every pair of bodies that might touch, piece by piece."""
+        for first, second in combinations(self._bodies, 2):
+            if (first.name, second.name) in NEVER_TESTED:
+                continue
+            shapes = product(*(zip(body.bare.solids, body.bare.hulls, strict=True) for body in (first, second)))
+            for (a, hull_a), (b, hull_b) in shapes:
+                yield Check(Contact(second.name, first.name), a, b, first, second, (hull_a, hull_b))
+
     def _place(self, q: Array) -> None:
-        if not np.isfinite(q).all():
-            raise InputError(f"joint angles {q} are not finite", where="collision check", allowed="six angles in rad")
+        require_finite(q)
         poses = link_poses(self.model, q)
         for body in self._bodies[1:]:
             body.place(poses)
@@ -222,6 +223,16 @@ class CellChecker:
         centre = collision_links(self.model)[0].mesh.bounds.mean(axis=0)
         if touch(self._patient, base.bare.surface) or abs(winding_number(patient, centre)) > 0.5:
             raise InputError("the robot's base stands in the patient", where="cell", allowed="a base outside the skin")
+
+
+def require_finite(q: Array) -> None:
+    """Refuse joint angles that are not finite: FCL would call them free.
+
+    Raises:
+        InputError: If one is not.
+    """
+    if not np.isfinite(q).all():
+        raise InputError(f"joint angles {q} are not finite", where="collision check", allowed="six angles in rad")
 
 
 def _nearest(bodies: Sequence[Body], others: Mapping[str, fcl.CollisionObject], bounds: Mapping[str, Array]) -> Nearest:

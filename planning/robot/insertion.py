@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.robot.kinematics import inverse, missing_reach_mm, singularity, wrap_to_pi
+from planning.robot import kernels
+from planning.robot.kinematics import N_BRANCHES, inverse, missing_reach_mm, singularity
 from planning.robot.ur import UrModel
 
 Array = NDArray[np.float64]
@@ -77,9 +79,8 @@ def insertion_paths(model: UrModel, target_base: Array, outward_base: Array, dis
     Returns:
         Shape (8, m, 6), rad, without jumps of whole turns; NaN from where a branch first does not exist.
     """
-    q = np.swapaxes(inverse(model, flange_poses(target_base, outward_base, distance_mm)), 0, 1)
-    steps = wrap_to_pi(np.diff(q, axis=1))
-    return np.concatenate([q[:, :1], q[:, :1] + np.cumsum(steps, axis=1)], axis=1)
+    line = needle_lines(np.atleast_2d(target_base), np.atleast_2d(outward_base))[0]
+    return every_way(model, line, np.ascontiguousarray(distance_mm, dtype=np.float64))
 
 
 def away_from_singularities(model: UrModel, q: Array, at_least: float = MIN_SINGULARITY) -> NDArray[np.bool_]:
@@ -95,19 +96,16 @@ def first_stop(model: UrModel, path: Array, depths_mm: Array) -> Stop | None:
         path: Shape (m, 6), rad, one branch of :func:`insertion_paths`.
         depths_mm: Shape (m,), rising, mm.
     """
-    far = singularity(model, path)
-    per_mm = np.abs(np.diff(path, axis=0)).max(axis=1) / np.diff(depths_mm)
-    jumps = np.append(per_mm > MAX_JOINT_STEP_RAD_PER_MM, False)
-    stops = ~(far.least() > MIN_SINGULARITY) | jumps
-    if not stops.any():
+    at = kernels.first_stop_at(model.lengths, path, depths_mm, MIN_SINGULARITY, MAX_JOINT_STEP_RAD_PER_MM)
+    if at < 0:
         return None
-    at = int(np.argmax(stops))
+    far = singularity(model, path[at])
     if np.isnan(path[at, 0]):
         what = "the arm does not reach on"
-    elif far.least()[at] > MIN_SINGULARITY:
+    elif far.least() > MIN_SINGULARITY:
         what = "a joint would jump"
     else:
-        what = f"too near the {min(far._fields, key=lambda name: getattr(far, name)[at])} singularity"
+        what = f"too near the {far.nearest} singularity"
     return Stop(float(depths_mm[at]), f"{what} {depths_mm[at]:.1f} mm after the standoff")
 
 
@@ -121,8 +119,7 @@ def reach_margin(model: UrModel, q: Array) -> float:
     Returns:
         0..1 for motions within the limits.
     """
-    to_limits = np.minimum(q - model.joint_limits[:, 0], model.joint_limits[:, 1] - q).min()
-    return float(min(1.0, to_limits / FULL_MARGIN_RAD, singularity(model, q).least().min()))
+    return float(kernels.path_margin(model.lengths, model.joint_limits, FULL_MARGIN_RAD, q))
 
 
 def why_unreachable(model: UrModel, T_base_flange: Array) -> str:
@@ -135,7 +132,97 @@ def why_unreachable(model: UrModel, T_base_flange: Array) -> str:
         return f"{stands}, its wrist too close to the base's axis for any shoulder angle"
     if missing > 0.0:
         return f"{stands}, {missing:.1f} mm out of the arm's reach in this direction"
-    far = singularity(model, inverse(model, T_base_flange)[0])
-    best = int(np.nanargmax(far.least()))
-    name = min(far._fields, key=lambda field: getattr(far, field)[best])
-    return f"{stands}, too near the {name} singularity ({far.least()[best]:.3f}, at least {MIN_SINGULARITY})"
+    solutions = inverse(model, T_base_flange)[0]
+    best = singularity(model, solutions[np.nanargmax(singularity(model, solutions).least())])
+    return f"{stands}, too near the {best.nearest} singularity ({best.least():.3f}, at least {MIN_SINGULARITY})"
+
+
+class NeedleLine(NamedTuple):
+    """A line to drive along, base frame."""
+
+    R_base_flange: Array
+    """Shape (3, 3): the flange's axes at roll 0."""
+    target: Array
+    """Shape (3,), mm."""
+    outward: Array
+    """Shape (3,), unit."""
+
+
+def needle_lines(targets_base: Array, outwards_base: Array) -> list[NeedleLine]:
+    """Lines through targets (n, 3), mm, outward along unit vectors (n, 3)."""
+    rotations = np.ascontiguousarray(flange_poses(targets_base, outwards_base, 0.0)[:, :3, :3])
+    return [NeedleLine(*row) for row in zip(rotations, targets_base, outwards_base, strict=True)]
+
+
+def flange_at(line: NeedleLine, distance_mm: float) -> Array:
+    """T_base_flange (4, 4), mm, at roll 0 and a distance from the target."""
+    T = np.eye(4)
+    T[:3, :3] = line.R_base_flange
+    T[:3, 3] = line.target + distance_mm * line.outward
+    return T
+
+
+def every_way(model: UrModel, line: NeedleLine, distance_mm: Array) -> Array:
+    """Every branch's way along a line, see :func:`insertion_paths`; ``distance_mm`` of shape (m,)."""
+    q = np.empty((N_BRANCHES, len(distance_mm), 6))
+    kernels.ways(model.lengths, *line, distance_mm, q)
+    return q
+
+
+def branch_way(model: UrModel, line: NeedleLine, distance_mm: Array, branch: int, turn: Array) -> Array:
+    """The way of one branch along the needle.
+
+    Args:
+        model: The arm.
+        line: The needle's line.
+        distance_mm: Shape (m,): target to flange along the way.
+        branch: Index among the eight of ``inverse``.
+        turn: Shape (6,), rad: added to every row, such as a roll and whole turns.
+
+    Returns:
+        Shape (m, 6), rad, without jumps of whole turns; NaN from where the branch first does not exist.
+    """
+    q = np.empty((len(distance_mm), 6))
+    kernels.way(model.lengths, *line, distance_mm, branch, turn, q)
+    return q
+
+
+class Survey(NamedTuple):
+    """What kinematics alone says of many directions, every branch and roll."""
+
+    stop_at: NDArray[np.int64]
+    """Shape (n, 8): index of the sample at which the way ends, -1 where it reaches the target."""
+    margins: Array
+    """Shape (n, 8, r): see :func:`reach_margin`; NaN where the way ends early or leaves the joint limits."""
+    turns: Array
+    """Shape (n, 8, r, 6), rad: what to add to the way at roll 0, the roll and whole turns."""
+
+
+def survey(
+    model: UrModel,
+    lines: Sequence[NeedleLine],
+    distances_mm: Sequence[Array],
+    depths_mm: Sequence[Array],
+    rolls: Array,
+) -> Survey:
+    """Every branch and roll of many straight insertions, each turned as far from the joint limits as whole turns allow.
+
+    Args:
+        model: The arm.
+        lines: The n directions.
+        distances_mm: For each direction, shape (m,): target to flange at the samples of the way.
+        depths_mm: The same as depths, rising, shape (m,).
+        rolls: Shape (r,), rad.
+    """
+    count = len(lines)
+    found = Survey(
+        np.empty((count, N_BRANCHES), np.int64),
+        np.empty((count, N_BRANCHES, len(rolls))),
+        np.empty((count, N_BRANCHES, len(rolls), 6)),
+    )
+    bounds = (MIN_SINGULARITY, MAX_JOINT_STEP_RAD_PER_MM, FULL_MARGIN_RAD)
+    for i in range(count):
+        filled = (found.stop_at[i], found.margins[i], found.turns[i])
+        way = (*lines[i], distances_mm[i], depths_mm[i])
+        kernels.survey(model.lengths, model.joint_limits, *way, rolls, *bounds, *filled)
+    return found

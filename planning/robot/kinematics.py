@@ -3,7 +3,8 @@
 The base frame is the controller's (a URDF's ``base_link`` is turned by 180 deg about z against it). Frames follow
 Denavit and Hartenberg: T_{i-1}_{i} = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i). The inverse is the usual split of a wrist
 with parallel axes 2, 3, 4 (Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms", 2013),
-with the wrist solved by ``atan2`` from the orientation alone so that it stays exact next to its singularity.
+with the wrist solved by ``atan2`` from the orientation alone so that it stays exact next to its singularity. The
+loops stand in :mod:`planning.robot.kernels`.
 """
 
 from __future__ import annotations
@@ -14,19 +15,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.robot import kernels
 from planning.robot.ur import UrModel
 
 Array = NDArray[np.float64]
 
 N_BRANCHES = 8
 """Shoulder left or right, times wrist flipped or not, times elbow up or down, in this order of weight 4, 2, 1."""
-
-BOUNDARY_TOLERANCE = 1e-12
-"""How far a cosine may exceed 1 and still count as the stretched pose: rounding of its few products, which moves
-the flange by less than 1e-9 mm."""
-
-WRIST_FREE = 1e-12
-"""Below this |sin q5| axes 4 and 6 are one within rounding: q6 is free, and 0 is taken."""
 
 
 class Singularity(NamedTuple):
@@ -43,6 +38,16 @@ class Singularity(NamedTuple):
         """The smallest of the three, shape (...)."""
         return np.minimum(np.minimum(self.shoulder, self.elbow), self.wrist)
 
+    @property
+    def nearest(self) -> str:
+        """Name of the nearest one, for a single configuration."""
+        return min(self._fields, key=lambda name: float(getattr(self, name)))
+
+
+def _rows(q: Array) -> Array:
+    """Configurations (..., 6) as one new (n, 6): a copy, since read-only arrays would be compiled for once more."""
+    return np.array(q, dtype=np.float64, order="C").reshape(-1, 6)
+
 
 def link_poses(model: UrModel, q: Array) -> Array:
     """Frames of the base and the six links.
@@ -54,29 +59,15 @@ def link_poses(model: UrModel, q: Array) -> Array:
     Returns:
         T_base_link, shape (..., 7, 4, 4), mm: the base (identity) first, the flange last.
     """
-    q = np.asarray(q, dtype=np.float64)
-    poses = np.zeros((*q.shape[:-1], 7, 4, 4))
-    poses[..., 0, :, :] = np.eye(4)
-    for joint in range(6):
-        step = _dh(q[..., joint], model.a[joint], model.d[joint], model.alpha[joint])
-        poses[..., joint + 1, :, :] = poses[..., joint, :, :] @ step
-    return poses
+    rows = _rows(q)
+    poses = np.empty((len(rows), 7, 4, 4))
+    kernels.link_frames(model.lengths, rows, poses)
+    return poses.reshape(*np.shape(q)[:-1], 7, 4, 4)
 
 
 def flange_pose(model: UrModel, q: Array) -> Array:
     """T_base_flange, shape (..., 4, 4), mm, of configurations ``q``, shape (..., 6), rad."""
     return np.ascontiguousarray(link_poses(model, q)[..., 6, :, :])
-
-
-def _dh(q: Array, a: float, d: float, alpha: float) -> Array:
-    c, s = np.cos(q), np.sin(q)
-    ca, sa = round(math.cos(alpha)), round(math.sin(alpha))  # all twists are quarter turns
-    T = np.zeros((*q.shape, 4, 4))
-    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2], T[..., 0, 3] = c, -s * ca, s * sa, a * c
-    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2], T[..., 1, 3] = s, c * ca, -c * sa, a * s
-    T[..., 2, 1], T[..., 2, 2], T[..., 2, 3] = sa, ca, d
-    T[..., 3, 3] = 1.0
-    return T
 
 
 def jacobian(model: UrModel, q: Array) -> Array:
@@ -90,11 +81,10 @@ def jacobian(model: UrModel, q: Array) -> Array:
         Shape (..., 6, 6): rows 0-2 give the velocity of the flange origin in mm/s, rows 3-5 the angular velocity in
         rad/s, from joint speeds in rad/s.
     """
-    poses = link_poses(model, q)
-    axes = poses[..., :6, :3, 2]
-    levers = poses[..., 6:7, :3, 3] - poses[..., :6, :3, 3]
-    columns = np.concatenate([np.cross(axes, levers), axes], axis=-1)
-    return np.ascontiguousarray(np.swapaxes(columns, -1, -2))
+    frames = link_poses(model, _rows(q))
+    columns = np.empty((len(frames), 6, 6))
+    kernels.jacobians(frames, columns)
+    return columns.reshape(*np.shape(q)[:-1], 6, 6)
 
 
 def singularity(model: UrModel, q: Array) -> Singularity:
@@ -107,10 +97,10 @@ def singularity(model: UrModel, q: Array) -> Singularity:
         model: The arm.
         q: Shape (..., 6), rad.
     """
-    q23 = q[..., 1] + q[..., 2]
-    in_plane = model.a2 * np.cos(q[..., 1]) + model.a3 * np.cos(q23) + model.d5 * np.sin(q23 + q[..., 3])
-    longest = abs(model.a2) + abs(model.a3) + model.d5
-    return Singularity(np.abs(in_plane) / longest, np.abs(np.sin(q[..., 2])), np.abs(np.sin(q[..., 4])))
+    rows = _rows(q)
+    terms = np.empty((3, len(rows)))
+    kernels.singularities(model.lengths, rows, terms)
+    return Singularity(*terms.reshape(3, *np.shape(q)[:-1]))
 
 
 def inverse(model: UrModel, T_base_flange: Array) -> Array:
@@ -126,13 +116,9 @@ def inverse(model: UrModel, T_base_flange: Array) -> Array:
         keeps its index. With the wrist aligned (sin q5 = 0) q6 is free and taken as 0, though another q6 might
         reach where 0 does not.
     """
-    wrist = _solve_wrist(model, np.asarray(T_base_flange, dtype=np.float64).reshape(-1, 4, 4))
-    q2, q3 = _two_links(model, wrist.in_plane, wrist.up)  # (n, 2, 2, 2)
-    q4 = wrist.q234[..., None] - q2 - q3
-    q1 = wrist.q1[..., None, None]
-    q = np.stack(np.broadcast_arrays(q1, q2, q3, q4, wrist.q5[..., None], wrist.q6[..., None]), axis=-1)
-    q = wrap_to_pi(q.reshape(-1, N_BRANCHES, 6))
-    q[np.isnan(q).any(axis=-1)] = np.nan
+    poses = np.array(T_base_flange, dtype=np.float64, order="C").reshape(-1, 4, 4)
+    q = np.empty((len(poses), N_BRANCHES, 6))
+    kernels.inverse_all(model.lengths, poses, q)
     return q
 
 
@@ -147,67 +133,10 @@ def missing_reach_mm(model: UrModel, T_base_flange: Array) -> Array:
         Shape (n,), mm: the least over all branches; 0 where a solution exists; infinite where no branch can turn its
         wrist so, because the wrist centre stands inside the cylinder of radius d4 about axis 1.
     """
-    wrist = _solve_wrist(model, np.asarray(T_base_flange, dtype=np.float64).reshape(-1, 4, 4))
-    distance = np.hypot(wrist.in_plane, wrist.up).reshape(-1, 4)
-    upper, fore = abs(model.a2), abs(model.a3)
-    missing = np.maximum(np.maximum(distance - (upper + fore), abs(upper - fore) - distance), 0.0)
-    return np.asarray(np.nan_to_num(missing, nan=np.inf).min(axis=1))
-
-
-class _Wrist(NamedTuple):
-    """The wrist's joints, and where they leave wrist 1 in the plane of the arm. All but q1 of shape (n, 2, 2)."""
-
-    q1: Array
-    q5: Array
-    q6: Array
-    q234: Array
-    in_plane: Array
-    up: Array
-
-
-def _solve_wrist(model: UrModel, T: Array) -> _Wrist:
-    """Shoulder pan (n, 2), then the wrist for each, flipped or not (n, 2, 2). NaN where there is no shoulder pan."""
-    x6, y6, z6 = T[:, :3, 0, None], T[:, :3, 1, None], T[:, :3, 2, None]
-    p6 = T[:, :3, 3, None]
-    q1 = _shoulder_pan(model, (p6 - model.d6 * z6)[:, :2, 0])
-    s1, c1 = np.sin(q1), np.cos(q1)
-    # The three parallel axes point along z1 = (s1, -c1, 0); its parts along the flange's axes give the wrist.
-    along_x, along_y, along_z = (s1 * axis[:, 0] - c1 * axis[:, 1] for axis in (x6, y6, z6))
-    flip = np.array([1.0, -1.0])
-    sin5 = np.hypot(along_x, along_y)[..., None] * flip
-    q5 = np.arctan2(sin5, along_z[..., None])
-    q6 = np.arctan2(-along_y[..., None] * flip, along_x[..., None] * flip)
-    q6 = np.where(np.abs(sin5) < WRIST_FREE, 0.0, q6)
-    s6, c6 = np.sin(q6), np.cos(q6)
-    x6, y6, z6, p6 = (v[:, :, :, None] for v in (x6, y6, z6, p6))  # (n, 3, 1, 1)
-    z4 = -(s6[:, None] * x6 + c6[:, None] * y6)  # axis 5, (n, 3, 2, 2)
-    p4 = p6 - model.d6 * z6 - model.d5 * z4
-    s1, c1 = s1[..., None], c1[..., None]
-    q234 = np.arctan2(c1 * z4[:, 0] + s1 * z4[:, 1], -z4[:, 2])
-    return _Wrist(q1, q5, q6, q234, c1 * p4[:, 0] + s1 * p4[:, 1], p4[:, 2] - model.d1)
-
-
-def _shoulder_pan(model: UrModel, wrist_xy: Array) -> Array:
-    """q1, shape (n, 2): the arm's plane passes the wrist centre (n, 2) at the distance d4. NaN inside that circle."""
-    radius = np.hypot(wrist_xy[:, 0], wrist_xy[:, 1])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        in_plane = np.sqrt((radius - model.d4) * (radius + model.d4))
-    barely = (radius < model.d4) & (radius > model.d4 * (1.0 - BOUNDARY_TOLERANCE))
-    in_plane = np.where(barely, 0.0, in_plane)
-    bearing = np.arctan2(wrist_xy[:, 1], wrist_xy[:, 0])[:, None]
-    return np.asarray(bearing + np.arctan2(model.d4, in_plane[:, None] * np.array([1.0, -1.0])))
-
-
-def _two_links(model: UrModel, x: Array, y: Array) -> tuple[Array, Array]:
-    """q2 and q3, each (..., 2), that reach (x, y) in the shoulder's plane. NaN where that is too far or too near."""
-    a2, a3 = model.a2, model.a3
-    cosine = (x * x + y * y - a2 * a2 - a3 * a3) / (2.0 * a2 * a3)
-    barely = (np.abs(cosine) > 1.0) & (np.abs(cosine) < 1.0 + BOUNDARY_TOLERANCE)
-    cosine = np.where(barely, np.sign(cosine), cosine)
-    with np.errstate(invalid="ignore"):
-        bend = np.arccos(cosine)[..., None] * np.array([1.0, -1.0])
-    q2 = np.arctan2(y, x)[..., None] - np.arctan2(a3 * np.sin(bend), a2 + a3 * np.cos(bend))
-    return q2, bend
+    poses = np.array(T_base_flange, dtype=np.float64, order="C").reshape(-1, 4, 4)
+    missing = np.empty(len(poses))
+    kernels.missing_reach(model.lengths, poses, missing)
+    return missing
 
 
 def wrap_to_pi(angle: Array) -> Array:

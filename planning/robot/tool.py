@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,6 +93,12 @@ class Box:
             raise InputError(f"size_mm = {self.size_mm}", where=f"box {self.name!r}", allowed="three lengths above 0")
         T.setflags(write=False)
         object.__setattr__(self, "T_base_box", T)
+
+    @property
+    def corners(self) -> Array:
+        """Its eight corners, base frame, shape (8, 3), mm."""
+        local = np.array(list(product((-0.5, 0.5), repeat=3))) * self.size_mm
+        return np.asarray(local @ self.T_base_box[:3, :3].T + self.T_base_box[:3, 3])
 
     @property
     def bounds(self) -> Array:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
@@ -71,6 +72,13 @@ class UrModel:
     def alpha(self) -> tuple[float, ...]:
         """DH link twists, rad: the same for the whole family."""
         return (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
+
+    @cached_property
+    def lengths(self) -> NDArray[np.float64]:
+        """(d1, a2, a3, d4, d5, d6), shape (6,), mm: the arm as compiled code takes it."""
+        lengths = np.array([self.d1, self.a2, self.a3, self.d4, self.d5, self.d6])
+        lengths.setflags(write=False)
+        return lengths
 
     @property
     def shoulder_base(self) -> NDArray[np.float64]:

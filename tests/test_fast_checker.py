@@ -1,0 +1,268 @@
+"""The fast checker: bounds that never exceed the distance, balls that enclose, and verdicts that are FCL's."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import fcl
+import numpy as np
+import pytest
+import trimesh
+
+from planning.errors import InputError
+from planning.mesh import TriangleMesh
+from planning.prepared import Prepared, prepare
+from planning.reach import ReachAnswer, assess_reach, assess_reach_all
+from planning.robot.bodies import arm_bodies
+from planning.robot.cell import Box, CellChecker, Tool
+from planning.robot.enclosures import ball_tree, coarse_hull, prism
+from planning.robot.fast_checker import FastChecker
+from planning.robot.kinematics import link_poses
+from planning.robot.proof_kernels import STACK, plane_gap, to_surface, to_triangle
+from planning.robot.shapes import convex
+from planning.robot.triangle_tree import TriangleTree
+from planning.robot.ur import ur_model
+from planning.room import ARM_PADDING_MM, case_boxes, case_tool
+from planning.search import case_directions, organ_candidates, reach_request
+
+UR3 = ur_model("ur3")
+TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
+CLEAR = np.array([0.4, -1.9, 1.6, -1.2, -1.5, 0.3])
+"""Elbow up, needle down."""
+
+
+def points_within(corners: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Random points of a convex hull, many of them on its edges and faces."""
+    chosen = corners[rng.integers(len(corners), size=(count, 4))]
+    weights = rng.dirichlet(np.full(4, 0.3), count)
+    return np.einsum("ij,ijk->ik", weights, chosen)
+
+
+def scene(kind: type[CellChecker], padding_mm: float = 5.0) -> CellChecker:
+    """A UR3 beside a lumpy patient on a table that is not square to the base, with a lamp above."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
+    lumps = 1.0 + 0.15 * np.sin(9.0 * ball.vertices[:, :1]) * np.cos(7.0 * ball.vertices[:, 1:2])
+    patient = TriangleMesh(ball.vertices * lumps * [160.0, 260.0, 110.0] + [380.0, 40.0, 60.0], np.asarray(ball.faces))
+    T = np.eye(4)
+    T[:3, :3] = trimesh.transformations.rotation_matrix(0.3, [0.2, 0.1, 1.0])[:3, :3]
+    T[:3, 3] = (400.0, 30.0, -140.0)
+    lamp = np.eye(4)
+    lamp[:3, 3] = (150.0, 250.0, 420.0)
+    boxes = [Box("table", T, (600.0, 900.0, 60.0)), Box("lamp", lamp, (120.0, 80.0, 60.0))]
+    return kind(UR3, TOOL, boxes, patient, padding_mm=padding_mm)
+
+
+@pytest.mark.parametrize(("name", "padding"), [("ur3", 0.0), ("ur3", 5.0), ("ur5", 5.0), ("ur10", 5.0)])
+def test_leaf_balls_cover_every_body(name: str, padding: float) -> None:
+    """Every corner and many points inside every padded piece lie in a leaf's ball, and in the root's."""
+    rng = np.random.default_rng(0)
+    for body in arm_bodies(ur_model(name), TOOL, padding):
+        tree = ball_tree(body.full.hulls)
+        for corners in body.full.hulls:
+            points = np.concatenate([corners, points_within(corners, 500, rng)])
+            distances = np.linalg.norm(points[:, None] - tree.centres, axis=2) - tree.radii
+            assert distances[:, tree.leaves].min(axis=1).max() <= 0.0, body.name
+            assert distances[:, 0].max() <= 0.0
+
+
+def test_every_ball_encloses_the_balls_parts_below_it() -> None:
+    """A parent may answer for its children: what of the body only its own leaves cover lies in its ball too."""
+    rng = np.random.default_rng(1)
+    body = arm_bodies(UR3, TOOL, 5.0)[2]
+    tree = ball_tree(body.full.hulls)
+    points = np.concatenate([points_within(corners, 3000, rng) for corners in body.full.hulls])
+    inside = np.linalg.norm(points[:, None] - tree.centres, axis=2) <= tree.radii
+    below: dict[int, set[int]] = {}
+    for node in reversed(range(len(tree.radii))):
+        left, right = tree.children[node]
+        below[node] = {node} if left < 0 else below[int(left)] | below[int(right)]
+    for node, leaves in below.items():
+        others = np.setdiff1d(tree.leaves, list(leaves))
+        own = inside[:, list(leaves)].any(axis=1) & ~inside[:, others].any(axis=1)
+        assert inside[own, node].all()
+
+
+def test_the_prism_encloses_the_cylinder() -> None:
+    """In every direction it reaches at least as far as the round body."""
+    u = np.random.default_rng(2).normal(size=(2000, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    cylinder = 15.0 * np.hypot(u[:, 0], u[:, 1]) + 40.0 * np.abs(u[:, 2])
+    assert ((prism(15.0, 80.0) @ u.T).max(axis=0) >= cylinder).all()
+
+
+@pytest.mark.parametrize("name", ["ur3", "ur5"])
+def test_no_corner_stands_out_of_the_coarse_hull_by_more_than_its_slack(name: str) -> None:
+    """In every direction the hull reaches no farther than the coarse one and its slack."""
+    u = np.random.default_rng(3).normal(size=(3000, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    for body in arm_bodies(ur_model(name), TOOL, 5.0):
+        for corners in (*body.bare.hulls, *body.full.hulls):
+            coarse = coarse_hull(corners)
+            beyond = (corners @ u.T).max(axis=0) - (coarse.corners @ u.T).max(axis=0)
+            assert beyond.max() <= coarse.slack_mm + 1e-9
+            assert len(coarse.corners) <= 60 and coarse.slack_mm < 12.0
+
+
+def test_distance_to_a_triangle_agrees_with_another_closest_point() -> None:
+    """Over random, thin and flat triangles, from near and far, to 1e-9 of the size; without area, the edges count."""
+    rng = np.random.default_rng(4)
+    triangles = rng.normal(size=(4000, 3, 3)) * 20.0
+    triangles[1000:2000, 2] = triangles[1000:2000, 1] + rng.normal(size=(1000, 3)) * 1e-3
+    points = triangles.mean(axis=1) + rng.normal(size=(4000, 3)) * 10.0 ** rng.uniform(-2, 2, (4000, 1))
+    closest = trimesh.triangles.closest_point(triangles, points)
+    ours = np.sqrt([to_triangle(t, *p) for t, p in zip(triangles, points, strict=True)])
+    assert np.abs(ours - np.linalg.norm(points - closest, axis=1)).max() < 1e-6
+    line = np.array([[0.0, 0, 0], [10, 0, 0], [5, 0, 0]])
+    assert np.sqrt(to_triangle(line, 4.0, 3.0, 0.0)) == pytest.approx(3.0)
+    assert np.sqrt(to_triangle(np.full((3, 3), 2.0), 2.0, 2.0, 7.0)) == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize("subdivisions", [0, 1, 4])
+def test_distance_to_a_surface_is_the_least_over_its_triangles(subdivisions: int) -> None:
+    """Whatever the number of triangles; and a nearer cutoff is what is returned when nothing is nearer."""
+    rng = np.random.default_rng(5)
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=80.0)
+    mesh = TriangleMesh(
+        np.asarray(ball.vertices) * [1.0, 2.0, 0.5], np.asarray(ball.faces)[: -1 if subdivisions else 1]
+    )
+    tree = TriangleTree.of(mesh)
+    assert {tuple(t.ravel()) for t in mesh.triangles} == {tuple(t.ravel()) for t in tree.corners.reshape(-1, 3, 3)}
+    stack = np.empty(STACK, np.int64)
+    for point in rng.uniform(-250, 250, (60, 3)):
+        least = np.sqrt(min(to_triangle(t, *point) for t in mesh.triangles))
+        assert to_surface(tree.lows, tree.highs, tree.corners, *point, 1e6, stack) == least
+        assert to_surface(tree.lows, tree.highs, tree.corners, *point, least / 2.0, stack) == pytest.approx(least / 2.0)
+
+
+def test_a_plane_between_two_hulls_is_never_wider_than_their_distance() -> None:
+    """The gap is at most FCL's distance; where it is positive FCL finds no contact; and most free pairs are parted."""
+    rng = np.random.default_rng(6)
+    pieces = [piece for body in arm_bodies(UR3, TOOL, 0.0)[:7] for piece in body.bare.hulls]
+    hulls = [trimesh.convex.convex_hull(piece) for piece in pieces]
+    solids = [fcl.CollisionObject(convex(TriangleMesh(h.vertices, h.faces))) for h in hulls]
+    parted = free = 0
+    for _ in range(1500):
+        i, j = rng.integers(len(pieces), size=2)
+        T = trimesh.transformations.random_rotation_matrix(rng.uniform(size=3))
+        T[:3, 3] = pieces[i].mean(axis=0) + rng.normal(size=3) * 60.0
+        a, b = (tuple(np.ascontiguousarray(axis) for axis in pieces[k].T) for k in (i, j))
+        axis = np.array([0.0, 0.0, 1.0])
+        gap = plane_gap(a, b, np.ascontiguousarray(T[:3, :3]), T[:3, 3], axis, 1e-3, 12)
+        other = fcl.CollisionObject(convex(TriangleMesh(hulls[j].vertices, hulls[j].faces)))
+        other.setTransform(fcl.Transform(T[:3, :3], T[:3, 3]))
+        touching = fcl.collide(solids[i], other, fcl.CollisionRequest(), fcl.CollisionResult()) > 0
+        if gap > 1e-3:
+            parted += 1
+            assert not touching
+            assert gap <= fcl.distance(solids[i], other, fcl.DistanceRequest(), fcl.DistanceResult()) + 1e-4
+        free += not touching
+    assert 300 < free < 1450 and parted >= 0.98 * free
+
+
+@pytest.fixture(scope="module")
+def states() -> np.ndarray:
+    """Ten thousand: anywhere, and in small steps away from where the needle is about to go in."""
+    rng = np.random.default_rng(7)
+    anywhere = rng.uniform(-np.pi, np.pi, (5000, 6))
+    near = CLEAR + rng.normal(size=(5000, 6)) * rng.choice([0.02, 0.2, 0.6], (5000, 1))
+    return np.concatenate([anywhere, near])
+
+
+def test_ten_thousand_verdicts_are_those_of_fcl(states: np.ndarray) -> None:
+    """The same contact or none at every state, the needle being allowed in or not; no state is falsely free.
+
+    What the bounds alone call free is free to FCL, and they settle nearly all of the free states.
+    """
+    slow, fast = scene(CellChecker), scene(FastChecker)
+    assert isinstance(fast, FastChecker)
+    free = proven = 0
+    met = set()
+    for i, q in enumerate(states):
+        may = bool(i % 2)
+        verdict = slow.contact(q, needle_may_touch_patient=may)
+        assert fast.contact(q, needle_may_touch_patient=may) == verdict, i
+        open_checks = fast.open_checks(q, needle_may_touch_patient=may)
+        assert verdict is None or verdict in open_checks
+        free += verdict is None
+        proven += not open_checks
+        met.add(verdict)
+    assert 2000 < free < 8000 and proven >= 0.9 * free
+    others = {verdict.other for verdict in met if verdict}
+    assert {"patient", "table", "lamp", "base", "upper_arm"} <= others
+
+
+def test_along_a_path_the_first_contact_is_the_one_that_asking_every_state_finds(states: np.ndarray) -> None:
+    """The same index and bodies on straight joint paths, long and short, clear and not."""
+    slow, fast = scene(CellChecker), scene(FastChecker)
+    free = [q for q in states[::25] if slow.contact(q, needle_may_touch_patient=False) is None]
+    met = clear = 0
+    for k in range(100):
+        path = free[k] + np.linspace(0.0, 0.1 + 0.009 * k, 40)[:, None] * (free[-1 - k] - free[k])
+        expected = slow.first_contact(path, needle_may_touch_patient=bool(k % 2))
+        assert fast.first_contact(path, needle_may_touch_patient=bool(k % 2)) == expected
+        met += expected is not None and expected.at > 0
+        clear += expected is None
+    assert met >= 15 and clear >= 15, (met, clear)
+
+
+def test_the_proof_holds_for_the_whole_stretch_that_is_skipped() -> None:
+    """A wrist that turns in place skips nothing it should not: tiny steps end at the state where FCL ends."""
+    slow, fast = scene(CellChecker, 0.0), scene(FastChecker, 0.0)
+    for joint in range(6):
+        path = np.tile(CLEAR, (1500, 1))
+        path[:, joint] += np.linspace(0.0, 3.0, 1500)
+        expected = slow.first_contact(path, needle_may_touch_patient=False)
+        assert fast.first_contact(path, needle_may_touch_patient=False) == expected
+
+
+def test_an_empty_room_and_a_needle_that_may_go_in() -> None:
+    """Without patient or boxes only the arm itself counts; distances are those of the plain checker."""
+    assert FastChecker(UR3, TOOL).contact(CLEAR, needle_may_touch_patient=False) is None
+    slow, fast = scene(CellChecker), scene(FastChecker)
+    assert fast.distances(CLEAR) == slow.distances(CLEAR)
+    with pytest.raises(InputError, match="not finite"):
+        fast.contact(np.full(6, np.nan), needle_may_touch_patient=False)
+    with pytest.raises(InputError, match="not finite"):
+        fast.first_contact(np.full((3, 6), np.inf), needle_may_touch_patient=False)
+
+
+@pytest.fixture(scope="module")
+def abdomen(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
+    """The embedded abdomen at 6 degrees."""
+    here = tmp_path_factory.mktemp("abdomen") / "case"
+    shutil.copytree(Path(__file__).parents[1] / "meshes" / "abdomen", here)
+    case = here / "case.toml"
+    case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 6.0"))
+    return prepare(case)
+
+
+def test_reach_answers_over_the_abdomen_are_those_of_fcl(abdomen: Prepared) -> None:
+    """Every organ-safe direction: the same verdict, reason, depth, contact, branch, roll and motion."""
+    case, anatomy, reach = abdomen.case, abdomen.anatomy, abdomen.reach
+    assert reach is not None
+    found = organ_candidates(case, anatomy, abdomen.engine, case_directions(case))
+    requests = [reach_request(case, found, int(row), reach.T_base_ct) for row in np.flatnonzero(found.safe)]
+    room = (case_tool(case), case_boxes(case, reach.T_base_ct), anatomy.skin.mesh.transformed(reach.T_base_ct))
+    slow, fast = (kind(UR3, *room, padding_mm=ARM_PADDING_MM) for kind in (CellChecker, FastChecker))
+    reports: list[tuple[int, int]] = []
+    answers = assess_reach_all(fast, requests, lambda done, total: reports.append((done, total)))
+    assert reports[-1] == (len(requests), len(requests)) and len(requests) > 300
+    for asked, answer in zip(requests, answers, strict=True):
+        assert_same(answer, assess_reach(slow, asked))
+    reasons = {answer.reason.value for answer in answers}
+    assert {"", "unreachable", "arm_collision", "insertion_blocked"} <= reasons
+
+
+def assert_same(a: ReachAnswer, b: ReachAnswer) -> None:
+    """Equal in everything."""
+    for name in ("reachable", "reason", "depth_mm", "detail", "contact", "branch", "margin"):
+        assert getattr(a, name) == getattr(b, name), name
+    assert np.array_equal(a.roll, b.roll, equal_nan=True)
+    assert np.array_equal(a.insertion_q, b.insertion_q) and np.array_equal(a.insertion_depth_mm, b.insertion_depth_mm)
+
+
+def test_frames_of_a_path_and_of_its_states_agree() -> None:
+    """What is judged along a path is what is judged state by state: the same frames to the last bit."""
+    path = np.random.default_rng(8).uniform(-np.pi, np.pi, (50, 6))
+    assert np.array_equal(link_poses(UR3, path), np.stack([link_poses(UR3, q) for q in path]))

@@ -1,0 +1,136 @@
+"""The compiled ways along a needle against the plain inverse, and the survey against its parts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from planning.robot.insertion import (
+    FULL_MARGIN_RAD,
+    branch_way,
+    every_way,
+    first_stop,
+    flange_at,
+    flange_poses,
+    insertion_paths,
+    needle_lines,
+    reach_margin,
+    survey,
+)
+from planning.robot.kinematics import flange_pose, inverse, nearest_within_limits, singularity, wrap_to_pi
+from planning.robot.sweep import SweptBodies
+from planning.robot.tool import Tool
+from planning.robot.ur import UR_MODELS, ur_model
+
+DEPTHS = np.linspace(0.0, 120.0, 61)
+DISTANCES = 320.0 - DEPTHS
+ROLLS = 2.0 * np.pi * np.arange(8) / 8.0
+
+
+def lines(count: int, seed: int) -> list:
+    """Random needle lines about a target that a UR3 reaches from some sides."""
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=(count, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return needle_lines(np.array([300.0, 20.0, 60.0]) + rng.uniform(-80, 80, (count, 3)), u)
+
+
+@pytest.mark.parametrize("name", sorted(UR_MODELS))
+def test_a_way_holds_every_flange_pose_along_the_line(name: str) -> None:
+    """Each row of a branch returns its pose to 1e-9 mm and is that branch of the plain inverse, but for whole turns."""
+    model = ur_model(name)
+    drawn = 0
+    for line in lines(15, seed=1):
+        q = every_way(model, line, DISTANCES)
+        poses = flange_poses(line.target, line.outward, DISTANCES)
+        plain = np.swapaxes(inverse(model, poses), 0, 1)
+        exists = ~np.isnan(q[..., 0])
+        assert (~exists | ~np.isnan(plain[..., 0])).all()
+        assert np.abs(wrap_to_pi(q - plain))[exists].max(initial=0.0) < 1e-9
+        for branch in range(8):
+            way = q[branch][exists[branch]]
+            assert exists[branch][: len(way)].all()  # nothing after the first gap
+            assert np.abs(flange_pose(model, way) - poses[: len(way)]).max(initial=0.0) < 1e-9
+            assert np.abs(np.diff(way, axis=0)).max(initial=0.0) <= np.pi
+        drawn += int(exists.sum())
+    assert drawn > 300
+
+
+def test_one_branch_alone_and_all_eight_agree() -> None:
+    """The same way to 1e-12 rad, the turn added to every row; NaN in the same rows."""
+    model, turn = ur_model("ur3"), np.array([0.0, 2 * np.pi, 0.0, -2 * np.pi, 0.0, 0.7])
+    for line in lines(10, seed=2):
+        every = every_way(model, line, DISTANCES)
+        assert np.array_equal(every, insertion_paths(model, line.target, line.outward, DISTANCES), equal_nan=True)
+        for branch in range(8):
+            alone = branch_way(model, line, DISTANCES, branch, turn)
+            assert np.allclose(alone, every[branch] + turn, rtol=0.0, atol=1e-12, equal_nan=True)
+
+
+def test_a_line_and_a_pose_agree() -> None:
+    """Two ways to say where the flange is."""
+    for line in lines(20, seed=3):
+        assert np.allclose(flange_at(line, 320.0), flange_poses(line.target, line.outward, 320.0)[0], atol=1e-12)
+
+
+def test_the_survey_is_what_its_parts_say() -> None:
+    """Stops as ``first_stop`` has them, margins as ``reach_margin`` of the motion that the turns give."""
+    model, many = ur_model("ur3"), lines(60, seed=4)
+    found = survey(model, many, [DISTANCES] * 60, [DEPTHS] * 60, ROLLS)
+    allowed = 0
+    for line, stop_at, margins, turns in zip(many, *found, strict=True):
+        ways = every_way(model, line, DISTANCES)
+        for branch in range(8):
+            stop = first_stop(model, ways[branch], DEPTHS)
+            assert (stop is None) == (stop_at[branch] < 0)
+            if stop is not None:
+                assert stop.depth_mm == DEPTHS[stop_at[branch]] and np.isnan(margins[branch]).all()
+                continue
+            for i, roll in enumerate(ROLLS):
+                rolled = ways[branch] + [0, 0, 0, 0, 0, roll]
+                middle = rolled[len(rolled) // 2]
+                moved = rolled + nearest_within_limits(model, middle, np.zeros(6)) - middle
+                assert np.abs(ways[branch] + turns[branch, i] - moved).max() < 1e-12
+                if model.within_limits(moved).all():
+                    assert margins[branch, i] == pytest.approx(reach_margin(model, moved), abs=1e-12)
+                    allowed += 1
+                else:
+                    assert np.isnan(margins[branch, i])
+    assert allowed > 200
+
+
+def test_margins_are_the_least_term_of_all() -> None:
+    """Over random motions: joint limits in quarter turns and the three singular terms, nothing else."""
+    model = ur_model("ur3")
+    for seed in range(20):
+        q = np.random.default_rng(seed).uniform(-3.0, 3.0, (10, 6))
+        limits = np.minimum(q - model.joint_limits[:, 0], model.joint_limits[:, 1] - q).min() / FULL_MARGIN_RAD
+        assert reach_margin(model, q) == pytest.approx(min(1.0, limits, singularity(model, q).least().min()), abs=1e-15)
+
+
+def test_a_jump_and_a_singularity_stop_a_way_where_they_are() -> None:
+    """A joint that turns 0.2 rad in 2 mm stops at the sample before; a stretched elbow at its own."""
+    model = ur_model("ur3")
+    still = np.tile([0.4, -1.9, 1.6, -1.2, -1.5, 0.3], (10, 1))
+    depths = 2.0 * np.arange(10.0)
+    assert first_stop(model, still, depths) is None
+    jump, stretched, lost = still.copy(), still.copy(), still.copy()
+    jump[6:, 5] += 0.2
+    stretched[4, 2] = 0.01
+    lost[7:] = np.nan
+    assert first_stop(model, jump, depths) == (10.0, "a joint would jump 10.0 mm after the standoff")
+    stop = first_stop(model, stretched, depths)
+    assert stop is not None and stop.depth_mm == 6.0 and "jump" in stop.detail  # 1.6 to 0.01 rad in 2 mm comes first
+    stop = first_stop(model, stretched[4:], depths[4:])
+    assert stop is not None and stop.depth_mm == 8.0 and "elbow" in stop.detail
+    stop = first_stop(model, lost, depths)
+    assert stop is not None and stop.depth_mm == 14.0 and "does not reach" in stop.detail
+
+
+def test_padding_moves_farther() -> None:
+    """The bound of the padded bodies is never below that of the bare ones, and holds their outermost corners."""
+    model, tool = ur_model("ur3"), Tool(250.0, 150.0, 1.2, 30.0)
+    bare, full = SweptBodies.of(model, tool), SweptBodies.of(model, tool, 5.0)
+    path = np.random.default_rng(9).uniform(-np.pi, np.pi, (30, 6))
+    assert (full.bounds_mm(path) >= bare.bounds_mm(path)).all()
+    assert np.allclose(np.ptp(full.corners, axis=1) - np.ptp(bare.corners, axis=1), 10.0)
