@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.mesh import TriangleMesh
-from planning.robot.cell import PATIENT
+from planning.robot.state_checker import PATIENT
 from planning.robot.tool import Box, Tool
 from planning.robot.ur import UrModel
 from twin.world.arm import Arm, load_arm
