@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out/demo
 
-.PHONY: demo test lint install meshes clean
+.PHONY: demo test lint install pictures meshes clean
 
 demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
@@ -24,6 +24,10 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[test]'
 	touch $@
+
+pictures: demo
+	$(BIN)/python docs/frames_picture.py
+	$(BIN)/python docs/readme_pictures.py $(OUT)
 
 meshes: install
 	$(BIN)/python -m twin.phantoms --out meshes

@@ -3,8 +3,12 @@
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import settings
 
 from planning.mesh import TriangleMesh
+
+settings.register_profile("shared machine", deadline=None)  # the first call of compiled code takes seconds
+settings.load_profile("shared machine")
 
 
 @pytest.fixture

@@ -1,0 +1,22 @@
+"""Shrink the demo's pictures for the README: ``make pictures``."""
+
+import sys
+from pathlib import Path
+
+from PIL import Image
+
+WIDTH = 1200
+COLOURS = 200
+
+
+def main(demo: Path) -> None:
+    """Write docs/map.png and docs/scene.png from a demo's folder."""
+    for name in ("map.png", "scene.png"):
+        picture = Image.open(demo / name).convert("RGB")
+        height = round(picture.height * WIDTH / picture.width)
+        small = picture.resize((WIDTH, height), Image.Resampling.LANCZOS).quantize(COLOURS)
+        small.save(Path(__file__).with_name(name), optimize=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
