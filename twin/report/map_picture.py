@@ -161,6 +161,8 @@ def _marks(axes: Axes, view: MapView, candidates: Candidates) -> None:
 def _title(figure: Figure, case: Any, candidates: Candidates) -> None:
     figure.text(0.02, 0.955, f"{case.name}: entry directions to {target_words(case)}", fontsize=19, fontweight="bold")
     line = f"{len(candidates):,} directions, step {np.degrees(step_of(candidates)):g}°;  {needle_words(case)}"
+    if len(candidates) and np.all(candidates.reachable == -1):
+        line += ";  ARM NOT ASKED"
     figure.text(0.02, 0.918, line, fontsize=12, color="0.25")
     figure.text(0.985, 0.012, "research software, not a medical device", fontsize=9, color="0.4", ha="right")
 
@@ -236,7 +238,7 @@ def _mark_legend(axes: Axes, candidates: Candidates, y: float) -> float:
     if not candidates.safe.any():
         return y
     axes.scatter([0.03], [y], s=240, marker="*", c="white", edgecolors="black", linewidths=1.5, clip_on=False)
-    axes.text(0.075, y, "chosen", fontsize=10.5, va="center")
+    axes.text(0.075, y, "best", fontsize=10.5, va="center")
     axes.scatter([0.32], [y], s=46, facecolors="none", edgecolors="black", linewidths=1.2)
     axes.text(0.36, y, "ten best", fontsize=10.5, va="center")
     if candidates.pareto.any():
@@ -255,7 +257,7 @@ def _chosen(axes: Axes, candidates: Candidates, y: float) -> float:
     name, clearance = nearest_structure(candidates, row)
     theta, beta = np.degrees(candidates.theta[row]), np.degrees(candidates.beta[row])
     lines = (
-        f"Chosen: θ {theta:g}°, β {beta:g}°",
+        f"Best: θ {theta:g}°, β {beta:g}°",
         f"path in the body {number(candidates.path_length[row], 1, 'mm')}, "
         f"skin angle {number(float(np.degrees(candidates.skin_angle[row])), 0)}°",
         f"nearest: {name.replace('_', ' ') or 'none'}, {number(clearance, 1, 'mm')}",
