@@ -63,4 +63,5 @@ def measure(
             violated[:, column] = distance[:, column] < limit
             for row in np.flatnonzero(np.abs(distance[:, column] - limit) < NEAR_THRESHOLD_MM):
                 violated[row, column] = engine.collides(column, target_ct, outward_ct[row], length, limit)
-    return Clearances(distance - radius, depth, violated)
+    distance -= radius
+    return Clearances(distance, depth, violated)
