@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,11 +44,8 @@ BODY_SHARE_MM = 700.0
 """The overview shows the patient within this distance of the target, and the whole arm."""
 
 CLOSE_RADIUS_MM = 38.0
-HIDDEN_NEARBY = ("needle holder", "safe corridor")
-"""What the close-up leaves out, because it would hide the path."""
-
-MOUTH_NEARBY = 0.3
-"""Opacity of the safe entry area in the close-up."""
+HIDDEN_NEARBY = ("room", "safe")
+"""Groups that the close-up leaves out: a rib seen through the green of the skin would look safe to hit."""
 
 NOTHING_RADIUS_MM = 90.0
 """Around the target, when there is no path to show."""
@@ -78,16 +74,12 @@ def draw_scene(case: Any, anatomy: Any, candidates: Candidates, plan: Any | None
     far = _overview_camera(case, with_arm, path_ct)
     _view(image, draw, with_arm, far, LEFT_BOX, case, "Overview" + (": needle on the target" if arm else ""))
     near = _close_camera(case, bodies, path_ct)
-    few = [_thinned(body) for body in bodies if body.name not in HIDDEN_NEARBY and body.group != "room"]
+    few = [body for body in bodies if body.name != "needle holder" and body.group not in HIDDEN_NEARBY]
     _view(image, draw, few, near, RIGHT_BOX, case, "Close-up of the path")
     bottom = _words(draw, case, candidates, plan, bool(arm), [b for b in bodies if b.group == "organ"])
     image = image.crop((0, 0, WIDTH, min(HEIGHT, round(bottom) + 8)))
     with atomic(Path(path)) as temporary:
         image.save(temporary, format="PNG", optimize=True)
-
-
-def _thinned(body: Body) -> Body:
-    return replace(body, alpha=MOUTH_NEARBY) if body.group == "safe" else body
 
 
 def render_bodies(bodies: Sequence[Body], camera: Camera) -> NDArray[np.uint8]:
@@ -185,7 +177,7 @@ def _words(
     annotate.write(draw, (18, 50), words, size=18, bold=row is None and plan is None, colour=colour)
     items = [("target", palette.TARGET_POINT), (needle_words(case.needle), palette.NEEDLE)]
     if candidates.safe.any():
-        items.append(("safe: where a needle may enter, and its corridor", palette.SAFE))
+        items.append(("safe: where a needle may enter, and its corridor (overview)", palette.SAFE))
     items.append(("skin (see-through)", palette.SKIN))
     if arm:
         items += [
