@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.errors import InputError
 from planning.files import atomic
 
 Arrays = dict[str, NDArray[Any]]
@@ -105,5 +106,5 @@ def _write(arrays: Arrays, path: Path, key: str) -> None:
         with atomic(path) as temporary, temporary.open("wb") as stream:
             stored: dict[str, Any] = {"digest": np.array(_digest(arrays, key)), **arrays}
             np.savez(stream, **stored)
-    except OSError:
+    except (OSError, InputError):
         return

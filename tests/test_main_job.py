@@ -3,6 +3,7 @@
 import io
 import json
 import shutil
+from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
@@ -155,6 +156,16 @@ def test_batch_goes_on_after_a_bad_case(carton, tmp_path, capfd):
     assert [row["exit_code"] for row in found["cases"]] == [0, 2]
     assert (out / "0001" / "candidates.parquet").is_file()
     assert len((out / "batch.csv").read_text().splitlines()) == 3
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no /proc on this system")
+def test_a_folder_that_only_looks_writable_is_refused(carton, capfd):
+    """Permissions say yes and the system says no: one line all the same."""
+    assert main(["search", str(carton), "--no-arm", "--no-pictures", "--out", "/proc/nowhere"]) == BAD_INPUT
+    said = capfd.readouterr()
+    assert said.out == ""
+    assert "cannot be written" in said.err
+    assert len(said.err.strip().splitlines()) == 1
 
 
 def test_a_bug_is_exit_code_3(monkeypatch, capfd):

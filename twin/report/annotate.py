@@ -151,14 +151,3 @@ def panel(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], title: str)
     """A frame around a view with its title in the upper left corner."""
     draw.rectangle(box, outline=(190, 194, 200), width=1)
     write(draw, (box[0] + 12, box[1] + 10), title, size=16, bold=True, halo=3)
-
-
-def text_block(
-    draw: ImageDraw.ImageDraw, at: tuple[float, float], lines: list[tuple[str, str]], size: int, column: float
-) -> None:
-    """Pairs of label and value below one another; values in bold at a fixed column."""
-    x, y = at
-    for label, value in lines:
-        write(draw, (x, y), label, size=size, colour=FAINT)
-        write(draw, (x + column, y), value, size=size, bold=True)
-        y += round(size * 1.55)

@@ -154,10 +154,6 @@ class ArmPicture:
         frames = [link.frame for link in self._links]
         return np.asarray(self._T_ct_base @ link_poses(self._model, np.asarray(q))[frames])
 
-    def flange_ct(self, q: Floats) -> Floats:
-        """T_ct_flange, shape (4, 4)."""
-        return np.asarray(self._T_ct_base @ link_poses(self._model, np.asarray(q))[6])
-
     def bodies(self, q: Floats) -> tuple[Body, ...]:
         """The links in the CT frame at one configuration."""
         poses = self.poses_ct(q)
