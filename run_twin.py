@@ -22,7 +22,7 @@ from planning.export import FORMATS
 from planning.files import check_writable
 from planning.prepared import prepare
 from twin import main_job, words
-from twin.ct.chen2019 import reproduce as reproduce_chen2019
+from twin.papers import PAPERS
 from twin.report.progress import progress_display
 
 OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED = 0, 1, 2, 3
@@ -175,13 +175,16 @@ def batch(
 
 @app.command()
 def reproduce(
-    paper: Annotated[str, typer.Argument(metavar="chen2019", help="Which paper.")], as_json: JsonOption = False
+    paper: Annotated[str, typer.Argument(metavar="|".join(PAPERS), help="Which paper.")],
+    out_dir: OutOption = Path("out"),
+    seeds: Annotated[int | None, typer.Option("--seeds", min=1, help="How many draws, if any.")] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Print a paper's numbers beside ours; exit 0 only if every one holds."""
-    if paper != "chen2019":
-        raise InputError(f"paper '{paper}' is not known", where="reproduce", allowed="chen2019")
-    result = reproduce_chen2019()
-    _print(words.reproduction_summary(result), words.reproduction_text(result), as_json)
+    if paper not in PAPERS:
+        raise InputError(f"paper '{paper}' is not known", where="reproduce", allowed=", ".join(PAPERS))
+    result = PAPERS[paper](out_dir, seeds)
+    _print(result.summary, result.text, as_json)
     if not result.holds:
         raise typer.Exit(ANSWER_IS_NO)
 
