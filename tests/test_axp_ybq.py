@@ -1,0 +1,279 @@
+"""A X P = Y B Q: closed form, Jacobians, weights and refinement, each against an independent version of itself."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from selfcal_world import as_estimate
+
+from planning.errors import InputError
+from twin.ultrasound.calibration import calibrate
+from twin.ultrasound.closed_form import closed_form
+from twin.ultrasound.direction import direction_from_plane, mean_direction
+from twin.ultrasound.estimate import N_PARAMETERS, SCALE, T_X, W_X, W_Y, active_columns
+from twin.ultrasound.recording import Recording
+from twin.ultrasound.refine import Problem, refine
+from twin.ultrasound.residuals import (
+    direction_residuals,
+    directions_image,
+    linearised_direction,
+    linearised_tip,
+    tip_residuals,
+)
+from twin.ultrasound.rotations import log
+from twin.ultrasound.simulate import SPEC_NOISE, PoseRanges, simulate_recording, with_noise
+from twin.ultrasound.weighting import UNWEIGHTED, covariances
+
+ALL = active_columns(tip=True, scale=False, direction=False)
+
+
+def difference(estimate, truth):
+    """Largest error in mm and degrees."""
+    t = [estimate.t_X - truth.X[:3, 3], estimate.t_Y - truth.Y[:3, 3], estimate.t_Q - truth.tip_end2]
+    R = [log(estimate.R_X.T @ truth.X[:3, :3]), log(estimate.R_Y.T @ truth.Y[:3, :3])]
+    return np.abs(t).max(), np.degrees(np.abs(R).max())
+
+
+@pytest.mark.parametrize(("n", "known"), [(16, False), (20, False), (50, False), (7, True), (16, True)])
+@pytest.mark.parametrize("scale", [False, True])
+def test_the_closed_form_is_exact_without_noise(n, known, scale):
+    """From 16 poses (7 with a known tip) it finds the truth to round-off, with and without an unknown pixel size."""
+    for seed in range(5):
+        exact, truth = simulate_recording(np.random.default_rng(seed), n, noise=None)
+        size = np.array([0.2, 0.25]) if scale else np.ones(2)
+        recording = Recording(exact.A, exact.B, exact.P / size, exact.v, pixels=scale)
+        found = closed_form(recording, known_tip=truth.tip_end2 if known else None, scale=scale)
+        assert max(difference(found, truth)) < 1e-6
+        np.testing.assert_allclose(found.scale, size, rtol=1e-9)
+
+
+def test_the_closed_form_is_the_kronecker_system(rng):
+    """The 48 columns written out pose by pose with numpy's kron give the same rotations, on noisy data."""
+    recording, _ = simulate_recording(rng, 22)
+    rows, right = [], []
+    for A, B, p in zip(recording.A, recording.B, recording.P / 100, strict=True):
+        R_A, R_B = A[:3, :3], B[:3, :3]
+        parts = [-p[0] * R_A, -p[1] * R_A, -R_A, np.kron(R_B.T.reshape(1, 9), np.eye(3))]
+        rows.append(np.hstack([*parts, np.kron(B[:3, 3] / 100, np.eye(3)), np.eye(3)]))
+        right.append(A[:3, 3] / 100)
+    z = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)[0]
+    U, _, Vt = np.linalg.svd(z[36:45].reshape(3, 3, order="F"))
+    found = closed_form(recording)
+    np.testing.assert_allclose(found.R_Y, U @ Vt, atol=1e-10)
+    tips = [np.trace((U @ Vt).T @ z[9 + 9 * j : 18 + 9 * j].reshape(3, 3, order="F")) / 3 * 100 for j in range(3)]
+    assert np.linalg.norm(found.t_Q - tips) < 5  # the linear solution afterwards is near, not equal
+
+
+@pytest.mark.parametrize("point", ["truth", "far from it"])
+def test_jacobians_are_the_finite_differences(rng, point):
+    """Every column, tip and direction, agrees with central differences to 1e-6 of its size."""
+    recording, truth = simulate_recording(rng, 12)
+    recording = Recording(recording.A, recording.B, recording.P, np.column_stack([recording.v, np.full(12, 0.05)]))
+    estimate = as_estimate(truth)._replace(scale=np.array([0.9, 1.1]))
+    if point != "truth":
+        estimate = estimate.moved(rng.normal(0, 0.3, N_PARAMETERS))
+    v = directions_image(recording, estimate)
+
+    def both(step):
+        moved = estimate.moved(step)
+        return np.hstack([tip_residuals(moved, recording), direction_residuals(moved, recording, v)])
+
+    tip, turn = linearised_tip(estimate, recording), linearised_direction(estimate, recording, v)
+    J = np.concatenate([tip.jacobian, turn.jacobian], axis=1)
+    np.testing.assert_allclose(np.hstack([tip.residuals, turn.residuals]), both(np.zeros(N_PARAMETERS)), atol=1e-12)
+    for column in range(N_PARAMETERS):
+        step = np.zeros(N_PARAMETERS)
+        step[column] = 1e-4
+        slope = (both(step) - both(-step)) / 2e-4
+        for part in (slice(0, 3), slice(3, 5)):
+            error = np.linalg.norm(J[:, part, column] - slope[:, part])
+            assert error <= 1e-6 * max(np.linalg.norm(slope[:, part]), 1e-6), column
+
+
+def test_the_patents_printed_jacobian_does_not_descend(rng):
+    """Without the minus signs that the print lost, Gauss-Newton walks away; with them it arrives in a few steps."""
+    recording, _ = simulate_recording(rng, 30)
+    start = closed_form(recording)
+    linear = linearised_tip(start, recording)
+    J, r = linear.jacobian[:, :, :15].reshape(-1, 15), linear.residuals.ravel()
+    printed = J.copy()
+    for lost in (T_X, W_Y):  # -R_A and -R_Y [R_B t_Q + t_B]x
+        printed[:, lost] *= -1
+
+    def cost_after(jacobian):
+        step = np.zeros(N_PARAMETERS)
+        step[:15] = -np.linalg.lstsq(jacobian, r, rcond=None)[0]
+        return np.sum(tip_residuals(start.moved(step), recording) ** 2)
+
+    assert cost_after(J) < np.sum(r**2) < cost_after(printed)
+    assert cost_after(-J) > np.sum(r**2)  # its G is -J: the sign of the step must follow
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_the_refinement_finds_scipys_minimum(rng, weighted):
+    """An independent optimiser with finite differences finds no lower cost and the same answer."""
+    recording, _ = simulate_recording(rng, 25)
+    start = closed_form(recording)
+    noise = SPEC_NOISE if weighted else UNWEIGHTED
+    fit = refine(Problem(recording, noise, ALL), start, np.ones((25, 3)))
+    W = np.linalg.cholesky(np.linalg.inv(covariances(fit.estimate, recording, noise))).transpose(0, 2, 1)
+
+    def white(step):
+        return (W @ tip_residuals(start.moved(np.append(step, np.zeros(4))), recording)[:, :, None]).ravel()
+
+    other = least_squares(white, np.zeros(15), x_scale=np.repeat([0.01, 1, 0.01, 1, 1], 3), xtol=1e-14, ftol=1e-14)
+    theirs = start.moved(np.append(other.x, np.zeros(4)))
+    np.testing.assert_allclose(fit.estimate.t_X, theirs.t_X, atol=2e-4)
+    np.testing.assert_allclose(fit.estimate.t_Q, theirs.t_Q, atol=2e-4)
+    assert fit.iterations <= 10
+
+
+def test_the_weights_are_the_spread_of_the_residuals(rng):
+    """The propagated covariance of a pose is that of many noisy copies of it, tip and direction together."""
+    exact, truth = simulate_recording(rng, 1, noise=None)
+    estimate, copies = as_estimate(truth), 20000
+    many = Recording(*(np.repeat(getattr(exact, key), copies, axis=0) for key in "ABPv"))
+    noisy = with_noise(rng, many, SPEC_NOISE)
+    v = directions_image(noisy, estimate)
+    r = np.hstack([tip_residuals(estimate, noisy), direction_residuals(estimate, noisy, v)])
+    expected = covariances(estimate, exact, SPEC_NOISE, directions_image(exact, estimate))[0]
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(np.cov(r.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.03)
+
+
+def test_the_direction_is_the_mean_of_what_was_seen(rng):
+    """V = normalise(sum M_i^T v_i): exact without noise, and the image plane alone gives it up to its sign."""
+    exact, truth = simulate_recording(rng, 16, noise=None)
+    estimate = as_estimate(truth)
+    np.testing.assert_allclose(mean_direction(estimate, exact), truth.direction_end2, atol=1e-12)
+    blind = direction_from_plane(estimate, exact)
+    assert abs(blind @ truth.direction_end2) == pytest.approx(1, abs=1e-12)
+
+
+def rms_over_runs(n, runs, **options):
+    """TRE (mm, rms over 200 held-out poses and the runs), and the directions' error in degrees."""
+    squared, angles = [], []
+    for seed in range(runs):
+        rng = np.random.default_rng([n, seed])
+        recording, truth = simulate_recording(rng, n)
+        held, _ = simulate_recording(rng, 200, truth, noise=None)
+        found = calibrate(recording, **options)
+        assert found.iterations <= 60
+        squared.append(np.mean(found.tre(held.A, held.B, held.P) ** 2))
+        angles.append(np.degrees(np.arccos(min(1.0, found.needle_direction_end2 @ truth.direction_end2))))
+    return np.sqrt(np.mean(squared)), np.sqrt(np.mean(np.square(angles)))
+
+
+@pytest.mark.parametrize(("n", "limit"), [(20, 0.34), (30, 0.24), (50, 0.18)])
+@pytest.mark.parametrize("known_noise", [False, True])
+def test_the_tre_is_within_the_figures(n, limit, known_noise):
+    """At the specified noise and poses, without help from the directions, and V within .2 deg from 30 poses on."""
+    tre, angle = rms_over_runs(n, 15, noise=SPEC_NOISE if known_noise else None, direction=False)
+    assert tre <= limit
+    assert n < 30 or angle <= 0.2
+
+
+def test_directions_help():
+    """Measured directions that take part in the fit lower the error at the tip."""
+    without, _ = rms_over_runs(20, 12, noise=SPEC_NOISE, direction=False)
+    tre, angle = rms_over_runs(20, 12, noise=SPEC_NOISE)
+    assert tre < 0.95 * without
+    assert angle < 0.2
+
+
+def test_an_unknown_pixel_size_is_found(rng):
+    """3 % off: left alone the residuals carry it, estimated it is gone and both sizes are right."""
+    recording, truth = simulate_recording(rng, 40)
+    stretched = Recording(recording.A, recording.B, recording.P / 1.03, recording.v)
+    held, _ = simulate_recording(rng, 100, truth, noise=None)
+    blind, found = calibrate(stretched, noise=SPEC_NOISE), calibrate(stretched, noise=SPEC_NOISE, scale=True)
+    assert np.sqrt(np.mean(blind.tre(held.A, held.B, held.P / 1.03) ** 2)) > 0.6
+    assert np.sqrt(np.mean(found.tre(held.A, held.B, held.P / 1.03) ** 2)) < 0.3
+    np.testing.assert_allclose(found.scale, 1.03, atol=0.02)
+    assert blind.noise_ratio > 1.2 > found.noise_ratio > 0.8
+
+
+def test_pixels_need_a_scale(rng):
+    """A tip in pixels without the wish to find their size is bad input; with it the answer is in mm."""
+    exact, truth = simulate_recording(rng, 20, noise=None)
+    in_pixels = Recording(exact.A, exact.B, exact.P / 0.2, exact.v, pixels=True)
+    with pytest.raises(InputError, match="the tip is in pixels"):
+        calibrate(in_pixels)
+    found = calibrate(in_pixels, scale=True)
+    np.testing.assert_allclose(found.scale, 0.2, rtol=1e-8)
+    assert max(difference(found.estimate, truth)) < 1e-5
+
+
+def test_a_known_tip_needs_seven_poses(rng):
+    """With t_Q known seven poses do, and t_Q stays what it was."""
+    recording, truth = simulate_recording(rng, 12)
+    with pytest.raises(InputError, match="12 poses; allowed: 16 or more, better 20"):
+        calibrate(recording)
+    found = calibrate(recording, known_tip=truth.tip_end2, noise=SPEC_NOISE)
+    np.testing.assert_array_equal(found.tip_end2, truth.tip_end2)
+    assert not any(name.startswith("t_Q") for name in found.parameters)
+    assert difference(found.estimate, truth)[0] < 5
+
+
+def test_few_poses_with_a_start(rng):
+    """From a calibration on paper eight poses do."""
+    recording, truth = simulate_recording(rng, 8)
+    paper = as_estimate(truth).moved(np.append(rng.normal(0, [0.1] * 3 + [10] * 3 + [0.1] * 3 + [10] * 6), np.zeros(4)))
+    found = calibrate(recording, noise=SPEC_NOISE, start=paper)
+    assert np.sqrt(np.mean(found.residuals**2)) < 0.5
+
+
+def test_nothing_depends_on_where_the_bases_stand(rng):
+    """Turning and moving base 1 changes Y alone, and by that motion."""
+    recording, truth = simulate_recording(rng, 24)
+    moved = np.eye(4)
+    moved[:3, :3], moved[:3, 3] = truth.X[:3, :3], [200.0, -50.0, 30.0]
+    here = calibrate(recording, noise=SPEC_NOISE)
+    there = calibrate(Recording(moved @ recording.A, recording.B, recording.P, recording.v), noise=SPEC_NOISE)
+    np.testing.assert_allclose(there.X, here.X, atol=1e-4)
+    np.testing.assert_allclose(there.Y, moved @ here.Y, atol=1e-3)
+    np.testing.assert_allclose(there.tip_end2, here.tip_end2, atol=1e-4)
+
+
+def test_a_needle_that_leans_out_of_the_slice_is_allowed_for():
+    """Directions seen in the image say nothing across it: with a lean of 1 deg V is right, and its covariance too."""
+    errors, expected = [], []
+    for seed in range(10):
+        recording, truth = simulate_recording(np.random.default_rng(seed), 30, ranges=PoseRanges(lean=np.radians(1)))
+        found = calibrate(recording, noise=SPEC_NOISE)
+        errors.append(found.parameter_error(as_estimate(truth))[-2:])
+        expected.append(np.diag(found.covariance)[-2:])
+    assert np.mean(np.square(errors)) == pytest.approx(np.mean(expected), rel=0.6)
+    assert np.degrees(np.sqrt(np.sum(np.square(errors)) / 10)) < 0.3
+
+
+def test_columns_are_named_once():
+    """Every free parameter has its own name, in the order of the covariance."""
+    recording, _ = simulate_recording(np.random.default_rng(0), 20)
+    found = calibrate(recording, scale=True)
+    assert len(set(found.parameters)) == len(found.parameters) == len(found.covariance) == N_PARAMETERS
+    assert found.parameters[SCALE] == ("scale_u", "scale_v")
+    assert found.parameters[W_X] == ("w_X_x_rad", "w_X_y_rad", "w_X_z_rad")
+
+
+def test_exact_data_give_an_exact_answer(rng):
+    """Without noise the whole chain, weights and outlier search included, stays at the truth and sets nothing aside."""
+    recording, truth = simulate_recording(rng, 20, noise=None)
+    for noise in (None, SPEC_NOISE):
+        found = calibrate(recording, noise=noise)
+        assert max(difference(found.estimate, truth)) < 1e-6
+        assert found.outliers == ()
+
+
+def test_exact_recordings_obey_the_equation(rng):
+    """A X P = Y B Q for every simulated pose, and the needle lies in the image as drawn."""
+    recording, truth = simulate_recording(rng, 50, noise=None)
+    P = np.column_stack([recording.P, np.zeros(50), np.ones(50)])
+    left = np.einsum("nij,jk,nk->ni", recording.A, truth.X, P)
+    right = np.einsum("ij,njk,k->ni", truth.Y, recording.B, np.append(truth.tip_end2, 1.0))
+    np.testing.assert_allclose(left, right, atol=1e-10)
+    behind = truth.tip_end2 - 30 * truth.direction_end2
+    shaft = np.einsum("ij,njk,k->ni", truth.Y, recording.B, np.append(behind, 1.0))
+    T_image_base1 = np.linalg.inv(recording.A @ truth.X)
+    in_image = np.einsum("nij,nj->ni", T_image_base1, shaft)[:, :3]
+    np.testing.assert_allclose(in_image[:, :2], recording.P - 30 * recording.v, atol=1e-9)
+    np.testing.assert_allclose(in_image[:, 2], 0, atol=1e-9)

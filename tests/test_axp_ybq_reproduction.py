@@ -1,0 +1,76 @@
+"""The reproduction: it tells what holds and what does not, and is wired to its name."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twin.papers import PAPERS
+from twin.ultrasound.axp_ybq import (
+    Reproduction,
+    Row,
+    reproduce,
+    reproduction_summary,
+    reproduction_text,
+    truth_estimate,
+)
+from twin.ultrasound.pose_choice import expected_tre_mm
+from twin.ultrasound.simulate import SPEC_NOISE, simulate_recording
+
+
+@pytest.fixture(scope="module")
+def result():
+    """Few runs: enough to see every row, not to judge the last percent."""
+    return reproduce(None, 4)
+
+
+def test_every_row_is_there(result):
+    """Four methods at four counts, steps, direction, outliers, pixel sizes, and the exact case."""
+    assert len(result.rows) == 1 + 16 + 3 + 1 + 3 + 4
+    assert result.rows[0].ours < 1e-6
+    assert all(np.isfinite(row.ours) for row in result.rows)
+    steps = [row.ours for row in result.rows if row.unit == "steps"]
+    assert max(steps) <= 10
+
+
+def test_few_runs_already_are_near_the_known_numbers(result):
+    """From 20 poses on every error is within half and double the known one, which is what four runs can tell."""
+    for row in result.rows:
+        if row.known is not None and not row.what.startswith("16"):
+            assert row.known / 2 < row.ours < row.known * 2, row.what
+
+
+def test_the_bound_is_the_known_one():
+    """The Cramer-Rao bound needs no noise: over 40 recordings it is within 5 % of the known numbers."""
+    for n, known in ((20, 0.273), (30, 0.211), (50, 0.157)):
+        bounds = []
+        for seed in range(40):
+            rng = np.random.default_rng([n, seed])
+            recording, truth = simulate_recording(rng, n, noise=None)
+            held, _ = simulate_recording(rng, 100, truth, noise=None)
+            bounds.append(expected_tre_mm(recording, SPEC_NOISE, truth_estimate(truth), held) ** 2)
+        assert np.sqrt(np.mean(bounds)) == pytest.approx(known, rel=0.05)
+
+
+def test_a_number_beyond_its_limit_does_not_hold():
+    """A row, the whole and the text all say so."""
+    bad = Reproduction((Row("a", 0.1, 0.2, None, "mm"), Row("b", None, 0.31, 0.3, "mm")), 3, 1)
+    assert not bad.holds
+    assert [row.holds for row in bad.rows] == [True, False]
+    text = reproduction_text(bad)
+    assert text.count("DOES NOT HOLD") == 1
+    assert "NOT every limit holds" in text
+
+
+def test_the_summary_is_plain(result):
+    """It survives JSON unchanged."""
+    summary = reproduction_summary(result)
+    assert json.loads(json.dumps(summary)) == summary
+
+
+def test_it_has_a_name_on_the_command_line():
+    """The paper is found by name; one run is enough to see that it answers."""
+    answer = PAPERS["axp-ybq"](Path("unused"), 1)
+    assert answer.summary["runs"] == 1
+    assert "Cramer-Rao bound" in answer.text

@@ -1,0 +1,115 @@
+"""Poses that cannot show the answer: each set is refused, its free motion named, and the proposed poses cure it."""
+
+import numpy as np
+import pytest
+from selfcal_world import DEGENERATE, as_estimate, cured, degenerate_set
+
+from planning.errors import InputError
+from twin.ultrasound.calibration import calibrate
+from twin.ultrasound.estimate import active_columns
+from twin.ultrasound.observability import LEAST_RATIO, observe, scaled_jacobian
+from twin.ultrasound.residuals import tip_residuals
+from twin.ultrasound.simulate import SPEC_NOISE, PoseRanges, exact_recording, simulate_recording, with_noise
+from twin.ultrasound.solve import Degenerate
+
+ALL = active_columns(tip=True, scale=False, direction=False)
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+@pytest.mark.parametrize("noisy", [False, True])
+def test_every_degenerate_set_is_refused_and_named(name, noisy):
+    """Exact or noisy, the set is refused as bad input that names the one motion that is free."""
+    truth, A, seen = degenerate_set(name)
+    recording = exact_recording(truth, A, seen)
+    if noisy:
+        recording = with_noise(np.random.default_rng(1), recording, SPEC_NOISE)
+    with pytest.raises(Degenerate) as refused:
+        calibrate(recording, noise=SPEC_NOISE)
+    assert isinstance(refused.value, InputError)
+    assert [(m.cause, m.dimensions) for m in refused.value.motions] == [DEGENERATE[name]]
+    assert refused.value.motions[0].words in str(refused.value)
+    assert refused.value.cure.words in str(refused.value)
+
+
+def test_the_words_are_those_of_a_person():
+    """The commonest case, a needle guide, is told in full: what does not vary, what can slide, what to do."""
+    with pytest.raises(Degenerate) as refused:
+        calibrate(exact_recording(*degenerate_set("constant insertion angle")))
+    text = str(refused.value)
+    assert "the insertion angle in the image hardly varies: the tip can slide along the needle" in text
+    assert "add 4 poses, each from pose" in text
+    assert "change the insertion angle in the image by +25 deg (2 poses)" in text
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+@pytest.mark.parametrize("seed", [3, 4])
+def test_the_proposed_poses_cure_it(name, seed):
+    """The same recording with the proposed poses added is accepted, and its answer is near the truth."""
+    truth, A, seen = degenerate_set(name, seed)
+    recording = exact_recording(truth, A, seen)
+    rng = np.random.default_rng(seed)
+    noisy = with_noise(rng, recording, SPEC_NOISE)
+    with pytest.raises(Degenerate) as refused:
+        calibrate(noisy, noise=SPEC_NOISE)
+    more = with_noise(rng, cured(truth, noisy, seen, refused.value.cure), SPEC_NOISE)
+    found = calibrate(noisy.joined(more), noise=SPEC_NOISE)
+    assert found.condition >= LEAST_RATIO
+    held, _ = simulate_recording(rng, 100, truth, noise=None)
+    assert np.sqrt(np.mean(found.tre(held.A, held.B, held.P) ** 2)) < 1.2
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_the_counts_are_the_null_spaces(name):
+    """An independent count: singular values of the Jacobian at the truth that are (nearly) zero."""
+    truth, A, seen = degenerate_set(name)
+    values = np.linalg.svd(scaled_jacobian(as_estimate(truth), exact_recording(truth, A, seen), ALL), compute_uv=False)
+    assert int((values < LEAST_RATIO * values[0]).sum()) == DEGENERATE[name][1]
+
+
+def test_a_constant_insertion_angle_slides_by_the_formula():
+    """t_X += k R_X d, t_Q += k V leaves every residual at zero."""
+    truth, A, seen = degenerate_set("constant insertion angle")
+    recording, estimate = exact_recording(truth, A, seen), as_estimate(truth)
+    d = np.append(recording.v[0], 0.0)
+    slid = estimate._replace(t_X=estimate.t_X + 7 * estimate.R_X @ d, t_Q=estimate.t_Q + 7 * truth.direction_end2)
+    assert np.abs(tip_residuals(slid, recording)).max() < 1e-9
+
+
+def test_usual_poses_are_accepted():
+    """Of a hundred recordings with usual poses none is refused, and the least ratio is far from the limit."""
+    ratios = []
+    for seed in range(100):
+        recording, truth = simulate_recording(np.random.default_rng(seed), 20, noise=None)
+        ratios.append(observe(as_estimate(truth), recording, ALL).ratio)
+    assert min(ratios) > 2 * LEAST_RATIO
+
+
+def test_the_ratio_grows_with_the_range_of_angles():
+    """45 +- w deg: the ratio is about proportional to w, and crosses the limit between 1 and 8 deg."""
+    ratios = []
+    for width in (1, 2, 4, 8):
+        ranges = PoseRanges(insertion=(np.radians(45 - width), np.radians(45 + width)))
+        recording, truth = simulate_recording(np.random.default_rng(8), 40, noise=None, ranges=ranges)
+        ratios.append(observe(as_estimate(truth), recording, ALL).ratio)
+    assert ratios[0] < LEAST_RATIO < ratios[3]
+    np.testing.assert_allclose(np.array(ratios[1:]) / ratios[:-1], 2, rtol=0.35)
+
+
+def test_a_known_tip_still_needs_a_probe_that_turns():
+    """With the needle's tip known the sliding along the needle is gone; a probe that never turns is still refused."""
+    truth, A, seen = degenerate_set("constant insertion angle")
+    found = calibrate(exact_recording(truth, A, seen), known_tip=truth.tip_end2)
+    np.testing.assert_allclose(found.X, truth.X, atol=1e-6)
+    truth, A, seen = degenerate_set("probe never turns")
+    with pytest.raises(Degenerate, match="the probe hardly turns"):
+        calibrate(exact_recording(truth, A, seen), known_tip=truth.tip_end2)
+
+
+def test_poses_that_outliers_alone_make_good_are_refused():
+    """The judgement is made on the poses that are used: two wrong ones do not make the others vary."""
+    truth, A, seen = degenerate_set("constant insertion angle")
+    recording = with_noise(np.random.default_rng(0), exact_recording(truth, A, seen), SPEC_NOISE)
+    P = np.array(recording.P)
+    P[:2] += 30
+    with pytest.raises(Degenerate, match="insertion angle"):
+        calibrate(type(recording)(recording.A, recording.B, P, recording.v), noise=SPEC_NOISE)

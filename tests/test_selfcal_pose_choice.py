@@ -1,0 +1,99 @@
+"""Poses chosen by information: against brute force, against chance, and in the real error."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from selfcal_world import as_estimate
+
+from planning.errors import InputError
+from twin.ultrasound.calibration import calibrate
+from twin.ultrasound.estimate import N_PARAMETERS
+from twin.ultrasound.pose_choice import choose_poses, expected_tre_mm
+from twin.ultrasound.simulate import SPEC_NOISE, PoseRanges, draw_truth, simulate_recording, with_noise
+
+
+@pytest.fixture
+def world(rng):
+    """A truth, 300 candidates that favour the ends of the ranges, usual held-out poses, and a drawing that is off."""
+    truth = draw_truth(rng)
+    candidates, _ = simulate_recording(rng, 300, truth, noise=None, ranges=PoseRanges(at_ends=0.8))
+    held, _ = simulate_recording(rng, 200, truth, noise=None)
+    step = np.zeros(N_PARAMETERS)
+    step[:15] = rng.normal(0, np.repeat([0.1, 15, 0.1, 15, 15], 3))
+    return truth, candidates, held, as_estimate(truth).moved(step)
+
+
+def test_sixty_percent_of_the_poses_do(rng, world):
+    """18 chosen poses, by a drawing that is 6 deg and 15 mm off, are as good as 30 at random: bound and real error."""
+    truth, candidates, held, drawing = world
+    chosen = candidates.subset(choose_poses(candidates, 18, SPEC_NOISE, drawing))
+    bound = expected_tre_mm(chosen, SPEC_NOISE, as_estimate(truth), held)
+    by_chance, real = [], []
+    for _ in range(40):
+        random, _ = simulate_recording(rng, 30, truth, noise=None)
+        by_chance.append(expected_tre_mm(random, SPEC_NOISE, as_estimate(truth), held))
+        found = calibrate(with_noise(rng, chosen, SPEC_NOISE), noise=SPEC_NOISE, direction=False)
+        real.append(np.mean(found.tre(held.A, held.B, held.P) ** 2))
+    assert bound < np.median(by_chance)
+    assert np.sqrt(np.mean(real)) < 1.1 * np.median(by_chance)
+
+
+@pytest.mark.parametrize("criterion", ["tre", "D"])
+def test_the_choice_beats_every_other_near_it(world, criterion):
+    """No exchange of one chosen pose against one other candidate is better (counted out in full, from scratch)."""
+    _, candidates, _, drawing = world
+    few = candidates.subset(np.arange(40))
+    chosen = choose_poses(few, 8, SPEC_NOISE, drawing, criterion=criterion)
+    assert len(set(chosen.tolist())) == 8
+
+    def value(rows):
+        if criterion == "tre":
+            return expected_tre_mm(few.subset(np.array(rows)), SPEC_NOISE, drawing, few)
+        return volume(few.subset(np.array(rows)), drawing)
+
+    best = value(chosen)
+    for out in chosen:
+        for other in set(range(40)) - set(chosen.tolist()):
+            assert value([other if row == out else row for row in chosen]) > best * (1 - 1e-3)
+
+
+def volume(recording, estimate):
+    """Size of the confidence region per parameter, from scratch."""
+    from twin.ultrasound.residuals import linearised_tip
+    from twin.ultrasound.weighting import covariances
+
+    J = linearised_tip(estimate, recording).jacobian[:, :, :15] * np.repeat([1, 100, 1, 100, 100], 3)
+    S = covariances(estimate, recording, SPEC_NOISE)
+    H = sum(j.T @ np.linalg.inv(s) @ j for j, s in zip(J, S, strict=True))
+    return np.exp(-np.linalg.slogdet(H)[1] / 15)
+
+
+def test_few_candidates_are_counted_out(world):
+    """6 of 9 candidates: within 2 % of the best of all 84 choices."""
+    _, candidates, _, drawing = world
+    few = candidates.subset(np.arange(9))
+    chosen = choose_poses(few, 6, SPEC_NOISE, drawing)
+    every = [
+        expected_tre_mm(few.subset(np.array(rows)), SPEC_NOISE, drawing, few) for rows in combinations(range(9), 6)
+    ]
+    assert expected_tre_mm(few.subset(chosen), SPEC_NOISE, drawing, few) <= 1.02 * min(every)
+
+
+def test_what_is_recorded_counts(world):
+    """Poses that are there already change what is worth recording next."""
+    _, candidates, held, drawing = world
+    recorded = candidates.subset(np.arange(12))
+    rest = candidates.subset(np.arange(12, 120))
+    knowing = choose_poses(rest, 6, SPEC_NOISE, drawing, recorded=recorded)
+    blind = choose_poses(rest, 6, SPEC_NOISE, drawing)
+    after = [expected_tre_mm(recorded.joined(rest.subset(c)), SPEC_NOISE, drawing, held) for c in (knowing, blind)]
+    assert after[0] < after[1]
+
+
+@pytest.mark.parametrize("n", [0, 301])
+def test_impossible_numbers_are_refused(world, n):
+    """One to all of the candidates."""
+    _, candidates, _, drawing = world
+    with pytest.raises(InputError, match="of 300 candidates"):
+        choose_poses(candidates, n, SPEC_NOISE, drawing)

@@ -1,0 +1,84 @@
+"""Single wrong poses: found, set aside, and without effect on the others."""
+
+import numpy as np
+import pytest
+
+from planning.errors import InputError
+from twin.ultrasound.calibration import calibrate
+from twin.ultrasound.recording import Recording
+from twin.ultrasound.simulate import SPEC_NOISE, simulate_recording
+
+
+def with_outliers(rng, recording, count, size_mm=5.0):
+    """Tips moved in the image, and which."""
+    rows = rng.choice(len(recording), count, replace=False)
+    angle = rng.uniform(0, 2 * np.pi, count)
+    P = np.array(recording.P)
+    P[rows] += size_mm * np.column_stack([np.cos(angle), np.sin(angle)])
+    return Recording(recording.A, recording.B, P, recording.v, recording.names), rows
+
+
+@pytest.mark.parametrize("known_noise", [True, False])
+def test_ten_percent_of_outliers_hardly_matter(known_noise):
+    """30 poses, three of them 5 mm off: at most .25 mm, where least squares over all has more than twice as much."""
+    robust, plain = [], []
+    noise = SPEC_NOISE if known_noise else None
+    for seed in range(10):
+        rng = np.random.default_rng([9, seed])
+        recording, truth = simulate_recording(rng, 30)
+        held, _ = simulate_recording(rng, 200, truth, noise=None)
+        broken, rows = with_outliers(rng, recording, 3)
+        found = calibrate(broken, noise=noise, direction=False)
+        assert {recording.names[row] for row in rows} <= set(found.outliers)
+        robust.append(np.mean(found.tre(held.A, held.B, held.P) ** 2))
+        left = calibrate(broken, noise=noise, direction=False, robust=False)
+        assert left.outliers == ()
+        plain.append(np.mean(left.tre(held.A, held.B, held.P) ** 2))
+    assert np.sqrt(np.mean(robust)) <= 0.25
+    assert np.sqrt(np.mean(plain)) > 2 * np.sqrt(np.mean(robust))
+
+
+def test_a_quarter_of_gross_outliers_is_still_found(rng):
+    """Ten of forty tips are 15 mm off: all are set aside, none of the others."""
+    recording, _ = simulate_recording(rng, 40)
+    broken, rows = with_outliers(rng, recording, 10, 15.0)
+    found = calibrate(broken, noise=SPEC_NOISE)
+    assert {recording.names[row] for row in rows} == set(found.outliers)
+    np.testing.assert_array_equal(found.weights == 0, np.isin(recording.names, found.outliers))
+
+
+def test_a_clean_recording_loses_nothing(rng):
+    """Without outliers nearly every recording keeps all of its poses (1 % may lose one)."""
+    lost = [len(calibrate(simulate_recording(rng, 25)[0], noise=SPEC_NOISE).outliers) for _ in range(20)]
+    assert sum(count > 0 for count in lost) <= 2
+
+
+def test_a_clean_recording_gives_the_same_answer(rng):
+    """Where nothing is set aside the robust answer is the plain one."""
+    recording, _ = simulate_recording(rng, 25)
+    robust, plain = (calibrate(recording, noise=SPEC_NOISE, robust=flag) for flag in (True, False))
+    assert robust.outliers == ()
+    np.testing.assert_allclose(robust.X, plain.X, atol=1e-5)
+
+
+def test_directions_that_point_backwards_are_set_aside(rng):
+    """A detector that takes the shaft's end for the tip turns v round: V does not follow, the tips still count."""
+    recording, truth = simulate_recording(rng, 30)
+    v = np.array(recording.v)
+    v[[3, 11, 20]] *= -1
+    found = calibrate(Recording(recording.A, recording.B, recording.P, v), noise=SPEC_NOISE)
+    assert found.outliers == calibrate(recording, noise=SPEC_NOISE).outliers
+    assert np.degrees(np.arccos(found.needle_direction_end2 @ truth.direction_end2)) < 0.2
+
+
+def test_a_recording_that_nobody_can_read_is_refused(rng):
+    """Tips at random places: more than half disagree, and the answer is an error, not a number."""
+    recording, _ = simulate_recording(rng, 30)
+    P = np.array(recording.P)
+    P[:20] = rng.uniform([-25, 5], [25, 65], (20, 2))
+    try:
+        found = calibrate(Recording(recording.A, recording.B, P, recording.v), noise=SPEC_NOISE)
+    except InputError as error:
+        assert "agree" in str(error) or "ratio" in str(error)
+    else:
+        assert found.noise_ratio > 3
