@@ -21,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script,
 from benchmarks import peers
 from benchmarks.proof import prove
 from benchmarks.scenes import Scene, dense, scenes
+from benchmarks.search_profile import profile
 from planning.clearance.fast_engine import FastEngine
 from planning.clearance.fcl_engine import FclEngine
 
@@ -30,7 +31,7 @@ REPEATS = 3
 
 
 def best(work, repeats: int = REPEATS) -> float:
-    """Least time on the processor (others share the machine) of a few runs, s."""
+    """Least time of one thread on the processor of a few runs, s: others share the machine; both sides alike."""
     times = []
     for _ in range(repeats):
         start = time.thread_time()
@@ -128,6 +129,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="a coarser grid and fewer FCL queries")
     parser.add_argument("--proof", action="store_true", help="every verdict of the 1-degree grid against FCL instead")
+    parser.add_argument("--profile", action="store_true", help="where the exact search spends its time instead")
     parser.add_argument("--fine", type=float, help="only time and peak memory at this step, degrees")
     parser.add_argument("--scene", default="", help="only scenes whose name holds this")
     parser.add_argument("--step", type=float, default=1.0, help="of the grid, degrees")
@@ -139,6 +141,10 @@ def main() -> None:
 
     if chosen.fine:
         large(chosen.fine)
+        return
+    if chosen.profile:
+        for scene in filter(asked, scenes()):
+            profile(scene, chosen.step)
         return
     if chosen.proof:
         answers = [prove(scene, chosen.step) for scene in filter(asked, scenes()) if scene.name != dense().name]

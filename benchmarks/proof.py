@@ -13,44 +13,93 @@ from planning.clearance.fast_engine import NEAR_THRESHOLD_MM, FastEngine
 
 RADII_MM = (0.5, 3.0, 5.5)
 PAIRS = 2000
+OTHER_DIRECTIONS, OTHER_PAIRS = 250, 60
 TOLERANCE_MM = 1e-6
 
 
 def prove(scene: Scene, step_deg: float) -> bool:
-    """Print how many verdicts differ from FCL's and how far distances are from brute force; whether all is well."""
+    """Print how many verdicts differ from FCL's and how far distances are from brute force; whether all is well.
+
+    The scene's own target with every direction of the grid, then other targets with random directions.
+    """
     directions, start = scene.hemisphere(step_deg), time.perf_counter()
     engine, objects = FastEngine(scene.meshes), trees(scene)
-    exact = engine.measure(scene.target, directions, scene.length).distance
-    wrong = asked = 0
-    for radius in RADII_MM:
-        verdicts = engine.nearer_than(scene.target, directions, scene.length, radius)
-        capsule, judged = fcl.Capsule(radius, scene.length), np.empty(verdicts.shape, bool)
-        for row, outward in enumerate(directions):
-            needle = fcl.CollisionObject(capsule, pose(scene.target, outward, scene.length))
-            for column, tree in enumerate(objects):
-                judged[row, column] = fcl.collide(needle, tree, fcl.CollisionRequest(), fcl.CollisionResult()) > 0
-        far = np.abs(exact - radius) >= NEAR_THRESHOLD_MM
-        wrong += int(np.sum(judged != verdicts)) + int(np.sum(far & (judged != (exact < radius))))
-        asked += judged.size
-    worst = max(brute_force_error(scene, engine, directions), 0.0)
+    asked, wrong = verdicts_unlike_fcl(scene, engine, objects, scene.target, directions)
     print(
-        f"{scene.name}: {asked:,} verdicts at {RADII_MM} mm, {step_deg:g} degree: {wrong} differ from FCL; "
-        f"{PAIRS} random pairs: largest error {worst:.1e} mm against brute force; {time.perf_counter() - start:.0f} s",
+        f"{scene.name}: {asked:,} verdicts at {RADII_MM} mm, {step_deg:g} degree: {wrong} differ from FCL", flush=True
+    )
+    worst = brute_force_error(scene, engine, scene.target, directions, PAIRS)
+    rng = np.random.default_rng(11)
+    for place, target in other_targets(scene, rng).items():
+        some = random_directions(rng, OTHER_DIRECTIONS)
+        count, differ = verdicts_unlike_fcl(scene, engine, objects, target, some)
+        worst = max(worst, brute_force_error(scene, engine, target, some, OTHER_PAIRS))
+        print(f"    target {place}: {count:,} verdicts, {differ} differ from FCL", flush=True)
+        asked, wrong = asked + count, wrong + differ
+    print(
+        f"    in all {asked:,} verdicts, {wrong} differ; largest error {worst:.1e} mm against brute force; "
+        f"{time.perf_counter() - start:.0f} s",
         flush=True,
     )
     return wrong == 0 and worst < TOLERANCE_MM
 
 
-def brute_force_error(scene: Scene, engine: FastEngine, directions: np.ndarray, pairs: int = PAIRS) -> float:
+def random_directions(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Unit vectors all over the sphere, shape (count, 3)."""
+    directions = rng.normal(size=(count, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def other_targets(scene: Scene, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Random targets on a vertex, on an edge, in a face, in a face's plane, amid a structure and outside them all."""
+    mesh = scene.meshes[int(rng.integers(len(scene.meshes)))]
+    a, b, c = mesh.triangles[int(rng.integers(len(mesh.faces)))]
+    other = scene.meshes[int(rng.integers(len(scene.meshes)))]
+    low = np.min([m.vertices.min(axis=0) for m in scene.meshes], axis=0)
+    high = np.max([m.vertices.max(axis=0) for m in scene.meshes], axis=0)
+    return {
+        "on a vertex": np.array(a),
+        "on an edge": 0.3 * a + 0.7 * b,
+        "in a face": (a + b + c) / 3,
+        "in a face's plane": 4 * a - 2 * b - c,
+        "amid a structure": other.vertices.mean(axis=0),
+        "anywhere": rng.uniform(low, high),
+        "anywhere else": rng.uniform(low, high),
+        "outside": high + 30.0,
+    }
+
+
+def verdicts_unlike_fcl(
+    scene: Scene, engine: FastEngine, objects: list[fcl.CollisionObject], target: np.ndarray, directions: np.ndarray
+) -> tuple[int, int]:
+    """Verdicts asked of both, and those that differ, of the verdict mode and of the exact distances."""
+    exact = engine.measure(target, directions, scene.length).distance
+    wrong = asked = 0
+    for radius in RADII_MM:
+        verdicts = engine.nearer_than(target, directions, scene.length, radius)
+        capsule, judged = fcl.Capsule(radius, scene.length), np.empty(verdicts.shape, bool)
+        for row, outward in enumerate(directions):
+            needle = fcl.CollisionObject(capsule, pose(target, outward, scene.length))
+            for column, tree in enumerate(objects):
+                judged[row, column] = fcl.collide(needle, tree, fcl.CollisionRequest(), fcl.CollisionResult()) > 0
+        far = np.abs(exact - radius) >= NEAR_THRESHOLD_MM
+        wrong += int(np.sum((judged != verdicts) | (far & (judged != (exact < radius)))))
+        asked += judged.size
+    return asked, wrong
+
+
+def brute_force_error(
+    scene: Scene, engine: FastEngine, target: np.ndarray, directions: np.ndarray, pairs: int
+) -> float:
     """Largest difference over random (direction, structure) pairs, mm."""
     rng = np.random.default_rng(7)
-    found = engine.measure(scene.target, directions, scene.length).distance
+    found = engine.measure(target, directions, scene.length).distance
     worst = 0.0
     for row, column in zip(
         rng.integers(0, len(directions), pairs), rng.integers(0, len(scene.meshes), pairs), strict=True
     ):
-        top = scene.target + scene.length * directions[row]
-        distance = segment_distance(scene.target, top, scene.meshes[column].triangles)
+        top = target + scene.length * directions[row]
+        distance = segment_distance(target, top, scene.meshes[column].triangles)
         worst = max(worst, abs(distance - found[row, column]))
     return worst
 

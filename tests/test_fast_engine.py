@@ -216,6 +216,23 @@ def test_a_kd_order_is_a_permutation_of_compact_runs(rng):
     assert np.median(np.ptp(runs, axis=1)) < 0.2
 
 
+def test_a_surface_beyond_the_top_and_one_across_it(rng, ball):
+    """Where the needle ends before the surface, or amid it, the distance is that of its top: near, far, aside."""
+    directions = np.concatenate([units(rng, 10), [1.0, 0, 0] + 0.05 * rng.normal(size=(40, 3))])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    for center in ((400.0, 30, 0), (LENGTH + 22.0, 0, 0), (LENGTH, 21.0, 0)):
+        agrees(ball(20, center, 1), [0, 0, 0], directions)
+
+
+def test_searches_are_counted(ball):
+    """The counts grow with what is searched, and far surfaces behind the target cost no triangle."""
+    engine, directions = FastEngine([ball(20, (60, 0, 0))]), np.array([[1.0, 0, 0], [0.9, 0.1, np.sqrt(0.18)]])
+    engine.measure(np.zeros(3), -directions, LENGTH)
+    assert engine.counts[0] > 0 and engine.counts[-1] == 0
+    engine.measure(np.zeros(3), directions, LENGTH)
+    assert (engine.counts > 0).all()
+
+
 @pytest.mark.parametrize("target, direction", [([np.nan, 0, 0], [1.0, 0, 0]), ([0, 0, 0], [np.inf, 0, 0])])
 def test_an_axis_that_is_not_finite_is_refused(ball, target, direction):
     """Nothing that is not a number reaches compiled code."""

@@ -6,6 +6,9 @@ import fcl
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import segment_mesh_distance
 
 import meshes
 from planning.clearance.engine import AxisDistances
@@ -121,3 +124,42 @@ def test_fcl_trees_are_built_when_first_asked(ball, monkeypatch):
     assert not built
     with pytest.raises(RuntimeError, match="a tree"):
         engine.collides(0, np.zeros(3), np.eye(3)[0], LENGTH, 1.0)
+
+
+def small_surface(rng, closed):
+    """A dented ball of 80 triangles, or 20 triangles strewn about."""
+    if closed:
+        ball = trimesh.creation.icosphere(subdivisions=0, radius=1.0).subdivide()
+        dents = rng.uniform(0.7, 1.3, (len(ball.vertices), 1))
+        return TriangleMesh(rng.normal(0, 30, 3) + 25 * dents * ball.vertices, ball.faces)
+    corners = rng.normal(0, 40, (20, 1, 3)) + rng.normal(0, 8, (20, 3, 3))
+    return TriangleMesh(corners.reshape(-1, 3), np.arange(60).reshape(-1, 3))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    closed=st.booleans(),
+    place=st.sampled_from(["vertex", "edge", "face", "plane", "amid", "outside", "far"]),
+    length=st.sampled_from([1.0, 40.0, LENGTH]),
+    radius=st.sampled_from(RADII_MM),
+)
+def test_verdicts_and_distances_hold_for_any_small_surface_and_target(seed, closed, place, length, radius):
+    """Whatever the surface, the target and the needle: FCL's verdict and brute force's distance, in all three modes."""
+    rng = np.random.default_rng(seed)
+    mesh = small_surface(rng, closed)
+    a, b, c = mesh.triangles[rng.integers(len(mesh.faces))]
+    share, middle = rng.uniform(0, 1), mesh.vertices.mean(axis=0)
+    spots = {"vertex": a, "edge": share * a + (1 - share) * b, "face": (a + b + c) / 3, "plane": 4 * a - 2 * b - c}
+    spots |= {"amid": middle, "outside": middle + [90.0, 20, 0], "far": middle - [0, 700.0, 300]}
+    target, directions = np.array(spots[place]), units(rng, 16)
+    toward = middle - target + rng.normal(0, 20, (8, 3))
+    directions[:8] = toward / np.linalg.norm(toward, axis=1, keepdims=True)
+    engine, judge = FastEngine([mesh]), FclEngine([mesh])
+    exact = engine.measure(target, directions, length).distance[:, 0]
+    expected = [segment_mesh_distance(target, target + length * u, mesh) for u in directions]
+    np.testing.assert_allclose(exact, expected, atol=1e-9, rtol=0)
+    capped = engine.measure_capped(target, directions, length, 20.0).distance[:, 0]
+    np.testing.assert_allclose(capped, np.minimum(exact, 20.0), atol=1e-9, rtol=0)
+    judged = [judge.collides(0, target, u, length, radius) for u in directions]
+    assert engine.nearer_than(target, directions, length, radius)[:, 0].tolist() == judged

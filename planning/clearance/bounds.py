@@ -21,6 +21,12 @@ COSINE_SLACK = np.float32(2e-6)
 TINY = np.float32(1e-30)
 """Keeps a division finite; far below any square of a length that matters."""
 
+HUGE = np.float32(3e38)
+"""More than any square of a length here."""
+
+ROOT = np.float32(1 - 1e-6)
+"""What float32 may take from a root is less than this takes."""
+
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 
 FAST = {"reassoc", "nsz", "contract", "arcp"}
@@ -56,9 +62,11 @@ def disc_bounds(nodes, group, lanes, u, chord, length, slack, bounds, first):  #
         sine = np.sqrt(abs(ONE - q * q) + SINE_SLACK)
         lateral = w - rho * sine - h * (q + COSINE_SLACK) - (rho + h) * slack * inverse
         beyond = t - radius - length
-        bound = lateral if lateral > beyond else beyond
-        bound -= chord * (reach if reach < length else length) + slack + slack
+        lateral = lateral if lateral > ZERO else ZERO
+        beyond = beyond if beyond > ZERO else ZERO
         ahead = t + radius + chord * reach + slack
+        bound = np.sqrt(lateral * lateral + beyond * beyond) * ROOT
+        bound -= chord * (ahead if ahead < length else length) + slack + slack
         bounds[first, k] = bound if ahead > ZERO else NEVER
 
 
@@ -128,6 +136,50 @@ def add_beyond(local, block, lanes, u, depth, slack, squares):  # type: ignore[n
         beyond = depth + ta - slack
         beyond = beyond if beyond > ZERO else ZERO
         squares[k] += beyond * beyond
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
+def lower_upper_bounds(frames, lanes, corners, length, error, upper):  # type: ignore[no-untyped-def]  # numba infers
+    """Let one triangle lower the upper bounds of a bundle's members, all at once.
+
+    Where the triangle lies beside the axis its nearest edge is taken, else its nearest corner.
+
+    Args:
+        frames: Shape (9, 16), float32, each member's direction u, and e and f that complete it to a frame.
+        lanes: 16, as above.
+        corners: Nine float32 numbers, from the target, mm.
+        length: Of the needle, mm.
+        error: What float32 may take from a distance, mm.
+        upper: Shape (16,), float32, changed, mm.
+    """
+    px, py, pz, qx, qy, qz, rx, ry, rz = corners
+    for k in range(lanes):
+        ux, uy, uz = frames[0, k], frames[1, k], frames[2, k]
+        ex, ey, ez = frames[3, k], frames[4, k], frames[5, k]
+        fx, fy, fz = frames[6, k], frames[7, k], frames[8, k]
+        ta, tb, tc = px * ux + py * uy + pz * uz, qx * ux + qy * uy + qz * uz, rx * ux + ry * uy + rz * uz
+        ax, ay = px * ex + py * ey + pz * ez, px * fx + py * fy + pz * fz
+        bx, by = qx * ex + qy * ey + qz * ez, qx * fx + qy * fy + qz * fz
+        cx, cy = rx * ex + ry * ey + rz * ez, rx * fx + ry * fy + rz * fz
+        one, two, three = _square(ax, ay, bx, by), _square(bx, by, cx, cy), _square(cx, cy, ax, ay)
+        one = one if one < two else two
+        one = one if one < three else three
+        a, b, c = _past(ta, length), _past(tb, length), _past(tc, length)
+        beside = (ta == a) & (tb == b) & (tc == c)
+        a = ax * ax + ay * ay + (ta - a) * (ta - a)
+        b = bx * bx + by * by + (tb - b) * (tb - b)
+        c = cx * cx + cy * cy + (tc - c) * (tc - c)
+        a = a if a < b else b
+        a = a if a < c else c
+        one = np.sqrt(one if beside else a) + error
+        upper[k] = one if one < upper[k] else upper[k]
+
+
+@nb.njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
+def _past(t, length):  # type: ignore[no-untyped-def]  # numba infers
+    """A depth, held to 0..length."""
+    t = t if t > ZERO else ZERO
+    return t if t < length else length
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from planning.clearance.blocks import LANES, Blocks, pack
 from planning.clearance.engine import AxisDistances, Floats
 from planning.clearance.fcl_engine import FclEngine
-from planning.clearance.tile_search import nearest_triangle, scratch_for, search_tiles
+from planning.clearance.tile_search import COUNTED, nearest_triangle, scratch_for, search_tiles
 from planning.clearance.tiles import Tiles, bundle
 from planning.errors import InputError
 from planning.mesh import TriangleMesh
@@ -44,6 +44,9 @@ class FastEngine:
     Args:
         meshes: The k surfaces, in the CT frame, mm.
         progress: Called with (structures done x directions, directions x structures).
+
+    Attributes:
+        counts: Shape (7,), what all searches so far went through, see `tile_search.COUNTED`.
     """
 
     def __init__(self, meshes: Sequence[TriangleMesh], progress: Progress | None = None) -> None:
@@ -51,6 +54,7 @@ class FastEngine:
         self._blocks = tuple(pack(mesh) for mesh in self._meshes)
         self._judges: dict[int, FclEngine] = {}
         self._progress = progress
+        self.counts = np.zeros(len(COUNTED), np.int64)
 
     def measure(self, target_ct: Floats, outward_ct: Floats, length: float) -> AxisDistances:
         """Exact distances of n axes from all k structures; see `ClearanceEngine`."""
@@ -112,7 +116,9 @@ class FastEngine:
         distance, depth = np.empty(shape), np.empty(shape)
         tiles = bundle(outward)
         for row, blocks in enumerate(self._blocks):
-            _one_structure(blocks, tiles, target, length, caps[row], enoughs[row], distance[row], depth[row])
+            _one_structure(
+                blocks, tiles, target, length, caps[row], enoughs[row], distance[row], depth[row], self.counts
+            )
             if self._progress is not None:
                 self._progress((row + 1) * len(outward), len(self._blocks) * len(outward))
         return AxisDistances(distance.T, depth.T)
@@ -127,6 +133,7 @@ def _one_structure(
     enough: float,
     distance: Floats,
     depth: Floats,
+    counts: NDArray[np.int64],
 ) -> None:
     """Fill one structure's distances and depths, in the caller's order."""
     if not cap > 0.0:
@@ -137,11 +144,11 @@ def _one_structure(
         distance[:], depth[:] = min(placed.distance, cap), 0.0
         return
     found, at = np.empty(len(distance)), np.empty(len(distance))
-    surface = (blocks.triangles, blocks.local, blocks.base, blocks.center)
+    surface = (blocks.triangles, blocks.local, blocks.base)
     bundles = (tiles.outward, tiles.starts, tiles.middle, tiles.chord)
     search_tiles(
         surface, placed.nodes, placed.slack, target, float(length), placed.distance, placed.nearest,
-        float(cap), float(enough), bundles, scratch_for(len(placed.nodes)), LANES, found, at,
+        float(cap), float(enough), bundles, scratch_for(len(placed.nodes)), LANES, found, at, counts,
     )  # fmt: skip
     distance[tiles.order], depth[tiles.order] = np.sqrt(found), at
 

@@ -13,6 +13,9 @@ import numpy as np
 CONTACT_MM = 1e-10
 """Below this the axis and the triangle meet: a thousand times the rounding of coordinates of 500 mm."""
 
+LEAST = 1e-300
+"""Keeps a division by the square of an edge that is a point finite, mm^2."""
+
 
 @nb.njit(cache=True, error_model="numpy")
 def axis_triangle(u, length, a, b, c):  # type: ignore[no-untyped-def]  # numba infers
@@ -73,11 +76,15 @@ def axis_triangle_beside(u, e, f, length, tri, row, o):  # type: ignore[no-untyp
     bx, by = bx * e[0] + by * e[1] + bz * e[2], bx * f[0] + by * f[1] + bz * f[2]
     cx, cy = cx * e[0] + cy * e[1] + cz * e[2], cx * f[0] + cy * f[1] + cz * f[2]
     best, depth = _shadow(ax, ay, ta, bx, by, tb)
-    best, depth = _nearer(best, depth, _shadow(bx, by, tb, cx, cy, tc))
-    best, depth = _nearer(best, depth, _shadow(cx, cy, tc, ax, ay, ta))
+    two, two_depth = _shadow(bx, by, tb, cx, cy, tc)
+    three, three_depth = _shadow(cx, cy, tc, ax, ay, ta)
+    depth, best = two_depth if two < best else depth, two if two < best else best
+    depth, best = three_depth if three < best else depth, three if three < best else best
     wa, wb, wc = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
-    around = (wa >= 0.0 and wb >= 0.0 and wc >= 0.0) or (wa <= 0.0 and wb <= 0.0 and wc <= 0.0)
-    if around or best < CONTACT_MM or min(ta, tb, tc) < 0.0 or max(ta, tb, tc) > length:
+    around = ((wa >= 0.0) & (wb >= 0.0) & (wc >= 0.0)) | ((wa <= 0.0) & (wb <= 0.0) & (wc <= 0.0))
+    behind = (ta < 0.0) | (tb < 0.0) | (tc < 0.0)
+    over = (ta > length) | (tb > length) | (tc > length)
+    if around | behind | over | (best < CONTACT_MM):
         return axis_triangle(u, length, corners[0], corners[1], corners[2])
     return best, depth
 
@@ -86,9 +93,9 @@ def axis_triangle_beside(u, e, f, length, tri, row, o):  # type: ignore[no-untyp
 def _shadow(px, py, tp, qx, qy, tq):  # type: ignore[no-untyped-def]  # numba infers
     """Squared distance of the origin from an edge's shadow p-q, and the depth there (at p and q ``tp`` and ``tq``)."""
     dx, dy = qx - px, qy - py
-    down = dx * dx + dy * dy
-    t = -(px * dx + py * dy) / down if down > 0.0 else 0.0
-    t = min(max(t, 0.0), 1.0)
+    t = -(px * dx + py * dy) / (dx * dx + dy * dy + LEAST)
+    t = t if t > 0.0 else 0.0
+    t = t if t < 1.0 else 1.0
     x, y = px + t * dx, py + t * dy
     return x * x + y * y, tp + t * (tq - tp)
 

@@ -1,0 +1,100 @@
+"""Where the exact search spends its time: what it counts, times what each step costs in a tight loop."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numba as nb
+import numpy as np
+
+from benchmarks.scenes import Scene
+from planning.clearance.bare import bare
+from planning.clearance.blocks import LANES
+from planning.clearance.bounds import disc_bounds, line_distances
+from planning.clearance.fast_engine import FastEngine
+from planning.clearance.segment_triangle import axis_triangle_beside
+from planning.clearance.tile_search import COUNTED
+
+TURNS = 300_000
+REPEATS = 7
+
+Single = np.float32
+X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+X32, Y32, Z32 = (tuple(Single(x) for x in axis) for axis in (X, Y, Z))
+
+
+@nb.njit(error_model="numpy")
+def _discs(nodes, bounds, lanes, turns):
+    nodes, bounds = bare(nodes), bare(bounds)
+    for i in range(turns):
+        disc_bounds(nodes, i & 31, lanes, Z32, Single(0.03), Single(210), Single(1e-4), bounds, i & 31)
+
+
+@nb.njit(error_model="numpy")
+def _blocks(local, squares, lanes, turns):
+    local, squares = bare(local), bare(squares)
+    for i in range(turns):
+        line_distances(local, i & 31, lanes, X32, Y32, Single(3), Single(2), Single(-1e-3), Single(5), squares)
+
+
+@nb.njit(error_model="numpy")
+def _triangles(triangles, turns):
+    triangles, total = bare(triangles), 0.0
+    for i in range(turns):
+        total += axis_triangle_beside(Z, X, Y, 210.0, triangles, i & 255, (0.0, 0.0, 0.0))[0]
+    return total
+
+
+def _least(work: Callable[[], object]) -> float:
+    """Least processor time of one turn, s."""
+    work()
+    times = []
+    for _ in range(REPEATS):
+        start = time.thread_time()
+        work()
+        times.append(time.thread_time() - start)
+    return min(times) / TURNS
+
+
+def unit_costs() -> tuple[float, float, float]:
+    """Seconds for the bounds of 16 discs, for a block of 16 triangles in float32, and for one triangle in float64."""
+    rng = np.random.default_rng(0)
+    nodes = np.abs(rng.normal(0, 3, (32, 10, LANES))).astype(Single)
+    local = rng.normal(0, 3, (32, 9, LANES)).astype(Single)
+    beside = rng.normal(0, 1, (256, 9)) + np.tile([30.0, 5.0, 40.0], 3)
+    bounds, squares = np.empty((32, LANES), Single), np.empty(LANES, Single)
+    return (
+        _least(lambda: _discs(nodes, bounds, LANES, TURNS)),
+        _least(lambda: _blocks(local, squares, LANES, TURNS)),
+        _least(lambda: _triangles(beside, TURNS)),
+    )
+
+
+def profile(scene: Scene, step_deg: float) -> None:
+    """Print what the search of one scene counts per answer, and how its time divides."""
+    directions, engine = scene.hemisphere(step_deg), FastEngine(scene.meshes)
+    took = min(_search(engine, scene, directions) for _ in range(3))
+    counts = dict(zip(COUNTED, engine.counts / 3, strict=True))
+    answers = len(directions) * len(scene.meshes)
+    disc, block, triangle = unit_costs()
+    per_answer = ", ".join(f"{name} {count / answers:.2f}" for name, count in counts.items())
+    print(f"{scene.name}: {took / answers * 1e9:.0f} ns per answer; per answer: {per_answer}")
+    shares = {
+        "walk (discs of the tree)": counts["nodes"] * disc,
+        "filter (discs per direction)": counts["filters"] * disc,
+        "blocks in float32": counts["block tests"] * block,
+        "triangles in float64": counts["triangle tests"] * triangle,
+    }
+    named = ", ".join(f"{name} {100 * cost / took:.0f} %" for name, cost in shares.items())
+    print(f"    {named}, between these {100 * (1 - sum(shares.values()) / took):.0f} %")
+    print(
+        f"    one step of each: {disc * 1e9:.0f}, {block * 1e9:.0f}, {triangle * 1e9:.0f} ns (discs, block, triangle)"
+    )
+
+
+def _search(engine: FastEngine, scene: Scene, directions: np.ndarray) -> float:
+    """Seconds on the processor for one search."""
+    start = time.thread_time()
+    engine.measure(scene.target, directions, scene.length)
+    return time.thread_time() - start
