@@ -1,6 +1,6 @@
 """How long a certified map takes, against the dense grids; and a million random directions thrown at it.
 
-python benchmarks/certify.py             times and queries for the abdomen at 0.25 degrees
+python benchmarks/certify.py             times and queries of three anatomies at 0.25 degrees, and at half of that
 python benchmarks/certify.py --million   a million random directions into certified cells of three anatomies
 """
 
@@ -9,15 +9,20 @@ from __future__ import annotations
 import argparse
 import platform
 import shutil
+import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numba
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, beside the package
+
 from meshes import folder
 from planning.certify import Certificate, certify, verify
+from planning.clearance.fast_engine import FastEngine
 from planning.entry import Directions, grid, outward
 from planning.prepared import Prepared, prepare
 from planning.search import organ_candidates
@@ -29,30 +34,64 @@ SEED = 20190401
 
 
 def times(size_deg: float, repeats: int) -> None:
-    """Certify the abdomen; compare with the distances alone on the dense grids."""
-    prepared = prepare(folder() / "abdomen", arm=False)
-    case, engine = prepared.case, prepared.engine
-    print(
-        f"{platform.machine()}, Python {platform.python_version()}, numba {numba.__version__}, numpy {np.__version__}"
+    """Certify each anatomy; compare with the exact distances alone on the dense grids."""
+    versions = f"Python {platform.python_version()}, numba {numba.__version__}, numpy {np.__version__}"
+    print(f"{platform.machine()}, {versions}; processor time of one thread, best of {repeats}")
+    print(f"fewer queries: than a {size_deg:g}-degree grid; the grid's time: of 1 degree, exact, and with its trees")
+    head = "anatomy (triangles) | size, deg | map / grid (+ trees) | fewer queries | safe | undecided | really mixed"
+    print(f"| {head} | map, s | grid, s (+ trees) | queries | cells |")
+    print("|" + "---|" * 11)
+    with tempfile.TemporaryDirectory() as temporary:
+        for name, path in _anatomies(Path(temporary)).items():
+            prepared = prepare(path, arm=False)
+            for size in (size_deg, size_deg / 2):
+                _row(name, prepared, size, size_deg, repeats)
+            found = certify(prepared.case, prepared.anatomy, size=np.radians(size_deg))
+            start = time.thread_time()
+            print(
+                f"  checked again: {verify(found, prepared.case, prepared.anatomy)}, {time.thread_time() - start:.0f} s"
+            )
+
+
+def _row(name: str, prepared: Prepared, size_deg: float, step_deg: float, repeats: int) -> None:
+    case, meshes = prepared.case, tuple(s.mesh for s in prepared.anatomy.structures)
+    R, length = case.T_ct_entry[:3, :3], case.needle.length_mm
+    coarse, fine = (grid(case.search.theta, case.search.beta, np.radians(step), R) for step in (1.0, step_deg))
+    own = _best(lambda: certify(case, prepared.anatomy, size=np.radians(size_deg)), repeats)
+    found = certify(case, prepared.anatomy, size=np.radians(size_deg))
+    engine = FastEngine(meshes)
+    trees = _best(lambda: FastEngine(meshes), repeats)
+    dense = _best(lambda: engine.measure(case.target_ct, coarse.outward_ct, length), repeats)
+    fewer, triangles = 100 * (1 - found.queries / len(fine)), sum(len(mesh.faces) for mesh in meshes)
+    shares = 100 * (found.share("S") or 0), 100 * (found.share("U") or 0), 100 * _mixed(prepared, found)
+    cells = " | ".join(
+        [
+            f"{name} ({triangles:,})",
+            f"{size_deg:g}",
+            f"{own / dense:.2f} ({own / (dense + trees):.2f})",
+            f"{fewer:.1f} %",
+            *(f"{share:.2f} %" for share in shares),
+            f"{own:.3f}",
+            f"{dense:.3f} ({dense + trees:.3f})",
+            f"{found.queries:,}",
+            f"{len(found.leaves):,}",
+        ]
     )
-    print(f"engine {type(engine).__name__}; median of {repeats}, first run (compiling) left out")
-    size = np.radians(size_deg)
-    own = _median(lambda: certify(case, prepared.anatomy, size=size), repeats)
-    found = certify(case, prepared.anatomy, size=size)
-    print(f"certified to {size_deg:g} deg    {own:8.3f} s, {found.queries} queries")
-    for step_deg in (1.0, size_deg):
-        directions = grid(case.search.theta, case.search.beta, np.radians(step_deg), case.T_ct_entry[:3, :3])
-        rays = directions.outward_ct
-        if len(rays) > CHUNK and type(engine).__name__ == "FclEngine":
-            print(f"dense {step_deg:g} deg grid    not timed with FCL, {len(rays)} queries")
-            continue
-        dense = _median(lambda rays=rays: engine.measure(case.target_ct, rays, case.needle.length_mm), repeats)
-        fewer = 100 * (1 - found.queries / len(rays))
-        line = f"dense {step_deg:g} deg grid    {dense:8.3f} s (distances alone), {len(rays)} queries"
-        print(f"{line}; the map takes {own / dense:.2f} of that time and {fewer:.1f} % fewer queries")
-    _areas("abdomen", found)
-    start = time.perf_counter()
-    print(f"checked again: {verify(found, case, prepared.anatomy)} in {time.perf_counter() - start:.1f} s")
+    print(f"| {cells} |", flush=True)
+
+
+def _mixed(prepared: Prepared, found: Certificate, across: int = 6) -> float:
+    """Share of the cap in undecided cells that hold safe and unsafe directions: no proof can decide these."""
+    cells, case = found.leaves.take(found.verdict == "U"), prepared.case
+    at = (np.arange(across) + 0.5) / across
+    theta = cells.theta[:, :1, None] + at[None, :, None] * np.diff(cells.theta)[:, :, None]
+    beta = cells.beta[:, None, :1] + at[None, None, :] * np.diff(cells.beta)[:, :, None]
+    angles = [np.ascontiguousarray(a).ravel() for a in np.broadcast_arrays(theta, beta)]
+    outward_ct = outward(*angles) @ case.T_ct_entry[:3, :3].T
+    safe = organ_candidates(case, prepared.anatomy, prepared.engine, Directions(*angles, outward_ct)).safe
+    share = safe.reshape(len(cells), -1).mean(axis=1)
+    mixed = cells.take((share > 0) & (share < 1)).solid_angle().sum()
+    return float(mixed / found.question.cap().solid_angle()[0])
 
 
 def million(total: int, size_deg: float) -> int:
@@ -109,13 +148,14 @@ def _areas(name: str, found: Certificate) -> None:
     )
 
 
-def _median(work: object, repeats: int) -> float:
+def _best(work: Callable[[], object], repeats: int) -> float:
+    """Least processor time, s: others share the machine."""
     seconds = []
     for _ in range(repeats + 1):
-        start = time.perf_counter()
-        work()  # type: ignore[operator]  # a function without arguments
-        seconds.append(time.perf_counter() - start)
-    return float(np.median(seconds[1:]))
+        start = time.thread_time()
+        work()
+        seconds.append(time.thread_time() - start)
+    return min(seconds)
 
 
 def main() -> int:

@@ -87,10 +87,10 @@ def hubmap() -> Scene:
     return Scene("hubmap", only, target, R, np.full(len(only), 3.6))
 
 
-def dense() -> Scene:
-    """Five bumpy organs of 160,000 triangles each (800k) around the target."""
+def dense(rows: int = 283) -> Scene:
+    """Five bumpy organs around the target, of 2 x ``rows`` x ``rows`` triangles each (160,000: 800k in all)."""
     rng, surfaces = np.random.default_rng(5), []
-    steps = np.linspace(0, 1, 284)
+    steps = np.linspace(0, 1, rows + 1)
     for center, radius in (
         ((60, 10, 40), 28),
         ((-55, 30, 50), 30),
@@ -104,7 +104,8 @@ def dense() -> Scene:
         )
         waves = rng.normal(0, 5, (12, 3))
         bumps = 1 + 0.03 * np.sin(u @ waves.T + rng.uniform(0, 6, 12)).sum(axis=1)
-        i = (np.arange(283)[:, None] * 284 + np.arange(283)).ravel()
-        faces = np.concatenate([np.stack([i, i + 284, i + 1], 1), np.stack([i + 1, i + 284, i + 285], 1)])
+        row = rows + 1
+        i = (np.arange(rows)[:, None] * row + np.arange(rows)).ravel()
+        faces = np.concatenate([np.stack([i, i + row, i + 1], 1), np.stack([i + 1, i + row, i + row + 1], 1)])
         surfaces.append(TriangleMesh(np.asarray(center) + radius * bumps[:, None] * u, faces))
     return Scene("dense synthetic", tuple(surfaces), np.zeros(3), np.eye(3), np.full(5, 3.6))

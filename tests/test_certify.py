@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import segment_mesh_distance
+from scipy.optimize import nnls
 
 from meshes import folder
 from planning.anatomy import Anatomy, Role, Structure
@@ -17,8 +18,9 @@ from planning.case_file import EntryAxes
 from planning.certify import certify, read_certificate, verify, write_certificate
 from planning.certify.bounds import view_bounds
 from planning.certify.cells import SQUARE_DEGREES, Cells, angle_between, nearest_cell, split
-from planning.certify.cones import Lists, narrowed, zones
-from planning.certify.near_organs import organ_bounds
+from planning.certify.checker import _apart, _Cell
+from planning.certify.cones import Lists, zones
+from planning.certify.near_organs import Organs, organ_facts
 from planning.certify.skin_cones import skin_bounds
 from planning.certify.skin_surface import skin_surface
 from planning.clearance.fcl_engine import FclEngine
@@ -30,6 +32,7 @@ from planning.prepared import prepare
 from planning.search import organ_candidates
 from planning.skin import FieldOfView, Skin, skin_from_mesh
 from planning.skin_entry import skin_paths
+from run_twin import OK, main
 
 REAL = Path(__file__).parent / "real"
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "totalseg_abdomen_3mm"
@@ -50,9 +53,9 @@ def certified(request):
 
 @pytest.fixture(scope="module")
 def carton():
-    """The carton with its certificate at 3°."""
+    """The carton with its certificate at 4°."""
     prepared = prepare(folder() / "carton" / "case_m.toml", arm=False)
-    return prepared, certify(prepared.case, prepared.anatomy, size=np.radians(3))
+    return prepared, certify(prepared.case, prepared.anatomy, size=np.radians(4))
 
 
 def _directions(case, theta, beta):
@@ -95,7 +98,7 @@ def test_halves_and_quarters_tile_their_cell(theta, rng):
     cells = Cells(np.array([theta], float), np.array([[0, 2 * np.pi]]))
     area = cells.solid_angle()[0]
     for _ in range(6):
-        cells = split(cells, cells.splits()).cells
+        cells = split(cells, cells.splits(cells.radius())).cells
     assert cells.solid_angle().sum() == pytest.approx(area, rel=1e-12)
     t, b = rng.uniform(*theta, 500), rng.uniform(0, 2 * np.pi, 500)
     within = (cells.theta[:, :1] < t) & (t < cells.theta[:, 1:]) & (cells.beta[:, :1] < b) & (b < cells.beta[:, 1:])
@@ -123,26 +126,66 @@ def test_the_nearest_cell_is_as_near_as_sampling_says(rng):
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=50)
-def test_distances_stay_within_their_bounds(seed):
-    """A few random triangles, an axis, and the same axis turned by up to the radius: brute force never contradicts."""
+@settings(max_examples=300)
+def test_a_cell_is_a_sum_of_its_corners_and_a_bulge(seed):
+    """Weights that are not negative and add up to at least 1 leave no more than the bulge, also at a pole."""
     rng = np.random.default_rng(seed)
-    corners = rng.normal(0, 40, (6, 1, 3)) + rng.normal(0, 8, (6, 3, 3))
-    mesh = TriangleMesh(corners.reshape(-1, 3), np.arange(18).reshape(6, 3))
-    length, limit, rho = 90.0, rng.uniform(0.1, 8), 10 ** rng.uniform(-3, -0.7)
-    u = outward(rng.uniform(0, np.pi), rng.uniform(0, 6.3))
-    cone, group = (u[None], np.array([rho])), np.zeros(6, np.int64)
-    near = narrowed(zones(corners, limit), group, 1, Lists.one(np.arange(6)), np.zeros(1, np.int64), *cone)
-    found = organ_bounds(
-        corners.reshape(6, 9), group, np.array([limit]), near.lists, np.zeros(1, np.int64), near.reach, *cone,
-        length=length, pad=0.0,
-    )  # fmt: skip
-    for _ in range(10):
-        v = _turned(u, rho, rng)
-        true = segment_mesh_distance(np.zeros(3), length * v, mesh)
-        assert true <= found.largest[0] + 1e-6
-        if found.slack[0] >= 0:  # otherwise nothing is claimed
-            assert true >= limit - 1e-6
+    cell = _random_cell(rng, 10 ** rng.uniform(-3, 0.4))
+    shape = cell.cones(np.eye(3))
+    v = outward(*_thrown_into(cell, np.zeros(1, int), rng))[0]
+    weights, rest = nnls(shape.corners[0].T, v)
+    assert rest <= shape.bulge[0] + 1e-12
+    assert weights.sum() >= 1 - shape.bulge[0]
+    assert angle_between(shape.centres[0], v) <= shape.radius[0]
+
+
+def _random_cell(rng, size):
+    theta, beta = rng.uniform(0, np.pi), rng.uniform(0, 6)
+    wide = min(size / max(np.sin(theta), 0.1), np.pi)
+    return Cells(np.array([[theta, min(theta + size, np.pi)]]), np.array([[beta, beta + wide]]))
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=60, deadline=None)
+def test_what_is_said_of_a_cell_holds_for_its_axes(seed):
+    """Random triangles and a random cell: brute force on axes all over it, also at its corners, never contradicts.
+
+    The checker's planes are held against the same axes.
+    """
+    rng = np.random.default_rng(seed)
+    corners = rng.normal(0, 40, (6, 1, 3)) + rng.normal(0, 10 ** rng.uniform(-1, 1.5), (6, 3, 3))
+    cell, limit, length = _random_cell(rng, 10 ** rng.uniform(-3, -0.5)), rng.uniform(0.1, 8), 90.0
+    shape, group, first = cell.cones(np.eye(3)), np.zeros(6, np.int64), np.zeros(1, np.int64)
+    organs = Organs(corners.reshape(6, 9), group, np.array([limit]), zones(corners, limit), length)
+    witness = np.array([rng.integers(-1, 6)])
+    found = organ_facts(organs, Lists.one(np.arange(6)), first, witness, shape, wide=9.0, pad=0.0)
+    plain = _apart(corners, np.full(6, limit), _Cell(tuple(cell.theta[0]), tuple(cell.beta[0]), np.eye(3)), length)
+    at = np.concatenate([rng.uniform(size=(6, 2)), [[0, 0], [0, 1], [1, 0], [1, 1], [0, 0.5], [1, 0.5]]])
+    for v in (cell.at(*parts)[0] for parts in at):
+        each = np.array([segment_mesh_distance(np.zeros(3), length * v, _triangle(t)) for t in corners])
+        assert (each[plain] >= limit - 1e-9).all()
+        if found.rejected[0]:
+            assert each[found.witness[0]] <= found.largest[0] + 1e-9 < limit + 1e-9
+        else:
+            clear = np.setdiff1d(np.arange(6), found.near.items)
+            assert (each[clear] >= limit - 1e-9).all()
+
+
+def _triangle(corners):
+    return TriangleMesh(corners, [[0, 1, 2]])
+
+
+def test_bounds_are_not_idle(rng):
+    """Beside a small triangle most cells are decided: clear when it is farther than the limit, rejected when nearer."""
+    decided = 0
+    for _ in range(200):
+        cell, length = _random_cell(rng, 0.005), 90.0
+        shape, first = cell.cones(np.eye(3)), np.zeros(1, np.int64)
+        corners = 60 * shape.centres[0] + rng.normal(0, 1, 3) + rng.normal(0, 0.3, (1, 3, 3))
+        organs = Organs(corners.reshape(1, 9), first, np.ones(1), zones(corners, 1.0), length)
+        found = organ_facts(organs, Lists.one(first), first, first - 1, shape, wide=9.0, pad=0.0)
+        decided += bool(found.rejected[0]) or not len(found.near.items)
+    assert decided > 150
 
 
 def _turned(u, rho, rng):
@@ -286,7 +329,7 @@ def test_a_file_gives_the_same_certificate(carton, tmp_path):
     read = read_certificate(tmp_path / "c.json")
     for name in ("theta", "beta"):
         np.testing.assert_array_equal(getattr(read.leaves, name), getattr(found.leaves, name))
-    for name in ("verdict", "reason", "structure"):
+    for name in ("verdict", "reason", "structure", "triangle"):
         np.testing.assert_array_equal(getattr(read, name), getattr(found, name))
     np.testing.assert_allclose(read.bound, found.bound, atol=1e-6)
     assert read.summary() == found.summary()
@@ -375,6 +418,17 @@ def test_a_large_undecided_cell_is_refused(carton):
         verify(replace(found, size=found.size / 3), prepared.case, prepared.anatomy)
 
 
+@pytest.mark.parametrize("triangle", [-1, 10**6, 0])
+def test_a_witness_that_is_none_is_refused(carton, triangle):
+    """A triangle that the structure does not have, or one that is far away."""
+    prepared, found = carton
+    row = int(np.flatnonzero(found.reason == "too_close")[0])
+    triangles = found.triangle.copy()
+    triangles[row] = triangle
+    with pytest.raises(InputError, match=f"cell {row} .* not proven rejected"):
+        verify(replace(found, triangle=triangles), prepared.case, prepared.anatomy)
+
+
 def test_other_inputs_are_refused(carton):
     """Another hash, needle, target, margin or case: the certificate was made for something else."""
     prepared, found = carton
@@ -452,6 +506,36 @@ def test_when_nothing_is_safe_the_map_proves_it(carton):
     assert found.areas["S"] == 0
     assert found.share("R") == pytest.approx(1)
     verify(found, prepared.case, anatomy)
+
+
+@pytest.mark.parametrize(
+    ("margin", "size", "says"),
+    [
+        ("80.0", "2", "proven: no direction of the cap is safe, to 2 deg; "),
+        ("29.0", "10", "proven: no direction of the cap is safe, to 10 deg, except perhaps in "),
+        ("2.0", "4", "certified to 4 deg: safe "),
+    ],
+)
+def test_the_command_line_says_what_is_proven(tmp_path, capfd, margin, size, says):
+    """A margin that nothing keeps, one that is kept in undecided cells at most, and the carton's own; all verified."""
+    case = tmp_path / "carton" / "case_m.toml"
+    shutil.copytree(folder() / "carton", case.parent)
+    text = case.read_text().replace("step_deg = 2.0", "step_deg = 12.0")
+    case.write_text(text.replace("margin_mm = 2.0", f"margin_mm = {margin}"))
+    options = ["--no-arm", "--no-pictures", "--certify", "--certify-size", size, "--out", str(tmp_path)]
+    code = main(["search", str(case), *options])
+    said = capfd.readouterr().out
+    assert says in said
+    assert "not certified: reach of the arm" in said
+    safe = certify_file_safe(tmp_path / "certificate.json")
+    assert (code == OK) == safe
+    assert main(["verify", str(tmp_path / "certificate.json"), "--case", str(case)]) == OK
+    assert says in capfd.readouterr().out
+
+
+def certify_file_safe(path):
+    """Whether a certificate holds a safe cell."""
+    return (read_certificate(path).verdict == "S").any()
 
 
 def test_a_target_inside_an_organ_to_avoid_is_rejected_at_once(carton, ball):

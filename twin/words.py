@@ -59,13 +59,19 @@ def _rehearsal(run: Run) -> list[str]:
 
 
 def certificate_lines(summary: dict[str, Any]) -> list[str]:
-    """What a certificate says of the cap."""
-    return [
-        f"certified to {summary['size_deg']:g} deg: safe {summary['safe_square_deg']:.1f} square degrees"
-        f" ({100 * summary['safe_share']:.1f} % of the cap), undecided {100 * summary['undecided_share']:.2f} %,"
-        f" {summary['queries']} exact queries",
-        f"  not certified: {', '.join(summary['not_certified'])}",
-    ]
+    """What a certificate says of the cap; where nothing is safe, that this is proven, and to what."""
+    share = summary["undecided_share"]
+    undecided = "" if share is None else f" ({100 * share:.2f} % of the cap)"
+    area = f"{summary['undecided_square_deg']:.1f} square degrees{undecided}"
+    if summary["safe_cells"] == 0:
+        left = f", except perhaps in {area} of undecided cells" if summary["undecided_cells"] else ""
+        said = f"proven: no direction of the cap is safe, to {summary['size_deg']:g} deg{left}"
+    else:
+        share = summary["safe_share"]
+        safe = "" if share is None else f" ({100 * share:.1f} % of the cap)"
+        said = f"certified to {summary['size_deg']:g} deg: safe {summary['safe_square_deg']:.1f} square degrees{safe}"
+        said += f", undecided {area}"
+    return [f"{said}; {summary['queries']} exact queries", f"  not certified: {', '.join(summary['not_certified'])}"]
 
 
 def certificate_text(report: dict[str, Any]) -> str:

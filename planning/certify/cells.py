@@ -67,33 +67,83 @@ class Cells:
 
     def radius(self) -> Floats:
         """Half-angle of the cone about the centre that encloses each cell, shape (n,), rad; π where none is known."""
-        centres = self.centres()
-        far = np.maximum(*(angle_between(centres, outward(self.theta[:, end], self.beta[:, 0])) for end in (0, 1)))
-        return np.where(np.ptp(self.beta, axis=1) <= WIDEST_BETA, far + ROUNDING_RAD, np.pi)
+        return self.cones(np.eye(3)).radius
 
     def solid_angle(self) -> Floats:
         """Area on the unit sphere, shape (n,), sr."""
         middle, half = self.theta.mean(axis=1), 0.5 * np.ptp(self.theta, axis=1)
         return np.asarray(2 * np.sin(middle) * np.sin(half) * np.ptp(self.beta, axis=1))
 
-    def splits(self, size: float = 0.0) -> NDArray[np.str_]:
+    def splits(self, radius: Floats, size: float = 0.0) -> NDArray[np.str_]:
         """How each cell is best halved, letters of `SPLITS`, shape (n,).
 
         Args:
+            radius: Of the cells, shape (n,), rad.
             size: The angular diameter that is wanted, rad: where one half is about as small, no quarters are made.
         """
-        tall = np.ptp(self.theta, axis=1)
+        tall = self.theta[:, 1] - self.theta[:, 0]
         widest = np.clip(np.pi / 2, self.theta[:, 0], self.theta[:, 1])
-        wide = np.ptp(self.beta, axis=1)
+        wide = self.beta[:, 1] - self.beta[:, 0]
         across = wide * np.sin(widest)
         best = np.where(tall > SQUARE * across, "t", np.where(across > SQUARE * tall, "b", "q"))
-        nearly = (best == "q") & (2 * self.radius() <= NEARLY * size)
+        nearly = (best == "q") & (2 * radius <= NEARLY * size)
         best = np.where(nearly, np.where(tall >= across, "t", "b"), best)
         return np.where(wide > WIDEST_BETA / 2, "b", best)
 
     def take(self, rows: NDArray[np.int64] | Bools) -> Cells:
         """Some of the cells."""
         return Cells(self.theta[rows], self.beta[rows])
+
+    def cones(self, R_ct_entry: Floats) -> Cones:
+        """The cells as seen in the CT frame."""
+        n = len(self)
+        cones = Cones(np.empty((n, 3)), np.empty(n), np.empty((n, 4, 3)), np.empty(n))
+        R = np.ascontiguousarray(R_ct_entry)
+        _cones(self.theta, self.beta, R, cones.centres, cones.radius, cones.corners, cones.bulge)
+        return cones
+
+
+@dataclass(frozen=True, eq=False)
+class Cones:
+    """What encloses n cells, in the CT frame.
+
+    Attributes:
+        centres: Shape (n, 3), unit, the middle of each cell.
+        radius: Shape (n,), half-angle of the cone about it that encloses the cell, rad; π where none is known.
+        corners: Shape (n, 4, 3), unit.
+        bulge: Shape (n,), every direction of the cell is a sum of its corners, with weights that are not negative and
+            add up to at least 1, and of a vector no longer than this.
+    """
+
+    centres: Floats
+    radius: Floats
+    corners: Floats
+    bulge: Floats
+
+
+@nb.njit(cache=True)
+def _cones(theta, beta, R, centres, radius, corners, bulge):  # type: ignore[no-untyped-def]  # numba infers
+    for i in range(len(theta)):
+        low, high, first, last = theta[i, 0], theta[i, 1], beta[i, 0], beta[i, 1]
+        up = (np.sin(low), np.sin(high), np.sin(low + 0.5 * (high - low)))
+        along = (np.cos(low), np.cos(high), np.cos(low + 0.5 * (high - low)))
+        x = (np.cos(first), np.cos(last), np.cos(first + 0.5 * (last - first)))
+        y = (np.sin(first), np.sin(last), np.sin(first + 0.5 * (last - first)))
+        for axis in range(3):
+            centres[i, axis] = up[2] * (R[axis, 0] * x[2] + R[axis, 1] * y[2]) + along[2] * R[axis, 2]
+        chord = 0.0
+        for end in range(4):
+            t, b = end // 2, end % 2
+            square = 0.0
+            for axis in range(3):
+                value = up[t] * (R[axis, 0] * x[b] + R[axis, 1] * y[b]) + along[t] * R[axis, 2]
+                corners[i, end, axis] = value
+                square += (value - centres[i, axis]) ** 2
+            chord = max(chord, square)
+        wide = last - first
+        radius[i] = 2 * np.arcsin(min(1.0, 0.5 * np.sqrt(chord))) + ROUNDING_RAD if wide <= WIDEST_BETA else np.pi
+        from_pole = 1.0 if low < np.pi / 2 < high else max(up[0], up[1])
+        bulge[i] = 2 * from_pole * np.sin(wide / 4) ** 2 + ROUNDING_RAD
 
 
 @dataclass(frozen=True, eq=False)

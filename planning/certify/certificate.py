@@ -21,7 +21,7 @@ from planning.reasons import Reason
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-CERTIFICATE_VERSION = 1
+CERTIFICATE_VERSION = 2
 """Version of the file's layout."""
 
 MAX_CERTIFICATE_BYTES = 500_000_000
@@ -59,12 +59,12 @@ class Certificate:
         leaves: The leaves, in the order in which the tree names them.
         verdict: Shape (n,), letter of each leaf.
         reason: Shape (n,), for a rejected leaf the `Reason` that holds all over it, else "".
-        structure: Shape (n,), the structure of the witness, or "".
-        bound: Shape (n,), the witness: for a safe leaf the least slack over any margin (mm); for ``too_close`` the
-            largest clearance (mm), for ``too_long`` the least path length (mm), for ``skin_angle`` the least angle
-            (deg), for ``unknown_region`` the largest depth (mm); NaN where no number was needed.
-        depth: Shape (n,), for ``too_close`` how deep on the centre's axis the structure is met, mm; NaN otherwise.
-        queries: Directions for which distances were measured.
+        structure: Shape (n,), for ``too_close`` the structure that every axis comes too near to, else "".
+        triangle: Shape (n,), which of its triangles, or -1: no axis of the leaf keeps its limit from this one.
+        bound: Shape (n,), for ``too_close`` the largest clearance (mm), for ``too_long`` the least path length (mm),
+            for ``skin_angle`` the least angle (deg), for ``unknown_region`` the largest depth (mm); NaN where no number
+            was needed.
+        queries: Cells for which distances from structures were measured.
     """
 
     question: Question
@@ -74,8 +74,8 @@ class Certificate:
     verdict: NDArray[np.str_]
     reason: NDArray[np.str_]
     structure: NDArray[np.str_]
+    triangle: Ints
     bound: Floats
-    depth: Floats
     queries: int
 
     @cached_property
@@ -195,12 +195,11 @@ def write_certificate(certificate: Certificate, path: Path) -> None:
 
 
 def _witnesses(certificate: Certificate) -> list[list[Any]]:
-    """Reason, structure, bound and depth of each leaf."""
-    numbers = np.stack([certificate.bound, certificate.depth], axis=1).tolist()
-    texts = zip(certificate.reason.tolist(), certificate.structure.tolist(), strict=True)
+    """Reason, structure, triangle and bound of each leaf."""
+    columns = certificate.reason, certificate.structure, certificate.triangle, certificate.bound
     return [
-        [*text, *(round(x, 6) if np.isfinite(x) else None for x in row)]
-        for text, row in zip(texts, numbers, strict=True)
+        [reason, structure, triangle, round(bound, 6) if np.isfinite(bound) else None]
+        for reason, structure, triangle, bound in zip(*(column.tolist() for column in columns), strict=True)
     ]
 
 
@@ -259,7 +258,7 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
     rows = document["witness"]
     if len(rows) != len(leaves):
         raise InputError(f"{len(rows)} witnesses for {len(leaves)} cells", where=path, allowed="one for each")
-    reasons, structures, bounds, depths = zip(*rows, strict=True)
+    reasons, structures, triangles, bounds = zip(*rows, strict=True)
     return Certificate(
         question=question,
         size=_number(document["size_rad"]),
@@ -268,8 +267,8 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
         verdict=np.array([letter for level in tree for letter in level if letter in "SRU"], dtype="U1"),
         reason=np.array([Reason(reason).value for reason in reasons], dtype="U32"),
         structure=np.array([str(name) for name in structures], dtype="U80"),
+        triangle=np.array([int(triangle) for triangle in triangles], dtype=np.int64),
         bound=_numbers_or_nan(bounds),
-        depth=_numbers_or_nan(depths),
         queries=int(document["queries"]),
     )
 

@@ -3,41 +3,45 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from planning.anatomy import Anatomy
 from planning.case import Case
-from planning.certify.bounds import (
-    ANGLE_PAD_RAD,
-    CLEARANCE_PAD_MM,
-    DEPTH_PAD_MM,
-    view_bounds,
-)
-from planning.certify.cells import OFF_CENTRE, Cells, split
+from planning.certify.bounds import ANGLE_PAD_RAD, CLEARANCE_PAD_MM, DEPTH_PAD_MM, view_bounds
+from planning.certify.cells import OFF_CENTRE, Cells, Cones, split
 from planning.certify.certificate import REJECTED, SAFE, UNDECIDED, Certificate
-from planning.certify.cones import Lists, Zones, narrowed, zones
-from planning.certify.near_organs import organ_bounds
+from planning.certify.cones import Lists, narrowed, zones
+from planning.certify.near_organs import Organs, organ_facts
 from planning.certify.question import Question, question_of
 from planning.certify.skin_cones import LENGTH_PAD_MM, skin_bounds
 from planning.certify.skin_surface import SkinSurface, skin_surface
 from planning.clearance.containment import Side, side_of
 from planning.errors import InputError
+from planning.mesh import TriangleMesh
 from planning.reasons import Reason
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-TOO_WIDE = np.radians(25)
-"""Cells with a larger radius are halved unasked: no cone so wide is ever all safe."""
+TOO_WIDE = np.radians(80)
+"""Cells with a larger radius are halved unasked."""
+
+SKIN_BELOW = np.radians(25)
+"""The skin is judged for cells with a smaller radius: no wider cone is ever all good."""
 
 ASK_BELOW = np.radians(4)
-"""Distances are measured for cells with a smaller radius: wider ones are settled by the skin or not at all."""
+"""Organs are judged for cells with a smaller radius: wider ones are settled by the skin or not at all."""
 
 SMALLEST_SIZE = np.radians(0.01)
 """A finer map would need millions of cells, and the padding against rounding would begin to count."""
+
+REASONS = tuple(Reason)
+"""A reason as a number, while cells are judged."""
 
 
 def certify(
@@ -68,16 +72,16 @@ def certify(
     record = _Record()
     cells, state = question.cap(), judge.start()
     while len(cells):
-        radius = cells.radius()
-        verdicts = judge.level(cells, radius, state)
-        letters = np.where(verdicts.letter != UNDECIDED, verdicts.letter, cells.splits(size))
-        letters = np.where((verdicts.letter == UNDECIDED) & (2 * radius <= size), UNDECIDED, letters)
+        cones = cells.cones(question.R_ct_entry)
+        verdicts = judge.level(cells, cones, state)
+        letters = np.where(verdicts.letter != UNDECIDED, verdicts.letter, cells.splits(cones.radius, size))
+        letters = np.where((verdicts.letter == UNDECIDED) & (2 * cones.radius <= size), UNDECIDED, letters)
         record.add(cells, letters, verdicts)
         inner = np.flatnonzero(np.char.islower(letters))
         children = split(cells.take(inner), letters[inner])
         state = verdicts.state.of(inner[children.parent])
         cells = children.cells
-    return record.certificate(question, size, judge.queries)
+    return record.certificate(question, size, judge)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +92,7 @@ class _State:
         parent: Shape (n,), row of each cell's lists.
         skin: Triangles of the skin that may matter.
         organs: Triangles of the organs that may matter.
+        witness: Shape (n,), the organs' triangle that nearly rejected the whole, or -1.
         skin_good: Shape (n,), the skin's constraints hold.
         view_good: Shape (n,), the field of view is kept.
     """
@@ -95,12 +100,14 @@ class _State:
     parent: Ints
     skin: Lists
     organs: Lists
+    witness: Ints
     skin_good: Bools
     view_good: Bools
 
     def of(self, rows: Ints) -> _State:
         """For parts of the cells ``rows``."""
-        return _State(self.parent[rows], self.skin, self.organs, self.skin_good[rows], self.view_good[rows])
+        good = self.skin_good[rows], self.view_good[rows]
+        return _State(self.parent[rows], self.skin, self.organs, self.witness[rows], *good)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,23 +115,21 @@ class _Verdicts:
     """The verdicts on the n cells of a level, with their witnesses, and what their parts inherit."""
 
     letter: NDArray[np.str_]
-    reason: NDArray[np.str_]
-    structure: NDArray[np.str_]
+    reason: Ints
+    triangle: Ints
     bound: Floats
-    depth: Floats
     state: _State
 
     @classmethod
     def none(cls, state: _State) -> _Verdicts:
         n = len(state.parent)
-        texts = np.full(n, UNDECIDED, "U1"), np.full(n, "", "U32"), np.full(n, "", "U80")
-        return cls(*texts, np.full(n, np.nan), np.full(n, np.nan), state)
+        return cls(np.full(n, UNDECIDED), np.zeros(n, np.int64), np.full(n, -1), np.full(n, np.nan), state)
 
-    def reject(self, where: Bools, reason: Reason, structure: NDArray[np.str_] | str, bound: Floats) -> None:
+    def reject(self, where: Bools, reason: Reason, bound: Floats | float = np.nan) -> None:
         """Reject those cells of ``where`` that have no verdict yet."""
         rows = np.flatnonzero(where & (self.letter == UNDECIDED))
-        self.letter[rows], self.reason[rows], self.bound[rows] = REJECTED, reason.value, bound[rows]
-        self.structure[rows] = structure if isinstance(structure, str) else structure[rows]
+        self.letter[rows], self.reason[rows] = REJECTED, REASONS.index(reason)
+        self.bound[rows] = np.broadcast_to(bound, len(where))[rows]
 
 
 class _Judge:
@@ -133,73 +138,80 @@ class _Judge:
     def __init__(self, question: Question, anatomy: Anatomy) -> None:
         self.queries = 0
         self._question = question
-        self._anatomy = anatomy
-        self._limits = question.margins + question.radius
+        self._view = anatomy.skin.field_of_view
         self._skin: SkinSurface = skin_surface(anatomy.skin, question.target_ct)
         demanding = [s for s in anatomy.structures if s.demands_margin]
-        self._group = np.repeat(np.arange(len(demanding)), [len(s.mesh.faces) for s in demanding])
-        triangles = [s.mesh.triangles for s in demanding] or [np.empty((0, 3, 3))]
-        self._organs = np.concatenate(triangles) - question.target_ct
-        self._zones: Zones = zones(self._organs, self._limits[self._group])
-        self._inside = np.array([side_of(s.mesh, question.target_ct) is Side.INSIDE for s in demanding], bool)
+        self._organs = _organs([s.mesh for s in demanding], question)
+        self._inside = [_is_inside(s.mesh, question.target_ct) for s in demanding]
 
     def start(self) -> _State:
         """What the whole cap knows: nothing, but which triangles a needle can come to at all."""
-        limit = self._limits.max(initial=0.0) + self._question.length
-        organs = np.flatnonzero(self._zones.nearest <= limit)
+        limit = self._organs.limits.max(initial=0.0) + self._question.length
+        organs = np.flatnonzero(self._organs.zones.nearest <= limit)
         skin = np.flatnonzero(self._skin.zones.nearest <= self._question.length + LENGTH_PAD_MM)
-        no = np.zeros(1, bool)
-        return _State(np.zeros(1, np.int64), Lists.one(skin), Lists.one(organs), no, no)
+        first, no = np.zeros(1, np.int64), np.zeros(1, bool)
+        return _State(first, Lists.one(skin), Lists.one(organs), first - 1, no, no)
 
-    def level(self, cells: Cells, radius: Floats, state: _State) -> _Verdicts:
+    def level(self, cells: Cells, cones: Cones, state: _State) -> _Verdicts:
         """Judge the cells of one level."""
-        if self._inside.any() or not self._skin.odd:
+        if any(self._inside) or not self._skin.odd:
             return self._all_rejected(state)
-        if radius.max() > TOO_WIDE:
+        if cones.radius.max() > TOO_WIDE:
             return _Verdicts.none(state)
-        centres = cells.centres() @ self._question.R_ct_entry.T
-        verdicts = _Verdicts.none(self._narrowed_skin(centres, radius, state))
-        self._judge_view(verdicts, centres, radius)
-        self._judge_skin(verdicts, cells, centres, radius)
-        return self._judge_organs(verdicts, centres, radius)
+        skin = narrowed(self._skin.zones, state.skin, state.parent, cones.centres, cones.radius)
+        organs = organ_facts(
+            self._organs, state.organs, state.parent, state.witness, cones, wide=ASK_BELOW, pad=CLEARANCE_PAD_MM
+        )
+        self.queries += organs.measured
+        rows, good = np.arange(len(cells)), (state.skin_good.copy(), state.view_good.copy())
+        verdicts = _Verdicts.none(_State(rows, skin, organs.near, organs.witness, *good))
+        verdicts.reject(organs.rejected, Reason.TOO_CLOSE, organs.largest - self._question.radius)
+        verdicts.triangle[organs.rejected] = organs.witness[organs.rejected]
+        if cones.radius.max() <= SKIN_BELOW:
+            self._judge_view(verdicts, cones)
+            self._judge_skin(verdicts, cells, cones)
+        clear = organs.near.start[1:] == organs.near.start[:-1]
+        good_skin = verdicts.state.skin_good & verdicts.state.view_good
+        verdicts.letter[clear & good_skin & (verdicts.letter == UNDECIDED)] = SAFE
+        return verdicts
+
+    def names(self, triangle: Ints) -> tuple[NDArray[np.str_], Ints]:
+        """The structure of each triangle, and which of its triangles it is; "" and -1 for -1."""
+        group = self._organs.group
+        column = np.concatenate([group, [len(self._question.structures)]])[triangle]
+        face = np.where(triangle < 0, -1, triangle - np.searchsorted(group, column))
+        return np.array([*self._question.structures, ""], dtype="U80")[column], face
 
     def _all_rejected(self, state: _State) -> _Verdicts:
         """The target lies in a structure to avoid, or no ray leaves the skin as it must."""
         verdicts = _Verdicts.none(state)
-        everywhere, nothing = np.ones(len(state.parent), bool), np.full(len(state.parent), np.nan)
-        if self._inside.any():
-            column = int(np.argmax(self._inside))
-            name = self._question.structures[column]
-            verdicts.reject(everywhere, Reason.TOO_CLOSE, name, nothing - self._question.radius)
-        verdicts.reject(everywhere, Reason.UNKNOWN_REGION, "skin", nothing)
+        everywhere = np.ones(len(state.parent), bool)
+        if any(self._inside):
+            verdicts.reject(everywhere, Reason.TOO_CLOSE, -self._question.radius)
+            verdicts.triangle[:] = np.searchsorted(self._organs.group, self._inside.index(True))
+        verdicts.reject(everywhere, Reason.UNKNOWN_REGION)
         return verdicts
 
-    def _narrowed_skin(self, centres: Floats, radius: Floats, state: _State) -> _State:
-        rows = np.arange(len(centres))
-        group = np.zeros(len(self._skin.corners), np.int64)
-        skin = narrowed(self._skin.zones, group, 1, state.skin, state.parent, centres, radius).lists
-        organs = narrowed(
-            self._zones, self._group, max(1, len(self._limits)), state.organs, state.parent, centres, radius
-        )
-        self._reach = np.minimum(organs.reach, self._question.length)
-        return _State(rows, skin, organs.lists, state.skin_good.copy(), state.view_good.copy())
+    def _judge_view(self, verdicts: _Verdicts, cones: Cones) -> None:
+        if self._view is None:
+            verdicts.state.view_good[:] = True
+            return
+        question, n = self._question, len(cones.radius)
+        rows = np.flatnonzero((verdicts.letter == UNDECIDED) & ~verdicts.state.view_good)
+        view = view_bounds(self._view, question.target_ct, cones.centres[rows], cones.radius[rows], question.length)
+        verdicts.state.view_good[rows] = view.kept
+        verdicts.reject(_spread(view.left, rows, n), Reason.UNKNOWN_REGION, _spread(view.depth, rows, n))
 
-    def _judge_view(self, verdicts: _Verdicts, centres: Floats, radius: Floats) -> None:
-        question = self._question
-        view = view_bounds(self._anatomy.skin.field_of_view, question.target_ct, centres, radius, question.length)
-        verdicts.state.view_good[view.kept] = True
-        verdicts.reject(view.left, Reason.UNKNOWN_REGION, "skin", view.depth)
-
-    def _judge_skin(self, verdicts: _Verdicts, cells: Cells, centres: Floats, radius: Floats) -> None:
+    def _judge_skin(self, verdicts: _Verdicts, cells: Cells, cones: Cones) -> None:
         question, state = self._question, verdicts.state
         rows = np.flatnonzero((verdicts.letter == UNDECIDED) & ~state.skin_good)
         if not len(rows):
             return
         found = skin_bounds(
             self._skin,
-            _some(state.skin, rows),
-            centres[rows],
-            radius[rows],
+            state.skin.take(rows),
+            cones.centres[rows],
+            cones.radius[rows],
             cells.take(rows).at(*OFF_CENTRE) @ question.R_ct_entry.T,
             length=question.length,
             longest=question.longest,
@@ -214,45 +226,36 @@ class _Judge:
         none_near = found.least_skin > question.longest + DEPTH_PAD_MM
         steep = ~none_near & (found.least_angle > question.max_skin_angle + ANGLE_PAD_RAD)
         nearest = np.where(np.isfinite(found.least_skin), found.least_skin, np.nan)
-        nothing = np.full(n, np.nan)
-        verdicts.reject(_where(none_near & found.cut, rows, n), Reason.UNKNOWN_REGION, "skin", nothing)
-        verdicts.reject(_where(none_near, rows, n), Reason.TOO_LONG, "skin", _spread(nearest, rows, n))
-        verdicts.reject(_where(found.count > 1, rows, n), Reason.REENTERS_SKIN, "skin", nothing)
-        angle = _spread(np.degrees(found.least_angle), rows, n)
-        verdicts.reject(_where(steep, rows, n), Reason.SKIN_ANGLE, "skin", angle)
+        verdicts.reject(_spread(none_near & found.cut, rows, n), Reason.UNKNOWN_REGION)
+        verdicts.reject(_spread(none_near, rows, n), Reason.TOO_LONG, _spread(nearest, rows, n))
+        verdicts.reject(_spread(found.count > 1, rows, n), Reason.REENTERS_SKIN)
+        angle = np.degrees(found.least_angle)
+        verdicts.reject(_spread(steep, rows, n), Reason.SKIN_ANGLE, _spread(angle, rows, n))
 
-    def _judge_organs(self, verdicts: _Verdicts, centres: Floats, radius: Floats) -> _Verdicts:
-        question, state = self._question, verdicts.state
-        good = state.skin_good & state.view_good & (verdicts.letter == UNDECIDED)
-        clear = (self._reach <= 0).all(axis=1)
-        verdicts.letter[good & clear] = SAFE
-        rows = np.flatnonzero((verdicts.letter == UNDECIDED) & ~clear & (radius <= ASK_BELOW))
-        if not len(rows):
-            return verdicts
-        self.queries += len(rows)
-        found = organ_bounds(
-            self._organs.reshape(-1, 9),
-            self._group,
-            self._limits,
-            state.organs,
-            rows,
-            self._reach,
-            centres,
-            radius,
-            length=question.length,
-            pad=CLEARANCE_PAD_MM,
-        )
-        names = np.array(question.structures, dtype="U80")
-        safe = good[rows] & (found.slack >= CLEARANCE_PAD_MM)
-        verdicts.letter[rows[safe]] = SAFE
-        verdicts.structure[rows[safe]] = names[found.tightest[safe]]
-        verdicts.bound[rows[safe]] = found.slack[safe]
-        structure = np.full(len(centres), "", "U80")
-        structure[rows] = names[found.hit]
-        clearance = _spread(found.largest - question.radius, rows, len(centres))
-        verdicts.reject(_where(found.hit >= 0, rows, len(centres)), Reason.TOO_CLOSE, structure, clearance)
-        verdicts.depth[rows] = found.depth
-        return verdicts
+
+def _organs(meshes: list[TriangleMesh], question: Question) -> Organs:
+    """The triangles of all structures that demand a margin, in one array."""
+    group = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
+    corners = np.concatenate([mesh.triangles for mesh in meshes] or [np.empty((0, 3, 3))]) - question.target_ct
+    limits = question.margins + question.radius
+    return Organs(
+        corners.reshape(-1, 9), group, limits, zones(corners, limits[group] + CLEARANCE_PAD_MM), question.length
+    )
+
+
+def _is_inside(mesh: TriangleMesh, point: Floats) -> bool:
+    """Whether a point lies in a closed surface; outside its box it cannot."""
+    return bool(_in_box(mesh.vertices, point)) and side_of(mesh, point) is Side.INSIDE
+
+
+@nb.njit(cache=True)
+def _in_box(vertices, point):  # type: ignore[no-untyped-def]  # numba infers
+    below, above = np.zeros(3, np.bool_), np.zeros(3, np.bool_)
+    for i in range(len(vertices)):
+        for axis in range(3):
+            below[axis] |= vertices[i, axis] <= point[axis]
+            above[axis] |= vertices[i, axis] >= point[axis]
+    return below.all() and above.all()
 
 
 @dataclass(eq=False)
@@ -260,41 +263,28 @@ class _Record:
     """Collects levels into a certificate."""
 
     tree: list[str] = field(default_factory=list)
-    leaves: list[tuple[Floats, ...]] = field(default_factory=list)
-    witnesses: list[tuple[NDArray[np.str_], ...]] = field(default_factory=list)
+    leaves: list[tuple[NDArray[np.generic], ...]] = field(default_factory=list)
 
     def add(self, cells: Cells, letters: NDArray[np.str_], verdicts: _Verdicts) -> None:
         """Record one level."""
-        self.tree.append("".join(letters))
+        self.tree.append("".join(letters.tolist()))
         leaf = np.char.isupper(letters)
-        self.leaves.append((cells.theta[leaf], cells.beta[leaf], verdicts.bound[leaf], verdicts.depth[leaf]))
-        self.witnesses.append((letters[leaf], verdicts.reason[leaf], verdicts.structure[leaf]))
+        columns = cells.theta, cells.beta, letters, verdicts.reason, verdicts.triangle, verdicts.bound
+        self.leaves.append(tuple(column[leaf] for column in columns))
 
-    def certificate(self, question: Question, size: float, queries: int) -> Certificate:
+    def certificate(self, question: Question, size: float, judge: _Judge) -> Certificate:
         """All levels together."""
-        theta, beta, bound, depth = (np.concatenate(column) for column in zip(*self.leaves, strict=True))
-        verdict, reason, structure = (np.concatenate(column) for column in zip(*self.witnesses, strict=True))
-        tree = tuple(self.tree)
-        return Certificate(question, size, tree, Cells(theta, beta), verdict, reason, structure, bound, depth, queries)
+        theta, beta, verdict, code, triangle, bound = (
+            np.concatenate(column) for column in zip(*self.leaves, strict=True)
+        )
+        reason = np.array([reason.value for reason in REASONS], dtype="U32")[code]
+        structure, face = judge.names(triangle)
+        leaves, tree = Cells(theta, beta), tuple(self.tree)
+        return Certificate(question, size, tree, leaves, verdict, reason, structure, face, bound, judge.queries)
 
 
-def _some(lists: Lists, rows: Ints) -> Lists:
-    """The lists of some cells."""
-    sizes = (lists.start[1:] - lists.start[:-1])[rows]
-    start = np.concatenate([[0], np.cumsum(sizes)])
-    where = np.arange(start[-1]) - np.repeat(start[:-1] - lists.start[rows], sizes)
-    return Lists(start, lists.items[where])
-
-
-def _where(values: Bools, rows: Ints, count: int) -> Bools:
-    """Answers for some rows among ``count``; False elsewhere."""
-    spread = np.zeros(count, np.bool_)
-    spread[rows] = values
-    return spread
-
-
-def _spread(values: Floats, rows: Ints, count: int) -> Floats:
-    """Numbers of some rows among ``count``; NaN elsewhere."""
-    spread = np.full(count, np.nan)
+def _spread(values: NDArray[np.generic], rows: Ints, count: int) -> NDArray[Any]:
+    """Values of some rows among ``count``; False or NaN elsewhere."""
+    spread = np.full(count, False if values.dtype == bool else np.nan)
     spread[rows] = values
     return spread

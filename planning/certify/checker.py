@@ -1,6 +1,7 @@
 """Does a certificate hold? Plain numpy and FCL, cell by cell; nothing of what made the certificate is used.
 
-What a cell claims is proven from the surfaces, the distance at the cell's centre and the bounds of docs/certificate.md.
+What a cell claims is proven from the surfaces by the lemmas of docs/certificate.md. A triangle that is proven clear of
+a cell is clear of its parts too, and what holds of the skin all over a cell holds all over its parts.
 """
 
 from __future__ import annotations
@@ -15,26 +16,30 @@ from numpy.typing import NDArray
 from planning.anatomy import Anatomy
 from planning.case import Case
 from planning.certify.certificate import Certificate
-from planning.certify.plain_skin import PlainSkin, SkinFacts
+from planning.certify.plain_skin import PlainSkin, SkinFacts, leaves_view
 from planning.certify.question import question_of
 from planning.clearance.containment import Side, side_of
 from planning.errors import InputError
-from planning.skin import FieldOfView
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 Progress = Callable[[int, int], None]
 
 CLEARANCE_PAD_MM = 1e-4
 """Within this of a margin the search leaves the verdict to FCL's capsule; the certifier keeps twice as much."""
 DEPTH_PAD_MM = 5e-5
 """Kept from limits on depths; the certifier keeps twice as much."""
-ZONE_PAD_RAD = 5e-7
-"""Widens the directions to which a triangle matters; the certifier widens twice as much."""
-STATED_TO_MM = 1e-5
-"""To which the file states depths, and more."""
+ANGLE_PAD_RAD = 5e-8
+"""Kept from the largest skin angle; the certifier keeps twice as much."""
+MET_MM = 0.01
+"""A triangle of the skin that keeps so far from an axis is not met, also where the search turns a ray a little."""
 WIDEST = np.radians(80)
 """Nothing is proven over a wider cone."""
+NEAR_BELOW = np.radians(4)
+"""Planes by the feet on the edges, which tell something of near triangles, are tried for smaller cones."""
+SKIN_BELOW = np.radians(25)
+"""The skin is looked at for cones of at most this half-angle: over a wider one nothing holds."""
 
 
 @dataclass(frozen=True)
@@ -46,18 +51,44 @@ class Verification:
     undecided: int
 
 
-@dataclass(frozen=True, eq=False)
-class _Node:
-    """A cell of the tree: its ranges, its cone, and the triangles that may matter to it."""
+class _Cell:
+    """A cell of the tree: its ranges of θ and β, and its shape.
 
-    theta: tuple[float, float]
-    beta: tuple[float, float]
-    u: Floats
-    rho: float
-    ray: Floats
+    It lies in the cone of half-angle ``rho`` about ``u``; its directions are sums, with weights that are not negative
+    and add up to at least 1, of its ``corners`` (4, 3), and of a vector no longer than ``bulge``.
+    """
+
+    def __init__(self, theta: tuple[float, float], beta: tuple[float, float], R_ct_entry: Floats) -> None:
+        self.theta, self.beta, self._R = theta, beta, R_ct_entry
+        self.u = self.ray(0.5, 0.5)
+        self.corners = np.array([self.ray(i, j) for i in (0, 1) for j in (0, 1)])
+        chord, wide = float(np.linalg.norm(self.corners - self.u, axis=1).max()), beta[1] - beta[0]
+        self.rho = 2 * np.arcsin(min(1.0, chord / 2)) + 1e-12 if wide <= np.pi else np.pi
+        self.bulge = np.sin(np.clip(np.pi / 2, *theta)) * (1 - np.cos(wide / 2)) + 1e-12
+
+    def ray(self, i: float, j: float) -> Floats:
+        """The direction at a part of the way from the lowest to the highest θ and β."""
+        t, b = self.theta[0] + i * (self.theta[1] - self.theta[0]), self.beta[0] + j * (self.beta[1] - self.beta[0])
+        return np.asarray(self._R @ np.array([np.sin(t) * np.cos(b), np.sin(t) * np.sin(b), np.cos(t)]))
+
+    def parts(self, letter: str) -> list[_Cell]:
+        """Its halves or quarters, low θ first, then low β."""
+        (t0, t1), (b0, b1) = self.theta, self.beta
+        t, b = 0.5 * (t0 + t1), 0.5 * (b0 + b1)
+        thetas = [(t0, t), (t, t1)] if letter in "tq" else [(t0, t1)]
+        betas = [(b0, b), (b, b1)] if letter in "bq" else [(b0, b1)]
+        return [_Cell(theta, beta, self._R) for theta in thetas for beta in betas]
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What is proven all over a cell: which triangles may be near, the skin, whether needles leave the image."""
+
     skin: Ints
     organs: Ints
-    parent: _Node | None
+    facts: SkinFacts | None = None
+    skin_good: bool = False
+    leaves: bool | None = None
 
 
 def verify(certificate: Certificate, case: Case, anatomy: Anatomy, progress: Progress | None = None) -> Verification:
@@ -81,13 +112,10 @@ def _check_question(certificate: Certificate, case: Case, anatomy: Anatomy) -> N
     if not (np.all(np.isfinite(stated.theta)) and 0 <= stated.theta[0] <= stated.theta[1] <= np.pi + 1e-12):
         raise InputError(f"theta {stated.theta} is no range", where="certificate", allowed="0 to pi")
     asked = question_of(case, anatomy, theta=stated.theta, beta=stated.beta)
-    for name in ("case_name", "inputs", "length", "radius", "longest", "max_skin_angle", "structures"):
-        if getattr(stated, name) != getattr(asked, name):
+    for name in vars(asked):
+        if not np.array_equal(getattr(stated, name), getattr(asked, name)):
             what = f"its {name} is not that of the case: the certificate was made for something else"
             raise InputError(what, where="certificate", allowed=f"a certificate of {case.path}, unchanged since")
-    for name in ("target_ct", "R_ct_entry", "margins"):
-        if not np.array_equal(getattr(stated, name), getattr(asked, name)):
-            raise InputError(f"its {name} is not that of the case", where="certificate", allowed=f"as in {case.path}")
 
 
 class _Checker:
@@ -95,205 +123,157 @@ class _Checker:
         self._certificate = certificate
         self._question = certificate.question
         self._view = anatomy.skin.field_of_view
-        self._structures = [s for s in anatomy.structures if s.demands_margin]
-        self._limits = self._question.margins + self._question.radius
         self._skin = PlainSkin(anatomy.skin, case.target_ct)
-        self._skin_zone = _zone(self._skin.corners, np.zeros(len(self._skin.corners)))
-        self._group = np.repeat(np.arange(len(self._structures)), [len(s.mesh.faces) for s in self._structures])
-        organs = [s.mesh.triangles for s in self._structures] or [np.empty((0, 3, 3))]
-        self._organs = np.concatenate(organs) - case.target_ct
-        self._organ_zone = _zone(self._organs, self._limits[self._group])
-        self._farthest = np.linalg.norm(self._organs, axis=2).max(axis=1)
-        self._trees = [fcl.CollisionObject(_bvh(s.mesh.vertices, s.mesh.faces)) for s in self._structures]
-        self._inside = [side_of(s.mesh, case.target_ct) is Side.INSIDE for s in self._structures]
         self._even = self._skin.closed and not self._skin.odd()
+        meshes = [s.mesh for s in anatomy.structures if s.demands_margin]
+        self._organs = np.concatenate([m.triangles for m in meshes] or [np.empty((0, 3, 3))]) - case.target_ct
+        self._first = np.cumsum([0, *(len(mesh.faces) for mesh in meshes)])
+        self._limits = self._question.margins + self._question.radius
+        self._limit = np.repeat(self._limits, np.diff(self._first))
+        self._inside = [side_of(mesh, case.target_ct) is Side.INSIDE for mesh in meshes]
 
     def run(self, progress: Progress | None) -> Verification:
         """Walk the tree, level by level; the leaves come in the certificate's order."""
-        whole = np.arange(len(self._skin.corners)), np.arange(len(self._organs))
-        nodes = [self._node(self._question.theta, self._question.beta, *whole, None)]
+        question = self._question
+        nothing = _Known(np.arange(len(self._skin.corners)), np.arange(len(self._organs)))
+        cells = [(_Cell(question.theta, question.beta, question.R_ct_entry), nothing)]
         leaf, total = 0, len(self._certificate.leaves)
         for level in self._certificate.tree:
-            below: list[_Node] = []
-            for node, letter in zip(nodes, level, strict=True):
+            below: list[tuple[_Cell, _Known]] = []
+            for (cell, whole), letter in zip(cells, level, strict=True):
                 if letter.islower():
-                    for theta, beta in _parts(node, letter):
-                        below.append(self._node(theta, beta, node.skin, node.organs, node))
+                    known = self._learn(cell, whole)
+                    below += [(part, known) for part in cell.parts(letter)]
                     continue
-                self._check_leaf(node, letter, leaf)
+                self._check_leaf(cell, whole, letter, leaf)
                 leaf += 1
                 if progress is not None:
                     progress(leaf, total)
-            nodes = below
-        counts = [int((self._certificate.verdict == letter).sum()) for letter in "SRU"]
-        return Verification(*counts)
+            cells = below
+        return Verification(*(int((self._certificate.verdict == letter).sum()) for letter in "SRU"))
 
-    def _node(
-        self,
-        theta: tuple[float, float],
-        beta: tuple[float, float],
-        skin: Ints,
-        organs: Ints,
-        parent: _Node | None,
-    ) -> _Node:
-        u, ray = self._ray(theta, beta, 0.5, 0.5), self._ray(theta, beta, 0.4142, 0.5432)
-        corners = [self._ray(theta, beta, i, j) for i in (0, 1) for j in (0, 1)]
-        rho = max(2 * np.arcsin(min(1.0, float(np.linalg.norm(u - corner)) / 2)) for corner in corners) + 1e-12
-        if beta[1] - beta[0] > np.pi or rho > WIDEST:
-            return _Node(theta, beta, u, np.pi, ray, skin, organs, parent)
-        skin = skin[_matters(self._skin_zone[skin], u, rho)]
-        return _Node(theta, beta, u, rho, ray, skin, organs[_matters(self._organ_zone[organs], u, rho)], parent)
+    def _learn(self, cell: _Cell, whole: _Known) -> _Known:
+        """What is known of a cell beyond what is known of the whole that it is part of."""
+        question = self._question
+        if cell.rho > WIDEST:
+            return whole
+        skin, organs, facts, good, leaves = whole.skin, whole.organs, None, whole.skin_good, whole.leaves
+        organs = organs[~_apart(self._organs[organs], self._limit[organs] + CLEARANCE_PAD_MM, cell, question.length)]
+        if not good:
+            skin = skin[~_apart(self._skin.corners[skin], np.full(len(skin), MET_MM), cell, question.length)]
+            if cell.rho <= SKIN_BELOW:
+                lengths = {"length": question.length, "longest": question.longest}
+                facts = self._skin.facts(skin, cell.u, cell.rho, cell.ray(0.4142, 0.5432), **lengths)
+                good = self._skin_good(facts)
+        if leaves is None:
+            leaves = leaves_view(self._view, question.target_ct, cell.u, cell.rho, question.length, DEPTH_PAD_MM)
+        return _Known(skin, organs, facts, good, leaves)
 
-    def _ray(self, theta: tuple[float, float], beta: tuple[float, float], i: float, j: float) -> Floats:
-        t, b = theta[0] + i * (theta[1] - theta[0]), beta[0] + j * (beta[1] - beta[0])
-        entry = np.array([np.sin(t) * np.cos(b), np.sin(t) * np.sin(b), np.cos(t)])
-        return np.asarray(self._question.R_ct_entry @ entry)
-
-    def _check_leaf(self, node: _Node, letter: str, row: int) -> None:
+    def _check_leaf(self, cell: _Cell, whole: _Known, letter: str, row: int) -> None:
         reason, structure = str(self._certificate.reason[row]), str(self._certificate.structure[row])
         if letter == "U":
-            holds = 2 * node.rho <= self._certificate.size + 1e-9
+            holds = 2 * cell.rho <= self._certificate.size + 1e-9
         elif letter == "S":
-            holds = not reason and self._safe(node)
+            holds = not reason and self._safe(self._learn(cell, whole))
         elif reason == "too_close":
-            holds = self._too_close(node, structure, float(self._certificate.depth[row]))
+            holds = self._too_close(cell, structure, int(self._certificate.triangle[row]))
         else:
-            holds = self._skin_rejects(node, reason)
+            holds = self._skin_rejects(self._learn(cell, whole), reason)
         if not holds:
-            theta, beta = (f"{np.degrees(low):.4f}..{np.degrees(high):.4f}" for low, high in (node.theta, node.beta))
+            theta, beta = (f"{np.degrees(low):.4f}..{np.degrees(high):.4f}" for low, high in (cell.theta, cell.beta))
             claim = {"S": "safe", "R": f"rejected ({reason})", "U": "small"}[letter]
             what = f"cell {row} (theta {theta}, beta {beta} degrees) is not proven {claim}"
             raise InputError(what, where="certificate", allowed="claims that follow from the case")
 
-    def _safe(self, node: _Node) -> bool:
+    def _safe(self, known: _Known) -> bool:
         """No structure comes near, and the skin is met once, soon enough and steeply enough, in what was imaged."""
-        question = self._question
-        if any(self._inside) or self._even or node.rho > WIDEST:
-            return False
-        groups = self._group[node.organs]
-        for column in np.unique(groups):
-            rows = node.organs[groups == column]
-            reach = min(question.length, self._farthest[rows].max())
-            enough = self._limits[column] + CLEARANCE_PAD_MM + 2 * reach * np.sin(node.rho / 2)
-            if self._distance(self._trees[column], node, question.length) < enough:
-                corners = self._organs[rows] + question.target_ct
-                tree = _bvh(corners.reshape(-1, 3), np.arange(3 * len(rows)).reshape(-1, 3))
-                if self._distance(fcl.CollisionObject(tree), node, question.length) < enough:
-                    return False
-        return self._anywhere(node, self._skin_good) and self._anywhere(node, lambda n: self._view_holds(n, kept=True))
+        lost = any(self._inside) or self._even
+        return not lost and len(known.organs) == 0 and known.skin_good and known.leaves is False
 
-    def _skin_good(self, node: _Node) -> bool:
-        facts, question = self._facts(node), self._question
-        return (
-            facts.count == 1
-            and not facts.cut
-            and facts.farthest <= question.longest - DEPTH_PAD_MM
-            and facts.largest_angle <= question.max_skin_angle - 5e-8
-        )
-
-    def _skin_rejects(self, node: _Node, reason: str) -> bool:
-        if reason == "unknown_region" and self._even:
-            return True
-        if node.rho > WIDEST:
-            return False
-        facts, question = self._facts(node), self._question
-        none_near = facts.least_skin > question.longest + DEPTH_PAD_MM
-        if reason == "unknown_region":
-            return none_near or self._view_holds(node, kept=False)
-        if reason == "too_long":
-            return none_near
-        if reason == "reenters_skin":
-            return facts.count > 1
-        return reason == "skin_angle" and facts.least_angle > question.max_skin_angle + 5e-8
-
-    def _too_close(self, node: _Node, structure: str, depth: float) -> bool:
-        """An axis point no deeper than ``depth`` is near the structure and stays so, however the axis turns."""
+    def _too_close(self, cell: _Cell, structure: str, triangle: int) -> bool:
+        """The axes at all corners come so near to one triangle that all between them do too (lemma 2)."""
         if structure not in self._question.structures:
             return False
         column = self._question.structures.index(structure)
         if self._inside[column]:
             return True
-        if not 0 <= depth <= self._question.length:
+        row = self._first[column] + triangle
+        if not self._first[column] <= row < self._first[column + 1] or cell.rho > WIDEST:
             return False
-        depth = min(depth + STATED_TO_MM, self._question.length)
-        moved = 2 * depth * np.sin(min(node.rho, np.pi) / 2)
-        return self._distance(self._trees[column], node, depth) + moved < self._limits[column] - CLEARANCE_PAD_MM
+        surface = _bvh(self._organs[row], np.array([[0, 1, 2]]))
+        ends = cell.corners * self._question.length
+        axes = [_bvh(np.stack([np.zeros(3), end]), np.array([[0, 1, 1]])) for end in ends]
+        worst = max(max(0.0, fcl.distance(axis, surface)) for axis in axes)
+        more = 3 * self._question.length * cell.bulge
+        return bool(worst + more < self._limits[column] - CLEARANCE_PAD_MM)
 
-    def _distance(self, surface: fcl.CollisionObject, node: _Node, length: float) -> float:
-        """FCL's distance of the centre's axis, so long, from a surface: its triangle distance, exact, 0 on contact."""
-        tip = self._question.target_ct
-        axis = fcl.CollisionObject(_bvh(np.stack([tip, tip + length * node.u]), np.array([[0, 1, 1]])))
-        return max(0.0, float(fcl.distance(axis, surface, fcl.DistanceRequest(), fcl.DistanceResult())))
+    def _skin_good(self, facts: SkinFacts) -> bool:
+        return (
+            facts.count == 1
+            and not facts.cut
+            and facts.farthest <= self._question.longest - DEPTH_PAD_MM
+            and facts.largest_angle <= self._question.max_skin_angle - ANGLE_PAD_RAD
+        )
 
-    def _facts(self, node: _Node) -> SkinFacts:
-        question = self._question
-        return self._skin.facts(node.skin, node.u, node.rho, node.ray, length=question.length, longest=question.longest)
-
-    def _view_holds(self, node: _Node, *, kept: bool) -> bool:
-        return _keeps(self._view, self._question.target_ct, node, self._question.length) is kept
-
-    @staticmethod
-    def _anywhere(node: _Node, holds: Callable[[_Node], bool]) -> bool:
-        """Whether something holds for a cell, or for a cell that it is part of."""
-        at: _Node | None = node
-        while at is not None and at.rho <= WIDEST:
-            if holds(at):
-                return True
-            at = at.parent
-        return False
-
-
-def _keeps(view: FieldOfView | None, target_ct: Floats, node: _Node, length: float) -> bool | None:
-    """Whether all needles stay off the faces that cut the body (True), or all leave through one (False)."""
-    if view is None:
-        return True
-    start, along = view.to_box(target_ct[None])[0], view.T_ct_box[:3, :3].T @ node.u
-    soonest, latest, cut = [], [], []
-    for axis in range(3):
-        for end, toward, height in ((0, -along[axis], start[axis]), (1, along[axis], view.size_mm[axis] - start[axis])):
-            angle = np.arccos(np.clip(toward, -1, 1))
-            best, worst = np.cos(max(angle - node.rho, 0)), np.cos(min(angle + node.rho, np.pi))
-            soonest.append(max(height, 0.0) / best if best > 0 else np.inf)
-            latest.append(max(height, 0.0) / worst if worst > 0 else np.inf)
-            cut.append(bool(view.cut[axis, end]))
-    first_cut = min((late for late, is_cut in zip(latest, cut, strict=True) if is_cut), default=np.inf)
-    first_other = min((soon for soon, is_cut in zip(soonest, cut, strict=True) if not is_cut), default=np.inf)
-    if first_cut < length - DEPTH_PAD_MM and first_other > first_cut + DEPTH_PAD_MM:
-        return False
-    limit = min(length, *latest) + DEPTH_PAD_MM
-    return True if all(soon > limit for soon, is_cut in zip(soonest, cut, strict=True) if is_cut) else None
+    def _skin_rejects(self, known: _Known, reason: str) -> bool:
+        """No skin soon enough (whatever else is there), a second crossing, too flat an entry, or out of the image."""
+        if reason == "unknown_region" and (self._even or known.leaves is True):
+            return True
+        facts = known.facts
+        if facts is None:
+            return False
+        if reason in ("too_long", "unknown_region"):
+            return facts.least_skin > self._question.longest + DEPTH_PAD_MM
+        if reason == "reenters_skin":
+            return facts.count > 1
+        return reason == "skin_angle" and facts.least_angle > self._question.max_skin_angle + ANGLE_PAD_RAD
 
 
-def _parts(node: _Node, letter: str) -> list[tuple[tuple[float, float], tuple[float, float]]]:
-    (t0, t1), (b0, b1) = node.theta, node.beta
-    t, b = 0.5 * (t0 + t1), 0.5 * (b0 + b1)
-    thetas = [(t0, t), (t, t1)] if letter in "tq" else [(t0, t1)]
-    betas = [(b0, b), (b, b1)] if letter in "bq" else [(b0, b1)]
-    return [(theta, beta) for theta in thetas for beta in betas]
+def _apart(corners: Floats, limit: Floats, cell: _Cell, length: float) -> Bools:
+    """Which triangles a plane proves to keep their limit from every axis of a cell (lemmas 3 and 4), shape (k,).
+
+    However a plane was found, it is proof. Tried are planes across the cell's middle, across the triangle's, and
+    those through the target that look from the middle axis to the triangle's middle or to the feet on its edges.
+
+    Args:
+        corners: Shape (k, 3, 3), triangles, mm from the target.
+        limit: Shape (k,), mm.
+        cell: With a cone below a right angle.
+        length: Needle, mm.
+    """
+    depth = corners @ cell.u
+    found = (depth.min(axis=1) >= limit + length) | (depth.max(axis=1) <= -limit)  # beyond the top, behind the target
+    middle = _unit(_unit(corners.reshape(-1, 3)).reshape(corners.shape).sum(axis=1))
+    behind = np.flatnonzero(~found & (middle @ cell.u <= -np.sin(cell.rho)))
+    found[behind] = np.einsum("kci,ki->kc", corners[behind], middle[behind]).min(axis=1) >= limit[behind]
+    found |= _separated(corners, depth, limit, middle - (middle @ cell.u)[:, None] * cell.u, cell)
+    rest = np.flatnonzero(~found) if cell.rho <= NEAR_BELOW else np.empty(0, np.int64)
+    beside = corners[rest] - depth[rest, :, None] * cell.u
+    edge = beside[:, [1, 2, 0]] - beside
+    part = -(beside * edge).sum(axis=2) / np.maximum((edge * edge).sum(axis=2), 1e-300)
+    feet = beside + np.clip(part, 0, 1)[:, :, None] * edge
+    for side in range(3):
+        found[rest] |= _separated(corners[rest], depth[rest], limit[rest], feet[:, side], cell)
+    return np.asarray(found)
 
 
-def _zone(corners: Floats, limits: Floats) -> Floats:
-    """Cone of directions (axis, half-angle) to which each triangle matters, shape (m, 4)."""
-    lengths = np.linalg.norm(corners, axis=2)
-    centre = corners.mean(axis=1)
-    nearest = np.linalg.norm(centre, axis=1) - np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1) - 1e-9
-    units = corners / np.maximum(lengths, 1e-300)[:, :, None]
-    total = units.sum(axis=1)
-    axis = total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None]
-    least = np.einsum("nci,ni->nc", units, axis).min(axis=1)
-    narrow = (lengths.min(axis=1) > 0) & (nearest > limits) & (np.linalg.norm(total, axis=1) > 0.5) & (least > 0.1)
-    grown = np.arcsin(np.clip(limits / np.where(narrow, nearest, 1.0), 0, 1))
-    half = np.where(narrow, np.arccos(np.clip(least, -1, 1)) + grown + ZONE_PAD_RAD, np.pi)
-    return np.column_stack([axis, half])
+def _separated(corners: Floats, depth: Floats, limit: Floats, aside: Floats, cell: _Cell) -> Bools:
+    """Where m·v <= 0 for every direction v of the cell and m·p >= limit for the corners p; m is ``aside``, tilted."""
+    normal, ahead = _unit(aside), cell.corners @ cell.u
+    tilt = np.full(len(corners), np.tan(cell.rho))
+    if ahead.min() > cell.bulge:
+        tilt = np.clip(((normal @ cell.corners.T + cell.bulge) / ahead).max(axis=1), 0.0, tilt)
+    least = (np.einsum("kci,ki->kc", corners, normal) - tilt[:, None] * depth).min(axis=1)
+    return np.asarray(least >= limit * np.sqrt(1 + tilt**2))
 
 
-def _matters(zone: Floats, u: Floats, rho: float) -> NDArray[np.bool_]:
-    return np.asarray(zone[:, :3] @ u >= np.cos(np.minimum(zone[:, 3] + rho, np.pi)) - 1e-15)
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.maximum(np.sqrt((vectors * vectors).sum(axis=1, keepdims=True)), 1e-300))
 
 
-def _bvh(vertices: Floats, faces: NDArray[np.integer]) -> fcl.BVHModel:
+def _bvh(vertices: Floats, faces: NDArray[np.integer]) -> fcl.CollisionObject:
     tree = fcl.BVHModel()
     tree.beginModel(num_tris_=len(faces), num_vertices_=len(vertices))
     tree.addSubModel(vertices, faces)
     tree.endModel()
-    return tree
+    return fcl.CollisionObject(tree)

@@ -21,7 +21,7 @@ class Zones:
 
     Attributes:
         axis: Shape (m, 3), unit.
-        cosine, sine: Shape (m,), of the half-angle; (-1, 0) for all directions.
+        cosine, sine: Shape (m,), of the half-angle, below a right angle; (-1, 0) for all directions.
         farthest: Shape (m,), largest distance of the triangle from the target, mm.
         nearest: Shape (m,), a distance from the target that no point of the triangle falls short of, mm.
     """
@@ -45,6 +45,13 @@ class Lists:
         """A single list."""
         return cls(np.array([0, len(items)]), items)
 
+    def take(self, rows: Ints) -> Lists:
+        """The lists of some cells."""
+        sizes = (self.start[1:] - self.start[:-1])[rows]
+        start = np.concatenate([[0], np.cumsum(sizes)])
+        where = np.arange(start[-1]) - np.repeat(start[:-1] - self.start[rows], sizes)
+        return Lists(start, self.items[where])
+
 
 def zones(corners: Floats, limit: Floats | float) -> Zones:
     """Zones of triangles seen from the origin, grown so that a needle within ``limit`` of a triangle points into it.
@@ -53,12 +60,12 @@ def zones(corners: Floats, limit: Floats | float) -> Zones:
         corners: Shape (m, 3, 3), mm from the target.
         limit: Shape (m,) or a number; 0 for the directions that meet the triangle, mm.
     """
-    limits = np.broadcast_to(np.asarray(limit, dtype=np.float64), len(corners)).copy()
-    return Zones(*_zones(np.ascontiguousarray(corners), limits, ZONE_PAD_RAD))
+    limits = np.ascontiguousarray(np.broadcast_to(np.asarray(limit, dtype=np.float64), len(corners)))
+    return Zones(*_zones(np.ascontiguousarray(corners), limits, np.cos(ZONE_PAD_RAD), np.sin(ZONE_PAD_RAD)))
 
 
 @nb.njit(cache=True)
-def _zones(corners, limits, pad):  # type: ignore[no-untyped-def]  # numba infers
+def _zones(corners, limits, cos_pad, sin_pad):  # type: ignore[no-untyped-def]  # numba infers
     count = len(corners)
     axis, cosine, sine = np.zeros((count, 3)), np.full(count, -1.0), np.zeros(count)
     farthest, nearest = np.empty(count), np.empty(count)
@@ -83,10 +90,14 @@ def _zones(corners, limits, pad):  # type: ignore[no-untyped-def]  # numba infer
         least = min(1.0, least / norm, (cx * tx + cy * ty + cz * tz) / (lc * norm))
         if least < 0.1:
             continue
-        half = np.arccos(least) + np.arcsin(limits[i] / nearest[i]) + pad
-        if half < np.pi:
-            cosine[i], sine[i] = np.cos(half), np.sin(half)
-            axis[i, 0], axis[i, 1], axis[i, 2] = tx / norm, ty / norm, tz / norm
+        # the half-angle is arccos(least) + arcsin(limit / nearest) + pad
+        wide, more = np.sqrt(1.0 - least * least), limits[i] / nearest[i]
+        rest = np.sqrt(1.0 - more * more)
+        c, s = least * rest - wide * more, wide * rest + least * more
+        if c <= sin_pad:
+            continue
+        cosine[i], sine[i] = c * cos_pad - s * sin_pad, s * cos_pad + c * sin_pad
+        axis[i, 0], axis[i, 1], axis[i, 2] = tx / norm, ty / norm, tz / norm
     return axis, cosine, sine, farthest, nearest
 
 
@@ -95,54 +106,27 @@ def _length(x, y, z):  # type: ignore[no-untyped-def]  # numba infers
     return np.sqrt(x * x + y * y + z * z)
 
 
-@dataclass(frozen=True, eq=False)
-class Narrowed:
-    """Lists for cells, and for each cell and group how far from the target its triangles reach (0: none matters)."""
-
-    lists: Lists
-    reach: Floats
-
-
-def narrowed(
-    zone: Zones, group: Ints, groups: int, lists: Lists, parent: Ints, centres: Floats, radius: Floats
-) -> Narrowed:
+def narrowed(zone: Zones, lists: Lists, parent: Ints, centres: Floats, radius: Floats) -> Lists:
     """Keep of each parent's list what matters to its part.
 
     Args:
         zone: Of all m triangles.
-        group: Shape (m,), the structure of each, 0 to ``groups`` - 1.
-        groups: Number of structures, k.
         lists: Of the parents.
         parent: Shape (n,), row of each cell's parent.
         centres: Shape (n, 3), unit.
         radius: Shape (n,), rad, at most π/2.
 
     Returns:
-        Lists of the n cells; reach of shape (n, k), mm.
+        Lists of the n cells.
     """
-    start, items, reach = _narrowed(
-        zone.axis,
-        zone.cosine,
-        zone.sine,
-        zone.farthest,
-        group,
-        groups,
-        lists.start,
-        lists.items,
-        parent,
-        np.ascontiguousarray(centres),
-        np.cos(radius),
-        np.sin(radius),
-    )
-    return Narrowed(Lists(start, items), reach)
+    cone = np.ascontiguousarray(centres), np.cos(radius), np.sin(radius)
+    return Lists(*_narrowed(zone.axis, zone.cosine, zone.sine, lists.start, lists.items, parent, *cone))
 
 
 @nb.njit(cache=True)
-def _narrowed(  # type: ignore[no-untyped-def]  # numba infers
-    axis, cosine, sine, farthest, group, groups, start, items, parent, centres, cos_radius, sin_radius
-):
+def _narrowed(axis, cosine, sine, start, items, parent, centres, cos_radius, sin_radius):  # type: ignore[no-untyped-def]  # numba infers
     count = len(parent)
-    out_start, reach = np.zeros(count + 1, np.int64), np.zeros((count, groups))
+    out_start = np.zeros(count + 1, np.int64)
     out = np.empty(max(1024, len(items)), np.int64)
     filled = 0
     for i in range(count):
@@ -161,6 +145,5 @@ def _narrowed(  # type: ignore[no-untyped-def]  # numba infers
             ):
                 out[filled] = t
                 filled += 1
-                reach[i, group[t]] = max(reach[i, group[t]], farthest[t])
         out_start[i + 1] = filled
-    return out_start, out[:filled].copy(), reach
+    return out_start, out[:filled].copy()

@@ -1,4 +1,8 @@
-"""How near the axes at the centres of cells come to the organs, and what follows for all axes of each cell."""
+"""Which cells of directions are clear of the organs, and which come too near, by planes and by convexity.
+
+docs/certificate.md, lemmas 2 to 4. No distance is needed to prove a cell clear: a plane through the target that keeps a
+triangle at the limit from every axis of the cell is proof enough, however it was found.
+"""
 
 from __future__ import annotations
 
@@ -8,92 +12,239 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.certify.cones import Lists
+from planning.certify.cells import Cones
+from planning.certify.cones import Lists, Zones
 from planning.clearance.segment_triangle import axis_triangle
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+BULGES = 3.0
+"""Times L and the bulge: what a witness must lack so that directions outside the hull of the corners are covered."""
+
+SURELY_MIXED = np.radians(0.5)
+"""A cell with a smaller radius of which the inherited witness rejects some corners, not all, is split unmeasured:
+it is not safe, and at such a size another triangle rejects all of it in one case of a hundred."""
+
+HOPELESS = 0.6
+"""At a corner of a cell the axis is farther from a triangle beside it by about this part of the cone's radius at
+least: a triangle that is no witness by this estimate is not tried."""
 
 
 @dataclass(frozen=True, eq=False)
-class OrganBounds:
+class Organs:
+    """The m triangles of k structures that demand a margin, from the target.
+
+    Attributes:
+        corners: Shape (m, 9), mm.
+        group: Shape (m,), the structure of each, 0 to k - 1.
+        limits: Shape (k,), needle radius plus margin, mm.
+        zones: The directions to which each triangle matters.
+        length: Needle, mm.
+    """
+
+    corners: Floats
+    group: Ints
+    limits: Floats
+    zones: Zones
+    length: float
+
+
+@dataclass(frozen=True, eq=False)
+class OrganFacts:
     """What holds for every axis of n cells.
 
     Attributes:
-        slack: Shape (n,), no axis lacks more: least distance minus limit, over all structures; inf where none matters.
-        tightest: Shape (n,), the structure with that slack.
-        largest: Shape (n,), every axis comes at least so near to the structure ``hit``; inf where none is too near.
-        hit: Shape (n,), a structure that every axis comes too near to, or -1.
-        depth: Shape (n,), how deep on the centre's axis it is so near, mm; NaN without a hit.
+        near: The triangles of which a cell is not proven clear; a cell without one is clear of all.
+        witness: Shape (n,), a triangle, -1 for none. In a rejected cell every axis comes too near to it.
+        rejected: Shape (n,), every axis comes too near to a structure.
+        largest: Shape (n,), in a rejected cell every axis comes at least so near to the witness, mm.
+        measured: Cells for which a triangle was measured that their parents' witness had not settled.
     """
 
-    slack: Floats
-    tightest: Ints
+    near: Lists
+    witness: Ints
+    rejected: Bools
     largest: Floats
-    hit: Ints
-    depth: Floats
+    measured: int
 
 
-def organ_bounds(
-    corners: Floats,
-    group: Ints,
-    limits: Floats,
-    lists: Lists,
-    rows: Ints,
-    reach: Floats,
-    centres: Floats,
-    radius: Floats,
-    *,
-    length: float,
-    pad: float,
-) -> OrganBounds:
-    """Bound the distances of axes over the cones of some cells; docs/certificate.md, lemmas 1 to 3.
+def organ_facts(
+    organs: Organs, lists: Lists, parent: Ints, witness: Ints, cones: Cones, *, wide: float, pad: float
+) -> OrganFacts:
+    """Judge cells against the triangles that matter to their parents.
 
     Args:
-        corners: Shape (m, 9), triangles from the target, mm.
-        group: Shape (m,), the structure of each, 0 to k - 1.
-        limits: Shape (k,), needle radius plus margin.
-        lists: Triangles that matter to each cell.
-        rows: Shape (n,), the cells to ask for.
-        reach: Shape (all cells, k), how far the triangles that matter reach from the target.
-        centres: Shape (all cells, 3), unit.
-        radius: Shape (all cells,), rad.
-        length: Needle, tip to flange, mm.
-        pad: A cell is too near where it lacks more than this, mm.
+        organs: All triangles.
+        lists: Those that matter to each parent.
+        parent: Shape (n,), row of each cell's parent.
+        witness: Shape (n,), the triangle that nearly rejected each parent, or -1.
+        cones: The n cells.
+        wide: Cells with a larger radius are only narrowed, rad.
+        pad: Kept from every limit, mm.
     """
-    n = len(rows)
-    found = OrganBounds(
-        np.full(n, np.inf), np.zeros(n, np.int64), np.full(n, np.inf), np.full(n, -1), np.full(n, np.nan)
-    )
-    chords = 2 * np.sin(radius / 2)
-    out = (found.slack, found.tightest, found.largest, found.hit, found.depth)
-    _bound(corners, group, limits, lists.start, lists.items, rows, reach, centres, chords, length, pad, out)
-    return found
+    n = len(parent)
+    found, rejected, largest = np.full(n, -1), np.zeros(n, bool), np.full(n, np.nan)
+    zone = organs.zones.axis, organs.zones.cosine, organs.zones.sine, organs.zones.nearest
+    shape = cones.centres, cones.corners, cones.radius, cones.bulge
+    start, items, measured = _judge(
+        organs.corners, organs.group, organs.limits, zone, organs.length, lists.start, lists.items, parent, witness,
+        shape, wide, pad, (found, rejected, largest),
+    )  # fmt: skip
+    return OrganFacts(Lists(start, items), found, rejected, largest, measured)
 
 
 @nb.njit(cache=True)
-def _bound(  # type: ignore[no-untyped-def]  # numba infers
-    corners, group, limits, start, items, rows, reach, centres, chords, length, pad, out
+def _judge(  # type: ignore[no-untyped-def]  # numba infers
+    corners, group, limits, zone, length, start, items, parent, witness, shape, wide, pad, out
 ):
-    slack, tightest, largest, hit, deep = out
-    least = np.empty(len(limits))
-    for i in range(len(rows)):
-        cell = rows[i]
-        u, chord = (centres[cell, 0], centres[cell, 1], centres[cell, 2]), chords[cell]
-        least[:] = np.inf
-        for k in range(start[cell], start[cell + 1]):
+    axis, cosine, sine, nearest = zone
+    centres, ends, radius, bulge = shape
+    found, rejected, largest = out
+    out_start, kept = np.zeros(len(parent) + 1, np.int64), np.empty(max(1024, len(items)), np.int64)
+    filled, measured = 0, 0
+    for i in range(len(parent)):
+        u, four = (centres[i, 0], centres[i, 1], centres[i, 2]), ends[i]
+        cos_radius, sin_radius, ask = np.cos(radius[i]), np.sin(radius[i]), radius[i] <= wide
+        first, last = start[parent[i]], start[parent[i] + 1]
+        filled = out_start[i]
+        out_start[i + 1] = filled
+        if filled + last - first > len(kept):
+            kept = _grown(kept, filled, 2 * (filled + last - first))
+        if ask and witness[i] >= 0:
+            more, limit = BULGES * length * bulge[i], limits[group[witness[i]]] - pad
+            hit, worst = _corners(corners[witness[i]], four, length, limit - more)
+            if hit == 4:
+                rejected[i], largest[i], found[i] = True, worst + more, witness[i]
+                continue
+            if hit > 0 and radius[i] <= SURELY_MIXED:
+                ask = False
+                found[i] = witness[i]
+        best, asked = np.inf, False
+        for k in range(first, last):
             t = items[k]
-            g = group[t]
-            a = (corners[t, 0], corners[t, 1], corners[t, 2])
-            b = (corners[t, 3], corners[t, 4], corners[t, 5])
-            c = (corners[t, 6], corners[t, 7], corners[t, 8])
-            square, depth = axis_triangle(u, length, a, b, c)
-            distance = np.sqrt(square)
-            least[g] = min(least[g], distance)
-            if distance + depth * chord < limits[g] - pad:  # all over the cell, whatever else is near
-                largest[i], hit[i], deep[i] = distance + depth * chord, g, depth
-                break
-        for g in range(len(limits)):
-            lack = least[g] - min(length, reach[cell, g]) * chord - limits[g]
-            if lack < slack[i]:
-                slack[i], tightest[i] = lack, g
+            if sin_radius * cosine[t] + cos_radius * sine[t] > 0.0:
+                # otherwise their sum passes pi, and the triangle matters everywhere
+                toward = axis[t, 0] * u[0] + axis[t, 1] * u[1] + axis[t, 2] * u[2]
+                if toward < cos_radius * cosine[t] - sin_radius * sine[t]:
+                    continue
+            if ask:
+                asked = True
+                limit = limits[group[t]]
+                width, side = _beside(u, corners[t])
+                if _apart(corners[t], side, u, four, bulge[i], limit + pad, length):
+                    continue
+                if width + HOPELESS * radius[i] * nearest[t] < limit or width <= 0.0:
+                    hit, worst = _corners(corners[t], four, length, limit - pad - BULGES * length * bulge[i])
+                    if hit == 4:
+                        rejected[i], largest[i], found[i] = True, worst + BULGES * length * bulge[i], t
+                        break
+                if width - limit < best:
+                    best, found[i] = width - limit, t
+            kept[filled] = t
+            filled += 1
+        measured += asked
+        out_start[i + 1] = out_start[i] if rejected[i] else filled
+    return out_start, kept[: out_start[-1]].copy(), measured
+
+
+@nb.njit(cache=True)
+def _grown(kept, filled, size):  # type: ignore[no-untyped-def]  # numba infers
+    larger = np.empty(size, np.int64)
+    larger[:filled] = kept[:filled]
+    return larger
+
+
+@nb.njit(cache=True)
+def _corners(triangle, four, length, limit):  # type: ignore[no-untyped-def]  # numba infers
+    """How many of the axes at a cell's corners come nearer to a triangle than the limit, and their largest distance."""
+    a = (triangle[0], triangle[1], triangle[2])
+    b = (triangle[3], triangle[4], triangle[5])
+    c = (triangle[6], triangle[7], triangle[8])
+    worst, hit = 0.0, 0
+    for j in range(4):
+        square, _ = axis_triangle((four[j, 0], four[j, 1], four[j, 2]), length, a, b, c)
+        worst = max(worst, square)
+        hit += limit > 0.0 and square < limit * limit
+    return hit, np.sqrt(worst)
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _beside(u, t):  # type: ignore[no-untyped-def]  # numba infers
+    """Distance of a line through the target from a triangle, and the unit normal that keeps all of it that far.
+
+    In the plane across the line the triangle's shadow is convex, and the foot of the origin on it supports it.
+    """
+    ta, tb, tc = (
+        t[0] * u[0] + t[1] * u[1] + t[2] * u[2],
+        t[3] * u[0] + t[4] * u[1] + t[5] * u[2],
+        t[6] * u[0] + t[7] * u[1] + t[8] * u[2],
+    )
+    a = (t[0] - ta * u[0], t[1] - ta * u[1], t[2] - ta * u[2])
+    b = (t[3] - tb * u[0], t[4] - tb * u[1], t[5] - tb * u[2])
+    c = (t[6] - tc * u[0], t[7] - tc * u[1], t[8] - tc * u[2])
+    wa, wb, wc = _turn(u, b, c), _turn(u, c, a), _turn(u, a, b)
+    around = (wa >= 0.0 and wb >= 0.0 and wc >= 0.0) or (wa <= 0.0 and wb <= 0.0 and wc <= 0.0)
+    if around and wa + wb + wc != 0.0:
+        return 0.0, (0.0, 0.0, 0.0)
+    best, side = _foot(a, b)
+    for p, q in ((b, c), (c, a)):
+        square, foot = _foot(p, q)
+        if square < best:
+            best, side = square, foot
+    width = np.sqrt(best)
+    if width <= 0.0:
+        return 0.0, (0.0, 0.0, 0.0)
+    return width, (side[0] / width, side[1] / width, side[2] / width)
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _turn(u, p, q):  # type: ignore[no-untyped-def]  # numba infers
+    return (
+        u[0] * (p[1] * q[2] - p[2] * q[1])
+        + u[1] * (p[2] * q[0] - p[0] * q[2])
+        + u[2] * (p[0] * q[1] - p[1] * q[0])
+    )  # fmt: skip
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _foot(p, q):  # type: ignore[no-untyped-def]  # numba infers
+    """The point of the edge p-q that is nearest to the origin, and its squared distance."""
+    dx, dy, dz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+    down = dx * dx + dy * dy + dz * dz
+    s = -(p[0] * dx + p[1] * dy + p[2] * dz) / down if down > 0.0 else 0.0
+    s = min(max(s, 0.0), 1.0)
+    x, y, z = p[0] + s * dx, p[1] + s * dy, p[2] + s * dz
+    return x * x + y * y + z * z, (x, y, z)
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _apart(t, n, u, four, bulge, limit, length):  # type: ignore[no-untyped-def]  # numba infers
+    """Whether a plane keeps a triangle at the limit from every axis of a cell; n is where to look for it.
+
+    Through the target: m·v <= 0 for all directions v of the cell, m·p >= limit for all corners p of the triangle.
+    """
+    low = min(_along(u, t, 0), _along(u, t, 3), _along(u, t, 6))
+    high = max(_along(u, t, 0), _along(u, t, 3), _along(u, t, 6))
+    least = 1.0
+    tilt = 0.0
+    for j in range(4):
+        ahead = u[0] * four[j, 0] + u[1] * four[j, 1] + u[2] * four[j, 2]
+        aside = n[0] * four[j, 0] + n[1] * four[j, 1] + n[2] * four[j, 2]
+        least = min(least, ahead)
+        tilt = max(tilt, (aside + bulge) / ahead)
+    if least <= bulge:
+        return False
+    if low >= limit + length or -high >= limit:  # beyond the top of all, or behind the target
+        return True
+    need = limit * np.sqrt(1.0 + tilt * tilt)
+    least = np.inf
+    for corner in (0, 3, 6):
+        least = min(least, _along(n, t, corner) - tilt * _along(u, t, corner))
+    return least >= need
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _along(n, t, k):  # type: ignore[no-untyped-def]  # numba infers
+    return n[0] * t[k] + n[1] * t[k + 1] + n[2] * t[k + 2]

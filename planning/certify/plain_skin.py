@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.mesh import TriangleMesh
-from planning.skin import Skin
+from planning.skin import FieldOfView, Skin
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -180,3 +180,22 @@ def _pierced(corners: Floats, ray: Floats) -> Ints:
     found[(np.abs(weights) <= doubt).any(axis=1)] = -1
     found[left & right] = 0
     return found
+
+
+def leaves_view(
+    view: FieldOfView | None, target_ct: Floats, u: Floats, rho: float, length: float, pad: float
+) -> bool | None:
+    """Whether all needles of a cone leave the image through a face that cuts the body, none does, or unknown (None)."""
+    if view is None:
+        return False
+    R, start = view.T_ct_box[:3, :3], view.to_box(target_ct[None])[0]
+    toward = np.concatenate([-(R.T @ u), R.T @ u])  # low faces, high faces
+    height = np.maximum(np.concatenate([start, view.size_mm - start]), 0.0)
+    cut, angle = view.cut.T.ravel(), np.arccos(np.clip(toward, -1, 1))
+    best, worst = np.cos(np.maximum(angle - rho, 0)), np.cos(np.minimum(angle + rho, np.pi))
+    soonest = np.where(best > 0, height / np.where(best > 0, best, 1.0), np.inf)
+    latest = np.where(worst > 0, height / np.where(worst > 0, worst, 1.0), np.inf)
+    first_cut = latest[cut].min(initial=np.inf)
+    if first_cut < length - pad and soonest[~cut].min(initial=np.inf) > first_cut + pad:
+        return True
+    return False if (soonest[cut] > min(length, latest.min()) + pad).all() else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,50 +51,111 @@ def skin_surface(skin: Skin, target_ct: Floats) -> SkinSurface:
 
 def _corner_normals(mesh: TriangleMesh) -> Floats:
     """Area-weighted vertex normals, per corner, shape (m, 3, 3)."""
-    corners = mesh.triangles
-    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    at_vertex = np.stack(
-        [
-            sum(np.bincount(mesh.faces[:, c], weights=areas[:, axis], minlength=len(mesh.vertices)) for c in range(3))
-            for axis in range(3)
-        ],
-        axis=1,
-    )
-    lengths = np.linalg.norm(at_vertex, axis=1, keepdims=True)
-    return np.ascontiguousarray((at_vertex / np.where(lengths > 0, lengths, 1.0))[mesh.faces])
+    normals = np.zeros((len(mesh.vertices), 3))
+    _add_normals(mesh.vertices, mesh.faces, normals)
+    return normals[mesh.faces]
+
+
+@nb.njit(cache=True)
+def _add_normals(vertices, faces, normals):  # type: ignore[no-untyped-def]  # numba infers
+    for i in range(len(faces)):
+        a, b, c = vertices[faces[i, 0]], vertices[faces[i, 1]], vertices[faces[i, 2]]
+        px, py, pz, qx, qy, qz = b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - a[0], c[1] - a[1], c[2] - a[2]
+        for k in range(3):
+            normals[faces[i, k], 0] += py * qz - pz * qy
+            normals[faces[i, k], 1] += pz * qx - px * qz
+            normals[faces[i, k], 2] += px * qy - py * qx
+    for i in range(len(normals)):
+        length = np.sqrt(normals[i, 0] ** 2 + normals[i, 1] ** 2 + normals[i, 2] ** 2)
+        if length > 0.0:
+            for k in range(3):
+                normals[i, k] /= length
 
 
 def _folds(mesh: TriangleMesh, corners: Floats) -> Bools:
     """Edges (m, 3) past which the number of crossings may change."""
-    _, welded = np.unique(mesh.vertices + 0.0, axis=0, return_inverse=True)
-    faces = welded.reshape(-1)[mesh.faces].astype(np.int64)
-    ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2)
-    proper = (ends[:, :, 0] != ends[:, :, 1]).all(axis=1)
-    key = ends.min(axis=2) * (faces.max() + 1) + ends.max(axis=2)
-    key[~proper] = -1
-    side = _side(corners)[:, None] * np.where(ends[:, :, 0] < ends[:, :, 1], 1, -1)
-    _, edge, count = np.unique(key.ravel(), return_inverse=True, return_counts=True)
-    edge = edge.reshape(-1)
-    balance = np.bincount(edge, weights=side.ravel())
-    seen = np.bincount(edge, weights=np.abs(side.ravel()))
-    fold = ~((count == 2) & (balance == 0) & (seen == 2))[edge].reshape(key.shape)
-    return fold & proper[:, None]
+    faces = welded(mesh.vertices)[mesh.faces]
+    fold = np.empty(faces.shape, bool)
+    _mark_folds(faces, _side(corners), len(mesh.vertices), fold)
+    return fold
 
 
-def _side(corners: Floats) -> NDArray[np.int64]:
+def welded(vertices: Floats) -> NDArray[np.int64]:
+    """For each vertex the number of the place where it lies, shape (n,)."""
+    order = np.lexsort((vertices + 0.0).T)
+    new = (np.diff(vertices[order], axis=0) != 0).any(axis=1)
+    place = np.empty(len(vertices), np.int64)
+    place[order] = np.concatenate([[0], np.cumsum(new)])
+    return place
+
+
+@nb.njit(cache=True)
+def _mark_folds(faces, side, places, fold):  # type: ignore[no-untyped-def]  # numba infers
+    """Each edge is looked for among those that leave the lower of its two ends."""
+    start = np.zeros(places + 1, np.int64)
+    for i in range(len(faces)):
+        for k in range(3):
+            start[min(faces[i, k], faces[i, (k + 1) % 3]) + 1] += 1
+    start = np.cumsum(start)
+    filled, edge = start[:-1].copy(), np.empty(3 * len(faces), np.int64)
+    for i in range(len(faces)):
+        for k in range(3):
+            low = min(faces[i, k], faces[i, (k + 1) % 3])
+            edge[filled[low]] = 3 * i + k
+            filled[low] += 1
+    for i in range(len(faces)):
+        a, b, c = faces[i, 0], faces[i, 1], faces[i, 2]
+        proper = a != b and b != c and c != a
+        for k in range(3):
+            p, q = faces[i, k], faces[i, (k + 1) % 3]
+            low, high = min(p, q), max(p, q)
+            count, balance, seen = 0, 0, 0
+            for j in range(start[low], start[low + 1]):
+                face, corner = edge[j] // 3, edge[j] % 3
+                after = corner + 1 if corner < 2 else 0
+                r, s = faces[face, corner], faces[face, after]
+                other = faces[face, 3 - corner - after]
+                if max(r, s) == high and r != s and s != other and other != r:
+                    count += 1
+                    balance += side[face] if r < s else -side[face]
+                    seen += abs(side[face])
+            fold[i, k] = proper and not (count == 2 and balance == 0 and seen == 2)
+
+
+@nb.njit(cache=True)
+def _side(corners):  # type: ignore[no-untyped-def]  # numba infers
     """Whether a triangle's corners turn to the left (1) or right (-1) as seen from the origin; 0 edge-on; (m,)."""
-    a, b, c = np.moveaxis(corners, 1, 0)
-    determinant = np.einsum("ij,ij->i", a, np.cross(b, c))
-    scale = np.prod(np.linalg.norm(corners, axis=2), axis=1)
-    return np.where(np.abs(determinant) > EDGE_ON * scale, np.sign(determinant), 0).astype(np.int64)
+    side = np.zeros(len(corners), np.int64)
+    for i in range(len(corners)):
+        a, b, c = corners[i, 0], corners[i, 1], corners[i, 2]
+        determinant = _triple(a, b, c)
+        scale = np.sqrt(_square(a) * _square(b) * _square(c))
+        if abs(determinant) > EDGE_ON * scale:
+            side[i] = 1 if determinant > 0.0 else -1
+    return side
 
 
-def _crosses_odd(corners: Floats) -> bool:
+@nb.njit(cache=True)
+def _crosses_odd(corners):  # type: ignore[no-untyped-def]  # numba infers
     """Parity of a ray's crossings: for a closed surface it is the same for all rays that meet no edge."""
-    ray = np.array([0.42426406871192845, 0.7071067811865476, 0.565685424949238])  # along no axis and no diagonal
-    a, b, c = np.moveaxis(corners, 1, 0)
-    weights = np.stack([np.cross(b, c) @ ray, np.cross(c, a) @ ray, np.cross(a, b) @ ray])
-    hit = (weights > 0).all(axis=0) | (weights < 0).all(axis=0)
-    total = weights.sum(axis=0)
-    depth = np.einsum("ki,ikj,j->i", weights, corners, ray)
-    return bool(np.count_nonzero(hit & (depth * total > 0)) % 2)
+    ray = (0.42426406871192845, 0.7071067811865476, 0.565685424949238)  # along no axis and no diagonal
+    odd = False
+    for i in range(len(corners)):
+        a, b, c = corners[i, 0], corners[i, 1], corners[i, 2]
+        wa, wb, wc = _triple(ray, b, c), _triple(ray, c, a), _triple(ray, a, b)
+        if (wa > 0.0 and wb > 0.0 and wc > 0.0) or (wa < 0.0 and wb < 0.0 and wc < 0.0):
+            ahead = 0.0
+            for k in range(3):
+                ahead += (wa * a[k] + wb * b[k] + wc * c[k]) * ray[k]
+            odd ^= ahead * (wa + wb + wc) > 0.0
+    return odd
+
+
+@nb.njit(cache=True)
+def _triple(u, p, q):  # type: ignore[no-untyped-def]  # numba infers
+    return u[0] * (p[1] * q[2] - p[2] * q[1]) + u[1] * (p[2] * q[0] - p[0] * q[2]) + u[2] * (p[0] * q[1] - p[1] * q[0])
+
+
+@nb.njit(cache=True)
+def _square(a):  # type: ignore[no-untyped-def]  # numba infers
+    return a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
