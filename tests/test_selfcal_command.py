@@ -1,0 +1,131 @@
+"""``selfcal`` from the command line: simulate, calibrate, puncture, write; and read recordings back."""
+
+import json
+
+import numpy as np
+import pytest
+
+from run_twin import ANSWER_IS_NO, BAD_INPUT, OK, main
+from twin.ultrasound.recording import read_recording, write_recording
+from twin.ultrasound.selfcal_case import load_selfcal_case
+from twin.ultrasound.selfcal_truth import draw_room
+from twin.ultrasound.simulate import PoseRanges, simulate_recording
+
+CASE = """
+schema = 1
+name = "small"
+seed = 3
+[poses]
+samples = 240
+count = 20
+"""
+
+
+@pytest.fixture(scope="module")
+def case_folder(tmp_path_factory):
+    """A small case."""
+    here = tmp_path_factory.mktemp("selfcal")
+    (here / "selfcal.toml").write_text(CASE)
+    return here
+
+
+@pytest.fixture(scope="module")
+def done(case_folder, tmp_path_factory):
+    """Run once: the folder of its files."""
+    out = tmp_path_factory.mktemp("out")
+    assert main(["selfcal", str(case_folder), "--seeds", "1", "--out", str(out)]) == OK
+    return out
+
+
+def test_every_file_is_written(done):
+    """The calibration, the recording, the pictures and the page."""
+    names = {"calibration.json", "recording.csv", "bmode.png", "room.png", "report.html"}
+    assert {path.name for path in done.iterdir()} == names
+    assert all(path.stat().st_size > 1000 for path in done.iterdir())
+
+
+def test_the_calibration_is_the_truth_within_what_it_claims(case_folder, done):
+    """Against the truth drawn anew from the seed: X, Y and the tip to a few of their standard deviations."""
+    found = json.loads((done / "calibration.json").read_text())
+    truth = draw_room(load_selfcal_case(case_folder), np.random.default_rng(3))
+    names, covariance = found["parameters"], np.array(found["covariance"])
+    drawn = {"t_X": truth.X[:3, 3], "t_Y": truth.Y[:3, 3], "t_Q": truth.tip_end2}
+    ours = {
+        "t_X": np.array(found["T_end1_image"])[:3, 3],
+        "t_Y": np.array(found["T_base1_base2"])[:3, 3],
+        "t_Q": np.array(found["tip_end2_mm"]),
+    }
+    case = load_selfcal_case(case_folder)
+    assert np.linalg.norm(case.T_base1_base2[:3, 3] - drawn["t_Y"]) > 1.0  # the drawing was wrong
+    for part, value in drawn.items():
+        rows = [names.index(f"{part}_{axis}_mm") for axis in "xyz"]
+        sigma = np.sqrt(np.diag(covariance)[rows])
+        # the arms' own errors do not average out as noise does: the claim holds to a factor
+        assert np.linalg.norm(ours[part] - value) < 5.0 * np.linalg.norm(sigma)
+    assert np.array(found["needle_direction_end2"]) @ truth.V > np.cos(np.radians(0.3))
+    assert found["version"] == 1
+    assert found["seed"] == 3
+    assert len(found["residuals_mm"]) == 20
+    assert found["inputs_sha256"].keys() == {"selfcal.toml"}
+    assert any("along the shaft" in line for line in found["cannot_show"])
+
+
+def test_the_page_says_what_matters(done):
+    """Puncture error, expected error, what cannot be shown, pictures inside, nothing from a network."""
+    page = (done / "report.html").read_text()
+    for words in ("tip to target, true", "expected error of the calibration", "cannot show", "along the shaft"):
+        assert words in page
+    assert page.count('<img class="wide"') == 2
+    assert "{{" not in page.split("<script>")[0]
+    assert 'src="http' not in page
+
+
+def test_a_recording_gives_the_same_calibration(done, tmp_path, capsys):
+    """The CSV that was written, read again, without any case; as one JSON object."""
+    assert main(["selfcal", "--recording", str(done), "--out", str(tmp_path), "--json"]) == OK
+    summary = json.loads(capsys.readouterr().out)
+    found = json.loads((done / "calibration.json").read_text())
+    assert summary["T_end1_image"] == pytest.approx(np.array(found["T_end1_image"]), abs=1e-6)
+    assert summary["predicted_tre_mm"] == pytest.approx(found["predicted_tre_mm"], rel=1e-4)
+    assert summary["trials"] == []
+    assert {path.name for path in tmp_path.iterdir()} == {"calibration.json", "report.html"}
+
+
+def test_poses_of_constant_insertion_are_refused(tmp_path, capsys):
+    """What a needle guide does: one line that names the motion, exit code 2, and no calibration."""
+    steep = float(np.radians(45.0))
+    ranges = PoseRanges(insertion=(steep, steep))
+    recording, _ = simulate_recording(np.random.default_rng(1), 30, ranges=ranges)
+    write_recording(recording, tmp_path / "recording.csv")
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "calibration.json").write_text("of an earlier run")
+    assert main(["selfcal", "--recording", str(tmp_path), "--out", str(out)]) == BAD_INPUT
+    said = capsys.readouterr().err.strip()
+    assert len(said.splitlines()) == 1
+    assert "insertion angle" in said
+    assert not (out / "calibration.json").exists()
+
+
+def test_too_few_poses_are_refused(done, tmp_path, capsys):
+    """Ten poses cannot hold 48 unknowns."""
+    few = read_recording(done / "recording.csv").subset(slice(0, 10))
+    write_recording(few, tmp_path / "few.csv")
+    assert main(["selfcal", "--recording", str(tmp_path / "few.csv"), "--out", str(tmp_path / "out")]) == BAD_INPUT
+    assert "16" in capsys.readouterr().err
+
+
+def test_an_unknown_key_names_the_nearest(tmp_path, capsys):
+    """Exit code 2 and one line."""
+    (tmp_path / "selfcal.toml").write_text(CASE.replace("samples", "sample"))
+    assert main(["selfcal", str(tmp_path), "--out", str(tmp_path / "out")]) == BAD_INPUT
+    said = capsys.readouterr().err
+    assert "did you mean 'samples'" in said
+    assert len(said.strip().splitlines()) == 1
+
+
+def test_no_pose_is_an_answer(tmp_path, capsys):
+    """A needle arm that cannot reach: exit code 1, and the counts by reason."""
+    (tmp_path / "selfcal.toml").write_text(CASE + "[needle_arm]\nposition_mm = [2500.0, 0.0, 0.0]\n")
+    assert main(["selfcal", str(tmp_path), "--out", str(tmp_path / "out")]) == ANSWER_IS_NO
+    assert "needle_out_of_reach" in capsys.readouterr().err

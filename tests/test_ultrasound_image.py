@@ -1,0 +1,178 @@
+"""The B-mode picture: laws of speckle, and a needle where its geometry says."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from planning.errors import InputError
+from twin.ultrasound.probe_image import Imager, Lesion, NeedleEcho, NeedlePose, needle_signal, render
+from twin.ultrasound.speckle import RAYLEIGH_SNR, PointSpread, blurred_speckle
+
+IMAGER = Imager()
+PLAIN = NeedleEcho(roughness=0.0, tip_gain=1.0, reverberations=0, steep_loss_db=0.0)
+
+
+def needle(steep_deg, tip=(25.0, 30.0, 0.0), lean_deg=0.0):
+    """A needle from the left."""
+    steep, lean = np.radians(steep_deg), np.radians(lean_deg)
+    direction = np.array([np.cos(steep) * np.cos(lean), np.sin(steep) * np.cos(lean), np.sin(lean)])
+    return NeedlePose(np.array(tip), direction)
+
+
+def speckle(rng, count):
+    """Complex speckle, shape (count, rows, columns)."""
+    ones = np.ones((IMAGER.rows, IMAGER.columns))
+    args = (IMAGER.rows, IMAGER.columns, IMAGER.pixel_mm, IMAGER.spread, ones)
+    return np.array([blurred_speckle(*args, rng) for _ in range(count)])
+
+
+@pytest.fixture(scope="module")
+def fields():
+    """Enough speckle for its statistics."""
+    return speckle(np.random.default_rng(1), 12)
+
+
+def test_envelope_is_rayleigh(fields):
+    """Mean over standard deviation is 1.91, and so is the whole distribution, at samples far enough apart."""
+    envelope = np.abs(fields)
+    assert envelope.mean() / envelope.std() == pytest.approx(RAYLEIGH_SNR, rel=0.02)
+    apart = envelope[:, ::12, ::20].ravel()
+    assert stats.kstest(apart, "rayleigh", args=(0.0, np.sqrt(0.5))).pvalue > 0.01
+
+
+def test_speckle_has_unit_power_everywhere(fields):
+    """At every depth and at the edges: the gain makes up for the blur, and nothing thins out."""
+    power = (np.abs(fields) ** 2).mean(axis=0)
+    parts = [power[rows] for rows in np.array_split(np.arange(IMAGER.rows), 5)]
+    parts += [power[:10], power[-10:], power[:, :10], power[:, -10:]]
+    assert [float(part.mean()) for part in parts] == pytest.approx([1.0] * len(parts), abs=0.12)
+
+
+@pytest.mark.parametrize("depth_mm", [10.0, 30.0, 50.0])
+def test_correlation_is_the_point_spreads(fields, depth_mm):
+    """Intensity is correlated as exp(-d^2 / 2 sigma^2), along and across the beam; both widen with depth."""
+    intensity = np.abs(fields) ** 2 - 1.0
+    rows = slice(int((depth_mm - 4) / IMAGER.pixel_mm), int((depth_mm + 4) / IMAGER.pixel_mm))
+    here = intensity[:, rows]
+    spread = IMAGER.spread
+    for axis, lag, sigma in (
+        (1, 1, float(spread.axial_sigma(np.array(depth_mm)))),
+        (2, 2, float(spread.lateral_sigma(np.array(depth_mm)))),
+    ):
+        first = np.take(here, np.arange(here.shape[axis] - lag), axis)
+        second = np.take(here, np.arange(lag, here.shape[axis]), axis)
+        measured = (first * second).mean() / np.sqrt((first**2).mean() * (second**2).mean())
+        width = lag * IMAGER.pixel_mm / np.sqrt(-2.0 * np.log(measured))
+        assert width == pytest.approx(sigma, rel=0.12)
+
+
+def test_measured_correlation_widens_with_depth(fields):
+    """Deep speckle is coarser than shallow speckle, both ways, without asking what the point spread is."""
+    intensity = np.abs(fields) ** 2 - 1.0
+
+    def correlation(part, axis):
+        first, second = (
+            np.take(part, range(part.shape[axis] - 2), axis),
+            np.take(part, range(2, part.shape[axis]), axis),
+        )
+        return (first * second).mean() / (part**2).mean()
+
+    shallow, deep = intensity[:, :80], intensity[:, -80:]
+    assert correlation(deep, 1) > correlation(shallow, 1) + 0.02
+    assert correlation(deep, 2) > correlation(shallow, 2) + 0.05
+
+
+def test_needle_signal_is_the_plain_sum():
+    """Every sample of the shaft, spread out one by one, at a few pixels."""
+    pose, rng = needle(40.0), np.random.default_rng(3)
+    signal = needle_signal(IMAGER, pose, PLAIN, rng)
+    level = 10 ** (PLAIN.contrast_db / 20) * np.sqrt(2 * np.pi)
+    level *= float(IMAGER.spread.axial_sigma(np.array(IMAGER.size_mm[1] / 2)))
+    s = np.arange(0.0005, 46.0, 0.001)  # to just below the face
+    x, y, _ = pose.tip_image[:, None] - s * pose.direction_image[:, None]
+    across, along = IMAGER.spread.lateral_sigma(y), IMAGER.spread.axial_sigma(y)
+    for row, column in ((140, 110), (150, 124), (137, 110), (100, 60)):
+        u, v = column * IMAGER.pixel_mm, row * IMAGER.pixel_mm
+        blur = np.exp(-0.5 * ((u - x) / across) ** 2 - 0.5 * ((v - y) / along) ** 2) / (2 * np.pi * across * along)
+        total = 0.001 * level * blur.sum()
+        assert abs(signal[row, column]) == pytest.approx(total, rel=3e-3, abs=1e-4)  # its steps are 0.2 mm at the tip
+
+
+def test_level_needle_has_the_stated_contrast():
+    """A needle parallel to the face at the middle depth is as bright as asked for."""
+    pose = needle(0.0, tip=(60.0, 30.0, 0.0))  # in the middle of a row
+    signal = needle_signal(IMAGER, pose, PLAIN, np.random.default_rng(0))
+    assert 20 * np.log10(np.abs(signal[:, 125]).max()) == pytest.approx(PLAIN.contrast_db, abs=0.25)
+
+
+@pytest.mark.parametrize("off_mm", [0.2, 0.6, 1.0])
+def test_off_plane_contrast_falls_as_the_slices_gaussian(off_mm):
+    """The amplitude falls as a Gaussian of the slice's width: to one half at half its full width."""
+    signals = [
+        needle_signal(IMAGER, needle(45.0, tip=(25.0, 30.0, z)), NeedleEcho(), np.random.default_rng(5))
+        for z in (0.0, off_mm)
+    ]
+    ratio = np.abs(signals[1]).max() / np.abs(signals[0]).max()
+    assert ratio == pytest.approx(0.5 ** ((off_mm / 0.6) ** 2), rel=1e-6)
+
+
+def test_leaning_needle_fades_along_its_shaft():
+    """With the tip in the plane and 3 degrees of lean, the shaft is half as bright where it is 0.6 mm off."""
+    pose = needle(45.0, lean_deg=3.0)
+    signal = np.abs(needle_signal(IMAGER, pose, PLAIN, np.random.default_rng(0)))
+    straight = np.abs(needle_signal(IMAGER, needle(45.0), PLAIN, np.random.default_rng(0)))
+    s = 0.6 / np.sin(np.radians(3.0))
+    column, row = np.round((pose.tip_image - s * pose.direction_image)[:2] / IMAGER.pixel_mm).astype(int)
+    assert signal[row, column] / straight[row, column] == pytest.approx(0.5, abs=0.05)
+
+
+def test_log_compression_is_undone():
+    """From amplitude to grey and back, to half a grey level; beyond the range it is black or white."""
+    amplitude = 10 ** (np.linspace(-24.0, 32.0, 57) / 20)
+    back = IMAGER.amplitude(IMAGER.grey(amplitude))
+    assert np.abs(20 * np.log10(back / amplitude)).max() <= 0.5 * IMAGER.range_db / 255 + 1e-9
+    assert IMAGER.grey(np.array([1e-9, 1e9])).tolist() == [0, 255]
+
+
+def test_shadow_and_lesion_darken():
+    """Below the needle half of the amplitude is left; inside a lesion a quarter."""
+    rng = np.random.default_rng(7)
+    pose = needle(20.0, tip=(30.0, 20.0, 0.0))
+    lesion = Lesion(np.array([40.0, 45.0, 0.0]), 6.0)
+    levels = np.zeros(3)
+    for _ in range(8):
+        picture = IMAGER.amplitude(render(IMAGER, pose, rng, lesion=lesion))
+        below, free, inside = picture[150:280, 30:120], picture[150:280, 160:170], picture[215:236, 190:210]
+        levels += [np.mean(part**2) for part in (below, free, inside)]
+    assert np.sqrt(levels[0] / levels[1]) == pytest.approx(0.5, abs=0.06)
+    assert np.sqrt(levels[2] / levels[1]) == pytest.approx(0.25, abs=0.06)
+
+
+def test_pictures_are_seeded():
+    """The same seed gives the same picture, another seed another."""
+    first, again, other = (render(IMAGER, needle(45.0), np.random.default_rng(seed)) for seed in (1, 1, 2))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        NeedlePose(np.array([np.nan, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])),
+        NeedlePose(np.zeros(3), np.array([1.0, 1.0, 0.0])),
+        NeedlePose(np.zeros(2), np.array([1.0, 0.0, 0.0])),
+    ],
+)
+def test_unusable_needles_are_refused(bad):
+    """Not finite, no unit direction, or no 3D point."""
+    with pytest.raises(InputError, match="a unit direction"):
+        render(IMAGER, bad, np.random.default_rng(0))
+
+
+def test_point_spread_widens():
+    """Both widths grow with depth, from the stated ones at the face."""
+    spread = PointSpread()
+    depth = np.array([0.0, 30.0, 60.0])
+    assert (np.diff(spread.axial_sigma(depth)) > 0).all()
+    assert (np.diff(spread.lateral_sigma(depth)) > 0).all()
+    assert 2.0 * np.sqrt(2.0 * np.log(2.0)) * spread.lateral_sigma(np.zeros(1)) == pytest.approx([spread.lateral_mm])
