@@ -1,183 +1,217 @@
-"""From home to the standoff pose: RRT-Connect, shortened, and checked again by FCL before anyone believes it.
+"""From home to a standoff pose: RRT-Connect to several goals, shortened, corners rounded, timed, and checked by FCL.
 
-Nothing here depends on the clock: the planner stops after a number of iterations, so the same seed gives the same
-path. OMPL keeps one random generator for the whole process and reseeds it here; two plans must not run in two threads.
+A fast checker proves whole segments (:meth:`FastChecker.segment_contact`). With FCL alone a segment is judged at
+samples, which can miss something thin; the check of the finished motion is closer, and plans anew what it refuses.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from ompl import base as ob
-from ompl import geometric as og
-from ompl import util as ou
 
+from planning.drive import follow, rounded
 from planning.errors import InputError, NoAnswerError
-from planning.robot.cell import DISTANCE_PAIRS, Contact, Distances, Nearest, StateChecker
+from planning.path_check import MAX_SWEEP_MM, dense_states, first_contact, least_clearance, path_length
+from planning.robot.cell import Contact, StateChecker
+from planning.robot.fast_checker import FastChecker, halving_order
+from planning.rrt_connect import Connected, SegmentContact, connect
+from planning.trajectory import Trajectory
+
+__all__ = [
+    "FINER",
+    "MAX_SWEEP_MM",
+    "RESOLUTION_RAD",
+    "Approach",
+    "dense_states",
+    "first_contact",
+    "least_clearance",
+    "path_length",
+    "plan_approach",
+]
 
 Array = NDArray[np.float64]
 
 RESOLUTION_RAD = 0.05
-"""Joint distance between the states that the planner itself checks: up to 50 mm at a metre, so never the last word."""
+"""Joint distance of the states at which FCL alone judges a segment: up to 50 mm at a metre, never the last word."""
 
 FINER = 10
-"""The check afterwards is this many times finer."""
+"""The check of the finished trajectory is this many times finer, and no body moves more than ``MAX_SWEEP_MM`` between
+its states."""
 
-MAX_SWEEP_MM = 2.0
-"""And so fine that no body point moves farther between two checked states."""
+MAX_SAMPLES = 2000
+"""Of the planner, in each run: what is possible takes it tens of them; all of them take it about a second."""
 
-RANGE_RAD = 0.5
-"""Longest branch of the planner's trees."""
+RUNS = 3
+"""Of the planner, while it might find a way that is much shorter; see ``SHORT_ENOUGH``."""
 
-MAX_ITERATIONS = 2000
-"""Of the planner: what is possible takes it tens of them; all of them take about 10 s."""
+SHORT_ENOUGH = 1.3
+"""No run seeks a way shorter than one that is this many times as long as the straight line to the nearest goal."""
 
 ATTEMPTS = 6
-"""Plans that the finer check may refuse; each next one plans at half the resolution."""
+"""Ways that the finer check may refuse; for FCL alone each next one is planned at half the resolution."""
 
-END_TOLERANCE_RAD = 1e-9
-"""How far the planner's ends may be from home and goal: rounding."""
+APPROACH_SPEED = 0.5
+"""Share of the joints' speed limits on the way to the patient."""
 
-CLEARANCE_STEP_MM = 1.0
-"""The least clearance is found to this: states that cannot improve on it by more are passed over."""
+CUT_SHARE = 0.5
+"""A corner is rounded from the middle of its shorter segment on: the farther, the faster."""
 
-SEEDS = 2**31 - 1
-"""OMPL takes positive seeds; 0 would mean its own choice."""
+HALVINGS = 5
+"""Of a rounding that is not free; then the arm stops at the corner."""
+
+CURVE_PIECES = 8
+"""Straight pieces that stand for a rounding when it is chosen; the finished trajectory is checked sample by sample."""
 
 
 @dataclass(frozen=True, eq=False)
 class Approach:
-    """A collision-free joint path from home to a standoff pose, with the needle outside the patient.
+    """A collision-free motion from home to a standoff pose, with the needle outside the patient.
 
     Attributes:
         waypoints: Shape (k, 6), rad, k >= 2: straight joint segments from home to the goal.
+        cuts: Shape (k - 2,), rad: how far from each waypoint between the ends its rounding begins; 0 stops there.
+        trajectory: The motion: rounded at the waypoints, within the limits of speed, acceleration and jerk.
         goal_index: Which of the goals it ends at.
         checked_q: Shape (m, 6), rad: the states that FCL found free, in order; no body moves more than
-            ``MAX_SWEEP_MM`` between two of them.
-        clearance: The least distances met on the way; the true least over the checked states are at most
-            ``CLEARANCE_STEP_MM`` less.
+            ``MAX_SWEEP_MM`` between two of them. For :func:`least_clearance`.
         seed: The seed that gave it.
-        attempts: How many plans it took.
+        attempts: How many ways were planned.
     """
 
     waypoints: Array
+    cuts: Array
+    trajectory: Trajectory
     goal_index: int
     checked_q: Array
-    clearance: Distances
     seed: int
     attempts: int
 
     def __post_init__(self) -> None:
-        self.waypoints.setflags(write=False)
-        self.checked_q.setflags(write=False)
+        for array in (self.waypoints, self.cuts, self.checked_q):
+            array.setflags(write=False)
+
+
+class _Way(NamedTuple):
+    """Straight segments from home to a goal."""
+
+    waypoints: Array
+    goal_index: int
 
     @property
-    def length_rad(self) -> float:
-        """Joint-space length, rad."""
+    def length(self) -> float:
         return path_length(self.waypoints)
 
 
-def path_length(waypoints: Array) -> float:
-    """Joint-space length of straight segments through (k, 6), rad."""
-    return float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum())
-
-
 def plan_approach(
-    checker: StateChecker, q_home: Array, q_goals: Array, *, seed: int, max_iterations: int = MAX_ITERATIONS
+    checker: StateChecker,
+    q_home: Array,
+    q_goals: Array,
+    *,
+    seed: int,
+    max_samples: int = MAX_SAMPLES,
+    speed_scale: float = APPROACH_SPEED,
 ) -> Approach:
-    """Plan from home to any of several goals.
+    """Plan from home to the goal that the shortest way found leads to.
 
     Args:
         checker: Judges contacts.
         q_home: Shape (6,), rad, within the joint limits.
         q_goals: Shape (6,) or (g, 6), rad, within the joint limits.
-        seed: Of OMPL's generator. Same seed, same path.
-        max_iterations: Of the planner, in each plan. Only a path that the finer check refuses is planned again.
+        seed: Of OMPL's generator. Same seed, same motion.
+        max_samples: Of the planner, in each of its runs.
+        speed_scale: Share of the joints' speed limits to use.
 
     Raises:
-        InputError: If home or a goal is not six finite angles within the limits.
-        NoAnswerError: If home or every goal is in collision, or no path was found.
+        InputError: If home or a goal is not six finite angles within the limits, or the scale makes no sense.
+        NoAnswerError: If home or every goal is in collision, or no way was found; says what touches what, and what was
+            in the way.
     """
     home = _within_limits(checker, q_home, "home")[0]
     goals = _within_limits(checker, q_goals, "goal")
-    _refuse_contact(checker, home, goals)
+    open_goals = _free_goals(checker, home, goals)
     refused = ""
     for attempt in range(ATTEMPTS):
-        resolution = RESOLUTION_RAD / 2**attempt
-        path = _plan(checker, home, goals, seed + attempt, max_iterations, resolution)
-        if path is None:
-            refused = f"no path within {max_iterations} iterations" + (refused and f"; before that, {refused}")
+        judge = _judge(checker, RESOLUTION_RAD / 2**attempt)
+        way = _shortest(checker, judge, home, goals[open_goals], seed + RUNS * attempt, max_samples)
+        if isinstance(way, Connected):
+            raise NoAnswerError(_why_none(way, len(goals), len(open_goals), max_samples, seed) + refused)
+        cuts = _cuts(judge, way.waypoints)
+        for rounding in (cuts, np.zeros_like(cuts)) if cuts.any() else (cuts,):
+            trajectory = follow(checker.model, way.waypoints, rounding, speed_scale=speed_scale)
+            checked = dense_states(checker, trajectory.q, RESOLUTION_RAD / FINER)
+            contact = first_contact(checker, checked)
+            if contact is None:
+                goal = int(open_goals[way.goal_index])
+                return Approach(way.waypoints, rounding, trajectory, goal, checked, seed, attempt + 1)
+        assert contact is not None
+        refused = f"; before that, on a closer look {contact.body} touched {contact.other} on the way"
+    raise NoAnswerError(f"approach not found: {ATTEMPTS} ways were refused (seed {seed}){refused}")
+
+
+def _judge(checker: StateChecker, resolution_rad: float) -> SegmentContact:
+    """Who judges segments: the fast checker's proof, or FCL at samples."""
+    if isinstance(checker, FastChecker):
+        return checker.segment_contact
+
+    def sampled(start: Array, end: Array) -> Contact | None:
+        shares = halving_order(max(1, math.ceil(float(np.linalg.norm(end - start)) / resolution_rad)))
+        states = end + shares[:, None] * (start - end)
+        return first_contact(checker, states)
+
+    return sampled
+
+
+def _shortest(
+    checker: StateChecker, judge: SegmentContact, home: Array, goals: Array, seed: int, max_samples: int
+) -> _Way | Connected:
+    """The shortest way found to any goal, or the run that found none.
+
+    No way is shorter than the straight line to its goal, so once there is a way, only goals nearer than it is long are
+    sought.
+    """
+    away = np.linalg.norm(goals - home, axis=1)
+    nearest_first = np.argsort(away, kind="stable")
+    straight = (goal for goal in nearest_first.tolist() if judge(home, goals[goal]) is None)
+    goal = next(straight, None)
+    best = None if goal is None else _Way(np.stack([home, goals[goal]]), goal)
+    for run in range(RUNS):
+        sought = nearest_first if best is None else nearest_first[away[nearest_first] * SHORT_ENOUGH < best.length]
+        if len(sought) == 0:
             break
-        waypoints, goal_index = _with_exact_ends(path, home, goals)
-        checked = dense_states(checker, waypoints, resolution / FINER)
-        contact = first_contact(checker, checked)
-        if contact is None:
-            clearance = least_clearance(checker, checked)
-            return Approach(waypoints, goal_index, checked, clearance, seed, attempt + 1)
-        refused = f"on a closer look {contact.body} touches {contact.other} on the way"
-    raise NoAnswerError(f"approach not found: {refused} (seed {seed})")
-
-
-def dense_states(checker: StateChecker, waypoints: Array, step_rad: float) -> Array:
-    """States along a path, so close that neither joint distance nor any body's motion exceeds its bound.
-
-    Args:
-        checker: Knows the bodies.
-        waypoints: Shape (k, 6), rad.
-        step_rad: Largest joint distance between two states; ``MAX_SWEEP_MM`` bounds the bodies.
-
-    Returns:
-        Shape (m, 6), rad, all waypoints among them.
-    """
-    parts = [waypoints[:1]]
-    for start, end in pairwise(waypoints):
-        count = max(1, math.ceil(float(np.linalg.norm(end - start)) / step_rad))
-        while (worst := checker.sweep_mm(_line(start, end, count)).max()) > MAX_SWEEP_MM:
-            count = math.ceil(count * float(worst) / MAX_SWEEP_MM)
-        parts.append(_line(start, end, count)[1:])
-    return np.concatenate(parts)
-
-
-def first_contact(checker: StateChecker, q_path: Array) -> Contact | None:
-    """The first contact along states (m, 6), the needle being outside the patient; None if all are free."""
-    met = checker.first_contact(q_path, needle_may_touch_patient=False)
-    return None if met is None else met.contact
-
-
-def least_clearance(checker: StateChecker, q_path: Array) -> Distances:
-    """The least of each distance over states along a path, to ``CLEARANCE_STEP_MM``.
-
-    Args:
-        checker: Judges distances.
-        q_path: Shape (m, 6), rad.
-    """
-    moved = {body: np.concatenate([[0.0], np.cumsum(sweep)]) for body, sweep in checker.body_sweeps_mm(q_path).items()}
-    return Distances(*(_least(checker, q_path, moved, pair) for pair in DISTANCE_PAIRS))
-
-
-def _least(checker: StateChecker, q_path: Array, moved: Mapping[str, Array], pair: str) -> Nearest:
-    """A body's distance changes by no more than the body moves: from room to spare, whole stretches are skipped.
-
-    ``moved`` is each body's way up to each state, shape (m,), mm.
-    """
-    starts = sorted((checker.nearest(q_path[0], pair, body), body) for body in DISTANCE_PAIRS[pair])
-    best = starts[0][0]
-    for here, body in starts:
-        at = 0
-        while np.isfinite(here.mm):
-            out_of_reach = moved[body][at] + (here.mm - best.mm) + CLEARANCE_STEP_MM
-            at = max(at + 1, int(np.searchsorted(moved[body], out_of_reach)))
-            if at >= len(q_path):
-                break
-            here = checker.nearest(q_path[at], pair, body)
-            best = min(best, here)
+        found = connect(
+            checker.model.joint_limits, judge, home, goals[sought], seed=seed + run, max_samples=max_samples
+        )
+        if found.waypoints is None:
+            return found if best is None else best
+        way = _Way(found.waypoints, int(sought[found.goal_index]))
+        best = way if best is None or way.length < best.length else best
+    assert best is not None  # the first run has returned without one
     return best
+
+
+def _cuts(judge: SegmentContact, waypoints: Array) -> Array:
+    """How far from each waypoint between the ends its rounding may begin, shape (k - 2,), rad; 0 where none is free."""
+    steps = np.diff(waypoints, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    if not lengths.all():
+        return np.zeros(len(waypoints) - 2)
+    directions, cuts = steps / lengths[:, None], np.zeros(len(waypoints) - 2)
+    share = np.linspace(0.0, 1.0, CURVE_PIECES + 1)
+    for at in range(len(cuts)):
+        cut = CUT_SHARE * float(lengths[at : at + 2].min())
+        for _ in range(HALVINGS):
+            curve = rounded(waypoints[at + 1], directions[at], directions[at + 1], cut, share)
+            if all(judge(start, end) is None for start, end in pairwise(curve)):
+                cuts[at] = cut
+                break
+            cut /= 2.0
+    return cuts
 
 
 def _within_limits(checker: StateChecker, q: Array, name: str) -> Array:
@@ -188,7 +222,8 @@ def _within_limits(checker: StateChecker, q: Array, name: str) -> Array:
     return rows
 
 
-def _refuse_contact(checker: StateChecker, home: Array, goals: Array) -> None:
+def _free_goals(checker: StateChecker, home: Array, goals: Array) -> NDArray[np.int64]:
+    """Which goals are free, home being free."""
     contact = checker.contact(home, needle_may_touch_patient=False)
     if contact is not None:
         raise NoAnswerError(f"home is in collision: {contact.body} touches {contact.other}")
@@ -196,93 +231,17 @@ def _refuse_contact(checker: StateChecker, home: Array, goals: Array) -> None:
     if all(contacts):
         named = sorted({f"{contact.body} touches {contact.other}" for contact in contacts if contact})
         raise NoAnswerError(f"every goal is in collision: {', '.join(named)}")
+    return np.array([row for row, contact in enumerate(contacts) if contact is None], dtype=np.int64)
 
 
-def _plan(
-    checker: StateChecker, home: Array, goals: Array, seed: int, max_iterations: int, resolution_rad: float
-) -> Array | None:
-    """One run of the planner and its shortcuts: waypoints (k, 6), or None."""
-    with _quiet_ompl():
-        ou.RNG.setSeed(1 + seed % SEEDS)
-        information = _space_information(checker, resolution_rad)
-        problem = ob.ProblemDefinition(information)
-        problem.addStartState(_state(information, home))
-        goal_states = ob.GoalStates(information)
-        for goal in goals:
-            if checker.contact(goal, needle_may_touch_patient=False) is None:
-                goal_states.addState(_state(information, goal))
-        problem.setGoal(goal_states)
-        planner = og.RRTConnect(information)
-        planner.setRange(RANGE_RAD)
-        planner.setProblemDefinition(problem)
-        planner.setup()
-        calls = iter(range(max_iterations))
-        planner.solve(ob.PlannerTerminationCondition(lambda: next(calls, None) is None))
-        if not problem.hasExactSolution():
-            return None
-        path = problem.getSolutionPath()
-        _shorten(information, path)
-        return np.array([[state[joint] for joint in range(6)] for state in path.getStates()])
-
-
-def _space_information(checker: StateChecker, resolution_rad: float) -> ob.SpaceInformation:
-    bounds = ob.RealVectorBounds(6)
-    for joint, (low, high) in enumerate(checker.model.joint_limits):
-        bounds.setLow(joint, float(low))
-        bounds.setHigh(joint, float(high))
-    space = ob.RealVectorStateSpace(6)
-    space.setBounds(bounds)
-
-    def free(state: ob.State) -> bool:
-        q = np.array([state[joint] for joint in range(6)])  # only 0..5: beyond them OMPL reads garbage
-        return checker.contact(q, needle_may_touch_patient=False) is None
-
-    information = ob.SpaceInformation(space)
-    information.setStateValidityChecker(free)
-    information.setStateValidityCheckingResolution(resolution_rad / space.getMaximumExtent())
-    information.setup()
-    return information
-
-
-def _shorten(information: ob.SpaceInformation, path: og.PathGeometric) -> None:
-    """Shortcuts by numbers of steps, never by time."""
-    simplifier = og.PathSimplifier(information)
-    simplifier.reduceVertices(path)
-    simplifier.partialShortcutPath(path)
-    simplifier.reduceVertices(path)
-
-
-def _state(information: ob.SpaceInformation, q: Array) -> ob.State:
-    state = information.allocState()
-    for joint in range(6):
-        state[joint] = float(q[joint])
-    return state
-
-
-def _with_exact_ends(path: Array, home: Array, goals: Array) -> tuple[Array, int]:
-    """The planner's path with home and its goal put in exactly, after a look that it is one."""
-    waypoints = np.asarray(path, dtype=np.float64)
-    off = np.abs(goals - waypoints[-1]).max(axis=1)
-    goal_index = int(np.argmin(off))
-    from_home = np.abs(waypoints[0] - home).max()
-    if len(waypoints) < 2 or max(from_home, off[goal_index]) > END_TOLERANCE_RAD:
-        raise NoAnswerError(f"the planner's path does not join home and goal: {from_home:.3g}, {off.min():.3g} rad off")
-    waypoints = np.concatenate([home[None], waypoints[1:-1], goals[goal_index][None]])
-    return waypoints, goal_index
-
-
-def _line(start: Array, end: Array, count: int) -> Array:
-    line = start + np.linspace(0.0, 1.0, count + 1)[:, None] * (end - start)
-    line[-1] = end
-    return line
-
-
-@contextmanager
-def _quiet_ompl() -> Iterator[None]:
-    """OMPL's own messages off, then as before. Reseeding makes it complain; a test holds that it works all the same."""
-    level = ou.getLogLevel()
-    ou.setLogLevel(ou.LOG_NONE)
-    try:
-        yield
-    finally:
-        ou.setLogLevel(level)
+def _why_none(found: Connected, n_goals: int, n_free: int, max_samples: int, seed: int) -> str:
+    """Why a run found no way, in words: which tree stayed small, and what was in the way."""
+    where = "the goals lie" if found.goal_states <= found.home_states else "home lies"
+    trees = f"{found.home_states} states joined home, {found.goal_states} the goals"
+    total = sum(found.blocked.values())
+    most = [f"{c.body} touches {c.other} ({n} of {total})" for c, n in Counter(found.blocked).most_common(2)]
+    busy = "" if n_free == n_goals else f"; {n_goals - n_free} of {n_goals} goals are in collision themselves"
+    return (
+        f"approach not found: {where} in a part of the space that {max_samples} samples could not reach (seed {seed}): "
+        f"{trees}; most often in the way: {', '.join(most) or 'nothing'}{busy}"
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -13,8 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
 from planning.case_file import (
+    Anatomical,
     CaseFile,
+    EntryAxes,
+    GantrySection,
     MountSection,
+    PlaceSection,
     RankingSection,
     RegistrationSection,
     RehearsalSection,
@@ -75,6 +79,23 @@ class Obstacle:
 
 
 @dataclass(frozen=True, eq=False)
+class Gantry:
+    """A wall with a round bore.
+
+    Attributes:
+        T_ct_gantry: Shape (4, 4), mm: the bore's centre; its axis is z, its top x.
+        bore_diameter_mm: Of the bore.
+        wall_mm: How far the wall reaches outward from the bore.
+        thickness_mm: Along the bore.
+    """
+
+    T_ct_gantry: Matrix
+    bore_diameter_mm: float
+    wall_mm: float
+    thickness_mm: float
+
+
+@dataclass(frozen=True, eq=False)
 class RobotSettings:
     """The arm: model name, home configuration (rad) or None for the model's own, mount or None."""
 
@@ -110,6 +131,8 @@ class Case:
     obstacles: tuple[Obstacle, ...]
     rehearsal: RehearsalSection
     inputs: MappingProxyType[str, str]
+    gantry: Gantry | None = None
+    place: PlaceSection = field(default_factory=PlaceSection)
 
     @property
     def folder(self) -> Path:
@@ -159,6 +182,8 @@ def load_case(path: Path | str) -> Case:
         ),
         rehearsal=content.rehearsal,
         inputs=MappingProxyType(_hashes(content, path)),
+        gantry=None if content.gantry is None else _gantry(content.gantry, space, path),
+        place=content.place,
     )
 
 
@@ -218,12 +243,16 @@ def _target(content: CaseFile, path: Path, space: Space) -> Matrix:
 def _robot(content: CaseFile, space: Space, path: Path) -> RobotSettings:
     robot = content.robot
     home = None if robot.home_deg is None else _read_only(np.radians(np.asarray(robot.home_deg)))
-    mount = None if robot.mount is None else _mount(robot.mount, space, path)
+    mount = None if robot.mount is None else mount_pose(robot.mount, space, path)
     return RobotSettings(ur_model(robot.model).name, home, mount)
 
 
-def _mount(mount: MountSection, space: Space, path: Path) -> Matrix:
-    """T_base_ct from the base's origin and axes, as the case states them in its own space."""
+def mount_pose(mount: MountSection, space: Space, path: Path) -> Matrix:
+    """T_base_ct, shape (4, 4), from the base's origin and axes, as a case states them in its own space.
+
+    Raises:
+        InputError: The axes are parallel or zero.
+    """
     x, z = (to_lps(np.asarray([v], dtype=float), space)[0] for v in (mount.x_axis, mount.z_axis))
     lengths = np.linalg.norm(x), np.linalg.norm(z)
     if min(lengths) == 0 or abs(x @ z) > AXES_PARALLEL * lengths[0] * lengths[1]:
@@ -235,6 +264,32 @@ def _mount(mount: MountSection, space: Space, path: Path) -> Matrix:
     T_ct_base[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
     T_ct_base[:3, 3] = to_lps(np.asarray([mount.position_mm]), space)[0]
     return _read_only(np.linalg.inv(T_ct_base))
+
+
+def _gantry(gantry: GantrySection, space: Space, path: Path) -> Gantry:
+    """The bore's pose: z along the axis, x to the top, and turned so that a positive tilt leans the top against z."""
+    T = np.eye(4)
+    T[:3, :3] = axes_frame(gantry.axis or "head", gantry.up or "anterior", space, path, "gantry: axis and up")
+    T[:3, 3] = to_lps(np.asarray([gantry.center_mm]), space)[0]
+    c, s = np.cos(np.radians(gantry.tilt_deg)), np.sin(np.radians(gantry.tilt_deg))
+    tilt = np.eye(4)
+    tilt[:3, :3] = [[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]
+    return Gantry(_read_only(T @ tilt), gantry.bore_diameter_mm, gantry.wall_mm, gantry.thickness_mm)
+
+
+Axis = Anatomical | tuple[float, float, float]
+
+
+def axes_frame(z: Axis, x: Axis, space: Space, path: Path, key: str) -> Matrix:
+    """R_ct_frame, shape (3, 3), of a frame whose z axis is given and whose x axis is what of ``x`` is square to it.
+
+    Raises:
+        InputError: The two are parallel or zero; names ``key``.
+    """
+    try:
+        return entry_frame(EntryAxes(z=z, x=x), space, where=path)
+    except InputError as error:
+        raise InputError(f"{key} are parallel or zero", where=path, allowed="two axes") from error
 
 
 def _hashes(content: CaseFile, path: Path) -> dict[str, str]:

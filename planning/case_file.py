@@ -223,6 +223,61 @@ class ObstacleSection(Section):
     size_mm: tuple[Length, Length, Length]
 
 
+class GantrySection(Section):
+    """A CT gantry: a wall with a round bore. ``axis`` and ``up`` are the bore's directions before the tilt."""
+
+    bore_diameter_mm: Annotated[Number, Field(ge=200, le=5000)]
+    center_mm: Vector
+    thickness_mm: Annotated[Number, Field(ge=10, le=5000)]
+    wall_mm: Annotated[Number, Field(ge=10, le=5000)] = 600.0
+    tilt_deg: Annotated[Number, Field(ge=-45, le=45)] = 0.0
+    axis: Anatomical | Vector | None = None
+    up: Anatomical | Vector | None = None
+
+
+Range = tuple[Coordinate, Coordinate]
+MountName = Literal["floor", "rail", "ceiling", "side"]
+
+
+class MountBounds(Section):
+    """Where a base of one kind may stand, seen from the target; what is left out follows from the arm's length."""
+
+    along_mm: Range | None = None
+    across_mm: Range | None = None
+    height_mm: Range | None = None
+
+    @model_validator(mode="after")
+    def _ranges_ascend(self) -> Self:
+        for key in ("along_mm", "across_mm", "height_mm"):
+            bounds = getattr(self, key)
+            if bounds is not None and bounds[0] > bounds[1]:
+                raise ValueError(f"{key} [{bounds[0]:g}, {bounds[1]:g}] descends; it is [lowest, highest]")
+        return self
+
+
+class PlaceSection(Section):
+    """Where ``place`` may stand the arm."""
+
+    mounts: tuple[MountName, ...] | None = None
+    step_mm: Annotated[Number, Field(ge=20, le=500)] = 150.0
+    table: Name = "table"
+    rail_gap_mm: Annotated[Number, Field(ge=0, le=1000)] = 110.0
+    up: Anatomical | Vector | None = None
+    along: Anatomical | Vector | None = None
+    floor: MountBounds = MountBounds()
+    rail: MountBounds = MountBounds()
+    ceiling: MountBounds = MountBounds()
+    side: MountBounds = MountBounds()
+
+    @model_validator(mode="after")
+    def _mounts_make_sense(self) -> Self:
+        if self.mounts is not None and (not self.mounts or len(set(self.mounts)) < len(self.mounts)):
+            raise ValueError(f"mounts {list(self.mounts)}: at least one, each once")
+        if self.rail.across_mm is not None:
+            raise ValueError("rail.across_mm: a rail lies beside the table; rail_gap_mm says how far")
+        return self
+
+
 class RehearsalSection(Section):
     """What the twin's truth is drawn from; the planner never reads it."""
 
@@ -254,6 +309,8 @@ class CaseFile(Section):
     registration: RegistrationSection | None = None
     robot: RobotSection = RobotSection()
     obstacle: tuple[ObstacleSection, ...] = ()
+    gantry: GantrySection | None = None
+    place: PlaceSection = PlaceSection()
     rehearsal: RehearsalSection = RehearsalSection()
 
     @model_validator(mode="after")
@@ -271,4 +328,15 @@ class CaseFile(Section):
         skins = [s.name for s in self.structure if s.role == "skin"]
         if len(skins) != 1:
             raise ValueError(f'one structure has role "skin"; here {skins or "none"}')
+        return self
+
+    @model_validator(mode="after")
+    def _local_has_no_head(self) -> Self:
+        if self.space != "local":
+            return self
+        gantry = self.gantry
+        if gantry is not None and not (isinstance(gantry.axis, tuple) and isinstance(gantry.up, tuple)):
+            raise ValueError('gantry: space "local" has no head and no front; give axis and up as vectors')
+        if isinstance(self.place.up, str) or isinstance(self.place.along, str):
+            raise ValueError('place: space "local" has no head and no front; give up and along as vectors')
         return self

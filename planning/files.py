@@ -21,6 +21,18 @@ OUTPUT_NAMES = (
     "rehearsal.json",
     "rehearsal.mp4",
     "batch.csv",
+    "placements.csv",
+    "place.json",
+    "placements.png",
+    "map_best_place.png",
+    "calibration.json",
+    "recording.csv",
+    "bmode.png",
+    "room.png",
+    "servo.html",
+    "convergence.png",
+    "camera_1.png",
+    "camera_2.png",
 )
 """The files that commands write into their output folder."""
 

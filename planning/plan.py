@@ -13,18 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.case import Case
+from planning.drive import MAX_JERK
 from planning.entry import needle_pose
 from planning.errors import InputError
 from planning.files import atomic
 from planning.formats.guard import guard_transform
 from planning.robot.kinematics import flange_pose
 from planning.robot.ur import ur_model
-from planning.trajectory import Trajectory
+from planning.trajectory import Peaks, Trajectory
 
 Floats = NDArray[np.float64]
 
-PLAN_VERSION = 1
-"""Version of the file's layout."""
+PLAN_VERSION = 2
+"""Version of the file's layout. 2: states the peaks of both phases beside the limits; the approach is smooth."""
 
 POSE_TOLERANCE_MM = 0.01
 """How far the tip of the stored joint angles may be from the stored pose: well above rounding, far below any error."""
@@ -38,8 +39,11 @@ STRAIGHT_TOLERANCE_MM = 0.1
 BETWEEN_RAD = 0.002
 """Joint step at which an insertion is looked at between its rows: up to 1.3 mm at the tip, bent by far less."""
 
-MAX_BETWEEN = 2000
-"""Points between two rows, at most: more than a whole turn needs."""
+MOST_STATES = 2_000_000
+"""Joints that turn through more steps than this during one insertion do something else."""
+
+SAME_PEAK = 1e-6
+"""Share by which a stated peak may differ from the samples' own: rounding."""
 
 INSERTION_MM_S = 10.0
 """Tip speed of the insertion: a needle is driven slowly, and an operator must be able to stop it."""
@@ -113,6 +117,7 @@ def write_plan(plan: Plan, path: Path) -> None:
         "roll_deg": float(np.degrees(plan.roll)),
         "standoff_mm": plan.standoff_mm,
         "needle_length_mm": plan.needle_length_mm,
+        "limits": _rates_document(_limits(plan.model)),
         "approach": _trajectory_document(plan.approach),
         "insertion": _trajectory_document(plan.insertion),
         "clearance_mm": {phase: _or_null(value) for phase, value in plan.clearance_mm.items()},
@@ -135,6 +140,7 @@ def read_plan(path: Path) -> Plan:
         what = f"key {error} is missing" if isinstance(error, KeyError) else f"does not fit: {error}"
         raise InputError(what, where=path, allowed=f"a plan.json of version {PLAN_VERSION}") from error
     check_geometry(plan, path)
+    _check_stated(document, plan, path)
     return plan
 
 
@@ -185,7 +191,7 @@ def _check_straight(plan: Plan, path: Path) -> None:
     Between two stored rows the joints turn evenly, so the motion is looked at there too.
     """
     model = ur_model(plan.model)
-    poses = flange_pose(model, _between(plan.insertion.q))
+    poses = flange_pose(model, _between(plan.insertion.q, path))
     forward = poses[:, :3, 2]
     tips = poses[:, :3, 3] + plan.needle_length_mm * forward
     R, t = plan.T_base_ct[:3, :3], plan.T_base_ct[:3, 3]
@@ -206,11 +212,15 @@ def _check_straight(plan: Plan, path: Path) -> None:
             raise InputError(f"the {what} by {amount:.3g} mm", where=path, allowed=allowed)
 
 
-def _between(q: Floats) -> Floats:
+def _between(q: Floats, path: Path) -> Floats:
     """The rows of a joint path and points between them, no more than `BETWEEN_RAD` apart in any joint."""
-    counts = np.ceil(np.abs(np.diff(q, axis=0)).max(axis=1) / BETWEEN_RAD).astype(int).clip(1, MAX_BETWEEN)
-    steps = [a + (b - a) * (np.arange(n) / n)[:, None] for a, b, n in zip(q[:-1], q[1:], counts, strict=True)]
-    return np.concatenate([*steps, q[-1:]])
+    counts = np.ceil(np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0) / BETWEEN_RAD).clip(min=1)
+    if counts.sum() > MOST_STATES:
+        raise InputError("the insertion turns its joints over and over", where=path, allowed="a straight insertion")
+    segment = np.repeat(np.arange(len(counts)), counts.astype(np.int64))
+    starts = np.cumsum(counts) - counts
+    share = (np.arange(len(segment)) - starts[segment]) / counts[segment]
+    return np.concatenate([q[segment] + share[:, None] * (q[segment + 1] - q[segment]), q[-1:]])
 
 
 def _check_speeds(plan: Plan, path: Path) -> None:
@@ -235,6 +245,32 @@ def _check_speeds(plan: Plan, path: Path) -> None:
         raise InputError(
             f"the insertion drives the tip at {speed:.3g} mm/s", where=path, allowed=f"at most {INSERTION_MM_S:g} mm/s"
         )
+
+
+def _check_stated(document: dict[str, Any], plan: Plan, path: Path) -> None:
+    """Refuse limits and peaks that are not the arm's and the samples' own: people read them."""
+    stated: tuple[tuple[str, Any, dict[str, list[float]]], ...] = (
+        ("limits", document.get("limits"), _rates_document(_limits(plan.model))),
+        ("peaks of the approach", document["approach"].get("peaks"), _rates_document(plan.approach.peaks())),
+        ("peaks of the insertion", document["insertion"].get("peaks"), _rates_document(plan.insertion.peaks())),
+    )
+    for name, said, known in stated:
+        try:
+            same = all(np.allclose(said[rate], known[rate], rtol=SAME_PEAK, atol=SAME_PEAK) for rate in known)
+        except (KeyError, TypeError, ValueError):
+            same = False
+        if not same:
+            raise InputError(f"the {name} are not those of its numbers", where=path, allowed="plan again")
+
+
+def _limits(model_name: str) -> Peaks:
+    model = ur_model(model_name)
+    return Peaks(model.max_speeds, np.full(6, model.max_acceleration), np.full(6, MAX_JERK))
+
+
+def _rates_document(rates: Peaks) -> dict[str, list[float]]:
+    units = ("speed_rad_s", "acceleration_rad_s2", "jerk_rad_s3")
+    return {unit: rate.tolist() for unit, rate in zip(units, rates, strict=True)}
 
 
 def _document(path: Path) -> dict[str, Any]:
@@ -303,7 +339,11 @@ def _trajectory(document: Any) -> Trajectory:
 
 
 def _trajectory_document(trajectory: Trajectory) -> dict[str, Any]:
-    return {"times_s": trajectory.times_s.tolist(), "q_rad": trajectory.q.tolist()}
+    return {
+        "times_s": trajectory.times_s.tolist(),
+        "q_rad": trajectory.q.tolist(),
+        "peaks": _rates_document(trajectory.peaks()),
+    }
 
 
 def _or_null(value: float) -> float | None:

@@ -9,21 +9,18 @@ import numpy as np
 
 from planning.approach import least_clearance, plan_approach
 from planning.candidates import Candidates
+from planning.drive import drive_smoothly
 from planning.errors import InputError, NoAnswerError
+from planning.goals import approach_goals
 from planning.plan import INSERTION_MM_S, Plan
 from planning.plan_check import motion_contact
 from planning.prepared import Prepared
-from planning.reach import assess_reach
 from planning.reasons import Reason
 from planning.room import home_configuration
 from planning.search import ranked, reach_request
-from planning.trajectory import drive_smoothly, stop_and_go
 
 MAX_TRIES = 20
 """Candidates to which an approach is sought; what none of the best twenty allows is a matter of the room."""
-
-APPROACH_SPEED = 0.5
-"""Share of the joints' speed limits on the way to the patient."""
 
 
 class Planned(NamedTuple):
@@ -87,8 +84,11 @@ def _plan(prepared: Prepared, candidates: Candidates, row: int, seed: int) -> Pl
     assert prepared.reach is not None and prepared.placement is not None  # the caller has refused this
     case, checker = prepared.case, prepared.reach.checker
     request = reach_request(case, candidates, row, prepared.reach.T_base_ct)
-    answer = assess_reach(checker, request)
-    approach = plan_approach(checker, home_configuration(case), answer.insertion_q[:1], seed=seed)
+    home = home_configuration(case)
+    goals = approach_goals(checker, request, home)
+    approach = plan_approach(checker, home, np.array([goal.insertion_q[0] for goal in goals]), seed=seed)
+    answer = goals[approach.goal_index]
+    approached = least_clearance(checker, approach.checked_q)
     driven = least_clearance(checker, answer.insertion_q)
     plan = Plan(
         case_name=case.name,
@@ -105,12 +105,12 @@ def _plan(prepared: Prepared, candidates: Candidates, row: int, seed: int) -> Pl
         roll=answer.roll,
         standoff_mm=request.standoff_mm,
         needle_length_mm=case.needle.length_mm,
-        approach=stop_and_go(checker.model, approach.waypoints, speed_scale=APPROACH_SPEED),
+        approach=approach.trajectory,
         insertion=drive_smoothly(
             checker.model, answer.insertion_q, answer.insertion_depth_mm, max_tip_speed_mm_s=INSERTION_MM_S
         ),
         clearance_mm={
-            "approach": min(approach.clearance.patient.mm, approach.clearance.boxes.mm),
+            "approach": min(approached.patient.mm, approached.boxes.mm),
             "insertion": min(driven.patient.mm, driven.boxes.mm),
             "needle": float(candidates.min_clearance[row]),
         },

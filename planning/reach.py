@@ -33,7 +33,15 @@ from planning.robot.insertion import (
 from planning.robot.kinematics import N_BRANCHES, inverse
 from planning.robot.ur import UrModel
 
-__all__ = ["MAX_SWEEP_MM", "ReachAnswer", "ReachRequest", "assess_reach", "assess_reach_all", "ik_exists"]
+__all__ = [
+    "MAX_SWEEP_MM",
+    "ReachAnswer",
+    "ReachRequest",
+    "assess_reach",
+    "assess_reach_all",
+    "every_reach",
+    "ik_exists",
+]
 
 Array = NDArray[np.float64]
 
@@ -138,6 +146,25 @@ def assess_reach(
     return _answers(checker, [request], n_rolls, step_mm)[0]
 
 
+def every_reach(
+    checker: StateChecker, request: ReachRequest, *, n_rolls: int = 8, step_mm: float = MAX_SWEEP_MM
+) -> list[ReachAnswer]:
+    """All rolls and branches on which :func:`assess_reach` would say yes, the best margin first; empty if none.
+
+    Args:
+        checker: Judges contacts, in the base frame.
+        request: The direction.
+        n_rolls: See :func:`assess_reach`.
+        step_mm: The same.
+
+    Raises:
+        InputError: The same.
+    """
+    surveyed = next(_surveyed(checker, [request], n_rolls, step_mm))
+    tries = ((drive, _try(checker, request, drive, surveyed.depths)) for drive in surveyed.drives())
+    return [_success(checker.model, drive, tried) for drive, tried in tries if tried.block is None]
+
+
 def assess_reach_all(
     checker: StateChecker,
     requests: Sequence[ReachRequest],
@@ -166,9 +193,25 @@ def assess_reach_all(
     return answers
 
 
-def _answers(
+class _Surveyed(NamedTuple):
+    """What kinematics alone says of one request."""
+
+    request: ReachRequest
+    line: NeedleLine
+    depths: Array
+    rolls: Array
+    stop_at: NDArray[np.int64]
+    margins: Array
+    turns: Array
+
+    def drives(self) -> Iterator[_Drive]:
+        """The motions that kinematics allows, see :func:`_drives`."""
+        return _drives(self.line, self.margins, self.turns, self.rolls)
+
+
+def _surveyed(
     checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int, step_mm: float
-) -> list[ReachAnswer]:
+) -> Iterator[_Surveyed]:
     for request in requests:
         if abs(request.needle_length_mm - checker.tool.needle_length_mm) > SAME_LENGTH_MM:
             allowed = f"the tool's {checker.tool.needle_length_mm}"
@@ -182,13 +225,19 @@ def _answers(
     distances = [_distances(request, depth) for request, depth in zip(requests, depths, strict=True)]
     lines = needle_lines(targets, outwards)
     found = survey(checker.model, lines, distances, depths, rolls)
-    answers = []
     for request, line, depth, stop_at, margins, turns in zip(requests, lines, depths, *found, strict=True):
-        if not np.isnan(margins).all():
-            drives = _drives(line, margins, turns, rolls)
-            answers.append(_first_clear(checker, request, depth, drives))
+        yield _Surveyed(request, line, depth, rolls, stop_at, margins, turns)
+
+
+def _answers(
+    checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int, step_mm: float
+) -> list[ReachAnswer]:
+    answers = []
+    for found in _surveyed(checker, requests, n_rolls, step_mm):
+        if not np.isnan(found.margins).all():
+            answers.append(_first_clear(checker, found.request, found.depths, found.drives()))
         else:
-            answers.append(_why_none(checker.model, request, line, depth, stop_at))
+            answers.append(_why_none(checker.model, found.request, found.line, found.depths, found.stop_at))
     return answers
 
 

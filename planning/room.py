@@ -6,8 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.anatomy import Anatomy
-from planning.case import Case, Obstacle
+from planning.cache import user_cache
+from planning.case import Case, Gantry, Obstacle
+from planning.errors import InputError
+from planning.mesh import TriangleMesh
 from planning.robot.fast_checker import FastChecker
+from planning.robot.gantry import gantry_boxes
 from planning.robot.tool import Box, Tool
 from planning.robot.ur import ur_model
 
@@ -26,8 +30,31 @@ def case_tool(case: Case) -> Tool:
 
 
 def case_boxes(case: Case, T_base_ct: Floats) -> tuple[Box, ...]:
-    """The obstacles, in the base frame."""
-    return tuple(_box(obstacle, T_base_ct) for obstacle in case.obstacles)
+    """The obstacles and the gantry, in the base frame; the gantry's boxes are called ``gantry_0`` ..."""
+    boxes = tuple(_box(obstacle, T_base_ct) for obstacle in case.obstacles)
+    return boxes if case.gantry is None else (*boxes, *_gantry_boxes(case.gantry, T_base_ct))
+
+
+def _gantry_boxes(gantry: Gantry, T_base_ct: Floats) -> tuple[Box, ...]:
+    return gantry_boxes(
+        T_base_ct @ gantry.T_ct_gantry,
+        bore_diameter_mm=gantry.bore_diameter_mm,
+        wall_mm=gantry.wall_mm,
+        depth_mm=gantry.thickness_mm,
+    )
+
+
+def gantry_in_patient_mm(gantry: Gantry, skin: TriangleMesh) -> float:
+    """How deep the skin's farthest corner lies in the gantry's wall, outward from the bore; 0 where none does.
+
+    Args:
+        gantry: The wall.
+        skin: CT frame.
+    """
+    T = np.linalg.inv(gantry.T_ct_gantry)
+    at = skin.vertices @ T[:3, :3].T + T[:3, 3]
+    beside = np.hypot(at[:, 0], at[:, 1])[np.abs(at[:, 2]) <= gantry.thickness_mm / 2]
+    return max(0.0, float(beside.max(initial=0.0)) - gantry.bore_diameter_mm / 2)
 
 
 def _box(obstacle: Obstacle, T_base_ct: Floats) -> Box:
@@ -38,11 +65,33 @@ def _box(obstacle: Obstacle, T_base_ct: Floats) -> Box:
     return Box(obstacle.name, T_base_box, (float(x), float(y), float(z)))
 
 
+def check_gantry(case: Case, skin: TriangleMesh) -> None:
+    """Refuse a gantry that does not go around the patient.
+
+    Args:
+        case: The case.
+        skin: CT frame.
+
+    Raises:
+        InputError: Its wall stands in him.
+    """
+    deep = 0.0 if case.gantry is None else gantry_in_patient_mm(case.gantry, skin)
+    if deep > 0.0:
+        what = f"the gantry's wall stands {deep:.0f} mm in the patient"
+        raise InputError(what, where=f"{case.path}: gantry", allowed="a bore about the body: see center_mm, tilt_deg")
+
+
 def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats) -> FastChecker:
-    """The collision checker of the case's room, with the patient where ``T_base_ct`` says."""
+    """The collision checker of the case's room, with the patient where ``T_base_ct`` says.
+
+    Raises:
+        InputError: The robot's base stands in the patient, or the gantry's wall does.
+    """
+    check_gantry(case, anatomy.skin.mesh)
     patient = anatomy.skin.mesh.transformed(T_base_ct)
     boxes = case_boxes(case, T_base_ct)
-    return FastChecker(ur_model(case.robot.model), case_tool(case), boxes, patient, padding_mm=ARM_PADDING_MM)
+    model, tool = ur_model(case.robot.model), case_tool(case)
+    return FastChecker(model, tool, boxes, patient, padding_mm=ARM_PADDING_MM, cache=user_cache())
 
 
 def home_configuration(case: Case) -> Floats:

@@ -33,6 +33,7 @@ def make_case(*, space="LPS", frame=None, name="ball"):
         needle=needle,
         T_ct_entry=view_frame(rotation, TARGET),
         obstacles=(),
+        gantry=None,
         inputs={"case.toml": "ab" * 32, "liver.ply": "cd" * 32},
         robot=SimpleNamespace(model="ur3"),
         rehearsal=SimpleNamespace(seed=7),

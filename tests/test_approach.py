@@ -10,23 +10,17 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from planning.approach import (
-    CLEARANCE_STEP_MM,
-    FINER,
-    MAX_SWEEP_MM,
-    RESOLUTION_RAD,
-    Approach,
-    dense_states,
-    least_clearance,
-    path_length,
-    plan_approach,
-)
+from planning.approach import APPROACH_SPEED, FINER, RESOLUTION_RAD, Approach, plan_approach
+from planning.drive import MAX_JERK, drive_smoothly, follow, rounded
 from planning.errors import InputError, NoAnswerError
 from planning.mesh import TriangleMesh
+from planning.path_check import CLEARANCE_STEP_MM, MAX_SWEEP_MM, dense_states, least_clearance, path_length
 from planning.robot.cell import Box, CellChecker, Tool
+from planning.robot.fast_checker import FastChecker
 from planning.robot.kinematics import flange_pose
 from planning.robot.ur import ur_model
-from planning.trajectory import Trajectory, drive_smoothly, in_sequence, stop_and_go
+from planning.time_law import LENGTH_SLACK, Rates, reachable_speed, speed_change_length, time_law
+from planning.trajectory import SAMPLE_S, Trajectory
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=200.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
@@ -59,72 +53,99 @@ def on_the_way_in_contact(checker: CellChecker) -> np.ndarray:
 
 
 def assert_sound(checker: CellChecker, path: Approach, home: np.ndarray, goals: np.ndarray) -> None:
-    """Exact ends, straight segments, and no contact at random places along them."""
-    assert np.array_equal(path.waypoints[0], home)
-    assert np.array_equal(path.waypoints[-1], np.atleast_2d(goals)[path.goal_index])
-    assert UR3.within_limits(path.waypoints).all()
+    """Exact ends, all of it within the limits, and no contact for FCL alone at random moments."""
+    q, times = path.trajectory.q, path.trajectory.times_s
+    assert np.array_equal(q[0], home) and np.array_equal(q[-1], np.atleast_2d(goals)[path.goal_index])
+    assert UR3.within_limits(q).all()
     assert checker.sweep_mm(path.checked_q).max() <= MAX_SWEEP_MM
     assert np.linalg.norm(np.diff(path.checked_q, axis=0), axis=1).max() <= RESOLUTION_RAD / FINER + 1e-12
-    assert path_length(path.checked_q) == pytest.approx(path.length_rad)
-    rng = np.random.default_rng(0)
-    for a, b in pairwise(path.waypoints):
-        for share in rng.uniform(0.0, 1.0, 60):
-            assert checker.contact(a + share * (b - a), needle_may_touch_patient=False) is None
+    assert np.abs(path.checked_q[:, None] - q[::7]).max(axis=2).min(axis=0).max() < 1e-12
+    peaks = path.trajectory.peaks()
+    assert (peaks.speed <= APPROACH_SPEED * UR3.max_speeds * (1 + 1e-6)).all()
+    assert (peaks.acceleration <= UR3.max_acceleration * (1 + 1e-6)).all() and (peaks.jerk <= MAX_JERK * 1.001).all()
+    for moment in np.random.default_rng(0).uniform(0.0, times[-1], 150):
+        state = path.trajectory.at(moment)
+        assert CellChecker.contact(checker, state, needle_may_touch_patient=False) is None
 
 
-def test_a_free_way_is_straight() -> None:
-    """With nothing between, shortening leaves home and goal alone."""
-    checker = CellChecker(UR3, TOOL, [floor()])
+KINDS = pytest.mark.parametrize("kind", [CellChecker, FastChecker])
+
+
+@KINDS
+def test_a_free_way_is_straight(kind: type[CellChecker]) -> None:
+    """With nothing between, home and goal are all there is."""
+    checker = kind(UR3, TOOL, [floor()])
     path = plan_approach(checker, LEFT, RIGHT, seed=1)
     assert len(path.waypoints) == 2 and path.attempts == 1
-    assert path.length_rad == pytest.approx(np.linalg.norm(RIGHT - LEFT))
+    assert path_length(path.waypoints) == pytest.approx(np.linalg.norm(RIGHT - LEFT))
     assert_sound(checker, path, LEFT, RIGHT)
 
 
-def test_a_wall_is_gone_around() -> None:
-    """The straight way collides; the planned one does not, and it is longer."""
-    checker = CellChecker(UR3, TOOL, [floor(), wall()])
+@KINDS
+def test_a_wall_is_gone_around(kind: type[CellChecker]) -> None:
+    """The straight way collides; the planned one does not, is longer, and does not stop at its corners."""
+    checker = kind(UR3, TOOL, [floor(), wall()])
     on_the_way_in_contact(checker)
     path = plan_approach(checker, LEFT, RIGHT, seed=1)
-    assert path.length_rad > np.linalg.norm(RIGHT - LEFT)
-    assert path.clearance.boxes.mm > 0.0 and np.isinf(path.clearance.patient.mm)
+    assert path_length(path.waypoints) > np.linalg.norm(RIGHT - LEFT)
+    assert len(path.cuts) == len(path.waypoints) - 2 and path.cuts.max() > 0.0
+    assert path.trajectory.duration_s < follow(UR3, path.waypoints, speed_scale=APPROACH_SPEED).duration_s
+    clearance = least_clearance(checker, path.checked_q)
+    assert clearance.boxes.mm > 0.0 and np.isinf(clearance.patient.mm)
     assert_sound(checker, path, LEFT, RIGHT)
 
 
-def test_a_thin_plate_that_the_planner_steps_over_is_seen_on_a_closer_look() -> None:
-    """Half a millimetre of plate hides between the planner's states; such a plan is refused and made again, finer."""
-    T = np.eye(4)
-    T[:3, 3] = (-350.0, -110.0, 100.0)
-    checker = CellChecker(UR3, TOOL, [floor(), Box("plate", T, (400.0, 0.5, 300.0))])
+def test_a_thin_plate_that_samples_step_over_is_seen_on_a_closer_look() -> None:
+    """Half a millimetre of plate hides between the states of FCL alone; such a plan is refused and made finer."""
+    checker = CellChecker(UR3, TOOL, [floor(), plate()])
     path = plan_approach(checker, LEFT, RIGHT, seed=1)
     assert path.attempts > 1
     assert all(checker.contact(q, needle_may_touch_patient=False) is None for q in path.checked_q)
 
 
-def test_padding_keeps_its_distance_all_along() -> None:
+def plate() -> Box:
+    """A wall so thin that states 50 mm apart step over it."""
+    T = np.eye(4)
+    T[:3, 3] = (-350.0, -110.0, 100.0)
+    return Box("plate", T, (400.0, 0.5, 300.0))
+
+
+def test_a_proven_segment_steps_over_nothing() -> None:
+    """The fast checker's first plan holds where FCL at samples needs several."""
+    checker = FastChecker(UR3, TOOL, [floor(), plate()])
+    path = plan_approach(checker, LEFT, RIGHT, seed=1)
+    assert path.attempts == 1
+    assert_sound(checker, path, LEFT, RIGHT)
+
+
+@KINDS
+def test_padding_keeps_its_distance_all_along(kind: type[CellChecker]) -> None:
     """With 5 mm of padding the arm as it is never comes nearer than 4 mm: half a sweep less, between checked states."""
     boxes = [floor(), wall()]
-    path = plan_approach(CellChecker(UR3, TOOL, boxes, padding_mm=5.0), LEFT, RIGHT, seed=3)
+    checker = kind(UR3, TOOL, boxes, padding_mm=5.0)
+    path = plan_approach(checker, LEFT, RIGHT, seed=3)
     bare = CellChecker(UR3, TOOL, boxes)
-    assert path.clearance.boxes.mm >= 5.0
+    assert least_clearance(checker, path.checked_q).boxes.mm >= 5.0
     rng = np.random.default_rng(1)
-    between = [a + rng.uniform() * (b - a) for a, b in pairwise(path.checked_q)]
+    between = [a + rng.uniform() * (b - a) for a, b in pairwise(path.checked_q[::3])]
     assert min(bare.nearest(q, "boxes").mm for q in between) >= 5.0 - MAX_SWEEP_MM / 2.0
 
 
-def test_the_same_seed_gives_the_same_path_whatever_ran_before() -> None:
+@KINDS
+def test_the_same_seed_gives_the_same_path_whatever_ran_before(kind: type[CellChecker]) -> None:
     """Bit by bit, though OMPL's generator serves the whole process; another seed goes another way."""
-    checker = CellChecker(UR3, TOOL, [floor(), wall()])
+    checker = kind(UR3, TOOL, [floor(), wall()])
     first = plan_approach(checker, LEFT, RIGHT, seed=7)
-    other = plan_approach(checker, LEFT, RIGHT, seed=8)
-    again = plan_approach(CellChecker(UR3, TOOL, [floor(), wall()]), LEFT, RIGHT, seed=7)
+    other = plan_approach(checker, LEFT, RIGHT, seed=28)
+    again = plan_approach(kind(UR3, TOOL, [floor(), wall()]), LEFT, RIGHT, seed=7)
     assert np.array_equal(first.waypoints, again.waypoints) and np.array_equal(first.checked_q, again.checked_q)
     assert not np.array_equal(first.waypoints, other.waypoints)
 
 
-def test_of_several_goals_a_free_one_is_taken() -> None:
+@KINDS
+def test_of_several_goals_a_free_one_is_taken(kind: type[CellChecker]) -> None:
     """A goal in the wall is left out; the answer says which of the others it is."""
-    checker = CellChecker(UR3, TOOL, [floor(), wall()])
+    checker = kind(UR3, TOOL, [floor(), wall()])
     in_wall = on_the_way_in_contact(checker)
     goals = np.stack([in_wall, RIGHT])
     path = plan_approach(checker, LEFT, goals, seed=1)
@@ -132,10 +153,21 @@ def test_of_several_goals_a_free_one_is_taken() -> None:
     assert_sound(checker, path, LEFT, goals)
 
 
+def test_of_several_goals_the_cheapest_that_is_reached_is_taken() -> None:
+    """RIGHT is nearer but behind the wall; a pose a little farther, on this side, costs less than the way around."""
+    checker = FastChecker(UR3, TOOL, [floor(), wall()])
+    this_side = LEFT + np.array([0.9, 0.0, 0.0, 0.0, 0.0, 1.6])
+    assert np.linalg.norm(RIGHT - LEFT) < np.linalg.norm(this_side - LEFT)
+    path = plan_approach(checker, LEFT, np.stack([RIGHT, this_side]), seed=1)
+    assert path.goal_index == 1
+    around = plan_approach(checker, LEFT, RIGHT, seed=1)
+    assert path_length(path.waypoints) <= path_length(around.waypoints)
+
+
 def test_home_is_a_goal_too() -> None:
     """Where home is the goal the path stays there."""
     path = plan_approach(CellChecker(UR3, TOOL), LEFT, LEFT, seed=1)
-    assert path.length_rad == 0.0 and np.array_equal(path.waypoints, np.stack([LEFT, LEFT]))
+    assert path.trajectory.duration_s == 0.0 and np.array_equal(path.waypoints, np.stack([LEFT, LEFT]))
 
 
 def test_refusals_say_what_touches_what() -> None:
@@ -148,8 +180,9 @@ def test_refusals_say_what_touches_what() -> None:
         plan_approach(checker, LEFT, in_wall, seed=1)
 
 
-def test_a_walled_in_goal_ends_in_a_bounded_number_of_iterations() -> None:
-    """No clock: the planner gives up after its iterations and says so."""
+@KINDS
+def test_a_walled_in_goal_ends_in_a_bounded_number_of_samples(kind: type[CellChecker]) -> None:
+    """No clock: the planner gives up after its samples, says which side is shut in, and by what."""
     flange = flange_pose(UR3, RIGHT)
     plates = []
     for name, turn in (("plus", 1.0), ("minus", -1.0)):
@@ -159,10 +192,12 @@ def test_a_walled_in_goal_ends_in_a_bounded_number_of_iterations() -> None:
         T = flange.copy()
         T[:3, 3] = flange[:3, 3] + 120.0 * flange[:3, 2] + turn * 25.0 * flange[:3, 1]
         plates.append(Box(f"y_{name}", T, (300.0, 4.0, 150.0)))
-    checker = CellChecker(UR3, TOOL, plates)
+    checker = kind(UR3, TOOL, plates)
     assert checker.contact(RIGHT, needle_may_touch_patient=False) is None
-    with pytest.raises(NoAnswerError, match=r"no path within 300 iterations.*\(seed 1\)"):
-        plan_approach(checker, LEFT, RIGHT, seed=1, max_iterations=300)
+    for home, goal, where in ((LEFT, RIGHT, "the goals lie"), (RIGHT, LEFT, "home lies")):
+        message = rf"{where} in a part of the space that 150 samples could not reach \(seed 1\).*touches [xy]_"
+        with pytest.raises(NoAnswerError, match=message):
+            plan_approach(checker, home, goal, seed=1, max_samples=150)
 
 
 def test_angles_outside_the_limits_are_refused() -> None:
@@ -177,44 +212,120 @@ def test_angles_outside_the_limits_are_refused() -> None:
         plan_approach(checker, LEFT, np.empty((0, 6)), seed=1)
 
 
-def test_the_least_clearance_is_that_of_every_state() -> None:
-    """Skipping states by how far the bodies moved finds what measuring all of them finds, to its step."""
+@KINDS
+def test_the_least_clearance_is_that_of_every_state(kind: type[CellChecker]) -> None:
+    """Skipping states by how far bodies moved, or by bounds, finds what measuring all of them finds, to its step."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=100.0)
     skin = TriangleMesh(np.asarray(ball.vertices) + np.array([-330.0, -100.0, 10.0]), np.asarray(ball.faces))
-    checker = CellChecker(UR3, TOOL, [floor(), wall()], skin)
-    states = dense_states(checker, np.stack([LEFT, LEFT + 0.3, LEFT + np.array([0.2, -0.1, 0.0, 0.3, 0.0, 0.0])]), 0.02)
-    found = least_clearance(checker, states)
-    every = [checker.distances(q) for q in states]
-    for pair in ("patient", "needle", "boxes"):
-        least = min(getattr(distances, pair).mm for distances in every)
-        assert least <= getattr(found, pair).mm <= least + CLEARANCE_STEP_MM
+    ways = np.stack([LEFT, LEFT + 0.3, LEFT + np.array([0.2, -0.1, 0.0, 0.3, 0.0, 0.0])])
+    for padding in (0.0, 5.0):
+        checker = kind(UR3, TOOL, [floor(), wall()], skin, padding_mm=padding)
+        states = dense_states(checker, ways, 0.02)[::2]
+        found = least_clearance(checker, states)
+        every = [checker.distances(q) for q in states]
+        for pair in ("patient", "needle", "boxes"):
+            least = min(getattr(distances, pair).mm for distances in every)
+            assert least <= getattr(found, pair).mm <= least + CLEARANCE_STEP_MM
 
 
 whole_thousandths = st.integers(-3000, 3000).map(lambda n: n / 1000.0)
 rows = st.lists(st.lists(whole_thousandths, min_size=6, max_size=6), min_size=2, max_size=5).map(np.array)
 
 
+def assert_within(trajectory: Trajectory, scale: float) -> None:
+    """Speed, acceleration and jerk by differences of even samples, from rest to rest."""
+    assert np.allclose(np.diff(trajectory.times_s), SAMPLE_S, rtol=0, atol=1e-12)
+    steps = np.concatenate(
+        [np.repeat(trajectory.q[:1], 3, axis=0), trajectory.q, np.repeat(trajectory.q[-1:], 3, axis=0)]
+    )
+    limits = (scale * UR3.max_speeds, np.full(6, UR3.max_acceleration), np.full(6, MAX_JERK))
+    for order, (limit, peak) in enumerate(zip(limits, trajectory.peaks(), strict=True), start=1):
+        found = np.abs(np.diff(steps, n=order, axis=0) / SAMPLE_S**order).max(axis=0)
+        rounding = 1e-14 / SAMPLE_S**order
+        assert (found <= limit * (1 + 1e-6) + rounding).all()
+        assert np.allclose(found, peak, rtol=1e-6, atol=rounding)
+
+
 @given(waypoints=rows, scale=st.floats(0.05, 1.0))
-@settings(max_examples=60, deadline=None)
-def test_stop_and_go_keeps_the_limits_and_the_path(waypoints: np.ndarray, scale: float) -> None:
-    """Ends exact, speed and acceleration within limits by the samples' own differences, every sample on the path."""
-    trajectory = stop_and_go(UR3, waypoints, speed_scale=scale)
-    assert np.array_equal(trajectory.q[0], waypoints[0]) and np.abs(trajectory.q[-1] - waypoints[-1]).max() < 1e-9
-    assert (trajectory.max_speeds() <= scale * UR3.max_speeds * (1 + 1e-9)).all()
-    assert (trajectory.max_accelerations() <= UR3.max_acceleration * (1 + 1e-6) + 1e-9).all()
+@settings(max_examples=25, deadline=None)
+def test_without_rounding_the_path_is_kept(waypoints: np.ndarray, scale: float) -> None:
+    """Ends exact, limits kept by differences, every sample on the segments, every waypoint a sample."""
+    trajectory = follow(UR3, waypoints, speed_scale=scale)
+    assert np.array_equal(trajectory.q[0], waypoints[0]) and np.array_equal(trajectory.q[-1], waypoints[-1])
+    assert_within(trajectory, scale)
     assert path_length(trajectory.q) == pytest.approx(path_length(waypoints), abs=1e-6)
     for waypoint in waypoints:
         assert np.abs(trajectory.q - waypoint).max(axis=1).min() < 1e-9
 
 
-@pytest.mark.parametrize("turn", [0.1, 1.0, 7.5])
+@given(waypoints=rows, scale=st.floats(0.05, 1.0), share=st.floats(0.01, 0.5))
+@settings(max_examples=30, deadline=None)
+def test_rounded_corners_keep_the_limits_and_their_triangle(waypoints: np.ndarray, scale: float, share: float) -> None:
+    """Within every limit, and off the segments by no more than 3/16 of the corner that is cut."""
+    lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
+    if not lengths.all():
+        return
+    cuts = share * np.minimum(lengths[:-1], lengths[1:])
+    trajectory = follow(UR3, waypoints, cuts, speed_scale=scale)
+    assert_within(trajectory, scale)
+    units = np.diff(waypoints, axis=0) / lengths[:, None]
+    allowed = np.max(3.0 / 16.0 * cuts * np.linalg.norm(np.diff(units, axis=0), axis=1), initial=0.0)
+    assert max(to_path(q, waypoints) for q in trajectory.q[::9]) <= allowed + 1e-9
+
+
+def to_path(q: np.ndarray, waypoints: np.ndarray) -> float:
+    """Distance of a state to straight segments."""
+    a, ab = waypoints[:-1], np.diff(waypoints, axis=0)
+    share = np.clip(((q - a) * ab).sum(axis=1) / (ab**2).sum(axis=1), 0.0, 1.0)
+    return float(np.linalg.norm(q - a - share[:, None] * ab, axis=1).min())
+
+
+def test_a_rounded_corner_is_the_integral_of_its_speed() -> None:
+    """The closed form against numbers: the velocity turns from one direction to the other by 3 x^2 - 2 x^3."""
+    u, w, corner = np.eye(6)[0], np.array([0.0, 0.6, 0.8, 0.0, 0.0, 0.0]), np.arange(6.0)
+    x = np.linspace(0.0, 1.0, 20001)
+    f = (3.0 * x**2 - 2.0 * x**3)[:, None]
+    velocity = 2.0 * 0.3 * ((1.0 - f) * u + f * w)
+    summed = (
+        corner
+        - 0.3 * u
+        + np.concatenate([np.zeros((1, 6)), np.cumsum((velocity[:-1] + velocity[1:]) / 2.0, axis=0)]) / 20000
+    )
+    assert np.abs(rounded(corner, u, w, 0.3, x) - summed).max() < 1e-8
+    assert np.allclose(rounded(corner, u, w, 0.3, np.ones(1)), corner + 0.3 * w)
+
+
+def test_cuts_that_overlap_are_refused() -> None:
+    """Two roundings must leave each other room."""
+    corners = np.array([[0.0] * 6, [1.0] * 6, [2.0] * 3 + [0.0] * 3, [0.0] * 6])
+    with pytest.raises(InputError, match="cuts"):
+        follow(UR3, corners, np.array([2.0, 2.0]))
+    with pytest.raises(InputError, match="cuts"):
+        follow(UR3, corners, np.array([0.1]))
+
+
+@pytest.mark.parametrize("turn", [0.002, 0.1, 1.0, 7.5])
 def test_one_joint_runs_in_the_shortest_time(turn: float) -> None:
-    """A triangle where the limit speed is not reached, else a trapezoid: 2 sqrt(L/a), or L/v + v/a."""
-    v, a = UR3.max_speeds[0], UR3.max_acceleration
-    shortest = 2.0 * np.sqrt(turn / a) if turn < v * v / a else turn / v + v / a
-    trajectory = stop_and_go(UR3, np.array([[0.0] * 6, [turn, 0, 0, 0, 0, 0]]))
-    assert trajectory.duration_s == pytest.approx(shortest)
-    assert trajectory.max_speeds()[0] == pytest.approx(min(v, np.sqrt(turn * a)), rel=0.02)
+    """Seven phases by hand: T = L / v + v / a + a / j with the highest v and a that the length allows."""
+    v, a, j = UR3.max_speeds[0], UR3.max_acceleration, MAX_JERK
+    if turn < v * (v / a + a / j):
+        v = a * (-a / j + np.sqrt((a / j) ** 2 + 4.0 * turn / a)) / 2.0
+    shortest = turn / v + v / a + a / j if v >= a * a / j else 4.0 * (turn / (2.0 * j)) ** (1.0 / 3.0)
+    trajectory = follow(UR3, np.array([[0.0] * 6, [turn, 0, 0, 0, 0, 0]]))
+    assert shortest - 1e-9 <= trajectory.duration_s <= shortest + SAMPLE_S
+
+
+def test_a_speed_is_reached_where_it_can_be() -> None:
+    """The way to a speed is the least: ruckig needs just as long; half of it allows a lower speed, which just fits."""
+    rates = Rates(3.0, 1.4, 14.0)
+    for start, end in ((0.0, 0.05), (0.2, 1.5), (1.0, 1.01)):
+        length = speed_change_length(start, end, rates) * (1.0 + 2.0 * LENGTH_SLACK)
+        law = time_law(length, rates, start, end)
+        assert law.duration_s == pytest.approx(2.0 * length / (start + end), rel=1e-3)
+        assert reachable_speed(start, end, length, rates) == end
+        less = reachable_speed(start, end, length / 2.0, rates)
+        assert start < less < end
+        assert speed_change_length(start, less, rates) == pytest.approx(length / 2.0, rel=1e-5)
 
 
 @pytest.mark.parametrize("tip_speed", [2.0, 20.0, 2000.0])
@@ -224,8 +335,7 @@ def test_a_smooth_drive_keeps_the_tips_speed_and_the_joints_limits(tip_speed: fl
     q = LEFT + np.sin(depths[:, None] / 80.0) * np.array([0.1, 0.5, -0.8, 0.3, 0.05, 0.0])
     trajectory = drive_smoothly(UR3, q, depths, max_tip_speed_mm_s=tip_speed)
     assert trajectory.q[0] == pytest.approx(q[0]) and trajectory.q[-1] == pytest.approx(q[-1])
-    assert (trajectory.max_speeds() <= UR3.max_speeds * (1 + 1e-6)).all()
-    assert (trajectory.max_accelerations() <= UR3.max_acceleration * (1 + 1e-3)).all()
+    assert_within(trajectory, 1.0)
     assert trajectory.duration_s >= 100.0 / tip_speed
     if tip_speed == 2.0:
         assert trajectory.duration_s == pytest.approx(50.0, rel=0.05)
@@ -234,18 +344,13 @@ def test_a_smooth_drive_keeps_the_tips_speed_and_the_joints_limits(tip_speed: fl
 
 
 def test_a_trajectory_is_sampled_anywhere_and_cannot_be_changed() -> None:
-    """Linear between samples, clamped outside; arrays are read-only; parts join end to start."""
+    """Linear between samples, clamped outside; arrays are read-only."""
     trajectory = Trajectory(np.array([0.0, 1.0, 3.0]), np.array([[0.0] * 6, [1.0] * 6, [2.0] * 6]))
     assert trajectory.at(2.0).tolist() == [1.5] * 6
     assert trajectory.at(np.array([-1.0, 9.0])).tolist() == [[0.0] * 6, [2.0] * 6]
     assert trajectory.duration_s == 3.0 and trajectory.max_speeds().tolist() == [1.0] * 6
     with pytest.raises(ValueError, match="read-only"):
         trajectory.q[0, 0] = 1.0
-    onward = Trajectory(np.array([0.0, 0.5]), np.array([[2.0] * 6, [1.0] * 6]))
-    whole = in_sequence([trajectory, onward])
-    assert whole.times_s.tolist() == [0.0, 1.0, 3.0, 3.5] and whole.q[-1].tolist() == [1.0] * 6
-    with pytest.raises(InputError, match="off the end before it"):
-        in_sequence([onward, onward])
 
 
 @pytest.mark.parametrize(
@@ -269,7 +374,7 @@ def test_time_laws_refuse_bad_numbers() -> None:
     """Speeds and depths that make no sense are input errors, not infinities."""
     two = np.stack([LEFT, RIGHT])
     with pytest.raises(InputError, match="speed_scale"):
-        stop_and_go(UR3, two, speed_scale=0.0)
+        follow(UR3, two, speed_scale=0.0)
     with pytest.raises(InputError, match="max_tip_speed"):
         drive_smoothly(UR3, two, np.array([0.0, 1.0]), max_tip_speed_mm_s=np.nan)
     with pytest.raises(InputError, match="rising depth"):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from planning.cache import Cache
 from planning.errors import InputError
 from planning.mesh import TriangleMesh
 from planning.prepared import Prepared, prepare
@@ -266,3 +267,86 @@ def test_frames_of_a_path_and_of_its_states_agree() -> None:
     """What is judged along a path is what is judged state by state: the same frames to the last bit."""
     path = np.random.default_rng(8).uniform(-np.pi, np.pi, (50, 6))
     assert np.array_equal(link_poses(UR3, path), np.stack([link_poses(UR3, q) for q in path]))
+
+
+def segments(rng: np.random.Generator, count: int) -> list[np.ndarray]:
+    """Straight joint segments of 0.5 rad, half of them near where the needle points at the patient."""
+    found = []
+    for n in range(count):
+        start = rng.uniform(-np.pi, np.pi, 6) if n % 2 else CLEAR + rng.uniform(-0.4, 0.4, 6)
+        step = rng.normal(size=6)
+        found.append(np.stack([start, start + 0.5 * step / np.linalg.norm(step)]))
+    return found
+
+
+@pytest.mark.parametrize("padding", [0.0, 5.0])
+def test_segments_have_the_verdict_of_many_states(padding: float) -> None:
+    """A segment that is called free has no contact at states 0.5 mm apart, but for grazes; one that is not has one."""
+    slow, fast = scene(CellChecker, padding), scene(FastChecker, padding)
+    assert isinstance(fast, FastChecker)
+    verdicts = []
+    for ends in segments(np.random.default_rng(4), 60):
+        states = ends[0] + np.linspace(0.0, 1.0, 1 + int(2.0 * slow.sweep_mm(ends).max()))[:, None] * (
+            ends[1] - ends[0]
+        )
+        met = fast.first_contact(states, needle_may_touch_patient=False)
+        contact = fast.segment_contact(*ends)
+        if (contact is None) != (
+            met is None
+        ):  # only where the deepest of it is within the 1 mm that a state answers for
+            thinner = scene(FastChecker, padding - 1.5) if padding else None
+            assert contact is None and thinner is not None
+            assert thinner.first_contact(states, needle_may_touch_patient=False) is None
+        if contact is not None:
+            assert any(slow.contact(q, needle_may_touch_patient=False) for q in states)
+        verdicts.append(contact is None)
+    assert 10 < sum(verdicts) < 50
+
+
+def test_pieces_that_are_never_asked_about_never_touch() -> None:
+    """Proven two joints apart: FCL's distance is above 0 at every one of many pairs of angles; some are left to ask."""
+    slow, fast = CellChecker(UR3, TOOL), FastChecker(UR3, TOOL)
+    asked = {id(check.first) ^ id(check.second) for check in fast._asked}
+    never = [check for check in fast._checks if id(check.first) ^ id(check.second) not in asked]
+    assert 5 < len(never) < len(fast._checks) - 20
+    q = np.random.default_rng(5).uniform(-np.pi, np.pi, (400, 6))
+    for poses in link_poses(UR3, q):
+        for check in never:
+            assert check.first_body is not None
+            assert check.second_body.frame - check.first_body.frame == 2
+            for item, body in ((check.first, check.first_body), (check.second, check.second_body)):
+                item.setTransform(body.pose(poses))
+            assert fcl.distance(check.first, check.second, fcl.DistanceRequest(), fcl.DistanceResult()) > 0.0
+    assert len(slow._checks) == len(fast._checks)
+
+
+def test_a_checker_from_the_cache_is_the_same(tmp_path: Path) -> None:
+    """Enclosures are kept by the hash of what they enclose; read back they prove the same; a spoiled file is remade."""
+    q = np.random.default_rng(6).uniform(-np.pi, np.pi, (60, 6))
+    found = []
+    for turn in range(3):
+        checker = FastChecker(UR3, TOOL, padding_mm=5.0, cache=Cache(tmp_path))
+        files = sorted(tmp_path.iterdir())
+        assert files
+        found.append([checker.open_checks(row, needle_may_touch_patient=False) for row in q])
+        if turn == 1:
+            for file in files:
+                file.write_bytes(file.read_bytes()[:-200])
+    assert found[0] == found[1] == found[2]
+    other = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=31.0)
+    FastChecker(UR3, other, padding_mm=5.0, cache=Cache(tmp_path))
+    assert len(sorted(tmp_path.iterdir())) > len(files)
+
+
+def test_next_nearer_never_passes_a_nearer_state() -> None:
+    """Every state that is passed over keeps its distance by FCL, padded checker or bare."""
+    for padding in (0.0, 5.0):
+        fast = scene(FastChecker, padding)
+        assert isinstance(fast, FastChecker)
+        states = CLEAR + np.linspace(0.0, 0.5, 40)[:, None] * np.array([0.5, 0.3, -0.4, 0.2, 0.1, 0.7])
+        motion = fast.motion(states)
+        for pair, body in (("patient", "forearm"), ("needle", "needle"), ("boxes", "holder")):
+            mm = [fast.nearest(q, pair, body).mm for q in states]
+            for wanted in (min(mm) - 1.0, float(np.median(mm))):
+                at = fast.next_nearer(motion, 0, pair, body, wanted)
+                assert min(mm[: at if at >= 0 else None], default=np.inf) > wanted

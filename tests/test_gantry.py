@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 import trimesh
 
+from meshes import folder
+from planning.case import load_case
 from planning.errors import InputError
+from planning.placement import load_placement
+from planning.prepared import prepare
+from planning.reasons import Reason
 from planning.robot.cell import CellChecker, Tool
 from planning.robot.fast_checker import FastChecker
 from planning.robot.gantry import SIDES, gantry_boxes
 from planning.robot.ur import ur_model
+from planning.room import case_boxes
+from twin.report.scene_parts import room
 
 TILT = trimesh.transformations.rotation_matrix(0.35, [1.0, 0.2, 0.0])
 TILT[:3, 3] = (420.0, 30.0, 80.0)
@@ -52,3 +61,111 @@ def test_sizes_that_make_no_sense_are_refused(name: str) -> None:
     """By name."""
     with pytest.raises(InputError, match=name):
         gantry_boxes(TILT, **{**SIZES, name: np.nan})
+
+
+GANTRY = """
+[gantry]
+bore_diameter_mm = 700.0
+center_mm = [0.0, 0.0, 60.0]
+thickness_mm = 300.0
+wall_mm = 150.0
+tilt_deg = {tilt}
+"""
+REGISTRATION = '[registration]\nmethod = "rigid"\nmarkers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"\n'
+
+
+@pytest.fixture
+def in_gantry(tmp_path):
+    """A function: the embedded abdomen in a tilted gantry, with more text."""
+
+    def make(more="", tilt=0.0, changes=()):
+        here = tmp_path / f"case{len(list(tmp_path.iterdir()))}"
+        shutil.copytree(folder() / "abdomen", here)
+        text = (here / "case.toml").read_text()
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new, 1)
+        (here / "case.toml").write_text(text + GANTRY.format(tilt=tilt) + more)
+        return here / "case.toml"
+
+    return make
+
+
+def test_a_tilt_leans_the_top_toward_the_feet(in_gantry):
+    """The bore's axis is the head's direction turned up by the tilt; the top, square to it, leans to the feet."""
+    T = load_case(in_gantry(tilt=20.0)).gantry.T_ct_gantry
+    s, c = np.sin(np.radians(20.0)), np.cos(np.radians(20.0))
+    np.testing.assert_allclose(T[:3, 2], [0.0, -s, c], atol=1e-12)  # LPS: the front is -y, the head +z
+    np.testing.assert_allclose(T[:3, 0], [0.0, -c, -s], atol=1e-12)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+    np.testing.assert_allclose(T[:3, 3], [0.0, 0.0, 60.0])
+
+
+def test_a_gantry_in_another_space_stands_at_the_same_place(in_gantry):
+    """The same gantry stated in RAS, its axes as vectors."""
+    more = "axis = [0.0, 0.0, 1.0]\nup = [0.0, 1.0, 0.0]\n"
+    ras = (('space = "LPS"', 'space = "RAS"'),)
+    T = load_case(in_gantry(more, 20.0, ras)).gantry.T_ct_gantry
+    np.testing.assert_allclose(T, load_case(in_gantry(tilt=20.0)).gantry.T_ct_gantry, atol=1e-12)
+
+
+def test_the_rooms_boxes_hold_the_gantry(in_gantry):
+    """Reach, approach and rehearsal take their boxes from here: the obstacles, then the gantry's."""
+    case = load_case(in_gantry())
+    T_base_ct = load_placement(case).T_base_ct
+    boxes = case_boxes(case, T_base_ct)
+    assert [box.name for box in boxes] == ["table", *(f"gantry_{side}" for side in range(SIDES))]
+    middle = np.mean([box.T_base_box[:3, 3] for box in boxes[1:]], axis=0)
+    np.testing.assert_allclose(middle, T_base_ct[:3, :3] @ [0.0, 0.0, 60.0] + T_base_ct[:3, 3], atol=1e-9)
+
+
+def test_an_arm_through_the_wall_is_a_collision_that_names_the_gantry(in_gantry):
+    """A base beside the bore must reach through its wall; without the gantry the same direction is held."""
+    mount = (
+        "\n[robot.mount]\nposition_mm = [-330.0, -330.0, -20.0]\nx_axis = [1.0, 0.0, 0.0]\nz_axis = [0.0, 0.0, 1.0]\n"
+    )
+    placed = ((REGISTRATION, ""), ("step_deg = 2.0", "step_deg = 15.0"))
+    walled = prepare(in_gantry(mount, changes=placed)).search()
+    free_case = in_gantry(mount, changes=placed)
+    free_case.write_text(free_case.read_text().replace(GANTRY.format(tilt=0.0), ""))
+    free = prepare(free_case).search()
+    hits = walled.reason == Reason.ARM_COLLISION.value
+    named = np.char.find(walled.reason_structure.astype(str), "/gantry_") >= 0
+    held = hits & named & (free.reachable == 1)
+    assert held.any() and not np.char.startswith(free.reason_structure.astype(str), "gantry").any()
+    row = int(np.flatnonzero(held)[0])
+    assert "touches gantry_" in walled.reason_detail[row]
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (("bore_diameter_mm = 700.0", "bore_diameter_mm = 70.0"), "gantry.bore_diameter_mm"),
+        (("tilt_deg = 0.0", "tilt_deg = 80.0"), "gantry.tilt_deg"),
+        (("tilt_deg = 0.0", 'up = "head"'), "gantry: axis and up are parallel"),
+        (("wall_mm", "wal_mm"), "did you mean 'wall_mm'"),
+    ],
+)
+def test_gantries_that_make_no_sense_are_refused(in_gantry, change, match):
+    """By key."""
+    path = in_gantry()
+    path.write_text(path.read_text().replace(*change))
+    with pytest.raises(InputError, match=match):
+        load_case(path)
+
+
+def test_a_gantry_that_does_not_go_around_the_patient_is_refused(in_gantry):
+    """A bore narrower than he is, or beside him."""
+    path = in_gantry()
+    path.write_text(path.read_text().replace("bore_diameter_mm = 700.0", "bore_diameter_mm = 300.0"))
+    with pytest.raises(InputError, match="wall stands .* mm in the patient"):
+        prepare(path)
+
+
+def test_the_gantry_is_drawn(in_gantry):
+    """One see-through ring in the CT frame, with a bore of the stated size."""
+    case = load_case(in_gantry(tilt=10.0))
+    body = next(body for body in room(case, None) if body.name == "gantry")
+    at = (body.mesh.vertices - case.gantry.T_ct_gantry[:3, 3]) @ case.gantry.T_ct_gantry[:3, :3]
+    assert np.hypot(at[:, 0], at[:, 1]).min() == pytest.approx(350.0) and body.alpha < 1
+    assert np.abs(at[:, 2]).max() == pytest.approx(150.0)

@@ -177,6 +177,11 @@ BROKEN = {
         lambda d: {"insertion": {**d["insertion"], "q_rad": [row[:5] for row in d["insertion"]["q_rad"]]}},
         "does not fit",
     ),
+    "a jerk that is not its own": (
+        lambda d: {"approach": {**d["approach"], "peaks": {**d["approach"]["peaks"], "jerk_rad_s3": [0.0] * 6}}},
+        "peaks of the approach",
+    ),
+    "other limits": (lambda d: {"limits": {**d["limits"], "speed_rad_s": [9.0] * 6}}, "the limits are not"),
     "an unknown arm": (lambda d: {"robot": "ur99"}, "ur99"),
 }
 
@@ -194,10 +199,11 @@ def test_a_plan_that_contradicts_itself_is_refused(name, document):
     ("data", "message"),
     [
         (b"", "is not JSON"),
-        (b'{"version": 1', "is not JSON"),
-        (b'{"version": 1}', "is missing"),
+        (b'{"version": 2', "is not JSON"),
+        (b'{"version": 2}', "is missing"),
+        (b'{"version": 1}', "version 1"),
         (b"[1, 2]", "version None"),
-        (b'{"version": 1, "x": NaN}', "NaN is no number"),
+        (b'{"version": 2, "x": NaN}', "NaN is no number"),
         (b"\xff\xfe\x00", "is not JSON"),
         (b"[" * 100_000, "is not JSON"),
     ],

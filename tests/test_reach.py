@@ -15,6 +15,7 @@ from planning.robot.insertion import MIN_SINGULARITY, flange_poses, insertion_pa
 from planning.robot.kinematics import flange_pose, inverse, singularity
 from planning.robot.links import collision_links
 from planning.robot.ur import ur_model
+from twin.chen2019_reach import SHARES, WINDOWS, PublishedShare, cap, runs
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=200.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
@@ -25,21 +26,6 @@ MARKERS_CT = np.array([[10.0, 20.0, 147.0], [110.0, 120.0, 147.0], [60.0, -10.0,
 MARKERS_BASE = np.array([[417.67, -291.23, 534.59], [557.74, -272.83, 534.57], [423.48, -231.41, 604.06]])
 LESION_M_CT = np.array([50.0, 130.0, 63.0])
 """Markers A, B, C and lesion M: Tables 1 and 2 of Chen 2019, mm."""
-
-WINDOWS: dict[int, list[tuple[int, int]]] = {
-    **{theta: [] for theta in range(9)},
-    9: [(243, 285)],
-    10: [(233, 295)],
-    20: [(207, 322)],
-    30: [(203, 325)],
-    40: [(204, 325)],
-    50: [(206, 322)],
-    60: [(211, 255), (273, 317)],
-    70: [(217, 253), (275, 311)],
-    80: [(226, 253), (275, 303)],
-    90: [(239, 253), (275, 289)],
-}
-"""beta, deg, that a UR3 reaches at each theta, deg: specification 1 section 2, r 150, l 401."""
 
 
 def triad(points: np.ndarray) -> np.ndarray:
@@ -64,12 +50,6 @@ def outward(R_base_ct: np.ndarray, theta_deg: float, beta_deg: np.ndarray) -> np
         [np.sin(theta) * np.cos(beta), np.sin(theta) * np.sin(beta), np.full_like(beta, np.cos(theta))], axis=1
     )
     return u @ R_base_ct.T
-
-
-def runs(flags: np.ndarray) -> list[tuple[int, int]]:
-    """First and last index of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
-    return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
 
 
 def directions(count: int, seed: int) -> np.ndarray:
@@ -109,36 +89,17 @@ def test_the_windows_of_the_papers_placement(theta_deg: int) -> None:
     assert np.abs(np.array(ours).reshape(-1) - np.array(WINDOWS[theta_deg]).reshape(-1)).max(initial=0) <= 1
 
 
-@pytest.mark.parametrize(
-    ("distance_mm", "rho", "z", "axis", "percent"),
-    [
-        (551.0, 250.0, 700.0, (0.0, 0.0, -1.0), 61),
-        (551.0, 400.0, 250.0, (-1.0, 0.0, 0.0), 68),
-        (451.0, 250.0, 150.0, (-1.0, 0.0, 0.0), 96),
-        (401.0, 250.0, 150.0, (-1.0, 0.0, 0.0), 93),
-        (300.0, 250.0, 500.0, (0.0, 0.0, -1.0), 81),
-        (300.0, 500.0, 200.0, (-1.0, 0.0, 0.0), 100),
-    ],
-)
-def test_the_shares_of_the_reach_table(
-    distance_mm: float, rho: float, z: float, axis: tuple[float, ...], percent: int
-) -> None:
+@pytest.mark.parametrize("row", SHARES, ids=str)
+def test_the_shares_of_the_reach_table(row: PublishedShare) -> None:
     """Share of the cap of 60 deg that a UR3 holds: within 1 point with |sin q5| > .05, as the table counts.
 
     With the other two singularities kept off as well it stays within 3.
     """
-    count = 4000
-    k = np.arange(count) + 0.5
-    height = 1.0 - 0.5 * k / count  # cos 60 deg = 0.5; equal area is equal height
-    turn = np.pi * (1.0 + np.sqrt(5.0)) * k
-    side = np.sqrt(1.0 - height**2)
-    cap = np.stack([side * np.cos(turn), side * np.sin(turn), height], axis=1)
-    tilt = flange_poses(np.zeros(3), -np.array(axis), 0.0)[0, :3, :3]  # z along the axis
-    target, u = np.array([rho, 0.0, z]), cap @ tilt.T
-    wrist = singularity(UR3, inverse(UR3, flange_poses(target, u, distance_mm))).wrist
-    assert 100.0 * (wrist > 0.05).any(axis=1).mean() == pytest.approx(percent, abs=1.0)
-    exists = ik_exists(UR3, target, u, needle_length_mm=distance_mm, standoff_mm=0.0, depths_mm=(0.0,))
-    assert 100.0 * exists.mean() == pytest.approx(percent, abs=3.0)
+    target, u = np.array([row.rho_mm, 0.0, row.z_mm]), cap(row.cap_axis_base)
+    wrist = singularity(UR3, inverse(UR3, flange_poses(target, u, row.distance_mm))).wrist
+    assert (wrist > 0.05).any(axis=1).mean() == pytest.approx(row.share, abs=0.01)
+    exists = ik_exists(UR3, target, u, needle_length_mm=row.distance_mm, standoff_mm=0.0, depths_mm=(0.0,))
+    assert exists.mean() == pytest.approx(row.share, abs=0.03)
 
 
 def test_the_worked_example_of_the_paper_is_out_of_reach() -> None:

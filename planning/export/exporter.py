@@ -17,7 +17,6 @@ from planning.export.motion import check_sampled
 from planning.export.program import program_of, waypoint_rows
 from planning.export.program_check import check_program
 from planning.export.ros2 import TIME_RESOLUTION_S, read_ros2, ros2_text
-from planning.export.straight import check_straight_between
 from planning.export.urscript import read_urscript, urscript_text
 from planning.files import atomic
 from planning.plan import Plan, check_geometry
@@ -69,7 +68,6 @@ def export_plan(
     check_geometry(plan, source)
     if len(plan.insertion.q) < 2:
         raise InputError("the insertion is a single state", where=source, allowed="a motion")
-    check_straight_between(plan, where=source)
     suffix, draft = FORMATS[format_name]
     checked = draft(plan, source, checker)
     path = folder / f"{source.stem}{suffix}"

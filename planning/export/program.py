@@ -163,7 +163,8 @@ def _joint_move(trajectory: Trajectory, first: int, last: int, blend_mm: float) 
 def _ramp(driven: Array, times: Array) -> _Ramp:
     """The trapezoid from rest to rest with a motion's length L, duration T and highest acceleration a.
 
-    From T = L / v + v / a follows v = a (T - sqrt(T^2 - 4 L / a)) / 2. Where a is too low for T, which samples too far
+    From T = L / v + v / a follows v = a (T - sqrt(T^2 - 4 L / a)) / 2: below the motion's own peak speed, since a plan
+    takes time to build up its acceleration and a trapezoid does not. Where a is too low for T, which samples too far
     apart can make it seem, v = a T / 2 takes longer.
 
     Args:

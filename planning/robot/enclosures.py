@@ -7,10 +7,12 @@ a ball about those corners contains the part, and the parts together are the pie
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
@@ -72,17 +74,42 @@ class BallTree:
         return np.flatnonzero(self.children[:, 0] < 0)
 
 
+def settings() -> dict[str, float]:
+    """The numbers of this module that decide what it makes."""
+    return {
+        "leaf": LEAF_RADIUS_MM,
+        "slack": SLACK_MM,
+        "steps": CENTRE_STEPS,
+        "sides": PRISM_SIDES,
+        "few": COARSE_DIRECTIONS,
+    }
+
+
 def enclosing_ball(points: Array) -> Ball:
     """A small ball about points (n, 3): steps toward the farthest point, ever shorter (Badoiu and Clarkson 2003)."""
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2.0
-    best = Ball(centre, np.inf)
-    for step in range(1, CENTRE_STEPS + 1):
-        squared = ((points - centre) ** 2).sum(axis=1)
-        farthest = int(np.argmax(squared))
-        if squared[farthest] < best.radius**2:
-            best = Ball(centre, float(np.sqrt(squared[farthest])))
-        centre = centre + (points[farthest] - centre) / (step + 1)
-    return Ball(best.centre, best.radius + SLACK_MM)
+    centre = np.empty(3)
+    radius = _walk_to_centre(np.ascontiguousarray(points), CENTRE_STEPS, centre)
+    return Ball(centre, radius + SLACK_MM)
+
+
+@nb.njit(cache=True)
+def _walk_to_centre(points, steps, best):  # type: ignore[no-untyped-def]  # numba infers
+    """Fill ``best`` (3,) with the best centre met for points (n, 3); the radius that it needs."""
+    x, y, z = [(points[:, i].min() + points[:, i].max()) / 2.0 for i in range(3)]
+    least = math.inf
+    for step in range(1, steps + 1):
+        most, far = -1.0, 0
+        for i in range(len(points)):
+            squared = (points[i, 0] - x) ** 2 + (points[i, 1] - y) ** 2 + (points[i, 2] - z) ** 2
+            if squared > most:
+                most, far = squared, i
+        if most < least:
+            least = most
+            best[0], best[1], best[2] = x, y, z
+        x += (points[far, 0] - x) / (step + 1)
+        y += (points[far, 1] - y) / (step + 1)
+        z += (points[far, 2] - z) / (step + 1)
+    return math.sqrt(least)
 
 
 def prism(radius_mm: float, length_mm: float) -> Array:
@@ -100,12 +127,11 @@ def halves(corners: Array) -> tuple[Array, Array]:
     axis = int(np.argmax(high - low))
     cut = (low[axis] + high[axis]) / 2.0
     faces = ConvexHull(corners).simplices
-    edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
-    a, b = corners[edges[:, 0]], corners[edges[:, 1]]
-    crosses = (a[:, axis] < cut) != (b[:, axis] < cut)
-    a, b = a[crosses], b[crosses]
-    crossings = a + ((cut - a[:, axis]) / (b[:, axis] - a[:, axis]))[:, None] * (b - a)
     below = corners[:, axis] < cut
+    starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    crosses = below[starts] & ~below[ends]  # of the two faces at an edge one runs along it this way
+    a, b = corners[starts[crosses]], corners[ends[crosses]]
+    crossings = a + ((cut - a[:, axis]) / (b[:, axis] - a[:, axis]))[:, None] * (b - a)
     return np.concatenate([corners[below], crossings]), np.concatenate([corners[~below], crossings])
 
 

@@ -1,7 +1,8 @@
 """Compiled proofs that parts of an arm are clear: by balls against the skin, by a plane between two convex hulls.
 
 Each answer is a lower bound on a distance, in mm: above 0 it proves that nothing touches; at or below, nothing is said.
-All functions that call one another stand in this one file: numba's cache notices an edit only in the file called.
+All functions that call one another stand in this one file, long as it is: numba's cache notices an edit only in the
+file called.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -31,6 +32,18 @@ PLANES = 4
 
 COARSE_PLANES = 3
 """Directions tried on few corners first."""
+
+CELL_MM = 16.0
+"""Of the field of distances to the skin."""
+
+HALF_CELL_MM = CELL_MM * math.sqrt(3.0) / 2.0 + 1e-3
+"""No point of a cell is farther from its middle; the rounding of float32 included."""
+
+ROUGH_MM = 8.0
+"""Larger gaps are not worth all corners: a few of them stand back by 1 to 3 mm."""
+
+OVERLAP_MM = -5.0
+"""Enclosures that overlap by more are taken to touch: the judge is asked at once."""
 
 STACK = 64
 """Of the descents: deeper than any tree here (a balanced one of 2^40 triangles needs 41)."""
@@ -143,21 +156,43 @@ def _moved(T, c):
 
 
 @nb.njit(cache=True)
-def skin_gap(skin, balls, root, T, enough, far, stack, inner_stack):
+def _field_distance(tree, field, origin, x, y, z, stack):
+    """Distance to the skin of the middle of the cell that a point lies in: kept in ``field`` once known; -1 outside."""
+    i, j, k = (x - origin[0]) / CELL_MM, (y - origin[1]) / CELL_MM, (z - origin[2]) / CELL_MM
+    if not (0.0 <= i < field.shape[0] and 0.0 <= j < field.shape[1] and 0.0 <= k < field.shape[2]):
+        return -1.0
+    i, j, k = int(i), int(j), int(k)
+    if math.isnan(field[i, j, k]):
+        lows, highs, corners = tree
+        mx, my, mz = (i + 0.5) * CELL_MM, (j + 0.5) * CELL_MM, (k + 0.5) * CELL_MM
+        field[i, j, k] = to_surface(lows, highs, corners, origin[0] + mx, origin[1] + my, origin[2] + mz, 1e9, stack)
+    return field[i, j, k]
+
+
+@nb.njit(cache=True)
+def skin_gap(skin, balls, root, T, enough, far, needed, stack, inner_stack):
     """Lower bound on the distance of a body's balls to the skin, the body's frame standing at ``T`` (4, 4).
 
-    A ball as clear as ``enough``, mm, is not divided further; no bound exceeds ``far``. Both stacks are scratch.
+    The field is asked first: a ball's centre is no farther from the middle of its cell than half of its diagonal. A
+    ball as clear as ``enough``, mm, is not divided further; no bound exceeds ``far``; the first part that is not clear
+    by ``needed`` ends the search. Both stacks are scratch.
     """
-    lows, highs, corners = skin
+    tree, field, origin = skin
     centres, radii, children = balls
     best = far
     stack[0], top = root, 1
-    while top > 0 and best > 0.0:
+    while top > 0 and best > needed:
         top -= 1
         node = stack[top]
         c, r = centres[node], radii[node]
         x, y, z = _moved(T, c)
-        gap = to_surface(lows, highs, corners, x, y, z, best + r, inner_stack) - r
+        about = _field_distance(tree, field, origin, x, y, z, inner_stack)
+        if about >= 0.0:
+            if about - HALF_CELL_MM - r >= best:
+                continue
+            if about + HALF_CELL_MM + r <= needed:  # no part of the body in this ball is clear by as much
+                return 0.0
+        gap = to_surface(tree[0], tree[1], tree[2], x, y, z, best + r, inner_stack) - r
         if gap >= best:
             continue
         if gap > enough or children[node, 0] < 0:
@@ -192,6 +227,8 @@ def _support(px, py, pz, x, y, z):
 def plane_gap(a, b, R, t, axis, needed, tries):
     """The gap between two hulls along the best direction found: a plane square to it stands between them if above 0.
 
+    0 says nothing: the search ended where two points of the hulls were too close for the gap needed.
+
     The direction is mirrored at the line through the two extreme points until it parts the hulls (Chung and Wang 1996).
 
     Args:
@@ -203,7 +240,7 @@ def plane_gap(a, b, R, t, axis, needed, tries):
         needed: A gap above this will do, mm.
         tries: Directions tried at most.
     """
-    gap = -math.inf
+    best = -math.inf
     for _ in range(tries):
         x, y, z = axis
         bx = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
@@ -211,6 +248,7 @@ def plane_gap(a, b, R, t, axis, needed, tries):
         bz = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
         gap = x * t[0] + y * t[1] + z * t[2] - _extreme(b[0], b[1], b[2], -bx, -by, -bz)
         gap -= _extreme(a[0], a[1], a[2], x, y, z)
+        best = max(best, gap)
         if gap > needed:
             return gap
         i = _support(a[0], a[1], a[2], x, y, z)
@@ -221,12 +259,14 @@ def plane_gap(a, b, R, t, axis, needed, tries):
         rz = R[2, 0] * qx + R[2, 1] * qy + R[2, 2] * qz + t[2] - a[2][i]
         squared = rx * rx + ry * ry + rz * rz
         if squared < ROUNDS_TO_ZERO:
-            return gap
+            return best
+        if squared <= needed * abs(needed):  # two points of the hulls: no gap is larger
+            return max(best, 0.0)
         twice = 2.0 * (rx * x + ry * y + rz * z) / squared
         x, y, z = x - twice * rx, y - twice * ry, z - twice * rz
         size = math.sqrt(x * x + y * y + z * z)
         axis[0], axis[1], axis[2] = x / size, y / size, z / size
-    return gap
+    return best
 
 
 @nb.njit(cache=True)
@@ -275,7 +315,7 @@ def box_gap(frames, row, frame_b, centres, radii, second, poses, halves, first):
 
 
 @nb.njit(cache=True)
-def hull_gap(points, coarse, hulls, first, second, A, B, axis):
+def hull_gap(points, coarse, hulls, first, second, A, B, axis, needed):
     """Lower bound on the distance of two hulls, by a plane between them.
 
     Args:
@@ -288,6 +328,7 @@ def hull_gap(points, coarse, hulls, first, second, A, B, axis):
         A: Frame of the one, (4, 4).
         B: Frame of the other, (4, 4).
         axis: See :func:`plane_gap`; where it is zero, the line through the centres is taken.
+        needed: A gap above this will do, mm; for one above ``ROUGH_MM`` the coarse corners must suffice.
     """
     starts, centres, _, coarse_starts, slack = hulls
     R, t = np.empty((3, 3)), np.empty(3)
@@ -304,27 +345,45 @@ def hull_gap(points, coarse, hulls, first, second, A, B, axis):
             axis[2] = 1.0
     fuller = slack[first] + slack[second]
     a, b = _hull(coarse, coarse_starts, first), _hull(coarse, coarse_starts, second)
-    gap = plane_gap(a, b, R, t, axis, fuller + MIN_GAP_MM, COARSE_PLANES) - fuller
-    if gap > MIN_GAP_MM:
+    gap = plane_gap(a, b, R, t, axis, fuller + needed, COARSE_PLANES) - fuller
+    if gap > needed or needed > ROUGH_MM:
         return gap
-    return plane_gap(_hull(points, starts, first), _hull(points, starts, second), R, t, axis, MIN_GAP_MM, PLANES)
+    return plane_gap(_hull(points, starts, first), _hull(points, starts, second), R, t, axis, needed, PLANES)
 
 
 @nb.njit(cache=True)
-def first_unproven(scene, motion, axes, proven, state, check, skip):
-    """The first state and check, in order, that the bounds do not prove clear.
+def _gap(scene, at, frames, row, axis, enough, far, needed, stacks):
+    """Lower bound on the distance of check ``at`` in state ``row``; see :func:`skin_gap` and :func:`hull_gap`."""
+    checks, skin, balls, points, coarse, hulls, boxes = scene
+    kind, first, second, frame_a, frame_b = checks[at]
+    if kind == SKIN:
+        return skin_gap(skin, balls, second, frames[row, frame_b], enough, far, needed, stacks[0], stacks[1])
+    _, centres, radii, _, _ = hulls
+    if kind == BOX:
+        gap = box_gap(frames, row, frame_b, centres, radii, second, boxes[0], boxes[1], first)
+    else:
+        gap = ball_gap(frames, row, frame_a, frame_b, centres, radii, first, second)
+    if gap <= enough:
+        gap = hull_gap(points, coarse, hulls, first, second, frames[row, frame_a], frames[row, frame_b], axis, needed)
+    return gap
 
-    A check whose gap was g stays clear until its two bodies have moved by g against one another.
+
+@nb.njit(cache=True)
+def first_unproven(scene, levers, motion, axes, proven, state, check, asked, clear_mm):
+    """The first state and check, in order, that the bounds do not prove to be more than ``clear_mm`` apart.
+
+    A check whose gap was g stays clear until its two bodies have moved by g - ``clear_mm`` against one another.
 
     Args:
-        scene: (checks, levers, skin, balls, points, coarse, hulls, boxes), with
+        scene: (checks, skin, balls, points, coarse, hulls, boxes), with
             checks: Shape (k, 5): kind, first, second, and the frames of both. For SKIN ``second`` is the row of the
             body's root among the balls;
-            levers: Shape (k, 6), mm: how far a radian of each joint may move the two bodies of a PAIR;
-            skin: (lows, highs, corners) of its tree;
+            skin: ((lows, highs, corners) of its tree, its field (i, j, k), NaN where nobody has asked yet, and the
+            field's lowest corner (3,));
             balls: (centres, radii, children) of all bodies' trees, each in the frame of its body;
             points, coarse, hulls: See :func:`hull_gap`;
             boxes: (T_box_base (h, 4, 4), half sizes (h, 3)) by hull; half sizes -1 where it is no box.
+        levers: Shape (k, 6), mm: how far a radian of each joint may move the two bodies of a PAIR.
         motion: (frames, moved, turned), with
             frames: Shape (m, 7, 4, 4), mm: the states;
             moved: Shape (m, 7), mm: how far each frame's bodies may have moved since the first state; rising;
@@ -333,41 +392,107 @@ def first_unproven(scene, motion, axes, proven, state, check, skip):
         proven: Shape (k,): scratch, mm: what the motion must stay below; -inf at the beginning.
         state: Where to begin.
         check: The first check there.
-        skip: A check to leave out; -1 for none.
+        asked: Shape (k,): which checks.
+        clear_mm: ``MIN_GAP_MM``, or any other distance that is asked for.
 
     Returns:
         state * k + check; -1 where all is clear.
     """
-    checks, levers, skin, balls, points, coarse, hulls, boxes = scene
+    checks = scene[0]
     frames, moved, turned = motion
-    _, centres, radii, _, _ = hulls
-    poses, halves = boxes
     count = len(checks)
-    enough, far = (ENOUGH_MM, FAR_MM) if len(frames) > 1 else (MIN_GAP_MM, 2.0 * MIN_GAP_MM)
-    stack, inner_stack = np.empty(STACK, np.int64), np.empty(STACK, np.int64)
+    enough, far = (clear_mm + ENOUGH_MM, clear_mm + FAR_MM) if len(frames) > 1 else (clear_mm, clear_mm + MIN_GAP_MM)
+    stacks = np.empty((2, STACK), np.int64)
     for row in range(state, len(frames)):
         for at in range(check if row == state else 0, count):
-            kind, frame_a, frame_b = checks[at, 0], checks[at, 3], checks[at, 4]
+            frame_a, frame_b = checks[at, 3], checks[at, 4]
             way = moved[row, frame_b]
-            if kind == PAIR:
+            if checks[at, 0] == PAIR:
                 way = 0.0
                 for joint in range(frame_a, frame_b):
                     way += levers[at, joint] * turned[row, joint]
-            if at == skip or way < proven[at]:
+            if way < proven[at] or not asked[at]:
                 continue
-            first, second = checks[at, 1], checks[at, 2]
-            if kind == SKIN:
-                gap = skin_gap(skin, balls, second, frames[row, frame_b], enough, far, stack, inner_stack)
-            else:
-                if kind == BOX:
-                    gap = box_gap(frames, row, frame_b, centres, radii, second, poses, halves, first)
-                else:
-                    gap = ball_gap(frames, row, frame_a, frame_b, centres, radii, first, second)
-                if gap <= enough:
-                    A, B = frames[row, frame_a], frames[row, frame_b]
-                    gap = hull_gap(points, coarse, hulls, first, second, A, B, axes[at])
-            if gap <= MIN_GAP_MM:
+            gap = _gap(scene, at, frames, row, axes[at], enough, far, clear_mm, stacks)
+            if gap <= clear_mm:
                 proven[at] = -math.inf
                 return row * count + at
-            proven[at] = way + gap - MIN_GAP_MM
+            proven[at] = way + gap - clear_mm
     return -1
+
+
+@nb.njit(cache=True)
+def _ways(frames, row, body_frame, centre, radius, turns, ways):
+    """How far a body may move while each joint turns by no more than ``turns`` (6,), rad, either way from a state.
+
+    Fills ``ways`` (7,), mm: entry j bounds the motion against the frame before joint j. A point's distance from axis j
+    is at most that of the body's ball, plus what the joints beyond have moved it against that axis.
+    """
+    x, y, z = _moved(frames[row, body_frame], centre)
+    ways[body_frame] = 0.0
+    for joint in range(body_frame - 1, -1, -1):
+        T = frames[row, joint]
+        dx, dy, dz = x - T[0, 3], y - T[1, 3], z - T[2, 3]
+        ax, ay, az = T[0, 2], T[1, 2], T[2, 2]
+        cx, cy, cz = dy * az - dz * ay, dz * ax - dx * az, dx * ay - dy * ax
+        lever = math.sqrt(cx * cx + cy * cy + cz * cz) + radius + ways[joint + 1]
+        ways[joint] = ways[joint + 1] + turns[joint] * lever
+
+
+@nb.njit(cache=True)
+def bisect(scene, movers, frames, turns, unproven, fine_mm, axes, questions):
+    """Prove parts of a straight joint segment clear: at the middle of each part, else of its halves, and so on.
+
+    A check that is farther apart at the middle than its bodies move from there to the part's ends is clear all over the
+    part (Schwarzer, Saha and Latombe 2005, "Adaptive dynamic collision checking for single and multiple articulated
+    robots in complex environments").
+
+    Args:
+        scene: See :func:`first_unproven`.
+        movers: (mover (k,), frame (b,), centres (b, 3), radii (b,)): what moves in each check, the frame that it moves
+            with, and a ball about it there.
+        frames: Shape (c, n, 7, 4, 4), mm: for each of c parts the state in its middle, in the middle of its halves, of
+            their halves ..., as a heap of n nodes.
+        turns: Shape (6,), rad: how far each joint turns from the middle of a part to its end.
+        unproven: Shape (c, 2 n + 1, k): True at node 0 where a check is open; filled for all nodes and, beyond, for
+            the parts that the last nodes' halves are.
+        fine_mm: Where the bodies of a check move no farther than this within a part, its middle decides.
+        axes: See :func:`first_unproven`.
+        questions: Shape (q, 3): filled with part, node and check of what a judge must be asked at the node's state.
+
+    Returns:
+        How many questions; more than q where they did not fit.
+    """
+    checks = scene[0]
+    mover_of, mover_frames, centres, radii = movers
+    stacks, ways = np.empty((2, STACK), np.int64), np.empty((len(mover_frames), 7))
+    fresh = np.empty(len(mover_frames), np.bool_)
+    asked = 0
+    for part in range(len(frames)):
+        share, level_ends = 1.0, 1
+        for node in range(frames.shape[1]):
+            if node == level_ends:
+                share, level_ends = share / 2.0, 2 * level_ends + 1
+            here, left, right = unproven[part, node], unproven[part, 2 * node + 1], unproven[part, 2 * node + 2]
+            fresh[:] = True
+            for at in range(len(checks)):
+                left[at] = right[at] = False
+                if not here[at]:
+                    continue
+                mover = mover_of[at]
+                if fresh[mover]:
+                    fresh[mover] = False
+                    ball = centres[mover], radii[mover]
+                    _ways(frames[part], node, mover_frames[mover], *ball, share * turns, ways[mover])
+                way = ways[mover, checks[at, 3]] + MIN_GAP_MM
+                gap = _gap(scene, at, frames[part], node, axes[at], way, way + MIN_GAP_MM, way, stacks)
+                if gap > way:
+                    continue
+                axes[at] = 0.0  # where a direction did not do, the next search begins anew
+                coarse = way - MIN_GAP_MM > fine_mm
+                left[at] = right[at] = coarse
+                if gap < OVERLAP_MM or (gap <= MIN_GAP_MM and not coarse):
+                    if asked < len(questions):
+                        questions[asked] = part, node, at
+                    asked += 1
+    return asked

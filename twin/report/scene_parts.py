@@ -18,7 +18,7 @@ from twin.report import palette
 from twin.report.numbers import chosen_row
 from twin.report.palette import Rgb
 from twin.report.render import Layer, Surface
-from twin.report.shapes import ball, bar, box, corridor_mouth, corridor_walls
+from twin.report.shapes import ball, bar, box, corridor_mouth, corridor_walls, ring
 
 Floats = NDArray[np.float64]
 
@@ -27,6 +27,9 @@ ORGAN_VEIL = 0.38
 
 UNKNOWN_VEIL = 0.30
 SKIN_VEIL = 0.20
+GANTRY_VEIL = 0.15
+"""Opacity of the gantry, so that it does not hide the patient in its bore."""
+
 MOUTH_VEIL = 0.60
 WALL_VEIL = 0.10
 
@@ -164,8 +167,8 @@ class ArmPicture:
 
 
 def room(case: Any, T_base_ct: Floats | None) -> tuple[Body, ...]:
-    """The case's obstacles (table and the like); those given in the base frame need to know where it is."""
-    bodies = []
+    """The case's gantry and obstacles (table and the like); those given in the base frame need to know where it is."""
+    bodies = [] if case.gantry is None else [_gantry(case.gantry)]
     for obstacle in case.obstacles:
         T = np.eye(4)
         T[:3, 3] = obstacle.center_mm
@@ -175,3 +178,9 @@ def room(case: Any, T_base_ct: Floats | None) -> tuple[Body, ...]:
             T = np.linalg.inv(T_base_ct) @ T
         bodies.append(Body(obstacle.name, "room", box(T, obstacle.size_mm), palette.TABLE))
     return tuple(bodies)
+
+
+def _gantry(gantry: Any) -> Body:
+    radius = gantry.bore_diameter_mm / 2
+    wall = ring(gantry.T_ct_gantry, radius, radius + gantry.wall_mm, gantry.thickness_mm)
+    return Body("gantry", "room", wall, palette.TABLE, GANTRY_VEIL)

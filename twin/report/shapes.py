@@ -43,6 +43,12 @@ def box(T_ct_box: Floats, size: Any) -> TriangleMesh:
     return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)).transformed(T_ct_box)
 
 
+def ring(T_ct_ring: Floats, inner: float, outer: float, thickness: float) -> TriangleMesh:
+    """A flat ring about the z axis of its frame, two radii and the extent along z, mm."""
+    mesh = trimesh.creation.annulus(inner, outer, thickness, sections=2 * SECTIONS)
+    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)).transformed(np.asarray(T_ct_ring))
+
+
 def corridor_mouth(candidates: Candidates, case: Any) -> TriangleMesh | None:
     """Where a needle may enter: one patch on the skin for every safe cell of the grid, None when nothing is safe."""
     cells = _cells(candidates, case)

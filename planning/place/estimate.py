@@ -1,0 +1,136 @@
+"""What share of directions an arm might hold from a placement: kinematics for all at once, then balls, then itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.place.arm_balls import ArmBalls, Surroundings, base_is_clear, clear_ways
+from planning.place.directions import WantedDirections
+from planning.place.mounts import Site
+from planning.robot.fast_checker import FastChecker
+from planning.robot.insertion import MIN_SINGULARITY, flange_poses
+from planning.robot.kinematics import N_BRANCHES, inverse, link_poses, singularity
+from planning.robot.tool import Tool
+from planning.robot.ur import UrModel, ur_model
+
+Floats = NDArray[np.float64]
+
+STATES = 3
+"""Of an insertion, from standoff to target: enough to see most of what ends it."""
+
+
+class Ways(NamedTuple):
+    """The straight insertions along n directions on every branch, looked at in m states each."""
+
+    q: Floats
+    """Shape (n, 8, m, 6), rad, standoff first; NaN where a branch does not exist."""
+    margin: Floats
+    """Shape (n, 8): least distance from a singularity over the states, 0..1; 0 where a way is not drivable."""
+
+
+class Estimate(NamedTuple):
+    """Shares of the directions, 0..1, each what the one before leaves."""
+
+    reach: float
+    """Kinematics allow the insertion."""
+    room: float
+    """And links and holder keep clear of patient and room."""
+    share: float
+    """And of one another, where that is asked; else the same."""
+    margin: float
+    """Mean distance of the held directions from singularities, 0..1; 0 where none is held."""
+
+
+NOTHING = Estimate(0.0, 0.0, 0.0, 0.0)
+
+
+def insertion_ways(
+    model: UrModel, target_base: Floats, outward_base: Floats, distances_mm: Floats, at_least: float = MIN_SINGULARITY
+) -> Ways:
+    """Every branch of many insertions, by kinematics alone; joint limits are not asked for.
+
+    Args:
+        model: The arm.
+        target_base: Shape (3,), mm.
+        outward_base: Shape (n, 3), unit.
+        distances_mm: Shape (n, m): target to flange at each state.
+        at_least: Each singularity must be farther than this.
+    """
+    count, states = distances_mm.shape
+    poses = flange_poses(target_base, np.repeat(outward_base, states, axis=0), distances_mm.reshape(-1))
+    q = inverse(model, poses).reshape(count, states, N_BRANCHES, 6)
+    least = singularity(model, q).least().min(axis=1)  # NaN where a state does not exist
+    return Ways(np.moveaxis(q, 2, 1), np.where(least > at_least, least, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Estimator:
+    """Estimates placements of one arm about one target. What it holds can be sent to another process.
+
+    Attributes:
+        model: Name of the arm.
+        tool: What its flange carries.
+        room: What stands about it.
+        T_ct_bed: Shape (4, 4), mm, its origin the target.
+        wanted: The directions.
+        itself: Whether the arm must keep clear of itself, which takes as long as all the rest.
+    """
+
+    model: str
+    tool: Tool
+    room: Surroundings
+    T_ct_bed: Floats
+    wanted: WantedDirections
+    itself: bool
+
+    def estimate(self, site: Site) -> Estimate:
+        """The shares at one site; ``NOTHING`` where the base would stand in something."""
+        model, balls = ur_model(self.model), _balls(self.model, self.tool)
+        T_ct_base = self.T_ct_bed @ site.T_bed_base()
+        if not base_is_clear(balls, self.room, T_ct_base):
+            return NOTHING
+        T_base_ct = np.linalg.inv(T_ct_base)
+        target = T_base_ct[:3, :3] @ self.T_ct_bed[:3, 3] + T_base_ct[:3, 3]
+        depths = np.linspace(0.0, 1.0, STATES)
+        distances = self.tool.needle_length_mm + self.wanted.standoff_mm[:, None] * (1.0 - depths)
+        found = insertion_ways(model, target, self.wanted.outward_ct @ T_base_ct[:3, :3].T, distances)
+        rows, branches = np.nonzero(found.margin)
+        clear = clear_ways(balls, self.room, T_ct_base, link_poses(model, found.q[rows, branches]))
+        open_margin = np.zeros_like(found.margin)
+        open_margin[rows[clear], branches[clear]] = found.margin[rows[clear], branches[clear]]
+        best = self._clear_of_itself(found.q, open_margin) if self.itself else open_margin.max(axis=1)
+        share = self._share(best)
+        margin = float(best @ self.wanted.weight) / share if share > 0.0 else 0.0
+        return Estimate(self._share(found.margin.max(axis=1)), self._share(open_margin.max(axis=1)), share, margin)
+
+    def _share(self, margins: Floats) -> float:
+        return float(self.wanted.weight[margins > 0.0].sum())
+
+    def _clear_of_itself(self, q: Floats, margin: Floats) -> Floats:
+        """The margin of each direction's best branch on which the arm does not meet itself, shape (n,); 0 for none."""
+        checker = _alone(self.model, self.tool)
+        best = np.zeros(len(q))
+        for row in np.flatnonzero(margin.any(axis=1)):
+            for branch in np.argsort(-margin[row], kind="stable"):
+                if margin[row, branch] == 0.0:
+                    break
+                if checker.first_contact(q[row, branch, [0, -1]], needle_may_touch_patient=True) is None:
+                    best[row] = margin[row, branch]
+                    break
+        return best
+
+
+@cache
+def _balls(model: str, tool: Tool) -> ArmBalls:
+    return ArmBalls.of(ur_model(model), tool)
+
+
+@cache
+def _alone(model: str, tool: Tool) -> FastChecker:
+    """The arm in an empty room: it meets nothing but itself."""
+    return FastChecker(ur_model(model), tool)

@@ -1,0 +1,174 @@
+"""The ways to mount an arm, where each may stand about the target, and the base's pose there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import product
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.case import Case, Obstacle
+from planning.case_file import MountBounds, MountName
+from planning.errors import InputError
+from planning.robot.ur import UrModel, ur_model
+
+Floats = NDArray[np.float64]
+Range = tuple[float, float]
+
+FREE_MM = 100.0
+"""By how much the default bounds go beyond what upper arm, forearm and needle span together."""
+
+ABOVE_MM = 200.0
+"""A floor mount may stand so much higher than the target, a ceiling or side mount so much lower, by default."""
+
+RAIL_MM = 100.0
+"""A base at the rail stands at most so much higher or lower than the table's top, by default."""
+
+ROUNDS_MM = 50.0
+"""Default bounds are multiples of this."""
+
+STRAIGHT_UP_MM = 1.0
+"""A base whose axis passes the target this close has no direction away from it."""
+
+FACINGS: Mapping[str, tuple[int, int, int]] = MappingProxyType(
+    {"to +along": (1, 0, 0), "to -along": (-1, 0, 0), "to +across": (0, 1, 0), "to -across": (0, -1, 0)}
+)
+"""A side mount's base axis, toward the target, in the bed frame."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """Where a base of one kind may stand, in the bed frame about the target.
+
+    Attributes:
+        mount: "floor", "rail", "ceiling" or "side".
+        facing: What tells two regions of a mount apart, or "".
+        axis: The base's z axis, unit.
+        low: Lowest position of the base's origin, mm.
+        high: Highest.
+    """
+
+    mount: MountName
+    facing: str
+    axis: tuple[int, int, int]
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    @property
+    def name(self) -> str:
+        """Mount and facing."""
+        return f"{self.mount} {self.facing}".strip()
+
+    def lattice(self, step_mm: float) -> Floats:
+        """Positions at a step, centred in the region, shape (n, 3), mm."""
+        axes = []
+        for low, high in zip(self.low, self.high, strict=True):
+            count = math.floor((high - low) / step_mm) + 1
+            first = (low + high - (count - 1) * step_mm) / 2
+            axes.append(first + step_mm * np.arange(count))
+        return np.array(list(product(*axes)))
+
+    def around(self, position: Floats, step_mm: float) -> Floats:
+        """The neighbours of a position in a grid of that step, those of them in the region, shape (n, 3), mm."""
+        steps = np.array([s for s in product((-1.0, 0.0, 1.0), repeat=3) if any(s)])
+        near = np.clip(position + step_mm * steps, self.low, self.high)
+        return np.unique(near[np.abs(near - position).max(axis=1) > 0], axis=0)
+
+
+@dataclass(frozen=True)
+class Site:
+    """One place for the base.
+
+    Attributes:
+        region: Of which it is a part.
+        position: The base's origin in the bed frame: along, across, up from the target, mm.
+    """
+
+    region: Region
+    position: tuple[float, float, float]
+
+    def T_bed_base(self) -> Floats:  # noqa: N802  # the field writes T_a_b
+        """The base's pose: its x axis leads away from the target, so that the arm reaches for it at q1 = 0.
+
+        Returns:
+            Shape (4, 4), mm.
+        """
+        z, at = np.array(self.region.axis, dtype=float), np.array(self.position)
+        x = at - z * (z @ at)
+        if np.linalg.norm(x) < STRAIGHT_UP_MM:
+            x = np.eye(3)[0] if abs(z[0]) < 0.5 else np.eye(3)[2]
+        x /= np.linalg.norm(x)
+        T = np.eye(4)
+        T[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+        T[:3, 3] = at
+        return T
+
+
+def regions(case: Case, T_ct_bed: Floats) -> tuple[Region, ...]:
+    """Where the case lets a base stand.
+
+    Raises:
+        InputError: A rail is asked for, and there is no table to which it belongs.
+    """
+    settings, model = case.place, ur_model(case.robot.model)
+    table = next((o for o in case.obstacles if o.name == settings.table and o.frame == "ct"), None)
+    mounts = settings.mounts or ("floor", "rail", "ceiling", "side")
+    if table is None and settings.mounts is not None and "rail" in mounts:
+        raise InputError(
+            f"place.mounts has a rail, and no obstacle '{settings.table}' of frame ct is the table",
+            where=case.path,
+            allowed="an [[obstacle]] of that name, or place.table",
+        )
+    reach = default_reach_mm(model, case.needle.length_mm)
+    found: list[Region] = []
+    for mount in mounts:
+        if mount == "rail":
+            found += [] if table is None else _rails(case, table, T_ct_bed, reach)
+        elif mount == "side":
+            found += [_side(facing, axis, settings.side, reach) for facing, axis in FACINGS.items()]
+        else:
+            heights = (-reach, ABOVE_MM) if mount == "floor" else (-ABOVE_MM, reach)
+            axis = (0, 0, 1) if mount == "floor" else (0, 0, -1)
+            bounds = settings.floor if mount == "floor" else settings.ceiling
+            found.append(_region(mount, "", axis, bounds, ((-reach, reach), (-reach, reach), heights)))
+    return tuple(found)
+
+
+def default_reach_mm(model: UrModel, needle_length_mm: float) -> float:
+    """How far from the target a base may stand where the case says nothing."""
+    span = abs(model.a2) + abs(model.a3) + needle_length_mm + FREE_MM
+    return ROUNDS_MM * math.ceil(span / ROUNDS_MM)
+
+
+def _region(
+    mount: MountName, facing: str, axis: tuple[int, int, int], bounds: MountBounds, defaults: tuple[Range, ...]
+) -> Region:
+    stated = (bounds.along_mm, bounds.across_mm, bounds.height_mm)
+    low, high = zip(*(s if s is not None else d for s, d in zip(stated, defaults, strict=True)), strict=True)
+    return Region(mount, facing, axis, low, high)
+
+
+def _side(facing: str, axis: tuple[int, int, int], bounds: MountBounds, reach: float) -> Region:
+    """The base's axis lies level and leads to the target's side of the room."""
+    toward = {1: (-reach, 0.0), -1: (0.0, reach), 0: (-reach, reach)}
+    return _region("side", facing, axis, bounds, (toward[axis[0]], toward[axis[1]], (-ABOVE_MM, reach)))
+
+
+def _rails(case: Case, table: Obstacle, T_ct_bed: Floats, reach: float) -> list[Region]:
+    """An upright base beside either long edge of the table, at about the height of its top."""
+    half = np.abs(T_ct_bed[:3, :3].T) @ np.asarray(table.size_mm) / 2
+    centre = T_ct_bed[:3, :3].T @ (np.asarray(table.center_mm) - T_ct_bed[:3, 3])
+    bounds = case.place.rail
+    height = bounds.height_mm if bounds.height_mm is not None else (-RAIL_MM, RAIL_MM)
+    top = float(centre[2] + half[2])
+    found = []
+    for facing, side in (("+across", 1.0), ("-across", -1.0)):
+        across = float(centre[1] + side * (half[1] + case.place.rail_gap_mm))
+        defaults = ((-reach, reach), (across, across), (0.0, 0.0))
+        heights = MountBounds(along_mm=bounds.along_mm, height_mm=(top + height[0], top + height[1]))
+        found.append(_region("rail", facing, (0, 0, 1), heights, defaults))
+    return found

@@ -1,0 +1,269 @@
+"""The search for a place to stand the arm: all regions coarsely, the best of each finely, the finalists exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.anatomy import Anatomy
+from planning.candidates import Candidates
+from planning.case import Case, mount_pose
+from planning.case_file import MountSection
+from planning.errors import NoAnswerError
+from planning.place.arm_balls import Surroundings
+from planning.place.bed import bed_frame
+from planning.place.directions import wanted_directions
+from planning.place.estimate import Estimate, Estimator
+from planning.place.judge import Judge, Verdict
+from planning.place.mount_lines import mount_section
+from planning.place.mounts import Site, regions
+from planning.place.needle_start import needle_can_start
+from planning.place.room_field import Boxes, SkinField
+from planning.place.workers import ask_all
+from planning.placement import Placement
+from planning.room import ARM_PADDING_MM, case_boxes, case_tool, check_gantry, home_configuration
+
+Floats = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+
+COARSE_DIRECTIONS = 64
+"""Directions that a site is estimated with at first."""
+
+FINE_DIRECTIONS = 128
+"""And those near the best."""
+
+SEEDS = 10
+"""Sites that are refined; each mount's best is among them."""
+
+HALVINGS = 3
+"""The step is halved so often: 150 mm to 19 mm, about what a base is stood to."""
+
+FINALISTS = 6
+"""Sites that are judged exactly; each mount's best is among them."""
+
+SHARE_DIGITS = 3
+"""Shares that agree to so many digits are equal; then the margin decides."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A placement and its worth.
+
+    Attributes:
+        site: Where the base stands; None for where the case itself has it.
+        mount: The base's pose as a case states it.
+        estimate: What it was chosen by; None for the case's own.
+        verdict: The exact answer.
+    """
+
+    site: Site | None
+    mount: MountSection
+    estimate: Estimate | None
+    verdict: Verdict
+
+    @property
+    def name(self) -> str:
+        """What the tables call it."""
+        return "as in the case" if self.site is None else self.site.region.name
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceSearch:
+    """What was found.
+
+    Attributes:
+        T_ct_bed: Shape (4, 4), mm: the frame of the sites.
+        coarse: Every site of the first lattice with its estimate.
+        refined: How many more were estimated.
+        possible: Share of the directions, 0..1, in which the needle itself may stand at standoff; none can hold more.
+        judged: Best first; the case's own placement is not among them.
+        own: The case's own placement, judged; None where it has none.
+    """
+
+    T_ct_bed: Floats
+    coarse: tuple[tuple[Site, Estimate], ...]
+    refined: int
+    possible: float
+    judged: tuple[Judged, ...]
+    own: Judged | None
+
+
+def search_placements(
+    case: Case,
+    anatomy: Anatomy,
+    found: Candidates,
+    placement: Placement | None,
+    *,
+    jobs: int = 1,
+    progress: Progress = lambda stage, done, total: None,
+) -> PlaceSearch:
+    """Look for the placements from which the arm can hold most of the organ-safe directions.
+
+    The answer does not depend on ``jobs``.
+
+    Args:
+        case: The validated case.
+        anatomy: Its structures.
+        found: Its directions, judged against the organs alone.
+        placement: Where the case itself has the arm.
+        jobs: Processes.
+        progress: Called with (stage, done, total).
+
+    Raises:
+        InputError: Bounds that contradict the case, or a gantry that stands in the patient.
+        NoAnswerError: No direction is safe for the organs, or in none the needle could start.
+    """
+    if not found.safe.any():
+        raise NoAnswerError("no direction is safe for the organs, so no placement can help", counts=found.counts())
+    check_gantry(case, anatomy.skin.mesh)
+    T_ct_bed = bed_frame(case)
+    judge = _judge(case, anatomy, found)
+    room = Surroundings(SkinField.of(anatomy.skin.mesh), Boxes.of(judge.fixed), Boxes.of(judge.carried), ARM_PADDING_MM)
+    startable = judge.wanted.only(
+        needle_can_start(judge.tool, judge.skin, case.target_ct, judge.wanted, ARM_PADDING_MM)
+    )
+    if not len(startable):
+        raise NoAnswerError("in every organ-safe direction the needle would start too near the skin")
+    coarse = Estimator(judge.model, judge.tool, room, T_ct_bed, startable.spread(COARSE_DIRECTIONS), itself=False)
+    fine = replace(coarse, wanted=startable.spread(FINE_DIRECTIONS))
+    sites = [
+        Site(region, (float(x), float(y), float(z)))
+        for region in regions(case, T_ct_bed)
+        for x, y, z in region.lattice(case.place.step_mm)
+    ]
+    estimates = ask_all(coarse.estimate, sites, jobs=jobs, progress=partial(progress, "placements"))
+    first = tuple(zip(sites, estimates, strict=True))
+    seeds = [site for site, _ in _best_apart(first, 1.5 * case.place.step_mm, SEEDS)]
+    refiner = _Refiner(fine, partial(progress, "refining"))
+    finalists = _best_apart(refiner.refine(seeds, case.place.step_mm), case.place.step_mm / 2, FINALISTS)
+    judged, own = _judged(case, judge, T_ct_bed, finalists, placement, jobs, partial(progress, "judged"))
+    return PlaceSearch(T_ct_bed, first, refiner.asked, float(startable.weight.sum()), judged, own)
+
+
+def _judged(
+    case: Case,
+    judge: Judge,
+    T_ct_bed: Floats,
+    finalists: Sequence[tuple[Site, Estimate]],
+    placement: Placement | None,
+    jobs: int,
+    progress: Callable[[int, int], None],
+) -> tuple[tuple[Judged, ...], Judged | None]:
+    """The finalists as they would be written, best first, and the case's own placement."""
+    mounts = [mount_section(T_ct_bed @ site.T_bed_base(), case.space) for site, _ in finalists]
+    poses = [mount_pose(mount, case.space, case.path) for mount in mounts]
+    if placement is not None:
+        poses.append(placement.T_base_ct)
+    verdicts = ask_all(judge.verdict, poses, jobs=jobs, progress=progress)
+    own = None
+    if placement is not None:
+        T_ct_base = np.asarray(np.linalg.inv(placement.T_base_ct), dtype=np.float64)
+        own = Judged(None, mount_section(T_ct_base, case.space), None, verdicts.pop())
+    judged = [Judged(site, m, e, v) for (site, e), m, v in zip(finalists, mounts, verdicts, strict=True)]
+    judged.sort(key=lambda one: (-round(one.verdict.share, SHARE_DIGITS), -one.verdict.margin))
+    return tuple(judged), own
+
+
+def _judge(case: Case, anatomy: Anatomy, found: Candidates) -> Judge:
+    """The case's room, patient-fixed and arm-fixed apart, and its directions."""
+    carried = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"}
+    boxes = case_boxes(case, np.eye(4))  # with the two frames in one place each box stands in its own
+    return Judge(
+        model=case.robot.model,
+        tool=case_tool(case),
+        skin=anatomy.skin.mesh,
+        fixed=tuple(box for box in boxes if box.name not in carried),
+        carried=tuple(box for box in boxes if box.name in carried),
+        padding_mm=ARM_PADDING_MM,
+        target_ct=case.target_ct,
+        wanted=wanted_directions(case, found),
+        home=home_configuration(case),
+    )
+
+
+class _Refiner:
+    """Walks from sites to better ones with ever shorter steps; asks about no site twice.
+
+    Whether the arm meets itself takes longest and can only lower a share: it is asked of the site that leads alone,
+    until the one that leads has been asked.
+    """
+
+    def __init__(self, estimator: Estimator, progress: Callable[[int, int], None]) -> None:
+        self._quick = replace(estimator, itself=False)
+        self._full = replace(estimator, itself=True)
+        self._progress = progress
+        self._hoped: dict[Site, Estimate] = {}
+        self._sure: dict[Site, Estimate] = {}
+
+    @property
+    def asked(self) -> int:
+        """How many sites were estimated."""
+        return len(self._hoped)
+
+    def refine(self, seeds: Sequence[Site], step_mm: float) -> list[tuple[Site, Estimate]]:
+        """Where each seed ends, with its estimate; each end once."""
+        ends = list(seeds)
+        for halving in range(1, HALVINGS + 1):
+            ends = self._leaders([[end, *_neighbours(end, step_mm / 2**halving)] for end in ends])
+        return [(end, self._sure[end]) for end in dict.fromkeys(ends)]
+
+    def _leaders(self, groups: Sequence[Sequence[Site]]) -> list[Site]:
+        """The best site of each group."""
+        self._ask(self._quick, self._hoped, [site for group in groups for site in group])
+        while True:
+            leaders = [max(group, key=lambda site: _score(self._sure.get(site, self._hoped[site]))) for group in groups]
+            if all(leader in self._sure for leader in leaders):
+                return leaders
+            self._ask(self._full, self._sure, leaders)
+
+    def _ask(self, estimator: Estimator, known: dict[Site, Estimate], sites: Sequence[Site]) -> None:
+        new = [site for site in dict.fromkeys(sites) if site not in known]
+        # In this process: there are few of them, and a new process would have to build its arm first.
+        known |= dict(zip(new, ask_all(estimator.estimate, new, jobs=1, progress=self._progress), strict=True))
+
+
+def _neighbours(site: Site, step_mm: float) -> list[Site]:
+    around = site.region.around(np.array(site.position), step_mm)
+    return [Site(site.region, (float(x), float(y), float(z))) for x, y, z in around]
+
+
+def _score(estimate: Estimate) -> tuple[float, float]:
+    """More is better."""
+    return round(estimate.share, SHARE_DIGITS), estimate.margin
+
+
+def _order(estimate: Estimate) -> tuple[float, float]:
+    share, margin = _score(estimate)
+    return -share, -margin
+
+
+def _best_apart(pairs: Sequence[tuple[Site, Estimate]], distance_mm: float, count: int) -> list[tuple[Site, Estimate]]:
+    """Each mount's best, then the best of the others, as far as they hold anything.
+
+    Args:
+        pairs: Sites with their estimates.
+        distance_mm: Two of the same region are at least so far apart.
+        count: So many, or as many as there are mounts.
+    """
+    holding = [pair for pair in pairs if pair[1].share > 0.0]
+    mounts = {site.region.mount for site, _ in holding}
+    firsts: list[tuple[Site, Estimate]] = []
+    others: list[tuple[Site, Estimate]] = []
+    for pair in sorted(holding, key=lambda pair: _order(pair[1])):
+        is_first = pair[0].region.mount not in {site.region.mount for site, _ in firsts}
+        if is_first:
+            firsts.append(pair)
+        elif len(firsts) + len(others) < count and all(_far(pair[0], k, distance_mm) for k, _ in firsts + others):
+            others.append(pair)
+        if len(firsts) == len(mounts) and len(firsts) + len(others) >= count:
+            break
+    return firsts + others[: max(0, count - len(firsts))]
+
+
+def _far(one: Site, other: Site, distance_mm: float) -> bool:
+    apart = float(np.linalg.norm(np.subtract(one.position, other.position)))
+    return one.region != other.region or apart >= distance_mm

@@ -1,0 +1,129 @@
+"""The mirror of a running arm: what it shows, what it refuses, and that it never sends anything."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import run_twin
+from meshes import folder
+from planning.case import load_case
+from planning.errors import InputError
+from planning.placement import load_placement
+from planning.reach import ReachRequest, assess_reach
+from planning.robot.cell import CellChecker
+from planning.robot.ur import ur_model
+from planning.room import case_tool
+from twin import mirror
+
+ABDOMEN = folder() / "abdomen"
+
+
+class FakeArm:
+    """Reads like a robot; anything but the two readings is an attribute error."""
+
+    def __init__(self, rows):
+        self.rows = list(rows)
+        self.time = 100.0
+
+    def getActualQ(self):  # noqa: N802
+        """The next joint angles."""
+        return self.rows.pop(0)
+
+    def getTimestamp(self):  # noqa: N802
+        """Half a second later each time."""
+        self.time += 0.5
+        return self.time
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """A straight insertion of the abdomen's arm from the front of the body, (m, 6) rad, with its tip distances."""
+    case = load_case(ABDOMEN)
+    T = load_placement(case).T_base_ct
+    target = T[:3, :3] @ case.target_ct + T[:3, 3]
+    model = ur_model("ur3")
+
+    checker = CellChecker(model, case_tool(case))
+    for tilt in np.linspace(-0.6, 0.6, 13):
+        u = T[:3, :3] @ [-np.sin(abs(tilt)), -np.cos(tilt), 0.0]
+        answer = assess_reach(checker, ReachRequest(target, u / np.linalg.norm(u), 210.0, 120.0))
+        if answer.reachable:
+            return answer
+    raise AssertionError("the arm must hold some of these")
+
+
+def test_the_tip_comes_straight_to_the_target(drive):
+    """Along an insertion the target stays on the needle's line, and the distance is the standoff less the depth."""
+    shown = mirror.Mirror.of(load_case(ABDOMEN))
+    for q, depth in zip(drive.insertion_q, drive.insertion_depth_mm, strict=True):
+        one = shown.show(mirror.JointState(0.0, q))
+        assert one.off_axis_mm < 1e-6 and one.to_target_mm == pytest.approx(120.0 - depth, abs=1e-6)
+
+
+def test_a_live_arm_is_read_until_its_time_is_over(drive):
+    """By the robot's clock: four readings in 1.5 seconds."""
+    arm = FakeArm([list(drive.insertion_q[0])] * 9)
+    states = list(mirror.live_states(arm, period_s=0.0, seconds=1.5))
+    assert [state.time_s for state in states] == [100.5, 101.0, 101.5, 102.0]
+
+
+@pytest.mark.parametrize("rows", [[[0.0] * 5], [[0.0] * 5 + [np.nan]]])
+def test_joint_angles_that_are_none_are_refused(rows):
+    """Five of them, or one that is no number."""
+    with pytest.raises(InputError, match="six finite angles"):
+        next(mirror.live_states(FakeArm(rows), period_s=0.0, seconds=None))
+
+
+def test_a_recording_is_mirrored(drive, tmp_path, capsys):
+    """As `export --format csv` writes it, comments and other columns and all; text a line a state, JSON one object."""
+    path = tmp_path / "joints.csv"
+    rows = [f"insertion,{i * 0.1},{','.join(map(repr, map(float, q)))}" for i, q in enumerate(drive.insertion_q[-3:])]
+    path.write_text("\n".join(["# a comment", "phase,time_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad", *rows]))
+    assert run_twin.main(["mirror", "--case", str(ABDOMEN), "--from", str(path)]) == 0
+    lines = capsys.readouterr().out.strip().splitlines()
+    assert len(lines) == 3 and "to target    0.00 mm" in lines[-1]
+    assert run_twin.main(["mirror", "--case", str(ABDOMEN), "--from", str(path), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)["states"]
+    np.testing.assert_allclose(said[-1]["tip_ct_mm"], load_case(ABDOMEN).target_ct, atol=1e-6)
+    np.testing.assert_allclose(np.radians(said[-1]["q_deg"]), drive.insertion_q[-1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("time_s,q1_rad\n0,0\n", "lacks q2_rad"),
+        ("time_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\n0,0,0,x,0,0,0\n", "row 1"),
+    ],
+)
+def test_recordings_that_cannot_be_read_are_refused(tmp_path, text, match):
+    """By column, by row, by file."""
+    path = tmp_path / "joints.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=match):
+        list(mirror.recorded_states(path))
+    with pytest.raises(InputError, match="cannot be read"):
+        list(mirror.recorded_states(tmp_path / "none.csv"))
+
+
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys):
+    """Exit code 2."""
+    monkeypatch.setitem(sys.modules, "rtde_receive", None)
+    assert run_twin.main(["mirror", "192.0.2.1", "--case", str(ABDOMEN)]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "pip install 'puncture-twin[mirror]'" in said and len(said.splitlines()) == 1
+
+
+def test_one_arm_at_a_time(capsys):
+    """A host or a recording."""
+    assert run_twin.main(["mirror", "--case", str(ABDOMEN)]) == 2
+    assert "either HOST or --from" in capsys.readouterr().err
+
+
+def test_only_the_receiving_half_is_ever_named():
+    """The library's controlling half stands nowhere in the mirror."""
+    text = (folder().parent / "twin" / "mirror.py").read_text()
+    assert "rtde_receive" in text and not any(word in text for word in ("rtde_control", "rtde_io", "RTDEControl"))

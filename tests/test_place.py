@@ -1,0 +1,328 @@
+"""Where to stand the arm: the published shares and windows, the frames, the estimate and the exact answer."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import run_twin
+from meshes import folder
+from planning.case import load_case, mount_pose
+from planning.errors import InputError
+from planning.mesh import TriangleMesh
+from planning.place.arm_balls import ArmBalls, Surroundings, base_is_clear, clear_ways, skin_distance
+from planning.place.bed import bed_frame
+from planning.place.directions import WantedDirections, ring_weights
+from planning.place.judge import Judge
+from planning.place.mount_lines import mount_lines, mount_section
+from planning.place.mounts import Region, Site, regions
+from planning.place.needle_start import needle_can_start
+from planning.place.room_field import Boxes, SkinField
+from planning.place.search import search_placements
+from planning.place.workers import ask_all
+from planning.placement import load_placement
+from planning.prepared import prepare
+from planning.robot.cell import Box, CellChecker, Tool
+from planning.robot.kinematics import link_poses
+from planning.robot.ur import ur_model
+from planning.search import Reach, case_directions, organ_candidates, with_reach
+from twin.chen2019_reach import SHARES, WINDOWS, our_share, our_windows
+
+UR3 = ur_model("ur3")
+TOOL = Tool(200.0, 150.0, 1.2, 30.0)
+ANYWHERE = (0.0, 0.0, 0.0)
+
+
+@pytest.fixture
+def case_folder(tmp_path):
+    """A function: the embedded abdomen with a coarse grid and its text changed."""
+
+    def make(*changes, more="", name="case"):
+        here = tmp_path / name
+        shutil.copytree(folder() / "abdomen", here)
+        text = (here / "case.toml").read_text()
+        for old, new in (("step_deg = 2.0", "step_deg = 15.0"), *changes):
+            assert old in text
+            text = text.replace(old, new, 1)
+        (here / "case.toml").write_text(text + more)
+        return here
+
+    return make
+
+
+FEW = """
+[place]
+mounts = ["ceiling", "rail"]
+step_mm = 400.0
+[place.ceiling]
+along_mm = [-100.0, 0.0]
+across_mm = [400.0, 500.0]
+height_mm = [450.0, 550.0]
+[place.rail]
+along_mm = [-300.0, -200.0]
+"""
+
+
+@pytest.mark.parametrize("row", SHARES, ids=str)
+def test_the_published_shares_are_reproduced(row):
+    """Within 3 points of specification 1, section 2, with all three singularities kept off."""
+    assert 100 * our_share(row) == pytest.approx(100 * row.share, abs=3.0)
+
+
+@pytest.mark.parametrize("theta_deg", sorted(WINDOWS))
+def test_the_windows_of_the_papers_own_placement(theta_deg):
+    """Within 2 degrees, through the embedded carton's registration; the same number of windows."""
+    placed, target = load_placement(load_case(folder() / "carton" / "case_h.toml")), np.array([50.0, 130.0, 63.0])
+    ours = our_windows(placed.T_base_ct, target, theta_deg)
+    assert len(ours) == len(WINDOWS[theta_deg])
+    differences = np.subtract(ours, WINDOWS[theta_deg]) if ours else np.zeros(1)
+    assert np.abs(differences).max() <= 2
+
+
+def test_the_bed_frame_of_a_patient_on_the_back():
+    """x to the head, y to the patient's right, z to the front; the target is the origin."""
+    case = load_case(folder() / "abdomen")
+    T = bed_frame(case)
+    np.testing.assert_allclose(T[:3, :3], np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]]), atol=1e-12)
+    np.testing.assert_allclose(T[:3, 3], case.target_ct)
+
+
+def test_up_and_along_may_be_stated(case_folder):
+    """A patient on the left side, in a RAS case: words are the patient's, vectors the case's."""
+    more = '\n[place]\nup = "right"\nalong = [0.0, 0.0, -1.0]\n'
+    T = bed_frame(load_case(case_folder(('space = "LPS"', 'space = "RAS"'), more=more)))
+    np.testing.assert_allclose(T[:3, 2], [-1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(T[:3, 0], [0, 0, -1], atol=1e-12)
+    parallel = '\n[place]\nup = "head"\n'
+    with pytest.raises(InputError, match="place: up and along are parallel"):
+        bed_frame(load_case(case_folder(more=parallel, name="other")))
+
+
+@pytest.mark.parametrize("axis", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0, -1, 0)])
+@pytest.mark.parametrize("position", [(300.0, -200.0, 150.0), (0.0, 0.0, 400.0), (350.0, 0.0, 0.0)])
+def test_a_sites_pose(axis, position):
+    """Rigid, its z the region's axis, its x square to it and away from the target."""
+    T = Site(Region("side", "", axis, ANYWHERE, ANYWHERE), position).T_bed_base()
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+    np.testing.assert_array_equal(T[:3, 2], axis)
+    np.testing.assert_array_equal(T[:3, 3], position)
+    assert T[:3, 0] @ position >= -1e-9
+
+
+def test_regions_follow_case_and_table(case_folder):
+    """Stated bounds are kept, others follow from the arm; the rails lie beside the table, at its top."""
+    more = "\n[place]\nrail_gap_mm = 90.0\n[place.floor]\nacross_mm = [100.0, 500.0]\n"
+    case = load_case(case_folder(more=more))
+    found = {region.name: region for region in regions(case, bed_frame(case))}
+    assert list(found) == [
+        *("floor", "rail +across", "rail -across", "ceiling"),
+        *("side to +along", "side to -along", "side to +across", "side to -across"),
+    ]
+    assert (found["floor"].low[1], found["floor"].high[1]) == (100.0, 500.0)
+    assert found["floor"].high[0] >= 600.0
+    # The target lies at x -90, y -10; the table is 480 wide about x 0 and its top is at y 112; LPS.
+    assert found["rail +across"].low[1] == found["rail +across"].high[1] == pytest.approx(240.0 + 90.0 - 90.0)
+    assert found["rail -across"].low[1] == pytest.approx(-(240.0 + 90.0 + 90.0))
+    assert (found["rail +across"].low[2], found["rail +across"].high[2]) == pytest.approx((-222.0, -22.0))
+    lattice = found["floor"].lattice(150.0)
+    assert (lattice >= found["floor"].low).all() and (lattice <= found["floor"].high).all()
+
+
+def test_a_rail_without_a_table_is_refused(case_folder):
+    """Where it is asked for by name; else it is left out."""
+    without = ('name = "table"', 'name = "desk"')
+    case = load_case(case_folder(without))
+    assert not any(region.mount == "rail" for region in regions(case, bed_frame(case)))
+    case = load_case(case_folder(without, more='\n[place]\nmounts = ["rail"]\n', name="rail"))
+    with pytest.raises(InputError, match="no obstacle 'table'"):
+        regions(case, bed_frame(case))
+
+
+@pytest.mark.parametrize(
+    ("lines", "match"),
+    [
+        ("mounts = []", "at least one"),
+        ('mounts = ["floor", "floor"]', "each once"),
+        ('mounts = ["wall"]', "place.mounts"),
+        ("step_mm = 5.0", "place.step_mm"),
+        ("[place.floor]\nheight_mm = [10.0, -10.0]", "descends"),
+        ("[place.rail]\nacross_mm = [0.0, 10.0]", "rail_gap_mm"),
+    ],
+)
+def test_bounds_that_make_no_sense_are_refused(case_folder, lines, match):
+    """By name."""
+    with pytest.raises(InputError, match=match):
+        load_case(case_folder(more=f"\n[place]\n{lines}\n"))
+
+
+def test_mount_lines_state_the_pose(case_folder):
+    """Pasted into the case in place of its registration they give the pose, in LPS and in RAS, to the rounding."""
+    T_ct_base = np.linalg.inv(load_placement(load_case(folder() / "abdomen")).T_base_ct)
+    registration = '[registration]\nmethod = "rigid"\nmarkers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"\n'
+    for space in ("LPS", "RAS"):
+        case = load_case(case_folder(('space = "LPS"', f'space = "{space}"'), name=space))
+        mount = mount_section(T_ct_base, case.space)
+        changes = (('space = "LPS"', f'space = "{space}"'), (registration, ""))
+        pasted = load_case(case_folder(*changes, more="\n" + mount_lines(mount) + "\n", name=f"{space}-pasted"))
+        np.testing.assert_allclose(np.linalg.inv(pasted.robot.T_base_ct_mount), T_ct_base, atol=0.05 + 1e-9)
+        np.testing.assert_array_equal(pasted.robot.T_base_ct_mount, mount_pose(mount, case.space, case.path))
+
+
+def test_the_skin_field_is_the_distance_to_a_ball(ball):
+    """Outside and inside, near and far from the grid; within 1.5 mm near the surface."""
+    field = SkinField.of(ball(100.0, (10.0, -20.0, 30.0)))
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=(400, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    radii = rng.uniform(60.0, 125.0, 400)
+    points = radii[:, None] * u + [10.0, -20.0, 30.0]
+    ours = np.array([skin_distance(field.origin, field.values, *p) for p in points])
+    assert np.abs(ours - (radii - 100.0)).max() < 1.5
+    far = np.array([skin_distance(field.origin, field.values, *(300.0 * v)) for v in u])
+    true = np.linalg.norm(300.0 * u - [10.0, -20.0, 30.0], axis=1) - 100.0
+    assert (far > 60.0).all() and (far <= true).all()
+
+
+def test_balls_never_call_clear_what_meets_a_box():
+    """Random states in a room with a box: where the balls are clear FCL finds no contact with the room; most agree."""
+    far_skin = SkinField(np.array([5000.0, 5000.0, 5000.0]), np.full((2, 2, 2), 1000.0))
+    box = Box(
+        "box", np.diag([1.0, 1.0, 1.0, 1.0]) + np.array([[0, 0, 0, 250.0]] + [[0.0] * 4] * 3), (200.0, 400.0, 500.0)
+    )
+    balls, checker = ArmBalls.of(UR3, TOOL), CellChecker(UR3, Tool(200.0, 150.0, 0.1, 30.0), [box], padding_mm=1.0)
+    room = Surroundings(far_skin, Boxes.of([box]), Boxes.of([]), 2.0)
+    q = np.random.default_rng(4).uniform(-np.pi, np.pi, (600, 6))
+    clear = clear_ways(balls, room, np.eye(4), link_poses(UR3, q)[:, None])
+    met = [checker.contact(row, needle_may_touch_patient=False) for row in q]
+    in_room = np.array([m is not None and m.other == "box" and m.body != "needle" for m in met])
+    assert not (clear & in_room).any()
+    assert 50 < clear.sum() < 550 and (clear == ~in_room).mean() > 0.9
+    carried = clear_ways(
+        balls, Surroundings(far_skin, Boxes.of([]), Boxes.of([box]), 2.0), np.eye(4), link_poses(UR3, q)[:, None]
+    )
+    np.testing.assert_array_equal(carried, clear)
+
+
+def test_a_base_in_the_patient_or_in_a_box_is_seen(ball):
+    """And one that stands beside them is not."""
+    balls, nothing = ArmBalls.of(UR3, TOOL), Boxes.of([])
+    room = Surroundings(SkinField.of(ball(150.0)), Boxes.of([Box("b", np.eye(4), (200.0, 200.0, 900.0))]), nothing, 5.0)
+    at = np.eye(4)
+    for x, clear in ((0.0, False), (200.0, False), (240.0, True)):
+        at[0, 3] = x
+        assert base_is_clear(balls, room, at) is clear
+
+
+def test_directions_spread_and_keep_their_weight():
+    """A grid's weights are solid angles; a spread subset carries the weight of all."""
+    theta = np.repeat(np.radians(np.arange(0.0, 91.0, 5.0)), 72)
+    weight = ring_weights(theta, np.radians(5.0))
+    cut = theta <= np.radians(61.0)
+    half = np.radians(2.5)
+    assert weight[cut].sum() / weight.sum() == pytest.approx(
+        (1 - np.cos(np.radians(60.0) + half)) / (1 - np.cos(np.radians(90.0) + half))
+    )
+    beta = np.tile(np.radians(np.arange(0.0, 360.0, 5.0)), 19)
+    u = np.stack([np.sin(theta) * np.cos(beta), np.sin(theta) * np.sin(beta), np.cos(theta)], axis=1)
+    wanted = WantedDirections(u, np.full(len(u), 100.0), weight / weight.sum())
+    few = wanted.spread(40)
+    assert len(few) == 40 and few.weight.sum() == pytest.approx(1.0)
+    angles = np.degrees(np.arccos(np.clip((u @ few.outward_ct.T).max(axis=1), -1, 1)))
+    assert angles.max() < 20.0
+    assert wanted.spread(10_000) is wanted
+
+
+def test_a_needle_that_would_start_in_the_skin_is_known(ball):
+    """The padded needle's flat end, 5 mm before a flat skin, meets it where tan(angle) > 5 / 5.6, at 41.8 degrees."""
+    plate = trimesh.creation.box(extents=(2000.0, 2000.0, 20.0))
+    skin = TriangleMesh(np.asarray(plate.vertices), np.asarray(plate.faces))
+    target, tilt = np.array([0.0, 0.0, -50.0]), np.radians([0.0, 41.0, 43.0])
+    u = np.stack([np.sin(tilt), np.zeros(3), np.cos(tilt)], axis=1)
+    wanted = WantedDirections(u, 60.0 / np.cos(tilt) + 10.0, np.ones(3) / 3)
+    assert needle_can_start(TOOL, skin, target, wanted, 5.0).tolist() == [True, True, False]
+
+
+def test_turning_the_base_about_its_own_axis_changes_no_share(ball):
+    """The first joint turns farther than any such turn."""
+    u = np.random.default_rng(6).normal(size=(30, 3))
+    u[:, 2] = np.abs(u[:, 2])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    wanted = WantedDirections(u, np.full(30, 110.0), np.full(30, 1 / 30))
+    judge = Judge("ur3", TOOL, ball(80.0, subdivisions=2), (), (), 5.0, np.zeros(3), wanted, np.zeros(6))
+    T = Site(Region("floor", "", (0, 0, 1), ANYWHERE, ANYWHERE), (300.0, 0.0, -250.0)).T_bed_base()
+    shares = set()
+    for turn in (0.0, 2.5):
+        R = trimesh.transformations.rotation_matrix(turn, [0, 0, 1])
+        shares.add(judge.verdict(np.linalg.inv(T @ R)).held)
+    assert len(shares) == 1 and 0 < shares.pop() < 30
+
+
+def test_answers_come_in_order_from_however_many_processes():
+    """And progress ends at the number of things."""
+    seen = []
+    for jobs in (1, 2):
+        assert ask_all(abs, [-3, 2, -1, 0, -7, 5], jobs=jobs, progress=lambda done, n: seen.append((done, n))) == [
+            *(3, 2, 1, 0, 7, 5)
+        ]
+    assert seen.count((6, 6)) == 2
+    assert ask_all(abs, [], jobs=2, progress=lambda done, n: None) == []
+
+
+def test_place_from_the_command_line(case_folder, tmp_path, capsys):
+    """Table, document and pictures agree; the share is the search's own from there."""
+    here = case_folder(more=FEW)
+    out = tmp_path / "out"
+    assert run_twin.main(["place", str(here), "--out", str(out), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    best, own = said["placements"][0], said["placements"][-1]
+    assert own["placement"] == "as in the case" and own["rank"] is None
+    shares = [one["share"] for one in said["placements"][:-1]]
+    assert shares == sorted(shares, reverse=True) and best["share"] > own["share"] * 0.5
+    assert {one["placement"].split()[0] for one in said["placements"][:-1]} == {"ceiling", "rail"}
+    rows = list(csv.DictReader((out / "placements.csv").open(encoding="utf-8")))
+    assert [float(row["share"]) for row in rows] == [one["share"] for one in said["placements"]]
+    assert all(one["share"] <= said["possible_share"] + 1e-9 for one in said["placements"])
+    assert [Path(name).name for name in said["files"]] == [
+        *("placements.csv", "place.json", "placements.png", "map_best_place.png")
+    ]
+    assert all(Path(name).stat().st_size > 200 for name in said["files"])
+    assert set(said["inputs"]) == set(load_case(here).inputs)
+    _same_as_the_search(here, best)
+
+
+def _same_as_the_search(here, best):
+    """The case with the lines pasted in: `search` holds exactly as many directions."""
+    text = (here / "case.toml").read_text()
+    start, end = text.index("[registration]"), text.index("[robot]")
+    mount = "\n".join(["[robot.mount]", *(f"{key} = {value}" for key, value in best["mount"].items())])
+    pasted = here / "pasted.toml"
+    pasted.write_text(text[:start] + text[end:] + "\n" + mount + "\n")
+    prepared = prepare(pasted)
+    found = organ_candidates(prepared.case, prepared.anatomy, prepared.engine, case_directions(prepared.case))
+    held = with_reach(prepared.case, found, Reach(prepared.reach.checker, prepared.reach.T_base_ct))
+    assert int((held.reachable == 1).sum()) == best["held"] and int(found.safe.sum()) == best["asked"]
+
+
+def test_no_placement_holds_anything(case_folder, tmp_path, capsys):
+    """Bounds out of reach: exit code 1, and the table is there, with the case's own placement alone."""
+    more = '\n[place]\nmounts = ["floor"]\nstep_mm = 500.0\n[place.floor]\nalong_mm = [3000.0, 3500.0]\n'
+    here = case_folder(more=more)
+    assert run_twin.main(["place", str(here), "--out", str(tmp_path / "out"), "--no-pictures", "--jobs", "1"]) == 1
+    assert "no placement holds any" in capsys.readouterr().err
+    rows = list(csv.DictReader((tmp_path / "out" / "placements.csv").open(encoding="utf-8")))
+    assert [row["placement"] for row in rows] == ["as in the case"]
+
+
+def test_a_search_that_finds_nothing_safe_says_so(case_folder):
+    """No direction is safe for the organs: nothing to hold."""
+    prepared = prepare(case_folder(("margin_mm = 2.0", "margin_mm = 400.0"), more=FEW), arm=False)
+    found = organ_candidates(prepared.case, prepared.anatomy, prepared.engine, case_directions(prepared.case))
+    with pytest.raises(Exception, match="no direction is safe"):
+        search_placements(prepared.case, prepared.anatomy, found, None)

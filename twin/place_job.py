@@ -1,0 +1,74 @@
+"""The job ``place``: search for a place to stand the arm, and the files that show it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from planning.case import mount_pose
+from planning.errors import NoAnswerError
+from planning.place.document import place_document, write_place_document, write_placements
+from planning.place.search import PlaceSearch, search_placements
+from planning.prepared import Prepared
+from planning.room import case_checker
+from planning.search import Reach, case_directions, organ_candidates, ranked, with_reach
+from twin.report.map_picture import draw_map
+from twin.report.placement_picture import draw_placements
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceRun:
+    """What ``place`` has found, and the files that it wrote."""
+
+    prepared: Prepared
+    found: PlaceSearch
+    document: dict[str, Any]
+    files: tuple[Path, ...]
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON: mm; shares 0..1."""
+        seconds = {stage: round(spent, 3) for stage, spent in self.prepared.stages.seconds.items()}
+        return {**self.document, "seconds": seconds, "files": [str(path) for path in self.files]}
+
+
+def place_case(prepared: Prepared, out: Path, *, jobs: int, pictures: bool = True) -> PlaceRun:
+    """Search; write ``placements.csv``, ``place.json`` and, if wanted, the two pictures.
+
+    Raises:
+        InputError: Bounds that contradict the case.
+        NoAnswerError: No direction is safe for the organs, or no placement holds one; the files are written in the
+            second case.
+    """
+    case, stages = prepared.case, prepared.stages
+    with stages.time("organs"):
+        candidates = organ_candidates(case, prepared.anatomy, prepared.engine, case_directions(case))
+    with stages.time("placements"):
+        found = search_placements(
+            case,
+            prepared.anatomy,
+            candidates,
+            prepared.placement,
+            jobs=jobs,
+            progress=prepared.watcher.count,
+        )
+    document = place_document(found, prepared.provenance())
+    write_placements(found, out / "placements.csv")
+    write_place_document(document, out / "place.json")
+    files = [out / "placements.csv", out / "place.json"]
+    if pictures:
+        with stages.time("pictures"):
+            draw_placements(found, case, prepared.anatomy.skin.mesh, out / "placements.png")
+            files.append(out / "placements.png")
+    if not any(one.verdict.held for one in found.judged):
+        raise NoAnswerError(f"no placement holds any of the {int(candidates.safe.sum())} organ-safe directions")
+    if pictures:
+        T_base_ct = mount_pose(found.judged[0].mount, case.space, case.path)
+        with stages.time("map"):
+            reach = Reach(case_checker(case, prepared.anatomy, T_base_ct), np.asarray(T_base_ct))
+            held = ranked(case, with_reach(case, candidates, reach))
+            draw_map(held, replace(case, name=f"{case.name}, arm at the best place"), out / "map_best_place.png")
+            files.append(out / "map_best_place.png")
+    return PlaceRun(prepared, found, document, tuple(files))

@@ -1,0 +1,53 @@
+"""What ``place`` and ``mirror`` print for a person."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from planning.place.search import Judged
+from twin.mirror import Mirrored
+from twin.place_job import PlaceRun
+from twin.report.mount_words import direction_words, mount_words
+
+
+def place_text(run: PlaceRun) -> str:
+    """The ranked placements, the case's own, the lines to paste, and the files."""
+    case, found = run.prepared.case, run.found
+    asked = found.judged[0].verdict.asked if found.judged else 0
+    x, y, z = (direction_words(found.T_ct_bed[:3, axis], str(case.space)) for axis in range(3))
+    lines = [
+        f"case {case.name}: {asked} organ-safe directions; {len(found.coarse)} + {found.refined} placements estimated,"
+        f" {len(found.judged)} judged",
+        f"  from the target, mm: along = toward {x}, across = toward {y}, height = toward {z}",
+        f"  at most {100 * found.possible:.1f} % can be held from anywhere: elsewhere the needle itself would start"
+        " too near the skin",
+        "rank  share %   held  margin  along  across  height  mount",
+    ]
+    lines += [_line(f"{rank:4d}", one, run) for rank, one in enumerate(found.judged, start=1)]
+    if found.own is not None:
+        lines.append(_line("   -", found.own, run))
+    best = run.document["mount_lines"]
+    if best:
+        lines += ["the best, for the case (in place of its [registration] or [robot.mount]):", ""]
+        lines += [f"  {line}" for line in str(best).splitlines()]
+        lines += ["", "a proposal: where the arm then really stands, markers must say ([registration])"]
+    seconds = ", ".join(f"{stage} {spent:.1f}" for stage, spent in run.prepared.stages.seconds.items())
+    return "\n".join([*lines, f"seconds: {seconds}", "look at:", *(f"  {path}" for path in run.files)])
+
+
+def _line(rank: str, one: Judged, run: PlaceRun) -> str:
+    verdict, space = one.verdict, str(run.prepared.case.space)
+    where = "     -       -       -" if one.site is None else "{:6.0f}  {:6.0f}  {:6.0f}".format(*one.site.position)
+    name = one.name if one.site is None else mount_words(one.site.region, run.found.T_ct_bed, space)
+    home = f"; home: {verdict.home_contact}" if verdict.home_contact else ""
+    return f"{rank}  {100 * verdict.share:7.1f}  {verdict.held:5d}  {verdict.margin:6.2f}  {where}  {name}{home}"
+
+
+def mirror_line(shown: Mirrored) -> str:
+    """One state of a mirrored arm."""
+    x, y, z = shown.tip_ct
+    joints = " ".join(f"{angle:7.2f}" for angle in np.degrees(shown.q))
+    return (
+        f"{shown.time_s:9.3f} s  joints {joints} deg  tip (CT) {x:8.2f} {y:8.2f} {z:8.2f} mm"
+        f"  to target {shown.to_target_mm:7.2f} mm, off its line {shown.off_axis_mm:6.2f} mm"
+    )
