@@ -8,6 +8,8 @@ from __future__ import annotations
 import json
 import sys
 import traceback
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,13 +19,20 @@ from typer._click.exceptions import ClickException  # typer carries its own clic
 
 from meshes import folder as meshes_folder
 from planning.batch import run_batch
+from planning.case import load_case
 from planning.errors import InputError, NoAnswerError, PlanningError
 from planning.export import FORMATS
 from planning.files import check_writable
 from planning.prepared import prepare
 from twin import main_job, words
+from twin.mirror import Mirror, connect, live_states, recorded_states
 from twin.papers import PAPERS
+from twin.place_job import place_case
+from twin.place_words import mirror_line, place_text
 from twin.report.progress import progress_display
+from twin.stereo.servo_job import run_servo
+from twin.ultrasound.selfcal_job import run_selfcal
+from twin.ultrasound.words import selfcal_text
 
 OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED = 0, 1, 2, 3
 
@@ -132,6 +141,49 @@ def rehearse(
 
 
 @app.command()
+def place(
+    case: CaseArgument,
+    out_dir: OutOption = Path("out"),
+    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Processes; the answer is the same.")] = 2,
+    pictures: PicturesOption = True,
+    as_json: JsonOption = False,
+) -> None:
+    """Find where the arm should stand to hold most of the organ-safe directions; write the placements and their map."""
+    with progress_display() as progress:
+        run = place_case(prepare(case, arm=False, watcher=progress), out_dir, jobs=jobs, pictures=pictures)
+    _print(run.summary(), place_text(run), as_json)
+
+
+@app.command()
+def mirror(
+    case: Annotated[Path, typer.Option("--case", help="The case whose patient the arm stands at.")],
+    host: Annotated[
+        str | None, typer.Argument(metavar="HOST", help="Address of a running UR; it is only read.")
+    ] = None,
+    recorded: Annotated[
+        Path | None, typer.Option("--from", help="A CSV with time_s and q1_rad..q6_rad instead.")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="How long; else until Ctrl-C.")] = None,
+    rate: Annotated[float, typer.Option("--rate", min=0.1, max=125, help="Readings a second.")] = 10.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Show a running arm's needle in the CT: tip, distance to the target. Writes nothing to the robot."""
+    if (host is None) == (recorded is None):
+        raise InputError("one arm at a time", where="mirror", allowed="either HOST or --from joints.csv")
+    mirrored = Mirror.of(load_case(case))
+    if recorded is not None:
+        states = recorded_states(recorded)
+    else:
+        states = live_states(connect(str(host)), period_s=1.0 / rate, seconds=seconds)
+    shown = []
+    with suppress(KeyboardInterrupt):
+        for one in mirrored.follow(states):
+            shown.append(one.summary()) if as_json else out.print(mirror_line(one), highlight=False, markup=False)
+    if as_json:
+        _print({"case": str(case), "states": shown}, "", as_json)
+
+
+@app.command()
 def export(
     plan: Annotated[Path, typer.Argument(metavar="PLAN", help="A plan.json.")],
     format_name: Annotated[str, typer.Option("--format", metavar="urscript|ros2|csv", help="For which robot.")],
@@ -171,6 +223,36 @@ def batch(
     for code in (PROGRAM_FAILED, BAD_INPUT, ANSWER_IS_NO):
         if any(row["exit_code"] == code for row in rows):
             raise typer.Exit(code)
+
+
+@app.command()
+def selfcal(
+    case: Annotated[Path | None, typer.Argument(metavar="[CASE]", help="selfcal.toml or its folder.")] = None,
+    recording: Annotated[Path | None, typer.Option("--recording", help="Calibrate this CSV, or its folder.")] = None,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Rooms that are drawn.")] = 3,
+    out_dir: OutOption = Path("out/selfcal"),
+    as_json: JsonOption = False,
+) -> None:
+    """Let two arms calibrate themselves by ultrasound, AXP = YBQ, and send the needle to targets in the image."""
+    case = meshes_folder() / "selfcal" if case is None and recording is None else case
+    with progress_display() as progress:
+        run = run_selfcal(case, recording, seeds, out_dir, progress)
+    _print(run.summary(), selfcal_text(run), as_json)
+
+
+@app.command()
+def servo(
+    case: Annotated[Path, typer.Argument(metavar="CASE", help="Servo case, or the folder that holds servo.toml.")],
+    out_dir: OutOption = Path("out"),
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="How many rooms to draw.")] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Servo the tool onto every target by two cameras, in rooms whose truth is drawn; pictures, plot and page."""
+    with progress_display() as progress:
+        job = run_servo(case, out_dir, seeds, partial(progress.count, "seeds"))
+    _print(job.summary, job.text, as_json)
+    if not job.holds:
+        raise typer.Exit(ANSWER_IS_NO)
 
 
 @app.command()

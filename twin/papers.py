@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 from twin import words
 from twin.ct import chen2019
+from twin.stereo.servo_job import reproduce_paper
+from twin.ultrasound import axp_ybq
 
 
 class PaperResult(NamedTuple):
@@ -32,5 +34,14 @@ def _chen2019(out_dir: Path, seeds: int | None) -> PaperResult:
     return PaperResult(result.holds, words.reproduction_summary(result), words.reproduction_text(result))
 
 
-PAPERS: Mapping[str, Reproduce] = MappingProxyType({"chen2019": _chen2019})
+def _axp_ybq(out_dir: Path, seeds: int | None) -> PaperResult:
+    result = axp_ybq.reproduce(out_dir, seeds)
+    return PaperResult(result.holds, axp_ybq.reproduction_summary(result), axp_ybq.reproduction_text(result))
+
+
+def _liu2007(out_dir: Path, seeds: int | None) -> PaperResult:
+    return PaperResult(*reproduce_paper(out_dir, seeds))
+
+
+PAPERS: Mapping[str, Reproduce] = MappingProxyType({"chen2019": _chen2019, "liu2007": _liu2007, "axp-ybq": _axp_ybq})
 """Name on the command line to what reproduces it."""

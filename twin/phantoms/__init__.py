@@ -1,8 +1,9 @@
-"""Bodies with known truth: the carton of Chen 2019 and an abdomen of our own."""
+"""Bodies with known truth: the carton of Chen 2019, an abdomen and an open head of our own."""
 
 from twin.phantoms.abdomen import STRUCTURES, abdomen_field, abdomen_mesh, lesion_centre_ct
 from twin.phantoms.carton import carton_field, carton_meshes
 from twin.phantoms.guidance import abdomen_guidance, patient_placement, skin_markers_ct
+from twin.phantoms.head import head_field, head_mesh, head_targets
 from twin.phantoms.manifest import write_phantoms
 
 __all__ = [
@@ -12,6 +13,9 @@ __all__ = [
     "abdomen_mesh",
     "carton_field",
     "carton_meshes",
+    "head_field",
+    "head_mesh",
+    "head_targets",
     "lesion_centre_ct",
     "patient_placement",
     "skin_markers_ct",

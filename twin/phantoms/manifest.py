@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from planning.mesh import TriangleMesh
-from twin.phantoms import abdomen, carton, guidance
+from twin.phantoms import abdomen, carton, guidance, head
 from twin.phantoms.implicit import Array
 
 __all__ = ["ply_bytes", "points_csv", "write_phantoms"]
@@ -67,7 +67,7 @@ def points_csv(points: dict[str, Array], decimals: int) -> bytes:
 
 
 def _files() -> list[tuple[dict[str, Any], bytes]]:
-    return [*_carton_files(), *_abdomen_files()]
+    return [*_carton_files(), *_abdomen_files(), *_head_files()]
 
 
 def _entry(path: str, space: str, made_by: str, parameters: dict[str, Any]) -> dict[str, Any]:
@@ -115,3 +115,18 @@ def _abdomen_files() -> list[tuple[dict[str, Any], bytes]]:
         entry = _entry(f"abdomen/{name}", space, "twin.phantoms.guidance.abdomen_guidance", {"seed": seed})
         files.append((entry, points_csv(points, decimals)))
     return files
+
+
+def _head_files() -> list[tuple[dict[str, Any], bytes]]:
+    mesh = head.head_mesh()
+    parameters = {"structure": "head", "spacing_mm": head.SPACING_MM}
+    entry = _entry("head/head.ply", "local", "twin.phantoms.head.head_mesh", parameters)
+    markers = {name: np.array(point) for name, point in head.MARKERS_MM.items()}
+    return [
+        ({**entry, "triangles": len(mesh.faces)}, ply_bytes(mesh)),
+        (_entry("head/markers.csv", "local", "twin.phantoms.head.MARKERS_MM", {}), points_csv(markers, 3)),
+        (
+            _entry("head/targets.csv", "local", "twin.phantoms.head.head_targets", {}),
+            points_csv(head.head_targets(), 3),
+        ),
+    ]

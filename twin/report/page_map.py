@@ -92,7 +92,7 @@ def _nearest(candidates: Candidates) -> tuple[list[str], Any]:
 
 def _png(rgba: Any) -> str:
     stream = io.BytesIO()
-    Image.fromarray(rgba).save(stream, format="PNG", optimize=True)
+    Image.fromarray(rgba).save(stream, format="PNG")
     return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
 
 

@@ -79,7 +79,7 @@ def draw_scene(case: Any, anatomy: Any, candidates: Candidates, plan: Any | None
     bottom = _words(draw, case, candidates, plan, bool(arm), [b for b in bodies if b.group == "organ"])
     image = image.crop((0, 0, WIDTH, min(HEIGHT, round(bottom) + 8)))
     with atomic(Path(path)) as temporary:
-        image.save(temporary, format="PNG", optimize=True)
+        image.save(temporary, format="PNG")
 
 
 def render_bodies(bodies: Sequence[Body], camera: Camera) -> NDArray[np.uint8]:

@@ -160,7 +160,7 @@ def _calibration(run: SelfcalRun) -> str:
     known = [(escape(name), f"{value:.4f}") for name, value in sigma.items()]
     shown = table(("parameter", "standard deviation"), known, kind="numbers")
     note = '<p class="faint">w: a small turn, R exp([w]×); t: a shift; V: the needle’s direction.</p>'
-    return f'<div class="two"><div>{pairs(rows)}</div><div>{shown}{note}</div></div>'
+    return f"{pairs(rows)}<h3>How well each number is known</h3>{shown}{note}"
 
 
 def _twin_section(run: SelfcalRun, sheet: Path, room: Path) -> str:

@@ -77,6 +77,14 @@ def load_box(client: int, size_mm: Floats, T_world_box: Floats, rgba: Rgba = BOX
     return int(pybullet.createMultiBody(0.0, collision, visual, position, quaternion, physicsClientId=client))
 
 
+def load_ball(client: int, center_mm: Floats, radius_mm: float, rgba: Rgba) -> int:
+    """A ball that is only seen; its centre (3,), world frame. Returns the body id."""
+    visual = pybullet.createVisualShape(
+        pybullet.GEOM_SPHERE, radius=float(to_m(radius_mm)), rgbaColor=rgba, physicsClientId=client
+    )
+    return int(pybullet.createMultiBody(0.0, -1, visual, to_m(center_mm).tolist(), physicsClientId=client))
+
+
 def let_pass(client: int, body: int, link: int, other: int) -> None:
     """Let one link go through another body (its base) without contact: the needle through the skin."""
     pybullet.setCollisionFilterPair(body, other, link, -1, 0, physicsClientId=client)

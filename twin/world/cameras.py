@@ -45,9 +45,41 @@ def picture(client: int, camera: Camera) -> NDArray[np.uint8]:
     projection = pybullet.computeProjectionMatrixFOV(FIELD_OF_VIEW_DEG, camera.width / camera.height, NEAR_M, FAR_M)
     away = camera.eye_mm - camera.look_at_mm
     lamp = away / np.linalg.norm(away) + LAMP_UP * camera.up / np.linalg.norm(camera.up)
+    return _drawn(client, (camera.width, camera.height), view, projection, lamp)
+
+
+def pinhole_picture(
+    client: int, size: tuple[int, int], K: NDArray[np.float64], T_camera_world: NDArray[np.float64]
+) -> NDArray[np.uint8]:
+    """The room as a calibrated camera sees it, without its lens's distortion, shape (height, width, 3), RGB.
+
+    For looking at, not for measuring: the renderer samples pixel corners and has no anti-aliasing.
+
+    Args:
+        client: Physics client id.
+        size: Width and height, px.
+        K: Intrinsic matrix, shape (3, 3), px; pixel centres at integers.
+        T_camera_world: Shape (4, 4), mm; the camera's x right, y down, z forward.
+    """
+    width, height = size
+    left, right = -(K[0, 2] + 0.5) / K[0, 0], (width - 0.5 - K[0, 2]) / K[0, 0]
+    bottom, top = -(height - 0.5 - K[1, 2]) / K[1, 1], (K[1, 2] + 0.5) / K[1, 1]
+    edges = [float(edge) * NEAR_M for edge in (left, right, bottom, top)]
+    projection = pybullet.computeProjectionMatrix(*edges, NEAR_M, FAR_M)
+    view = np.diag([1.0, -1.0, -1.0, 1.0]) @ T_camera_world
+    view[:3, 3] = to_m(view[:3, 3])
+    lamp = -T_camera_world[2, :3] + LAMP_UP * -T_camera_world[1, :3]
+    return _drawn(client, size, view.T.ravel().tolist(), projection, lamp)
+
+
+def _drawn(
+    client: int, size: tuple[int, int], view: list[float], projection: list[float], lamp: NDArray[np.float64]
+) -> NDArray[np.uint8]:
+    """A picture by PyBullet's software renderer; the lamp shines from a direction (3,)."""
+    width, height = size
     image = pybullet.getCameraImage(
-        camera.width,
-        camera.height,
+        width,
+        height,
         view,
         projection,
         lightDirection=lamp.tolist(),
@@ -55,5 +87,5 @@ def picture(client: int, camera: Camera) -> NDArray[np.uint8]:
         renderer=pybullet.ER_TINY_RENDERER,
         physicsClientId=client,
     )
-    rgba = np.asarray(image[2], dtype=np.uint8).reshape(camera.height, camera.width, 4)
+    rgba = np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)
     return np.ascontiguousarray(rgba[..., :3])

@@ -1,0 +1,132 @@
+"""The servo case's file, and the embedded room that it describes."""
+
+import numpy as np
+import pytest
+
+from meshes import folder
+from planning.errors import InputError
+from planning.registration import apply
+from planning.robot.links import collision_links
+from planning.winding import winding_number
+from twin.phantoms import head_field, head_targets
+from twin.phantoms.head import FLOOR_MM, MARKERS_MM, RIM_MM
+from twin.stereo.experiment import varied
+from twin.stereo.poses import configurations, way_up
+from twin.stereo.robot_calibration import grid_points, held_rod
+from twin.stereo.room import Room, draw_room, head_pose, room_checker
+from twin.stereo.servo_case import load_servo_case
+from twin.stereo.servo_loop import way_contact
+
+HEAD = folder() / "head"
+TEXT = (HEAD / "servo.toml").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def case():
+    """The embedded case."""
+    return load_servo_case(HEAD)
+
+
+def written(tmp_path, text):
+    """A copy of the embedded case with another text."""
+    for name in ("head.ply", "markers.csv", "targets.csv"):
+        (tmp_path / name).symlink_to(HEAD / name)
+    path = tmp_path / "servo.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "what"),
+    [
+        ("noise_grey", "noise_gray", "unknown key 'noise_gray'; did you mean 'noise_grey'"),
+        ("baseline_mm = 500.0", "baseline_mm = -5.0", "cameras.baseline_mm"),
+        ("schema = 1", "schema = 2", "this version reads schema = 1"),
+        ('mesh = "head.ply"', 'mesh = "lost.ply"', "head.mesh: file 'lost.ply' is not there"),
+        ('model = "ur3"', 'model = "ur99"', "ur99"),
+        ("holder_mm = 40.0", "holder_mm = 400.0", "holder_mm 400 is not shorter"),
+        ("rod_diameter_mm = 3.0", "rod_diameter_mm = 9.0", "hides a ball"),
+        ("tolerance_mm = 0.1", "tolerance_mm = nan", "tolerance_mm"),
+        ("[cameras]", "[cameras", "not TOML"),
+        ("max_steps = 10", "max_steps = true", "max_steps"),
+    ],
+)
+def test_mistakes_are_named(tmp_path, old, new, what):
+    """The key, what is wrong, and the nearest valid one."""
+    assert old in TEXT
+    with pytest.raises(InputError, match=what.replace("[", r"\[")):
+        load_servo_case(written(tmp_path, TEXT.replace(old, new, 1)))
+
+
+def test_a_missing_case_is_named(tmp_path):
+    """A folder without one."""
+    with pytest.raises(InputError, match=r"servo\.toml: cannot be read"):
+        load_servo_case(tmp_path)
+
+
+def test_changed_keys_are_checked_as_when_read(case):
+    """``varied`` changes what it is told and refuses what the file would."""
+    assert varied(case, cameras={"noise_grey": 6.0}).file.cameras.noise_grey == 6.0
+    assert case.file.cameras.noise_grey == 2.0
+    with pytest.raises(ValueError, match="noise_grey"):
+        varied(case, cameras={"noise_grey": -1.0})
+
+
+def test_the_head_is_open_and_holds_its_targets(case):
+    """Sixteen targets in the hollow's air with room for the ball; markers outside the solid; the mesh is closed."""
+    field = head_field()
+    targets, markers = np.array(list(head_targets().values())), np.array(list(MARKERS_MM.values()))
+    assert targets == pytest.approx(case.targets.points, abs=1e-3)
+    assert len(targets) == 16
+    assert np.all(field(targets) > 15.0)
+    assert np.all((targets[:, 2] > FLOOR_MM) & (targets[:, 2] < RIM_MM))
+    assert np.all(field(markers) >= 4.0)
+    assert case.skin.closed
+    assert all(abs(winding_number(case.skin, point)) < 0.5 for point in np.concatenate([targets, markers]))
+    assert np.abs(field(np.asarray(case.skin.vertices))).max() < 0.02
+
+
+def test_both_cameras_see_every_target_and_marker(case):
+    """No line of sight from either camera to a ball there meets the head, and all lie well inside the pictures."""
+    room = draw_room(case, np.random.default_rng(0))
+    for camera in room.cameras:
+        for point in np.concatenate([room.targets_c, room.markers_c]):
+            assert room.hidden_share(camera, point, 4.0) == 0.0
+            assert camera.sees(camera.project(point), 40.0)
+
+
+def test_a_ball_behind_the_head_is_hidden(case):
+    """A ball beyond the far wall, below its rim, is hidden whole; one whose edge it touches in part."""
+    room = draw_room(case, np.random.default_rng(0))
+    behind = apply(room.T_c_m, np.array([0.0, 110.0, -60.0]))
+    assert room.hidden_share(room.cameras[0], behind, 4.0) == 1.0
+    heights = np.linspace(-60.0, 40.0, 60)
+    shares = [room.hidden_share(room.cameras[0], apply(room.T_c_m, np.array([0, 110.0, z])), 4.0) for z in heights]
+    assert any(0.0 < share < 1.0 for share in shares)
+
+
+def test_the_arm_reaches_everything_without_a_contact(case):
+    """Calibration grid, every target from its hovering pose with the head there; no link before the ball."""
+    room = draw_room(case, np.random.default_rng(0))
+    held, T = held_rod(case, room), head_pose(case)
+    calibrated = configurations(held, grid_points(case), room_checker(case, None)).branch
+    targets, checker = apply(T, case.targets.points), room_checker(case, T)
+    q = configurations(
+        held, np.concatenate([targets, way_up(held, targets, case.file.servo.hover_mm)]), checker, first=calibrated
+    ).q
+    for aim, hover in zip(q[:16], q[16:], strict=True):
+        assert way_contact(checker, np.stack([hover, aim])) is None
+        assert not arm_hides_ball(room, aim)
+
+
+def arm_hides_ball(room: Room, q):
+    """Whether some link stands between a camera and the ball, by the links' own meshes."""
+    poses = room.arm.link_poses(q)
+    for link in collision_links(room.model)[1:]:
+        T_c_link = room.T_c_base @ poses[link.frame]
+        vertices = apply(T_c_link, np.asarray(link.mesh.vertices))
+        for camera in room.cameras:
+            pixels, ball = camera.project(vertices), camera.project(room.ball_c(q))
+            if np.linalg.norm(pixels - ball, axis=1).min() < 30.0:
+                return True
+    return False

@@ -1,0 +1,75 @@
+"""The words and the page of a servo session, from plain numbers."""
+
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+from servo_world import CASE
+
+from planning.errors import NoAnswerError
+from twin.stereo.experiment import Row, Trial, statistics
+from twin.stereo.liu2007 import paper_columns
+from twin.stereo.servo_page import write_servo_page
+from twin.stereo.servo_words import servo_summary, servo_text
+
+
+def trials():
+    """Two seeds of two targets, one not confirmed; a third seed that could not be held."""
+    rows = [
+        Row(1, "T1", 0.30, 0.25, 0.9, 0.31, 0.05, 1, "converged"),
+        Row(1, "T2", 0.20, 0.25, 1.1, 0.25, 0.15, 10, "tolerance_not_reached"),
+        Row(2, "T1", 0.10, 0.25, 0.7, 0.12, 0.04, 2, "converged"),
+        Row(2, "T2", 0.40, 0.25, 0.5, 0.32, 0.08, 1, "converged"),
+    ]
+    held = [Trial(seed, (0.01, 0.03), (0.02, 0.03), 0.4, 0.2, tuple(r for r in rows if r.seed == seed), "")
+            for seed in (1, 2)]  # fmt: skip
+    return [*held, Trial(3, (), (), float("nan"), float("nan"), (), "calibration, point 4: camera 1: few_inliers")]
+
+
+def test_statistics_are_those_of_the_rows():
+    """Means, maxima, medians, shares, against the numbers by hand."""
+    ours = statistics(trials())
+    assert (ours.seeds, ours.targets, ours.refused) == (3, 4, 1)
+    assert ours.mapping_mean == pytest.approx(0.25)
+    assert ours.before_mean == pytest.approx(0.8)
+    assert ours.after_mean == pytest.approx(0.25)
+    assert ours.after_over_mapping == pytest.approx(1.0)
+    assert ours.servo_only_max == pytest.approx(0.15)
+    assert ours.mapping_rms == pytest.approx(np.sqrt((0.09 + 0.04 + 0.01 + 0.16) / 4))
+    assert ours.median_steps == 1.5
+    assert ours.not_confirmed == 0.25
+    assert (ours.stereo_mean, ours.stereo_max) == pytest.approx((0.02, 0.03))
+    with pytest.raises(NoAnswerError, match="few_inliers"):
+        statistics(trials()[2:])
+
+
+def test_the_words_say_what_was_not_reached():
+    """A target that was not confirmed and a session that was not held are both said."""
+    text = servo_text(CASE, trials(), statistics(trials()), ["out/servo.html"])
+    assert "tolerance not reached" in text
+    assert "1 sessions could not be held" in text
+    assert "not confirmed 25.0 %" in text
+    summary = servo_summary(CASE, trials(), statistics(trials()))
+    assert summary["sessions"][2]["refused"].endswith("few_inliers")
+    assert summary["stops"] == {"converged": 3, "tolerance_not_reached": 1}
+
+
+def test_the_page_needs_no_network_and_shows_every_number(tmp_path):
+    """Pictures are embedded, nothing is loaded, and cards, rows and the paper's columns are there."""
+    picture = tmp_path / "one.png"
+    Image.new("RGB", (4, 4)).save(picture)
+    page = tmp_path / "servo.html"
+    ours = statistics(trials())
+    write_servo_page(CASE, trials(), ours, [picture, picture], picture, page, paper_columns())
+    text = page.read_text(encoding="utf-8")
+    assert "http" not in re.sub(r"http-equiv", "", text)
+    assert text.count("data:image/png;base64,") == 3
+    assert "{{" not in text
+    assert "25.0 %" in text
+    assert "tolerance not reached" in text
+    assert "1.47 / 2.41 (not what the rows give)" in text
+    assert "1.479 / 2.41" in text
+    without = tmp_path / "plain.html"
+    write_servo_page(CASE, trials(), ours, [picture], picture, without)
+    assert "Liu et al." not in without.read_text(encoding="utf-8")
