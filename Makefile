@@ -11,7 +11,7 @@ demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
 
 test: install lint
-	$(BIN)/pytest -q
+	$(BIN)/pytest -q -n auto
 
 lint: install
 	$(BIN)/ruff check .
