@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import ValidationError
 
 from planning.case_file import (
     Anatomical,
@@ -31,14 +28,14 @@ from planning.files import sha256
 from planning.formats.points import read_points
 from planning.formats.spaces import Space, to_lps
 from planning.robot.ur import ur_model
+from planning.toml_file import find_toml, read_toml
+
+ALLOWED_CASE = "a TOML case file with schema = 1, or a folder with case.toml"
 
 Matrix = NDArray[np.float64]
 
 AXES_PARALLEL = 0.999
 """|cos| above which a mount's x and z axes do not span a frame (2.6 degrees)."""
-
-MAX_CASE_BYTES = 1_000_000
-"""A case file is written by hand; a larger one is something else."""
 
 
 @dataclass(frozen=True)
@@ -146,8 +143,8 @@ def load_case(path: Path | str) -> Case:
     Raises:
         InputError: Anything unreadable, unknown, missing or contradictory; names the key.
     """
-    path = _case_path(Path(path))
-    content = _validated(_parsed(path), path)
+    path = find_toml(path, "case.toml")
+    content = read_toml(path, CaseFile, allowed=ALLOWED_CASE, keys="docs/case.md")
     space = Space(content.space)
     target = _target(content, path, space)
     settings = content.search
@@ -185,47 +182,6 @@ def load_case(path: Path | str) -> Case:
         gantry=None if content.gantry is None else _gantry(content.gantry, space, path),
         place=content.place,
     )
-
-
-def _case_path(path: Path) -> Path:
-    """The case file itself, also of a folder.
-
-    Raises:
-        InputError: A name that the system cannot look up, or something that is no plain file.
-    """
-    allowed = "a case file, or a folder that holds case.toml"
-    try:
-        path = path / "case.toml" if path.is_dir() else path
-        if path.exists() and not path.is_file():
-            raise InputError("is no plain file", where=path, allowed=allowed)
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot be looked up ({error})", where=str(path)[:80], allowed=allowed) from error
-    return path
-
-
-def _parsed(path: Path) -> dict[str, Any]:
-    allowed = "a TOML case file with schema = 1, or a folder with case.toml"
-    try:
-        if path.stat().st_size > MAX_CASE_BYTES:
-            raise InputError("larger than 1 MB, not a case file", where=path, allowed=allowed)
-        return tomllib.loads(path.read_bytes().decode("utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed=allowed) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"is not TOML: {error}", where=path, allowed=allowed) from error
-
-
-def _validated(data: dict[str, Any], path: Path) -> CaseFile:
-    try:
-        return CaseFile.model_validate(data)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"]) or "top level"
-        said = first["msg"].removeprefix("Value error, ")
-        value = "" if isinstance(first["input"], dict | list) else f" (given: {first['input']!r:.60})"
-        raise InputError(
-            f"{place}: {said}{value}", where=path, allowed="the keys, types and ranges of docs/case.md"
-        ) from error
 
 
 def _target(content: CaseFile, path: Path, space: Space) -> Matrix:

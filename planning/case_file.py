@@ -8,13 +8,14 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import (
     AllowInfNan,
     BaseModel,
-    BeforeValidator,
     ConfigDict,
     Field,
     Strict,
     StringConstraints,
     model_validator,
 )
+
+from planning.toml_file import SchemaOne
 
 Number = Annotated[float, Strict(), AllowInfNan(False)]
 Positive = Annotated[Number, Field(gt=0)]
@@ -288,16 +289,10 @@ class RehearsalSection(Section):
     joint_offset_deg: NotNegative = 0.02
 
 
-def _schema_one(value: Any) -> Any:
-    if value != 1 or not isinstance(value, int) or isinstance(value, bool):
-        raise ValueError(f"schema {value!r} is not known; this version reads schema = 1")
-    return value
-
-
 class CaseFile(Section):
     """The whole file."""
 
-    schema_: Annotated[int, BeforeValidator(_schema_one)] = Field(alias="schema")
+    schema_: SchemaOne = Field(alias="schema")
     name: Name
     space: Literal["LPS", "RAS", "local"]
     target: TargetSection

@@ -17,20 +17,20 @@ A file holds one or many::
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from planning.case_file import Degrees180, Degrees360, NotNegative, Number, Section
 from planning.errors import InputError
 from planning.explain import Explanation
 from planning.prepared import Prepared, prepare
 from planning.reasons import Reason
+from planning.toml_file import read_toml
 
 SUFFIX = ".collision.toml"
 PREPARED = pytest.StashKey[dict[tuple[Path, bool], Prepared]]()
@@ -114,14 +114,7 @@ def read_checks(path: Path) -> ChecksFile:
     Raises:
         InputError: Not TOML, or not this schema.
     """
-    try:
-        return ChecksFile.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"is not TOML: {error}", where=path, allowed="[[check]] tables") from error
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{place}: {first['msg']}", where=path, allowed="the keys of docs/pytest.md") from error
+    return read_toml(path, ChecksFile, allowed="[[check]] tables", keys="docs/pytest.md")
 
 
 def compare(check: CheckSection, found: Explanation) -> None:

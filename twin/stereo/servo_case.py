@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, Strict, ValidationError, model_validator
+from pydantic import Field, Strict, model_validator
 
 from planning.case_file import Coordinate, Length, Name, Number, Section, Vector
 from planning.errors import InputError
@@ -20,13 +19,11 @@ from planning.formats.spaces import Space, Unit
 from planning.mesh import TriangleMesh
 from planning.registration import MIN_MARKERS
 from planning.robot.ur import ur_model
+from planning.toml_file import SchemaOne, find_toml, read_toml
 
 Floats = NDArray[np.float64]
 
 CASE_NAME = "servo.toml"
-MAX_CASE_BYTES = 1_000_000
-"""A case file is written by hand; a larger one is something else."""
-
 ALLOWED_CASE = "a TOML servo case with schema = 1, or a folder with servo.toml"
 
 Pixels = Annotated[int, Strict(), Field(ge=64, le=8192)]
@@ -135,16 +132,10 @@ class BoxSection(Section):
     size_mm: tuple[Length, Length, Length]
 
 
-def _schema_one(value: object) -> object:
-    if value != 1 or not isinstance(value, int) or isinstance(value, bool):
-        raise ValueError(f"schema {value!r} is not known; this version reads schema = 1")
-    return value
-
-
 class ServoFile(Section):
     """The whole file."""
 
-    schema_: Annotated[int, BeforeValidator(_schema_one)] = Field(alias="schema")
+    schema_: SchemaOne = Field(alias="schema")
     name: Name
     seed: Annotated[int, Strict(), Field(ge=0, lt=2**31)] = 0
     cameras: CamerasSection = CamerasSection()
@@ -188,9 +179,8 @@ def load_servo_case(path: Path | str) -> ServoCase:
     Raises:
         InputError: Anything unreadable, unknown, missing or contradictory; names the key.
     """
-    path = Path(path)
-    path = path / CASE_NAME if path.is_dir() else path
-    file = _validated(_parsed(path), path)
+    path = find_toml(path, CASE_NAME)
+    file = read_toml(path, ServoFile, allowed=ALLOWED_CASE, keys="docs/stereo.md")
     ur_model(file.robot.model)
     named = {key: getattr(file.head, key) for key in ("mesh", "markers", "targets")}
     for key, name in named.items():
@@ -204,25 +194,3 @@ def load_servo_case(path: Path | str) -> ServoCase:
         raise InputError(f"head.markers: {len(markers.names)} markers", where=path, allowed="3 or more")
     inputs = {path.name: sha256(path)} | {name: sha256(path.parent / name) for name in named.values()}
     return ServoCase(path, file, skin, markers, targets, inputs)
-
-
-def _parsed(path: Path) -> dict[str, object]:
-    try:
-        if path.stat().st_size > MAX_CASE_BYTES:
-            raise InputError("larger than 1 MB, not a case file", where=path, allowed=ALLOWED_CASE)
-        return tomllib.loads(path.read_bytes().decode("utf-8"))
-    except (OSError, ValueError) as error:
-        said = error.strerror if isinstance(error, OSError) else f"not TOML: {error}"
-        raise InputError(f"cannot be read ({said})", where=path, allowed=ALLOWED_CASE) from error
-
-
-def _validated(data: dict[str, object], path: Path) -> ServoFile:
-    try:
-        return ServoFile.model_validate(data)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"]) or "top level"
-        said = first["msg"].removeprefix("Value error, ")
-        value = "" if isinstance(first["input"], dict | list) else f" (given: {first['input']!r:.60})"
-        allowed = "the keys, types and ranges of docs/stereo.md"
-        raise InputError(f"{place}: {said}{value}", where=path, allowed=allowed) from error

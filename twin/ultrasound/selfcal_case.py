@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, Strict, ValidationError, field_validator, model_validator
+from pydantic import Field, Strict, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
 from planning.case_file import Length, Name, Number, Section, Sextuple, Vector
-from planning.errors import InputError
 from planning.files import sha256
-from planning.formats.input_file import read_input
 from planning.robot.ur import ur_model
+from planning.toml_file import SchemaOne, find_toml, read_toml
 from twin.true_arm import ArmErrors
 from twin.ultrasound.probe_image import Imager, NeedleEcho
 from twin.ultrasound.recording import Noise
@@ -26,8 +24,6 @@ Floats = NDArray[np.float64]
 CASE_NAME = "selfcal.toml"
 """What a folder is searched for."""
 
-MAX_CASE_BYTES = 1_000_000
-"""A case file is written by hand; a larger one is something else."""
 
 ALLOWED_CASE = "a TOML self-calibration case with schema = 1, or a folder with selfcal.toml"
 
@@ -189,16 +185,10 @@ class NoiseSection(Section):
         )
 
 
-def _schema_one(value: object) -> object:
-    if value != 1 or not isinstance(value, int) or isinstance(value, bool):
-        raise ValueError(f"schema {value!r} is not known; this version reads schema = 1")
-    return value
-
-
 class SelfcalFile(Section):
     """The whole file."""
 
-    schema_: Annotated[int, BeforeValidator(_schema_one)] = Field(alias="schema")
+    schema_: SchemaOne = Field(alias="schema")
     name: Name
     seed: Annotated[int, Strict(), Field(ge=0, lt=2**31)] = 0
     hold_needle_length: Annotated[bool, Strict()] = False
@@ -273,20 +263,8 @@ def load_selfcal_case(path: Path | str) -> SelfcalCase:
     Raises:
         InputError: Anything unreadable, unknown, missing or contradictory; names the key.
     """
-    path = Path(path)
-    path = path / CASE_NAME if path.is_dir() else path
-    data = read_input(path, max_bytes=MAX_CASE_BYTES, where=str(path))
-    try:
-        content = SelfcalFile.model_validate(tomllib.loads(data.decode("utf-8")))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"is not TOML: {error}", where=path, allowed=ALLOWED_CASE) from error
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"]) or "top level"
-        said = first["msg"].removeprefix("Value error, ")
-        value = "" if isinstance(first["input"], dict | list) else f" (given: {first['input']!r:.60})"
-        allowed = "the keys, types and ranges of docs/ultrasound.md"
-        raise InputError(f"{place}: {said}{value}", where=path, allowed=allowed) from error
+    path = find_toml(path, CASE_NAME)
+    content = read_toml(path, SelfcalFile, allowed=ALLOWED_CASE, keys="docs/ultrasound.md")
     for arm in (content.probe_arm, content.needle_arm):
         ur_model(arm.model)
     return SelfcalCase(path, content, {path.name: sha256(path)})

@@ -1,0 +1,74 @@
+"""TOML files of a stated schema: found, read and validated, with one line for whatever is wrong."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ValidationError
+
+from planning.errors import InputError
+
+MAX_BYTES = 1_000_000
+"""Such a file is written by hand; a larger one is something else."""
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def _one(value: object) -> object:
+    if value != 1 or not isinstance(value, int) or isinstance(value, bool):
+        raise ValueError(f"schema {value!r} is not known; this version reads schema = 1")
+    return value
+
+
+SchemaOne = Annotated[int, BeforeValidator(_one)]
+"""The key ``schema``: 1."""
+
+
+def find_toml(path: Path | str, usual_name: str) -> Path:
+    """The file itself, also of a folder that holds one of the usual name.
+
+    Raises:
+        InputError: A name that the system cannot look up, or something that is no plain file.
+    """
+    path = Path(path)
+    allowed = f"a TOML file, or a folder that holds {usual_name}"
+    try:
+        path = path / usual_name if path.is_dir() else path
+        if path.exists() and not path.is_file():
+            raise InputError("is no plain file", where=path, allowed=allowed)
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be looked up ({error})", where=str(path)[:80], allowed=allowed) from error
+    return path
+
+
+def read_toml(path: Path, model: type[Model], *, allowed: str, keys: str) -> Model:
+    """Read a file and validate it.
+
+    Args:
+        path: The file.
+        model: Its schema.
+        allowed: What would have been accepted in its place.
+        keys: Where its keys are described.
+
+    Raises:
+        InputError: Unreadable, too large, not TOML, or not of the schema: names the first key that is wrong.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError("larger than 1 MB, not written by hand", where=path, allowed=allowed)
+        data = tomllib.loads(path.read_bytes().decode("utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed=allowed) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"is not TOML: {error}", where=path, allowed=allowed) from error
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in first["loc"]) or "top level"
+        said = first["msg"].removeprefix("Value error, ")
+        value = "" if isinstance(first["input"], dict | list) else f" (given: {first['input']!r:.60})"
+        allowed = f"the keys, types and ranges of {keys}"
+        raise InputError(f"{place}: {said}{value}", where=path, allowed=allowed) from error
