@@ -9,6 +9,8 @@ k1, k2, p1, p2 of Brown's model, in the order and with the signs of OpenCV:
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -87,7 +89,7 @@ def fold(coefficients: Floats) -> float:
     square = 9 * k1 * k1 - 20 * k2
     if square < 0:
         return float("inf")
-    q = -(3 * k1 + np.copysign(np.sqrt(square), k1)) / 2
+    q = -(3 * k1 + math.copysign(math.sqrt(square), k1)) / 2
     roots = [1 / q if q else 0.0, q / (5 * k2) if k2 else 0.0]
     squares = [root for root in roots if root > 0]
     return float(np.sqrt(min(squares))) if squares else float("inf")
