@@ -10,10 +10,10 @@ import numpy as np
 
 from benchmarks.scenes import Scene
 from planning.clearance.bare import bare
-from planning.clearance.blocks import LANES
 from planning.clearance.bounds import disc_bounds, line_distances
 from planning.clearance.fast_engine import FastEngine
-from planning.clearance.segment_triangle import axis_triangle_beside
+from planning.clearance.lanes import LANES
+from planning.clearance.side_by_side import ROWS, bring_into_frame, measure_beside
 from planning.clearance.tile_search import COUNTED
 
 TURNS = 300_000
@@ -25,25 +25,26 @@ X32, Y32, Z32 = (tuple(Single(x) for x in axis) for axis in (X, Y, Z))
 
 
 @nb.njit(error_model="numpy")
-def _discs(nodes, bounds, lanes, turns):
+def _discs(nodes, bounds, turns):
     nodes, bounds = bare(nodes), bare(bounds)
     for i in range(turns):
-        disc_bounds(nodes, i & 31, lanes, Z32, Single(0.03), Single(210), Single(1e-4), bounds, i & 31)
+        disc_bounds(nodes, i & 31, Z32, Single(0.03), Single(210), Single(1e-4), bounds, i & 31)
 
 
 @nb.njit(error_model="numpy")
-def _blocks(local, squares, lanes, turns):
+def _blocks(local, squares, turns):
     local, squares = bare(local), bare(squares)
     for i in range(turns):
-        line_distances(local, i & 31, lanes, X32, Y32, Single(3), Single(2), Single(-1e-3), Single(5), squares)
+        line_distances(local, i & 31, X32, Y32, Single(3), Single(2), Single(-1e-3), squares, i & 31)
 
 
 @nb.njit(error_model="numpy")
-def _triangles(triangles, turns):
-    triangles, total = bare(triangles), 0.0
-    for i in range(turns):
-        total += axis_triangle_beside(Z, X, Y, 210.0, triangles, i & 255, (0.0, 0.0, 0.0))[0]
-    return total
+def _triangles(triangles, pairs, turns):
+    triangles, pairs = bare(triangles), bare(pairs)
+    for i in range(0, turns, 16):
+        for k in range(16):
+            bring_into_frame(Z, X, Y, triangles, (i + k) & 255, (0.0, 0.0, 0.0), pairs, k)
+        measure_beside(pairs, 16, 210.0)
 
 
 def _least(work: Callable[[], object]) -> float:
@@ -63,11 +64,11 @@ def unit_costs() -> tuple[float, float, float]:
     nodes = np.abs(rng.normal(0, 3, (32, 10, LANES))).astype(Single)
     local = rng.normal(0, 3, (32, 9, LANES)).astype(Single)
     beside = rng.normal(0, 1, (256, 9)) + np.tile([30.0, 5.0, 40.0], 3)
-    bounds, squares = np.empty((32, LANES), Single), np.empty(LANES, Single)
+    bounds, squares = np.empty((32, LANES), Single), np.empty((32, LANES), Single)
     return (
-        _least(lambda: _discs(nodes, bounds, LANES, TURNS)),
-        _least(lambda: _blocks(local, squares, LANES, TURNS)),
-        _least(lambda: _triangles(beside, TURNS)),
+        _least(lambda: _discs(nodes, bounds, TURNS)),
+        _least(lambda: _blocks(local, squares, TURNS)),
+        _least(lambda: _triangles(beside, np.empty((ROWS, 24)), TURNS)),
     )
 
 

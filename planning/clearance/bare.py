@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+from numba import extending
 from numba.core import cgutils
-from numba.extending import intrinsic
+
+intrinsic: Any = extending.intrinsic
+"""Numba's own; callers leave out the first argument, which mypy cannot know."""
 
 
-@intrinsic
+@intrinsic  # type: ignore[untyped-decorator]  # numba's own types
 def bare(typing_context: Any, array: Any) -> Any:
     """The same array without its reference count, which numba would touch at every call in a loop.
 

@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.clearance.kd_order import kd_order
+from planning.clearance.lanes import LANES
 from planning.mesh import TriangleMesh
 
 Floats = NDArray[np.float64]
-
-LANES = 16
-"""Triangles of a block and children of a node: the float32 numbers of one AVX-512 register."""
 
 PARALLEL = 1e-6
 """Share of its triangles' area below which a block's mean normal says nothing."""

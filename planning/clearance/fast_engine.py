@@ -8,10 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.clearance.blocks import LANES, Blocks, pack
+from planning.clearance.blocks import Blocks, pack
 from planning.clearance.engine import AxisDistances, Floats
 from planning.clearance.fcl_engine import FclEngine
-from planning.clearance.tile_search import COUNTED, nearest_triangle, scratch_for, search_tiles
+from planning.clearance.lanes import LANES
+from planning.clearance.nearest_triangle import nearest_triangle
+from planning.clearance.scratch import Found, scratch_for
+from planning.clearance.tile_search import COUNTED, search_tiles
 from planning.clearance.tiles import Tiles, bundle
 from planning.errors import InputError
 from planning.mesh import TriangleMesh
@@ -143,14 +146,14 @@ def _one_structure(
     if placed.distance == 0.0 or placed.distance < enough:
         distance[:], depth[:] = min(placed.distance, cap), 0.0
         return
-    found, at = np.empty(len(distance)), np.empty(len(distance))
+    found = Found(np.empty(len(distance)), np.empty(len(distance)), counts)
     surface = (blocks.triangles, blocks.local, blocks.base)
     bundles = (tiles.outward, tiles.starts, tiles.middle, tiles.chord)
     search_tiles(
         surface, placed.nodes, placed.slack, target, float(length), placed.distance, placed.nearest,
-        float(cap), float(enough), bundles, scratch_for(len(placed.nodes)), LANES, found, at, counts,
+        float(cap), float(enough), bundles, scratch_for(len(placed.nodes)), found, LANES,
     )  # fmt: skip
-    distance[tiles.order], depth[tiles.order] = np.sqrt(found), at
+    distance[tiles.order], depth[tiles.order] = np.sqrt(found.square), found.depth
 
 
 def _placed(blocks: Blocks, target: Floats) -> _Placed:
@@ -163,5 +166,5 @@ def _placed(blocks: Blocks, target: Floats) -> _Placed:
     nodes[9] = (away + nodes[8]) * np.float32(1 + 1e-6)
     slack = COORDINATE_SLACK * float(nodes[9][: len(blocks.local)].max())
     grouped = np.ascontiguousarray(nodes.reshape(10, -1, LANES).transpose(1, 0, 2))
-    distance, nearest = nearest_triangle(blocks.triangles, grouped, blocks.base, target, slack, LANES)
+    distance, nearest = nearest_triangle(blocks.triangles, grouped, blocks.base, target, slack)
     return _Placed(grouped, slack, distance, nearest)

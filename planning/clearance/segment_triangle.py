@@ -52,55 +52,6 @@ def axis_triangle(u, length, a, b, c):  # type: ignore[no-untyped-def]  # numba 
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def axis_triangle_beside(u, e, f, length, tri, row, o):  # type: ignore[no-untyped-def]  # numba infers
-    """What `axis_triangle` answers, in a third of the time where the triangle lies wholly beside the axis.
-
-    Between the depths 0 and ``length`` the distance from the axis is that from its line: in the plane across it, the
-    distance of the origin from the triangle's shadow. A triangle elsewhere, or one that may be met, goes the long way.
-
-    Args:
-        u: Unit direction.
-        e: With f it completes u to an orthonormal frame.
-        f: See e.
-        length: Length of the axis, mm.
-        tri: Shape (m, 9), corners a, b, c of triangles.
-        row: Which triangle.
-        o: Where the axis starts, in the frame of ``tri``.
-    """
-    ax, ay, az = tri[row, 0] - o[0], tri[row, 1] - o[1], tri[row, 2] - o[2]
-    bx, by, bz = tri[row, 3] - o[0], tri[row, 4] - o[1], tri[row, 5] - o[2]
-    cx, cy, cz = tri[row, 6] - o[0], tri[row, 7] - o[1], tri[row, 8] - o[2]
-    corners = (ax, ay, az), (bx, by, bz), (cx, cy, cz)
-    ta, tb, tc = ax * u[0] + ay * u[1] + az * u[2], bx * u[0] + by * u[1] + bz * u[2], cx * u[0] + cy * u[1] + cz * u[2]
-    ax, ay = ax * e[0] + ay * e[1] + az * e[2], ax * f[0] + ay * f[1] + az * f[2]
-    bx, by = bx * e[0] + by * e[1] + bz * e[2], bx * f[0] + by * f[1] + bz * f[2]
-    cx, cy = cx * e[0] + cy * e[1] + cz * e[2], cx * f[0] + cy * f[1] + cz * f[2]
-    best, depth = _shadow(ax, ay, ta, bx, by, tb)
-    two, two_depth = _shadow(bx, by, tb, cx, cy, tc)
-    three, three_depth = _shadow(cx, cy, tc, ax, ay, ta)
-    depth, best = two_depth if two < best else depth, two if two < best else best
-    depth, best = three_depth if three < best else depth, three if three < best else best
-    wa, wb, wc = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
-    around = ((wa >= 0.0) & (wb >= 0.0) & (wc >= 0.0)) | ((wa <= 0.0) & (wb <= 0.0) & (wc <= 0.0))
-    behind = (ta < 0.0) | (tb < 0.0) | (tc < 0.0)
-    over = (ta > length) | (tb > length) | (tc > length)
-    if around | behind | over | (best < CONTACT_MM):
-        return axis_triangle(u, length, corners[0], corners[1], corners[2])
-    return best, depth
-
-
-@nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _shadow(px, py, tp, qx, qy, tq):  # type: ignore[no-untyped-def]  # numba infers
-    """Squared distance of the origin from an edge's shadow p-q, and the depth there (at p and q ``tp`` and ``tq``)."""
-    dx, dy = qx - px, qy - py
-    t = -(px * dx + py * dy) / (dx * dx + dy * dy + LEAST)
-    t = t if t > 0.0 else 0.0
-    t = t if t < 1.0 else 1.0
-    x, y = px + t * dx, py + t * dy
-    return x * x + y * y, tp + t * (tq - tp)
-
-
-@nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _nearer(best, depth, found):  # type: ignore[no-untyped-def]  # numba infers
     """The nearer of two candidates; of two that are equally near, the one met first."""
     if found[0] < best or (found[0] == best and found[1] < depth):
