@@ -11,9 +11,10 @@ import report_world as world
 from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
+from planning.cache import Cache
 from planning.case_file import EntryAxes
 from planning.entry import ANATOMICAL_LPS
-from twin.report import annotate, draw_film, draw_map, draw_scene, film, page, scene_picture, write_page
+from twin.report import annotate, draw_film, draw_map, draw_scene, film, page, page_scene, scene_picture, write_page
 from twin.report.camera import Camera, camera_around
 from twin.report.compositing import Shot, compose, empty_veil
 from twin.report.map_picture import FIGURE_INCHES, MAP_BOX, RIM
@@ -240,7 +241,7 @@ def sphere_view(width=200, height=160):
 
 
 def test_depth_and_outline_of_a_ball(ball):
-    """The ray caster agrees with the analytic sphere within the mesh's sagitta."""
+    """What is drawn agrees with the analytic sphere within the mesh's sagitta."""
     centre, camera, near, _ = sphere_view()
     shot = opaque_shot(Layer([Surface(ball(60.0, centre, 5), (200, 40, 40))]), camera)
     struck = np.isfinite(shot.depth)
@@ -275,7 +276,7 @@ def test_a_veil_behind_something_opaque_is_not_drawn():
 
 
 def test_a_moved_body_looks_like_a_body_that_stands_there(ball, rng):
-    """Casting in the body's own frame gives the picture of the transformed mesh."""
+    """Drawing in the body's own frame gives the picture of the transformed mesh."""
     mesh = ball(30.0, (10, 5, 0), 2)
     T = np.eye(4)
     T[:3, :3] = Rotation.random(rng=rng).as_matrix()
@@ -403,13 +404,13 @@ def test_the_cross_of_directions_points_the_right_way(monkeypatch, case):
 
 def test_the_scene_with_and_without_an_answer(anatomy, case, candidates, plan, tmp_path, monkeypatch):
     """scene.png is drawn with the arm, with the best candidate alone, and when nothing is safe."""
-    monkeypatch.setattr(scene_picture, "LEFT_BOX", (16, 84, 316, 284))
-    monkeypatch.setattr(scene_picture, "RIGHT_BOX", (330, 84, 630, 284))
+    monkeypatch.setattr(scene_picture, "LEFT_BOX", (16, 84, 616, 484))
+    monkeypatch.setattr(scene_picture, "RIGHT_BOX", (630, 84, 1230, 484))
     nothing = world.make_candidates(case, safe=False)
     pictures = []
     for number, (found, motion) in enumerate(((candidates, plan), (candidates, None), (nothing, None))):
         draw_scene(case, anatomy, found, motion, tmp_path / f"{number}.png")
-        pictures.append(np.asarray(Image.open(tmp_path / f"{number}.png"))[90:280, 20:310].astype(int))
+        pictures.append(np.asarray(Image.open(tmp_path / f"{number}.png"))[90:480, 20:610].astype(int))
     greens = [((p[..., 1] > p[..., 0] + 25) & (p[..., 1] > p[..., 2] + 10)).sum() for p in pictures]
     assert greens[1] > 200 and greens[2] == 0
     assert len(list(tmp_path.iterdir())) == 3
@@ -569,3 +570,53 @@ def test_meshes_are_lightened_but_none_is_lost(ball):
     assert TRIANGLES <= 100_000
     for before, after in zip(bodies, light, strict=True):
         assert np.allclose(before.mesh.bounds, after.mesh.bounds, atol=0.02 * np.ptp(before.mesh.bounds))
+
+
+def test_lightened_meshes_are_kept(ball, tmp_path, monkeypatch):
+    """The second time nothing is simplified, and the meshes are the same; another budget is another mesh."""
+    bodies = [Body("big", "organ", ball(80.0, (0, 0, 0), 5), (1, 2, 3))]
+    cache = Cache(tmp_path)
+    (first,) = lightened(bodies, 2_000, cache)
+    with monkeypatch.context() as patch:
+        patch.setattr(page_scene.fast_simplification, "simplify", None)
+        (again,) = lightened(bodies, 2_000, cache)
+        with pytest.raises(TypeError):
+            lightened(bodies, 1_000, cache)
+    assert np.array_equal(first.mesh.vertices, again.mesh.vertices) and again.colour == (1, 2, 3)
+    assert np.array_equal(first.mesh.faces, again.mesh.faces)
+
+
+@pytest.mark.parametrize("toward", [(0.1, 0.6, -0.75), (0.0, 1.0, 0.2), (0.7, 0.5, -0.5), (-0.9, 0.1, -0.3)])
+def test_the_cross_s_words_keep_apart(monkeypatch, case, toward):
+    """Whatever the view, no two names of directions run into each other."""
+    boxes = []
+    image = ImageDraw.Draw(Image.new("RGB", (300, 300)))
+
+    def note(draw, at, words, *, size, bold, anchor, **look):
+        boxes.append(draw.textbbox(at, words, font=annotate.font(size, bold), anchor=anchor))
+
+    monkeypatch.setattr(annotate, "write", note)
+    camera = Camera(-500 * np.array(toward), np.zeros(3), np.array([0, -1.0, 0.1]), 0.5, 200, 200)
+    annotate.body_axes(image, camera, case.space, (150.0, 150.0), 44.0)
+    assert len(boxes) >= 4
+    for i, a in enumerate(boxes):
+        for b in boxes[:i]:
+            assert a[0] >= b[2] or b[0] >= a[2] or a[1] >= b[3] or b[1] >= a[3]
+
+
+def test_the_legend_names_the_room(anatomy, case, candidates, tmp_path, monkeypatch):
+    """A gantry and a table are named; the see-through one is said to be."""
+    written = []
+    monkeypatch.setattr(annotate, "legend", lambda draw, items, *place: written.extend(n for n, _ in items) or 900.0)
+    monkeypatch.setattr(scene_picture, "LEFT_BOX", (16, 84, 216, 284))
+    monkeypatch.setattr(scene_picture, "RIGHT_BOX", (230, 84, 430, 284))
+    box = stand_in_room(anatomy)
+    monkeypatch.setattr(scene_picture, "room", lambda *_: box)
+    draw_scene(case, anatomy, candidates, None, tmp_path / "scene.png")
+    assert {"gantry (see-through)", "table"} <= set(written)
+
+
+def stand_in_room(anatomy):
+    """Something to stand for a gantry and a table."""
+    mesh = anatomy.skin.mesh
+    return (Body("gantry", "room", mesh, (1, 2, 3), 0.15), Body("table", "room", mesh, (1, 2, 3)))

@@ -68,7 +68,7 @@ def body_axes(
         length: Pixels of an axis that lies in the picture plane.
         size: Of the words.
     """
-    reach = length + 3.1 * size
+    reach = length + 3.6 * size
     disc = [centre[0] - reach, centre[1] - reach, centre[0] + reach, centre[1] + reach]
     draw.ellipse(disc, fill=(250, 250, 252), outline=(200, 204, 210))
     toward = camera.axes[2]
@@ -87,17 +87,20 @@ def body_axes(
         at = end[0] + out[0] * 6, end[1] + out[1] * (size * 0.75)
         short = name.removeprefix("patient's ")
         anchor: Anchor = "lm" if out[0] > 0.35 else "rm" if out[0] < -0.35 else "mm"
-        for _ in range(4):  # move outward past words that already stand there
-            box = draw.textbbox(at, short, font=font(size, not far), anchor=anchor)
+        box = draw.textbbox(at, short, font=font(size, not far), anchor=anchor)
+        for side in (1, -1, 2, -2, 3, -3):  # beside words that already stand there: above them it would read as one
             if not any(_overlap(box, other) for other in taken):
                 break
-            at = at[0] + out[0] * size * 0.6, at[1] + out[1] * size * 0.6
+            at = end[0] + side * size * 0.6, end[1]
+            anchor = "lm" if side > 0 else "rm"
+            box = draw.textbbox(at, short, font=font(size, not far), anchor=anchor)
         taken.append(box)
         write(draw, at, short, size=size, bold=not far, colour=colour, anchor=anchor, halo=2)
 
 
 def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+    gap = 6  # pixels; words that stand nearer read as one
+    return a[0] < b[2] + gap and b[0] < a[2] + gap and a[1] < b[3] + gap and b[1] < a[3] + gap
 
 
 def scale_bar(

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,9 +14,6 @@ Floats32 = NDArray[np.float32]
 
 SAMPLES = 2
 """Samples per pixel side."""
-
-SAMPLES_AT_ONCE = 40_000
-"""Work is done in bands of about so many samples: arrays of that size stay in the cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,17 +86,33 @@ def compose(shot: Shot, veils: Sequence[Veil], box: PixelBox | None = None) -> N
         box: The part to make, in samples, whole pixels; all of it when None.
     """
     height, width = shot.depth.shape
-    box = box or PixelBox(0, 0, width, height)
-    size = (box.y1 - box.y0) // SAMPLES, (box.x1 - box.x0) // SAMPLES
-    pixels = np.empty((*size, 3), dtype=np.uint8)
-    rows = max(1, SAMPLES_AT_ONCE // (size[1] * SAMPLES**2))
-    for top in range(0, size[0], rows):
-        bottom = min(top + rows, size[0])
-        part = slice(box.y0 + top * SAMPLES, box.y0 + bottom * SAMPLES), slice(box.x0, box.x1)
-        colour = shot.colour[part]
-        for veil in reversed(veils):
-            alpha = np.where(veil.depth[part] < shot.depth[part], veil.alpha[part], np.float32(0))[..., None]
-            colour = colour + alpha * (veil.colour[part] - colour)
-        mean = colour.reshape(bottom - top, SAMPLES, size[1], SAMPLES, 3).mean(axis=(1, 3))
-        pixels[top:bottom] = np.clip(np.round(mean), 0, 255)
+    part = (box or PixelBox(0, 0, width, height)).slices
+    colour = shot.colour[part].copy()
+    for veil in reversed(veils):
+        _blend(colour, shot.depth[part], veil.colour[part], veil.alpha[part], veil.depth[part])
+    return np.asarray(_pixels(colour, SAMPLES))
+
+
+@nb.njit(cache=True, nogil=True)
+def _blend(colour, depth, veil_colour, veil_alpha, veil_depth):  # type: ignore[no-untyped-def]  # numba infers
+    """One veil over what lies behind it, sample by sample, in place."""
+    for i in range(depth.shape[0]):
+        for j in range(depth.shape[1]):
+            if veil_depth[i, j] < depth[i, j]:
+                for k in range(3):
+                    colour[i, j, k] += veil_alpha[i, j] * (veil_colour[i, j, k] - colour[i, j, k])
+
+
+@nb.njit(cache=True, nogil=True)
+def _pixels(colour, samples):  # type: ignore[no-untyped-def]  # numba infers
+    """Means of squares of samples, rounded."""
+    pixels = np.empty((colour.shape[0] // samples, colour.shape[1] // samples, 3), dtype=np.uint8)
+    for i in range(pixels.shape[0]):
+        for j in range(pixels.shape[1]):
+            for k in range(3):
+                total = 0.0
+                for a in range(samples):
+                    for b in range(samples):
+                        total += colour[i * samples + a, j * samples + b, k]
+                pixels[i, j, k] = np.uint8(min(max(np.round(total / samples**2), 0.0), 255.0))
     return pixels

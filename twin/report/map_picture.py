@@ -29,9 +29,9 @@ from twin.report.numbers import (
     reason_counts,
     target_words,
 )
-from twin.report.palette import safe_shades
+from twin.report.palette import PNG_LEVEL, safe_shades
 
-PIXELS = 1400
+PIXELS = 1120
 """Side of the raster; finer than the picture shows it."""
 
 FIGURE_INCHES = (13.0, 9.4)
@@ -76,7 +76,7 @@ def draw_map(candidates: Candidates, case: Any, path: Path) -> None:
     _side(figure.add_axes(SIDE_BOX), case, candidates, view)
     with atomic(Path(path)) as temporary:
         FigureCanvasAgg(figure)
-        figure.savefig(temporary, format="png")
+        figure.savefig(temporary, format="png", pil_kwargs={"compress_level": PNG_LEVEL})
 
 
 def _frame(axes: Axes, view: MapView) -> None:
@@ -120,10 +120,11 @@ def _names(axes: Axes, raster: MapRaster, candidates: Candidates) -> None:
     named = np.isin(candidates.reason, [reason.value for reason in NAMED_REASONS])
     every, coded = np.unique(np.append(np.where(named, candidates.reason_structure, ""), ""), return_inverse=True)
     codes = coded[raster.rows]
-    border = np.zeros((*codes.shape, 4))
-    border[:-1, :, 3] = (codes[1:] != codes[:-1]) & (codes[1:] * codes[:-1] > 0)
-    border[:, :-1, 3] += (codes[:, 1:] != codes[:, :-1]) & (codes[:, 1:] * codes[:, :-1] > 0)
-    border[..., 3] = ndimage.maximum_filter(np.minimum(border[..., 3], 1), 3) * BORDER_OPACITY
+    parted = np.zeros(codes.shape, dtype=bool)
+    parted[:-1] = (codes[1:] != codes[:-1]) & (codes[1:] * codes[:-1] > 0)
+    parted[:, :-1] |= (codes[:, 1:] != codes[:, :-1]) & (codes[:, 1:] * codes[:, :-1] > 0)
+    border = np.zeros((*codes.shape, 4), dtype=np.uint8)
+    border[ndimage.binary_dilation(parted, np.ones((3, 3))), 3] = round(255 * BORDER_OPACITY)
     axes.imshow(border, extent=(-1, 1, -1, 1), interpolation="antialiased", zorder=2)
     coarse = codes[::4, ::4]
     size = len(coarse)

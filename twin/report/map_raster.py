@@ -1,4 +1,7 @@
-"""The map as pixels: every pixel asks which grid cell it lies in, so no gap and no moire can arise."""
+"""The map as pixels: every pixel asks which grid cell it lies in, so no gap and no moire can arise.
+
+A pixel with other colours around it is the mean of a few samples; all others have the colour of their cell.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.candidates import Candidates
-from twin.report.map_view import MapView, rows_at
+from twin.report.map_view import Cells, MapView
 from twin.report.palette import REASON_COLOURS, reason_of, safe_shades
 
 OVERSAMPLING = 2
-"""Samples per pixel side; averaged, they smooth the cells' borders."""
+"""Samples per pixel side at the cells' borders, which they smooth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,19 +62,40 @@ def map_raster(candidates: Candidates, view: MapView, size: int) -> MapRaster:
         view: The map's geometry.
         size: Pixels per side.
     """
-    fine = _rows(candidates, view, size * OVERSAMPLING)
-    table = np.zeros((len(candidates) + 1, 4))
+    cells = Cells.of(candidates)
+    rows = cells.picture(view, size)
+    table = np.zeros((len(candidates) + 1, 4), dtype=np.uint8)
     table[:-1, :3] = row_colours(candidates)
-    table[:-1, 3] = 255.0
-    rgba = table[fine]
-    rgba[..., :3] *= rgba[..., 3:] / 255.0
-    rgba = rgba.reshape(size, OVERSAMPLING, size, OVERSAMPLING, 4).mean(axis=(1, 3))
-    rgba[..., :3] /= np.maximum(rgba[..., 3:], 1.0) / 255.0
-    return MapRaster(np.clip(np.round(rgba), 0, 255).astype(np.uint8), _rows(candidates, view, size))
+    table[:-1, 3] = 255
+    whole = table.view(np.uint32)[rows, 0]
+    rgba = whole.view(np.uint8).reshape(size, size, 4)
+    line, column = np.nonzero(_beside_another(whole))
+    parts = (np.arange(OVERSAMPLING) + 0.5) / OVERSAMPLING
+    within = np.stack(np.meshgrid(parts, parts), axis=-1).reshape(-1, 1, 2)
+    fine = table[cells.rows(*view.angles_at(_to_disc(np.stack([column, line], axis=-1) + within, size)))].astype(float)
+    opaque = fine[..., 3:] / 255.0
+    mean = (fine[..., :3] * opaque).mean(axis=0) / np.maximum(opaque.mean(axis=0), 1.0 / 255.0)
+    rgba[line, column] = np.round(np.concatenate([mean, 255.0 * opaque.mean(axis=0)], axis=-1))
+    return MapRaster(rgba, rows)
 
 
-def _rows(candidates: Candidates, view: MapView, size: int) -> NDArray[np.int64]:
-    axis = (np.arange(size) + 0.5) / size * 2 - 1
-    x, y = np.meshgrid(axis, -axis)
-    theta, beta = view.angles_at(np.stack([x, y], axis=-1))
-    return rows_at(candidates, theta, beta)
+def _to_disc(pixels: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Points of the unit disc (x right, y up) at columns and rows of the picture, shape (..., 2)."""
+    return (pixels / size * 2 - 1) * [1.0, -1.0]
+
+
+def _beside_another(colours: NDArray[np.uint32]) -> NDArray[np.bool_]:
+    """Whether one of the eight around each entry, or nothing at the border, differs from it; shape (n, n)."""
+    beside = np.zeros(colours.shape, dtype=bool)
+    beside[[0, -1]] = beside[:, [0, -1]] = True
+    here, there = slice(None, -1), slice(1, None)
+    for a, b in (
+        ((here, slice(None)), (there, slice(None))),
+        ((slice(None), here), (slice(None), there)),
+        ((here, here), (there, there)),
+        ((here, there), (there, here)),
+    ):
+        differs = colours[a] != colours[b]
+        beside[a] |= differs
+        beside[b] |= differs
+    return beside

@@ -8,8 +8,10 @@ possible (else the front); seen from the front, the patient's right is then on t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -131,38 +133,120 @@ def rows_at(candidates: Candidates, theta: Floats, beta: Floats) -> NDArray[np.i
 
     A cell reaches half a step to each side in θ and in β. At θ = 0 the cell is the whole circle.
     """
-    step = step_of(candidates)
-    order = np.argsort(candidates.theta, kind="stable")
-    cuts = np.flatnonzero(np.diff(candidates.theta[order]) > RING_SLACK) + 1
-    rings = np.split(order, cuts)
-    heights = np.array([candidates.theta[ring[0]] for ring in rings])
-    edges = (heights[1:] + heights[:-1]) / 2
-    ring_of = np.searchsorted(edges, theta)
-    rows = np.full(theta.shape, -1, dtype=np.int64)
-    half = step / 2 * (1 + HALF_CELL_SLACK)
-    inside = (theta <= heights[ring_of] + half) & (theta >= heights[ring_of] - half)
-    for index, ring in enumerate(rings):
-        here = inside & (ring_of == index)
-        if here.any():
-            rows[here] = _rows_in_ring(candidates.beta[ring], ring, beta[here], step, heights[index])
-    return rows
+    return Cells.of(candidates).rows(theta, beta)
 
 
-def _rows_in_ring(
-    beta_ring: Floats, ring: NDArray[np.int64], beta: Floats, step: float, theta: float
-) -> NDArray[np.int64]:
-    wrapped = np.mod(beta_ring, 2 * np.pi)
-    order = np.argsort(wrapped, kind="stable")
-    wrapped, ring = wrapped[order], ring[order]
-    after = np.searchsorted(wrapped, beta) % len(ring)
-    before = (after - 1) % len(ring)
-    nearer = np.abs(_turn_between(wrapped[after], beta)) < np.abs(_turn_between(wrapped[before], beta))
-    pick = np.where(nearer, after, before)
-    gaps = np.diff(wrapped)
-    half = (float(np.median(gaps)) if len(gaps) else step) / 2 * (1 + HALF_CELL_SLACK)
-    pole = theta < RING_SLACK and len(ring) == 1
-    near = pole | (np.abs(_turn_between(wrapped[pick], beta)) <= half)
-    return np.where(near, ring[pick], -1)
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """The grid's cells, ring after ring of equal θ, and in each ring by β in 0..2π.
+
+    Attributes:
+        rows_in_order: Shape (n,), the candidate of each cell.
+        beta: Shape (n,), rad, in 0..2π.
+        starts: Shape (k + 1,), where each ring begins.
+        heights: Shape (k,), θ of each ring, ascending, rad.
+        half_theta: Half a cell, rad.
+        half_beta: Shape (k,), half a cell of each ring, rad.
+    """
+
+    rows_in_order: NDArray[np.int64]
+    beta: Floats
+    starts: NDArray[np.int64]
+    heights: Floats
+    half_theta: float
+    half_beta: Floats
+
+    @classmethod
+    def of(cls, candidates: Candidates) -> Cells:
+        """The cells of a search's grid."""
+        step, wrapped = step_of(candidates), np.mod(candidates.beta, 2 * np.pi)
+        by_theta = np.argsort(candidates.theta, kind="stable")
+        fresh = np.diff(candidates.theta[by_theta]) > RING_SLACK
+        ring = np.empty(len(by_theta), dtype=np.int64)
+        ring[by_theta] = np.concatenate([[0], np.cumsum(fresh)])
+        order = np.lexsort([wrapped, ring])
+        starts = np.concatenate([[0], np.flatnonzero(np.diff(ring[order])) + 1, [len(order)]])
+        heights = candidates.theta[by_theta[starts[:-1]]]
+        beta, half = wrapped[order], step / 2 * (1 + HALF_CELL_SLACK)
+        half_beta = np.empty(len(heights))
+        for i, (begin, end) in enumerate(pairwise(starts)):
+            gaps = np.diff(beta[begin:end])
+            half_beta[i] = float(np.median(gaps)) / 2 * (1 + HALF_CELL_SLACK) if len(gaps) else half
+            if heights[i] < RING_SLACK and len(gaps) == 0:
+                half_beta[i] = np.inf  # one cell at the pole
+        return cls(order, beta, starts, heights, half, half_beta)
+
+    def rows(self, theta: Floats, beta: Floats) -> NDArray[np.int64]:
+        """The candidate at each direction (rad, β in 0..2π), -1 outside the grid; same shape as ``theta``."""
+        theta, beta = np.asarray(theta, dtype=float), np.asarray(beta, dtype=float)
+        found = _find_rows(*self._arrays, theta.ravel(), beta.ravel())  # type: ignore[call-arg]  # numba infers
+        return np.asarray(found).reshape(theta.shape)
+
+    def picture(self, view: MapView, size: int) -> NDArray[np.int64]:
+        """The candidate under the middle of each pixel of a square picture of the disc, shape (size, size)."""
+        found = _find_picture(*self._arrays, view.turn, view.theta_max, size)  # type: ignore[call-arg]  # numba infers
+        return np.asarray(found)
+
+    @property
+    def _arrays(self) -> Any:
+        return self.rows_in_order, self.beta, self.starts, self.heights, self.half_theta, self.half_beta
+
+
+@nb.njit(cache=True)
+def _find_rows(rows, betas, starts, heights, half_theta, half_beta, theta, beta):  # type: ignore[no-untyped-def]  # numba infers
+    found = np.empty(len(theta), dtype=np.int64)
+    for i in range(len(theta)):
+        found[i] = _find_row(rows, betas, starts, heights, half_theta, half_beta, theta[i], beta[i])
+    return found
+
+
+@nb.njit(cache=True)
+def _find_picture(rows, betas, starts, heights, half_theta, half_beta, turn, theta_max, size):  # type: ignore[no-untyped-def]  # numba infers
+    found = np.empty((size, size), dtype=np.int64)
+    for line in range(size):
+        y = 1.0 - (line + 0.5) / size * 2
+        for column in range(size):
+            x = (column + 0.5) / size * 2 - 1
+            theta, beta = np.hypot(x, y) * theta_max, np.mod(np.arctan2(y, x) - turn, 2 * np.pi)
+            found[line, column] = _find_row(rows, betas, starts, heights, half_theta, half_beta, theta, beta)
+    return found
+
+
+@nb.njit(cache=True)
+def _find_row(rows, betas, starts, heights, half_theta, half_beta, theta, beta):  # type: ignore[no-untyped-def]  # numba infers
+    """The cell of a direction: in the nearest ring that of the nearest azimuth; -1 where that is too far."""
+    ring = _first_not_below(heights, 0, len(heights), theta)
+    if ring == len(heights) or (ring > 0 and theta - heights[ring - 1] <= heights[ring] - theta):
+        ring -= 1
+    if abs(theta - heights[ring]) > half_theta:
+        return -1
+    begin, end = starts[ring], starts[ring + 1]
+    after = _first_not_below(betas, begin, end, beta)
+    before = after - 1 if after > begin else end - 1
+    after = after if after < end else begin
+    ahead, behind = _turn(betas[after] - beta), _turn(betas[before] - beta)
+    if min(ahead, behind) > half_beta[ring]:
+        return -1
+    return rows[after] if ahead < behind else rows[before]
+
+
+@nb.njit(cache=True)
+def _first_not_below(values, begin, end, value):  # type: ignore[no-untyped-def]  # numba infers
+    """Where in ``values[begin:end]``, which ascend, the first stands that is not below a value; ``end`` if none is."""
+    while begin < end:
+        middle = (begin + end) // 2
+        if values[middle] < value:
+            begin = middle + 1
+        else:
+            end = middle
+    return begin
+
+
+@nb.njit(cache=True)
+def _turn(angle):  # type: ignore[no-untyped-def]  # numba infers
+    """The size of a difference of two angles in 0..2π."""
+    angle = abs(angle)
+    return angle if angle <= np.pi else abs(2 * np.pi - angle)
 
 
 def _turn_between(a: Any, b: Any) -> Any:

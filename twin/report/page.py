@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 from plotly.offline import get_plotlyjs
-from plotly.utils import PlotlyJSONEncoder
 
+from planning.cache import user_cache
 from planning.candidates import Candidates
 from planning.files import atomic
 from twin.report import page_tables as tables
@@ -45,7 +45,7 @@ def write_page(
     """
     data = {
         "map": map_data(case, candidates),
-        "scene": scene_figure(case, anatomy, candidates, plan),
+        "scene": scene_figure(case, anatomy, candidates, plan, user_cache()),
         "charts": None if rehearsal is None else rehearsal_charts(rehearsal, case.target_ct, demanding(anatomy)),
         "target": [float(v) for v in case.target_ct],
         "probe_mm": float(case.needle.length_mm),
@@ -93,7 +93,7 @@ def _part(name: str) -> str:
 
 def _json(data: Any) -> str:
     """JSON that may stand inside a script element: no tag can end it early."""
-    text = json.dumps(data, cls=PlotlyJSONEncoder, allow_nan=False, separators=(",", ":"))
+    text = json.dumps(data, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 

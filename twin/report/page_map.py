@@ -13,7 +13,7 @@ from planning.candidates import Candidates
 from planning.reasons import Reason
 from twin.report.map_raster import map_raster
 from twin.report.map_view import map_view
-from twin.report.palette import REASON_WORDS, reason_of
+from twin.report.palette import PNG_LEVEL, REASON_WORDS, reason_of
 
 PIXELS = 560
 """Side of the map on the page, CSS pixels; the picture is twice as fine for sharp screens."""
@@ -92,10 +92,14 @@ def _nearest(candidates: Candidates) -> tuple[list[str], Any]:
 
 def _png(rgba: Any) -> str:
     stream = io.BytesIO()
-    Image.fromarray(rgba).save(stream, format="PNG")
+    Image.fromarray(rgba).save(stream, format="PNG", compress_level=PNG_LEVEL)
     return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
 
 
 def _rounded(values: Any, digits: int) -> list[float | None]:
     """JSON-ready numbers; what is not finite becomes null."""
-    return [round(v, digits) if np.isfinite(v) else None for v in np.asarray(values, dtype=float).tolist()]
+    values = np.asarray(values, dtype=float)
+    rounded: list[float | None] = np.round(values, digits).tolist()
+    for i in np.flatnonzero(~np.isfinite(values)):
+        rounded[i] = None
+    return rounded

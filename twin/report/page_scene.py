@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
+from dataclasses import replace
+from hashlib import sha256
 from typing import Any
 
 import fast_simplification
 import numpy as np
-import plotly.graph_objects as go
+from numpy.typing import NDArray
 
+from planning.cache import NO_CACHE, Arrays, Cache
 from planning.candidates import Candidates
 from planning.mesh import TriangleMesh
 from twin.report.map_view import body_directions
@@ -34,6 +38,9 @@ VIEW = (1200, 640)
 LEAST_TRIANGLES = 300
 """A body is never cut below this."""
 
+WELDED = 0.75
+"""Corners per triangle; a closed surface that shares its corners has half a corner per triangle."""
+
 LABEL_OUT_MM = 45.0
 LEGEND_SHARE = 0.14
 """Of the width; the legend stands left of the scene."""
@@ -45,7 +52,9 @@ GROUP_NAMES = {"safe": "safe region", "arm": "arm", "room": "room", "needle": "n
 """Bodies that share one line of the legend."""
 
 
-def scene_figure(case: Any, anatomy: Any, candidates: Candidates, plan: Any | None) -> dict[str, Any]:
+def scene_figure(
+    case: Any, anatomy: Any, candidates: Candidates, plan: Any | None, cache: Cache = NO_CACHE
+) -> dict[str, Any]:
     """A plotly figure as plain values, meshes in base64.
 
     Args:
@@ -53,37 +62,51 @@ def scene_figure(case: Any, anatomy: Any, candidates: Candidates, plan: Any | No
         anatomy: Structures and skin.
         candidates: The search's rows.
         plan: The plan, or None: then there is no arm.
+        cache: Where lightened meshes are kept.
     """
     bodies, standoff = _bodies(case, anatomy, candidates, plan)
-    light = lightened([*bodies, *standoff], TRIANGLES)
+    light = lightened([*bodies, *standoff], TRIANGLES, cache)
     hidden = set(range(len(bodies), len(light)))
     first = {_legend_name(body): i for i, body in reversed(list(enumerate(light))) if i not in hidden}
     traces = [
         _trace(body, hidden=i in hidden, in_legend=first.get(_legend_name(body)) == i) for i, body in enumerate(light)
     ]
     traces.append(_labels(case, anatomy))
-    figure = go.Figure(data=[*traces, _probe()], layout=_layout(case, bodies))
-    return dict(figure.to_plotly_json())
+    return {"data": [*traces, _probe()], "layout": _layout(case, bodies)}
 
 
-def lightened(bodies: Sequence[Body], triangles: int) -> list[Body]:
+def lightened(bodies: Sequence[Body], triangles: int, cache: Cache = NO_CACHE) -> list[Body]:
     """The bodies with about so many triangles altogether, each cut by the same share."""
     share = min(1.0, triangles / max(1, sum(len(b.mesh.faces) for b in bodies)))
     light = []
     for body in bodies:
         wanted = max(LEAST_TRIANGLES, int(share * len(body.mesh.faces)))
-        light.append(body if wanted >= len(body.mesh.faces) else _lighter(body, wanted))
+        light.append(body if wanted >= len(body.mesh.faces) else _lighter(body, wanted, cache))
     return light
 
 
-def _lighter(body: Body, wanted: int) -> Body:
-    corners, welded = np.unique(body.mesh.vertices, axis=0, return_inverse=True)  # a robot's STL shares no corners
-    faces = np.ascontiguousarray(welded.reshape(-1)[body.mesh.faces], dtype=np.int32)
-    vertices, faces = fast_simplification.simplify(corners, faces, target_count=wanted)
-    if len(faces) == 0:  # nothing may vanish from a picture
+def _lighter(body: Body, wanted: int, cache: Cache) -> Body:
+    mesh = body.mesh
+    made_from = {
+        "what": "lighter mesh",
+        "vertices": sha256(mesh.vertices.tobytes()).hexdigest(),
+        "faces": sha256(mesh.faces.tobytes()).hexdigest(),
+        "triangles": wanted,
+        "by": fast_simplification.__version__,
+    }
+    found = cache.arrays(made_from, lambda: _simplified(mesh, wanted))
+    if len(found["faces"]) == 0:  # nothing may vanish from a picture
         return body
-    mesh = TriangleMesh(np.asarray(vertices, dtype=np.float64), np.asarray(faces))
-    return Body(body.name, body.group, mesh, body.colour, body.alpha)
+    return replace(body, mesh=TriangleMesh(found["vertices"], found["faces"]))
+
+
+def _simplified(mesh: TriangleMesh, wanted: int) -> Arrays:
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    if len(vertices) > WELDED * len(faces):  # a robot's STL shares no corners
+        vertices, welded = np.unique(vertices, axis=0, return_inverse=True)
+        faces = np.ascontiguousarray(welded.reshape(-1)[faces], dtype=np.int32)
+    vertices, faces = fast_simplification.simplify(vertices, faces, target_count=wanted)
+    return {"vertices": np.asarray(vertices, dtype=np.float64), "faces": np.asarray(faces, dtype=np.int32)}
 
 
 def _bodies(case: Any, anatomy: Any, candidates: Candidates, plan: Any | None) -> tuple[list[Body], list[Body]]:
@@ -107,61 +130,61 @@ def _legend_name(body: Body) -> str:
     return GROUP_NAMES.get(base, body.name).replace("_", " ")
 
 
-def _trace(body: Body, *, hidden: bool, in_legend: bool) -> go.Mesh3d:
-    vertices, faces = body.mesh.vertices.astype(np.float32), body.mesh.faces
+def _trace(body: Body, *, hidden: bool, in_legend: bool) -> dict[str, Any]:
     base, group = body.group.removesuffix("-standoff"), _legend_name(body)
     moving = base in {"arm", "needle"}
-    return go.Mesh3d(
-        x=vertices[:, 0],
-        y=vertices[:, 1],
-        z=vertices[:, 2],
-        i=faces[:, 0],
-        j=faces[:, 1],
-        k=faces[:, 2],
-        color=css(body.colour),
-        opacity=body.alpha,
-        name=group,
-        legendgroup=group,
-        showlegend=in_legend,
-        visible=not hidden,
-        hoverinfo="name" if base == "organ" else "skip",
-        flatshading=False,
-        lighting={"ambient": 0.5, "diffuse": 0.7, "specular": 0.15, "roughness": 0.6, "fresnel": 0.1},
-        meta={"pose": "standoff" if hidden else "target" if moving else ""},
-    )
+    return {
+        "type": "mesh3d",
+        **{axis: _packed(values, np.float32) for axis, values in zip("xyz", body.mesh.vertices.T, strict=True)},
+        **{corner: _packed(values, np.int32) for corner, values in zip("ijk", body.mesh.faces.T, strict=True)},
+        "color": css(body.colour),
+        "opacity": body.alpha,
+        "name": group,
+        "legendgroup": group,
+        "showlegend": in_legend,
+        "visible": not hidden,
+        "hoverinfo": "name" if base == "organ" else "skip",
+        "flatshading": False,
+        "lighting": {"ambient": 0.5, "diffuse": 0.7, "specular": 0.15, "roughness": 0.6, "fresnel": 0.1},
+        "meta": {"pose": "standoff" if hidden else "target" if moving else ""},
+    }
 
 
-def _labels(case: Any, anatomy: Any) -> go.Scatter3d:
+def _packed(values: NDArray[Any], dtype: type) -> dict[str, str]:
+    """An array as plotly's script reads it: its type and its bytes in base64."""
+    array: NDArray[Any] = np.ascontiguousarray(values, dtype=dtype)
+    return {"dtype": array.dtype.str[1:], "bdata": base64.b64encode(array.tobytes()).decode("ascii")}
+
+
+def _labels(case: Any, anatomy: Any) -> dict[str, Any]:
     """The body's directions, written around it."""
     low, high = anatomy.skin.mesh.bounds
     centre, half = (low + high) / 2, (high - low) / 2
     names = body_directions(case.space)
     places = np.array([centre + v * (np.abs(v) @ half + LABEL_OUT_MM) for v in names.values()])
-    return go.Scatter3d(
-        x=places[:, 0],
-        y=places[:, 1],
-        z=places[:, 2],
-        mode="text",
-        text=[f"<b>{name}</b>" for name in names],
-        textfont={"size": 14, "color": "#222222"},
-        hoverinfo="skip",
-        showlegend=False,
-        name="directions",
-    )
+    return {
+        "type": "scatter3d",
+        **{axis: values.tolist() for axis, values in zip("xyz", places.T, strict=True)},
+        "mode": "text",
+        "text": [f"<b>{name}</b>" for name in names],
+        "textfont": {"size": 14, "color": "#222222"},
+        "hoverinfo": "skip",
+        "showlegend": False,
+        "name": "directions",
+    }
 
 
-def _probe() -> go.Scatter3d:
+def _probe() -> dict[str, Any]:
     """The line of the direction that the pointer chose on the map; the page's script fills it."""
-    return go.Scatter3d(
-        x=[None],
-        y=[None],
-        z=[None],
-        mode="lines",
-        line={"color": "#d6001e", "width": 7},
-        name="direction clicked on the map",
-        hoverinfo="skip",
-        showlegend=False,
-    )
+    return {
+        "type": "scatter3d",
+        **{axis: [None] for axis in "xyz"},
+        "mode": "lines",
+        "line": {"color": "#d6001e", "width": 7},
+        "name": "direction clicked on the map",
+        "hoverinfo": "skip",
+        "showlegend": False,
+    }
 
 
 def _layout(case: Any, bodies: Sequence[Body]) -> dict[str, Any]:

@@ -1,42 +1,47 @@
-"""Pictures without a screen: rays cast into triangle meshes with Embree, shaded with numpy.
+"""Pictures without a screen: triangles drawn into a sample grid with depth, and shaded, by compiled code.
 
-Opaque surfaces give one hit per ray; veils (skin, corridor) are surfaces that one sees through, with up to
-``MAX_SHELLS`` hits per ray.
+Opaque surfaces give one hit per sample; veils (skin, corridor) are surfaces that one sees through, with up to
+``MAX_SHELLS`` hits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh as EmbreeMesh
-from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from planning.mesh import TriangleMesh
 from twin.report.camera import Camera
-from twin.report.compositing import NOWHERE, SAMPLES_AT_ONCE, PixelBox, Shot, Veil, empty_veil
+from twin.report.compositing import NOWHERE, SAMPLES, PixelBox, Shot, Veil, compose, empty_veil
+from twin.report.line_of_sight import blocked
 from twin.report.palette import Rgb
+from twin.report.raster import depth_before, draw, outlines, sorted_by_band
+from twin.report.shading import corner_normals, flat_normals, shade_nearest, shade_shells, turned
 
+Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
+Integers = NDArray[np.int32]
+T = TypeVar("T")
 
 MAX_SHELLS = 4
 """Layers of a veil that are drawn: skin in, skin out, twice."""
 
-SHELL_GAP = 1e-2
-"""mm behind a hit where the next layer's search starts; single precision at 2 m is 1e-4 mm."""
-
 SIGHT_SLACK_MM = 2.0
 """A point this close behind a surface still counts as seen: points on the needle lie inside its bar."""
 
-CREASE = 0.75
-"""Cosine between a triangle's and its corner's normal below which the edge is drawn sharp."""
-
 BACKGROUND = np.array([246.0, 247.0, 249.0], dtype=np.float32)
 
-AMBIENT, DIFFUSE, SHINE, SHARPNESS = 0.38, 0.62, 0.18, 24
-"""Weights of Phong's terms; the highlight's exponent."""
+LAMP = np.array([-0.45, 0.6, -1.0]) / np.linalg.norm([-0.45, 0.6, -1.0])
+"""Over the viewer's left shoulder: right, up, forward."""
+
+BAND = 120_000
+"""Samples that are worked on at once: their arrays stay in the cache, and the bands share the processors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,140 +62,148 @@ class Surface:
 
 
 class Layer:
-    """Surfaces that move together, ready to be hit by rays in their own frame.
+    """Surfaces that move together, in their own frame. Of two in one place the first is seen.
 
     Args:
         surfaces: The surfaces, in one frame.
     """
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
-        self._scene = EmbreeScene()
         meshes = [s.mesh for s in surfaces]
-        for mesh in meshes:
-            EmbreeMesh(self._scene, mesh.vertices.astype(np.float32), mesh.faces)
-        self._first = np.cumsum([0, *(len(m.faces) for m in meshes)])
-        corner_shift = np.cumsum([0, *(len(m.vertices) for m in meshes)])
-        self._faces = np.concatenate([m.faces + k for m, k in zip(meshes, corner_shift, strict=False)])
-        self._normals = np.concatenate([corner_normals(m) for m in meshes])
-        self._colours = np.array([s.colour for s in surfaces], dtype=np.float32)
-        self._alphas = np.array([s.alpha for s in surfaces], dtype=np.float32)
-        self._rims = np.array([s.rim for s in surfaces], dtype=np.float32)
-        self.vertices = np.concatenate([m.vertices for m in meshes])
+        shifts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
+        self.vertices = _joined([m.vertices for m in meshes], np.float64)
+        self.faces: Integers = _joined([m.faces + k for m, k in zip(meshes, shifts, strict=False)], np.int32)
+        self.bodies: Integers = np.repeat(np.arange(len(meshes), dtype=np.int32), [len(m.faces) for m in meshes])
+        self.colours = np.array([s.colour for s in surfaces], dtype=np.float32).reshape(-1, 3)
+        self.alphas = np.array([s.alpha for s in surfaces], dtype=np.float32)
+        self.rims = np.array([s.rim for s in surfaces], dtype=np.float32)
 
-    def cast(self, origins: Floats32, rays: Floats32, light: Floats32) -> tuple[Shot, Floats32]:
-        """First hits: lit colours and depths as flat arrays (n, 3), (n,), and each hit's opacity (n,).
+    @cached_property
+    def normals(self) -> Floats32:
+        """Of the corners, shape (n, 3)."""
+        return np.asarray(corner_normals(self.vertices, self.faces))
+
+    def sees(self, eye: Floats, points: Floats) -> NDArray[np.bool_]:
+        """Whether nothing of this layer lies between an eye and each point (n, 3), in the layer's frame."""
+        return np.asarray(~blocked(self.vertices, self.faces, np.asarray(eye), np.asarray(points), SIGHT_SLACK_MM))
+
+
+class _View:
+    """A layer as a camera has it before it: corners in the camera's frame, and where each triangle lies.
+
+    Args:
+        layer: The layer.
+        camera: Its pixels are the samples.
+        T_ct_layer: The layer's pose, shape (4, 4), mm; the CT frame itself when None.
+    """
+
+    def __init__(self, layer: Layer, camera: Camera, T_ct_layer: Floats | None = None) -> None:
+        turn, eye = camera.axes, np.asarray(camera.eye, dtype=float)
+        if T_ct_layer is not None:
+            turn, eye = camera.axes @ T_ct_layer[:3, :3], (eye - T_ct_layer[:3, 3]) @ T_ct_layer[:3, :3]
+        self.points = turned(layer.vertices, turn, eye)
+        self._grid = camera.scale, camera.height, camera.width
+        self._layer = layer
+        self._mesh = self.points, layer.faces, layer.bodies
+        normals = turned(layer.normals, turn, np.zeros(3))
+        self._look = normals, flat_normals(self.points, layer.faces), layer.colours
+        self.spans = outlines(self.points, layer.faces, self._grid)
+        self._starts, self._in_bands = sorted_by_band(self.spans, _band_rows(camera), len(_bands(camera)))
+
+    def of_band(self, band: int) -> Integers:
+        """The rows of ``spans`` that a band of the picture needs."""
+        return np.asarray(self._in_bands[self._starts[band] : self._starts[band + 1]])
+
+    def put_opaque(self, shot: Shot, corner: tuple[int, int], spans: Integers) -> None:
+        """Draw what is opaque into a picture, where it is nearer than what is there; in place.
 
         Args:
-            origins: Shape (n, 3), in this layer's frame.
-            rays: Shape (n, 3), unit.
-            light: Shape (3,), unit, toward the light.
+            shot: A part of the picture.
+            corner: Row and column of the whole picture at which it begins, multiples of ``SAMPLES``.
+            spans: The triangles that it needs.
         """
-        hits = self._scene.run(origins, rays, output=True)
-        struck = np.flatnonzero(hits["geomID"] >= 0)
-        colour = np.zeros((len(rays), 3), dtype=np.float32)
-        depth = np.full(len(rays), np.inf, dtype=np.float32)
-        alpha = np.zeros(len(rays), dtype=np.float32)
-        body = hits["geomID"][struck]
-        normals = self._hit_normals(hits, struck, rays)
-        lit, facing = _phong(self._colours[body], normals, rays[struck], light)
-        colour[struck], depth[struck] = lit, hits["tfar"][struck]
-        # A shell seen edge-on is thicker along the ray: glass-like outlines help to read the body's shape.
-        alpha[struck] = np.minimum(1.0, self._alphas[body] * (1.0 + self._rims[body] * (1.0 - facing) ** 3))
-        return Shot(colour, depth), alpha
+        inverse, triangle = self._drawn(1, shot.depth, corner, spans)
+        place = tuple(LAMP), self._grid, corner, inverse[0], triangle[0]
+        shade_nearest(*self._mesh, *self._look, *place, shot.colour, shot.depth)
 
-    def sees(self, eye: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether nothing of this layer lies between an eye and each point (n, 3), in the layer's frame."""
-        way = points - eye
-        far = np.linalg.norm(way, axis=1)
-        rays = np.asarray(way / far[:, None], dtype=np.float32)
-        hits = self._scene.run(_origins(eye, len(rays)), rays, output=True)
-        return np.asarray((hits["geomID"] < 0) | (hits["tfar"] > far - SIGHT_SLACK_MM))
+    def shells(self, before: Floats32, corner: tuple[int, int], spans: Integers) -> tuple[Veil, ...]:
+        """What is see-through, as far as nothing opaque hides it, nearest first.
 
-    def _hit_normals(self, hits: dict[str, NDArray[np.float32]], struck: NDArray[np.int64], rays: Floats32) -> Floats32:
-        flat = hits["Ng"][struck]
-        flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
-        corners = self._normals[self._faces[self._first[hits["geomID"][struck]] + hits["primID"][struck]]]
-        u, v = hits["u"][struck, None], hits["v"][struck, None]
-        smooth = (1 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2]
-        smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
-        cosine = np.einsum("ij,ij->i", smooth, flat)
-        smooth = np.where((np.abs(cosine) > CREASE)[:, None], smooth * np.sign(cosine)[:, None], flat)
-        away = np.einsum("ij,ij->i", flat, rays[struck]) > 0
-        return np.asarray(np.where(away[:, None], -smooth, smooth), dtype=np.float32)
+        Args:
+            before: Depth of what is opaque in a part of the picture, shape (h, w), mm along the ray.
+            corner: Row and column of the whole picture at which it begins, multiples of ``SAMPLES``.
+            spans: The triangles that it needs.
+        """
+        inverse, triangle = self._drawn(MAX_SHELLS, before, corner, spans)
+        veils = tuple(empty_veil(before.shape) for _ in range(MAX_SHELLS))
+        look: Any = (*self._look, self._layer.alphas, self._layer.rims, tuple(LAMP), self._grid, corner)
+        for veil, *drawn in zip(veils, inverse, triangle, strict=True):
+            samples: Any = (*drawn, veil.colour, veil.alpha, veil.depth)
+            shade_shells(*self._mesh, *look, *samples)
+        return veils
 
-
-def corner_normals(mesh: TriangleMesh) -> Floats32:
-    """Area-weighted unit normals at the vertices, shape (n, 3)."""
-    a, b, c = (mesh.triangles[:, k] for k in range(3))
-    faces = np.cross(b - a, c - a)
-    normals = np.stack(
-        [
-            np.bincount(mesh.faces.ravel(), weights=np.repeat(faces[:, k], 3), minlength=len(mesh.vertices))
-            for k in range(3)
-        ],
-        axis=1,
-    )
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12), dtype=np.float32)
-
-
-def _phong(colours: Floats32, normals: Floats32, rays: Floats32, light: Floats32) -> tuple[Floats32, Floats32]:
-    """Phong's lighting (Commun. ACM 18, 1975) by one lamp beside the camera; also |cos| between normal and ray."""
-    facing = -np.einsum("ij,ij->i", normals, rays)
-    toward = normals @ light
-    # Half Lambert: what faces away from the lamp keeps some shape instead of going flat.
-    diffuse = (0.5 + 0.5 * toward) ** 2
-    mirrored = 2 * toward[:, None] * normals - light
-    highlight = np.clip(-np.einsum("ij,ij->i", mirrored, rays), 0, 1) ** SHARPNESS
-    lit = colours * (AMBIENT + DIFFUSE * diffuse)[:, None] + 255 * SHINE * highlight[:, None]
-    return np.minimum(lit, 255.0), np.clip(facing, 0, 1)
-
-
-def light_of(camera: Camera) -> Floats32:
-    """The lamp: over the viewer's left shoulder."""
-    light = np.array([-0.45, 0.6, -1.0]) @ camera.axes
-    return np.asarray(light / np.linalg.norm(light), dtype=np.float32)
+    def _drawn(
+        self, most: int, before: Floats32, corner: tuple[int, int], spans: Integers
+    ) -> tuple[Floats32, Integers]:
+        """1/z and triangle of the nearest surfaces, shape (most, h, w), before what is opaque already."""
+        size = (most, *before.shape)
+        inverse, triangle = np.zeros(size, dtype=np.float32), np.full(size, -1, dtype=np.int32)
+        hidden = depth_before(before, self._grid, corner)
+        draw(*self._mesh, spans, self._grid, corner, hidden, inverse, triangle)
+        return inverse, triangle
 
 
 def opaque_shot(layer: Layer, camera: Camera) -> Shot:
     """Everything opaque of one layer in the CT frame, at the camera's own resolution."""
-    size = camera.height, camera.width
-    shot = Shot(np.empty((*size, 3), dtype=np.float32), np.empty(size, dtype=np.float32))
-    for rows in _bands(camera):
-        rays = _rays(camera, rows)
-        flat, _ = layer.cast(_origins(camera.eye, len(rays)), rays, light_of(camera))
-        colour = np.where(np.isfinite(flat.depth)[:, None], flat.colour, BACKGROUND)
-        shot.colour[rows], shot.depth[rows] = colour.reshape(-1, size[1], 3), flat.depth.reshape(-1, size[1])
+    view, shot = _View(layer, camera), _background(camera.height, camera.width)
+
+    def draw_band(band: int, rows: slice) -> None:
+        view.put_opaque(Shot(shot.colour[rows], shot.depth[rows]), (rows.start, 0), view.of_band(band))
+
+    _in_bands(camera, draw_band)
     return shot
 
 
-def veils_of(layer: Layer, camera: Camera) -> tuple[Veil, ...]:
-    """The shells of a see-through layer: the nearest hit of every ray first, then the one behind it, and so on."""
-    veils = tuple(empty_veil((camera.height, camera.width)) for _ in range(MAX_SHELLS))
-    for rows in _bands(camera):
-        parts = [Veil(veil.colour[rows], veil.alpha[rows], veil.depth[rows]) for veil in veils]
-        _fill_shells(layer, _rays(camera, rows), camera, parts)
+def veils_of(layer: Layer, camera: Camera, behind: Shot | None = None) -> tuple[Veil, ...]:
+    """The shells of a see-through layer: the nearest hit of every sample first, then the one behind it, and so on.
+
+    Args:
+        layer: The surfaces, CT frame.
+        camera: Its pixels are the samples.
+        behind: What hides shells behind it; nothing when None.
+    """
+    size = camera.height, camera.width
+    depth = np.full(size, np.inf, dtype=np.float32) if behind is None else behind.depth
+    view = _View(layer, camera)
+    parts = _in_bands(camera, lambda band, rows: view.shells(depth[rows], (rows.start, 0), view.of_band(band)))
+    veils = (
+        Veil(*(np.concatenate([getattr(part[k], name) for part in parts]) for name in ("colour", "alpha", "depth")))
+        for k in range(MAX_SHELLS)
+    )
     return tuple(veil for veil in veils if np.isfinite(veil.depth).any())
 
 
-def _fill_shells(layer: Layer, rays: Floats32, camera: Camera, veils: Sequence[Veil]) -> None:
-    origins, travelled = _origins(camera.eye, len(rays)), np.zeros(len(rays), dtype=np.float32)
-    alive = np.arange(len(rays))
-    for veil in veils:
-        flat, alpha = layer.cast(origins[alive], rays[alive], light_of(camera))
-        struck = np.isfinite(flat.depth)
-        if not struck.any():
-            return
-        alive, step = alive[struck], flat.depth[struck]
-        veil.colour.reshape(-1, 3)[alive] = flat.colour[struck]
-        veil.alpha.reshape(-1)[alive] = alpha[struck]
-        veil.depth.reshape(-1)[alive] = step + travelled[alive]
-        step = step + np.float32(SHELL_GAP)
-        origins[alive] += step[:, None] * rays[alive]
-        travelled[alive] += step
+def picture(opaque: Layer, veils: Layer, camera: Camera) -> NDArray[np.uint8]:
+    """A scene in the CT frame in pixels, shape (h, w, 3): what is opaque, and what is see-through over it.
+
+    Args:
+        opaque: The opaque surfaces.
+        veils: The see-through ones.
+        camera: Its pixels are the picture's; each is the mean of ``SAMPLES`` by ``SAMPLES``.
+    """
+    fine = camera.finer(SAMPLES)
+    solid, glass = _View(opaque, fine), _View(veils, fine)
+
+    def draw_band(band: int, rows: slice) -> NDArray[np.uint8]:
+        shot = _background(rows.stop - rows.start, fine.width)
+        solid.put_opaque(shot, (rows.start, 0), solid.of_band(band))
+        return compose(shot, glass.shells(shot.depth, (rows.start, 0), glass.of_band(band)))
+
+    return np.concatenate(_in_bands(fine, draw_band))
 
 
-def put_moving(shot: Shot, layer: Layer, T_ct_layer: NDArray[np.float64], camera: Camera) -> PixelBox:
-    """Draw one more rigid body into a shot, in place; rays are cast only in the box around its outline.
+def put_moving(shot: Shot, layer: Layer, T_ct_layer: Floats, camera: Camera) -> PixelBox:
+    """Draw one more rigid body into a shot, in place, where it is nearer than what is there.
 
     Args:
         shot: What is there already, at the camera's resolution; its arrays are written to.
@@ -201,45 +214,39 @@ def put_moving(shot: Shot, layer: Layer, T_ct_layer: NDArray[np.float64], camera
     Returns:
         Where something may have changed.
     """
-    R, t = T_ct_layer[:3, :3], T_ct_layer[:3, 3]
-    box = _outline_box(camera, layer.vertices @ R.T + t)
-    if box.empty:
+    view = _View(layer, camera, T_ct_layer)
+    if len(view.spans) == 0:
         return NOWHERE
-    rows, columns = (grid.ravel() for grid in np.mgrid[box.y0 : box.y1, box.x0 : box.x1])
-    turn = R.astype(np.float32)
-    rays = np.ascontiguousarray(camera.directions(rows, columns) @ turn)
-    flat, _ = layer.cast(_origins((camera.eye - t) @ R, len(rays)), rays, light_of(camera) @ turn)
-    colour, depth = shot.colour[box.slices], shot.depth[box.slices]
-    new_depth = flat.depth.reshape(depth.shape)
-    nearer = new_depth < depth
-    colour[nearer] = flat.colour.reshape(colour.shape)[nearer]
-    depth[nearer] = new_depth[nearer]
+    first, last, begin, end = view.spans[:, 1:].T
+    top, left = (int(low.min()) // SAMPLES * SAMPLES for low in (first, begin))
+    box = PixelBox(left, top, int(end.max()) + 1, int(last.max()) + 1)
+    view.put_opaque(Shot(shot.colour[box.slices], shot.depth[box.slices]), (top, left), view.spans)
     return box
 
 
-def _outline_box(camera: Camera, points_ct: NDArray[np.float64]) -> PixelBox:
-    seen = camera.project(points_ct)
-    whole = PixelBox(0, 0, camera.width, camera.height)
-    if seen[:, 2].max() <= 0:
-        return NOWHERE
-    if seen[:, 2].min() <= 0:
-        return whole
-    limits = np.array([camera.width, camera.height])
-    low = np.clip(np.floor(seen[:, :2].min(axis=0)) - 1, 0, limits).astype(int)
-    high = np.clip(np.ceil(seen[:, :2].max(axis=0)) + 1, 0, limits).astype(int)
-    return PixelBox(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+def _background(height: int, width: int) -> Shot:
+    colour = np.empty((height, width, 3), dtype=np.float32)
+    colour[:] = BACKGROUND
+    return Shot(colour, np.full((height, width), np.inf, dtype=np.float32))
+
+
+def _band_rows(camera: Camera) -> int:
+    return max(1, BAND // (camera.width * SAMPLES)) * SAMPLES
 
 
 def _bands(camera: Camera) -> list[slice]:
-    """The picture's rows, band by band."""
-    rows = max(1, SAMPLES_AT_ONCE // camera.width)
+    """The picture's rows, band by band, whole pixels of ``SAMPLES`` rows, from the top."""
+    rows = _band_rows(camera)
     return [slice(top, min(top + rows, camera.height)) for top in range(0, camera.height, rows)]
 
 
-def _rays(camera: Camera, band: slice) -> Floats32:
-    rows, columns = (grid.ravel() for grid in np.mgrid[band, 0 : camera.width])
-    return camera.directions(rows, columns)
+def _in_bands(camera: Camera, work: Callable[[int, slice], T]) -> list[T]:
+    """What a function makes of the number and the rows of every band; the processors share them."""
+    bands = _bands(camera)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(work, range(len(bands)), bands))
 
 
-def _origins(eye: NDArray[np.float64], count: int) -> Floats32:
-    return np.tile(np.asarray(eye, dtype=np.float32), (count, 1))
+def _joined(arrays: Sequence[NDArray[Any]], dtype: type) -> NDArray[Any]:
+    """Rows of three, one after the other; also of no array at all."""
+    return np.concatenate([np.empty((0, 3), dtype=dtype), *arrays]).astype(dtype, copy=False)

@@ -30,7 +30,9 @@ SKIN_VEIL = 0.20
 GANTRY_VEIL = 0.15
 """Opacity of the gantry, so that it does not hide the patient in its bore."""
 
-MOUTH_VEIL = 0.60
+MOUTH_VEIL = 0.88
+"""Of where a needle may enter: what lies behind it hardly shows, since seen through green it would look safe to hit."""
+
 WALL_VEIL = 0.10
 
 TARGET_BALL_MM = 3.0
@@ -90,8 +92,11 @@ def patient(anatomy: Any, case: Any) -> tuple[Body, ...]:
 def _opacity(structure: Any, case: Any) -> float:
     if str(structure.role) == "unknown":
         return UNKNOWN_VEIL
-    around = abs(winding_number(structure.mesh, case.target_ct)) > 0.5
-    return ORGAN_VEIL if around or structure.name == case.target_structure else 1.0
+    if structure.name == case.target_structure:
+        return ORGAN_VEIL
+    low, high = structure.mesh.bounds
+    near = bool(np.all((low <= case.target_ct) & (case.target_ct <= high)))
+    return ORGAN_VEIL if near and abs(winding_number(structure.mesh, case.target_ct)) > 0.5 else 1.0
 
 
 def safe_region(candidates: Candidates, case: Any) -> tuple[Body, ...]:

@@ -14,9 +14,8 @@ from planning.candidates import Candidates
 from planning.files import atomic
 from twin.report import annotate, palette
 from twin.report.camera import Camera
-from twin.report.compositing import SAMPLES, compose
 from twin.report.numbers import chosen_row, nearest_structure, number, target_words
-from twin.report.render import BACKGROUND, Layer, opaque_shot, veils_of
+from twin.report.render import BACKGROUND, Layer, picture
 from twin.report.scene_parts import (
     ArmPicture,
     Body,
@@ -34,7 +33,7 @@ LEFT_BOX = (16, 84, 926, 840)
 RIGHT_BOX = (942, 84, 1704, 840)
 LEGEND_TOP = 858
 
-AXES_LENGTH, AXES_CORNER = 44, 104
+AXES_LENGTH, AXES_CORNER = 44, 110
 """Pixels: length of the body's axes, and how far from the corner they cross."""
 
 CORNER_GAIN = 0.1
@@ -72,23 +71,22 @@ def draw_scene(case: Any, anatomy: Any, candidates: Candidates, plan: Any | None
     path_ct = _path(case, candidates, plan, direction)
     with_arm = [*bodies, *arm]
     far = _overview_camera(case, with_arm, path_ct)
-    _view(image, draw, with_arm, far, LEFT_BOX, case, "Overview" + (": needle on the target" if arm else ""))
+    needle = None if path_ct is None else _needle_line(case, path_ct)
+    title = "Overview" + (": needle on the target" if arm else "")
+    _view(image, draw, with_arm, far, LEFT_BOX, case, title, needle)
     near = _close_camera(case, bodies, path_ct)
     few = [body for body in bodies if body.name != "needle holder" and body.group not in HIDDEN_NEARBY]
-    _view(image, draw, few, near, RIGHT_BOX, case, "Close-up of the path")
-    bottom = _words(draw, case, candidates, plan, bool(arm), [b for b in bodies if b.group == "organ"])
+    _view(image, draw, few, near, RIGHT_BOX, case, "Close-up of the path", needle)
+    bottom = _words(draw, case, candidates, plan, bool(arm), bodies)
     image = image.crop((0, 0, WIDTH, min(HEIGHT, round(bottom) + 8)))
     with atomic(Path(path)) as temporary:
-        image.save(temporary, format="PNG")
+        image.save(temporary, format="PNG", compress_level=palette.PNG_LEVEL)
 
 
 def render_bodies(bodies: Sequence[Body], camera: Camera) -> NDArray[np.uint8]:
     """One view of a scene, anti-aliased: the opaque bodies, and the see-through ones over them."""
-    fine = camera.finer(SAMPLES)
-    opaque = [b.surface for b in bodies if b.alpha >= 1]
-    veils = [b.surface for b in bodies if b.alpha < 1]
-    shells = veils_of(Layer(veils), fine) if veils else ()
-    return compose(opaque_shot(Layer(opaque), fine), shells)
+    opaque = Layer([b.surface for b in bodies if b.alpha >= 1])
+    return picture(opaque, Layer([b.surface for b in bodies if b.alpha < 1]), camera)
 
 
 def _path(case: Any, candidates: Candidates, plan: Any | None, direction: Any) -> NDArray[np.float64] | None:
@@ -142,21 +140,28 @@ def _view(
     box: tuple[int, int, int, int],
     case: Any,
     title: str,
+    needle: NDArray[np.float64] | None,
 ) -> None:
-    picture = render_bodies(bodies, camera)
-    image.paste(Image.fromarray(picture), box[:2])
+    seen = render_bodies(bodies, camera)
+    image.paste(Image.fromarray(seen), box[:2])
     annotate.panel(draw, box, title)
-    annotate.body_axes(draw, camera, case.space, _empty_corner(picture, box), AXES_LENGTH)
+    on_needle = np.empty((0, 2)) if needle is None else camera.project(needle)[:, :2] + box[:2]
+    annotate.body_axes(draw, camera, case.space, _empty_corner(seen, box, on_needle), AXES_LENGTH)
     annotate.scale_bar(draw, camera, case.target_ct, box[0] + 20, box[3] - 22, 200)
 
 
-def _empty_corner(picture: NDArray[np.uint8], box: tuple[int, int, int, int]) -> tuple[float, float]:
-    """The middle of the right corner, upper or lower, in which less is to be seen."""
+def _empty_corner(
+    seen: NDArray[np.uint8], box: tuple[int, int, int, int], on_needle: NDArray[np.float64]
+) -> tuple[float, float]:
+    """The middle of the right corner, upper or lower, where no needle is, or else less is to be seen."""
     far = AXES_CORNER
-    plain = (picture == np.round(BACKGROUND).astype(np.uint8)).all(axis=2)
-    if plain[: 2 * far, -2 * far :].mean() > plain[-2 * far :, -2 * far :].mean() + CORNER_GAIN:
-        return box[2] - far, box[1] + far
-    return box[2] - far, box[3] - far
+    upper, lower = (box[2] - far, box[1] + far), (box[2] - far, box[3] - far)
+    covers = [bool((np.linalg.norm(on_needle - corner, axis=1) < far).any()) for corner in (upper, lower)]
+    if covers[0] != covers[1]:
+        return lower if covers[0] else upper
+    plain = (seen == np.round(BACKGROUND).astype(np.uint8)).all(axis=2)
+    emptier = plain[: 2 * far, -2 * far :].mean() > plain[-2 * far :, -2 * far :].mean() + CORNER_GAIN
+    return upper if emptier else lower
 
 
 def _words(
@@ -165,7 +170,7 @@ def _words(
     candidates: Candidates,
     plan: Any | None,
     arm: bool,
-    organs: Sequence[Body],
+    bodies: Sequence[Body],
 ) -> float:
     """Everything around the views; returns the row below the legend."""
     annotate.write(draw, (18, 12), f"{case.name}: needle path to {target_words(case)}", size=28, bold=True)
@@ -184,11 +189,16 @@ def _words(
             (f"arm ({plan.model})" if plan is not None else "arm", palette.ARM),
             ("needle holder", palette.HOLDER),
         ]
+    items += [(_see_through(b), b.colour) for b in bodies if b.group == "room"]
     below = annotate.legend(draw, items, 20, LEGEND_TOP, WIDTH - 20)
-    names = [(b.name + (" (see-through)" if b.alpha < 1 else ""), b.colour) for b in organs]
+    names = [(_see_through(b), b.colour) for b in bodies if b.group == "organ"]
     note = "research software, not a medical device"
     annotate.write(draw, (WIDTH - 18, 24), note, size=14, colour=annotate.FAINT, anchor="ra")
     return annotate.legend(draw, families(names), 20, below, WIDTH - 20)
+
+
+def _see_through(body: Body) -> str:
+    return body.name + (" (see-through)" if body.alpha < 1 else "")
 
 
 def _path_words(candidates: Candidates, plan: Any | None, row: int | None) -> str:

@@ -1,0 +1,180 @@
+"""The pictures' compiled core against slower engines: Embree for what is seen, plain numpy for the rest."""
+
+import numpy as np
+import pytest
+import report_world as world
+from embreex.mesh_construction import TriangleMesh as EmbreeMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from planning.mesh import TriangleMesh
+from twin.report.camera import Camera
+from twin.report.line_of_sight import blocked
+from twin.report.map_raster import map_raster, row_colours
+from twin.report.map_view import Cells, map_view, rows_at
+from twin.report.render import Layer, Surface, opaque_shot, picture, put_moving, veils_of
+from twin.report.shading import corner_normals
+
+SIZE = 90, 120
+
+
+def soup(rng, count, size=30.0, spread=80.0):
+    """Triangles of any place and shape."""
+    middle = rng.uniform(-spread, spread, (count, 1, 3))
+    corners = (middle + rng.normal(0, size, (count, 3, 3))).reshape(-1, 3)
+    return TriangleMesh(corners, np.arange(3 * count, dtype=np.int32).reshape(-1, 3))
+
+
+def camera_at(eye, look_at=(0.0, 0.0, 0.0)):
+    """A small picture."""
+    return Camera(
+        np.array(eye, dtype=float), np.array(look_at, dtype=float), np.array([0, 0, 1.0]), 0.6, SIZE[1], SIZE[0]
+    )
+
+
+def rays_of(camera):
+    """Every sample's ray."""
+    rows, columns = (g.ravel() for g in np.mgrid[0 : camera.height, 0 : camera.width])
+    return camera.directions(rows, columns)
+
+
+def all_hits(mesh, eye, rays):
+    """Distances of every triangle along every ray, infinite where it is missed, by Möller and Trumbore (1997)."""
+    a, b, c = (mesh.triangles[:, k] for k in range(3))
+    p = np.cross(rays[:, None], c - a)
+    det = np.einsum("rtk,tk->rt", p, b - a)
+    s = eye - a
+    q = np.cross(s, b - a)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = np.einsum("rtk,tk->rt", p, s) / det
+        v = np.einsum("rk,tk->rt", rays, q) / det
+        t = np.einsum("tk,tk->t", q, c - a) / det
+        return np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0), t, np.inf)
+
+
+@pytest.mark.parametrize("eye", [(0, -400, 30), (20, -95, 10)])
+def test_what_is_seen_is_what_embree_hits(rng, eye):
+    """Depth of every sample, from outside and from amid triangles that reach behind the eye."""
+    mesh, camera = soup(rng, 400), camera_at(eye)
+    shot = opaque_shot(Layer([Surface(mesh, (200, 100, 50))]), camera)
+    scene = EmbreeScene()
+    EmbreeMesh(scene, mesh.vertices.astype(np.float32), mesh.faces)
+    rays = rays_of(camera)
+    hits = scene.run(np.tile(np.float32(camera.eye), (len(rays), 1)), rays, output=True)
+    wanted = np.where(hits["geomID"] >= 0, hits["tfar"], np.inf).reshape(SIZE)
+    agree = np.isclose(shot.depth, wanted, rtol=1e-3, atol=0.02) | (np.isinf(shot.depth) & np.isinf(wanted))
+    assert np.isfinite(wanted).mean() > 0.3
+    assert agree.mean() > 0.998  # single precision may see an edge on either side
+
+
+def test_no_sample_falls_between_triangles(ball):
+    """A closed ball seen from within has no hole, whatever its triangles' edges meet."""
+    shot = opaque_shot(
+        Layer([Surface(ball(60.0, (0, 0, 0), 5), (200, 40, 40))]), camera_at((1.0, 2.0, -3.0), (50, 1, 0))
+    )
+    assert np.isfinite(shot.depth).all()
+
+
+def test_shells_are_all_hits_in_order(rng):
+    """The shells hold the nearest hits of each sample, sorted, as a plain search over all triangles finds them."""
+    mesh, camera = soup(rng, 60), camera_at((0, -400, 30))
+    shells = veils_of(Layer([Surface(mesh, (200, 100, 50), 0.3)]), camera)
+    wanted = np.sort(all_hits(mesh, camera.eye, rays_of(camera).astype(float)), axis=1)[:, : len(shells)]
+    near = np.where(np.isfinite(wanted), wanted, 1e6 * np.arange(1, 1 + len(shells)))
+    apart = (np.diff(near, axis=1) > 0.05).all(axis=1)  # else two count as one
+    found = np.stack([shell.depth.ravel() for shell in shells], axis=1)
+    agree = (np.isclose(found, wanted, atol=0.01) | (np.isinf(found) & np.isinf(wanted))).all(axis=1)
+    assert apart.mean() > 0.5
+    assert agree[apart].mean() > 0.999
+
+
+def test_shells_behind_something_opaque_are_left_out(ball):
+    """What is hidden is not drawn at all."""
+    camera = camera_at((0, -400, 0))
+    wall = opaque_shot(Layer([Surface(ball(50.0), (9, 9, 9))]), camera)
+    veil = Layer([Surface(ball(40.0), (200, 0, 0), 0.3)])
+    assert len(veils_of(veil, camera)) == 2
+    assert veils_of(veil, camera, wall) == ()
+
+
+def test_of_two_surfaces_in_one_place_the_first_is_seen():
+    """Organs cut off by the image end in one plane with the skin: no flicker, whatever rounding says."""
+    plate = np.array([[-50.0, 0, -50], [50, 0, -50], [50, 0, 50], [-50, 0, 50]])
+    one = TriangleMesh(plate, np.array([[0, 1, 2], [0, 2, 3]]))
+    other = TriangleMesh(plate + [0.3, 0.0, 0.7], np.array([[1, 2, 3], [1, 3, 0]]))
+    camera = camera_at((60, -300, 80))
+    red, blue = (255, 0, 0), (0, 0, 255)
+    for first, second, channel in ((red, blue, 0), (blue, red, 2)):
+        shot = opaque_shot(Layer([Surface(one, first), Surface(other, second)]), camera)
+        (veil, *_) = veils_of(Layer([Surface(one, first, 0.5), Surface(other, second, 0.5)]), camera)
+        inner = np.isfinite(opaque_shot(Layer([Surface(one, red)]), camera).depth)
+        for colour in (shot.colour, veil.colour):
+            assert (colour[inner].argmax(axis=1) == channel).all()
+
+
+def test_an_empty_layer_is_background():
+    """Nothing to draw is no error."""
+    assert (picture(Layer([]), Layer([]), camera_at((0, -400, 0))) == [246, 247, 249]).all()
+
+
+def test_a_moving_body_out_of_the_picture_changes_nothing(ball):
+    """Behind the eye, or beside the picture, there is no box."""
+    camera = camera_at((0, -400, 0))
+    shot = opaque_shot(Layer([]), camera)
+    for place in ((0, -800, 0), (900, 0, 0)):
+        T = np.eye(4)
+        T[:3, 3] = place
+        assert put_moving(shot, Layer([Surface(ball(20.0), (1, 2, 3))]), T, camera).empty
+
+
+@pytest.mark.parametrize("points", ["line", "one", "cloud", "back and forth"])
+def test_line_of_sight_is_what_all_triangles_say(rng, points):
+    """The slab leaves out no triangle that hides something."""
+    mesh, eye = soup(rng, 300, size=8.0), np.array([30.0, -300, 20])
+    line = np.array([5.0, 0, 0]) + np.linspace(0, 1, 24)[:, None] * [10.0, 60.0, 70.0]
+    seen = {"line": line, "one": line[:1], "cloud": rng.uniform(-60, 60, (24, 3)), "back and forth": [*line, line[0]]}
+    seen = np.array(seen[points])
+    way = seen - eye
+    far = np.linalg.norm(way, axis=1)
+    wanted = all_hits(mesh, eye, way / far[:, None]).min(axis=1) < far - 2.0
+    assert np.array_equal(blocked(mesh.vertices, mesh.faces, eye, seen, 2.0), wanted)
+    assert points == "one" or 0 < wanted.sum() < len(wanted)
+
+
+def test_corner_normals_of_a_ball_point_outward(ball):
+    """Area-weighted normals of a fine ball are its radii."""
+    mesh = ball(30.0, (1, 2, 3), 4)
+    radii = (mesh.vertices - [1, 2, 3]) / 30.0
+    assert np.abs(corner_normals(mesh.vertices, mesh.faces) - radii).max() < 0.01
+
+
+@pytest.mark.parametrize("grid", [{}, {"theta_deg": (20, 150)}, {"theta_deg": (30, 60), "beta_deg": (90, 180)}])
+def test_the_cells_of_a_picture_are_those_of_its_directions(grid):
+    """The picture's rows are the nearest grid directions by brute force, and nothing beyond half a step."""
+    case = world.make_case()
+    found = world.make_candidates(case, step_deg=5.0, **grid)
+    view = map_view(case, found)
+    rows = Cells.of(found).picture(view, 101)
+    axis = (np.arange(101) + 0.5) / 101 * 2 - 1
+    theta, beta = view.angles_at(np.stack(np.meshgrid(axis, -axis), axis=-1))
+    assert (rows == rows_at(found, theta, beta)).mean() > 0.999  # a direction on a border may fall to either side
+    turn = np.abs(np.mod(found.beta - beta.ravel()[:, None] + np.pi, 2 * np.pi) - np.pi)
+    near = np.abs(found.theta - theta.ravel()[:, None]) <= np.radians(2.5) * (1 + 1e-9)
+    near &= (turn <= np.radians(2.5) * (1 + 1e-9)) | (found.theta < 1e-9)
+    flat = rows.ravel()
+    assert np.array_equal(flat >= 0, near.any(axis=1))
+    pole = found.theta[flat] < 1e-9
+    assert near[np.flatnonzero(flat >= 0), flat[flat >= 0]][~pole[flat >= 0]].all()
+
+
+def test_only_pixels_at_borders_are_mixed():
+    """Inside a cell the colour is the cell's own; at a border it is the mean of four samples."""
+    case = world.make_case()
+    found = world.make_candidates(case, step_deg=5.0)
+    size, view = 120, map_view(case, found)
+    raster = map_raster(found, view, size)
+    fine = Cells.of(found).picture(view, 2 * size)
+    table = np.vstack([np.c_[row_colours(found), np.full(len(found), 255)], np.zeros(4)])[fine]
+    table[..., :3] *= table[..., 3:] / 255
+    mean = table.reshape(size, 2, size, 2, 4).mean(axis=(1, 3))
+    mean[..., :3] /= np.maximum(mean[..., 3:], 1) / 255
+    assert np.abs(raster.rgba - mean).max() <= 0.5 + 1e-6
