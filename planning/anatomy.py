@@ -215,12 +215,19 @@ def _distance(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
     return float(np.sqrt(squared_distance(point, mesh.triangles).min()))
 
 
+def _in_box(mesh: TriangleMesh, point: NDArray[np.float64]) -> bool:
+    low, high = mesh.bounds
+    return bool(np.all((low <= point) & (point <= high)))
+
+
 def _check_target(case: Case, structures: list[Structure], skin: Skin) -> None:
     """A target must lie inside the skin and its own structure, and inside nothing that is to be avoided."""
     point = ", ".join(f"{x:.1f}" for x in case.target_ct)
     if side_of(skin.mesh, case.target_ct) is Side.OUTSIDE:
         raise InputError(f"target ({point}) lies outside the skin", where=case.path, allowed="a point in the body")
     for structure in structures:
+        if structure.name != case.target_structure and not _in_box(structure.mesh, case.target_ct):
+            continue
         side = side_of(structure.mesh, case.target_ct)
         if structure.role is Role.AVOID and side is Side.INSIDE:
             raise InputError(

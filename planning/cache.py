@@ -12,6 +12,7 @@ import os
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -75,8 +76,14 @@ def user_cache() -> Cache:
     return Cache((Path(base) if base else Path.home() / ".cache") / "puncture-twin")
 
 
+@cache
+def _version() -> str:
+    """Of this package; reading it takes a millisecond, and a case has a hundred surfaces."""
+    return version("puncture-twin")
+
+
 def _key(made_from: Mapping[str, Any]) -> str:
-    whole = {"layout": LAYOUT, "version": version("puncture-twin"), "numpy": np.__version__, **made_from}
+    whole = {"layout": LAYOUT, "version": _version(), "numpy": np.__version__, **made_from}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
 
 
