@@ -39,19 +39,11 @@ class Verdicts:
 def longest_path(needle: Needle) -> float:
     """The longest path, target to skin, that the needle can drive, mm.
 
-    The shaft must reach; and with a fixed standoff the tip must still clear the skin before the insertion starts.
+    The shaft must reach; and with a fixed standoff the tip must still lie ``skin_gap_mm`` outside, along the needle.
     """
     if needle.standoff_mm is None:
         return needle.shaft_mm
     return min(needle.shaft_mm, needle.standoff_mm - needle.skin_gap_mm)
-
-
-def standoffs(needle: Needle, path_length: Floats | float) -> Floats:
-    """Distance tip to target before the insertion: the case's, or just so that the tip clears the skin; mm."""
-    path_length = np.asarray(path_length, dtype=float)
-    if needle.standoff_mm is None:
-        return path_length + needle.skin_gap_mm
-    return np.full(path_length.shape, needle.standoff_mm)
 
 
 def judge(

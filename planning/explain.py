@@ -10,7 +10,8 @@ import numpy as np
 from planning.anatomy import Anatomy
 from planning.candidates import Candidates
 from planning.case import Case
-from planning.constraints import longest_path, standoffs
+from planning.constraints import longest_path
+from planning.standoff import standoffs
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +82,12 @@ class Explanation:
             return ["  no skin entry on this path"]
         entry = ", ".join(f"{x:.1f}" for x in row.entry_ct[0])
         limit = np.degrees(self.case.search.max_skin_angle)
+        standoff = float(standoffs(needle, row.path_length[0], row.skin_angle[0]))
         return [
             f"  skin entry     ({entry}) mm in the CT frame",
             f"  path length    {row.path_length[0]:8.2f} mm, allowed {longest_path(needle):g}",
             f"  skin angle     {np.degrees(row.skin_angle[0]):8.2f} deg, allowed {limit:g}",
-            f"  standoff       {float(standoffs(needle, row.path_length[0])):8.2f} mm",
+            f"  standoff       {standoff:8.2f} mm, its tip {standoff - row.path_length[0]:.1f} mm before the skin",
             f"  tissue crossed {row.tissue[0]:8.2f} mm",
         ]
 

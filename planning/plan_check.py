@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from planning.approach import FINER, RESOLUTION_RAD, dense_states
 from planning.candidates import Candidates
-from planning.constraints import standoffs
 from planning.errors import InputError
 from planning.explain import reason_text
 from planning.plan import Plan, check_inputs
 from planning.prepared import Prepared
 from planning.robot.cell import CellChecker
+from planning.standoff import standoffs
 
 Floats = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ def _check_labels(plan: Plan, prepared: Prepared, candidates: Candidates, path: 
         ("needle_length_mm", plan.needle_length_mm, case.needle.length_mm),
         ("target_ct_mm", plan.target_ct, case.target_ct),
         ("entry_ct_mm", plan.entry_ct, candidates.entry_ct[0]),
-        ("standoff_mm", plan.standoff_mm, standoffs(case.needle, candidates.path_length[0])),
+        ("standoff_mm", plan.standoff_mm, standoffs(case.needle, candidates.path_length[0], candidates.skin_angle[0])),
         ("expected_target_error_mm", plan.expected_target_error_mm, error),
         ("clearance_mm.needle", plan.clearance_mm.get("needle", np.nan), candidates.min_clearance[0]),
     )

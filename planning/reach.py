@@ -17,20 +17,17 @@ from planning.reach_answer import ReachAnswer, ReachRequest
 from planning.reasons import Reason
 from planning.robot.cell import Contact, StateChecker
 from planning.robot.insertion import (
-    MIN_SINGULARITY,
     NeedleLine,
     away_from_singularities,
     branch_way,
     every_way,
     first_stop,
     flange_at,
-    flange_poses,
     needle_lines,
     reach_margin,
     survey,
     why_unreachable,
 )
-from planning.robot.kinematics import N_BRANCHES, inverse
 from planning.robot.ur import UrModel
 
 __all__ = [
@@ -40,7 +37,6 @@ __all__ = [
     "assess_reach",
     "assess_reach_all",
     "every_reach",
-    "ik_exists",
 ]
 
 Array = NDArray[np.float64]
@@ -92,39 +88,6 @@ class _Tried(NamedTuple):
     q: Array
     depths: Array
     block: _Blocked | None
-
-
-def ik_exists(
-    model: UrModel,
-    target_base: Array,
-    outward_base: Array,
-    *,
-    needle_length_mm: float,
-    standoff_mm: float,
-    depths_mm: Sequence[float] | None = None,
-    min_singularity: float = MIN_SINGULARITY,
-) -> NDArray[np.bool_]:
-    """Which of many directions might be reached, by kinematics alone. A False is final; a True is not a verdict yet.
-
-    Args:
-        model: The arm.
-        target_base: Shape (3,) or (n, 3), mm.
-        outward_base: Shape (n, 3), unit.
-        needle_length_mm: Flange to tip.
-        standoff_mm: Tip to target before the insertion.
-        depths_mm: Insertion depths at which one and the same branch must exist; standoff and target when None.
-        min_singularity: Required distance from each singularity; the roll and joint limits are not asked for.
-
-    Returns:
-        Shape (n,).
-    """
-    outward = np.atleast_2d(outward_base)
-    holds = np.ones((len(outward), N_BRANCHES), dtype=np.bool_)
-    for depth in (0.0, standoff_mm) if depths_mm is None else depths_mm:
-        distance = needle_length_mm + standoff_mm - depth
-        q = inverse(model, flange_poses(target_base, outward, distance))
-        holds &= away_from_singularities(model, q, min_singularity)
-    return np.asarray(holds.any(axis=1))
 
 
 def assess_reach(

@@ -13,13 +13,14 @@ from planning.candidates import Candidates
 from planning.case import Case
 from planning.clearance.engine import ClearanceEngine
 from planning.clearance.measure import measure
-from planning.constraints import judge, standoffs
+from planning.constraints import judge
 from planning.entry import Directions, direction, grid
 from planning.ranking import rank
 from planning.reach import ReachRequest, assess_reach_all
 from planning.reasons import Reason
 from planning.robot.cell import CellChecker
 from planning.skin_entry import skin_paths
+from planning.standoff import standoffs
 from planning.tissue import tissue_crossed
 
 Floats = NDArray[np.float64]
@@ -112,7 +113,7 @@ def reach_request(case: Case, candidates: Candidates, row: int, T_base_ct: Float
         target_base=T_base_ct[:3, :3] @ case.target_ct + T_base_ct[:3, 3],
         outward_base=T_base_ct[:3, :3] @ candidates.outward_ct[row],
         needle_length_mm=case.needle.length_mm,
-        standoff_mm=float(standoffs(case.needle, candidates.path_length[row])),
+        standoff_mm=float(standoffs(case.needle, candidates.path_length[row], candidates.skin_angle[row])),
     )
 
 
@@ -143,7 +144,7 @@ def with_reach(case: Case, found: Candidates, reach: Reach, progress: Progress |
 
 def reach_depth(case: Case, found: Candidates, row: int, driven_mm: float) -> float:
     """Where the tip stands, from the target along the needle, after so many mm of insertion; mm."""
-    return float(standoffs(case.needle, found.path_length[row])) - driven_mm
+    return float(standoffs(case.needle, found.path_length[row], found.skin_angle[row])) - driven_mm
 
 
 def ranked(case: Case, found: Candidates) -> Candidates:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from planning.mesh import TriangleMesh
 from planning.place.arm_balls import ArmBalls, Surroundings, base_is_clear, clear_ways, skin_distance
 from planning.place.bed import bed_frame
 from planning.place.directions import WantedDirections, ring_weights
+from planning.place.estimate import Estimator, insertion_ways
 from planning.place.judge import Judge
 from planning.place.mount_lines import mount_lines, mount_section
 from planning.place.mounts import Region, Site, regions
@@ -33,6 +35,7 @@ from planning.robot.kinematics import link_poses
 from planning.robot.ur import ur_model
 from planning.search import Reach, case_directions, organ_candidates, with_reach
 from twin.chen2019_reach import SHARES, WINDOWS, our_share, our_windows
+from twin.place_words import needle_line
 
 UR3 = ur_model("ur3")
 TOOL = Tool(200.0, 150.0, 1.2, 30.0)
@@ -273,6 +276,45 @@ def test_answers_come_in_order_from_however_many_processes():
         ]
     assert seen.count((6, 6)) == 2
     assert ask_all(abs, [], jobs=2, progress=lambda done, n: None) == []
+
+
+def test_asking_the_best_branch_first_changes_no_estimate():
+    """The share and the margin are those of asking about every branch of every direction."""
+    body, rng = trimesh.creation.icosphere(subdivisions=3, radius=90.0), np.random.default_rng(6)
+    balls, outward = ArmBalls.of(UR3, TOOL), rng.normal(size=(24, 3))
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    wanted = WantedDirections(outward, np.full(24, 110.0), np.full(24, 1.0 / 24.0))
+    skin, nothing = SkinField.of(TriangleMesh(body.vertices, body.faces)), Boxes.of([])
+    at = trimesh.transformations.translation_matrix([0.0, 0.0, -120.0])
+    table = Boxes.of([Box("table", at, (800.0, 800.0, 20.0))])
+    room = Surroundings(skin, table, nothing, 5.0)
+    quick = Estimator("ur3", TOOL, room, np.eye(4), wanted, itself=False)
+    region, seen = Region("ceiling", "", (0, 0, -1), ANYWHERE, ANYWHERE), set()
+    for position in rng.uniform([-400, -400, 0], [400, 400, 600], (8, 3)):
+        site = Site(region, tuple(position))
+        T = np.linalg.inv(site.T_bed_base())
+        distances = 200.0 + 110.0 * np.array([[1.0, 0.5, 0.0]] * 24)
+        ways = insertion_ways(UR3, T[:3, 3], outward @ T[:3, :3].T, distances)
+        T_ct_base = site.T_bed_base()
+        best = np.zeros(24)
+        for row, branch in np.argwhere(ways.margin):
+            if clear_ways(balls, room, T_ct_base, link_poses(UR3, ways.q[row, branch][None]))[0]:
+                best[row] = max(best[row], ways.margin[row, branch])
+        if not base_is_clear(balls, room, T_ct_base):
+            best[:] = 0.0
+        said = quick.estimate(site)
+        assert said.share == pytest.approx((best > 0).mean())
+        assert said.margin == pytest.approx(best[best > 0].mean() if best.any() else 0.0)
+        assert replace(quick, itself=True).estimate(site).room == said.room
+        seen.add(round(said.share, 3))
+    assert len(seen) > 3
+
+
+def test_what_the_needle_cannot_do_is_said_only_where_there_is_such_a_thing():
+    """No line about directions that nobody can hold where every one can be held."""
+    assert needle_line(1.0) == [] and needle_line(1.0 - 1e-12) == []
+    (line,) = needle_line(0.815)
+    assert "at most 81.5 %" in line and "too near the skin" in line
 
 
 def test_place_from_the_command_line(case_folder, tmp_path, capsys):

@@ -8,7 +8,7 @@ import trimesh
 
 from planning.errors import InputError
 from planning.mesh import TriangleMesh
-from planning.reach import MAX_SWEEP_MM, ReachRequest, assess_reach, ik_exists
+from planning.reach import MAX_SWEEP_MM, ReachRequest, assess_reach
 from planning.reasons import Reason
 from planning.robot.cell import Box, CellChecker, Tool
 from planning.robot.insertion import MIN_SINGULARITY, flange_poses, insertion_paths, reach_margin
@@ -74,6 +74,19 @@ def reached(checker: CellChecker, count: int, seed: int) -> list:
         if len(found) == count:
             return found
     raise AssertionError("the scene must leave enough directions")
+
+
+def ik_exists(model, target, u, *, needle_length_mm, standoff_mm, depths_mm=None):
+    """Which directions ``u`` (n, 3) one and the same branch reaches at some depths, standoff and target if None.
+
+    By the inverse kinematics of single poses, away from singularities; rolls and joint limits are not asked for.
+    """
+    u = np.atleast_2d(u)
+    holds = np.ones((len(u), 8), bool)
+    for depth in (0.0, standoff_mm) if depths_mm is None else depths_mm:
+        q = inverse(model, flange_poses(target, u, needle_length_mm + standoff_mm - depth))
+        holds &= singularity(model, q).least() > MIN_SINGULARITY
+    return holds.any(axis=1)
 
 
 @pytest.mark.parametrize("theta_deg", sorted(WINDOWS))
@@ -182,17 +195,6 @@ def test_what_kinematics_rejects_is_never_reached() -> None:
         answer = assess_reach(checker, request(direction))
         assert answer.reason in (Reason.UNREACHABLE, Reason.INSERTION_BLOCKED)
         assert "touches" not in answer.detail
-
-
-def test_batch_and_single_directions_agree() -> None:
-    """One call for many directions, or for many targets, answers as one call each."""
-    u = directions(40, seed=4)
-    targets = TARGET + np.random.default_rng(4).uniform(-80, 80, (40, 3))
-    many = ik_exists(UR3, targets, u, needle_length_mm=200.0, standoff_mm=120.0)
-    single = [
-        ik_exists(UR3, t, d, needle_length_mm=200.0, standoff_mm=120.0)[0] for t, d in zip(targets, u, strict=True)
-    ]
-    assert many.tolist() == single and 0 < many.sum() < 40
 
 
 def slab(u: np.ndarray, start_mm: float, thickness_mm: float) -> np.ndarray:

@@ -171,15 +171,23 @@ def _meets(room, T_ct_base, T_base_body, centre, radius):
 
 
 @nb.njit(cache=True)
-def _is_clear(arm, room, T_ct_base, frames):
-    """One state, the far bodies first: they meet something most often."""
+def _is_clear(arm, room, T_ct_base, frames, met):
+    """One state. First the ball ``met`` (body, ball) that met something last; then the far bodies before the near."""
     centres, radii, starts, body_frames = arm
+    body, ball = met
+    if ball >= 0:
+        T, first = frames[body_frames[body]], starts[body]
+        if _meets(room, T_ct_base, T, centres[ball], radii[ball]) and _meets(
+            room, T_ct_base, T, centres[first], radii[first]
+        ):
+            return False
     for body in range(len(body_frames) - 1, -1, -1):
         T = frames[body_frames[body]]
         first = starts[body]
         if _meets(room, T_ct_base, T, centres[first], radii[first]):
             for ball in range(first + 1, starts[body + 1]):
                 if _meets(room, T_ct_base, T, centres[ball], radii[ball]):
+                    met[0], met[1] = body, ball
                     return False
     return True
 
@@ -187,9 +195,10 @@ def _is_clear(arm, room, T_ct_base, frames):
 @nb.njit(cache=True)
 def _clear(arm, room, T_ct_base, frames, clear):
     """Fill ``clear`` (k,) for motions ``frames`` (k, m, 7, 4, 4)."""
+    met = np.array([0, -1])
     for way in range(len(frames)):
         clear[way] = True
-        for state in range(frames.shape[1]):
-            if not _is_clear(arm, room, T_ct_base, frames[way, state]):
+        for state in range(frames.shape[1] - 1, -1, -1):  # the last is the nearest to the patient
+            if not _is_clear(arm, room, T_ct_base, frames[way, state], met):
                 clear[way] = False
                 break

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from planning.candidates import Candidates
 from planning.case import Case
-from planning.constraints import standoffs
+from planning.standoff import standoffs
 
 Floats = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ def wanted_directions(case: Case, found: Candidates) -> WantedDirections:
     weight = ring_weights(found.theta, case.search.step)[rows]
     return WantedDirections(
         found.outward_ct[rows],
-        np.asarray(standoffs(case.needle, found.path_length[rows]), dtype=np.float64),
+        standoffs(case.needle, found.path_length[rows], found.skin_angle[rows]),
         weight / weight.sum() if len(rows) else weight,
     )
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.cache import user_cache
 from planning.place.arm_balls import ArmBalls, Surroundings, base_is_clear, clear_ways
 from planning.place.directions import WantedDirections
 from planning.place.mounts import Site
@@ -99,14 +100,30 @@ class Estimator:
         depths = np.linspace(0.0, 1.0, STATES)
         distances = self.tool.needle_length_mm + self.wanted.standoff_mm[:, None] * (1.0 - depths)
         found = insertion_ways(model, target, self.wanted.outward_ct @ T_base_ct[:3, :3].T, distances)
-        rows, branches = np.nonzero(found.margin)
-        clear = clear_ways(balls, self.room, T_ct_base, link_poses(model, found.q[rows, branches]))
-        open_margin = np.zeros_like(found.margin)
-        open_margin[rows[clear], branches[clear]] = found.margin[rows[clear], branches[clear]]
+        open_margin = self._open_margins(found, T_ct_base)
         best = self._clear_of_itself(found.q, open_margin) if self.itself else open_margin.max(axis=1)
         share = self._share(best)
         margin = float(best @ self.wanted.weight) / share if share > 0.0 else 0.0
         return Estimate(self._share(found.margin.max(axis=1)), self._share(open_margin.max(axis=1)), share, margin)
+
+    def _open_margins(self, ways: Ways, T_ct_base: Floats) -> Floats:
+        """The margins of the ways that keep clear of the room, shape (n, 8); 0 for the others.
+
+        Of each direction the branches are asked about in the order of their margins. Where the arm itself does not
+        count, those after the first clear one are left at 0: no answer depends on them.
+        """
+        model, balls = ur_model(self.model), _balls(self.model, self.tool)
+        open_margin = np.zeros_like(ways.margin)
+        order = np.argsort(-ways.margin, axis=1, kind="stable")
+        rows = np.arange(len(order))
+        for place in range(N_BRANCHES):
+            rows = rows[ways.margin[rows, order[rows, place]] > 0.0]
+            branches = order[rows, place]
+            clear = clear_ways(balls, self.room, T_ct_base, link_poses(model, ways.q[rows, branches]))
+            open_margin[rows[clear], branches[clear]] = ways.margin[rows[clear], branches[clear]]
+            if not self.itself:
+                rows = rows[~clear]
+        return open_margin
 
     def _share(self, margins: Floats) -> float:
         return float(self.wanted.weight[margins > 0.0].sum())
@@ -133,4 +150,4 @@ def _balls(model: str, tool: Tool) -> ArmBalls:
 @cache
 def _alone(model: str, tool: Tool) -> FastChecker:
     """The arm in an empty room: it meets nothing but itself."""
-    return FastChecker(ur_model(model), tool)
+    return FastChecker(ur_model(model), tool, cache=user_cache())

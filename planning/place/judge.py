@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.cache import user_cache
 from planning.mesh import TriangleMesh
 from planning.place.directions import WantedDirections
 from planning.reach import ReachRequest, assess_reach_all
@@ -93,10 +94,8 @@ class Judge:
 
     def _checker(self, T_base_ct: Floats) -> FastChecker:
         boxes = [Box(box.name, T_base_ct @ box.T_base_box, box.size_mm) for box in self.fixed]
-        patient = self.skin.transformed(T_base_ct)
-        return FastChecker(
-            ur_model(self.model), self.tool, (*boxes, *self.carried), patient, padding_mm=self.padding_mm
-        )
+        patient, model, everything = self.skin.transformed(T_base_ct), ur_model(self.model), (*boxes, *self.carried)
+        return FastChecker(model, self.tool, everything, patient, padding_mm=self.padding_mm, cache=user_cache())
 
 
 def _words(contact: Contact | None) -> str:

@@ -156,13 +156,13 @@ def _judged(
     """The finalists as they would be written, best first, and the case's own placement."""
     mounts = [mount_section(T_ct_bed @ site.T_bed_base(), case.space) for site, _ in finalists]
     poses = [mount_pose(mount, case.space, case.path) for mount in mounts]
-    if placement is not None:
-        poses.append(placement.T_base_ct)
+    if placement is not None:  # first: nobody chose it, and the directions that are not held take longest
+        poses.insert(0, placement.T_base_ct)
     verdicts = ask_all(judge.verdict, poses, jobs=jobs, progress=progress)
     own = None
     if placement is not None:
         T_ct_base = np.asarray(np.linalg.inv(placement.T_base_ct), dtype=np.float64)
-        own = Judged(None, mount_section(T_ct_base, case.space), None, verdicts.pop())
+        own = Judged(None, mount_section(T_ct_base, case.space), None, verdicts.pop(0))
     judged = [Judged(site, m, e, v) for (site, e), m, v in zip(finalists, mounts, verdicts, strict=True)]
     judged.sort(key=lambda one: (-round(one.verdict.share, SHARE_DIGITS), -one.verdict.margin))
     return tuple(judged), own
