@@ -11,6 +11,8 @@ import trimesh
 from meshes import folder
 from planning.case import load_case
 from planning.errors import InputError
+from planning.mesh import TriangleMesh
+from planning.place.bed import bed_frame
 from planning.placement import load_placement
 from planning.prepared import prepare
 from planning.reasons import Reason
@@ -18,8 +20,10 @@ from planning.robot.cell import CellChecker, Tool
 from planning.robot.fast_checker import FastChecker
 from planning.robot.gantry import SIDES, gantry_boxes
 from planning.robot.ur import ur_model
-from planning.room import case_boxes
+from planning.room import case_boxes, case_tool, home_configuration
 from twin.report.scene_parts import room
+from twin.world.execution import execute
+from twin.world.room import open_room
 
 TILT = trimesh.transformations.rotation_matrix(0.35, [1.0, 0.2, 0.0])
 TILT[:3, 3] = (420.0, 30.0, 80.0)
@@ -160,6 +164,27 @@ def test_a_gantry_that_does_not_go_around_the_patient_is_refused(in_gantry):
     path.write_text(path.read_text().replace("bore_diameter_mm = 700.0", "bore_diameter_mm = 300.0"))
     with pytest.raises(InputError, match="wall stands .* mm in the patient"):
         prepare(path)
+
+
+def test_the_physics_feels_the_gantry(in_gantry):
+    """In the twin's room the wall is solid: an arm sent through it is stopped, and the contact names the gantry."""
+    path = in_gantry()
+    further = (("[0.0, 0.0, 60.0]", "[0.0, 0.0, 330.0]"), ("wall_mm = 150.0", "wall_mm = 400.0"))
+    path.write_text(path.read_text().replace(*further[0]).replace(*further[1]))
+    case = load_case(path)
+    T_base_ct, model = load_placement(case).T_base_ct, ur_model(case.robot.model)
+    skin = trimesh.creation.icosphere(radius=50.0)
+    patient = TriangleMesh(skin.vertices, skin.faces)
+    away, home = np.radians([0.0, -165.0, -90.0, 0.0, 90.0, 0.0]), home_configuration(case)
+    checker = CellChecker(model, case_tool(case), case_boxes(case, T_base_ct))
+    assert checker.contact(away, needle_may_touch_patient=False) is None
+    assert checker.contact(home, needle_may_touch_patient=False).other.startswith("gantry_")
+    commands = away + (home - away) * np.linspace(0.0, 1.0, 480)[:, None]
+    down = -bed_frame(case)[:3, 2]
+    with open_room(model, case_tool(case), patient, T_base_ct, case_boxes(case, T_base_ct), down_ct=down) as room:
+        done = execute(room, commands, np.zeros(6))
+    assert done.touches and {touch.body.split("_")[0] for touch in done.touches} == {"gantry"}
+    assert np.abs(done.q[-1] - home).max() > np.radians(2.0)
 
 
 def test_the_gantry_is_drawn(in_gantry):

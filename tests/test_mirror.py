@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
+import itertools
 import json
 import sys
 
 import numpy as np
 import pytest
+from rtde_server import PERIOD_S, START_S, rtde_server
 
 import run_twin
 from meshes import folder
@@ -20,6 +23,13 @@ from planning.room import case_tool
 from twin import mirror
 
 ABDOMEN = folder() / "abdomen"
+
+HOST = "127.0.0.47"
+"""A loopback address of its own, so that a controller's ports are free there."""
+
+needs_the_extra = pytest.mark.skipif(
+    importlib.util.find_spec("rtde_receive") is None, reason="ur-rtde is not installed: pip install '.[mirror]'"
+)
 
 
 class FakeArm:
@@ -37,6 +47,10 @@ class FakeArm:
         """Half a second later each time."""
         self.time += 0.5
         return self.time
+
+    def isConnected(self):  # noqa: N802
+        """It is."""
+        return True
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +90,96 @@ def test_joint_angles_that_are_none_are_refused(rows):
     """Five of them, or one that is no number."""
     with pytest.raises(InputError, match="six finite angles"):
         next(mirror.live_states(FakeArm(rows), period_s=0.0, seconds=None))
+
+
+class SilentArm(FakeArm):
+    """Says the same for ever, as the library does once the line is gone."""
+
+    def __init__(self, connected):
+        super().__init__([])
+        self.connected = connected
+
+    def getActualQ(self):  # noqa: N802
+        """Always the same."""
+        return [0.0] * 6
+
+    def getTimestamp(self):  # noqa: N802
+        """Always the same."""
+        return 7.5
+
+    def isConnected(self):  # noqa: N802
+        """As told."""
+        return self.connected
+
+
+@pytest.mark.parametrize(("connected", "match"), [(False, "hung up, 7.500 s"), (True, "tells nothing new, 7.500 s")])
+def test_an_old_state_is_not_shown_again(monkeypatch, connected, match):
+    """The last word of a robot that is gone must not look like an arm that stands still."""
+    monkeypatch.setattr(mirror, "SILENCE_S", 0.05)
+    states = mirror.live_states(SilentArm(connected), period_s=0.001, seconds=None)
+    assert next(states).time_s == 7.5
+    with pytest.raises(InputError, match=match):
+        next(states)
+
+
+def test_before_the_first_word_nothing_is_shown():
+    """Time 0 and angles 0 are what the library has before it has heard anything."""
+    arm = FakeArm([[0.0] * 6, [0.1] * 6])
+    times = iter([0.0, 3.0])
+    arm.getTimestamp = lambda: next(times)
+    state = next(mirror.live_states(arm, period_s=0.0, seconds=None))
+    assert state.time_s == 3.0 and state.q[0] == 0.1
+
+
+@pytest.fixture(scope="module")
+def rows(drive):
+    """The drive as a controller would tell it, 125 times a second for four seconds."""
+    q = drive.insertion_q
+    at = np.linspace(0.0, len(q) - 1.0, 500)
+    return np.stack([np.interp(at, np.arange(len(q)), q[:, joint]) for joint in range(6)], axis=1)
+
+
+@needs_the_extra
+def test_a_controller_is_mirrored_as_its_recording_is(rows, tmp_path, capfd):
+    """Through ur-rtde itself: the same tips. The controller is sent four packages that set up the reading, no more."""
+    recording = tmp_path / "joints.csv"
+    lines = [f"{START_S + i * PERIOD_S!r},{','.join(map(repr, map(float, q)))}" for i, q in enumerate(rows)]
+    recording.write_text("\n".join(["time_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad", *lines]))
+    assert run_twin.main(["mirror", "--case", str(ABDOMEN), "--from", str(recording), "--json"]) == 0
+    recorded = json.loads(capfd.readouterr().out)["states"]
+    with rtde_server(HOST, rows) as controller:
+        live = ["mirror", HOST, "--case", str(ABDOMEN), "--seconds", "0.5", "--rate", "50", "--json"]
+        assert run_twin.main(live) == 0
+    said = json.loads(capfd.readouterr().out)["states"]
+    assert len(said) >= 5 and said[-1]["time_s"] - said[0]["time_s"] > 0.3
+    by_joints = {tuple(one["q_deg"]): one for one in recorded}
+    for one in said:
+        same = by_joints[tuple(one["q_deg"])]  # bit for bit the recording's
+        assert one["time_s"] == pytest.approx(same["time_s"], abs=1.5 * PERIOD_S)
+        assert {**one, "time_s": 0} == {**same, "time_s": 0}
+    assert "".join(kind for kind, _ in controller.received) == "VvOS"  # an input's setup would be an I, its data a U
+    assert controller.received[2][1][8:].decode().strip(",") == "timestamp,actual_q"
+    assert controller.knocks == []  # no dashboard, no interface that takes programs
+
+
+@needs_the_extra
+@pytest.mark.parametrize(("order", "match"), [("hang up", "hung up"), ("hang", "tells nothing new")])
+def test_a_controller_that_stops_ends_the_mirror(rows, order, match):
+    """Whether it closes the line or leaves it open."""
+    with rtde_server(HOST, rows) as controller:
+        states = mirror.live_states(mirror.connect(HOST), period_s=0.02, seconds=None)
+        assert len(list(itertools.islice(states, 3))) == 3
+        controller.order(order)
+        with pytest.raises(InputError, match=match):
+            list(states)
+
+
+@needs_the_extra
+def test_a_host_without_a_robot_is_one_line(capfd):
+    """Exit code 2; the library's own words do not come between."""
+    assert run_twin.main(["mirror", HOST, "--case", str(ABDOMEN)]) == 2
+    said = capfd.readouterr().err.strip()
+    assert "no robot answers" in said and f"mirror {HOST}, port 30004" in said and len(said.splitlines()) == 1
 
 
 def test_a_recording_is_mirrored(drive, tmp_path, capsys):

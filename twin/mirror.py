@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import socket
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -25,6 +26,18 @@ JOINT_COLUMNS = tuple(f"q{joint}_rad" for joint in range(1, 7))
 
 INSTALL = "pip install 'puncture-twin[mirror]'"
 
+RTDE_PORT = 30004
+"""On which a controller tells its state; the only port that is used."""
+
+VARIABLES = ("timestamp", "actual_q")
+"""What the controller is asked to tell."""
+
+ANSWER_S = 5.0
+"""A controller that does not take the call within this time is not there."""
+
+SILENCE_S = 1.0
+"""A controller that tells nothing new for so long has stopped: it tells its state at least every 8 ms."""
+
 
 class Receiver(Protocol):
     """The part of ``rtde_receive.RTDEReceiveInterface`` that is used: it only reads."""
@@ -34,7 +47,11 @@ class Receiver(Protocol):
         ...
 
     def getTimestamp(self) -> float:  # noqa: N802  # the library's name
-        """Seconds since the controller started."""
+        """Seconds since the controller started; 0 before its first word."""
+        ...
+
+    def isConnected(self) -> bool:  # noqa: N802  # the library's name
+        """Whether the line stands."""
         ...
 
 
@@ -116,28 +133,39 @@ def connect(host: str) -> Receiver:
         from rtde_receive import RTDEReceiveInterface
     except ImportError as error:
         raise InputError("mirroring a robot needs ur-rtde, an extra", where="mirror", allowed=INSTALL) from error
-    try:
-        receiver: Receiver = RTDEReceiveInterface(host)
-    except RuntimeError as error:
-        raise InputError(f"no robot answers: {error}", where=f"mirror {host}", allowed="a UR that is on") from error
+    try:  # first by ourselves: the library waits for minutes, and cannot be interrupted
+        socket.create_connection((host, RTDE_PORT), timeout=ANSWER_S).close()
+        receiver: Receiver = RTDEReceiveInterface(host, variables=list(VARIABLES))
+    except (OSError, RuntimeError) as error:
+        where = f"mirror {host}, port {RTDE_PORT}"
+        raise InputError(f"no robot answers: {error}", where=where, allowed="a UR that is on") from error
     return receiver
 
 
 def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -> Iterator[JointState]:
-    """What a receiver reads, every so often.
+    """What a receiver reads, every so often; nothing twice. Time and angles may be one package (8 ms) apart.
 
     Args:
         receiver: A running arm.
         period_s: Between two readings.
         seconds: How long, by the robot's clock; None for ever.
+
+    Raises:
+        InputError: The robot hangs up or falls silent, or tells something that is no joint angles.
     """
-    start = None
+    start, last, heard = None, 0.0, time.monotonic()
     while True:
         state = checked(receiver.getTimestamp(), receiver.getActualQ(), "the robot's answer")
-        start = state.time_s if start is None else start
-        if seconds is not None and state.time_s - start > seconds:
-            return
-        yield state
+        if state.time_s != last:
+            start = state.time_s if start is None else start
+            last, heard = state.time_s, time.monotonic()
+            if seconds is not None and state.time_s - start > seconds:
+                return
+            yield state
+        elif not receiver.isConnected() or time.monotonic() - heard > SILENCE_S:
+            # the library goes on to give the last state it has heard
+            said = "hung up" if not receiver.isConnected() else "tells nothing new"
+            raise InputError(f"the robot {said}, {last:.3f} s by its clock", where="mirror", allowed="a UR that is on")
         time.sleep(period_s)
 
 

@@ -9,6 +9,9 @@ from twin.mirror import Mirrored
 from twin.place_job import PlaceRun
 from twin.report.mount_words import direction_words, mount_words
 
+HALF_A_DIGIT = 5e-4
+"""Of a share that is printed in % with one digit."""
+
 
 def place_text(run: PlaceRun) -> str:
     """The ranked placements, the case's own, the lines to paste, and the files."""
@@ -19,8 +22,7 @@ def place_text(run: PlaceRun) -> str:
         f"case {case.name}: {asked} organ-safe directions; {len(found.coarse)} + {found.refined} placements estimated,"
         f" {len(found.judged)} judged",
         f"  from the target, mm: along = toward {x}, across = toward {y}, height = toward {z}",
-        f"  at most {100 * found.possible:.1f} % can be held from anywhere: elsewhere the needle itself would start"
-        " too near the skin",
+        *needle_line(found.possible),
         "rank  share %   held  margin  along  across  height  mount",
     ]
     lines += [_line(f"{rank:4d}", one, run) for rank, one in enumerate(found.judged, start=1)]
@@ -33,6 +35,14 @@ def place_text(run: PlaceRun) -> str:
         lines += ["", "a proposal: where the arm then really stands, markers must say ([registration])"]
     seconds = ", ".join(f"{stage} {spent:.1f}" for stage, spent in run.prepared.stages.seconds.items())
     return "\n".join([*lines, f"seconds: {seconds}", "look at:", *(f"  {path}" for path in run.files)])
+
+
+def needle_line(possible: float) -> list[str]:
+    """What no placement can mend, where there is such a thing."""
+    if possible > 1.0 - HALF_A_DIGIT:
+        return []
+    share = f"at most {100 * possible:.1f} % can be held from anywhere"
+    return [f"  {share}: elsewhere the needle itself would start too near the skin"]
 
 
 def _line(rank: str, one: Judged, run: PlaceRun) -> str:

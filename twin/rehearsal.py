@@ -17,8 +17,7 @@ from planning.anatomy import Anatomy
 from planning.case import Case
 from planning.clearance.containment import Side, side_of
 from planning.clearance.fcl_engine import FclEngine
-from planning.entry import ANATOMICAL_LPS
-from planning.formats.spaces import Space
+from planning.place.bed import bed_frame
 from planning.plan import Plan
 from planning.robot.ur import ur_model
 from planning.room import case_boxes, case_checker, case_tool
@@ -38,9 +37,6 @@ HOLD_S = 1.0
 
 CLEARANCE_SAMPLES = 48
 """Moments of the insertion at which the needle's clearance is measured, the last one included."""
-
-UPRIGHT = 0.5
-"""An entry frame whose z lies within 60 degrees of the body's long axis is not the direction up."""
 
 
 @dataclass(frozen=True)
@@ -109,16 +105,6 @@ class Rehearsal:
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
 
-    @property
-    def within_speed_limits(self) -> bool:
-        """Whether every joint kept its limit at every physics step."""
-        return bool(np.all(self.max_joint_speed <= self.speed_limits))
-
-    @property
-    def tracking_error(self) -> Floats:
-        """Largest |measured - asked| of each joint, shape (6,), rad."""
-        return np.asarray(np.abs(self.q - self.q_command).max(axis=0))
-
 
 @dataclass(frozen=True)
 class TipError:
@@ -144,7 +130,8 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
     commands = _commands(plan)
     T_base_ct = truth.T_base_ct_true
     model, tool, boxes = ur_model(plan.model), case_tool(case), case_boxes(case, T_base_ct)
-    with open_room(model, tool, anatomy.skin.mesh, T_base_ct, boxes, down_ct=down_ct(case)) as room:
+    down_ct = -bed_frame(case)[:3, 2]
+    with open_room(model, tool, anatomy.skin.mesh, T_base_ct, boxes, down_ct=down_ct) as room:
         done = execute(room, commands.q, truth.joint_offsets)
     times, phase = commands.times_s[done.steps], commands.phase[done.steps]
     T_ct_flange = np.linalg.inv(T_base_ct) @ done.T_base_flange
@@ -185,18 +172,6 @@ def split_error(tip: Floats, forward: Floats, target: Floats) -> TipError:
     error = tip - target
     depth = float(error @ forward)
     return TipError(float(np.linalg.norm(error)), float(np.linalg.norm(error - depth * forward)), depth)
-
-
-def down_ct(case: Case) -> Floats:
-    """The direction of gravity in the CT frame, shape (3,).
-
-    Down is against the entry frame's z, which points up from the bed. Where it does not (a frame with the axes of a
-    patient's CT: z to the head), the patient is taken to lie on the back.
-    """
-    up = case.T_ct_entry[:3, 2]
-    if case.space is not Space.LOCAL and abs(up @ np.array(ANATOMICAL_LPS["head"])) > UPRIGHT:
-        up = np.array(ANATOMICAL_LPS["anterior"])
-    return -up
 
 
 @dataclass(frozen=True, eq=False)
