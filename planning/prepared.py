@@ -128,7 +128,7 @@ def prepare(path: Path | str, *, arm: bool = True, engine: str = "fast", watcher
     if engine not in ENGINES:
         raise InputError(f"engine '{engine}' is not known", where="--engine", allowed=", ".join(ENGINES))
     watcher = watcher or Silent()
-    stages = Stages()
+    stages = Stages(announce=partial(watcher.step, "stage"))
     with stages.time("case"):
         case = load_case(path)
         placement = load_placement(case)

@@ -12,6 +12,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from planning.candidates import Candidates
@@ -46,6 +47,9 @@ NAMED_SHARE = 0.006
 
 NAMED_REASONS = (Reason.TOO_CLOSE, Reason.UNKNOWN_REGION)
 """Reasons whose structure is written into the map."""
+
+NAME_POINTS = 9.0
+"""Size of such a name; no two of them lie over one another while there is room."""
 
 BORDER_OPACITY = 0.45
 
@@ -127,17 +131,33 @@ def _names(axes: Axes, raster: MapRaster, candidates: Candidates) -> None:
     border[ndimage.binary_dilation(parted, np.ones((3, 3))), 3] = round(255 * BORDER_OPACITY)
     axes.imshow(border, extent=(-1, 1, -1, 1), interpolation="antialiased", zorder=2)
     coarse = codes[::4, ::4]
-    size = len(coarse)
-    for code, structure in enumerate(map(str, every)):
-        if not structure:
-            continue
-        labels, _ = ndimage.label(coarse == code)
+    free = np.ones(coarse.shape, dtype=bool)
+    for depth, structure in _regions(coarse, list(map(str, every))):
+        words = structure.replace("_", " ")
+        high, wide = (round(part * len(coarse) / 2) for part in _size(words))
+        room = np.where(ndimage.minimum_filter(free, (2 * high + 1, 2 * wide + 1)), depth, 0.0)
+        row, column = np.unravel_index(int(np.where(room.any(), room, depth).argmax()), depth.shape)
+        free[max(0, row - high) : row + high + 1, max(0, column - wide) : column + wide + 1] = False
+        x, y = (column + 0.5) / len(coarse) * 2 - 1, 1 - (row + 0.5) / len(coarse) * 2
+        _text(axes, x, y, words, size=NAME_POINTS, style="italic")
+
+
+def _regions(codes: NDArray[np.int64], names: list[str]) -> list[tuple[NDArray[np.float64], str]]:
+    """Large enough regions of one name, the largest first: how deep inside each pixel lies, and the name."""
+    found = []
+    for code, name in enumerate(names):
+        labels, _ = ndimage.label((codes == code) if name else np.zeros(codes.shape, dtype=bool))
         areas = ndimage.sum_labels(np.ones_like(labels), labels, np.arange(1, labels.max() + 1))
-        for part in np.flatnonzero(areas > NAMED_SHARE * size**2 * np.pi / 4) + 1:
+        for part in np.flatnonzero(areas > NAMED_SHARE * codes.size * np.pi / 4) + 1:
             depth = ndimage.distance_transform_edt(np.pad(labels == part, 1))[1:-1, 1:-1]
-            row, column = np.unravel_index(int(depth.argmax()), depth.shape)
-            x, y = (column + 0.5) / size * 2 - 1, 1 - (row + 0.5) / size * 2
-            _text(axes, x, y, structure.replace("_", " "), size=9, style="italic")
+            found.append((float(areas[part - 1]), depth, name))
+    return [(depth, name) for _, depth, name in sorted(found, key=lambda region: -region[0])]
+
+
+def _size(words: str) -> tuple[float, float]:
+    """Half the height and half the width of a name, in the disc's radii."""
+    radius_points = MAP_BOX[3] * FIGURE_INCHES[1] * 72 / (2 * RIM)
+    return 0.7 * NAME_POINTS / radius_points, 0.29 * NAME_POINTS * len(words) / radius_points
 
 
 def _marks(axes: Axes, view: MapView, candidates: Candidates) -> None:
