@@ -77,7 +77,7 @@ class NeedleSection(Section):
     shaft_mm: Annotated[Number, Field(ge=10, le=1000)]
     diameter_mm: Annotated[Number, Field(ge=0.1, le=20)]
     standoff_mm: Annotated[Number, Field(ge=5, le=1000)] | None = None
-    skin_gap_mm: Annotated[Number, Field(ge=6, le=200)] = 10.0  # the arm's padding of 5 mm, and some
+    skin_gap_mm: Annotated[Number, Field(ge=6, le=200)] = 10.0  # the least, along the needle; see standoff.py
     holder_diameter_mm: Annotated[Number, Field(ge=1, le=200)] = 30.0
 
     @model_validator(mode="after")

@@ -14,13 +14,14 @@ from scipy.spatial.transform import Rotation
 from planning.cache import Cache
 from planning.case_file import EntryAxes
 from planning.entry import ANATOMICAL_LPS
+from planning.place.directions import ring_weights
 from twin.report import annotate, draw_film, draw_map, draw_scene, film, page, page_scene, scene_picture, write_page
 from twin.report.camera import Camera, camera_around
 from twin.report.compositing import Shot, compose, empty_veil
 from twin.report.map_picture import FIGURE_INCHES, MAP_BOX, RIM
 from twin.report.map_raster import map_raster
-from twin.report.map_view import map_view, rows_at
-from twin.report.numbers import reason_counts, solid_angles
+from twin.report.map_view import map_view, rows_at, step_of
+from twin.report.numbers import reason_counts
 from twin.report.page_map import map_data
 from twin.report.page_scene import TRIANGLES, lightened
 from twin.report.palette import REASON_COLOURS, SAFE_HIGH, SAFE_LOW
@@ -220,7 +221,7 @@ def test_counts_and_solid_angles(case, candidates):
     assert lines[0].code == "safe"
     assert sum(line.count for line in lines) == len(candidates)
     assert sum(line.solid_angle for line in lines) == pytest.approx(1)
-    weights = solid_angles(candidates)
+    weights = ring_weights(candidates.theta, step_of(candidates))
     cap = weights[candidates.theta < np.radians(31)].sum() / weights.sum()
     assert cap == pytest.approx((1 - np.cos(np.radians(32.5))) / (1 - np.cos(np.radians(92.5))))
 

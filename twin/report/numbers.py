@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from planning.candidates import Candidates
+from planning.place.directions import ring_weights
 from planning.reasons import Reason
 from twin.report.map_view import step_of
 from twin.report.palette import REASON_COLOURS, REASON_WORDS, SAFE, Rgb, reason_of
@@ -38,7 +38,7 @@ class ReasonCount:
 
 def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
     """Safe first, then the reasons that occur, most frequent first."""
-    weights = solid_angles(candidates)
+    weights = ring_weights(candidates.theta, step_of(candidates))
     lines = []
     for value in np.unique(candidates.reason):
         here = candidates.reason == value
@@ -50,14 +50,6 @@ def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
     if not candidates.safe.any():
         lines.append(ReasonCount(REASON_WORDS[Reason.NONE], "safe", SAFE, 0, 0.0, 0.0))
     return tuple(sorted(lines, key=lambda line: (line.code != "safe", -line.count)))
-
-
-def solid_angles(candidates: Candidates) -> NDArray[np.float64]:
-    """The share of the sphere that each cell of the grid covers, up to a common factor, shape (n,)."""
-    half = step_of(candidates) / 2
-    low, high = np.maximum(candidates.theta - half, 0.0), np.minimum(candidates.theta + half, np.pi)
-    _, ring, sizes = np.unique(np.round(candidates.theta, 7), return_inverse=True, return_counts=True)
-    return np.asarray((np.cos(low) - np.cos(high)) / sizes[ring])
 
 
 def chosen_row(candidates: Candidates) -> int | None:

@@ -46,6 +46,9 @@ EDGE_CELLS = 1.6
 
 TICKS_MM = 500.0
 
+ALL_OF_IT = 1.0 - 5e-4
+"""A share that is not told from the whole."""
+
 HALO = [withStroke(linewidth=2.5, foreground="white")]
 SAME_AXIS = 0.94
 """Cosine from which the case's own base axis is a panel's (20 degrees)."""
@@ -165,8 +168,12 @@ def _bed(axes: Axes, found: PlaceSearch, case: Any, skin: TriangleMesh) -> None:
     """Outlines of the patient, of the boxes that stand with him, and of the gantry; the target."""
     T_bed_ct = np.linalg.inv(found.T_ct_bed)
     carried = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"}
-    boxes = [box.corners for box in case_boxes(case, np.eye(4)) if box.name not in carried]
-    for corners, look in [(c, {"ls": "--", "lw": 0.9}) for c in boxes] + [(skin.vertices, {"ls": "-", "lw": 1.6})]:
+    parts: dict[str, list[Floats]] = defaultdict(list)
+    for box in case_boxes(case, np.eye(4)):
+        if box.name not in carried:
+            parts["gantry" if box.name.startswith("gantry_") else box.name].append(box.corners)
+    things = [(np.concatenate(corners), {"ls": "--", "lw": 0.9}) for corners in parts.values()]
+    for corners, look in [*things, (skin.vertices, {"ls": "-", "lw": 1.6})]:
         flat = (corners @ T_bed_ct[:3, :3].T + T_bed_ct[:3, 3])[:, SEEN_FROM_ABOVE]
         outline = flat[ConvexHull(flat).vertices]
         axes.add_patch(Polygon(outline, closed=True, fill=False, edgecolor="black", zorder=7, **look))
@@ -187,9 +194,12 @@ def _legend(axes: Axes, figure: Figure, found: PlaceSearch, case: Any, scale: No
         "height h of the base over the target, mm."
         + ("\nDiamond: where the case has the arm now." if found.own is not None else "")
         + "\n\nSolid line: the patient from above. Dashed: table, gantry,\nother boxes.\n\n"
-        f"From anywhere at most {100 * found.possible:.0f} % can be held: elsewhere\n"
-        "the needle itself would start too near the skin."
     )
+    if found.possible < ALL_OF_IT:
+        words += (
+            f"From anywhere at most {100 * found.possible:.0f} % can be held: elsewhere\n"
+            "the needle itself would start too near the skin."
+        )
     axes.text(0.0, 1.0, words, transform=axes.transAxes, fontsize=9.5, va="top", linespacing=1.35)
     bar = axes.inset_axes((0.0, 0.06, 0.95, 0.05))
     figure.colorbar(ScalarMappable(scale, SHADES), cax=bar, orientation="horizontal")
