@@ -46,6 +46,8 @@ class Scene:
     fast: FastChecker
     slow: CellChecker
     built_s: tuple[float, float, float]
+    boxes: tuple[Box, ...]
+    patient: TriangleMesh | None
     problems: list[tuple[np.ndarray, np.ndarray]]
 
 
@@ -97,7 +99,7 @@ def scenes(count: int) -> Iterator[Scene]:
         while len(problems) < wanted:
             found = between(fast, rng) if patient is None else to_a_puncture(fast, prepared, T_base_ct, start, rng)
             problems += [] if found is None else [found]
-        yield Scene(name, fast, slow, built, problems)
+        yield Scene(name, fast, slow, built, room, patient, problems)
 
 
 FOLDED = [np.radians([pan, -120.0, 130.0, -100.0, -90.0, 0.0]) for pan in range(-180, 180, 15)]

@@ -1,6 +1,6 @@
 """From home to a standoff pose: RRT-Connect to several goals, shortened, corners rounded, timed, and checked by FCL.
 
-A fast checker proves whole segments (:meth:`FastChecker.segment_contact`). With FCL alone a segment is judged at
+A fast checker proves whole segments (:class:`SegmentJudge`). With FCL alone a segment is judged at
 samples, which can miss something thin; the check of the finished motion is closer, and plans anew what it refuses.
 """
 
@@ -19,7 +19,8 @@ from planning.drive import follow, rounded
 from planning.errors import InputError, NoAnswerError
 from planning.path_check import MAX_SWEEP_MM, dense_states, first_contact, least_clearance, path_length
 from planning.robot.cell import Contact, StateChecker
-from planning.robot.fast_checker import FastChecker, halving_order
+from planning.robot.fast_checker import FastChecker
+from planning.robot.segments import halving_order
 from planning.rrt_connect import Connected, SegmentContact, connect
 from planning.trajectory import Trajectory
 
@@ -44,8 +45,12 @@ FINER = 10
 """The check of the finished trajectory is this many times finer, and no body moves more than ``MAX_SWEEP_MM`` between
 its states."""
 
-MAX_SAMPLES = 2000
-"""Of the planner, in each run: what is possible takes it tens of them; all of them take it about a second."""
+MAX_SAMPLES = 6000
+"""Of the planner, in each run: in a free room tens of them do, beside a gantry it may take thousands; all of them take
+it one to two seconds."""
+
+PATIENCE, LEAST_SAMPLES = 4, 500
+"""A run for a shorter way gets so many times the samples that the first one took, or at least so many."""
 
 RUNS = 3
 """Of the planner, while it might find a way that is much shorter; see ``SHORT_ENOUGH``."""
@@ -140,7 +145,7 @@ def plan_approach(
         judge = _judge(checker, RESOLUTION_RAD / 2**attempt)
         way = _shortest(checker, judge, home, goals[open_goals], seed + RUNS * attempt, max_samples)
         if isinstance(way, Connected):
-            raise NoAnswerError(_why_none(way, len(goals), len(open_goals), max_samples, seed) + refused)
+            raise NoAnswerError(_why_none(way, len(goals), len(open_goals), seed) + refused)
         cuts = _cuts(judge, way.waypoints)
         for rounding in (cuts, np.zeros_like(cuts)) if cuts.any() else (cuts,):
             trajectory = follow(checker.model, way.waypoints, rounding, speed_scale=speed_scale)
@@ -157,7 +162,7 @@ def plan_approach(
 def _judge(checker: StateChecker, resolution_rad: float) -> SegmentContact:
     """Who judges segments: the fast checker's proof, or FCL at samples."""
     if isinstance(checker, FastChecker):
-        return checker.segment_contact
+        return checker.segment_judge()
 
     def sampled(start: Array, end: Array) -> Contact | None:
         shares = halving_order(max(1, math.ceil(float(np.linalg.norm(end - start)) / resolution_rad)))
@@ -189,6 +194,7 @@ def _shortest(
         )
         if found.waypoints is None:
             return found if best is None else best
+        max_samples = min(max_samples, max(LEAST_SAMPLES, PATIENCE * found.samples))
         way = _Way(found.waypoints, int(sought[found.goal_index]))
         best = way if best is None or way.length < best.length else best
     assert best is not None  # the first run has returned without one
@@ -234,7 +240,7 @@ def _free_goals(checker: StateChecker, home: Array, goals: Array) -> NDArray[np.
     return np.array([row for row, contact in enumerate(contacts) if contact is None], dtype=np.int64)
 
 
-def _why_none(found: Connected, n_goals: int, n_free: int, max_samples: int, seed: int) -> str:
+def _why_none(found: Connected, n_goals: int, n_free: int, seed: int) -> str:
     """Why a run found no way, in words: which tree stayed small, and what was in the way."""
     where = "the goals lie" if found.goal_states <= found.home_states else "home lies"
     trees = f"{found.home_states} states joined home, {found.goal_states} the goals"
@@ -242,6 +248,6 @@ def _why_none(found: Connected, n_goals: int, n_free: int, max_samples: int, see
     most = [f"{c.body} touches {c.other} ({n} of {total})" for c, n in Counter(found.blocked).most_common(2)]
     busy = "" if n_free == n_goals else f"; {n_goals - n_free} of {n_goals} goals are in collision themselves"
     return (
-        f"approach not found: {where} in a part of the space that {max_samples} samples could not reach (seed {seed}): "
-        f"{trees}; most often in the way: {', '.join(most) or 'nothing'}{busy}"
+        f"approach not found: {where} in a part of the space that {found.samples} samples could not reach "
+        f"(seed {seed}): {trees}; most often in the way: {', '.join(most) or 'nothing'}{busy}"
     )

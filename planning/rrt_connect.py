@@ -2,7 +2,8 @@
 
 Source: Kuffner and LaValle 2000, "RRT-Connect: an efficient approach to single-query path planning".
 
-Nothing here depends on the clock: the planner stops after a number of samples, so the same seed gives the same path.
+Nothing here depends on the clock: the planner stops after a number of samples, or when one of its trees has not grown
+for some of them in a row, so the same seed gives the same path.
 OMPL keeps one random generator for the whole process and reseeds it here; two plans must not run in two threads.
 """
 
@@ -24,7 +25,8 @@ from planning.robot.cell import Contact
 
 Array = NDArray[np.float64]
 SegmentContact = Callable[[Array, Array], Contact | None]
-"""What the straight joint segment between two states (6,) meets; None when it is free, its end included."""
+"""What the straight joint segment between two states (6,) meets; None when it is free, its end included. Of a segment
+that begins at a state known to be free the judge is told that state first."""
 
 RANGE_RAD = 0.5
 """Longest branch of the planner's trees."""
@@ -35,8 +37,12 @@ END_TOLERANCE_RAD = 1e-9
 SEEDS = 2**31 - 1
 """OMPL takes positive seeds; 0 would mean its own choice."""
 
-GOAL_TREE = 2
-"""How OMPL tags the states of the tree that grows from the goals; those of the other have 1."""
+HOME_TREE, GOAL_TREE = 0, 1
+"""The planner's two trees."""
+
+STALLED = 1000
+"""When so many samples in a row have made a tree no larger, it is taken to be shut in. Beside a gantry, where most
+branches touch something, a tree that later found its way out grew every 25 samples."""
 
 
 class Connected(NamedTuple):
@@ -50,6 +56,8 @@ class Connected(NamedTuple):
     """How many states the tree from home has."""
     goal_states: int
     """How many the one from the goals has."""
+    samples: int
+    """How many samples it took."""
     blocked: Counter[Contact]
     """What its segments met, and how often."""
 
@@ -73,7 +81,7 @@ def connect(
     with _quiet_ompl():
         ou.RNG.setSeed(1 + seed % SEEDS)
         information = ob.SpaceInformation(_space(joint_limits))
-        validator = _Validator(information, judge)
+        validator = _Validator(information, judge, home, goals)
         information.setStateValidityChecker(_everything)  # a segment is judged with its end
         information.setMotionValidator(validator)
         information.setup()
@@ -87,38 +95,63 @@ def connect(
         planner.setRange(RANGE_RAD)
         planner.setProblemDefinition(problem)
         planner.setup()
-        samples = iter(range(max_samples))
-        planner.solve(ob.PlannerTerminationCondition(lambda: next(samples, None) is None))
-        sizes = _tree_sizes(information, planner)
+        planner.solve(ob.PlannerTerminationCondition(lambda: validator.next_sample(max_samples)))
+        of_home, of_goals = validator.grown
+        none = Connected(None, -1, of_home, of_goals, validator.samples, validator.blocked)
         if not problem.hasExactSolution():
-            return Connected(None, -1, *sizes, validator.blocked)
+            return none
         path = problem.getSolutionPath()
         _shorten(information, path)
         found = np.array([_angles(state) for state in path.getStates()])
-    return Connected(*_with_exact_ends(found, home, goals), *sizes, validator.blocked)
+    waypoints, goal_index = _with_exact_ends(found, home, goals)
+    return none._replace(waypoints=waypoints, goal_index=goal_index)
 
 
 class _Validator(ob.MotionValidator):  # type: ignore[misc]  # compiled, without types
-    """Hands segments to a judge and counts what they met."""
+    """Hands segments to a judge, and counts what they met and how the trees grow.
 
-    def __init__(self, information: ob.SpaceInformation, judge: SegmentContact) -> None:
+    A free segment from a state of a tree makes its other end a state of that tree. OMPL asks about a branch of the tree
+    from the goals the other way round, toward that tree.
+    """
+
+    def __init__(self, information: ob.SpaceInformation, judge: SegmentContact, home: Array, goals: Array) -> None:
         super().__init__(information)
         self._judge = judge
+        self._tree_of = {tuple(goal): GOAL_TREE for goal in goals.tolist()} | {tuple(home.tolist()): HOME_TREE}
+        self._grew_at = [0, 0]
+        self.samples = 0
+        self.grown = [1, len(goals)]
         self.blocked: Counter[Contact] = Counter()
 
+    def next_sample(self, most: int) -> bool:
+        """Counts the planner's samples; whether to stop instead, after so many or where a tree has stalled."""
+        if self.samples >= most or self.samples - min(self._grew_at) >= STALLED:
+            return True
+        self.samples += 1
+        return False
+
     def checkMotion(self, start: ob.State, end: ob.State) -> bool:  # noqa: N802  # OMPL's name
-        contact = self._judge(_angles(start), _angles(end))
+        known, new = _angles(start), _angles(end)
+        if known not in self._tree_of:
+            known, new = (new, known) if new in self._tree_of else (known, new)
+        contact = self._judge(np.array(known), np.array(new))
         if contact is not None:
             self.blocked[contact] += 1
-        return contact is None
+            return False
+        tree = self._tree_of.get(known)
+        if tree is not None and new not in self._tree_of:
+            self._tree_of[new] = tree
+            self._grew_at[tree] = self.samples
+            self.grown[tree] += 1
+        return True
 
 
 def _everything(state: ob.State) -> bool:
     return True
 
 
-def _angles(state: ob.State) -> Array:
-    return np.array([state[joint] for joint in range(6)])  # only 0..5: beyond them OMPL reads garbage
+def _angles(state: ob.State) -> tuple[float, ...]:
+    return state[0], state[1], state[2], state[3], state[4], state[5]  # beyond them OMPL reads garbage
 
 
 def _space(joint_limits: Array) -> ob.RealVectorStateSpace:
@@ -136,14 +169,6 @@ def _state(information: ob.SpaceInformation, q: Array) -> ob.State:
     for joint in range(6):
         state[joint] = float(q[joint])
     return state
-
-
-def _tree_sizes(information: ob.SpaceInformation, planner: og.RRTConnect) -> tuple[int, int]:
-    """How many states the trees from home and from the goals have."""
-    data = ob.PlannerData(information)
-    planner.getPlannerData(data)
-    of_goals = sum(data.getVertex(index).getTag() == GOAL_TREE for index in range(data.numVertices()))
-    return data.numVertices() - of_goals, of_goals
 
 
 def _shorten(information: ob.SpaceInformation, path: og.PathGeometric) -> None:

@@ -15,10 +15,11 @@ from planning.drive import MAX_JERK, drive_smoothly, follow, rounded
 from planning.errors import InputError, NoAnswerError
 from planning.mesh import TriangleMesh
 from planning.path_check import CLEARANCE_STEP_MM, MAX_SWEEP_MM, dense_states, least_clearance, path_length
-from planning.robot.cell import Box, CellChecker, Tool
+from planning.robot.cell import Box, CellChecker, Contact, Tool
 from planning.robot.fast_checker import FastChecker
 from planning.robot.kinematics import flange_pose
 from planning.robot.ur import ur_model
+from planning.rrt_connect import STALLED, connect
 from planning.time_law import LENGTH_SLACK, Rates, reachable_speed, speed_change_length, time_law
 from planning.trajectory import SAMPLE_S, Trajectory
 
@@ -198,6 +199,29 @@ def test_a_walled_in_goal_ends_in_a_bounded_number_of_samples(kind: type[CellChe
         message = rf"{where} in a part of the space that 150 samples could not reach \(seed 1\).*touches [xy]_"
         with pytest.raises(NoAnswerError, match=message):
             plan_approach(checker, home, goal, seed=1, max_samples=150)
+
+
+@pytest.mark.parametrize("shut_in", ["home", "goal"])
+def test_a_tree_that_never_grows_ends_the_search_early(shut_in: str) -> None:
+    """Nothing leads in or out of a small ball about one end: the other tree grows, and the samples are not used up.
+
+    The judge is told of every segment that begins in a tree that known, free end first.
+    """
+    ends, known = {"home": LEFT, "goal": RIGHT}, {tuple(LEFT), tuple(RIGHT)}
+
+    def judge(start: np.ndarray, end: np.ndarray) -> Contact | None:
+        assert tuple(start) in known
+        inside = [np.linalg.norm(q - ends[shut_in]) < 0.01 for q in (start, end)]
+        if inside[0] != inside[1]:
+            return Contact("needle", "wall")
+        known.add(tuple(end))
+        return None
+
+    found = connect(UR3.joint_limits, judge, LEFT, RIGHT[None], seed=1, max_samples=10 * STALLED)
+    assert found.waypoints is None and found.samples == STALLED
+    shut, open_ = (found.home_states, found.goal_states)[:: 1 if shut_in == "home" else -1]
+    assert shut == 1 and open_ > 100 and shut + open_ == len(known)
+    assert set(found.blocked) == {Contact("needle", "wall")}
 
 
 def test_angles_outside_the_limits_are_refused() -> None:

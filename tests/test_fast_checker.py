@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from itertools import pairwise
 from pathlib import Path
 
 import fcl
@@ -17,11 +18,13 @@ from planning.prepared import Prepared, prepare
 from planning.reach import ReachAnswer, assess_reach, assess_reach_all
 from planning.robot.bodies import arm_bodies
 from planning.robot.cell import Box, CellChecker, Tool
-from planning.robot.enclosures import ball_tree, coarse_hull, prism
+from planning.robot.enclosures import ball_tree, coarse_hull, inscribed_prism, neighbours, prism
 from planning.robot.fast_checker import FastChecker
+from planning.robot.hull_kernels import TOUCHING, hull_gap
 from planning.robot.kinematics import link_poses
-from planning.robot.proof_kernels import STACK, plane_gap, to_surface, to_triangle
+from planning.robot.proofs import ask_fcl
 from planning.robot.shapes import convex
+from planning.robot.surface_kernels import STACK, to_surface, to_triangle
 from planning.robot.triangle_tree import TriangleTree
 from planning.robot.ur import ur_model
 from planning.room import ARM_PADDING_MM, case_boxes, case_tool
@@ -121,7 +124,7 @@ def test_distance_to_a_triangle_agrees_with_another_closest_point() -> None:
 
 @pytest.mark.parametrize("subdivisions", [0, 1, 4])
 def test_distance_to_a_surface_is_the_least_over_its_triangles(subdivisions: int) -> None:
-    """Whatever the number of triangles; and a nearer cutoff is what is returned when nothing is nearer."""
+    """Whatever the number of triangles; where nothing is nearer than a cutoff, that; any distance where near enough."""
     rng = np.random.default_rng(5)
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=80.0)
     mesh = TriangleMesh(
@@ -134,31 +137,88 @@ def test_distance_to_a_surface_is_the_least_over_its_triangles(subdivisions: int
         least = np.sqrt(min(to_triangle(t, *point) for t in mesh.triangles))
         assert to_surface(tree.lows, tree.highs, tree.corners, *point, 1e6, stack) == least
         assert to_surface(tree.lows, tree.highs, tree.corners, *point, least / 2.0, stack) == pytest.approx(least / 2.0)
+        near = to_surface(tree.lows, tree.highs, tree.corners, *point, 1e6, stack, 2.0 * least)
+        assert least <= near <= 2.0 * least
+        assert to_surface(tree.lows, tree.highs, tree.corners, *point, 1e6, stack, 0.9 * least) == least
 
 
-def test_a_plane_between_two_hulls_is_never_wider_than_their_distance() -> None:
-    """The gap is at most FCL's distance; where it is positive FCL finds no contact; and most free pairs are parted."""
-    rng = np.random.default_rng(6)
-    pieces = [piece for body in arm_bodies(UR3, TOOL, 0.0)[:7] for piece in body.bare.hulls]
-    hulls = [trimesh.convex.convex_hull(piece) for piece in pieces]
-    solids = [fcl.CollisionObject(convex(TriangleMesh(h.vertices, h.faces))) for h in hulls]
-    parted = free = 0
-    for _ in range(1500):
-        i, j = rng.integers(len(pieces), size=2)
+def hull_shapes(checker: FastChecker) -> tuple[list[fcl.CollisionGeometry], list[np.ndarray]]:
+    """Of each packed hull what FCL takes it for, as a function of nothing else, and its middle."""
+    hulls = checker._proofs.scene.hulls
+    shapes, middles = [], []
+    for row, (begin, end) in enumerate(pairwise(hulls.starts)):
+        corners = hulls.corners[begin:end]
+        middles.append(corners.mean(axis=0))
+        if hulls.rounded[row]:
+            size = hulls.inner[begin:end] - middles[-1]
+            shapes.append(fcl.Cylinder(float(np.hypot(size[:, 0], size[:, 1]).max()), float(np.ptp(size[:, 2]))))
+        else:
+            hull = trimesh.convex.convex_hull(corners)
+            shapes.append(convex(TriangleMesh(hull.vertices, hull.faces)))
+    return shapes, middles
+
+
+def test_bounds_on_the_distance_of_two_hulls_hold_it() -> None:
+    """Against FCL: no gap exceeds the distance, what surely touches does, and hardly anything is left open.
+
+    Boxes, links and the prisms about holder and needle; for these FCL is asked about the cylinders.
+    """
+    checker, rng = scene(FastChecker), np.random.default_rng(6)
+    assert isinstance(checker, FastChecker)
+    hulls, (shapes, middles) = checker._proofs.scene.hulls, hull_shapes(checker)
+    S, free, touching, left_open = np.empty((4, 3)), 0, 0, 0
+    for trial in range(3000):
+        i, j = rng.integers(len(shapes), size=2)
+        i = i if trial % 3 else int(rng.choice(np.flatnonzero(hulls.rounded)))
         T = trimesh.transformations.random_rotation_matrix(rng.uniform(size=3))
-        T[:3, 3] = pieces[i].mean(axis=0) + rng.normal(size=3) * 60.0
-        a, b = (tuple(np.ascontiguousarray(axis) for axis in pieces[k].T) for k in (i, j))
-        axis = np.array([0.0, 0.0, 1.0])
-        gap = plane_gap(a, b, np.ascontiguousarray(T[:3, :3]), T[:3, 3], axis, 1e-3, 12)
-        other = fcl.CollisionObject(convex(TriangleMesh(hulls[j].vertices, hulls[j].faces)))
-        other.setTransform(fcl.Transform(T[:3, :3], T[:3, 3]))
-        touching = fcl.collide(solids[i], other, fcl.CollisionRequest(), fcl.CollisionResult()) > 0
-        if gap > 1e-3:
-            parted += 1
-            assert not touching
-            assert gap <= fcl.distance(solids[i], other, fcl.DistanceRequest(), fcl.DistanceResult()) + 1e-4
-        free += not touching
-    assert 300 < free < 1450 and parted >= 0.98 * free
+        T[:3, 3] = middles[i] - T[:3, :3] @ middles[j] + rng.normal(size=3) * 60.0
+        placed = [T if not hulls.rounded[j] else T @ moved_to(middles[j]), moved_to(middles[i] * hulls.rounded[i])]
+        a, b = (
+            fcl.CollisionObject(shapes[row], fcl.Transform(at[:3, :3], at[:3, 3]))
+            for row, at in ((i, placed[1]), (j, placed[0]))
+        )
+        touches = fcl.collide(a, b, fcl.CollisionRequest(), fcl.CollisionResult()) > 0
+        apart = 0.0 if touches else fcl.distance(a, b, fcl.DistanceRequest(), fcl.DistanceResult())
+        for needed in (1e-3, 25.0):
+            gap = hull_gap(hulls, i, j, T[:3].copy(), np.zeros(3), np.zeros(2, np.int64), needed, S)
+            assert gap <= apart + 1e-4
+            assert touches or gap != TOUCHING
+            left_open += needed < 1.0 and abs(gap) <= needed
+        free, touching = free + (not touches), touching + touches
+    assert min(free, touching) > 500 and left_open < 30, (free, touching, left_open)
+
+
+def moved_to(point: np.ndarray) -> np.ndarray:
+    """The frame (4, 4) at a point."""
+    T = np.eye(4)
+    T[:3, 3] = point
+    return T
+
+
+def test_a_hull_is_climbed_to_its_outermost_corner() -> None:
+    """From any corner, by neighbours alone, in any direction; corners within the hull have no neighbours."""
+    rng = np.random.default_rng(9)
+    for body in arm_bodies(UR3, TOOL, 5.0):
+        for corners in body.full.hulls:
+            edges = neighbours(corners)
+            assert edges.degrees.sum() == len(edges.rows) and edges.degrees.min() >= 3
+            around = np.split(edges.rows, np.cumsum(edges.degrees)[:-1])
+            for u in rng.normal(size=(20, 3)):
+                at, along = int(rng.integers(len(corners))), corners @ u
+                while along[around[at]].max() > along[at]:
+                    at = int(around[at][np.argmax(along[around[at]])])
+                assert along[at] == pytest.approx(along.max(), abs=1e-9)
+    inside = np.vstack([prism(10.0, 20.0), np.zeros(3)])
+    assert neighbours(inside).degrees[-1] == 0
+
+
+def test_the_inner_prism_lies_in_the_cylinder() -> None:
+    """In every direction it reaches no farther than the round body, and nearly as far."""
+    u = np.random.default_rng(2).normal(size=(2000, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    cylinder = 5.6 * np.hypot(u[:, 0], u[:, 1]) + 80.0 * np.abs(u[:, 2])
+    reach = (inscribed_prism(prism(5.6, 160.0) + 7.0) @ u.T).max(axis=0) - 7.0 * u.sum(axis=1)
+    assert (reach <= cylinder).all() and (reach >= 0.985 * cylinder).all()
 
 
 @pytest.fixture(scope="module")
@@ -301,6 +361,43 @@ def test_segments_have_the_verdict_of_many_states(padding: float) -> None:
             assert any(slow.contact(q, needle_may_touch_patient=False) for q in states)
         verdicts.append(contact is None)
     assert 10 < sum(verdicts) < 50
+
+
+def test_what_a_judge_remembers_changes_no_verdict() -> None:
+    """Free or not is the same for a fresh judge and for one that has seen other segments; so is it the other way round.
+
+    What a judge calls a contact without asking FCL is one: some state of the segment has it.
+    """
+    fast, slow = scene(FastChecker), scene(CellChecker)
+    assert isinstance(fast, FastChecker)
+    asked = segments(np.random.default_rng(11), 150)
+    seasoned = fast.segment_judge()
+    fresh = [fast.segment_contact(*ends) for ends in asked]
+    assert [seasoned(*ends) is None for ends in asked] == [contact is None for contact in fresh]
+    again = [seasoned(*ends) for ends in reversed(asked)][::-1]
+    assert [contact is None for contact in again] == [contact is None for contact in fresh]
+    assert any(a != b for a, b in zip(again, fresh, strict=True))  # it does remember
+    for ends, contact in zip(asked, again, strict=True):
+        if contact is not None:
+            states = ends[0] + np.linspace(0.0, 1.0, 400)[:, None] * (ends[1] - ends[0])
+            names = [check for check in slow._checks if check.contact == contact]
+            met = (ask_fcl(check, poses) for poses in link_poses(UR3, states) for check in names)
+            assert any(met)
+
+
+def test_segments_of_no_length_and_no_number() -> None:
+    """A segment that does not move is its state; angles that are no numbers are refused; a long one is judged whole."""
+    fast, slow = scene(FastChecker), scene(CellChecker)
+    assert isinstance(fast, FastChecker)
+    for q in (CLEAR, CLEAR + np.array([0.0, 1.2, 0.0, 0.0, 0.0, 0.0])):
+        verdict = slow.contact(q, needle_may_touch_patient=False)
+        assert (fast.segment_contact(q, q) is None) == (verdict is None)
+    for spoiled in (np.full(6, np.nan), CLEAR * np.inf):
+        with pytest.raises(InputError, match="not finite"):
+            fast.segment_contact(CLEAR, spoiled)
+        with pytest.raises(InputError, match="not finite"):
+            fast.segment_contact(spoiled, CLEAR)
+    assert fast.segment_contact(CLEAR, CLEAR + np.array([2.0 * np.pi, 0, 0, 0, 0, 0])) is not None
 
 
 def test_pieces_that_are_never_asked_about_never_touch() -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from planning.robot.proof_kernels import farthest_from
+from planning.robot.surface_kernels import farthest_from
 
 Array = NDArray[np.float64]
 
@@ -29,6 +29,9 @@ SLACK_MM = 1e-6
 
 CENTRE_STEPS = 25
 """Of the walk to a ball's centre; how good it is decides how tight the ball is, never whether it encloses."""
+
+INSIDE = 1e-5
+"""By this share a prism within a cylinder is smaller still: more than the slack of any cylinder of 1 mm or more."""
 
 PRISM_SIDES = 24
 """Of the prism about a cylinder: 0.9 % fuller than it."""
@@ -119,6 +122,29 @@ def prism(radius_mm: float, length_mm: float) -> Array:
     ring = outer * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     half = length_mm / 2.0 + SLACK_MM
     return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
+
+
+def inscribed_prism(corners: Array) -> Array:
+    """Corners of a prism inside the cylinder that :func:`prism` gave the corners about, along z of any frame."""
+    middle, inside = corners.mean(axis=0), 1.0 - INSIDE
+    return np.asarray(middle + (corners - middle) * (2 * [inside * np.cos(np.pi / PRISM_SIDES)] + [inside]))
+
+
+class Neighbours(NamedTuple):
+    """The edges of a convex hull of n corners."""
+
+    degrees: NDArray[np.int64]
+    """Shape (n,): how many neighbours each corner has."""
+    rows: NDArray[np.int64]
+    """The neighbours of the first corner, of the second, and so on."""
+
+
+def neighbours(corners: Array) -> Neighbours:
+    """Which corners (n, 3) of a convex hull share an edge of its triangles; a corner within the hull has none."""
+    faces = ConvexHull(corners).simplices
+    edges = np.concatenate([np.roll(faces, turn, axis=1)[:, :2] for turn in range(3)])
+    pairs = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0).astype(np.int64)
+    return Neighbours(np.bincount(pairs[:, 0], minlength=len(corners)), pairs[:, 1])
 
 
 def halves(corners: Array) -> tuple[Array, Array]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,6 +13,7 @@ from planning.robot.cell import NEEDLE_IN_PATIENT, CellChecker, Contact, Met, re
 from planning.robot.kinematics import link_poses
 from planning.robot.neighbours import without_neighbours
 from planning.robot.proofs import Motion, Proofs, ask_fcl
+from planning.robot.segments import SegmentJudge
 from planning.robot.state_checker import PATIENT
 from planning.robot.sweep import SweptBodies
 from planning.robot.tool import Box, Tool
@@ -21,33 +21,6 @@ from planning.robot.ur import UrModel
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-
-FIRST_LEVELS, MORE_LEVELS = 4, 3
-"""How often a segment is halved in the first call of the compiled code, and in each one that follows."""
-
-LOOK_FIRST_RAD = 0.125
-"""States of a segment so far apart are judged before it is proven: what it touches is found soonest so."""
-
-UNRELATED_MM = 1e9
-"""Motion between states of which none says anything about another."""
-
-FINE_MM = 1.0
-"""A state answers for a part of a segment within which no body moves farther from it. So states that were judged are no
-more than 2 mm of motion apart, which with 1 mm of padding proves the way between them (see :class:`CellChecker`)."""
-
-
-def _heap(levels: int) -> Array:
-    """The middle of a part, of its halves, of their halves ...: shape (2^levels - 1,), from -1 to 1 over the part."""
-    return np.concatenate([(2.0 * np.arange(2**level) + 1.0) / 2**level - 1.0 for level in range(levels)])
-
-
-HEAPS = {levels: _heap(levels) for levels in (FIRST_LEVELS, MORE_LEVELS)}
-
-
-def halving_order(count: int) -> Array:
-    """0, 1/n, 2/n ... (n - 1)/n in an order that spreads over the whole at once (van der Corput's), shape (n,)."""
-    order = np.argsort([int(f"{n:032b}"[::-1], 2) for n in range(count)], kind="stable")
-    return np.asarray(order / max(1, count))
 
 
 class FastChecker(CellChecker):
@@ -108,40 +81,16 @@ class FastChecker(CellChecker):
         return None
 
     def segment_contact(self, start: Array, end: Array) -> Contact | None:
-        """A contact on the straight joint segment between two states, the needle being outside the patient; or None.
-
-        All of the segment is proven clear but for parts within which no body moves farther than ``FINE_MM`` from a
-        state at which FCL found nothing. The ends themselves are not looked at beyond that.
-
-        Args:
-            start: Shape (6,), rad.
-            end: The same.
+        """A contact on the straight joint segment between states (6,), rad; None if free. See :class:`SegmentJudge`.
 
         Raises:
             InputError: If a state is not finite.
         """
-        step = np.asarray(end) - start
-        require_finite(step)
-        shares = halving_order(math.ceil(float(np.linalg.norm(step)) / LOOK_FIRST_RAD))[:, None]
-        apart = UNRELATED_MM * np.ones((1, 7)) * np.arange(len(shares))[:, None]
-        looked = Motion(link_poses(self.model, end - shares * step), apart, apart[:, 1:])
-        met = self._first_met(looked, self._masks[False])
-        if met is not None:
-            return met.contact
-        middles, half = np.array([0.5]), 0.5
-        unproven, levels = np.ones((1, len(self._asked)), np.bool_), FIRST_LEVELS
-        while len(middles):
-            shares = middles[:, None] + half * HEAPS[levels]
-            frames = link_poses(self.model, start + shares[..., None] * step)
-            left = self._proofs.bisect(frames, half * np.abs(step), unproven, FINE_MM)
-            for part, node, check in left.questions.tolist():
-                if ask_fcl(self._asked[check], frames[part, node]):
-                    return self._asked[check].contact
-            half /= 2**levels
-            finer = middles[:, None] + half * (2 * np.arange(2**levels) + 1 - 2**levels)
-            still = left.unproven.any(axis=2)
-            middles, unproven, levels = finer[still], left.unproven[still], MORE_LEVELS
-        return None
+        return self.segment_judge()(start, end)
+
+    def segment_judge(self) -> SegmentJudge:
+        """A judge of many segments, which remembers what touched last."""
+        return SegmentJudge(self.model, self._asked, self._proofs)
 
     def open_checks(self, q: Array, *, needle_may_touch_patient: bool) -> list[Contact]:
         """The questions at ``q`` (6,) that are left to FCL."""

@@ -75,10 +75,10 @@ def _clear_all_over(model: UrModel, proofs: Proofs, touches: Judge, joint: int, 
         q, turns = np.zeros((len(middles), 6)), np.zeros(6)
         q[:, joint : joint + 2], turns[joint : joint + 2] = middles, half
         frames = link_poses(model, q)
-        left = proofs.bisect(frames[:, None], turns, unproven, 0.0)
-        for square, _, check in left.questions.tolist():
+        left = proofs.clear_about(frames, turns, unproven)
+        for square, check in np.argwhere(left.touching).tolist():
             touching[check] = touching[check] or touches(check, frames[square])
-        still = left.unproven[:, 0] & ~touching
+        still = left.unproven & ~touching
         kept = still.any(axis=1)
         if not kept.any():
             break

@@ -15,8 +15,18 @@ from planning.mesh import TriangleMesh
 from planning.robot import enclosures, proof_kernels
 from planning.robot.bodies import Body
 from planning.robot.cell import Check
-from planning.robot.enclosures import BallTree, ball_tree, coarse_hull, enclosing_ball
+from planning.robot.enclosures import (
+    BallTree,
+    ball_tree,
+    coarse_hull,
+    enclosing_ball,
+    inscribed_prism,
+    neighbours,
+)
+from planning.robot.hull_kernels import Hulls
+from planning.robot.proof_kernels import Movers, Scene, Skin, scratch
 from planning.robot.shapes import touch
+from planning.robot.surface_kernels import CELL_MM
 from planning.robot.tool import Box
 from planning.robot.triangle_tree import TriangleTree
 from planning.robot.ur import UrModel
@@ -32,7 +42,7 @@ ROOM_FRAME = 0
 NO_BOX = -1.0
 """Half sizes of what is no box."""
 
-ENCLOSURES = 1
+ENCLOSURES = 2
 """Raised whenever what is kept about convex pieces is made in another way."""
 
 FIELD_MARGIN_MM = 500.0
@@ -41,8 +51,8 @@ FIELD_MARGIN_MM = 500.0
 MOST_CELLS = 4_000_000
 """Of that field (16 MB): a larger skin gets a narrower margin."""
 
-QUESTIONS = 1024
-"""Room for what one call leaves to a judge, at first."""
+ROUND = ("holder", "needle")
+"""Bodies that are cylinders: their hulls are prisms about them."""
 
 
 class Motion(NamedTuple):
@@ -53,13 +63,13 @@ class Motion(NamedTuple):
     turned: Array
 
 
-class Parts(NamedTuple):
-    """What :func:`proof_kernels.bisect` leaves open of some parts of a segment."""
+class Around(NamedTuple):
+    """What :meth:`Proofs.clear_about` leaves open."""
 
-    questions: Indices
-    """Shape (q, 3): part, node and check of what a judge must be asked."""
+    touching: Flags
+    """Shape (m, k): at the state itself a judge must be asked, and is likely to find that something touches."""
     unproven: Flags
-    """Shape (c, n + 1, k): the checks open in the parts below the last nodes."""
+    """Shape (m, k): the checks open about each state."""
 
 
 class Proofs:
@@ -92,24 +102,23 @@ class Proofs:
                 pair = (hulls.add(check.hulls[0], check.first_body), hulls.add(check.hulls[1], check.second_body))
                 row = (proof_kernels.PAIR, *pair, check.first_body.frame, frame)
             rows.append(row)
-        self._scene = (np.array(rows, dtype=np.int64), _skin(patient), balls, *hulls.packed(cache))
+        self.scene = Scene(np.array(rows, dtype=np.int64), _skin(patient), balls, *hulls.packed(cache))
         self._levers = np.array([_levers(model, check) for check in checks])
-        self._movers = _moving(checks)
-        self._axes = np.zeros((len(rows), 3))
+        self.movers = _moving(checks)
+        self._work = scratch(len(rows), len(self.scene.hulls.radii))
         self._proven = np.empty(len(rows))
         self.joint_spans = np.array([(row[0] == proof_kernels.PAIR, row[3], row[4]) for row in rows], dtype=np.int64)
-        self._questions = np.empty((QUESTIONS, 3), np.int64)
 
     def __len__(self) -> int:
         return len(self._proven)
 
     def drop(self, never: Flags) -> None:
         """Ask no more of some checks (k,): the others keep their order."""
-        kept, (mover, frame, centres, radii) = ~never, self._movers
-        self._scene = (self._scene[0][kept], *self._scene[1:])
+        kept = ~never
+        self.scene = self.scene._replace(checks=self.scene.checks[kept])
+        self.movers = self.movers._replace(of_check=self.movers.of_check[kept])
         self._levers, self.joint_spans = self._levers[kept], self.joint_spans[kept]
-        self._movers = (mover[kept], frame, centres, radii)
-        self._axes, self._proven = self._axes[kept].copy(), self._proven[kept].copy()
+        self._work, self._proven = scratch(int(kept.sum()), len(self.scene.hulls.radii)), self._proven[kept].copy()
 
     def first_unproven(
         self, motion: Motion, begin: int, asked: Flags, clear_mm: float = proof_kernels.MIN_GAP_MM
@@ -125,25 +134,20 @@ class Proofs:
         if begin == 0:
             self._proven.fill(-np.inf)
         at = divmod(begin, len(self._proven))
-        arguments = (self._scene, self._levers, tuple(motion), self._axes, self._proven, *at, asked, clear_mm)
+        arguments = (self.scene, self._levers, tuple(motion), self._work, self._proven, *at, asked, clear_mm)
         return int(proof_kernels.first_unproven(*arguments))
 
-    def bisect(self, frames: Array, turns: Array, open_checks: Flags, fine_mm: float) -> Parts:
-        """Prove parts of a straight segment clear, by their middles and the middles of their halves.
+    def clear_about(self, frames: Array, turns: Array, asked: Flags) -> Around:
+        """Prove checks clear all about some states.
 
         Args:
-            frames: Shape (c, n, 7, 4, 4), mm; see :func:`proof_kernels.bisect`.
-            turns: Shape (6,), rad.
-            open_checks: Shape (c, k): what is to be proven of each part.
-            fine_mm: Where a check's bodies move no farther, the middle decides.
+            frames: Shape (m, 7, 4, 4), mm: the states.
+            turns: Shape (6,), rad: how far each joint may turn either way from each of them.
+            asked: Shape (m, k): what is to be proven.
         """
-        parts, nodes = frames.shape[:2]
-        unproven = np.empty((parts, 2 * nodes + 1, len(self)), np.bool_)
-        unproven[:, 0] = open_checks
-        arguments = (self._scene, self._movers, frames, turns, unproven, fine_mm, self._axes)
-        while (asked := proof_kernels.bisect(*arguments, self._questions)) > len(self._questions):
-            self._questions = np.empty((2 * asked, 3), np.int64)
-        return Parts(self._questions[:asked].copy(), unproven[:, nodes:])
+        unproven, gaps = asked.copy(), np.full(asked.shape, np.inf)
+        proof_kernels.clear_about(self.scene, self.movers, frames, turns, self._work, gaps, unproven)
+        return Around(gaps <= 0.0, unproven)
 
 
 def ask_fcl(check: Check, frames: Array) -> bool:
@@ -171,8 +175,8 @@ def _levers(model: UrModel, check: Check) -> Array:
     return levers
 
 
-def _moving(checks: Sequence[Check]) -> tuple[Indices, Indices, Array, Array]:
-    """``movers`` of :func:`proof_kernels.bisect`: the piece that each check is about, or all of a body for the skin."""
+def _moving(checks: Sequence[Check]) -> Movers:
+    """The piece that each check is about, or all of a body for the skin."""
     rows: dict[int, int] = {}
     frames, balls, mover = [], [], []
     for check in checks:
@@ -185,7 +189,7 @@ def _moving(checks: Sequence[Check]) -> tuple[Indices, Indices, Array, Array]:
             balls.append(enclosing_ball(_in_frame(corners, body)))
         mover.append(rows[key])
     centres, radii = np.array([ball.centre for ball in balls]), np.array([ball.radius for ball in balls])
-    return np.array(mover, dtype=np.int64), np.array(frames, dtype=np.int64), centres, radii
+    return Movers(np.array(mover, dtype=np.int64), np.array(frames, dtype=np.int64), centres, radii)
 
 
 def _in_frame(corners: Array, body: Body) -> Array:
@@ -201,6 +205,8 @@ class _Hulls:
         self._boxes = list(boxes)
         self._names = {box.name: row for row, box in enumerate(boxes)}
         self._corners = [box.corners for box in boxes]
+        self._rounded = [False] * len(boxes)
+        self._frames = [ROOM_FRAME] * len(boxes)
 
     def box(self, name: str) -> int:
         """Row of the box of that name."""
@@ -211,33 +217,44 @@ class _Hulls:
         row = self._rows.setdefault(id(corners), len(self._corners))
         if row == len(self._corners):
             self._corners.append(_in_frame(corners, body))
+            self._rounded.append(body.name in ROUND)
+            self._frames.append(body.frame)
         return row
 
-    def packed(
-        self, cache: Cache
-    ) -> tuple[_Axes, _Axes, tuple[Indices, Array, Array, Indices, Array], tuple[Array, Array]]:
-        """``points``, ``coarse``, ``hulls`` and ``boxes`` of :func:`proof_kernels.hull_gap`."""
+    def packed(self, cache: Cache) -> tuple[Hulls, Array, Array]:
+        """``hulls``, ``T_box_base`` and ``halves`` of :class:`Scene`."""
         count = len(self._boxes)
         boxes, bodies = _enclosed(self._corners[:count]), self._corners[count:]
         arm = cache.arrays(made_from("hulls", bodies), lambda: _enclosed(bodies))
-        centres, radii, slack, sizes, few = (np.concatenate([boxes[key], arm[key]]) for key in boxes)
+        centres, radii, slack, sizes, few, degrees = (
+            np.concatenate([boxes[key], arm[key]]) for key in ("centres", "radii", "slack", "sizes", "few", "degrees")
+        )
+        neighbours = np.concatenate([boxes["neighbours"], arm["neighbours"] + sum(map(len, self._corners[:count]))])
         poses, halves = np.tile(np.eye(4), (len(self._corners), 1, 1)), np.full((len(self._corners), 3), NO_BOX)
         for row, box in enumerate(self._boxes):
             poses[row], halves[row] = np.linalg.inv(box.T_base_box), np.asarray(box.size_mm) / 2.0
-        starts = _starts([len(corners) for corners in self._corners])
-        hulls = (starts, centres, radii, _starts(sizes), slack)
-        return _axes(np.concatenate(self._corners)), _axes(few), hulls, (poses, halves)
+        corners, pieces = np.concatenate(self._corners), zip(self._corners, self._rounded, strict=True)
+        inner = np.concatenate([inscribed_prism(piece) if about else piece for piece, about in pieces])
+        starts, around = _starts([len(piece) for piece in self._corners]), np.array(self._rounded)
+        few_axes, frames = (_axes(few), _starts(sizes)), np.array(self._frames, dtype=np.int64)
+        links = (_starts(degrees), neighbours)
+        hulls = Hulls(_axes(corners), starts, *few_axes, slack, corners, inner, around, *links, centres, radii, frames)
+        return hulls, poses, halves
 
 
 def _enclosed(hulls: Sequence[Array]) -> Arrays:
     """Of each convex hull a ball about it and a coarse hull: their numbers, one array each."""
     balls, coarse = [enclosing_ball(corners) for corners in hulls], [coarse_hull(corners) for corners in hulls]
+    edges, first = [neighbours(corners) for corners in hulls], _starts([len(corners) for corners in hulls])
+    rows = [hull.rows + start for hull, start in zip(edges, first[:-1], strict=True)]
     return {
         "centres": np.array([ball.centre for ball in balls]).reshape(-1, 3),
         "radii": np.array([ball.radius for ball in balls]),
         "slack": np.array([hull.slack_mm for hull in coarse]),
         "sizes": np.array([len(hull.corners) for hull in coarse], dtype=np.int64),
         "few": np.concatenate([np.empty((0, 3)), *(hull.corners for hull in coarse)]),
+        "degrees": np.concatenate([np.empty(0, np.int64), *(hull.degrees for hull in edges)]),
+        "neighbours": np.concatenate([np.empty(0, np.int64), *rows]),
     }
 
 
@@ -259,22 +276,19 @@ def _axes(points: Array) -> _Axes:
     return x, y, z
 
 
-def _skin(patient: TriangleMesh | None) -> tuple[tuple[Array, Array, Array], NDArray[np.float32], Array]:
+def _skin(patient: TriangleMesh | None) -> Skin:
     """The skin's tree and its field, of which nothing is known yet; or some that no check asks for."""
     if patient is None:
-        return (
-            (np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 1, 3, 3))),
-            np.zeros((1, 1, 1), np.float32),
-            np.zeros(3),
-        )
+        nothing = (np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 1, 3, 3)))
+        return Skin(nothing, np.zeros((1, 1, 1), np.float32), np.zeros(3))
     tree, (low, high) = TriangleTree.of(patient), patient.bounds
     margin = FIELD_MARGIN_MM
-    while np.prod(cells := np.ceil((high - low + 2.0 * margin) / proof_kernels.CELL_MM).astype(np.int64)) > MOST_CELLS:
+    while np.prod(cells := np.ceil((high - low + 2.0 * margin) / CELL_MM).astype(np.int64)) > MOST_CELLS:
         margin = margin / 2.0 if margin > 1.0 else 0.0
         if margin == 0.0:
             cells = np.ones(3, np.int64)
             break
-    return (tree.lows, tree.highs, tree.corners), np.full(cells, np.nan, np.float32), low - margin
+    return Skin((tree.lows, tree.highs, tree.corners), np.full(cells, np.nan, np.float32), low - margin)
 
 
 def _tree_arrays(pieces: Sequence[Array]) -> Arrays:
