@@ -1,6 +1,8 @@
 """The command line: parses, calls, prints.
 
 Exit codes: 0 done, 1 done and the answer is no, 2 bad input, 3 the program failed.
+
+Commands that stand apart from the main job import what they need themselves: it would cost all others a second.
 """
 
 from __future__ import annotations
@@ -26,13 +28,8 @@ from planning.files import check_writable
 from planning.prepared import prepare
 from twin import main_job, words
 from twin.mirror import Mirror, connect, live_states, recorded_states
-from twin.papers import PAPERS
-from twin.place_job import place_case
 from twin.place_words import mirror_line, place_text
 from twin.report.progress import progress_display
-from twin.stereo.servo_job import run_servo
-from twin.ultrasound.selfcal_job import run_selfcal
-from twin.ultrasound.words import selfcal_text
 
 OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED = 0, 1, 2, 3
 
@@ -149,6 +146,8 @@ def place(
     as_json: JsonOption = False,
 ) -> None:
     """Find where the arm should stand to hold most of the organ-safe directions; write the placements and their map."""
+    from twin.place_job import place_case
+
     with progress_display() as progress:
         run = place_case(prepare(case, arm=False, watcher=progress), out_dir, jobs=jobs, pictures=pictures)
     _print(run.summary(), place_text(run), as_json)
@@ -234,6 +233,9 @@ def selfcal(
     as_json: JsonOption = False,
 ) -> None:
     """Let two arms calibrate themselves by ultrasound, AXP = YBQ, and send the needle to targets in the image."""
+    from twin.ultrasound.selfcal_job import run_selfcal
+    from twin.ultrasound.words import selfcal_text
+
     case = meshes_folder() / "selfcal" if case is None and recording is None else case
     with progress_display() as progress:
         run = run_selfcal(case, recording, seeds, out_dir, progress)
@@ -248,6 +250,8 @@ def servo(
     as_json: JsonOption = False,
 ) -> None:
     """Servo the tool onto every target by two cameras, in rooms whose truth is drawn; pictures, plot and page."""
+    from twin.stereo.servo_job import run_servo
+
     with progress_display() as progress:
         job = run_servo(case, out_dir, seeds, partial(progress.count, "seeds"))
     _print(job.summary, job.text, as_json)
@@ -257,12 +261,14 @@ def servo(
 
 @app.command()
 def reproduce(
-    paper: Annotated[str, typer.Argument(metavar="|".join(PAPERS), help="Which paper.")],
+    paper: Annotated[str, typer.Argument(metavar="chen2019|liu2007|axp-ybq", help="Which paper.")],
     out_dir: OutOption = Path("out"),
     seeds: Annotated[int | None, typer.Option("--seeds", min=1, help="How many draws, if any.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Print a paper's numbers beside ours; exit 0 only if every one holds."""
+    from twin.papers import PAPERS
+
     if paper not in PAPERS:
         raise InputError(f"paper '{paper}' is not known", where="reproduce", allowed=", ".join(PAPERS))
     result = PAPERS[paper](out_dir, seeds)

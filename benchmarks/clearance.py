@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import os
 import platform
-import resource
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -27,55 +27,62 @@ from planning.clearance.fcl_engine import FclEngine
 
 CAP_MM = 20.0
 SAMPLE, QUICK_SAMPLE = 300, 60
-REPEATS = 3
+ROUNDS = 6
 
 
-def best(work, repeats: int = REPEATS) -> float:
-    """Least time of one thread on the processor of a few runs, s: others share the machine; both sides alike."""
-    times = []
-    for _ in range(repeats):
-        start = time.thread_time()
-        work()
-        times.append(time.thread_time() - start)
-    return min(times)
+def took(work: Callable[[], object]) -> float:
+    """Time of one thread on the processor, s: others share the machine."""
+    start = time.thread_time()
+    work()
+    return time.thread_time() - start
+
+
+def rounds(scene: Scene, directions: np.ndarray, sample: int) -> dict[str, float]:
+    """Seconds of everybody for all directions, means over rounds in which all take their turn.
+
+    FCL is asked for another part of a random sample in each round, and its time scaled to all directions. So a
+    neighbour who comes or goes in between slows both sides alike.
+    """
+    chosen = np.random.default_rng(1).choice(len(directions), min(sample, len(directions)), replace=False)
+    engine, judge, objects = FastEngine(scene.meshes), FclEngine(scene.meshes), peers.trees(scene)
+    ask = (scene.target, directions, scene.length)
+    engine.measure(*ask)
+    engine.nearer_than(*ask, scene.thresholds)  # FCL's trees, where a tie asks for one
+    sums: dict[str, float] = {}
+    for part in np.array_split(directions[chosen], ROUNDS):
+        scale = len(directions) / len(part)
+        times = {
+            "build": took(lambda: FastEngine(scene.meshes)),
+            "exact": took(lambda: engine.measure(*ask)),
+            "capped": took(lambda: engine.measure_capped(*ask, CAP_MM)),
+            "verdicts": took(lambda: engine.nearer_than(*ask, scene.thresholds)),
+            "FCL build": took(lambda: FclEngine(scene.meshes)),
+            "FCL capsule": peers.fcl_capsule_distance(scene, part, objects) * scale,
+            "FCL triangle": took(lambda part=part: judge.measure(scene.target, part, scene.length)) * scale,
+            "FCL collide": peers.fcl_collide(scene, part, objects) * scale,
+        }
+        sums = {name: sums.get(name, 0.0) + seconds / ROUNDS for name, seconds in times.items()}
+    return sums
 
 
 def measure_scene(scene: Scene, sample: int, step_deg: float) -> None:
     """Print one scene's rows."""
     directions = scene.hemisphere(step_deg)
-    some = directions[np.random.default_rng(1).choice(len(directions), min(sample, len(directions)), replace=False)]
-    scale, ask = len(directions) / len(some), (scene.target, directions, scene.length)
-    build = best(lambda: FastEngine(scene.meshes))
-    engine = FastEngine(scene.meshes)
-    engine.measure(scene.target, some, scene.length)
-    exact = best(lambda: engine.measure(*ask))
-    capped = best(lambda: engine.measure_capped(*ask, CAP_MM))
-    engine.nearer_than(
-        scene.target, directions, scene.length, scene.thresholds
-    )  # FCL's trees, where a tie asks for one
-    verdict = best(lambda: engine.nearer_than(*ask, scene.thresholds))
-    fcl_build = best(lambda: FclEngine(scene.meshes), 1)
-    judge = FclEngine(scene.meshes)
-    segment = best(lambda: judge.measure(scene.target, some, scene.length), 2) * scale
-    capsule = peers.fcl_capsule_distance(scene, some) * scale
-    collide = peers.fcl_collide(scene, some) * scale
+    s = rounds(scene, directions, sample)
     sizes = f"{scene.triangles:,} triangles, {len(scene.meshes)} surfaces, {len(directions):,} directions"
     print(f"\n## {scene.name}: {sizes}")
     print("| ratio | search alone | end to end, building included |\n|---|---|---|")
-    for name, theirs in (("FCL distance, capsule", capsule), ("FCL distance, degenerate triangle", segment)):
-        print(f"| {name} / ours, exact | {theirs / exact:.0f}x | {(theirs + fcl_build) / (exact + build):.0f}x |")
-    print(
-        f"| FCL distance, capsule / ours, capped at {CAP_MM:g} mm | {capsule / capped:.0f}x | "
-        f"{(capsule + fcl_build) / (capped + build):.0f}x |"
-    )
-    both = (collide + fcl_build) / (verdict + build)
-    print(f"| FCL collide / ours, verdicts | {collide / verdict:.1f}x | {both:.1f}x |")
-    print(
-        f"seconds: build {build:.3f}, exact {exact:.3f}, capped {capped:.3f}, verdicts {verdict:.3f}; FCL build "
-        f"{fcl_build:.2f}, capsule {capsule:.1f}, segment {segment:.1f}, collide {collide:.1f} "
-        f"(FCL on {len(some)} random directions, scaled)"
-    )
-    peers.optional(scene, some)
+    for label, theirs, ours in (
+        ("FCL distance, capsule / ours, exact", "FCL capsule", "exact"),
+        ("FCL distance, degenerate triangle / ours, exact", "FCL triangle", "exact"),
+        (f"FCL distance, capsule / ours, capped at {CAP_MM:g} mm", "FCL capsule", "capped"),
+        ("FCL collide / ours, verdicts", "FCL collide", "verdicts"),
+    ):
+        both = (s[theirs] + s["FCL build"]) / (s[ours] + s["build"])
+        print(f"| {label} | {s[theirs] / s[ours]:.0f}x | {both:.0f}x |")
+    seconds = ", ".join(f"{name} {mean:.3f}" for name, mean in s.items())
+    print(f"seconds, mean of {ROUNDS} rounds: {seconds} (FCL on {sample} random directions in all, scaled)")
+    peers.optional(scene, directions[:: max(1, len(directions) // sample)])
 
 
 def compile_times() -> None:
@@ -102,10 +109,10 @@ def large(step_deg: float) -> None:
     directions, engine = scene.hemisphere(step_deg), FastEngine(scene.meshes)
     start = time.perf_counter()
     engine.measure(scene.target, directions, scene.length)
-    took = time.perf_counter() - start
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    seconds = time.perf_counter() - start
+    peak = int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) / 1024  # this program's alone
     print(
-        f"{step_deg:g} degree, {len(directions):,} directions, {scene.name}: {took:.2f} s, "
+        f"{step_deg:g} degree, {len(directions):,} directions, {scene.name}: {seconds:.2f} s, "
         f"peak memory of the process {peak:.0f} MB"
     )
 

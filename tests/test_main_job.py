@@ -170,7 +170,7 @@ def test_a_folder_that_only_looks_writable_is_refused(carton, capfd):
 
 def test_a_bug_is_exit_code_3(monkeypatch, capfd):
     """What nobody foresaw shows its traceback and the third code."""
-    monkeypatch.setattr("run_twin.PAPERS", {"chen2019": lambda *_: 1 / 0})
+    monkeypatch.setattr("twin.papers.PAPERS", {"chen2019": lambda *_: 1 / 0})
     assert main(["reproduce", "chen2019"]) == PROGRAM_FAILED
     assert "ZeroDivisionError" in capfd.readouterr().err
 
