@@ -1,8 +1,7 @@
 """Compiled kinematics of the UR arms: poses, all inverse branches, and the way of a branch along a needle.
 
 Plain loops over plain arrays, called by :mod:`planning.robot.kinematics` and :mod:`planning.robot.insertion`, which
-say what they compute and where it comes from. An arm is its lengths (d1, a2, a3, d4, d5, d6) in mm. All functions that
-call one another stand in this one file: numba's cache notices an edit only in the file of the function called.
+say what they compute and where it comes from. An arm is its lengths (d1, a2, a3, d4, d5, d6) in mm.
 """
 
 # mypy: disable-error-code="no-untyped-def"

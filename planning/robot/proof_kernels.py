@@ -1,8 +1,7 @@
 """Compiled proofs that parts of an arm are clear, check by check, at states and all about them.
 
 Each answer is a lower bound on a distance, in mm: above 0 it proves that nothing touches; at or below, nothing is said.
-The bounds themselves are those of :mod:`planning.robot.surface_kernels` and :mod:`planning.robot.hull_kernels`. Numba's
-cache does not notice an edit there: delete ``__pycache__`` after one.
+The bounds themselves are those of :mod:`planning.robot.surface_kernels` and :mod:`planning.robot.hull_kernels`.
 """
 
 # mypy: disable-error-code="no-untyped-def"

@@ -1,7 +1,7 @@
 """Compiled judgement of one straight joint segment: what surely touches, what is surely clear, and what is left to ask.
 
 It calls the kernels of :mod:`planning.robot.proof_kernels`, of those that they call and of
-:mod:`planning.robot.kernels`. Numba's cache does not notice an edit there: delete ``__pycache__`` after one.
+:mod:`planning.robot.kernels`.
 """
 
 # mypy: disable-error-code="no-untyped-def"

@@ -5,9 +5,6 @@ triangle a, b, c at 1/z = d.((b - a) x (c - a)) / a.(b x c), and lies inside whe
 agree in sign. That is linear in x and y, also for triangles that reach behind the eye, and two triangles compute the
 same number, but for its sign, at an edge that they share: no sample falls between them. (Olano and Greer, "Triangle
 scan conversion using 2D homogeneous coordinates", Graphics Hardware 1997.)
-
-All functions that call one another stand in this one file: numba's cache notices an edit only in the file of the
-function called.
 """
 
 # numba infers the types
