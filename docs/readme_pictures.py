@@ -6,16 +6,14 @@ from pathlib import Path
 from PIL import Image
 
 WIDTH = 1200
-COLOURS = 200
 
 
 def main(demo: Path) -> None:
-    """Write docs/map.png and docs/scene.png from a demo's folder."""
+    """Write docs/map.png and docs/scene.png from a demo's folder; all colours stay, for a legend names them."""
     for name in ("map.png", "scene.png"):
         picture = Image.open(demo / name).convert("RGB")
         height = round(picture.height * WIDTH / picture.width)
-        small = picture.resize((WIDTH, height), Image.Resampling.LANCZOS).quantize(COLOURS)
-        small.save(Path(__file__).with_name(name), optimize=True)
+        picture.resize((WIDTH, height), Image.Resampling.LANCZOS).save(Path(__file__).with_name(name), optimize=True)
 
 
 if __name__ == "__main__":
