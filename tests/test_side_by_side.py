@@ -38,13 +38,15 @@ def _frames(rng, count):
 def _triangles(rng, axes, kind):
     """Triangles of one kind, placed along their axes; corners one after the other."""
     depths = {"beside": (5, 75), "pierced": (5, 75), "beyond": (85, 160), "behind": (-60, -5)}.get(kind, (-40, 120))
-    size = 40.0 if kind == "anywhere" else 2.0
+    size = 40.0 if kind in ("anywhere", "along") else 2.0
     along = rng.uniform(*depths, len(axes))
     corners = rng.normal(0.0, size, (len(axes), 3, 3)) + (along[:, None] * axes[:, 0])[:, None]
     if kind == "beyond":  # never back below the top
         corners += (
             np.maximum(0.0, LENGTH + 1.0 - np.einsum("ncj,nj->nc", corners, axes[:, 0]))[..., None] * axes[:, None, 0]
         )
+    if kind == "along":  # the axis runs in the triangle's plane
+        corners -= np.einsum("ncj,nj->nc", corners, axes[:, 1])[..., None] * axes[:, None, 1]
     if kind == "pierced":
         corners -= corners.mean(axis=1, keepdims=True) - (along[:, None] * axes[:, 0])[:, None]
     if kind == "degenerate":
@@ -54,7 +56,7 @@ def _triangles(rng, axes, kind):
     return corners.reshape(-1, 9)
 
 
-@pytest.mark.parametrize("kind", ["anywhere", "beside", "pierced", "beyond", "behind", "degenerate"])
+@pytest.mark.parametrize("kind", ["anywhere", "beside", "pierced", "beyond", "behind", "degenerate", "along"])
 def test_pairs_answer_what_one_triangle_answers(kind):
     """Beside, pierced, beyond the top, behind the target, anywhere, degenerate: the same distance and depth."""
     rng = np.random.default_rng(7)

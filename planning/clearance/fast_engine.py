@@ -24,6 +24,9 @@ Progress = Callable[[int, int], None]
 COORDINATE_SLACK = 1e-6
 """Share of a coordinate by which float32 arithmetic of a few terms may err: 8 times its rounding."""
 
+LONGEST_MM = 1e9
+"""A needle that could reach the nodes that only fill a level up would be measured from them."""
+
 NEAR_THRESHOLD_MM = 1e-4
 """Within this of a threshold FCL's capsule collision decides: its own tolerance is 1e-6 mm."""
 
@@ -90,6 +93,8 @@ class FastEngine:
             threshold: One number or shape (k,), mm: needle radius plus margin; -inf asks nothing of a structure.
         """
         thresholds = np.broadcast_to(np.asarray(threshold, dtype=np.float64), len(self._meshes))
+        if np.isnan(thresholds).any():
+            raise InputError("a threshold is not a number", where="clearance", allowed="mm, or -inf to ask nothing")
         cap, enough = thresholds + 2 * NEAR_THRESHOLD_MM, thresholds - NEAR_THRESHOLD_MM
         distance = self._search(target_ct, outward_ct, length, cap=cap, enough=enough).distance
         verdicts = distance < thresholds
@@ -112,7 +117,7 @@ class FastEngine:
     ) -> AxisDistances:
         target = np.ascontiguousarray(target, dtype=np.float64)
         outward = np.ascontiguousarray(outward, dtype=np.float64).reshape(-1, 3)
-        if not (np.isfinite(target).all() and np.isfinite(outward).all() and 0.0 <= length < np.inf):
+        if not (np.isfinite(target).all() and np.isfinite(outward).all() and 0.0 <= length <= LONGEST_MM):
             raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
         shape = (len(self._meshes), len(outward))
         caps, enoughs = (np.broadcast_to(np.asarray(x, dtype=np.float64), shape[:1]) for x in (cap, enough))

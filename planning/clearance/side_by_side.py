@@ -54,6 +54,7 @@ def measure_beside(pairs, count, length):  # type: ignore[no-untyped-def]  # num
         x, y = (wa * ax + wb * bx + wc * cx) * share, (wa * ay + wb * by + wc * cy) * share
         pierced = (wa * ta + wb * tb + wc * tc) * share
         met = around & (x * x + y * y < CONTACT_MM * CONTACT_MM) & (pierced >= 0.0) & (pierced <= length)
+        met &= best >= CONTACT_MM  # else the axis may run along the triangle's plane and meet it earlier
         best = ASK if around | outside | (best < CONTACT_MM) else best
         best = BEYOND if (ta > length) & (tb > length) & (tc > length) else best
         pairs[9, k], pairs[10, k] = 0.0 if met else best, pierced if met else depth
