@@ -14,6 +14,7 @@ Files outside the project are left to numba.
 from __future__ import annotations
 
 import hashlib
+import re
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,9 @@ config: Any = numba_config
 PROJECT = Path(__file__).resolve().parents[1]
 PACKAGES = ("planning", "twin")
 
+IMPORTED = re.compile(rb"^ *(?:from|import) ((?:planning|twin)[\w.]*)", re.MULTILINE)
+"""The module of an import from the project."""
+
 NUMBAS = (
     "UserProvidedCacheLocator",
     "InTreeCacheLocator",
@@ -39,13 +43,22 @@ NUMBAS = (
 
 @cache
 def kernels_stamp() -> str:
-    """A hash of every source file of the project that speaks of numba."""
+    """A hash of every source file of the project that speaks of numba, and of all that they import from the project.
+
+    What they import counts too: numba freezes a constant into the kernel that names it.
+    """
+    sources = {path: path.read_bytes() for package in PACKAGES for path in (PROJECT / package).rglob("*.py")}
+    waiting = [path for path, source in sources.items() if b"numba" in source]
+    taken: set[Path] = set()
+    while waiting:
+        path = waiting.pop()
+        if path not in taken and path in sources:
+            taken.add(path)
+            named = (PROJECT / name.decode().replace(".", "/") for name in IMPORTED.findall(sources[path]))
+            waiting += [file for module in named for file in (module.with_suffix(".py"), module / "__init__.py")]
     stamp = hashlib.sha256()
-    for package in PACKAGES:
-        for path in sorted((PROJECT / package).rglob("*.py")):
-            source = path.read_bytes()
-            if b"numba" in source:
-                stamp.update(str(path.relative_to(PROJECT)).encode() + hashlib.sha256(source).digest())
+    for path in sorted(taken):
+        stamp.update(str(path.relative_to(PROJECT)).encode() + hashlib.sha256(sources[path]).digest())
     return stamp.hexdigest()
 
 

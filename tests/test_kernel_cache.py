@@ -10,7 +10,10 @@ import pytest
 
 import planning
 
-CALLEE = "import numba as nb\n\n@nb.njit(cache=True, forceinline=True)\ndef rule(x):\n    return x + {}\n"
+CALLEE = (
+    "import numba as nb\nfrom planning.room import SIZE\n\n"
+    "@nb.njit(cache=True, forceinline=True)\ndef rule(x):\n    return x + {} * SIZE\n"
+)
 CALLER = (
     "import numba as nb\nfrom planning.callee import rule\n\n@nb.njit(cache=True)\ndef judge(x):\n    return rule(x)\n"
 )
@@ -36,11 +39,16 @@ def test_an_edit_of_a_kernel_that_is_taken_in_reaches_its_callers(tmp_path, own)
     for name in ("__init__.py", "kernel_cache.py"):
         shutil.copy(Path(planning.__file__).parent / name, folder)
     (folder / "caller.py").write_text(CALLER)
+    (folder / "room.py").write_text("SIZE = 1\n")
     (folder / "callee.py").write_text(CALLEE.format(1))
     assert _answer(tmp_path, own) == (2, 0)
     assert _answer(tmp_path, own) == (2, 1)
     (folder / "callee.py").write_text(CALLEE.format(10))
     assert _answer(tmp_path, own) == ((11, 0) if own else (2, 1))
+    (folder / "room.py").write_text("SIZE = 2\n")
+    assert _answer(tmp_path, own) == ((21, 0) if own else (2, 1))
+    (folder / "beside.py").write_text("SIZE = 3\n")  # no kernel names it
+    assert _answer(tmp_path, own) == ((21, 1) if own else (2, 1))
 
 
 def test_kernels_of_others_are_left_to_numba(tmp_path):
