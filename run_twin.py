@@ -45,7 +45,14 @@ EngineOption = Annotated[str, typer.Option("--engine", help="Who measures cleara
 PicturesOption = Annotated[
     bool, typer.Option("--pictures/--no-pictures", help="Whether to draw the map, the scene and the page.")
 ]
-ArmOption = Annotated[bool, typer.Option("--arm/--no-arm", help="Whether the arm must be able to hold a candidate.")]
+ArmOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--arm/--no-arm",
+        help="Whether the arm must be able to reach a candidate.",
+        show_default="where the case says where its base is",
+    ),
+]
 
 
 @app.callback(invoke_without_command=True)
@@ -65,7 +72,7 @@ def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> 
 def search(
     case: CaseArgument,
     out_dir: OutOption = Path("out"),
-    arm: ArmOption = True,
+    arm: ArmOption = None,
     pictures: PicturesOption = True,
     engine: EngineOption = "fast",
     check_again: Annotated[int, typer.Option("--cross-check", min=0, help="Directions that FCL measures again.")] = 0,
@@ -102,7 +109,7 @@ def check(
     case: CaseArgument,
     theta: Annotated[float, typer.Option("--theta", min=0, max=180, help="Puncture angle, degrees.")],
     beta: Annotated[float, typer.Option("--beta", min=0, max=360, help="Azimuth, degrees.")],
-    arm: ArmOption = True,
+    arm: ArmOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Explain one candidate in full."""
@@ -212,7 +219,7 @@ def batch(
     cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case files or folders.")],
     out_dir: OutOption = Path("out/batch"),
     jobs: Annotated[int, typer.Option("--jobs", min=1, help="Processes.")] = 1,
-    arm: ArmOption = True,
+    arm: ArmOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Search many cases; one that fails does not stop the others."""

@@ -31,14 +31,16 @@ COLUMNS = (
 """Columns of ``batch.csv``."""
 
 
-def run_batch(cases: Sequence[Path], out: Path, *, jobs: int, arm: bool, watcher: Watcher) -> list[dict[str, Any]]:
+def run_batch(
+    cases: Sequence[Path], out: Path, *, jobs: int, arm: bool | None, watcher: Watcher
+) -> list[dict[str, Any]]:
     """Search every case; write ``0001/candidates.parquet`` and so on, and ``batch.csv`` for all.
 
     Args:
         cases: Case files or folders.
         out: Folder for the results.
         jobs: Processes; each case runs in one.
-        arm: Whether the arm is asked too.
+        arm: Whether the arm is checked too, see `prepare`.
         watcher: Whoever shows progress, in cases.
 
     Returns:
@@ -70,7 +72,7 @@ def _failed(path: Path, error: BaseException) -> dict[str, Any]:
     return row | {"case": str(path), "directions": 0, "safe": 0, "exit_code": 3, "said": " ".join(said.split())}
 
 
-def search_one(path: Path, out: Path, arm: bool) -> dict[str, Any]:
+def search_one(path: Path, out: Path, arm: bool | None) -> dict[str, Any]:
     """Search one case and write its table; a refusal becomes a row."""
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
     row |= {"case": str(path), "folder": out.name, "directions": 0, "safe": 0}
@@ -86,4 +88,5 @@ def search_one(path: Path, out: Path, arm: bool) -> dict[str, Any]:
         return row | {"exit_code": 1, "said": "no safe candidate"}
     best = int(found.ranked[0])
     angles = {"best_theta_deg": np.degrees(found.theta[best]), "best_beta_deg": np.degrees(found.beta[best])}
-    return row | {"exit_code": 0, "said": "done"} | {key: float(value) for key, value in angles.items()}
+    said = "done" if found.arm_checked else f"done for the organs; arm {found.arm}"
+    return row | {"exit_code": 0, "said": said} | {key: float(value) for key, value in angles.items()}

@@ -12,6 +12,9 @@ from planning.reasons import Reason
 
 Floats = NDArray[np.float64]
 
+ARM_CHECKED = "checked"
+"""What ``Candidates.arm`` says where a safe candidate is one that the arm can reach and insert along."""
+
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
@@ -42,6 +45,7 @@ class Candidates:
         cost: Shape (n,), NaN for rejected candidates.
         rank: Shape (n,), 1 is best, 0 for rejected candidates.
         pareto: Shape (n,), on the Pareto front of the cost's terms.
+        arm: `ARM_CHECKED`, or "not checked: " and why: then a safe candidate is safe for the organs alone.
     """
 
     theta: Floats
@@ -66,6 +70,7 @@ class Candidates:
     cost: Floats
     rank: NDArray[np.int32]
     pareto: NDArray[np.bool_]
+    arm: str = "not checked"
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -80,6 +85,16 @@ class Candidates:
     def safe(self) -> NDArray[np.bool_]:
         """Which rows are not rejected, shape (n,)."""
         return self.reason == Reason.NONE.value
+
+    @property
+    def arm_checked(self) -> bool:
+        """Whether "safe" includes the arm."""
+        return self.arm == ARM_CHECKED
+
+    @property
+    def safe_text(self) -> str:
+        """What a person reads for a safe candidate: never "safe" alone where the arm was not checked."""
+        return "safe" if self.arm_checked else "safe for the organs"
 
     @property
     def ranked(self) -> NDArray[np.int64]:

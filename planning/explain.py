@@ -33,7 +33,7 @@ class Explanation:
 
     @property
     def verdict(self) -> str:
-        """``safe`` or ``rejected``."""
+        """``safe`` or ``rejected``; for the organs alone where ``candidates.arm`` says that the arm was not checked."""
         return "safe" if self.safe else "rejected"
 
     def clearances(self) -> dict[str, float]:
@@ -48,6 +48,7 @@ class Explanation:
             "theta_deg": float(np.degrees(row.theta[0])),
             "beta_deg": float(np.degrees(row.beta[0])),
             "verdict": self.verdict,
+            "arm": row.arm,
             "reason": str(row.reason[0]),
             "reason_structure": str(row.reason_structure[0]),
             "reason_depth_mm": finite(row.reason_depth[0]),
@@ -68,7 +69,8 @@ class Explanation:
     def text(self) -> str:
         """The same for a person."""
         row = self.candidates
-        head = f"theta {np.degrees(row.theta[0]):g} deg, beta {np.degrees(row.beta[0]):g} deg: {self.verdict}"
+        verdict = row.safe_text if self.safe else self.verdict
+        head = f"theta {np.degrees(row.theta[0]):g} deg, beta {np.degrees(row.beta[0]):g} deg: {verdict}"
         return "\n".join(
             [f"case {self.case.name}", head, *self._reason(), *self._path(), *self._table(), *self._rest()]
         )
@@ -105,9 +107,15 @@ class Explanation:
         return lines
 
     def _rest(self) -> list[str]:
-        asked = {-1: "not asked", 0: "no", 1: f"yes, margin {self.candidates.reach_margin[0]:.2f}"}
-        lines = [f"  arm can hold it: {asked[int(self.candidates.reachable[0])]}"]
-        return lines + [f"  warning: {warning}" for warning in self.anatomy.warnings]
+        return [f"  {self._arm()}", *(f"  warning: {warning}" for warning in self.anatomy.warnings)]
+
+    def _arm(self) -> str:
+        row = self.candidates
+        if not row.arm_checked:
+            return f"arm {row.arm}"
+        no_need = "not computed, the organs reject the direction"
+        reached = {-1: no_need, 0: "no", 1: f"yes, margin {row.reach_margin[0]:.2f}"}
+        return f"arm reaches it: {reached[int(row.reachable[0])]}"
 
 
 def reason_text(candidates: Candidates, row: int) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from planning.anatomy import Anatomy, load_anatomy
 from planning.cache import user_cache
-from planning.candidates import Candidates
+from planning.candidates import ARM_CHECKED, Candidates
 from planning.case import Case, load_case
 from planning.clearance.cross_check import CrossChecked, cross_check
 from planning.clearance.engine import ClearanceEngine
@@ -29,6 +29,9 @@ from planning.stages import Stages
 
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
 """Who measures clearance: the fast exact engine, or FCL alone as the plain reference."""
+
+NO_BASE = "the case does not say where the robot's base is"
+ALLOWED_BASE = "[registration] with markers_ct and markers_base, or [robot.mount]; or a check without the arm"
 
 
 class Watcher(Protocol):
@@ -71,10 +74,17 @@ class Prepared:
     watcher: Watcher
     stages: Stages
 
+    @property
+    def arm(self) -> str:
+        """Whether the arm is checked, and if not, why: see `Candidates.arm`."""
+        if self.reach is not None:
+            return ARM_CHECKED
+        return f"not checked: {NO_BASE if self.placement is None else 'switched off (--no-arm)'}"
+
     def search(self) -> Candidates:
         """Judge the case's whole grid."""
         with self.stages.time("search"):
-            return search(
+            found = search(
                 self.case,
                 self.anatomy,
                 self.engine,
@@ -82,11 +92,13 @@ class Prepared:
                 reach=self.reach,
                 progress=partial(self.watcher.count, "arm"),
             )
+        return replace(found, arm=self.arm)
 
     def check(self, theta: float, beta: float) -> Candidates:
         """Judge a single direction (rad)."""
         directions = one_direction(self.case, theta, beta)
-        return search(self.case, self.anatomy, self.engine, directions, reach=self.reach)
+        found = search(self.case, self.anatomy, self.engine, directions, reach=self.reach)
+        return replace(found, arm=self.arm)
 
     def cross_check(self, count: int) -> CrossChecked:
         """Measure random directions of the grid again with FCL.
@@ -109,21 +121,25 @@ class Prepared:
             "version": version("puncture-twin"),
             "seed": self.case.rehearsal.seed,
             "step_deg": float(np.degrees(self.case.search.step)),
+            "arm": self.arm,
             "warnings": list(self.anatomy.warnings),
         }
 
 
-def prepare(path: Path | str, *, arm: bool = True, engine: str = "fast", watcher: Watcher | None = None) -> Prepared:
+def prepare(
+    path: Path | str, *, arm: bool | None = None, engine: str = "fast", watcher: Watcher | None = None
+) -> Prepared:
     """Read a case and everything that it names.
 
     Args:
         path: Case file, or the folder that holds ``case.toml``.
-        arm: Whether the arm is asked too, where the case says where it stands.
+        arm: Whether the arm is checked too; None checks it where the case says where its base is.
         engine: A name of `ENGINES`.
         watcher: Whoever shows progress.
 
     Raises:
-        InputError: Anything in the case that cannot be used, or an unknown engine.
+        InputError: Anything in the case that cannot be used, an unknown engine, or an arm that is to be checked in a
+            case that does not say where its base is.
     """
     if engine not in ENGINES:
         raise InputError(f"engine '{engine}' is not known", where="--engine", allowed=", ".join(ENGINES))
@@ -132,6 +148,8 @@ def prepare(path: Path | str, *, arm: bool = True, engine: str = "fast", watcher
     with stages.time("case"):
         case = load_case(path)
         placement = load_placement(case)
+    if arm and placement is None:
+        raise InputError(f"the arm is to be checked, but {NO_BASE}", where=case.path, allowed=ALLOWED_BASE)
     with stages.time("anatomy"):
         anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), user_cache())
         anatomy = replace(anatomy, warnings=(*anatomy.warnings, *check_consistency(case, anatomy, placement)))
@@ -139,6 +157,6 @@ def prepare(path: Path | str, *, arm: bool = True, engine: str = "fast", watcher
         meshes = [structure.mesh for structure in anatomy.structures]
         measurer = ENGINES[engine](meshes, partial(watcher.count, "directions"))
         reach = None
-        if arm and placement is not None:
+        if arm is not False and placement is not None:
             reach = Reach(case_checker(case, anatomy, placement.T_base_ct), placement.T_base_ct)
     return Prepared(case, anatomy, placement, measurer, reach, watcher, stages)

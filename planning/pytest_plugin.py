@@ -12,7 +12,7 @@ A file holds one or many::
     structure = "rib_right"           # optional: the structure that the reason names
     clearance_mm = { aorta = 41.2 }   # optional, within tolerance_mm
     tolerance_mm = 0.1                # optional, 0.01 if left out
-    arm = false                       # optional: judge the organs alone (the default)
+    arm = false                       # optional: check the organs alone (the default); true fails without a base
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def _judge(config: pytest.Config, path: Path, check: CheckSection) -> Explanation:
     cases, key = config.stash[PREPARED], (path.resolve(), check.arm)
     if key not in cases:
-        cases[key] = prepare(path, arm=check.arm)
+        cases[key] = prepare(path, arm=check.arm)  # True refuses a case that does not say where the base is
     prepared = cases[key]
     found = prepared.check(np.radians(check.theta_deg), np.radians(check.beta_deg))
     return Explanation(prepared.case, prepared.anatomy, found)

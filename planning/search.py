@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.anatomy import Anatomy
-from planning.candidates import Candidates
+from planning.candidates import ARM_CHECKED, Candidates
 from planning.case import Case
 from planning.clearance.engine import ClearanceEngine
 from planning.clearance.measure import measure
@@ -139,6 +139,7 @@ def with_reach(case: Case, found: Candidates, reach: Reach, progress: Progress |
         reason_depth=depth,
         reachable=reachable,
         reach_margin=margin,
+        arm=ARM_CHECKED,
     )
 
 

@@ -78,6 +78,7 @@ def make_candidates(case, *, step_deg=5.0, theta_deg=(0, 90), beta_deg=(0, 360),
         cost=np.where(good, 0.1 * rank, np.nan),
         rank=rank,
         pareto=(rank > 0) & (rank < 4),
+        arm="checked",
     )
 
 

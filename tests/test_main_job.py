@@ -126,8 +126,56 @@ def test_check_explains_a_refusal(carton, capfd):
     assert "rejected" in said
     assert "too_close (bolt_h) at" in said
     assert "-1.00 mm clearance" in said
-    for line in ("skin entry", "path length", "skin angle", "standoff", "bolt_l", "arm can hold it"):
+    for line in ("skin entry", "path length", "skin angle", "standoff", "bolt_l", "arm reaches it"):
         assert line in said
+
+
+@pytest.fixture
+def without_base(carton, tmp_path):
+    """The carton, in a case that does not say where the robot's base is."""
+    other = tmp_path / "without_base"
+    shutil.copytree(carton.parent, other)
+    text = (other / "case_m.toml").read_text()
+    start, end = text.index("[registration]"), text.index("[robot]")
+    (other / "case_m.toml").write_text(text[:start] + text[end:])
+    return other / "case_m.toml"
+
+
+NO_BASE = "not checked: the case does not say where the robot's base is"
+
+
+@pytest.mark.parametrize("switch", [[], ["--no-arm"]])
+def test_a_case_without_a_base_is_safe_for_the_organs_only(without_base, switch, tmp_path, capfd):
+    """Search and check name the arm that was not checked, in text and in JSON; nothing reads "safe" alone."""
+    candidate = ["check", without_base, "--theta", 0, "--beta", 0, *switch]
+    code, found = run(capfd, *candidate)
+    assert (code, found["verdict"], found["arm"]) == (OK, "safe", NO_BASE)
+    main([str(word) for word in candidate])
+    said = capfd.readouterr().out
+    assert "theta 0 deg, beta 0 deg: safe for the organs\n" in said
+    assert f"arm {NO_BASE}" in said
+    search = ["search", without_base, "--out", tmp_path / "out", "--no-pictures", *switch]
+    assert run(capfd, *search)[1]["arm"] == NO_BASE
+    main([str(word) for word in search])
+    said = capfd.readouterr().out
+    assert "  safe for the organs\n" in said
+    assert f"arm {NO_BASE}" in said
+
+
+def test_an_arm_that_was_switched_off_is_named(carton, capfd):
+    """--no-arm on a case that says where the base is: the verdict is for the organs, and why is said."""
+    code, found = run(capfd, "check", carton, "--theta", 0, "--beta", 0, "--no-arm")
+    assert (code, found["arm"]) == (OK, "not checked: switched off (--no-arm)")
+
+
+@pytest.mark.parametrize("command", [["search"], ["check", "--theta", "0", "--beta", "0"]])
+def test_an_arm_that_is_asked_for_must_have_a_base(without_base, command, capfd):
+    """--arm typed for a case without a base: bad input, one line."""
+    assert main([*command, str(without_base), "--arm"]) == BAD_INPUT
+    said = capfd.readouterr()
+    assert said.out == ""
+    assert len(said.err.strip().splitlines()) == 1
+    assert "the arm is to be checked, but the case does not say where the robot's base is" in said.err
 
 
 def test_reproduce_holds(capfd):

@@ -1,5 +1,7 @@
 """Collision cases as pytest cases: collected, judged, and explained when they fail."""
 
+import shutil
+
 import pytest
 
 from meshes import folder
@@ -69,6 +71,26 @@ def test_a_check_without_a_case_is_an_error(pytester):
     result = run(pytester, GOOD.replace(f'case = "{CARTON}"', ""))
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(["*no case; allowed: case = FILE*"])
+
+
+@pytest.fixture
+def carton_without_base(tmp_path):
+    """The carton, in a case that does not say where the robot's base is."""
+    folder_ = tmp_path / "carton"
+    shutil.copytree(CARTON.parent, folder_)
+    text = (folder_ / "case_m.toml").read_text()
+    start, end = text.index("[registration]"), text.index("[robot]")
+    (folder_ / "case_m.toml").write_text(text[:start] + text[end:])
+    return folder_ / "case_m.toml"
+
+
+def test_a_check_of_the_arm_fails_where_the_case_does_not_say_where_it_is(pytester, carton_without_base):
+    """``arm = true`` never passes without an arm: the check fails with one line."""
+    text = GOOD.replace(str(CARTON), str(carton_without_base))
+    run(pytester, text).assert_outcomes(passed=1)
+    result = run(pytester, text.replace("[[check]]", "[[check]]\narm = true"))
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*the arm is to be checked, but the case does not say where the robot's base is*"])
 
 
 def test_the_fixture_judges_in_python(collision_check):

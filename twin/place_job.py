@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from planning.candidates import ARM_CHECKED
 from planning.case import mount_pose
 from planning.errors import NoAnswerError
 from planning.place.document import place_document, write_place_document, write_placements
@@ -54,7 +55,7 @@ def place_case(prepared: Prepared, out: Path, *, jobs: int, pictures: bool = Tru
             jobs=jobs,
             progress=prepared.watcher.count,
         )
-    document = place_document(found, prepared.provenance())
+    document = place_document(found, prepared.provenance() | {"arm": ARM_CHECKED})
     write_placements(found, out / "placements.csv")
     write_place_document(document, out / "place.json")
     files = [out / "placements.csv", out / "place.json"]

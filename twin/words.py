@@ -30,7 +30,9 @@ def rehearsal_text(run: Run) -> str:
 def _search(run: Run) -> list[str]:
     found = run.candidates
     lines = [f"case {run.prepared.case.name}: {len(found)} direction{'s' if len(found) != 1 else ''}"]
-    lines += [f"  {count:7d}  {reason}" for reason, count in found.counts().items()]
+    counts = ((found.safe_text if reason == "safe" else reason, count) for reason, count in found.counts().items())
+    lines += [f"  {count:7d}  {reason}" for reason, count in counts]
+    lines += [] if found.arm_checked else [f"arm {found.arm}"]
     return lines + (_best(run) if found.safe.any() else _nothing_safe(run))
 
 

@@ -182,8 +182,8 @@ def _marks(axes: Axes, view: MapView, candidates: Candidates) -> None:
 def _title(figure: Figure, case: Any, candidates: Candidates) -> None:
     figure.text(0.02, 0.955, f"{case.name}: entry directions to {target_words(case)}", fontsize=19, fontweight="bold")
     line = f"{len(candidates):,} directions, step {np.degrees(step_of(candidates)):g}°;  {needle_words(case)}"
-    if len(candidates) and np.all(candidates.reachable == -1):
-        line += ";  ARM NOT ASKED"
+    if not candidates.arm_checked:
+        line += ";  ARM NOT CHECKED"
     figure.text(0.02, 0.918, line, fontsize=12, color="0.25")
     figure.text(0.985, 0.012, "research software, not a medical device", fontsize=9, color="0.4", ha="right")
 
@@ -251,7 +251,7 @@ def _scale(axes: Axes, candidates: Candidates, y: float) -> float:
     axes.set_ylim(1, 0)
     axes.text(0.0, y + 0.05, number(low, 1, "mm"), fontsize=9.5, va="top")
     axes.text(1.0, y + 0.05, number(high, 1, "mm"), fontsize=9.5, va="top", ha="right")
-    axes.text(0.5, y + 0.05, "safe, by least clearance", fontsize=9.5, va="top", ha="center")
+    axes.text(0.5, y + 0.05, f"{candidates.safe_text}, by least clearance", fontsize=9.5, va="top", ha="center")
     return y + 0.06
 
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from planning.candidates import Candidates
 from planning.place.directions import ring_weights
-from planning.reasons import Reason
 from twin.report.map_view import step_of
 from twin.report.palette import REASON_COLOURS, REASON_WORDS, SAFE, Rgb, reason_of
 
@@ -44,11 +43,12 @@ def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
         here = candidates.reason == value
         reason = reason_of(str(value))
         colour = REASON_COLOURS.get(reason, SAFE)
+        words = REASON_WORDS[reason] if reason else candidates.safe_text
         share, solid = float(here.mean()), float(weights[here].sum() / weights.sum())
         count = int(here.sum())
-        lines.append(ReasonCount(REASON_WORDS[reason], reason.value or "safe", colour, count, share, solid))
+        lines.append(ReasonCount(words, reason.value or "safe", colour, count, share, solid))
     if not candidates.safe.any():
-        lines.append(ReasonCount(REASON_WORDS[Reason.NONE], "safe", SAFE, 0, 0.0, 0.0))
+        lines.append(ReasonCount(candidates.safe_text, "safe", SAFE, 0, 0.0, 0.0))
     return tuple(sorted(lines, key=lambda line: (line.code != "safe", -line.count)))
 
 
@@ -88,9 +88,9 @@ def percent(share: float) -> str:
 
 def arm_words(candidates: Candidates) -> str:
     """Whether "safe" includes the arm."""
-    if len(candidates) and np.all(candidates.reachable == -1):
-        return "the arm was not asked: “safe” speaks of the needle alone"
-    return "“safe” includes that the arm can hold and drive the needle"
+    if not candidates.arm_checked:
+        return f"arm {candidates.arm}; “safe” speaks of the needle and the organs alone"
+    return "“safe” includes that the arm can reach the direction and insert the needle"
 
 
 def target_words(case: Any) -> str:

@@ -87,7 +87,7 @@
     if (row < 0) { panel.textContent = "Point at the map."; return; }
     const code = map.codes[map.reason[row]], safe = code === "safe";
     add("div", `θ ${+map.theta[row].toFixed(3)}°, β ${+map.beta[row].toFixed(3)}°`);
-    add("b", safe ? `safe${map.rank[row] > 0 ? `, rank ${map.rank[row]}` : ""}` : `rejected: ${map.reasons[map.reason[row]]}`,
+    add("b", safe ? `${map.safe}${map.rank[row] > 0 ? `, rank ${map.rank[row]}` : ""}` : `rejected: ${map.reasons[map.reason[row]]}`,
       safe ? "verdict" : "verdict bad");
     if (!safe) {
       const structure = map.structures[map.structure[row]], [what, unit] = map.details[map.reason[row]];
@@ -102,7 +102,7 @@
     if (map.nearest[row] >= 0)
       add("div", `least clearance ${shown(map.clearance[row], 1, "mm")} (${words(map.structures[map.nearest[row]])})`);
     add("div", `path in the body ${shown(map.path[row], 1, "mm")}; skin angle ${shown(map.skin_angle[row], 0, "°")}`);
-    add("div", `arm: ${map.reachable[row] === 1 ? "can hold it" : map.reachable[row] === 0 ? "cannot hold it" : "not asked"}`);
+    add("div", `arm: ${map.reachable[row] === 1 ? "can reach it" : map.reachable[row] === 0 ? "cannot reach it" : map.arm === "checked" ? "not computed, the organs reject it" : map.arm}`);
   }
   const surface = document.getElementById("map");
   surface.addEventListener("mousemove", (event) => explain(rowAt(event)));

@@ -107,7 +107,11 @@ def _verdict(candidates: Candidates, plan: Any | None, rehearsal: Any | None) ->
             f"<p>All {len(candidates):,} directions are refused ({counts}).</p></div>"
         )
     cards = [
-        ("safe directions", f"{safe:,} of {len(candidates):,}", f"{100 * safe / len(candidates):.1f} % of the grid")
+        (
+            f"directions {candidates.safe_text}",
+            f"{safe:,} of {len(candidates):,}",
+            f"{100 * safe / len(candidates):.1f} % of the grid",
+        )
     ]
     if row is not None:
         name, clearance = nearest_structure(candidates, row)
@@ -116,6 +120,8 @@ def _verdict(candidates: Candidates, plan: Any | None, rehearsal: Any | None) ->
         if name:
             detail += f"; nearest {tables.escape(name.replace('_', ' '))}, {number(clearance, 1, 'mm')}"
         cards.append(("best direction", where, detail))
+    if not candidates.arm_checked:
+        cards.append(("arm", "not checked", tables.escape(candidates.arm.removeprefix("not checked: "))))
     if plan is None:
         cards.append(("plan", "none", "the arm's motion was not planned or not found"))
     if rehearsal is not None:

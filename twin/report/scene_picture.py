@@ -182,7 +182,7 @@ def _words(
     annotate.write(draw, (18, 50), words, size=18, bold=row is None and plan is None, colour=colour)
     items = [("target", palette.TARGET_POINT), (needle_words(case.needle), palette.NEEDLE)]
     if candidates.safe.any():
-        items.append(("safe: where a needle may enter, and its corridor (overview)", palette.SAFE))
+        items.append((f"{candidates.safe_text}: where a needle may enter, and its corridor (overview)", palette.SAFE))
     items.append(("skin (see-through)", palette.SKIN))
     if arm:
         items += [
