@@ -5,6 +5,7 @@ import shutil
 import pytest
 
 from meshes import folder
+from planning.prepared import prepare
 
 pytest_plugins = ["pytester"]
 
@@ -18,6 +19,12 @@ verdict = "safe"
 clearance_mm = {{ bolt_h = 5.0 }}
 tolerance_mm = 0.02
 """
+
+
+@pytest.fixture(autouse=True, scope="module")
+def kernels_loaded():
+    """Run compiled code once: pytester forgets modules that it saw imported, and numba's register only once."""
+    prepare(CARTON, arm=False).check(0.0, 0.0)
 
 
 def run(pytester, text):
