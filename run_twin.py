@@ -26,6 +26,7 @@ from planning.errors import InputError, NoAnswerError, PlanningError
 from planning.export import FORMATS
 from planning.files import check_writable
 from planning.prepared import prepare
+from planning.provenance import inputs_document
 from twin import main_job, words
 from twin.mirror import Mirror, connect, live_states, recorded_states
 from twin.place_words import mirror_line, place_text
@@ -176,7 +177,8 @@ def mirror(
     """Show a running arm's needle in the CT: tip, distance to the target. Writes nothing to the robot."""
     if (host is None) == (recorded is None):
         raise InputError("one arm at a time", where="mirror", allowed="either HOST or --from joints.csv")
-    mirrored = Mirror.of(load_case(case))
+    followed = load_case(case)
+    mirrored = Mirror.of(followed)
     if recorded is not None:
         states = recorded_states(recorded)
     else:
@@ -186,7 +188,7 @@ def mirror(
         for one in mirrored.follow(states):
             shown.append(one.summary()) if as_json else out.print(mirror_line(one), highlight=False, markup=False)
     if as_json:
-        _print({"case": str(case), "states": shown}, "", as_json)
+        _print({"case": str(case), "inputs": inputs_document(followed.inputs), "states": shown}, "", as_json)
 
 
 @app.command()

@@ -17,7 +17,7 @@ from planning.case_file import StructureSection, StructuresSection
 from planning.clearance.containment import Side, side_of
 from planning.errors import InputError
 from planning.formats.decimation import squared_distance
-from planning.formats.meshes import mesh_warnings, read_mesh
+from planning.formats.meshes import mesh_warnings, parse_mesh
 from planning.formats.naming import RuleKind, names_for, select
 from planning.formats.spaces import Space, parse_space, parse_unit
 from planning.mesh import TriangleMesh
@@ -133,7 +133,7 @@ class _Loader:
         """All labels of one map that the rules do not ignore."""
         volume = self._labels(section.labelmap)
         rules = select(
-            names_for(section.naming, self._case.folder, volume),
+            names_for(section.naming, self._case.folder, self._case.files.content, volume),
             volume.labels_present(),
             avoid=section.avoid,
             traverse=section.traverse,
@@ -175,7 +175,7 @@ class _Loader:
             raise InputError("no mesh with a unit", where=where, allowed="mesh and unit")
         space = parse_space(section.space or self._case.space, where=where)
         unit = parse_unit(section.unit, where=where)
-        return read_mesh(self._file(section.mesh), unit=unit, space=space)
+        return parse_mesh(self._case.files.content(section.mesh), self._file(section.mesh), unit=unit, space=space)
 
     def _label(self, section: StructureSection) -> TriangleMesh:
         if section.labelmap is None or section.label is None:
@@ -191,7 +191,7 @@ class _Loader:
 
     def _volume(self, name: str) -> VolumeSurfaces:
         if name not in self._volumes:
-            self._volumes[name] = VolumeSurfaces(self._file(name), self._case.inputs[name], self._cache)
+            self._volumes[name] = VolumeSurfaces(self._file(name), self._case.files.sha256(name), self._cache)
         return self._volumes[name]
 
     def _file(self, name: str) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import multiprocessing
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -14,6 +15,7 @@ import numpy as np
 from planning.errors import InputError, PlanningError
 from planning.files import atomic
 from planning.prepared import Watcher, prepare
+from planning.provenance import inputs_document
 from planning.table import write_table
 
 COLUMNS = (
@@ -27,8 +29,9 @@ COLUMNS = (
     "best_beta_deg",
     "seconds",
     "said",
+    "inputs",
 )
-"""Columns of ``batch.csv``."""
+"""Columns of ``batch.csv``; ``inputs`` is the list of role, path and sha256 as JSON, empty where a case was refused."""
 
 
 def run_batch(
@@ -61,7 +64,7 @@ def run_batch(
     with atomic(out / "batch.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, COLUMNS)
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({**row, "inputs": json.dumps(row["inputs"] or [])} for row in rows)
     return rows
 
 
@@ -83,6 +86,7 @@ def search_one(path: Path, out: Path, arm: bool | None) -> dict[str, Any]:
         return row | {"exit_code": 2 if isinstance(error, InputError) else 3, "said": str(error)}
     write_table(found, prepared.provenance(), out / "candidates.parquet")
     row |= {"name": prepared.case.name, "directions": len(found), "safe": int(found.safe.sum())}
+    row["inputs"] = inputs_document(prepared.case.inputs)
     row["seconds"] = sum(prepared.stages.seconds.values())
     if not found.safe.any():
         return row | {"exit_code": 1, "said": "no safe candidate"}

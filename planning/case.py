@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
-from types import MappingProxyType
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,11 +25,12 @@ from planning.case_file import (
 )
 from planning.entry import entry_frame, view_frame
 from planning.errors import InputError
-from planning.files import sha256
-from planning.formats.points import read_points
+from planning.formats import meshes, naming, points, volumes
+from planning.formats.points import parse_points
 from planning.formats.spaces import Space, to_lps
+from planning.provenance import CASE_ROLE, Input, InputFiles
 from planning.robot.ur import ur_model
-from planning.toml_file import find_toml, read_toml
+from planning.toml_file import find_toml, parse_toml, read_toml_bytes
 
 ALLOWED_CASE = "a TOML case file with schema = 1, or a folder with case.toml"
 
@@ -108,7 +110,7 @@ class Case:
     Attributes:
         target_ct: Shape (3,), the point to reach.
         T_ct_entry: Shape (4, 4), the entry frame, its origin on the target.
-        inputs: File name relative to the case's folder, to SHA-256, for the case file and all it names.
+        files: The case file and all that it names, read once.
     """
 
     path: Path
@@ -127,7 +129,7 @@ class Case:
     robot: RobotSettings
     obstacles: tuple[Obstacle, ...]
     rehearsal: RehearsalSection
-    inputs: MappingProxyType[str, str]
+    files: InputFiles
     gantry: Gantry | None = None
     place: PlaceSection = field(default_factory=PlaceSection)
 
@@ -135,6 +137,11 @@ class Case:
     def folder(self) -> Path:
         """The folder to which every path of the case is relative."""
         return self.path.parent
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """The case file and all that it names, each with its role and hash."""
+        return self.files.inputs
 
 
 def load_case(path: Path | str) -> Case:
@@ -144,9 +151,14 @@ def load_case(path: Path | str) -> Case:
         InputError: Anything unreadable, unknown, missing or contradictory; names the key.
     """
     path = find_toml(path, "case.toml")
-    content = read_toml(path, CaseFile, allowed=ALLOWED_CASE, keys="docs/case.md")
+    files = InputFiles(path.parent)
+    stated = files.add(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE))
+    content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/case.md")
+    for one in _named_files(content):
+        files.read(one.role, one.name, max_bytes=one.max_bytes, key=one.key, where=path)
+        _read_data_beside(files, one, path)
     space = Space(content.space)
-    target = _target(content, path, space)
+    target = _target(content, path, space, files)
     settings = content.search
     return Case(
         path=path,
@@ -178,22 +190,22 @@ def load_case(path: Path | str) -> Case:
             for o in content.obstacle
         ),
         rehearsal=content.rehearsal,
-        inputs=MappingProxyType(_hashes(content, path)),
+        files=files,
         gantry=None if content.gantry is None else _gantry(content.gantry, space, path),
         place=content.place,
     )
 
 
-def _target(content: CaseFile, path: Path, space: Space) -> Matrix:
+def _target(content: CaseFile, path: Path, space: Space, files: InputFiles) -> Matrix:
     target = content.target
     if target.position_mm is not None:
         return _read_only(to_lps(np.asarray([target.position_mm]), space)[0])
     assert target.points is not None  # held by the schema
-    points = read_points(_existing(path, target.points, "target.points"), default_space=space)
-    if target.name not in points.names:
-        names = ", ".join(points.names)
+    listed = parse_points(files.content(target.points), path.parent / target.points, default_space=space)
+    if target.name not in listed.names:
+        names = ", ".join(listed.names)
         raise InputError(f"target.name '{target.name}' is not in {target.points}", where=path, allowed=names)
-    return _read_only(points.points[points.names.index(target.name)].copy())
+    return _read_only(listed.points[listed.names.index(target.name)].copy())
 
 
 def _robot(content: CaseFile, space: Space, path: Path) -> RobotSettings:
@@ -248,31 +260,46 @@ def axes_frame(z: Axis, x: Axis, space: Space, path: Path, key: str) -> Matrix:
         raise InputError(f"{key} are parallel or zero", where=path, allowed="two axes") from error
 
 
-def _hashes(content: CaseFile, path: Path) -> dict[str, str]:
-    """SHA-256 of the case file and of every file that it names."""
-    named: dict[str, str | None] = {"target.points": content.target.points}
+class _Named(NamedTuple):
+    """A file that a case names."""
+
+    role: str
+    name: str
+    key: str
+    max_bytes: int
+
+
+def _named_files(content: CaseFile) -> Iterator[_Named]:
+    """Every file that a case names, in the order of its sections."""
+    if content.target.points is not None:
+        yield _Named("target", content.target.points, "target.points", points.MAX_FILE_BYTES)
     for one in content.structure:
-        named[f"structure '{one.name}'"] = one.mesh or one.labelmap or one.ct
+        key = f"structure '{one.name}'"
+        if one.mesh is not None:
+            yield _Named(f"mesh {one.name}", one.mesh, key, meshes.MAX_FILE_BYTES)
+        if one.labelmap is not None:
+            yield _Named("labelmap", one.labelmap, key, volumes.MAX_FILE_BYTES)
+        if one.ct is not None:
+            yield _Named("ct", one.ct, key, volumes.MAX_FILE_BYTES)
     for number, many in enumerate(content.structures):
-        named[f"structures.{number}.labelmap"] = many.labelmap
-        if many.naming is not None and many.naming.endswith(".csv"):
-            named[f"structures.{number}.naming"] = many.naming
+        yield _Named("labelmap", many.labelmap, f"structures.{number}.labelmap", volumes.MAX_FILE_BYTES)
+        if many.naming is not None and naming.is_naming_file(many.naming):
+            yield _Named("naming", many.naming, f"structures.{number}.naming", naming.MAX_CSV_BYTES)
     if content.registration is not None:
-        named["registration.markers_ct"] = content.registration.markers_ct
-        named["registration.markers_base"] = content.registration.markers_base
-    named["rehearsal.truth_base"] = content.rehearsal.truth_base
-    hashes = {path.name: sha256(path)}
-    for key, name in named.items():
-        if name is not None and name not in hashes:
-            hashes[name] = sha256(_existing(path, name, key))
-    return hashes
+        for side in ("markers_ct", "markers_base"):
+            yield _Named(side, getattr(content.registration, side), f"registration.{side}", points.MAX_FILE_BYTES)
+    if content.rehearsal.truth_base is not None:
+        yield _Named("truth_base", content.rehearsal.truth_base, "rehearsal.truth_base", points.MAX_FILE_BYTES)
 
 
-def _existing(path: Path, name: str, key: str) -> Path:
-    file = path.parent / name
-    if not file.is_file():
-        raise InputError(f"{key}: file '{name}' is not there", where=path, allowed=f"a file in {path.parent}")
-    return file
+def _read_data_beside(files: InputFiles, header: _Named, path: Path) -> None:
+    """Read the file that a volume's detached header names, which holds what decides."""
+    if header.role not in {"labelmap", "ct"}:
+        return
+    beside = volumes.data_file(files.content(header.name), path.parent / header.name)
+    if beside is not None:
+        name = str(PurePosixPath(header.name).with_name(beside))
+        files.read(f"{header.role} data", name, max_bytes=volumes.MAX_FILE_BYTES, key=header.name, where=path)
 
 
 def _read_only(array: ArrayLike) -> Matrix:

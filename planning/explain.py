@@ -11,6 +11,7 @@ from planning.anatomy import Anatomy
 from planning.candidates import Candidates
 from planning.case import Case
 from planning.constraints import longest_path
+from planning.provenance import inputs_document
 from planning.standoff import standoffs
 
 
@@ -45,6 +46,7 @@ class Explanation:
         row = self.candidates
         return {
             "case": self.case.name,
+            "inputs": inputs_document(self.case.inputs),
             "theta_deg": float(np.degrees(row.theta[0])),
             "beta_deg": float(np.degrees(row.beta[0])),
             "verdict": self.verdict,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.case import Case
-from planning.formats.points import read_points
+from planning.formats.points import NamedPoints, parse_points
 from planning.formats.spaces import Space
 from planning.registration import Registration, match, register
 
@@ -40,8 +40,8 @@ def load_placement(case: Case) -> Placement | None:
         mount = case.robot.T_base_ct_mount
         return None if mount is None else Placement(mount, None, float("nan"))
     settings = case.registration
-    markers_ct = read_points(case.folder / settings.markers_ct, default_space=case.space)
-    markers_base = read_points(case.folder / settings.markers_base, default_space=Space.LOCAL)
+    markers_ct = _points(case, settings.markers_ct, case.space)
+    markers_base = _points(case, settings.markers_base, Space.LOCAL)
     where = f"{case.path}: registration"
     registration = register(
         match(markers_ct, markers_base, use=settings.use, where=where),
@@ -52,3 +52,7 @@ def load_placement(case: Case) -> Placement | None:
     )
     error = float(registration.expected_tre_mm(case.target_ct[None])[0])
     return Placement(registration.T_base_ct, registration, error)
+
+
+def _points(case: Case, name: str, space: Space) -> NamedPoints:
+    return parse_points(case.files.content(name), case.folder / name, default_space=space)

@@ -18,14 +18,17 @@ from planning.entry import needle_pose
 from planning.errors import InputError
 from planning.files import atomic
 from planning.formats.guard import guard_transform
+from planning.formats.input_file import read_input
+from planning.provenance import Input, differing_input, inputs_document, read_inputs
 from planning.robot.kinematics import flange_pose
 from planning.robot.ur import ur_model
 from planning.trajectory import Peaks, Trajectory
 
 Floats = NDArray[np.float64]
 
-PLAN_VERSION = 2
-"""Version of the file's layout. 2: states the peaks of both phases beside the limits; the approach is smooth."""
+PLAN_VERSION = 3
+"""Version of the file's layout. 2: states the peaks of both phases beside the limits; the approach is smooth. 3: lists
+its inputs with their roles, files that a file names included."""
 
 POSE_TOLERANCE_MM = 0.01
 """How far the tip of the stored joint angles may be from the stored pose: well above rounding, far below any error."""
@@ -61,7 +64,7 @@ class Plan:
 
     Attributes:
         case_name: The case that it was made for.
-        inputs: File name to SHA-256 of every input of that case.
+        inputs: Every file of that case, with role and hash.
         seed: Of the approach's planner.
         model: The arm.
         T_base_ct: Shape (4, 4), the belief of where the patient is.
@@ -81,7 +84,7 @@ class Plan:
     """
 
     case_name: str
-    inputs: Mapping[str, str]
+    inputs: tuple[Input, ...]
     seed: int
     model: str
     T_base_ct: Floats
@@ -104,7 +107,7 @@ def write_plan(plan: Plan, path: Path) -> None:
     document = {
         "version": PLAN_VERSION,
         "case": plan.case_name,
-        "inputs": dict(plan.inputs),
+        "inputs": inputs_document(plan.inputs),
         "seed": plan.seed,
         "robot": plan.model,
         "T_base_ct": plan.T_base_ct.tolist(),
@@ -133,7 +136,16 @@ def read_plan(path: Path) -> Plan:
         InputError: Not a plan, another version, missing keys, numbers that do not fit, or a pose that the stored
             joint angles do not reach.
     """
-    document = _document(path)
+    return parse_plan(read_input(path, max_bytes=MAX_PLAN_BYTES, where=str(path)), path)
+
+
+def parse_plan(content: bytes, path: Path) -> Plan:
+    """The same of a file that has been read; it is not opened again.
+
+    Raises:
+        InputError: As `read_plan`, but for reading.
+    """
+    document = _document(content, path)
     try:
         plan = _plan(document, path)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
@@ -150,11 +162,9 @@ def check_inputs(plan: Plan, case: Case, path: Path) -> None:
     Raises:
         InputError: Names the first input that differs.
     """
-    for name in sorted(set(plan.inputs) | set(case.inputs)):
-        if plan.inputs.get(name) != case.inputs.get(name):
-            raise InputError(
-                f"input '{name}' is not the one that the plan was made from", where=path, allowed="plan again"
-            )
+    name = differing_input(plan.inputs, case.inputs)
+    if name is not None:
+        raise InputError(f"input '{name}' is not the one that the plan was made from", where=path, allowed="plan again")
 
 
 def check_geometry(plan: Plan, path: Path) -> None:
@@ -273,14 +283,10 @@ def _rates_document(rates: Peaks) -> dict[str, list[float]]:
     return {unit: rate.tolist() for unit, rate in zip(units, rates, strict=True)}
 
 
-def _document(path: Path) -> dict[str, Any]:
-    allowed = f"a plan.json of version {PLAN_VERSION}"
+def _document(content: bytes, path: Path) -> dict[str, Any]:
+    allowed = f"a plan.json of version {PLAN_VERSION}; plan again"
     try:
-        if path.stat().st_size > MAX_PLAN_BYTES:
-            raise InputError("larger than 50 MB, not a plan", where=path, allowed=allowed)
-        document = json.loads(path.read_bytes().decode("utf-8"), parse_constant=_refuse_constant)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed=allowed) from error
+        document = json.loads(content.decode("utf-8"), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
         raise InputError(f"is not JSON: {error}", where=path, allowed=allowed) from error
     if not isinstance(document, dict) or document.get("version") != PLAN_VERSION:
@@ -298,7 +304,7 @@ def _plan(document: dict[str, Any], path: Path) -> Plan:
     error = document["expected_target_error_mm"]
     return Plan(
         case_name=str(document["case"]),
-        inputs=MappingProxyType({str(k): str(v) for k, v in document["inputs"].items()}),
+        inputs=read_inputs(document["inputs"]),
         seed=int(document["seed"]),
         model=str(document["robot"]),
         T_base_ct=guard_transform(document["T_base_ct"], where=f"{path}: T_base_ct"),

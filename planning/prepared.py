@@ -23,6 +23,7 @@ from planning.clearance.fcl_engine import FclEngine
 from planning.consistency import check_consistency
 from planning.errors import InputError
 from planning.placement import Placement, load_placement
+from planning.provenance import inputs_document
 from planning.room import case_checker
 from planning.search import Reach, case_directions, one_direction, search
 from planning.stages import Stages
@@ -117,7 +118,7 @@ class Prepared:
         """Where a result comes from: case, inputs, version, grid."""
         return {
             "case": self.case.name,
-            "inputs": dict(self.case.inputs),
+            "inputs": inputs_document(self.case.inputs),
             "version": version("puncture-twin"),
             "seed": self.case.rehearsal.seed,
             "step_deg": float(np.degrees(self.case.search.step)),

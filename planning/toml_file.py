@@ -55,12 +55,31 @@ def read_toml(path: Path, model: type[Model], *, allowed: str, keys: str) -> Mod
     Raises:
         InputError: Unreadable, too large, not TOML, or not of the schema: names the first key that is wrong.
     """
+    return parse_toml(read_toml_bytes(path, allowed), path, model, allowed=allowed, keys=keys)
+
+
+def read_toml_bytes(path: Path, allowed: str) -> bytes:
+    """The bytes of such a file.
+
+    Raises:
+        InputError: Unreadable, or too large.
+    """
     try:
         if path.stat().st_size > MAX_BYTES:
             raise InputError("larger than 1 MB, not written by hand", where=path, allowed=allowed)
-        data = tomllib.loads(path.read_bytes().decode("utf-8"))
+        return path.read_bytes()
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path, allowed=allowed) from error
+
+
+def parse_toml(content: bytes, path: Path, model: type[Model], *, allowed: str, keys: str) -> Model:
+    """The same of a file that has been read; it is not opened again.
+
+    Raises:
+        InputError: Not TOML, or not of the schema: names the first key that is wrong.
+    """
+    try:
+        data = tomllib.loads(content.decode("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"is not TOML: {error}", where=path, allowed=allowed) from error
     try:

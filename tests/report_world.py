@@ -9,6 +9,7 @@ from planning.candidates import Candidates
 from planning.entry import entry_frame, grid, view_frame
 from planning.formats.spaces import Space
 from planning.mesh import TriangleMesh
+from planning.provenance import Input
 from planning.robot.kinematics import flange_pose, inverse
 from planning.robot.ur import ur_model
 from planning.trajectory import Trajectory
@@ -34,7 +35,7 @@ def make_case(*, space="LPS", frame=None, name="ball"):
         T_ct_entry=view_frame(rotation, TARGET),
         obstacles=(),
         gantry=None,
-        inputs={"case.toml": "ab" * 32, "liver.ply": "cd" * 32},
+        inputs=(Input("case", "case.toml", "ab" * 32), Input("mesh liver", "liver.ply", "cd" * 32)),
         robot=SimpleNamespace(model="ur3"),
         rehearsal=SimpleNamespace(seed=7),
     )

@@ -62,8 +62,12 @@ def test_a_good_case_is_read(write):
     assert case.search.theta == (0, pytest.approx(np.pi / 3))
     assert case.search.max_skin_angle == pytest.approx(np.pi / 3)
     assert case.needle.radius_mm == 0.6
-    assert case.inputs["organ.stl"] == hashlib.sha256(b"organ.stl").hexdigest()
-    assert set(case.inputs) == {"case.toml", "skin.stl", "organ.stl"}
+    assert [(one.role, one.path) for one in case.inputs] == [
+        ("case", "case.toml"),
+        ("mesh skin", "skin.stl"),
+        ("mesh organ", "organ.stl"),
+    ]
+    assert case.inputs[2].sha256 == hashlib.sha256(b"organ.stl").hexdigest()
     assert case.registration is None
 
 

@@ -29,6 +29,7 @@ from planning.errors import InputError
 from planning.formats.spaces import Space
 from planning.mesh import TriangleMesh
 from planning.prepared import prepare
+from planning.provenance import InputFiles
 from planning.search import organ_candidates
 from planning.skin import FieldOfView, Skin, skin_from_mesh
 from planning.skin_entry import skin_paths
@@ -429,12 +430,20 @@ def test_a_witness_that_is_none_is_refused(carton, triangle):
         verify(replace(found, triangle=triangles), prepared.case, prepared.anatomy)
 
 
+def changed_files(case, name):
+    """The case's files, one of them with other content."""
+    files = InputFiles(case.folder)
+    for one in case.inputs:
+        files.add(one.role, one.path, case.files.content(one.path) + (b" " if one.path == name else b""))
+    return files
+
+
 def test_other_inputs_are_refused(carton):
     """Another hash, needle, target, margin or case: the certificate was made for something else."""
     prepared, found = carton
     case, anatomy = prepared.case, prepared.anatomy
     others = [
-        replace(case, inputs={**case.inputs, "skin.ply": "0" * 64}),
+        replace(case, files=changed_files(case, "skin.ply")),
         replace(case, name="other"),
         replace(case, needle=replace(case.needle, diameter_mm=2.1)),
         replace(case, target_ct=case.target_ct + [0, 0, 0.01]),

@@ -27,6 +27,7 @@ from planning.export.ros2 import read_ros2, ros2_text, velocities
 from planning.export.text import PLAIN
 from planning.export.urscript import read_urscript, urscript_text
 from planning.plan import Plan, read_plan, write_plan
+from planning.provenance import Input
 from planning.robot.cell import Box, CellChecker, Tool
 from planning.robot.insertion import insertion_paths
 from planning.robot.kinematics import flange_pose, inverse, jacobian, nearest_within_limits
@@ -62,7 +63,7 @@ def plan_to(waypoints, *, speed_scale=0.5, tip_mm_s=10.0, model=UR3):
     T_base_ct[:3, 3] = (100.0, -200.0, 50.0)
     return Plan(
         case_name="liver-s7",
-        inputs={"case.toml": "0" * 64, "liver.stl": "a" * 64},
+        inputs=(Input("case", "case.toml", "0" * 64), Input("mesh liver", "liver.stl", "a" * 64)),
         seed=3,
         model=model.name,
         T_base_ct=T_base_ct,
@@ -537,7 +538,7 @@ NAMES = [
 @pytest.mark.parametrize("name", NAMES)
 def test_a_name_stays_in_its_comment(plan, name, tmp_path):
     """Whatever a case or a file is called, the numbers and the moves are the same."""
-    odd = replace(plan, case_name=name, inputs={name: name})
+    odd = replace(plan, case_name=name, inputs=(Input(name, name, name),))
     for one in FORMATS:
         texts = [
             export_plan(p, one, tmp_path / str(n), source=Path("plan.json")).path.read_text(encoding="ascii")

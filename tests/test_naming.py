@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -48,14 +49,19 @@ def test_tables_agree_with_the_real_label_maps(table: dict[int, str], name: str)
     assert {int(label): text for label, text in named.items()} == {int(label): table[int(label)] for label in named}
 
 
+def read_from(folder: Path) -> Callable[[str], bytes]:
+    """Gives the bytes of a file of this folder."""
+    return lambda name: (folder / name).read_bytes()
+
+
 def test_namings_by_name_by_file_and_by_the_map_itself(tmp_path: Path) -> None:
     """All four ways to name labels."""
     (tmp_path / "names.csv").write_text('id,name\n1,liver\n\n7,"vein, portal"\n', encoding="utf-8")
-    assert names_for("totalsegmentator-v1", tmp_path, map_with(None))[7] == "aorta"
-    assert names_for("totalsegmentator-v2", tmp_path, map_with(None))[52] == "aorta"
-    assert names_for("names.csv", tmp_path, map_with(None)) == {1: "liver", 7: "vein, portal"}
-    assert names_for(None, tmp_path, map_with({3: "x"})) == {3: "x"}
-    assert names_for("seg.nrrd", tmp_path, map_with({3: "x"})) == {3: "x"}
+    assert names_for("totalsegmentator-v1", tmp_path, read_from(tmp_path), map_with(None))[7] == "aorta"
+    assert names_for("totalsegmentator-v2", tmp_path, read_from(tmp_path), map_with(None))[52] == "aorta"
+    assert names_for("names.csv", tmp_path, read_from(tmp_path), map_with(None)) == {1: "liver", 7: "vein, portal"}
+    assert names_for(None, tmp_path, read_from(tmp_path), map_with({3: "x"})) == {3: "x"}
+    assert names_for("seg.nrrd", tmp_path, read_from(tmp_path), map_with({3: "x"})) == {3: "x"}
 
 
 @pytest.mark.parametrize(
@@ -79,19 +85,17 @@ def test_broken_name_tables_are_refused(tmp_path: Path, content: bytes, match: s
     """By line where there is one."""
     (tmp_path / "names.csv").write_bytes(content)
     with pytest.raises(InputError, match=match):
-        names_for("names.csv", tmp_path, map_with(None))
+        names_for("names.csv", tmp_path, read_from(tmp_path), map_with(None))
 
 
 def test_unknown_namings_are_refused_with_the_nearest(tmp_path: Path) -> None:
-    """A misspelt naming, a missing CSV, a map without names, and a map that names two labels alike."""
+    """A misspelt naming, a map without names, and a map that names two labels alike."""
     with pytest.raises(InputError, match="nearest: totalsegmentator-v2"):
-        names_for("totalsegmentator_v2", tmp_path, map_with(None))
-    with pytest.raises(InputError, match="cannot be read"):
-        names_for("none.csv", tmp_path, map_with(None))
+        names_for("totalsegmentator_v2", tmp_path, read_from(tmp_path), map_with(None))
     with pytest.raises(InputError, match="holds no names"):
-        names_for(None, tmp_path, map_with(None))
+        names_for(None, tmp_path, read_from(tmp_path), map_with(None))
     with pytest.raises(InputError, match="both named"):
-        names_for(None, tmp_path, map_with({1: "a", 2: "a"}))
+        names_for(None, tmp_path, read_from(tmp_path), map_with({1: "a", 2: "a"}))
 
 
 def test_patterns_give_every_label_its_rule() -> None:

@@ -96,7 +96,7 @@ def test_a_plan_reads_back_as_it_was_written(carton, planned, document):
     back = read_plan(path)
     np.testing.assert_array_equal(back.approach.q, planned.plan.approach.q)
     np.testing.assert_array_equal(back.T_base_ct, planned.plan.T_base_ct)
-    assert back.inputs == dict(carton.case.inputs)
+    assert back.inputs == carton.case.inputs
     assert back.theta == pytest.approx(planned.plan.theta, abs=1e-12)
     assert check_plan(back, carton, path).safe[0]
 
@@ -198,12 +198,13 @@ def test_a_plan_that_contradicts_itself_is_refused(name, document):
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "is not JSON"),
-        (b'{"version": 2', "is not JSON"),
-        (b'{"version": 2}', "is missing"),
+        (b"", "file of 0 bytes"),
+        (b'{"version": 3', "is not JSON"),
+        (b'{"version": 3}', "is missing"),
+        (b'{"version": 2}', "version 2; allowed: .* plan again"),
         (b'{"version": 1}', "version 1"),
         (b"[1, 2]", "version None"),
-        (b'{"version": 2, "x": NaN}', "NaN is no number"),
+        (b'{"version": 3, "x": NaN}', "NaN is no number"),
         (b"\xff\xfe\x00", "is not JSON"),
         (b"[" * 100_000, "is not JSON"),
     ],
@@ -219,8 +220,9 @@ def test_what_is_no_plan_is_refused(data, message, tmp_path):
 def test_a_plan_of_other_inputs_is_refused(carton, document):
     """When a marker file or a mesh changed, the plan is stale."""
     content, write = document
-    path = write(inputs=content["inputs"] | {"touch.csv": "0" * 64})
-    with pytest.raises(InputError, match=r"input 'touch.csv' is not the one"):
+    changed = [one | {"sha256": "0" * 64} if one["path"] == "touch.csv" else one for one in content["inputs"]]
+    path = write(inputs=changed)
+    with pytest.raises(InputError, match=r"input 'markers_base \(touch.csv\)' is not the one"):
         check_plan(read_plan(path), carton, path)
 
 

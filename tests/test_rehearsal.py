@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from planning.formats.spaces import Space
 from planning.mesh import TriangleMesh
 from planning.place.bed import bed_frame
 from planning.plan import Plan
+from planning.provenance import InputFiles
 from planning.robot.kinematics import flange_pose, inverse, jacobian, nearest_within_limits
 from planning.robot.ur import ur_model
 from planning.skin import skin_from_mesh
@@ -80,7 +80,7 @@ def case(*obstacles: Obstacle) -> Case:
         robot=RobotSettings("ur3", None, T_BASE_CT),
         obstacles=obstacles,
         rehearsal=RehearsalSection(),
-        inputs=MappingProxyType({}),
+        files=InputFiles(Path()),
     )
 
 
@@ -111,7 +111,7 @@ def make_plan() -> Plan:
     ease = ease**2 * (3 - 2 * ease)
     return Plan(
         case_name="ball",
-        inputs={},
+        inputs=(),
         seed=0,
         model="ur3",
         T_base_ct=T_BASE_CT,

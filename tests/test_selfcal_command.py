@@ -66,7 +66,7 @@ def test_the_calibration_is_the_truth_within_what_it_claims(case_folder, done):
     assert found["version"] == 1
     assert found["seed"] == 3
     assert len(found["residuals_mm"]) == 20
-    assert found["inputs_sha256"].keys() == {"selfcal.toml"}
+    assert [(one["role"], one["path"]) for one in found["inputs"]] == [("case", "selfcal.toml")]
     assert any("along the shaft" in line for line in found["cannot_show"])
 
 

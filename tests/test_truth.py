@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from planning.entry import view_frame
 from planning.errors import InputError
 from planning.formats.spaces import Space
 from planning.placement import load_placement
+from planning.provenance import InputFiles
 from planning.registration import apply, fit_rigid, fit_triad, leverage
 from twin.truth import MarkerNoise, draw_truth, registration_error
 
@@ -37,6 +37,14 @@ def write_points(path: Path, names: tuple[str, ...], points: np.ndarray) -> None
     """A CSV of named points."""
     rows = [f"{name},{x:.9f},{y:.9f},{z:.9f}" for name, (x, y, z) in zip(names, points, strict=True)]
     path.write_text("\n".join(["name,x_mm,y_mm,z_mm", *rows]) + "\n")
+
+
+def files_in(folder: Path) -> InputFiles:
+    """Every CSV of a folder, as a case has read it."""
+    files = InputFiles(folder)
+    for path in sorted(folder.glob("*.csv")):
+        files.add(path.stem, path.name, path.read_bytes())
+    return files
 
 
 def case(folder: Path, *, markers: bool = True, method: str = "rigid", **rehearsal: object) -> Case:
@@ -64,7 +72,7 @@ def case(folder: Path, *, markers: bool = True, method: str = "rigid", **rehears
         robot=RobotSettings("ur3", None, None if markers else pose(0)),
         obstacles=(),
         rehearsal=RehearsalSection(**rehearsal),
-        inputs=MappingProxyType({}),
+        files=files_in(folder),
     )
 
 

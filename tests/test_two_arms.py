@@ -32,7 +32,7 @@ from twin.ultrasound.two_arms import (
 def make_case(**sections):
     """A case with some sections changed."""
     content = SelfcalFile.model_validate({"schema": 1, "name": "room", **sections})
-    return SelfcalCase(path=None, content=content, inputs={})
+    return SelfcalCase(path=None, content=content, inputs=())
 
 
 @pytest.fixture(scope="module")

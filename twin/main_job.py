@@ -12,17 +12,20 @@ import numpy as np
 
 from planning.candidates import Candidates
 from planning.case import load_case
-from planning.certify import Certificate, certify, read_certificate, verify, with_safe_cone, write_certificate
+from planning.certify import Certificate, certify, verify, with_safe_cone, write_certificate
+from planning.certify.certificate import MAX_CERTIFICATE_BYTES, parse_certificate
 from planning.clearance.cross_check import CrossChecked
 from planning.errors import InputError, NoAnswerError
 from planning.explain import Explanation, finite
 from planning.export import Exported, export_plan
 from planning.files import atomic
+from planning.formats.input_file import read_input
 from planning.placement import load_placement
-from planning.plan import Plan, read_plan, write_plan
+from planning.plan import MAX_PLAN_BYTES, Plan, parse_plan, write_plan
 from planning.plan_check import check_plan
 from planning.planner import make_plan
 from planning.prepared import Prepared
+from planning.provenance import Input, content_input, inputs_document
 from planning.registration import Registration
 from planning.table import write_table
 from twin.rehearsal import Rehearsal, rehearse
@@ -42,12 +45,19 @@ class Run:
     rehearsal: Rehearsal | None = None
     checked: CrossChecked | None = None
     certificate: Certificate | None = None
+    read: tuple[Input, ...] = ()
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """The files that the command read beside the case's, then the case's."""
+        return (*self.read, *self.prepared.case.inputs)
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees."""
         found = self.candidates
         return {
             **self.prepared.provenance(),
+            "inputs": inputs_document(self.inputs),
             "directions": len(found),
             "counts": found.counts(),
             "best": [candidate_summary(found, int(row)) for row in found.ranked[:10]],
@@ -117,10 +127,10 @@ def rehearse_plan(prepared: Prepared, plan_path: Path, out: Path) -> Run:
     Raises:
         InputError: A plan that does not belong to the case or does not hold any more.
     """
-    plan = read_plan(plan_path)
+    source, plan = _read_plan(plan_path)
     with prepared.stages.time("plan"):
         candidates = check_plan(plan, prepared, plan_path)
-    run = _rehearsed(Run(prepared, candidates, (), plan), out)
+    run = _rehearsed(Run(prepared, candidates, (), plan, read=(source,)), out)
     with prepared.stages.time("scene"):
         draw_scene(prepared.case, prepared.anatomy, candidates, plan, out / "scene.png")
     return _with(run, out / "scene.png")
@@ -133,7 +143,8 @@ def _rehearsed(run: Run, out: Path) -> Run:
     with prepared.stages.time("rehearsal"):
         truth = draw_truth(prepared.case, run.plan.T_base_ct)
         rehearsal = rehearse(run.plan, prepared.case, prepared.anatomy, truth)
-    run = _with(replace(run, rehearsal=rehearsal), _write_json(rehearsal_summary(rehearsal), out / "rehearsal.json"))
+    document = {**rehearsal_summary(rehearsal), "inputs": inputs_document(run.inputs)}
+    run = _with(replace(run, rehearsal=rehearsal), _write_json(document, out / "rehearsal.json"))
     with prepared.stages.time("film"):
         film = draw_film(
             rehearsal,
@@ -158,12 +169,18 @@ def export(plan_path: Path, format_name: str, out: Path, prepared: Prepared | No
     Raises:
         InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
     """
-    plan = read_plan(plan_path)
+    _, plan = _read_plan(plan_path)
     if prepared is None:
         return export_plan(plan, format_name, out, source=plan_path)
     check_plan(plan, prepared, plan_path)
     assert prepared.reach is not None  # the check has refused this
     return export_plan(plan, format_name, out, source=plan_path, checker=prepared.reach.checker)
+
+
+def _read_plan(path: Path) -> tuple[Input, Plan]:
+    """A plan, and the hash of the bytes that it was read from."""
+    content = read_input(path, max_bytes=MAX_PLAN_BYTES, where=str(path))
+    return content_input("plan", path.name, content), parse_plan(content, path)
 
 
 def check_candidate(prepared: Prepared, theta_deg: float, beta_deg: float) -> Explanation:
@@ -186,6 +203,7 @@ def registration_report(path: Path) -> dict[str, Any]:
     pose = case.target_ct + case.needle.shaft_mm * case.T_ct_entry[:3, 2]
     along = np.linspace(case.target_ct, pose, 4)
     report["case"] = case.name
+    report["inputs"] = inputs_document(case.inputs)
     report["expected_tre_target_mm"] = placement.target_error_mm
     report["expected_tre_along_shaft_mm"] = placement.registration.expected_tre_mm(along).tolist()
     return report
@@ -260,9 +278,11 @@ def verify_certificate(path: Path, prepared: Prepared) -> dict[str, Any]:
     Raises:
         InputError: Not a certificate, not of this case, or a cell whose verdict does not follow.
     """
-    certificate = read_certificate(path)
+    content = read_input(path, max_bytes=MAX_CERTIFICATE_BYTES, where=str(path))
+    stated, certificate = content_input("certificate", path.name, content), parse_certificate(content, path)
     done = verify(certificate, prepared.case, prepared.anatomy, partial(prepared.watcher.count, "cells"))
-    return {"certificate": str(path), **certificate.summary(), "verified": asdict(done)}
+    inputs = inputs_document((stated, *prepared.case.inputs))
+    return {"certificate": str(path), "inputs": inputs, **certificate.summary(), "verified": asdict(done)}
 
 
 def _certified(run: Run, size_deg: float, out: Path) -> Run:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from planning.case import Case
 from planning.case_file import RegistrationSection
 from planning.errors import InputError
-from planning.formats.points import NamedPoints, read_points
+from planning.formats.points import NamedPoints, parse_points
 from planning.formats.spaces import Space
 from planning.registration import MIN_MARKERS, MarkerPairs, apply, fit_rigid, fit_triad, match
 
@@ -165,4 +165,4 @@ def _from_file(case: Case, name: str) -> Floats:
 
 
 def _read(case: Case, name: str, space: Space | None) -> NamedPoints:
-    return read_points(case.folder / name, default_space=space)
+    return parse_points(case.files.content(name), case.folder / name, default_space=space)

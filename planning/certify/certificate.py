@@ -16,13 +16,15 @@ from planning.certify.question import Question
 from planning.entry import angles
 from planning.errors import InputError
 from planning.files import atomic
+from planning.formats.input_file import read_input
+from planning.provenance import inputs_document, read_inputs
 from planning.reasons import Reason
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-CERTIFICATE_VERSION = 2
-"""Version of the file's layout."""
+CERTIFICATE_VERSION = 3
+"""Version of the file's layout. 3: lists its inputs with their roles, files that a file names included."""
 
 MAX_CERTIFICATE_BYTES = 500_000_000
 """A certificate has some ten thousand cells; a larger file is something else."""
@@ -174,7 +176,7 @@ def write_certificate(certificate: Certificate, path: Path) -> None:
     document = {
         "version": CERTIFICATE_VERSION,
         "case": question.case_name,
-        "inputs": dict(question.inputs),
+        "inputs": inputs_document(question.inputs),
         "target_ct_mm": question.target_ct.tolist(),
         "R_ct_entry": question.R_ct_entry.tolist(),
         "theta_rad": list(question.theta),
@@ -209,7 +211,16 @@ def read_certificate(path: Path) -> Certificate:
     Raises:
         InputError: Not a certificate, another version, missing or contradicting parts.
     """
-    document = _document(path)
+    return parse_certificate(read_input(path, max_bytes=MAX_CERTIFICATE_BYTES, where=str(path)), path)
+
+
+def parse_certificate(content: bytes, path: Path) -> Certificate:
+    """The same of a file that has been read; it is not opened again.
+
+    Raises:
+        InputError: As `read_certificate`, but for reading.
+    """
+    document = _document(content, path)
     try:
         certificate = _certificate(document, path)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -223,13 +234,9 @@ def read_certificate(path: Path) -> Certificate:
     return certificate
 
 
-def _document(path: Path) -> dict[str, Any]:
+def _document(content: bytes, path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > MAX_CERTIFICATE_BYTES:
-            raise InputError("too large", where=path, allowed=f"at most {MAX_CERTIFICATE_BYTES} bytes")
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed="a readable file") from error
+        document = json.loads(content.decode("utf-8"))
     except (ValueError, RecursionError) as error:
         raise InputError(f"no JSON ({error})", where=path, allowed="a file that search --certify wrote") from error
     if not isinstance(document, dict) or document.get("version") != CERTIFICATE_VERSION:
@@ -241,7 +248,7 @@ def _document(path: Path) -> dict[str, Any]:
 def _certificate(document: dict[str, Any], path: Path) -> Certificate:
     question = Question(
         case_name=str(document["case"]),
-        inputs={str(k): str(v) for k, v in document["inputs"].items()},
+        inputs=read_inputs(document["inputs"]),
         target_ct=_numbers(document["target_ct_mm"], (3,)),
         R_ct_entry=_numbers(document["R_ct_entry"], (3, 3)),
         theta=_range(document["theta_rad"]),

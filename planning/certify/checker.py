@@ -20,6 +20,7 @@ from planning.certify.plain_skin import PlainSkin, SkinFacts, leaves_view
 from planning.certify.question import question_of
 from planning.clearance.containment import Side, side_of
 from planning.errors import InputError
+from planning.provenance import differing_input
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -112,8 +113,12 @@ def _check_question(certificate: Certificate, case: Case, anatomy: Anatomy) -> N
     if not (np.all(np.isfinite(stated.theta)) and 0 <= stated.theta[0] <= stated.theta[1] <= np.pi + 1e-12):
         raise InputError(f"theta {stated.theta} is no range", where="certificate", allowed="0 to pi")
     asked = question_of(case, anatomy, theta=stated.theta, beta=stated.beta)
+    changed = differing_input(stated.inputs, asked.inputs)
+    if changed is not None:
+        what = f"input '{changed}' is not the one that the certificate was made from"
+        raise InputError(what, where="certificate", allowed=f"a certificate of {case.path}, unchanged since")
     for name in vars(asked):
-        if not np.array_equal(getattr(stated, name), getattr(asked, name)):
+        if name != "inputs" and not np.array_equal(getattr(stated, name), getattr(asked, name)):
             what = f"its {name} is not that of the case: the certificate was made for something else"
             raise InputError(what, where="certificate", allowed=f"a certificate of {case.path}, unchanged since")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +12,7 @@ from planning.case import Case
 from planning.certify.cells import Cells
 from planning.constraints import longest_path
 from planning.errors import InputError
+from planning.provenance import Input
 
 Floats = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ class Question:
 
     Attributes:
         case_name: The case.
-        inputs: File name to SHA-256 of every input of that case.
+        inputs: Every file of that case, with role and hash.
         target_ct: Shape (3,).
         R_ct_entry: Shape (3, 3).
         theta, beta: The cap: lowest and highest angle.
@@ -36,7 +36,7 @@ class Question:
     """
 
     case_name: str
-    inputs: Mapping[str, str]
+    inputs: tuple[Input, ...]
     target_ct: Floats
     R_ct_entry: Floats
     theta: tuple[float, float]
@@ -67,7 +67,7 @@ def question_of(
     demanding = [s for s in anatomy.structures if s.demands_margin]
     return Question(
         case_name=case.name,
-        inputs=dict(case.inputs),
+        inputs=case.inputs,
         target_ct=case.target_ct,
         R_ct_entry=case.T_ct_entry[:3, :3],
         theta=(float(theta[0]), float(theta[1])),

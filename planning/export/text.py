@@ -36,7 +36,7 @@ def heading(plan: Plan, notes: Iterable[str], *, case_checked: bool) -> list[str
         "research software, not a medical device",
         f"made by puncture-twin {version('puncture-twin')} from a plan of version {PLAN_VERSION}, seed {plan.seed}",
         f"case: {plain_text(plan.case_name)}",
-        *(f"input: {plain_text(name)} sha256 {plain_text(plan.inputs[name])}" for name in sorted(plan.inputs)),
+        *(f"input: {plain_text(f'{one.role}: {one.path}')} sha256 {plain_text(one.sha256)}" for one in plan.inputs),
         f"robot: {plain_text(plan.model)}",
         "this plan was " + ("checked against its case again" if case_checked else "NOT checked against its case again"),
         *notes,

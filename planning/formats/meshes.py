@@ -54,8 +54,25 @@ def read_mesh(path: Path, *, unit: Unit, space: Space, where: str | None = None)
         InputError: If it is missing, cut, contradicts itself, is empty, or fails the guard.
     """
     name = where or str(path)
+    _reader(path, name)  # an unknown ending is refused before anything is read
+    return parse_mesh(read_input(path, max_bytes=MAX_FILE_BYTES, where=name), path, unit=unit, space=space, where=name)
+
+
+def parse_mesh(data: bytes, path: Path, *, unit: Unit, space: Space, where: str | None = None) -> TriangleMesh:
+    """The same of a file that has been read; it is not opened again.
+
+    Args:
+        data: The whole file.
+        path: Its name, whose ending says the format.
+        unit: The unit of its coordinates.
+        space: Their space.
+        where: How errors name the file; its path by default.
+
+    Raises:
+        InputError: As `read_mesh`, but for reading.
+    """
+    name = where or str(path)
     reader = _reader(path, name)
-    data = read_input(path, max_bytes=MAX_FILE_BYTES, where=name)
     with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite or NaN here, the guard refuses
         raw = reader(data, name)
         vertices = to_lps(raw.vertices, space) * unit.mm

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import difflib
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from fnmatch import fnmatchcase
@@ -79,13 +79,19 @@ class OwnNames(Protocol):
         """Label to name, or None."""
 
 
-def names_for(naming: str | None, folder: Path, labelmap: OwnNames) -> dict[int, str]:
+def is_naming_file(naming: str | None) -> bool:
+    """Whether a naming is a file, and not a table of this package or of the label map itself."""
+    return naming is not None and naming not in BUILT_IN and naming.lower().endswith(".csv")
+
+
+def names_for(naming: str | None, folder: Path, content: Callable[[str], bytes], labelmap: OwnNames) -> dict[int, str]:
     """The names of labels, by number.
 
     Args:
         naming: ``"totalsegmentator-v1"``, ``"totalsegmentator-v2"``, the path of a CSV with the columns
             ``id,name``, or None or ``"seg.nrrd"`` for the names that a .seg.nrrd holds.
         folder: What a CSV's path is relative to.
+        content: Gives the bytes of a CSV by its path.
         labelmap: The map, for its own names.
 
     Raises:
@@ -99,7 +105,7 @@ def names_for(naming: str | None, folder: Path, labelmap: OwnNames) -> dict[int,
     if naming in BUILT_IN:
         return dict(BUILT_IN[naming])
     if naming.lower().endswith(".csv"):
-        return _unique(_read_csv(folder / naming), folder / naming)
+        return _unique(_read_csv(content(naming), folder / naming), folder / naming)
     near = difflib.get_close_matches(naming, BUILT_IN, n=1)
     hint = f" (nearest: {near[0]})" if near else ""
     raise InputError(f"unknown naming {naming!r}{hint}", where=labelmap.path, allowed=allowed)
@@ -192,14 +198,10 @@ def _unique(names: Mapping[int, str], where: Path) -> dict[int, str]:
     return dict(names)
 
 
-def _read_csv(path: Path) -> dict[int, str]:
+def _read_csv(data: bytes, path: Path) -> dict[int, str]:
     allowed = "a CSV with the header id,name and one label per line"
     try:
-        if path.stat().st_size > MAX_CSV_BYTES:
-            raise InputError("the naming is too large", where=path, allowed=f"at most {MAX_CSV_BYTES} bytes")
-        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines(), strict=True))
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed=allowed) from error
+        rows = list(csv.reader(data.decode("utf-8-sig").splitlines(), strict=True))
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"is no CSV text ({error})", where=path, allowed=allowed) from error
     if not rows or [cell.strip().lower() for cell in rows[0]] != ["id", "name"]:

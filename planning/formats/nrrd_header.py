@@ -102,7 +102,8 @@ def read_nrrd_header(path: Path) -> VolumeHeader:
         InputError: A damaged header, an unknown field, a space that is not patient space, data elsewhere than
             in the file or beside it, or data shorter or longer than promised.
     """
-    raw = _split(path)
+    with path.open("rb") as stream:
+        raw = _split(stream.read(MAX_HEADER_BYTES), path)
     fields = raw.fields
     if fields.get("dimension") != "3":
         layers = " (segments that overlap are stored in layers: export them as separate label maps)"
@@ -118,9 +119,21 @@ def read_nrrd_header(path: Path) -> VolumeHeader:
     return VolumeHeader(shape, T_ct_index, raw.remarks)
 
 
-def _split(path: Path) -> _Raw:
-    with path.open("rb") as stream:
-        head = stream.read(MAX_HEADER_BYTES)
+def data_file(content: bytes, path: Path) -> str | None:
+    """The name of the file beside a detached header that holds its data; None where header and data are one file.
+
+    Args:
+        content: The file, or its beginning.
+        path: Its name.
+
+    Raises:
+        InputError: A damaged header, or data elsewhere than in the file or beside it.
+    """
+    raw = _split(content[:MAX_HEADER_BYTES], path)
+    return None if raw.data_path == path else raw.data_path.name
+
+
+def _split(head: bytes, path: Path) -> _Raw:
     if re.match(rb"NRRD000[1-5]\r?\n", head) is None:
         raise InputError("no NRRD header (magic NRRD0001 to NRRD0005)", where=path, allowed="a .nrrd or .nhdr file")
     end = re.search(rb"\n\r?\n", head)

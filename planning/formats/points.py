@@ -74,10 +74,33 @@ def read_points(
         InputError: If it cannot be read, contradicts the caller, or its points fail the guard.
     """
     name = where or str(path)
-    reader = next((read for suffix, read in _READERS.items() if path.name.lower().endswith(suffix)), None)
-    if reader is None:
-        raise InputError(f"unknown point file {path.name!r}", where=name, allowed=", ".join(_READERS))
-    raw = reader(read_input(path, max_bytes=MAX_FILE_BYTES, where=name), name)
+    _reader(path, name)  # an unknown ending is refused before anything is read
+    data = read_input(path, max_bytes=MAX_FILE_BYTES, where=name)
+    return parse_points(data, path, default_space=default_space, default_unit=default_unit, where=name)
+
+
+def parse_points(
+    data: bytes,
+    path: Path,
+    *,
+    default_space: Space | None = None,
+    default_unit: Unit | None = None,
+    where: str | None = None,
+) -> NamedPoints:
+    """The same of a file that has been read; it is not opened again.
+
+    Args:
+        data: The whole file.
+        path: Its name, whose ending says the format.
+        default_space: As in `read_points`.
+        default_unit: As in `read_points`.
+        where: How errors name the file; its path by default.
+
+    Raises:
+        InputError: As `read_points`, but for reading.
+    """
+    name = where or str(path)
+    raw = _reader(path, name)(data, name)
     unit = raw.unit or default_unit
     if unit is None:
         raise InputError("no unit of length", where=name, allowed="x_mm,y_mm,z_mm in the header, or coordinateUnits")
@@ -90,6 +113,13 @@ def read_points(
         points = points * unit.mm if space is None else to_lps(points, space) * unit.mm
     guarded = guard_points(points, raw.names, where=name)
     return NamedPoints(tuple(raw.names), guarded, Space.LPS if space is Space.RAS else space, raw.kinds)
+
+
+def _reader(path: Path, where: str) -> Callable[[bytes, str], RawPoints]:
+    reader = next((read for suffix, read in _READERS.items() if path.name.lower().endswith(suffix)), None)
+    if reader is None:
+        raise InputError(f"unknown point file {path.name!r}", where=where, allowed=", ".join(_READERS))
+    return reader
 
 
 def write_points(path: Path, points: NamedPoints) -> None:

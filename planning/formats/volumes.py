@@ -16,12 +16,15 @@ import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation u
 from numpy.typing import NDArray
 
 from planning.errors import InputError
+from planning.formats import nrrd_header
 from planning.formats.nifti_header import read_nifti_header
 from planning.formats.nrrd_header import read_nrrd_header
-from planning.formats.volume_header import VolumeHeader, corner_deviation_mm
+from planning.formats.volume_header import MAX_VOXELS, VolumeHeader, corner_deviation_mm
 
 NIFTI_ENDINGS = (".nii", ".nii.gz")
 NRRD_ENDINGS = (".nrrd", ".nhdr")
+MAX_FILE_BYTES = 8 * MAX_VOXELS + 10_000_000
+"""As many voxels as are taken, of the widest type, behind the longest header."""
 AFFINE_TOLERANCE_MM = 0.25
 """How far SimpleITK and we may place a corner apart: its choice of qform over sform (0.2 mm), and rounding."""
 
@@ -66,6 +69,19 @@ def read_header(path: Path) -> VolumeHeader:
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path, allowed="a readable file") from error
     raise InputError("unknown file ending", where=path, allowed=", ".join(NIFTI_ENDINGS + NRRD_ENDINGS))
+
+
+def data_file(content: bytes, path: Path) -> str | None:
+    """The name of the file beside this one that holds its voxels; None for a volume in one file.
+
+    Args:
+        content: The file that was named.
+        path: Its name.
+
+    Raises:
+        InputError: A header that is damaged, or names data elsewhere.
+    """
+    return nrrd_header.data_file(content, path) if path.name.lower().endswith(NRRD_ENDINGS) else None
 
 
 def read_volume(path: Path) -> Volume:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from planning.candidates import Candidates
+from planning.provenance import Input
 from twin.report.numbers import arm_words, nearest_structure, number, percent, reason_counts
 from twin.report.palette import css
 
@@ -200,10 +201,10 @@ def warnings_section(warnings: Sequence[str]) -> str:
     return "<ul>" + "".join(f'<li class="bad">{escape(warning)}</li>' for warning in warnings) + "</ul>"
 
 
-def inputs_table(inputs: Mapping[str, str]) -> str:
-    """Every input with its hash."""
-    rows = [(escape(name), f"<code>{escape(digest)}</code>") for name, digest in inputs.items()]
-    return table(("file", "SHA-256"), rows)
+def inputs_table(inputs: Iterable[Input]) -> str:
+    """Every input with its role and hash."""
+    rows = [(escape(one.role), escape(one.path), f"<code>{escape(one.sha256)}</code>") for one in inputs]
+    return table(("role", "file", "SHA-256"), rows)
 
 
 def origin_section(seed: int, stages: Mapping[str, float]) -> str:

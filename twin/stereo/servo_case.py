@@ -12,14 +12,15 @@ from pydantic import Field, Strict, model_validator
 
 from planning.case_file import Coordinate, Length, Name, Number, Section, Vector
 from planning.errors import InputError
-from planning.files import sha256
-from planning.formats.meshes import read_mesh
-from planning.formats.points import NamedPoints, read_points
+from planning.formats import meshes, points
+from planning.formats.meshes import parse_mesh
+from planning.formats.points import NamedPoints, parse_points
 from planning.formats.spaces import Space, Unit
 from planning.mesh import TriangleMesh
+from planning.provenance import CASE_ROLE, Input, InputFiles
 from planning.registration import MIN_MARKERS
 from planning.robot.ur import ur_model
-from planning.toml_file import SchemaOne, find_toml, read_toml
+from planning.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
 
 Floats = NDArray[np.float64]
 
@@ -157,7 +158,7 @@ class ServoCase:
         skin: The head's surface, image frame, mm.
         markers: The markers' centres, image frame, as they truly are.
         targets: The targets, likewise.
-        inputs: SHA-256 of every file.
+        inputs: Every file, with role and hash.
     """
 
     path: Path
@@ -165,7 +166,7 @@ class ServoCase:
     skin: TriangleMesh
     markers: NamedPoints
     targets: NamedPoints
-    inputs: dict[str, str]
+    inputs: tuple[Input, ...]
 
     @property
     def name(self) -> str:
@@ -180,17 +181,19 @@ def load_servo_case(path: Path | str) -> ServoCase:
         InputError: Anything unreadable, unknown, missing or contradictory; names the key.
     """
     path = find_toml(path, CASE_NAME)
-    file = read_toml(path, ServoFile, allowed=ALLOWED_CASE, keys="docs/stereo.md")
+    files = InputFiles(path.parent)
+    stated = files.add(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE))
+    file = parse_toml(stated, path, ServoFile, allowed=ALLOWED_CASE, keys="docs/stereo.md")
     ur_model(file.robot.model)
-    named = {key: getattr(file.head, key) for key in ("mesh", "markers", "targets")}
-    for key, name in named.items():
-        if not (path.parent / name).is_file():
-            allowed = f"a file in {path.parent}"
-            raise InputError(f"head.{key}: file '{name}' is not there", where=path, allowed=allowed)
-    skin = read_mesh(path.parent / file.head.mesh, unit=Unit(file.head.unit), space=Space.LOCAL)
-    markers = read_points(path.parent / file.head.markers, default_space=Space.LOCAL)
-    targets = read_points(path.parent / file.head.targets, default_space=Space.LOCAL)
+    surface = _read(files, file.head, "mesh", meshes.MAX_FILE_BYTES, path)
+    named = {key: _read(files, file.head, key, points.MAX_FILE_BYTES, path) for key in ("markers", "targets")}
+    skin = parse_mesh(surface, path.parent / file.head.mesh, unit=Unit(file.head.unit), space=Space.LOCAL)
+    markers = parse_points(named["markers"], path.parent / file.head.markers, default_space=Space.LOCAL)
+    targets = parse_points(named["targets"], path.parent / file.head.targets, default_space=Space.LOCAL)
     if len(markers.names) < MIN_MARKERS:
         raise InputError(f"head.markers: {len(markers.names)} markers", where=path, allowed="3 or more")
-    inputs = {path.name: sha256(path)} | {name: sha256(path.parent / name) for name in named.values()}
-    return ServoCase(path, file, skin, markers, targets, inputs)
+    return ServoCase(path, file, skin, markers, targets, files.inputs)
+
+
+def _read(files: InputFiles, head: HeadSection, role: str, max_bytes: int, path: Path) -> bytes:
+    return files.read(role, getattr(head, role), max_bytes=max_bytes, key=f"head.{role}", where=path)

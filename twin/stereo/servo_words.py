@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from planning.provenance import inputs_document
 from twin.stereo.experiment import Row, Statistics, Trial
 from twin.stereo.liu2007 import TABLE_1, TABLE_2, Reproduction, paper_servo_only_at_least
 from twin.stereo.servo_case import ServoCase
@@ -65,7 +66,7 @@ def servo_summary(case: ServoCase, trials: Sequence[Trial], ours: Statistics | N
     stops = Counter(row.stop for one in trials for row in one.rows)
     return {
         "case": case.name,
-        "inputs": case.inputs,
+        "inputs": inputs_document(case.inputs),
         "tolerance_mm": case.file.servo.tolerance_mm,
         "estimate": case.file.servo.estimate,
         "stops": dict(stops),

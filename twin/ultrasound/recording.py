@@ -118,7 +118,16 @@ def read_recording(path: Path) -> Recording:
         InputError: Another header, a field that is no finite number, or a matrix that is no rigid motion.
     """
     file = path / FILE_NAME if path.is_dir() else path
-    text = decode_text(read_input(file, max_bytes=MAX_BYTES, where=str(file)), str(file))
+    return parse_recording(read_input(file, max_bytes=MAX_BYTES, where=str(file)), file)
+
+
+def parse_recording(content: bytes, file: Path) -> Recording:
+    """The same of a file that has been read; it is not opened again.
+
+    Raises:
+        InputError: As `read_recording`, but for reading.
+    """
+    text = decode_text(content, str(file))
     rows = [row for row in csv.reader(io.StringIO(text)) if row and not row[0].startswith("#")]
     header = tuple(cell.strip() for cell in rows[0]) if rows else ()
     kinds = {_columns(pixels, width): (pixels, width) for pixels in (False, True) for width in (0, 2, 3)}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,23 +10,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.files import atomic, sha256
+from planning.files import atomic
+from planning.formats.input_file import read_input
 from planning.prepared import Watcher
+from planning.provenance import Input, content_input, inputs_document
 from planning.stages import Stages
 from twin.ultrasound.acquisition import Acquisition, acquire, choice_noise
 from twin.ultrasound.calibration import Calibration, calibrate
 from twin.ultrasound.candidate_poses import Candidates, drawing, find_candidates
 from twin.ultrasound.pose_choice import expected_tre_mm
 from twin.ultrasound.puncture import Puncture, held_out_errors_mm, punctures
-from twin.ultrasound.recording import FILE_NAME, Recording, read_recording, write_recording
+from twin.ultrasound.recording import FILE_NAME, MAX_BYTES, Recording, parse_recording, write_recording
 from twin.ultrasound.selfcal_case import SelfcalCase
 from twin.ultrasound.selfcal_truth import draw_room
 from twin.ultrasound.summaries import calibration_summary, choice_summary, puncture_summary, trial_summary
 from twin.ultrasound.trial import Choice, Trial
 from twin.ultrasound.two_arms import TwoArms
 
-VERSION = 1
-"""Of ``calibration.json``."""
+VERSION = 2
+"""Of ``calibration.json``. 2: ``inputs`` lists each file with its role."""
 
 TARGETS = 6
 """Punctures per seed."""
@@ -47,7 +48,7 @@ class SelfcalRun:
         name: The case's, or the recording file's.
         calibration: The first trial's, or the recording's.
         recording: What it was made from.
-        inputs: File name to SHA-256.
+        inputs: Recording and case file, with role and hash.
         trials: In the twin, one per seed; empty for a recording.
         case: The case, in the twin.
         candidates: The same.
@@ -59,7 +60,7 @@ class SelfcalRun:
     name: str
     calibration: Calibration
     recording: Recording
-    inputs: Mapping[str, str]
+    inputs: tuple[Input, ...]
     trials: tuple[Trial, ...] = ()
     case: SelfcalCase | None = None
     candidates: Candidates | None = None
@@ -77,7 +78,7 @@ class SelfcalRun:
         return {
             **calibration_summary(self.calibration, self.recording),
             "name": self.name,
-            "inputs": dict(self.inputs),
+            "inputs": inputs_document(self.inputs),
             "candidates": None if self.candidates is None else self.candidates.counts,
             "choice": None if self.choice is None else choice_summary(self.choice),
             "trials": [trial_summary(trial) for trial in self.trials],
@@ -132,10 +133,11 @@ def selfcal_recording(path: Path, case: SelfcalCase | None) -> SelfcalRun:
     file = path / FILE_NAME if path.is_dir() else path
     stages = Stages()
     with stages.time("read"):
-        recording = read_recording(file)
+        content = read_input(file, max_bytes=MAX_BYTES, where=str(file))
+        recording = parse_recording(content, file)
     with stages.time("calibrate"):
         calibration = calibrate_case(recording, case)
-    inputs = {file.name: sha256(file), **({} if case is None else case.inputs)}
+    inputs = (content_input("recording", file.name, content), *(() if case is None else case.inputs))
     return SelfcalRun(file.stem, calibration, recording, inputs, case=case, stages=stages)
 
 
@@ -193,7 +195,7 @@ def calibration_file(run: SelfcalRun) -> dict[str, Any]:
         "version": VERSION,
         "name": run.name,
         "seed": run.trials[0].seed if run.trials else None,
-        "inputs_sha256": dict(run.inputs),
+        "inputs": inputs_document(run.inputs),
         **calibration_summary(found, run.recording),
         "residuals_mm": dict(zip(run.recording.names, found.residuals.tolist(), strict=True)),
         "parameters": list(found.parameters),

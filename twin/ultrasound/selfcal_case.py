@@ -12,9 +12,9 @@ from pydantic import Field, Strict, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
 from planning.case_file import Length, Name, Number, Section, Sextuple, Vector
-from planning.files import sha256
+from planning.provenance import CASE_ROLE, Input, content_input
 from planning.robot.ur import ur_model
-from planning.toml_file import SchemaOne, find_toml, read_toml
+from planning.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
 from twin.true_arm import ArmErrors
 from twin.ultrasound.probe_image import Imager, NeedleEcho
 from twin.ultrasound.recording import Noise
@@ -216,7 +216,7 @@ class SelfcalCase:
     Attributes:
         path: The case file.
         content: What it says.
-        inputs: File name to SHA-256.
+        inputs: The case file, with role and hash.
         T_end1_image: The drawing's X, shape (4, 4), mm: the face's middle on the flange's z axis, the depth along it.
         T_base1_base2: The drawing's Y, shape (4, 4), mm.
         tip_end2: The drawing's tip, shape (3,), mm.
@@ -224,7 +224,7 @@ class SelfcalCase:
 
     path: Path
     content: SelfcalFile
-    inputs: dict[str, str]
+    inputs: tuple[Input, ...]
     T_end1_image: Floats = field(init=False)
     T_base1_base2: Floats = field(init=False)
     tip_end2: Floats = field(init=False)
@@ -264,7 +264,8 @@ def load_selfcal_case(path: Path | str) -> SelfcalCase:
         InputError: Anything unreadable, unknown, missing or contradictory; names the key.
     """
     path = find_toml(path, CASE_NAME)
-    content = read_toml(path, SelfcalFile, allowed=ALLOWED_CASE, keys="docs/ultrasound.md")
+    stated = read_toml_bytes(path, ALLOWED_CASE)
+    content = parse_toml(stated, path, SelfcalFile, allowed=ALLOWED_CASE, keys="docs/ultrasound.md")
     for arm in (content.probe_arm, content.needle_arm):
         ur_model(arm.model)
-    return SelfcalCase(path, content, {path.name: sha256(path)})
+    return SelfcalCase(path, content, (content_input(CASE_ROLE, path.name, stated),))

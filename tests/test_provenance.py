@@ -1,0 +1,81 @@
+"""What a result was made from: each file read once, hashed as it was read, and listed with its role."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from pathlib import Path
+
+import pytest
+
+from planning.errors import InputError
+from planning.provenance import Input, InputFiles, differing_input, inputs_document, read_inputs
+
+LISTED = (Input("case", "case.toml", "a" * 64), Input("mesh liver", "liver.stl", "b" * 64))
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> InputFiles:
+    """A folder with one file, which was read."""
+    (tmp_path / "a.csv").write_bytes(b"first")
+    files = InputFiles(tmp_path)
+    assert files.read("markers_ct", "a.csv", max_bytes=100, key="x", where=tmp_path) == b"first"
+    return files
+
+
+def test_the_hash_is_that_of_the_bytes_that_are_parsed(files: InputFiles, tmp_path: Path) -> None:
+    """A file that changes after it was read changes neither the content nor the hash, in no role."""
+    (tmp_path / "a.csv").write_bytes(b"second")
+    assert files.read("target", "a.csv", max_bytes=100, key="x", where=tmp_path) == b"first"
+    assert files.content("a.csv") == b"first"
+    first = hashlib.sha256(b"first").hexdigest()
+    assert files.inputs == (Input("markers_ct", "a.csv", first), Input("target", "a.csv", first))
+
+
+def test_a_large_file_that_was_let_go_of_must_be_the_same_when_it_is_read_again(tmp_path: Path) -> None:
+    """Also in another process, which is sent the hashes alone."""
+    (tmp_path / "ct.nii").write_bytes(bytes(11_000_000))
+    files = InputFiles(tmp_path)
+    files.read("ct", "ct.nii", max_bytes=1 << 30, key="x", where=tmp_path)
+    files.release()
+    other = pickle.loads(pickle.dumps(files))
+    assert files.content("ct.nii") == other.content("ct.nii") == bytes(11_000_000)
+    (tmp_path / "ct.nii").write_bytes(bytes(11_000_001))
+    for each in (files, other):
+        with pytest.raises(InputError, match="has changed since it was read"):
+            each.content("ct.nii")
+    assert len(pickle.dumps(files)) < 1000
+
+
+@pytest.mark.parametrize("name", ["gone.csv", "folder", "x" * 5000, "a\0b", "../none"])
+def test_a_file_that_is_not_there_is_named_by_its_key(files: InputFiles, tmp_path: Path, name: str) -> None:
+    """Missing, a folder, a name that no file system takes."""
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(InputError, match=r"case.toml: structure 'liver': file '.* is not there"):
+        files.read("mesh liver", name, max_bytes=100, key="structure 'liver'", where=tmp_path / "case.toml")
+
+
+def test_a_list_survives_its_document() -> None:
+    """A list of role, path and sha256 reads back to the same inputs."""
+    assert read_inputs(inputs_document(LISTED)) == LISTED
+
+
+@pytest.mark.parametrize("wrong", [{"case.toml": "a"}, "x", [["case"]], [{"role": "case", "path": 1, "sha256": "a"}]])
+def test_what_is_no_list_of_inputs_is_refused(wrong: object) -> None:
+    """Older plans hold a mapping; numbers are no paths."""
+    with pytest.raises((TypeError, KeyError)):
+        read_inputs(wrong)
+
+
+def test_the_input_that_differs_is_named() -> None:
+    """By role and path; another notation of a path, another name of the case file and another order are the same."""
+    case, liver = LISTED
+    same = (Input("mesh liver", "./liver.stl", "b" * 64), Input("case", "renamed.toml", "a" * 64))
+    assert differing_input(LISTED, same) is None
+    assert differing_input(LISTED, (case, Input("mesh liver", "liver.stl", "c" * 64))) == "mesh liver (liver.stl)"
+    assert differing_input(LISTED, (case,)) == "mesh liver (liver.stl)"
+    assert differing_input((case,), LISTED) == "mesh liver (liver.stl)"
+    assert differing_input(LISTED, (Input("case", "case.toml", "d" * 64), liver)) == "case"
+    labels = [Input("labelmap", name, digest * 64) for name, digest in (("a.nii", "a"), ("b.nii", "b"))]
+    swapped = [Input("labelmap", name, digest * 64) for name, digest in (("a.nii", "b"), ("b.nii", "a"))]
+    assert differing_input(labels, swapped) == "labelmap (a.nii)"
