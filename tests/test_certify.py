@@ -381,7 +381,7 @@ def test_no_certificate_is_refused(tmp_path, content):
     path.write_text(content)
     with pytest.raises(InputError):
         read_certificate(path)
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="no such file"):
         read_certificate(tmp_path / "none.json")
 
 
