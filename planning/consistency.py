@@ -2,21 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.anatomy import Anatomy, Role
+from planning.anatomy import Anatomy, Role, Structure
 from planning.case import Case
 from planning.errors import InputError
 from planning.formats.decimation import squared_distance
+from planning.formats.volume_header import VolumeHeader
 from planning.formats.volumes import read_header
+from planning.inside_skin import LEAST_TOLERANCE_MM, inside_skin
 from planning.placement import Placement
+from planning.skin import Skin
 from planning.winding import winding_number
 
 Floats = NDArray[np.float64]
+Headers = Mapping[str, VolumeHeader]
 
 MARKER_ON_SKIN_MM = 30.0
 """A skin marker's centre lies within its own height of the skin; one farther off stands on a frame, or is misread."""
+
+USUAL_INSIDE = 0.99
+"""Of a structure's area, inside the skin; a smaller fraction is a warning. One percent is what smoothing moves."""
+
+LEAST_INSIDE = 0.9
+"""A smaller fraction is refused: whatever the cause is, the organ is not where the search takes it to be."""
+
+ALLOWED_INSIDE = (
+    f"at least {100 * LEAST_INSIDE:g} % of a structure's surface inside the skin; "
+    'role "unknown" for what is known to lie outside'
+)
+
+CAUSES = "a part of the body that the skin does not hold (such as an arm), or a slip of space (LPS/RAS) or unit?"
 
 VOXELS_OF_SLACK = 1.0
 """A map may end so many voxels inside the skin's box: the skin itself is found to that."""
@@ -29,19 +48,40 @@ def check_consistency(case: Case, anatomy: Anatomy, placement: Placement | None)
         Warnings, one sentence each.
 
     Raises:
-        InputError: A structure wholly outside the body, an open one that seems to hold the target, or a label map that
-            ends inside the body within the needle's reach.
+        InputError: A structure of which too much lies outside the body, an open one that seems to hold the target, or a
+            label map that ends inside the body within the needle's reach.
     """
-    _refuse_outside(case, anatomy)
+    headers = volume_headers(case)
+    outside = _outside_warnings(case, anatomy, headers)
     _refuse_open_around_target(case, anatomy)
-    _refuse_short_maps(case, anatomy)
-    return (*_marker_warnings(anatomy, placement), *_unnamed_warnings(case))
+    _refuse_short_maps(case, anatomy, headers)
+    return (*outside, *_marker_warnings(anatomy, placement), *_unnamed_warnings(case))
 
 
-def _refuse_outside(case: Case, anatomy: Anatomy) -> None:
-    """An organ beside the body is a slip of space or unit, and an organ that is elsewhere protects nothing."""
-    low, high = anatomy.skin.mesh.bounds
-    for structure in anatomy.structures:
+def _outside_warnings(case: Case, anatomy: Anatomy, headers: Headers) -> tuple[str, ...]:
+    """An organ that is elsewhere protects nothing; what is `unknown` may lie anywhere."""
+    placed = [structure for structure in anatomy.structures if structure.role is not Role.UNKNOWN]
+    _refuse_wholly_outside(case, anatomy.skin, placed)
+    if not anatomy.skin.mesh.closed:
+        return ("the skin mesh is open: how much of each structure lies inside the body is not known",)
+    skin_volume = next(section.ct or section.labelmap for section in case.structure if section.role == "skin")
+    tolerances = np.array([_surface_tolerance_mm(structure, skin_volume, headers) for structure in placed])
+    parts = inside_skin([structure.mesh for structure in placed], anatomy.skin, case.target_ct, tolerances)
+    warnings = []
+    for structure, part in zip(placed, parts, strict=True):
+        outside = f"{100 * (1 - part.fraction):.1f} % of its surface lies outside the skin"
+        said = f"structure '{structure.name}': {outside}: {CAUSES}"
+        if part.fraction < LEAST_INSIDE:
+            raise InputError(said, where=case.path, allowed=ALLOWED_INSIDE)
+        if part.fraction < USUAL_INSIDE:
+            warnings.append(said)
+    return tuple(warnings)
+
+
+def _refuse_wholly_outside(case: Case, skin: Skin, structures: Sequence[Structure]) -> None:
+    """Also where the skin is open, or its cut sides say nothing: no box of an organ lies beside the body's."""
+    low, high = skin.mesh.bounds
+    for structure in structures:
         below, above = structure.mesh.bounds
         if np.any(below > high) or np.any(above < low):
             raise InputError(
@@ -49,6 +89,24 @@ def _refuse_outside(case: Case, anatomy: Anatomy) -> None:
                 where=case.path,
                 allowed="structures that reach into the body",
             )
+
+
+def _surface_tolerance_mm(structure: Structure, skin_volume: str | None, headers: Headers) -> float:
+    """How far a structure's surface and the skin may be off: half a voxel each, and no less than a mesh may."""
+    names = (skin_volume, structure.source.rpartition(":")[0])
+    halves = [float(headers[name].spacing_mm.max()) / 2 for name in names if name and name in headers]
+    return max(LEAST_TOLERANCE_MM, sum(halves))
+
+
+def volume_headers(case: Case) -> dict[str, VolumeHeader]:
+    """The headers of the CT and the label maps that the case's structures come from, by file name.
+
+    Raises:
+        InputError: A header that cannot be trusted.
+    """
+    named = {section.ct or section.labelmap for section in case.structure}
+    named |= {section.labelmap for section in case.structures}
+    return {name: read_header(case.folder / name) for name in sorted(name for name in named if name)}
 
 
 def _refuse_open_around_target(case: Case, anatomy: Anatomy) -> None:
@@ -65,7 +123,7 @@ def _refuse_open_around_target(case: Case, anatomy: Anatomy) -> None:
             )
 
 
-def _refuse_short_maps(case: Case, anatomy: Anatomy) -> None:
+def _refuse_short_maps(case: Case, anatomy: Anatomy, headers: Headers) -> None:
     """Beyond a label map's box organs have no label: within the needle's reach the box must hold the body."""
     reach = case.needle.length_mm
     low, high = anatomy.skin.mesh.bounds
@@ -73,7 +131,7 @@ def _refuse_short_maps(case: Case, anatomy: Anatomy) -> None:
     corners = np.array([[low[0], high[0]], [low[1], high[1]], [low[2], high[2]]])
     points = np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, 3)
     for name in sorted({s.labelmap for s in case.structure if s.labelmap} | {s.labelmap for s in case.structures}):
-        header = read_header(case.folder / name)
+        header = headers[name]
         T_index_ct = np.linalg.inv(header.T_ct_index)
         index = points @ T_index_ct[:3, :3].T + T_index_ct[:3, 3]
         outside = np.maximum(-0.5 - index, index - (np.array(header.shape) - 0.5)).max()

@@ -47,7 +47,7 @@ def skin_paths(skin: Skin, target_ct: Floats, outward_ct: Floats, length: float)
         outward_ct: Shape (n, 3), unit vectors.
         length: Needle length, tip to flange: how far skin and unknown regions matter, mm.
     """
-    found, odd = _settled(skin.mesh, target_ct, outward_ct)
+    found, odd = settled_crossings(skin.mesh, target_ct, outward_ct)
     has = found.count > 0
     first = found.first[has]
     depth, face = np.full(len(outward_ct), np.nan), np.zeros(len(outward_ct), np.int64)
@@ -68,7 +68,7 @@ def skin_paths(skin: Skin, target_ct: Floats, outward_ct: Floats, length: float)
     return SkinPaths(entry, depth, np.arccos(np.clip(cosine, 0, 1)), reentry, unknown)
 
 
-def _settled(mesh: TriangleMesh, origin: Floats, directions: Floats) -> tuple[Crossings, Bools]:
+def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) -> tuple[Crossings, Bools]:
     """Crossings, and which rays leave the body an odd number of times, as a ray from inside a closed surface must.
 
     A ray through an edge or corner may count twice or touch without crossing; it is turned by `NUDGE` and asked again.

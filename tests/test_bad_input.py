@@ -238,6 +238,15 @@ BREAKS = {
         "lies inside 'rib', which is to be avoided",
     ),
     "an organ beside the body": (lambda f: ball(f / "rib.stl", 5, (400, 0, 40)), "lies wholly outside the skin"),
+    "an organ outside of a round body, inside its box": (
+        lambda f: ball(f / "rib.stl", 5, (75, 75, 75)),
+        "'rib': 100.0 % of its surface lies outside the skin: a part of the body that the skin does not hold",
+    ),
+    "an organ half outside": (lambda f: ball(f / "rib.stl", 20, (90, 0, 0)), "% of its surface lies outside the skin"),
+    "an organ to be crossed half outside": (
+        lambda f: (ball(f / "rib.stl", 20, (90, 0, 0)), replace("case.toml", '"avoid"', '"traverse"')(f)),
+        "'rib': 5",
+    ),
     "an open organ around the target": (
         lambda f: opened(f / "rib.stl", 30),
         "is an open mesh that goes around the target",

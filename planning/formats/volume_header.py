@@ -41,6 +41,11 @@ class VolumeHeader:
     T_ct_index: NDArray[np.float64]
     fields: dict[str, str]
 
+    @property
+    def spacing_mm(self) -> NDArray[np.float64]:
+        """Distance of neighbouring voxels along i, j and k, shape (3,)."""
+        return np.asarray(np.linalg.norm(self.T_ct_index[:3, :3], axis=0))
+
 
 def check_shape(shape: tuple[int, ...], *, where: Path) -> tuple[int, int, int]:
     """The shape, if it is that of a volume in three dimensions that fits a machine.
