@@ -40,15 +40,32 @@ class TriangleMesh:
     @cached_property
     def closed(self) -> bool:
         """Whether there is an inside: every edge of welded vertices has an even number of triangles."""
+        a, b, c = self._welded[self.distinct].T
+        ends = np.stack([np.concatenate([a, b, c]), np.concatenate([b, c, a])])
+        edges = np.sort(ends.min(axis=0) * len(self.vertices) + ends.max(axis=0))
+        starts = np.flatnonzero(np.r_[True, edges[1:] != edges[:-1], True])
+        return bool(len(edges) and np.all(np.diff(starts) % 2 == 0))
+
+    @cached_property
+    def distinct(self) -> NDArray[np.bool_]:
+        """Which triangles have three corners in different places and are not given before, shape (m,)."""
+        a, b, c = self._welded.T
+        return (a != b) & (b != c) & (c != a) & _first_of_equals(np.sort(np.stack([a, b, c]), axis=0))
+
+    @cached_property
+    def wound_alike(self) -> bool:
+        """Whether every edge is run as often one way as the other: else no side of the surface is its outer side."""
+        a, b, c = self._welded.T
+        starts, ends = np.concatenate([a, b, c]), np.concatenate([b, c, a])
+        count = len(self.vertices)
+        return bool(np.array_equal(np.sort(starts * count + ends), np.sort(ends * count + starts)))
+
+    @cached_property
+    def _welded(self) -> NDArray[np.int64]:
+        """Numbers of the corners' places, equal where the coordinates are, shape (m, 3)."""
         keys = (self.vertices + 0.0).view(np.dtype((np.void, 24))).reshape(-1)  # + 0.0 makes -0.0 equal to 0.0
         _, welded = np.unique(keys, return_inverse=True)
-        a, b, c = welded[self.faces].T.astype(np.int64)
-        proper = (a != b) & (b != c) & (c != a)
-        proper &= _first_of_equals(np.sort(np.stack([a, b, c]), axis=0))  # one that stands twice closes nothing
-        ends = np.stack([np.concatenate([a, b, c]), np.concatenate([b, c, a])])[:, np.tile(proper, 3)]
-        edges = np.sort(ends.min(axis=0) * len(keys) + ends.max(axis=0))
-        starts = np.flatnonzero(np.r_[True, edges[1:] != edges[:-1], True])
-        return bool(proper.any() and np.all(np.diff(starts) % 2 == 0))
+        return np.asarray(welded[self.faces], dtype=np.int64)
 
     @property
     def bounds(self) -> NDArray[np.float64]:

@@ -74,6 +74,14 @@ def test_a_needle_wholly_inside_is_a_hit(rng, ball):
     assert found.violated.all()
 
 
+def test_a_needle_wholly_inside_a_badly_wound_mesh_is_a_hit(rng, ball):
+    """A third of the triangles wound the other way: still a closed surface, and the needle in it is in the organ."""
+    mesh = ball(400)
+    flip = rng.random((len(mesh.faces), 1)) < 0.33
+    mixed = TriangleMesh(mesh.vertices, np.where(flip, mesh.faces[:, ::-1], mesh.faces))
+    assert clearances(mixed, [3.0, 5.0, 7.0], units(rng, 20)).violated.all()
+
+
 def test_inside_an_open_mesh_distance_stays(rng, ball):
     """An open mesh has no inside: the distance from its surface is what can be said."""
     mesh = ball(400)

@@ -90,3 +90,36 @@ def test_open_surfaces_have_no_side(ball):
     """Without one triangle a sphere has no inside that could be known."""
     mesh = ball(50)
     assert side_of(TriangleMesh(mesh.vertices, mesh.faces[1:]), np.zeros(3)) is Side.UNKNOWN
+
+
+@pytest.mark.parametrize("fraction", [0.1, 0.5, 0.9])
+def test_a_closed_surface_wound_at_random_has_its_inside(rng, ball, fraction):
+    """Where triangles are wound against their neighbours the winding number may be 0 amid them; rays still tell."""
+    mesh = ball(50)
+    flip = rng.random((len(mesh.faces), 1)) < fraction
+    mixed = TriangleMesh(mesh.vertices, np.where(flip, mesh.faces[:, ::-1], mesh.faces))
+    assert mesh.wound_alike and not mixed.wound_alike
+    points = rng.uniform(-60, 60, (300, 3))
+    away = np.linalg.norm(points, axis=1)
+    for point in points[(away < 49) | (away > 51)]:
+        assert side_of(mixed, point) is (Side.INSIDE if np.linalg.norm(point) < 50 else Side.OUTSIDE)
+
+
+def test_triangles_given_again_the_other_way_do_not_hide_an_inside(ball):
+    """A closed ball whose near triangles are given twice more, reversed: their solid angles do not undo the inside."""
+    mesh, point = ball(50, subdivisions=1), np.array([0.0, 0, 40.0])
+    near = mesh.faces[np.argsort(np.linalg.norm(mesh.triangles.mean(axis=1) - [0, 0, 50.0], axis=1))[:6], ::-1]
+    again = TriangleMesh(mesh.vertices, np.concatenate([mesh.faces, near, near]))
+    assert again.closed and abs(winding_number(again, point)) < 0.5
+    assert side_of(again, point) is Side.INSIDE
+
+
+def test_shells_within_shells_keep_their_hollows(ball):
+    """An inner shell that is wound against the outer one is a hollow; wound alike it is solid throughout."""
+    outer, inner = ball(50), ball(20)
+    for faces, expected in ((inner.faces[:, ::-1], Side.OUTSIDE), (inner.faces, Side.INSIDE)):
+        both = TriangleMesh(
+            np.concatenate([outer.vertices, inner.vertices]), np.concatenate([outer.faces, faces + len(outer.vertices)])
+        )
+        assert side_of(both, np.zeros(3)) is expected
+        assert side_of(both, np.array([35.0, 0, 0])) is Side.INSIDE

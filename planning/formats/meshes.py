@@ -95,6 +95,8 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
             f"{name}: open mesh: inside or outside cannot be known, only the distance to its surface; "
             "if it should be closed, the file may be incomplete"
         )
+    elif not mesh.wound_alike:
+        warnings.append(f"{name}: triangles are wound against their neighbours: inside is found by rays")
     elif _signed_volume(mesh) < 0.0:
         warnings.append(f"{name}: inverted normals: they point inward; inside is judged without them")
     return tuple(warnings)
