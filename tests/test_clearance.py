@@ -116,7 +116,7 @@ def test_clearance_grows_by_no_more_than_the_distance_moved(seed, step):
 
 
 def test_the_verdict_is_fcls_own_near_the_threshold(rng, ball):
-    """With the margin set to the exact clearance ± 1e-3 ... 1e-7 mm, the verdict is FCL's capsule collision."""
+    """With the margin at the exact clearance ± 1e-3 ... 1e-7 mm: FCL's capsule collision decides, and may only add."""
     mesh = ball(20, (60, 10, 5), 3)
     target, radius = np.zeros(3), 0.6
     engine = FclEngine([mesh])
@@ -130,9 +130,22 @@ def test_the_verdict_is_fcls_own_near_the_threshold(rng, ball):
                 margin = exact[row] + sign * offset
                 found = clearances(mesh, target, directions[row : row + 1], margin=margin)
                 judged = engine.collides(0, target, directions[row], LENGTH, radius + margin)
-                assert bool(found.violated[0, 0]) == judged
+                assert bool(found.violated[0, 0]) == (judged or sign > 0)
                 decided += 1
     assert decided >= 50
+
+
+def test_an_overlap_that_fcl_does_not_see_is_too_close(rng, ball):
+    """A margin that lacks 1e-7 mm is not kept: FCL calls a capsule free that overlaps by less than its tolerance."""
+    mesh, radius, unseen = ball(20, (60, 10, 5), 3), 0.6, 0
+    engine, directions = FclEngine([mesh]), np.array([[1.0, 0, 0]]) + 0.7 * units(rng, 20)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    exact = clearances(mesh, np.zeros(3), directions).clearance[:, 0]
+    for row in np.flatnonzero(exact > 0):
+        margin = exact[row] + 1e-7
+        unseen += not engine.collides(0, np.zeros(3), directions[row], LENGTH, radius + margin)
+        assert clearances(mesh, np.zeros(3), directions[row : row + 1], margin=margin).violated.all()
+    assert unseen > 0
 
 
 def test_far_from_the_threshold_distance_and_collision_agree(rng, ball, box):

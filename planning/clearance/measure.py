@@ -14,6 +14,10 @@ from planning.clearance.engine import ClearanceEngine, Floats
 NEAR_THRESHOLD_MM = 1e-4
 """Within this of a margin FCL's capsule collision decides: its own tolerance is 1e-6 mm."""
 
+ROUNDING_MM = 1e-9
+"""An axis that is too near by more than this is too close even where FCL does not see it: a capsule that overlaps a
+triangle by less than 1e-6 mm is free to FCL."""
+
 
 @dataclass(frozen=True, eq=False)
 class Clearances:
@@ -22,7 +26,7 @@ class Clearances:
     Attributes:
         clearance: Shape (n, k), axis distance minus needle radius, never below minus the radius.
         depth: Shape (n, k), where along the needle, from the target.
-        violated: Shape (n, k), the structure demands a margin and does not get it.
+        violated: Shape (n, k), the structure demands a margin and does not get it, by its distance or by FCL's word.
     """
 
     clearance: Floats
@@ -62,6 +66,8 @@ def measure(
             limit = radius + structure.margin_mm
             violated[:, column] = distance[:, column] < limit
             for row in np.flatnonzero(np.abs(distance[:, column] - limit) < NEAR_THRESHOLD_MM):
-                violated[row, column] = engine.collides(column, target_ct, outward_ct[row], length, limit)
+                violated[row, column] = distance[row, column] < limit - ROUNDING_MM or engine.collides(
+                    column, target_ct, outward_ct[row], length, limit
+                )
     distance -= radius
     return Clearances(distance, depth, violated)
