@@ -622,6 +622,7 @@ def test_an_obj_cut_at_a_line_end_is_open_where_it_is_not_refused(tmp_path: Path
     [
         pytest.param(lambda faces: faces[1:], "open mesh: inside or outside cannot be known", id="open"),
         pytest.param(lambda faces: faces[:, ::-1], "inverted normals", id="inverted"),
+        pytest.param(lambda f: np.vstack([f[:9, ::-1], f[9:]]), "wound against their neighbours", id="mixed"),
         pytest.param(lambda f: np.vstack([f, [[0, 0, 1]]]), "1 of 81 triangles have no area", id="no-area"),
     ],
 )
