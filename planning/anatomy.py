@@ -20,11 +20,15 @@ from planning.formats.decimation import squared_distance
 from planning.formats.meshes import mesh_warnings, parse_mesh
 from planning.formats.naming import RuleKind, names_for, select
 from planning.formats.spaces import Space, parse_space, parse_unit
+from planning.formats.volumes import NRRD_ENDINGS
 from planning.mesh import TriangleMesh
 from planning.skin import Skin, flat_ends, skin_from_mesh
 from planning.surfaces import VolumeSurfaces
 
 Progress = Callable[[str], None]
+
+UNNAMED_SHOWN = 8
+"""Labels that a warning lists; a person looks at the map for the rest."""
 
 ON_SURFACE_MM = 1e-3
 """A target this close to its structure's surface lies on it: meshes in single precision round to 1e-5 mm."""
@@ -103,7 +107,7 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
         structures.extend(loader.many(section))
     skin = loader.skin(skin_section)
     _check_names(case, structures)
-    warnings = [*loader.warnings, *skin.warnings]
+    warnings = [*loader.warnings, *loader.unnamed_warnings(), *skin.warnings]
     for structure in structures:
         warnings.extend(mesh_warnings(structure.mesh, structure.name))
     _check_target(case, structures, skin)
@@ -151,6 +155,25 @@ class _Loader:
             role = Role(rule.kind.value)
             structures.append(Structure(rule.name, role, rule.margin_mm, volume.label(rule.label), source))
         return structures
+
+    def unnamed_warnings(self) -> list[str]:
+        """Maps from which the case takes single labels, and which hold others that nobody names."""
+        named: dict[str, set[int]] = {}
+        for section in self._case.structure:
+            if section.labelmap is not None and section.label is not None:
+                named.setdefault(section.labelmap, set()).add(section.label)
+        whole = {section.labelmap for section in self._case.structures}
+        return [w for name, labels in sorted(named.items()) if name not in whole for w in self._unnamed(name, labels)]
+
+    def _unnamed(self, name: str, labels: set[int]) -> list[str]:
+        volume = self._labels(name)
+        others = [label for label in volume.labels_present() if label not in labels]
+        if not others:
+            return []
+        names = (volume.names or {}) if name.lower().endswith(NRRD_ENDINGS) else {}
+        shown = [f"{label} {names[label]}" if label in names else str(label) for label in others[:UNNAMED_SHOWN]]
+        more = f" and {len(others) - len(shown)} more" if len(others) > len(shown) else ""
+        return [f"{name} holds labels that the case does not name, and they count as free: {', '.join(shown)}{more}"]
 
     def skin(self, section: StructureSection) -> Skin:
         """The body's surface, from whatever the case names."""

@@ -39,6 +39,10 @@ Matrix = NDArray[np.float64]
 AXES_PARALLEL = 0.999
 """|cos| above which a mount's x and z axes do not span a frame (2.6 degrees)."""
 
+AXES_SQUARE_DEG = 1.0
+"""A mount's x and z axes may differ from a right angle by this much: what rounding to two digits leaves. More is
+another rotation than was meant, and 1 degree moves the needle's tip by 9 mm at the arm's reach of half a metre."""
+
 
 @dataclass(frozen=True)
 class Needle:
@@ -219,12 +223,19 @@ def mount_pose(mount: MountSection, space: Space, path: Path) -> Matrix:
     """T_base_ct, shape (4, 4), from the base's origin and axes, as a case states them in its own space.
 
     Raises:
-        InputError: The axes are parallel or zero.
+        InputError: The axes are parallel or zero, or not at a right angle.
     """
     x, z = (to_lps(np.asarray([v], dtype=float), space)[0] for v in (mount.x_axis, mount.z_axis))
     lengths = np.linalg.norm(x), np.linalg.norm(z)
     if min(lengths) == 0 or abs(x @ z) > AXES_PARALLEL * lengths[0] * lengths[1]:
         raise InputError("robot.mount: x_axis and z_axis are parallel or zero", where=path, allowed="two axes")
+    angle = float(np.degrees(np.arccos(x @ z / (lengths[0] * lengths[1]))))
+    if abs(angle - 90.0) > AXES_SQUARE_DEG:
+        raise InputError(
+            f"robot.mount: x_axis and z_axis are {angle:.1f} degrees apart",
+            where=path,
+            allowed=f"a right angle, to {AXES_SQUARE_DEG:g} degree",
+        )
     z = z / lengths[1]
     x = x - z * (x @ z)
     x = x / np.linalg.norm(x)

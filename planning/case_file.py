@@ -121,6 +121,8 @@ class SearchSection(Section):
             low, high = getattr(self, key)
             if low > high:
                 raise ValueError(f"{key} [{low:g}, {high:g}] descends; it is [lowest, highest]")
+            if 0 < high - low < self.step_deg:
+                raise ValueError(f"step_deg {self.step_deg:g} is larger than the range {key} [{low:g}, {high:g}]")
         return self
 
 

@@ -15,6 +15,7 @@ from planning.formats.volume_header import VolumeHeader
 from planning.formats.volumes import read_header
 from planning.inside_skin import LEAST_TOLERANCE_MM, inside_skin
 from planning.placement import Placement
+from planning.resolution import resolution_warnings
 from planning.skin import Skin
 from planning.winding import winding_number
 
@@ -55,7 +56,7 @@ def check_consistency(case: Case, anatomy: Anatomy, placement: Placement | None)
     outside = _outside_warnings(case, anatomy, headers)
     _refuse_open_around_target(case, anatomy)
     _refuse_short_maps(case, anatomy, headers)
-    return (*outside, *_marker_warnings(anatomy, placement), *_unnamed_warnings(case))
+    return (*outside, *_marker_warnings(anatomy, placement), *resolution_warnings(case, anatomy, headers))
 
 
 def _outside_warnings(case: Case, anatomy: Anatomy, headers: Headers) -> tuple[str, ...]:
@@ -152,12 +153,3 @@ def _marker_warnings(anatomy: Anatomy, placement: Placement | None) -> tuple[str
     if not far:
         return ()
     return (f"markers far from the skin: {', '.join(far)}; is their file in the case's space (LPS/RAS) and unit?",)
-
-
-def _unnamed_warnings(case: Case) -> tuple[str, ...]:
-    """Single labels taken from a map: what else it holds counts as free."""
-    whole = {section.labelmap for section in case.structures}
-    single = sorted({s.labelmap for s in case.structure if s.labelmap and s.role != "skin"} - whole)
-    return tuple(
-        f"of {name} only the labels that the case names are judged; the others count as free" for name in single
-    )

@@ -1,0 +1,98 @@
+"""What the grids of a case miss: thick slices, steps that do not fit, labels that nobody names."""
+
+import numpy as np
+import pytest
+import SimpleITK
+
+from planning.case import load_case
+from planning.errors import InputError
+from planning.prepared import prepare
+from tests.case_world import write_case, write_labels
+
+
+def warnings_of(path):
+    """What the case is warned about."""
+    return prepare(path, arm=False).anatomy.warnings
+
+
+@pytest.mark.parametrize(
+    ("spacing", "margin", "said"),
+    [
+        ((2.0, 2.0, 2.0), "3.0", None),
+        ((2.0, 2.0, 20.0), "3.0", "slices 20 mm apart, and the least margin demanded from it is 3 mm (vessel)"),
+        ((2.0, 2.0, 20.0), "0.0", "slices 20 mm apart, and the least margin demanded from it is 0 mm (vessel)"),
+        ((2.0, 2.0, 2.0), "1.5", "slices 2 mm apart, and the least margin demanded from it is 1.5 mm (vessel)"),
+    ],
+)
+def test_slices_thicker_than_the_least_margin_are_a_warning(tmp_path, spacing, margin, said):
+    """The distance of two slices stands beside the least margin that the map must keep."""
+    role = 'label = 3\nrole = "avoid"\nmargin_mm = '
+    path = write_case(tmp_path, (f"{role}3.0", f"{role}{margin}"), spacing=spacing)
+    found = [warning for warning in warnings_of(path) if "slices" in warning]
+    assert len(found) == (said is not None)
+    assert said is None or said in found[0]
+
+
+@pytest.mark.parametrize(("spacing", "warned"), [(3.0, False), (8.0, True)])
+def test_a_skin_from_thick_slices_is_a_warning(tmp_path, spacing, warned):
+    """A CT whose slices are farther apart than the needle keeps from the skin."""
+    z, y, x = np.meshgrid(*(np.arange(-117, 118, step) for step in (spacing, 3.0, 3.0)), indexing="ij")
+    hu = np.where(x**2 + y**2 + z**2 < 90**2, 40, -1000).astype(np.int16)
+    image = SimpleITK.GetImageFromArray(hu)
+    image.SetSpacing((3.0, 3.0, spacing))
+    image.SetOrigin((-117.0, -117.0, -117.0))
+    SimpleITK.WriteImage(image, tmp_path / "ct.nii.gz")
+    path = write_case(tmp_path, ('mesh = "skin.stl"\nunit = "mm"', 'ct = "ct.nii.gz"'))
+    found = [warning for warning in warnings_of(path) if "ct.nii.gz: slices" in warning]
+    assert len(found) == warned
+
+
+@pytest.mark.parametrize(
+    ("theta", "step", "said"),
+    [
+        ("[0, 90]", "7.0", "theta_deg [0, 90] is no whole number of steps of 7: the last angle that is checked is 84"),
+        ("[0, 90]", "0.7", "the last angle that is checked is 89.6"),
+        ("[0, 90]", "0.3", None),
+        ("[10, 10]", "10.0", None),
+    ],
+)  # fmt: skip
+def test_a_step_that_does_not_divide_the_range_is_a_warning(tmp_path, theta, step, said):
+    """The last angle that is checked is named."""
+    path = write_case(tmp_path, ("[0, 10]", f"{theta}\nbeta_deg = [0, 0]"), ("step_deg = 10.0", f"step_deg = {step}"))
+    found = [warning for warning in warnings_of(path) if "whole number of steps" in warning]
+    assert len(found) == (said is not None)
+    assert said is None or said in found[0]
+
+
+@pytest.mark.parametrize(("theta", "step"), [("[0, 10]", "45.0"), ("[0, 10]", "10.1")])
+def test_a_step_larger_than_the_range_is_refused(tmp_path, theta, step):
+    """Only one end of the range would be searched."""
+    path = write_case(tmp_path, ("[0, 10]", theta), ("step_deg = 10.0", f"step_deg = {step}"))
+    with pytest.raises(InputError, match=r"step_deg [\d.]+ is larger than the range theta_deg \[0, 10\]"):
+        load_case(path)
+
+
+@pytest.mark.parametrize(("x_axis", "refused"), [("[1.0, 0.0, 0.01]", False), ("[1.0, 0.0, 0.2]", True)])
+def test_the_axes_of_a_mount_stand_at_a_right_angle(tmp_path, x_axis, refused):
+    """Rounding is taken; 11 degrees off the right angle are refused, and the angle is said."""
+    mount = f"[robot.mount]\nposition_mm = [0, -500, 0]\nx_axis = {x_axis}\nz_axis = [0, 0, 1]"
+    path = write_case(tmp_path, ('[registration]\nmarkers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"', mount))
+    if refused:
+        with pytest.raises(InputError, match=r"x_axis and z_axis are 78\.7 degrees apart; allowed: a right angle"):
+            load_case(path)
+    else:
+        np.testing.assert_allclose(np.linalg.det(load_case(path).robot.T_base_ct_mount[:3, :3]), 1)
+
+
+def test_labels_that_nobody_names_are_named(tmp_path):
+    """Only where the map really holds others: their numbers are in the warning."""
+    path = write_case(tmp_path)
+    assert not [warning for warning in warnings_of(path) if "count as free" in warning]
+    labels = np.zeros((100, 100, 100), np.uint8)
+    labels[40:60, 67:69, 67:69] = 3
+    for label in (*range(5, 17), 200):
+        labels[40:60, 30, 30 + label % 20] = label
+    write_labels(tmp_path / "labels.nrrd", labels)
+    found = [warning for warning in warnings_of(path) if "count as free" in warning]
+    shown = "5, 6, 7, 8, 9, 10, 11, 12 and 5 more"
+    assert found == [f"labels.nrrd holds labels that the case does not name, and they count as free: {shown}"]
