@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from planning.reasons import Reason
 
 Floats = NDArray[np.float64]
+Texts = NDArray[np.object_]
+"""Strings of any length: an array of a fixed width would cut a name."""
 
 ARM_CHECKED = "checked"
 """What ``Candidates.arm`` says where a safe candidate is one that the arm can reach and insert along."""
@@ -51,11 +53,11 @@ class Candidates:
     theta: Floats
     beta: Floats
     outward_ct: Floats
-    reason: NDArray[np.str_]
-    reason_structure: NDArray[np.str_]
+    reason: Texts
+    reason_structure: Texts
     reason_depth: Floats
     reason_amount: Floats
-    reason_detail: NDArray[np.str_]
+    reason_detail: Texts
     entry_ct: Floats
     path_length: Floats
     skin_angle: Floats

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.anatomy import Role, Structure
+from planning.candidates import Texts
 from planning.case import Needle
 from planning.clearance.engine import Floats
 from planning.clearance.measure import Clearances
@@ -30,8 +31,8 @@ class Verdicts:
         amount: Shape (n,), what fell short (see `planning.candidates.Candidates.reason_amount`).
     """
 
-    reason: NDArray[np.str_]
-    structure: NDArray[np.str_]
+    reason: Texts
+    structure: Texts
     depth: Floats
     amount: Floats
 
@@ -69,8 +70,8 @@ def judge(
     """
     count = len(paths.path_length)
     verdicts = Verdicts(
-        np.full(count, Reason.NONE.value, dtype="U32"),
-        np.full(count, "", dtype="U80"),
+        np.full(count, Reason.NONE.value, dtype=object),
+        np.full(count, "", dtype=object),
         np.full(count, np.nan),
         np.full(count, np.nan),
     )
@@ -92,7 +93,7 @@ def judge(
     give(Reason.TOO_LONG, length > longest_path(needle), skin, length, length)
     give(Reason.SKIN_ANGLE, paths.skin_angle > max_skin_angle, skin, length, np.degrees(paths.skin_angle))
     worst = worst_violation(clearances, structures)
-    names = np.array([s.name for s in structures] or [""], dtype="U80")[worst]
+    names = np.array([s.name for s in structures] or [""], dtype=object)[worst]
     unknown = np.array([s.role is Role.UNKNOWN for s in structures] or [False])[worst]
     rows = np.arange(count)
     if structures:

@@ -103,7 +103,7 @@ class Explanation:
             margin = f"{structure.margin_mm:11.2f}" if structure.demands_margin else "          -"
             short = structure.demands_margin and clearances[column] < structure.margin_mm
             lines.append(
-                f"  {structure.name:32.32s} {structure.role:8s} {clearances[column]:14.3f} {margin}"
+                f"  {structure.name:32s} {structure.role:8s} {clearances[column]:14.3f} {margin}"
                 + ("  too close" if short else "")
             )
         return lines

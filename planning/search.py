@@ -89,7 +89,7 @@ def organ_candidates(case: Case, anatomy: Anatomy, engine: ClearanceEngine, dire
         reason_structure=verdicts.structure,
         reason_depth=verdicts.depth,
         reason_amount=verdicts.amount,
-        reason_detail=np.full(count, "", dtype="U200"),
+        reason_detail=np.full(count, "", dtype=object),
         entry_ct=paths.entry_ct,
         path_length=paths.path_length,
         skin_angle=paths.skin_angle,

@@ -180,7 +180,7 @@ class _Judge:
         group = self._organs.group
         column = np.concatenate([group, [len(self._question.structures)]])[triangle]
         face = np.where(triangle < 0, -1, triangle - np.searchsorted(group, column))
-        return np.array([*self._question.structures, ""], dtype="U80")[column], face
+        return np.array([*self._question.structures, ""], dtype=np.str_)[column], face
 
     def _all_rejected(self, state: _State) -> _Verdicts:
         """The target lies in a structure to avoid, or no ray leaves the skin as it must."""
@@ -277,7 +277,7 @@ class _Record:
         theta, beta, verdict, code, triangle, bound = (
             np.concatenate(column) for column in zip(*self.leaves, strict=True)
         )
-        reason = np.array([reason.value for reason in REASONS], dtype="U32")[code]
+        reason = np.array([reason.value for reason in REASONS], dtype=np.str_)[code]
         structure, face = judge.names(triangle)
         leaves, tree = Cells(theta, beta), tuple(self.tree)
         return Certificate(question, size, tree, leaves, verdict, reason, structure, face, bound, judge.queries)
