@@ -15,6 +15,7 @@ from pydantic import (
     model_validator,
 )
 
+from planning.formats.names import MAX_NAME, unprintable_texts
 from planning.toml_file import SchemaOne
 
 Number = Annotated[float, Strict(), AllowInfNan(False)]
@@ -27,6 +28,7 @@ Weight = Annotated[Number, Field(ge=0, le=1000)]
 JointDegrees = Annotated[Number, Field(ge=-360, le=360)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
 Sextuple = tuple[JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees]
+Text = Annotated[str, StringConstraints(min_length=1, max_length=MAX_NAME)]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=80)]
 Degrees360 = Annotated[Number, Field(ge=0, le=360)]
 Degrees180 = Annotated[Number, Field(ge=0, le=180)]
@@ -60,7 +62,7 @@ class TargetSection(Section):
 
     position_mm: Vector | None = None
     points: str | None = None
-    name: str = "target"
+    name: Text = "target"
     structure: Name
 
     @model_validator(mode="after")
@@ -185,10 +187,10 @@ class StructuresSection(Section):
 
     labelmap: str
     naming: str | None = None
-    target: tuple[str, ...] = ()
-    avoid: dict[str, Margin] = Field(default_factory=dict)
-    traverse: tuple[str, ...] = ()
-    ignore: tuple[str, ...] = ()
+    target: tuple[Text, ...] = ()
+    avoid: dict[Text, Margin] = Field(default_factory=dict)
+    traverse: tuple[Text, ...] = ()
+    ignore: tuple[Text, ...] = ()
 
 
 class RegistrationSection(Section):
@@ -197,7 +199,7 @@ class RegistrationSection(Section):
     method: Literal["triad", "rigid", "affine"] = "rigid"
     markers_ct: str
     markers_base: str
-    use: tuple[str, ...] | None = None
+    use: tuple[Text, ...] | None = None
     fle_mm: Positive | None = None
 
 
@@ -309,6 +311,13 @@ class CaseFile(Section):
     gantry: GantrySection | None = None
     place: PlaceSection = PlaceSection()
     rehearsal: RehearsalSection = RehearsalSection()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unprintable(cls, data: Any) -> Any:
+        for text in unprintable_texts(data):
+            raise ValueError(f"{text[:60]!a} holds a control or format character; names and paths are plain text")
+        return data
 
     @model_validator(mode="after")
     def _no_contradiction(self) -> Self:

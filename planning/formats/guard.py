@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from planning.errors import InputError
+from planning.formats.names import check_name
 from planning.mesh import TriangleMesh
 
 MIN_DIAGONAL_MM = 0.5
@@ -105,17 +106,15 @@ def guard_points(points: ArrayLike, names: Sequence[str], *, where: str | Path) 
         Shape (n, 3), float64, mm, read-only.
 
     Raises:
-        InputError: If there is no point, a name is missing or doubled, a coordinate not finite or too far.
+        InputError: If there is no point, a name is missing, doubled, too long or not printable, or a coordinate is not
+            finite or too far.
     """
     allowed = "one printable name per point, not empty and used once"
     array = _points_array(points, names, what="point", where=where)
     if len(names) != len(array):
         _refuse(f"{len(names)} names for {len(array)} points", where, allowed)
     for number, name in enumerate(names, start=1):
-        if not name.strip():
-            _refuse(f"point {number} has an empty name", where, allowed)
-        if not name.isprintable():
-            _refuse(f"point {number} has the name {name!a}", where, allowed)
+        check_name(name, f"point {number}", where=where)
     for name, count in Counter(names).items():
         if count > 1:
             _refuse(f"the name {name!r} is used {count} times", where, allowed)

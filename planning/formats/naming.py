@@ -15,6 +15,7 @@ from typing import Protocol
 from planning.errors import InputError
 from planning.formats import totalsegmentator
 from planning.formats.labelmaps import MAX_LABEL
+from planning.formats.names import check_name
 
 BUILT_IN: Mapping[str, Mapping[int, str]] = {
     "totalsegmentator-v1": totalsegmentator.V1,
@@ -189,8 +190,7 @@ def _unique(names: Mapping[int, str], where: Path) -> dict[int, str]:
     """The names, each of one label: two structures of one name could not be told apart in a result."""
     seen: dict[str, int] = {}
     for label, name in names.items():
-        if not name.strip():
-            raise InputError(f"label {label} has an empty name", where=where, allowed="a name")
+        check_name(name, f"label {label}", where=where)
         if name in seen:
             what = f"labels {seen[name]} and {label} are both named {name!r}"
             raise InputError(what, where=where, allowed="a name of its own for each label")

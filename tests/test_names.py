@@ -1,0 +1,107 @@
+"""Names that come from files: kept whole, and refused where they would reach a terminal as something else."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from meshes import folder
+from planning.case import load_case
+from planning.clearance.fast_engine import FastEngine
+from planning.errors import InputError
+from planning.explain import Explanation
+from planning.formats.labelmaps import LabelMap
+from planning.formats.naming import names_for
+from planning.formats.points import read_points
+from planning.prepared import prepare
+from planning.table import to_table, write_table
+from tests.case_world import write_case
+
+HOSTILE = {
+    "an escape sequence": "liver\x1b[2J",
+    "a line break": "liver\nsafe",
+    "a right-to-left mark": "liver\u200f",
+    "a right-to-left override": "\u202erevil",
+    "a zero-width joiner": "li\u200dver",
+    "a NUL": "liver\0",
+    "201 characters": "x" * 201,
+}
+
+
+@pytest.fixture(scope="module")
+def long_named():
+    """The carton with bolts whose names have 200 characters and differ in the last one."""
+    carton = prepare(folder() / "carton" / "case_m.toml", arm=False)
+    names = {"bolt_h": 199 * "v" + "h", "bolt_l": 199 * "v" + "l"}
+    structures = tuple(replace(s, name=names.get(s.name, s.name)) for s in carton.anatomy.structures)
+    anatomy = replace(carton.anatomy, structures=structures)
+    return replace(carton, anatomy=anatomy, engine=FastEngine([s.mesh for s in structures], lambda *_: None))
+
+
+def test_a_long_name_is_whole_in_the_verdict_and_in_the_table(long_named, tmp_path):
+    """Reason, text, JSON and Parquet hold every character of a name."""
+    found = long_named.check(np.radians(50), np.radians(270))
+    name = 199 * "v" + "h"
+    assert found.reason_structure[0] == name
+    explained = Explanation(long_named.case, long_named.anatomy, found)
+    assert f"too_close ({name})" in explained.text()
+    assert f"  {name} avoid" in explained.text()
+    assert explained.summary()["reason_structure"] == name
+    write_table(found, {"case": "carton"}, tmp_path / "candidates.parquet")
+    assert pq.read_table(tmp_path / "candidates.parquet")["reason_structure"].to_pylist() == [name]
+
+
+def test_a_long_sentence_is_whole(long_named):
+    """What kept the arm may take more than 200 characters."""
+    found = long_named.check(0.0, 0.0)
+    detail = found.reason_detail.copy()
+    detail[0] = 300 * "a" + " end"
+    assert to_table(replace(found, reason_detail=detail), {})["reason_detail"].to_pylist()[0].endswith("a end")
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_label_name_is_refused(name, tmp_path):
+    """From a CSV and from a .seg.nrrd: one line that names the label."""
+    labelmap = LabelMap(np.ones((2, 2, 2), np.int32), np.eye(4), {1: HOSTILE[name]}, tmp_path / "a.seg.nrrd")
+    with pytest.raises(InputError, match="label 1 has (the|a) name") as caught:
+        names_for(None, tmp_path, lambda _: b"", labelmap)
+    assert str(caught.value).isprintable()
+    content = f'id,name\n1,"{HOSTILE[name]}"\n'.encode()
+    with pytest.raises(InputError):
+        names_for("names.csv", tmp_path, lambda _: content, labelmap)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_point_name_is_refused(name, tmp_path):
+    """From Slicer's JSON: one line that names the point."""
+    point = {"label": HOSTILE[name], "position": [0, 0, 0]}
+    markup = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": [point]}
+    (tmp_path / "a.mrk.json").write_text(json.dumps({"markups": [markup]}))
+    with pytest.raises(InputError, match="point 1 has (the|a) name") as caught:
+        read_points(tmp_path / "a.mrk.json")
+    assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        ('structure = "organ"', 'structure = "organ"\nname = "a\\u001b[31mb"'),
+        ('mesh = "organ.stl"', 'mesh = "organ\\u202e.stl"'),
+        ('markers_base = "touch.csv"', 'markers_base = "touch.csv"\nuse = ["A\\n", "B", "C"]'),
+        ("[[structure]]", '[[structures]]\nlabelmap = "labels.nrrd"\navoid = { "\\u0007*" = 1 }\n[[structure]]'),
+    ],
+)
+def test_a_hostile_text_of_the_case_is_refused(changes, tmp_path):
+    """Names, patterns and paths of a case file are plain text."""
+    path = write_case(tmp_path, changes)
+    with pytest.raises(InputError, match="holds a control or format character") as caught:
+        load_case(path)
+    assert str(caught.value).isprintable()
+
+
+def test_names_of_other_scripts_are_names(tmp_path):
+    """Letters of any script are printable; a name of 200 characters is one."""
+    (tmp_path / "a.csv").write_text(f"name,x_mm,y_mm,z_mm\nлегкое,1,2,3\n肝臓,1,2,4\n{'n' * 200},1,2,5\n")
+    assert read_points(tmp_path / "a.csv").names == ("легкое", "肝臓", "n" * 200)
