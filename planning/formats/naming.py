@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import difflib
+import io
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -201,7 +202,7 @@ def _unique(names: Mapping[int, str], where: Path) -> dict[int, str]:
 def _read_csv(data: bytes, path: Path) -> dict[int, str]:
     allowed = "a CSV with the header id,name and one label per line"
     try:
-        rows = list(csv.reader(data.decode("utf-8-sig").splitlines(), strict=True))
+        rows = list(csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True))
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"is no CSV text ({error})", where=path, allowed=allowed) from error
     if not rows or [cell.strip().lower() for cell in rows[0]] != ["id", "name"]:

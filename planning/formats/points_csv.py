@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -55,7 +56,7 @@ def read_csv_points(data: bytes, where: str) -> RawPoints:
 
 
 def _rows(data: bytes, where: str) -> Iterator[_Row]:
-    reader = csv.reader(decode_text(data, where).splitlines(), strict=True)
+    reader = csv.reader(io.StringIO(decode_text(data, where), newline=""), strict=True)
     try:
         for fields in reader:
             if any(field.strip() for field in fields):
