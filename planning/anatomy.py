@@ -101,17 +101,29 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
         InputError: A file that cannot be trusted, a label that no rule names, or a target that contradicts them.
     """
     loader = _Loader(case, progress or (lambda _: None), cache)
-    skin_section = next(s for s in case.structure if s.role == "skin")
     structures = [loader.one(section) for section in case.structure if section.role != "skin"]
     for section in case.structures:
         structures.extend(loader.many(section))
-    skin = loader.skin(skin_section)
+    skin = loader.skin(_skin_section(case))
     _check_names(case, structures)
     warnings = [*loader.warnings, *loader.unnamed_warnings(), *skin.warnings]
     for structure in structures:
         warnings.extend(mesh_warnings(structure.mesh, structure.name))
     _check_target(case, structures, skin)
     return Anatomy(tuple(structures), skin, tuple(warnings))
+
+
+def load_skin(case: Case, cache: Cache = NO_CACHE) -> Skin:
+    """The skin of a case alone.
+
+    Raises:
+        InputError: A file that cannot be trusted.
+    """
+    return _Loader(case, lambda _: None, cache).skin(_skin_section(case))
+
+
+def _skin_section(case: Case) -> StructureSection:
+    return next(section for section in case.structure if section.role == "skin")
 
 
 class _Loader:

@@ -32,6 +32,7 @@ Text = Annotated[str, StringConstraints(min_length=1, max_length=MAX_NAME)]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=80)]
 Degrees360 = Annotated[Number, Field(ge=0, le=360)]
 Degrees180 = Annotated[Number, Field(ge=0, le=180)]
+Yes = Annotated[bool, Strict()]
 Label = Annotated[int, Strict(), Field(ge=1, le=65535)]
 
 
@@ -201,6 +202,8 @@ class RegistrationSection(Section):
     markers_base: str
     use: tuple[Text, ...] | None = None
     fle_mm: Positive | None = None
+    accept_residuals: Yes = False
+    accept_symmetry: Yes = False
 
 
 class MountSection(Section):

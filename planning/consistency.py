@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from planning.anatomy import Anatomy, Role, Structure
 from planning.case import Case
 from planning.errors import InputError
-from planning.formats.decimation import squared_distance
 from planning.formats.volume_header import VolumeHeader
 from planning.formats.volumes import read_header
 from planning.inside_skin import LEAST_TOLERANCE_MM, inside_skin
+from planning.marker_check import check_markers
 from planning.placement import Placement
 from planning.resolution import resolution_warnings
 from planning.skin import Skin
@@ -21,9 +21,6 @@ from planning.winding import winding_number
 
 Floats = NDArray[np.float64]
 Headers = Mapping[str, VolumeHeader]
-
-MARKER_ON_SKIN_MM = 30.0
-"""A skin marker's centre lies within its own height of the skin; one farther off stands on a frame, or is misread."""
 
 USUAL_INSIDE = 0.99
 """Of a structure's area, inside the skin; a smaller fraction is a warning. One percent is what smoothing moves."""
@@ -49,14 +46,15 @@ def check_consistency(case: Case, anatomy: Anatomy, placement: Placement | None)
         Warnings, one sentence each.
 
     Raises:
-        InputError: A structure of which too much lies outside the body, an open one that seems to hold the target, or a
-            label map that ends inside the body within the needle's reach.
+        InputError: A structure of which too much lies outside the body, an open one that seems to hold the target, a
+            label map that ends inside the body within the needle's reach, or markers whose names or axes have likely
+            slipped.
     """
     headers = volume_headers(case)
     outside = _outside_warnings(case, anatomy, headers)
     _refuse_open_around_target(case, anatomy)
     _refuse_short_maps(case, anatomy, headers)
-    return (*outside, *_marker_warnings(anatomy, placement), *resolution_warnings(case, anatomy, headers))
+    return (*outside, *_marker_warnings(case, anatomy, placement), *resolution_warnings(case, anatomy, headers))
 
 
 def _outside_warnings(case: Case, anatomy: Anatomy, headers: Headers) -> tuple[str, ...]:
@@ -144,12 +142,8 @@ def _refuse_short_maps(case: Case, anatomy: Anatomy, headers: Headers) -> None:
             )
 
 
-def _marker_warnings(anatomy: Anatomy, placement: Placement | None) -> tuple[str, ...]:
+def _marker_warnings(case: Case, anatomy: Anatomy, placement: Placement | None) -> tuple[str, ...]:
     if placement is None or placement.registration is None:
         return ()
-    markers = placement.registration.markers
-    gaps = [float(np.sqrt(squared_distance(p, anatomy.skin.mesh.triangles).min())) for p in markers.points_ct]
-    far = [f"{name} ({gap:.0f} mm)" for name, gap in zip(markers.names, gaps, strict=True) if gap > MARKER_ON_SKIN_MM]
-    if not far:
-        return ()
-    return (f"markers far from the skin: {', '.join(far)}; is their file in the case's space (LPS/RAS) and unit?",)
+    weak = tuple(f"registration: {flag}" for flag in placement.registration.flags)
+    return (*weak, *check_markers(case, anatomy.skin, placement.registration).warnings)

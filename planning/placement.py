@@ -48,6 +48,7 @@ def load_placement(case: Case) -> Placement | None:
         method=settings.method,
         target_ct=case.target_ct,
         fle_mm=settings.fle_mm,
+        accept_residuals=settings.accept_residuals,
         where=where,
     )
     error = float(registration.expected_tre_mm(case.target_ct[None])[0])

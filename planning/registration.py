@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from planning.conditioning import Conditioning, conditioning, leverage
 from planning.errors import InputError
 from planning.formats.points import NamedPoints
+from planning.residual_test import Interval, ResidualTest
 
 Floats = NDArray[np.float64]
 
@@ -26,6 +27,8 @@ UNIT_SLIP = 5.0
 
 MAX_RESIDUAL_MM = 15.0
 """A marker that misses by more was swapped, moved or typed wrongly: the paper's worst set misses by 7 mm."""
+
+ALLOWED_RESIDUALS = "markers measured again, the true fle_mm, or registration.accept_residuals = true"
 
 MIRROR_GAIN = 2.0
 """A mirrored fit that is better than the proper one by this factor (and 1 mm) says that one side is mirrored."""
@@ -52,18 +55,32 @@ class Registration:
         T_base_ct: Shape (4, 4), rigid, mm.
         markers: The matched markers.
         residuals: Shape (n, 3), T_base_ct markers_ct - markers_base, mm.
-        fle_mm: The fiducial localisation error (rms) that the expectations use.
-        fle_source: Where that number comes from.
-        conditioning: The three flags, for the target given.
+        residual_test: The residuals of the rigid fit against the noise.
+        conditioning: The three flags of a weak set, for the target given.
     """
 
     method: str
     T_base_ct: Floats
     markers: MarkerPairs
     residuals: Floats
-    fle_mm: float
-    fle_source: str
+    residual_test: ResidualTest
     conditioning: Conditioning
+
+    @property
+    def fle_mm(self) -> float:
+        """The fiducial localisation error (rms) that the expectations use."""
+        return self.residual_test.fle_mm
+
+    @property
+    def fle_source(self) -> str:
+        """Where that number comes from."""
+        return self.residual_test.source
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """What weakens this registration, in words: the conditioning, and residuals that were accepted."""
+        accepted = () if self.residual_test.explained else (f"{self.residual_test.text()}; accepted by the case",)
+        return (*self.conditioning.flags, *accepted)
 
     @property
     def residual_mm(self) -> Floats:
@@ -83,6 +100,11 @@ class Registration:
     def expected_tre_mm(self, points_ct: Floats) -> Floats:
         """Expected (rms) target registration error at points (n, 3) of the CT frame, shape (n,), mm."""
         return self.fle_mm * leverage(self.markers.points_ct, points_ct)
+
+    def expected_tre_interval_mm(self, point_ct: Floats) -> Interval:
+        """The same at one point (3,), at both ends of the noise's 95 % interval, mm."""
+        lever = float(leverage(self.markers.points_ct, point_ct[None])[0])
+        return Interval(*(fle * lever for fle in self.residual_test.fle_interval_mm))
 
 
 def match(
@@ -129,19 +151,22 @@ def register(
     method: Literal["triad", "rigid", "affine"],
     target_ct: Floats,
     fle_mm: float | None = None,
+    accept_residuals: bool = False,
     where: str | Path = "registration",
 ) -> Registration:
-    """Fit T_base_ct and judge it.
+    """Fit T_base_ct, and hold its residuals against the noise.
 
     Args:
         markers: At least three, matched.
         method: ``triad`` (Chen 2019, Eq. 1-9, three markers in the order given) or ``rigid`` (least squares).
         target_ct: Shape (3,), where the error matters.
         fle_mm: Known localisation error (rms, both sides together); None estimates it from FRE.
+        accept_residuals: Whether residuals beyond the noise are taken, and the noise is scaled to them.
         where: What errors name.
 
     Raises:
-        InputError: Fewer than three markers, collinear, mirrored, a unit slip, a marker far off, or ``affine``.
+        InputError: Fewer than three markers, collinear, mirrored, a unit slip, a marker far off, ``affine``, or
+            residuals that the noise does not explain.
     """
     if method == "affine":
         raise InputError(
@@ -156,9 +181,10 @@ def register(
     T_base_ct = fit(markers.points_ct, markers.points_base)
     residuals = apply(T_base_ct, markers.points_ct) - markers.points_base
     _check_residuals(markers, residuals, where)
-    source = "given" if fle_mm is not None else "estimated from FRE of the rigid fit"
-    fle = fle_mm if fle_mm is not None else _estimated_fle(markers)
-    return Registration(method, T_base_ct, markers, residuals, fle, source, conditioning(markers.points_ct, target_ct))
+    test = ResidualTest(len(markers), _rigid_fre(markers), fle_mm)
+    if not (test.explained or accept_residuals):
+        raise InputError(test.text(), where=where, allowed=ALLOWED_RESIDUALS)
+    return Registration(method, T_base_ct, markers, residuals, test, conditioning(markers.points_ct, target_ct))
 
 
 def fit_triad(points_ct: Floats, points_base: Floats) -> Floats:
@@ -217,11 +243,10 @@ def apply(T_b_a: Floats, points_a: Floats) -> Floats:
     return points_a @ T_b_a[:3, :3].T + T_b_a[:3, 3]
 
 
-def _estimated_fle(markers: MarkerPairs) -> float:
-    """FLE from <FRE^2> = (1 - 2/N) <FLE^2> (Fitzpatrick 1998)."""
+def _rigid_fre(markers: MarkerPairs) -> float:
+    """FRE of the least-squares fit, whatever the method: the chi-squared test is about that."""
     fitted = apply(fit_rigid(markers.points_ct, markers.points_base), markers.points_ct)
-    fre_squared = np.mean(np.sum((fitted - markers.points_base) ** 2, axis=1))
-    return float(np.sqrt(fre_squared / (1 - 2 / len(markers))))
+    return _rms(fitted - markers.points_base)
 
 
 def _rigid(R: Floats, t: Floats) -> Floats:

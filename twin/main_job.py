@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from planning.cache import user_cache
 from planning.candidates import Candidates
 from planning.case import load_case
 from planning.certify import Certificate, certify, verify, with_safe_cone, write_certificate
@@ -20,7 +21,7 @@ from planning.explain import Explanation, finite
 from planning.export import Exported, export_plan
 from planning.files import atomic
 from planning.formats.input_file import read_input
-from planning.placement import load_placement
+from planning.marker_check import checked_placement
 from planning.plan import MAX_PLAN_BYTES, Plan, parse_plan, write_plan
 from planning.plan_check import check_plan
 from planning.planner import make_plan
@@ -196,16 +197,19 @@ def registration_report(path: Path) -> dict[str, Any]:
         InputError: The case has no markers, or they cannot be used.
     """
     case = load_case(path)
-    placement = load_placement(case)
-    if placement is None or placement.registration is None:
+    checked = checked_placement(case, user_cache())
+    if checked is None or checked.placement.registration is None:
         raise InputError("the case has no [registration]", where=case.path, allowed="markers_ct and markers_base")
-    report = registration_summary(placement.registration)
+    placement, registration = checked.placement, checked.placement.registration
+    report = registration_summary(registration)
     pose = case.target_ct + case.needle.shaft_mm * case.T_ct_entry[:3, 2]
     along = np.linspace(case.target_ct, pose, 4)
     report["case"] = case.name
     report["inputs"] = inputs_document(case.inputs)
     report["expected_tre_target_mm"] = placement.target_error_mm
-    report["expected_tre_along_shaft_mm"] = placement.registration.expected_tre_mm(along).tolist()
+    report["expected_tre_target_interval_mm"] = list(registration.expected_tre_interval_mm(case.target_ct))
+    report["expected_tre_along_shaft_mm"] = registration.expected_tre_mm(along).tolist()
+    report["warnings"], report["notes"] = list(checked.findings.warnings), list(checked.findings.notes)
     return report
 
 
@@ -219,10 +223,14 @@ def registration_summary(registration: Registration) -> dict[str, Any]:
         "mean_error_mm": registration.mean_error_mm,
         "fle_mm": registration.fle_mm,
         "fle_source": registration.fle_source,
+        "fle_interval_mm": list(registration.residual_test.fle_interval_mm),
+        "chi_squared": finite(registration.residual_test.chi_squared),
+        "degrees_of_freedom": registration.residual_test.freedom,
+        "noise_scale": registration.residual_test.scale,
         "spread_ratio": registration.conditioning.spread_ratio,
         "altitude_mm": registration.conditioning.altitude_mm,
         "leverage": registration.conditioning.leverage,
-        "flags": list(registration.conditioning.flags),
+        "flags": list(registration.flags),
     }
 
 

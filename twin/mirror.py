@@ -13,9 +13,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.cache import user_cache
 from planning.case import Case
 from planning.errors import InputError
-from planning.placement import load_placement
+from planning.marker_check import checked_placement
 from planning.robot.kinematics import flange_pose
 from planning.robot.ur import UrModel, ur_model
 
@@ -101,13 +102,13 @@ class Mirror:
         """The mirror of a case.
 
         Raises:
-            InputError: The case does not say where the robot stands.
+            InputError: The case does not say where the robot stands, or its markers cannot be trusted.
         """
-        placement = load_placement(case)
-        if placement is None:
+        checked = checked_placement(case, user_cache())
+        if checked is None:
             allowed = "[registration] with markers, or [robot.mount]"
             raise InputError("the case does not say where the robot stands", where=case.path, allowed=allowed)
-        return cls(ur_model(case.robot.model), placement.T_base_ct, case.needle.length_mm, case.target_ct)
+        return cls(ur_model(case.robot.model), checked.placement.T_base_ct, case.needle.length_mm, case.target_ct)
 
     def show(self, state: JointState) -> Mirrored:
         """One joint state."""

@@ -102,13 +102,22 @@ def registration_text(report: dict[str, Any]) -> str:
     lines += [
         f"  FRE {report['fre_mm']:.3f} mm, mean residual {report['mean_error_mm']:.3f} mm",
         "  (the residuals are not the accuracy at the target)",
-        f"  FLE {report['fle_mm']:.3f} mm, {report['fle_source']}",
-        f"  expected error at the target {report['expected_tre_target_mm']:.3f} mm",
+        f"  FLE {report['fle_mm']:.3f} mm, {report['fle_source']}{_interval(report['fle_interval_mm'])}",
+        f"  expected error at the target {report['expected_tre_target_mm']:.3f} mm"
+        + _interval(report["expected_tre_target_interval_mm"]),
         "  along the shaft, target to hub: " + ", ".join(f"{mm:.3f}" for mm in report["expected_tre_along_shaft_mm"]),
         f"  spread s2/s1 {report['spread_ratio']:.2f}, altitude {report['altitude_mm']:.0f} mm, "
         f"TRE/FLE {report['leverage']:.2f}",
     ]
-    return "\n".join(lines + [f"  weak: {flag}" for flag in report["flags"]])
+    for kind, key in (("weak", "flags"), ("warning", "warnings"), ("note", "notes")):
+        lines += [f"  {kind}: {sentence}" for sentence in report[key]]
+    return "\n".join(lines)
+
+
+def _interval(bounds: Sequence[float]) -> str:
+    """A 95 % interval; nothing where both bounds are one."""
+    low, high = bounds
+    return "" if low == high else f" (95 %: {low:.3f} to {high:.3f})"
 
 
 def batch_text(rows: Sequence[dict[str, Any]]) -> str:

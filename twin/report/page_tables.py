@@ -112,9 +112,12 @@ def registration_section(registration: Mapping[str, Any] | None, plan: Any | Non
     for key, words, unit, digits in names:
         if registration.get(key) is not None:
             rows.append((words, _value(registration[key], unit, digits)))
+    low, high = registration.get("fle_interval_mm") or (0.0, 0.0)
+    if low < high:
+        rows.append(("95 % interval of the FLE", f"{number(low, 2)} to {number(high, 2, 'mm')}"))
     flags = list(registration.get("flags") or ())
     warned = "".join(f'<li class="bad">{escape(flag)}</li>' for flag in flags)
-    rows.append(("conditioning", f"<ul>{warned}</ul>" if flags else "no flag raised"))
+    rows.append(("weak points", f"<ul>{warned}</ul>" if flags else "no flag raised"))
     residuals = registration.get("residual_mm") or {}
     shown = table(
         ("marker", "residual mm"), [(escape(n), number(float(v), 3)) for n, v in residuals.items()], kind="numbers"

@@ -1,0 +1,162 @@
+"""Do the markers' residuals fit the noise? The chi-squared test of a rigid fit, and the noise that follows from it.
+
+With normal errors of standard deviation fle/sqrt(3) in each axis, both sides together, N markers of a rigid fit leave
+nu s^2 = 3 sum |r_i|^2 / fle^2, distributed as chi-squared with nu = 3 N - 6 degrees of freedom.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtrc, chdtri, fdtri
+
+DOUBT = 0.001
+"""Residuals that honest noise exceeds once in 1,000 registrations contradict the declared noise."""
+
+MAX_FRE_MM = 5.0
+"""Without a declared noise: markers that miss by more (rms) are not the same markers, or have moved."""
+
+MIN_FLE_MM = 0.3
+"""An estimate below is luck, not accuracy: a voxel of 0.4 mm leaves 0.2 mm, a touch of 0.1 mm in each axis 0.17 mm."""
+
+ALIKE_MM = 1.0
+"""Without a declared noise: a permuted fit with a smaller FRE is always as good as the given one."""
+
+INTERVAL = 0.95
+"""Of the noise that is estimated."""
+
+
+class Interval(NamedTuple):
+    """Lower and upper bound, mm."""
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class ResidualTest:
+    """The residuals of a rigid fit against the noise.
+
+    Attributes:
+        count: Markers, N >= 3.
+        fre_mm: Root mean square residual of the least-squares rigid fit, whatever method the case takes.
+        declared_fle_mm: The noise (rms length, both sides together) that the user states, or None.
+    """
+
+    count: int
+    fre_mm: float
+    declared_fle_mm: float | None = None
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom, nu = 3 N - 6."""
+        return 3 * self.count - 6
+
+    @property
+    def chi_squared(self) -> float:
+        """The statistic nu s^2 of the declared noise; NaN where none is declared."""
+        if self.declared_fle_mm is None:
+            return float("nan")
+        return 3 * self.count * (self.fre_mm / self.declared_fle_mm) ** 2
+
+    @property
+    def probability(self) -> float:
+        """Of residuals as large as these by the declared noise; NaN where none is declared."""
+        return float(chdtrc(self.freedom, self.chi_squared))
+
+    @property
+    def limit_mm(self) -> float:
+        """The greatest FRE that passes."""
+        if self.declared_fle_mm is None:
+            return MAX_FRE_MM
+        return self.declared_fle_mm * float(np.sqrt(chdtri(self.freedom, DOUBT) / (3 * self.count)))
+
+    @property
+    def explained(self) -> bool:
+        """Whether noise explains the residuals."""
+        return self.fre_mm <= self.limit_mm
+
+    @property
+    def scale(self) -> float:
+        """s, by which a declared noise is to be multiplied: 1 where it explains the residuals, or none is declared."""
+        if self.declared_fle_mm is None or self.explained:
+            return 1.0
+        return float(np.sqrt(self.chi_squared / self.freedom))
+
+    @property
+    def fle_mm(self) -> float:
+        """The noise to compute with, rms length: declared (and scaled), or estimated and never below a floor.
+
+        The estimate is <FRE^2> = (1 - 2/N) <FLE^2> (Fitzpatrick 1998).
+        """
+        if self.declared_fle_mm is not None:
+            return self.declared_fle_mm * self.scale
+        return max(self._estimate_mm, MIN_FLE_MM)
+
+    @property
+    def fle_interval_mm(self) -> Interval:
+        """The 95 % interval of an estimated noise by chi-squared with nu degrees; a declared noise is known."""
+        if self.declared_fle_mm is not None and self.explained:
+            return Interval(self.fle_mm, self.fle_mm)
+        tail = (1 - INTERVAL) / 2
+        low, high = (self.fle_mm * float(np.sqrt(self.freedom / chdtri(self.freedom, p))) for p in (tail, 1 - tail))
+        return Interval(low, high)
+
+    @property
+    def source(self) -> str:
+        """Where the noise comes from, in words."""
+        if self.declared_fle_mm is not None:
+            scaled = f", scaled by {self.scale:.2f} to the residuals" if self.scale > 1 else ""
+            return f"given{scaled}"
+        if self._estimate_mm < MIN_FLE_MM:
+            return f"the floor of {MIN_FLE_MM:g} mm: so small an FRE of {self.count} markers is luck"
+        return "estimated from FRE of the rigid fit"
+
+    def text(self) -> str:
+        """What the test found, in words."""
+        if self.declared_fle_mm is None:
+            what = "exceeds" if not self.explained else "keeps"
+            return f"FRE {self.fre_mm:.2f} mm {what} the {MAX_FRE_MM:g} mm that pass without a declared fle_mm"
+        what = "explains" if self.explained else "does not explain"
+        scaled = "" if self.explained else f"; noise of {self.scale:.2f} times that would"
+        return (
+            f"fle_mm = {self.declared_fle_mm:g} {what} FRE {self.fre_mm:.2f} mm (chi-squared {self.chi_squared:.1f}, "
+            f"{100 * (1 - DOUBT):g} % stay below {chdtri(self.freedom, DOUBT):.1f} at {self.freedom} degrees of "
+            f"freedom){scaled}"
+        )
+
+    @property
+    def alike_mm(self) -> float:
+        """Other pairings of the markers fit as well within the noise where their FRE stays below this.
+
+        By a declared noise: what the given names would have to pass. Without one: what F(nu, nu) allows at 99.9 %
+        for two fits of the same noise, at least `ALIKE_MM`, and at most what a registration is refused for anyway.
+        """
+        if self.declared_fle_mm is not None:
+            alike = self.limit_mm * self.scale
+        else:
+            alike = min(MAX_FRE_MM, max(ALIKE_MM, self._f_ratio * max(self.fre_mm, self._floor_fre_mm)))
+        return max(alike, self.fre_mm)
+
+    def contradicted_by(self, other_fre_mm: float) -> bool:
+        """Whether another pairing with this FRE fits so much better that the given names are likely wrong."""
+        if not self.explained:
+            return other_fre_mm <= self.limit_mm
+        if self.declared_fle_mm is not None:
+            return False
+        return self.fre_mm > self._f_ratio * max(other_fre_mm, self._floor_fre_mm)
+
+    @property
+    def _estimate_mm(self) -> float:
+        return self.fre_mm / float(np.sqrt(1 - 2 / self.count))
+
+    @property
+    def _floor_fre_mm(self) -> float:
+        return MIN_FLE_MM * float(np.sqrt(1 - 2 / self.count))
+
+    @property
+    def _f_ratio(self) -> float:
+        """The ratio of two FRE of the same noise that is exceeded once in 1,000."""
+        return float(np.sqrt(fdtri(self.freedom, self.freedom, 1 - DOUBT)))
