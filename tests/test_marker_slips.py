@@ -1,0 +1,269 @@
+"""Slips that leave no residual, from outside: permuted names, half turns; refused by name, or flagged everywhere."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+
+from meshes import folder as meshes_folder
+from planning.case import load_case
+from planning.errors import InputError
+from planning.prepared import prepare
+from run_twin import BAD_INPUT, main
+from twin.mirror import Mirror
+
+CASE = """
+schema = 1
+name = "slips"
+space = "{space}"
+[target]
+position_mm = [0.0, 0.0, 0.0]
+structure = "organ"
+[needle]
+length_mm = 210.0
+shaft_mm = 180.0
+diameter_mm = 1.2
+[search]
+theta_deg = [0, 10]
+step_deg = 10.0
+[registration]
+markers_ct = "markers_ct.csv"
+markers_base = "touch.csv"
+{registration}
+[[structure]]
+name = "skin"
+mesh = "skin.stl"
+unit = "mm"
+space = "{skin_space}"
+role = "skin"
+[[structure]]
+name = "organ"
+mesh = "organ.stl"
+unit = "mm"
+role = "target"
+[[structure]]
+name = "rib"
+mesh = "rib.stl"
+unit = "mm"
+role = "avoid"
+{more}
+"""
+
+TABLE = '[[obstacle]]\nname = "table"\nframe = "ct"\ncenter_mm = [0.0, 150.0, 0.0]\nsize_mm = [600.0, 40.0, 1200.0]\n'
+LOPSIDED = np.array([15.0, 30.0, 40.0])
+RADII = np.array([150.0, 100.0, 180.0])
+BASE_AXES = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+IN_FRONT = np.array([-450.0, 0.0, 100.0])
+"""Where the target is in the base frame: the base stands 450 mm in front of the patient."""
+
+
+def on_skin(directions, center=LOPSIDED):
+    """Where rays from the ellipsoid's centre leave it, LPS, mm."""
+    directions = np.asarray(directions, float)
+    return center + directions / np.linalg.norm(directions / RADII, axis=1, keepdims=True)
+
+
+FRONT = on_skin([[-0.9, -1, 0.3], [0.5, -1, 0.9], [0.1, -1, -0.8], [0.9, -0.7, 0.0], [-0.3, -1, 0.7]])
+"""Five markers on the front, without a symmetry."""
+
+
+def triangle(count=3, radius=50.0):
+    """A regular polygon of markers before the target, LPS."""
+    angle = 2 * np.pi * np.arange(count) / count
+    return np.column_stack([radius * np.cos(angle), np.full(count, -68.0), radius * np.sin(angle)])
+
+
+def touched(points):
+    """The points as the robot touches them."""
+    return points @ BASE_AXES.T + IN_FRONT
+
+
+def csv(points):
+    """A file of points named A, B, ..."""
+    rows = [",".join([name, *(f"{x:.3f}" for x in point)]) for name, point in zip("ABCDEF", points, strict=False)]
+    return "\n".join(["name,x_mm,y_mm,z_mm", *rows]) + "\n"
+
+
+@pytest.fixture
+def case(tmp_path):
+    """A function: a case with an ellipsoid for a body, and these markers."""
+
+    def make(points_ct, points_base, registration="", more="", center=LOPSIDED, space="LPS"):
+        here = tmp_path / f"case{len(list(tmp_path.iterdir()))}"
+        here.mkdir()
+        texts = {"registration": registration, "more": more, "space": space, "skin_space": "LPS"}
+        (here / "case.toml").write_text(CASE.format(**texts))
+        body = trimesh.creation.icosphere(subdivisions=5)
+        trimesh.Trimesh(body.vertices * RADII + center, body.faces).export(here / "skin.stl")
+        for name, radius, at in (("organ", 20.0, (0, 0, 0)), ("rib", 5.0, (40, 0, 40))):
+            trimesh.creation.icosphere(subdivisions=2, radius=radius).apply_translation(at).export(here / f"{name}.stl")
+        (here / "markers_ct.csv").write_text(csv(points_ct))
+        (here / "touch.csv").write_text(csv(points_base))
+        return here
+
+    return make
+
+
+def refused(arguments, capfd):
+    """Run a command that must be refused; returns its one line."""
+    assert main([str(argument) for argument in arguments]) == BAD_INPUT
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    lines = [line for line in captured.err.splitlines() if line.strip()]
+    assert len(lines) == 1, captured.err
+    return lines[0]
+
+
+def registered(here, capfd):
+    """What `register --json` prints."""
+    assert main(["register", str(here), "--json"]) == 0
+    return json.loads(capfd.readouterr().out)
+
+
+def warned(here):
+    """Warnings of a case, as search, check and plan have them."""
+    return prepare(here, arm=False).anatomy.warnings
+
+
+def test_markers_in_order_raise_no_word(case, capfd):
+    """Five markers without a symmetry, on the skin: no warning, no flag."""
+    here = case(FRONT, touched(FRONT))
+    report = registered(here, capfd)
+    assert report["warnings"] == []
+    assert report["flags"] == []
+    assert warned(here) == ()
+
+
+@pytest.mark.parametrize("name", ["abdomen", "carton/case_h.toml", "carton/case_m.toml", "carton/case_l.toml"])
+def test_the_embedded_cases_raise_no_word(name, capfd):
+    """Neither the abdomen nor the paper's carton is ambiguous, slipped, or beyond its noise."""
+    report = registered(meshes_folder() / name, capfd)
+    assert report["warnings"] == []
+    assert report["flags"] == []
+
+
+def test_the_abdomens_markers_read_as_ras_are_refused(tmp_path, capfd):
+    """x and y negated: FRE stays 0.3 mm; the skin says that they are turned by half a turn, in every command."""
+    here = tmp_path / "abdomen"
+    shutil.copytree(meshes_folder() / "abdomen", here)
+    rows = [line.split(",") for line in (here / "markers_ct.csv").read_text().split()[1:]]
+    points = np.array([[float(x) for x in row[1:]] for row in rows])
+    text = csv(points * [-1, -1, 1])
+    for row, letter in zip(rows, "ABCDEF", strict=True):
+        text = text.replace(f"{letter},", f"{row[0]},", 1)
+    (here / "markers_ct.csv").write_text(text)
+    for command in (["register", here], ["search", here, "--no-arm", "--out", tmp_path / "out"]):
+        line = refused(command, capfd)
+        assert "markers_ct look like coordinates of other axes: with x and y negated, as LPS and RAS differ" in line
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match="x and y negated"):
+        Mirror.of(load_case(here))
+
+
+@pytest.mark.parametrize(
+    ("signs", "name"),
+    [([-1, -1, 1], "x and y negated"), ([1, -1, -1], "y and z negated"), ([-1, 1, -1], "x and z negated")],
+)
+def test_every_half_turn_is_refused_by_name(case, signs, name, capfd):
+    """Markers off the skin that lie on it after a half turn: that slip is named."""
+    line = refused(["register", case(FRONT * signs, touched(FRONT))], capfd)
+    assert f"with {name}" in line
+    assert "as given to" in line
+
+
+def test_a_half_turn_in_a_case_of_ras(case, capfd):
+    """The case's space is RAS, its marker list is LPS: the same slip."""
+    line = refused(["register", case(FRONT, touched(FRONT), space="RAS")], capfd)
+    assert "with x and y negated" in line
+
+
+def test_a_round_body_leaves_the_half_turns_open(case, capfd):
+    """An ellipsoid about the origin is its own half turn: nothing tells, so each is a warning."""
+    points = on_skin(FRONT - LOPSIDED, center=np.zeros(3))
+    here = case(points, touched(points), center=np.zeros(3))
+    said = registered(here, capfd)["warnings"]
+    assert len(said) == 3
+    assert all("would lie on the skin as well" in one and "mm away: check the axes" in one for one in said)
+    assert [one for one in warned(here) if "on the skin as well" in one] == said
+
+
+def test_the_couch_tells_what_a_round_body_does_not(case, capfd):
+    """Given with x and y negated, the markers lie between body and table, where no needle touches them."""
+    points = on_skin([[-0.1, -1, 0.3], [0.3, -1, 0.2], [0.1, -1, -0.3]], center=np.zeros(3))
+    line = refused(["register", case(points * [-1, -1, 1], touched(points), more=TABLE, center=np.zeros(3))], capfd)
+    assert "behind obstacle 'table', where no needle touches it" in line
+    said = registered(case(points, touched(points), more=TABLE, center=np.zeros(3)), capfd)["warnings"]
+    assert not any("x and y negated" in one or "y and z negated" in one for one in said)
+
+
+def test_markers_far_from_the_skin_are_a_warning_where_no_slip_explains_them(case):
+    """On a frame 60 mm off the skin: said, not refused."""
+    points = LOPSIDED + (FRONT - LOPSIDED) * 1.5
+    said = warned(case(points, touched(points)))
+    assert any("far from the skin" in one for one in said)
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_a_symmetric_set_is_refused_unless_accepted(case, count, capfd):
+    """Equilateral triangle, square: any slip of names fits with FRE 0; the line names one and what follows."""
+    points = triangle(count)
+    for names in (slice(None), np.roll(np.arange(count), 1)):
+        line = refused(["register", case(points, touched(points)[names])], capfd)
+        assert "a slip in the marker names would pass unnoticed" in line
+        assert "fit with FRE 0.00 mm and put the target" in line
+        assert "registration.accept_symmetry = true" in line
+
+
+def test_an_accepted_symmetry_is_flagged_everywhere(case, tmp_path, capfd):
+    """`register`, `check`, `search`, their --json and the page say what a slip would do; the error is not 0."""
+    here = case(triangle(), touched(triangle()), registration="accept_symmetry = true")
+    report = registered(here, capfd)
+    assert report["expected_tre_target_mm"] > 0.1
+    assert report["expected_tre_target_interval_mm"][1] > 3 * report["expected_tre_target_mm"]
+    (said,) = [one for one in report["warnings"] if "accepted by accept_symmetry" in one]
+    assert main(["register", str(here)]) == 0
+    assert f"warning: {said}" in capfd.readouterr().out
+    direction = ["--theta", "5", "--beta", "0", "--no-arm"]
+    assert main(["check", str(here), *direction, "--json"]) == 0
+    assert said in json.loads(capfd.readouterr().out)["warnings"]
+    assert main(["check", str(here), *direction]) == 0
+    assert f"warning: {said}" in capfd.readouterr().out
+    out = tmp_path / "out"
+    assert main(["search", str(here), "--no-arm", "--json", "--out", str(out)]) == 0
+    assert said in json.loads(capfd.readouterr().out)["warnings"]
+    assert "accepted by accept_symmetry" in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_names_that_fit_better_permuted_are_refused_even_if_symmetry_is_accepted(case, capfd):
+    """A triangle with one side 12 mm longer, two names swapped: a declared noise says which naming is right."""
+    points = triangle() * [1.0, 1.0, 1.12]
+    points[0] += [0.0, 0.0, 4.0]
+    swapped = touched(points)[[1, 0, 2]]
+    keys = "accept_symmetry = true\naccept_residuals = true\nfle_mm = 0.5"
+    line = refused(["register", case(points, swapped, registration=keys)], capfd)
+    assert "the marker names look permuted: A and B swapped fit with FRE 0.00 mm" in line
+
+
+def test_a_permutation_that_puts_the_robot_elsewhere_is_a_warning(case, capfd):
+    """The base stands close before the patient; with two names swapped it would stand in them: said, not refused."""
+    points = np.array([[-60.0, -68.0, 0.0], [60.0, -68.0, 0.0], [0.0, -69.0, -110.0]])
+    shifted = touched(points) + [200.0, 0.0, 0.0]
+    said = registered(case(points, shifted), capfd)["warnings"]
+    (swapped,) = [one for one in said if "A and B swapped" in one]
+    assert "told apart by this alone: then the robot's base would stand in the patient" in swapped
+
+
+def test_residuals_that_the_case_accepts_are_flagged_everywhere(case, capfd):
+    """Declared 0.3 mm against residuals of 2: refused; accepted, the noise is scaled, and every command says so."""
+    base = touched(FRONT)
+    base[:2] += [[2.0, -2.5, 0.0], [-2.0, 2.5, 1.0]]
+    line = refused(["register", case(FRONT, base, registration="fle_mm = 0.3")], capfd)
+    assert "fle_mm = 0.3 does not explain FRE" in line
+    here = case(FRONT, base, registration="fle_mm = 0.3\naccept_residuals = true")
+    report = registered(here, capfd)
+    assert report["noise_scale"] > 3
+    assert report["fle_mm"] == pytest.approx(0.3 * report["noise_scale"])
+    assert any("accepted by the case" in flag for flag in report["flags"])
+    assert any("does not explain" in one for one in warned(here))

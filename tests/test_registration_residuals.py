@@ -1,0 +1,136 @@
+"""Residuals against the noise: what honest noise leaves passes, more is refused, and no estimated noise is zero."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from planning.errors import InputError
+from planning.marker_ambiguity import rigid_rss
+from planning.registration import MarkerPairs, apply, fit_rigid, register
+from planning.residual_test import DOUBT, MIN_FLE_MM, ResidualTest
+from twin.chen2019_tables import TABLE_1, TABLE_2
+
+TARGET = np.array([50.0, 130.0, 63.0])
+MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [20, 150, 147], [-40, 30, 60], [90, -60, 10]])
+DRAWS = 20_000
+FLE_MM = 1.5
+
+
+def pairs(points_ct, points_base):
+    """Matched markers with made-up names."""
+    return MarkerPairs(tuple("ABCDEF"[: len(points_ct)]), points_ct, points_base)
+
+
+def drawn_fre(count, fle_mm, rng):
+    """FRE of many rigid fits of noisy markers, shape (DRAWS,)."""
+    noisy = MARKERS[:count] + rng.normal(0, fle_mm / np.sqrt(3), (DRAWS, count, 3))
+    x = MARKERS[:count] - MARKERS[:count].mean(axis=0)
+    return np.sqrt(rigid_rss(x, noisy - noisy.mean(axis=1, keepdims=True)) / count)
+
+
+def missing_by(millimetres):
+    """The first four markers, two of them touched too far apart and two too near, each off by about so much."""
+    base = MARKERS[:4].copy()
+    spokes = base - base.mean(axis=0)
+    signs = np.array([1.0, 1.0, -1.0, -1.0])[:, None]
+    return base + signs * millimetres * spokes / np.linalg.norm(spokes, axis=1, keepdims=True)
+
+
+def test_the_closed_form_of_the_residuals_is_that_of_the_fit():
+    """Spreads less twice the singular values: what the fitted markers miss by, proper rotations only."""
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        count = int(rng.integers(3, 7))
+        x, y = rng.normal(0, 80, (2, count, 3))
+        x, y = x - x.mean(axis=0), y - y.mean(axis=0)
+        residuals = apply(fit_rigid(x, y), x) - y
+        assert rigid_rss(x, y) == pytest.approx(np.sum(residuals**2), rel=1e-9)
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 6])
+def test_honest_noise_is_refused_once_in_a_thousand(count):
+    """Of 20,000 registrations with the declared noise 0.1 % are refused, to four standard errors of the draws."""
+    limit = ResidualTest(count, 0.0, FLE_MM).limit_mm
+    refused = np.mean(drawn_fre(count, FLE_MM, np.random.default_rng(count)) > limit)
+    assert refused == pytest.approx(DOUBT, abs=4 * np.sqrt(DOUBT / DRAWS))
+
+
+@pytest.mark.parametrize(("count", "power"), [(3, 0.797), (4, 0.966), (5, 0.995), (6, 0.9993)])
+def test_noise_four_times_the_declared_is_refused(count, power):
+    """The refusals are what chi-squared says: 80 % with three markers, 97 % with four, over 99 % from five on."""
+    limit = ResidualTest(count, 0.0, FLE_MM).limit_mm
+    refused = np.mean(drawn_fre(count, 4 * FLE_MM, np.random.default_rng(count)) > limit)
+    assert power == pytest.approx(chi2.sf(chi2.isf(DOUBT, 3 * count - 6) / 16, 3 * count - 6), abs=0.001)
+    assert refused == pytest.approx(power, abs=0.012)
+
+
+@pytest.mark.parametrize("count", [3, 4, 6])
+def test_the_interval_of_the_estimated_noise_holds_the_truth_in_95_percent(count):
+    """Chi-squared with 3N - 6 degrees: with three markers the truth may be 3.7 times the estimate."""
+    fre = drawn_fre(count, FLE_MM, np.random.default_rng(10 + count))[:4000]
+    bounds = np.array([ResidualTest(count, float(value)).fle_interval_mm for value in fre])
+    held = np.mean((bounds[:, 0] <= FLE_MM) & (bounds[:, 1] >= FLE_MM))
+    assert held == pytest.approx(0.95, abs=0.015)  # four standard errors
+    if count == 3:
+        low, high = np.array(ResidualTest(3, 1.0).fle_interval_mm) / ResidualTest(3, 1.0).fle_mm
+        assert (low, high) == (pytest.approx(0.57, abs=0.005), pytest.approx(3.73, abs=0.005))
+
+
+def test_residuals_of_11_mm_are_refused():
+    """Without a declared noise an FRE above 5 mm passes no more."""
+    with pytest.raises(InputError, match=r"FRE 10\.\d+ mm exceeds the 5 mm .*accept_residuals = true"):
+        register(pairs(MARKERS[:4], missing_by(11.0)), method="rigid", target_ct=TARGET)
+
+
+def test_accepted_residuals_are_flagged():
+    """The user's word lets them pass, and the registration says so."""
+    found = register(pairs(MARKERS[:4], missing_by(11.0)), method="rigid", target_ct=TARGET, accept_residuals=True)
+    assert any("exceeds the 5 mm" in flag and "accepted" in flag for flag in found.flags)
+    assert found.fle_mm > 10.0
+
+
+def test_a_declared_noise_that_does_not_explain_the_residuals_is_refused_or_scaled():
+    """Chi-squared beyond its 99.9 % point: refused; accepted, the noise is s times the declared, and so the error."""
+    base = missing_by(3.0)
+    with pytest.raises(InputError, match=r"fle_mm = 0.5 does not explain FRE .* 6 degrees of freedom"):
+        register(pairs(MARKERS[:4], base), method="rigid", target_ct=TARGET, fle_mm=0.5)
+    found = register(pairs(MARKERS[:4], base), method="rigid", target_ct=TARGET, fle_mm=0.5, accept_residuals=True)
+    s = np.sqrt(np.sum(found.residuals**2) / (0.5**2 / 3) / 6)
+    assert found.residual_test.scale == pytest.approx(s, rel=1e-9)
+    assert found.fle_mm == pytest.approx(0.5 * s, rel=1e-9)
+    low, high = found.expected_tre_interval_mm(TARGET)
+    assert low < found.expected_tre_mm(TARGET[None])[0] < high
+    assert f"scaled by {s:.2f}" in found.fle_source
+    assert any("does not explain" in flag for flag in found.flags)
+
+
+def test_a_declared_noise_that_explains_the_residuals_stays_as_declared():
+    """No scale, no flag, no interval: what is declared is known."""
+    found = register(pairs(MARKERS[:4], missing_by(1.0)), method="rigid", target_ct=TARGET, fle_mm=1.5)
+    assert found.fle_mm == 1.5
+    assert found.residual_test.fle_interval_mm == (1.5, 1.5)
+    assert found.flags == ()
+
+
+def test_a_triad_is_tested_by_its_rigid_fit():
+    """The triad's own residuals are larger and follow no chi-squared; the paper's set passes a declared 2.5 mm."""
+    ct = np.array([TABLE_1[name] for name in "ABC"], dtype=float)
+    base = np.array([TABLE_2[name] for name in "ABC"])
+    found = register(pairs(ct, base), method="triad", target_ct=TARGET, fle_mm=2.5)
+    residuals = apply(fit_rigid(ct, base), ct) - base
+    assert found.residual_test.fre_mm == pytest.approx(np.sqrt(np.mean(np.sum(residuals**2, axis=1))), rel=1e-9)
+    assert found.residual_test.fre_mm < found.fre_mm
+
+
+@pytest.mark.parametrize("count", [3, 4, 6])
+def test_no_residual_is_no_error_of_zero(count):
+    """Markers that fit to the digit: the noise keeps a floor, and three markers leave it open up to 3.7 times."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    found = register(pairs(MARKERS[:count], apply(T, MARKERS[:count])), method="rigid", target_ct=TARGET)
+    assert found.fre_mm < 1e-9
+    assert found.fle_mm == MIN_FLE_MM
+    assert "floor" in found.fle_source
+    assert found.expected_tre_mm(TARGET[None])[0] > 0.1
+    assert found.expected_tre_interval_mm(TARGET).high > found.expected_tre_mm(TARGET[None])[0]
