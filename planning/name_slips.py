@@ -17,7 +17,7 @@ from planning.skin import Skin
 from planning.touching import place_excluded
 
 ALLOWED_NAMES = (
-    "markers without a symmetry, a smaller fle_mm if that is known, or registration.accept_symmetry = true once the "
+    "markers without a symmetry, fle_mm as small as it is known, or registration.accept_symmetry = true once the "
     "names have been checked at the patient"
 )
 

@@ -28,7 +28,7 @@ UNIT_SLIP = 5.0
 MAX_RESIDUAL_MM = 15.0
 """A marker that misses by more was swapped, moved or typed wrongly: the paper's worst set misses by 7 mm."""
 
-ALLOWED_RESIDUALS = "markers measured again, the true fle_mm, or registration.accept_residuals = true"
+ALLOWED_RESIDUALS = "names and readings checked, the true fle_mm, or registration.accept_residuals = true"
 
 MIRROR_GAIN = 2.0
 """A mirrored fit that is better than the proper one by this factor (and 1 mm) says that one side is mirrored."""

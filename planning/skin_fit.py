@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtri
 
+from planning.clearance.containment import Side, side_of
 from planning.formats.decimation import squared_distance
 from planning.skin import Skin
-from planning.winding import winding_number
 
 Floats = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ class SkinFit:
     """Markers against the skin.
 
     Attributes:
-        gaps_mm: Shape (n,), distance from the skin, negative inside the body.
+        gaps_mm: Shape (n,), distance from the skin, negative inside the body (of an open skin that is not known).
         normals_ct: Shape (n, 3), unit vectors out of the skin at its nearest triangle.
     """
 
@@ -70,7 +70,7 @@ def skin_fit(points_ct: Floats, skin: Skin) -> SkinFit:
         from_centres = np.linalg.norm(centres - point, axis=1)
         near = triangles[from_centres <= from_centres.min() + reach]  # holds the nearest one
         squares = squared_distance(point, near)
-        inside = abs(winding_number(skin.mesh, point)) > 0.5
+        inside = side_of(skin.mesh, point) is Side.INSIDE
         gaps[row] = np.sqrt(squares.min()) * (-1.0 if inside else 1.0)
         normals[row] = outward * _normal(near[int(np.argmin(squares))])
     return SkinFit(gaps, normals)

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.case import Case, Obstacle
+from planning.clearance.containment import Side, side_of
 from planning.mesh import TriangleMesh
 from planning.robot.ur import ur_model
-from planning.winding import winding_number
 
 Floats = NDArray[np.float64]
 
@@ -17,9 +17,6 @@ CONE = np.radians(60.0)
 
 CONE_DIRECTIONS = 100
 """Tried in that cone: one every 10 degrees."""
-
-INSIDE = 0.5
-"""Winding number from which a point lies inside."""
 
 
 def place_excluded(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
@@ -36,7 +33,7 @@ def place_excluded(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
     model = ur_model(case.robot.model)
     T_ct_base = np.linalg.inv(T_base_ct)
     column = np.stack([np.zeros(3), model.shoulder_base]) @ T_ct_base[:3, :3].T + T_ct_base[:3, 3]
-    if any(_inside(skin, point) for point in column):
+    if any(side_of(skin, point) is Side.INSIDE for point in column):
         return "the robot's base would stand in the patient"
     for box in _boxes_ct(case):
         if any(np.all(np.abs(point - box.center_mm) <= box.size_mm / 2) for point in column):
@@ -65,12 +62,6 @@ def untouchable(case: Case, points_ct: Floats, normals_ct: Floats) -> tuple[tupl
         if blocked and np.any(blocked, axis=0).all():
             found.append((row, _boxes_ct(case)[int(np.argmax(np.sum(blocked, axis=1)))].name))
     return tuple(found)
-
-
-def _inside(skin: TriangleMesh, point: Floats) -> bool:
-    low, high = skin.bounds
-    in_box = bool(np.all((low <= point) & (point <= high)))
-    return in_box and abs(winding_number(skin, point)) > INSIDE
 
 
 def _boxes_ct(case: Case) -> tuple[Obstacle, ...]:
