@@ -147,6 +147,10 @@ class Case:
         """The case file and all that it names, each with its role and hash."""
         return self.files.inputs
 
+    def data_beside(self, name: str) -> str | None:
+        """The file that a volume's detached header names for its voxels; None for a volume in one file."""
+        return _data_beside(self.files, self.path, name)
+
 
 def load_case(path: Path | str) -> Case:
     """Read and validate a case file, or a folder that holds ``case.toml``.
@@ -307,10 +311,15 @@ def _read_data_beside(files: InputFiles, header: _Named, path: Path) -> None:
     """Read the file that a volume's detached header names, which holds what decides."""
     if header.role not in {"labelmap", "ct"}:
         return
-    beside = volumes.data_file(files.content(header.name), path.parent / header.name)
-    if beside is not None:
-        name = str(PurePosixPath(header.name).with_name(beside))
-        files.read(f"{header.role} data", name, max_bytes=volumes.MAX_FILE_BYTES, key=header.name, where=path)
+    name = _data_beside(files, path, header.name)
+    if name is not None:
+        files.read(f"{header.role} data", name, max_bytes=volumes.MAX_FILE_BYTES, key=header.key, where=path)
+
+
+def _data_beside(files: InputFiles, path: Path, name: str) -> str | None:
+    """The data file of a detached header, as a name relative to the case's folder."""
+    beside = volumes.data_file(files.content(name), path.parent / name)
+    return None if beside is None else str(PurePosixPath(name).with_name(beside))
 
 
 def _read_only(array: ArrayLike) -> Matrix:

@@ -11,7 +11,7 @@ from planning.anatomy import Anatomy, Role, Structure
 from planning.case import Case
 from planning.errors import InputError
 from planning.formats.volume_header import VolumeHeader
-from planning.formats.volumes import read_header
+from planning.formats.volumes import parse_header
 from planning.inside_skin import LEAST_TOLERANCE_MM, inside_skin
 from planning.marker_check import check_markers
 from planning.placement import Placement
@@ -105,7 +105,7 @@ def volume_headers(case: Case) -> dict[str, VolumeHeader]:
     """
     named = {section.ct or section.labelmap for section in case.structure}
     named |= {section.labelmap for section in case.structures}
-    return {name: read_header(case.folder / name) for name in sorted(name for name in named if name)}
+    return {name: parse_header(case.files.content(name), case.folder / name) for name in sorted(name for name in named if name)}
 
 
 def _refuse_open_around_target(case: Case, anatomy: Anatomy) -> None:

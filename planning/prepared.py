@@ -154,6 +154,7 @@ def prepare(
     with stages.time("anatomy"):
         anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), user_cache())
         anatomy = replace(anatomy, warnings=(*anatomy.warnings, *check_consistency(case, anatomy, placement)))
+        case.files.release()
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.structures]
         measurer = ENGINES[engine](meshes, partial(watcher.count, "directions"))

@@ -11,35 +11,44 @@ import numpy as np
 
 from planning.cache import Arrays, Cache
 from planning.formats.label_surface import label_mesh
-from planning.formats.labelmaps import LabelMap, read_labelmap
-from planning.formats.volumes import read_volume
+from planning.formats.labelmaps import LabelMap, labelmap_of, segment_names
+from planning.formats.volumes import Volume, parse_header, parse_volume
 from planning.mesh import TriangleMesh
 from planning.skin import FieldOfView, Skin, skin_from_ct, skin_from_label
 
 
 @dataclass(frozen=True)
 class VolumeSurfaces:
-    """The surfaces of one label map or CT. The file itself is read only if something is not in the cache.
+    """The surfaces of one label map or CT. Its voxels are decoded only if something is not in the cache.
 
     Attributes:
-        path: The volume's file.
-        sha256: Of its content.
+        path: The volume's name.
+        content: The file that was named.
+        data: The file that it names for its voxels, or None.
+        sha256: Of content and data.
         cache: Where surfaces are kept.
     """
 
     path: Path
-    sha256: str
+    content: bytes
+    data: bytes | None
+    sha256: tuple[str, ...]
     cache: Cache
+
+    @cached_property
+    def volume(self) -> Volume:
+        """The volume itself."""
+        return parse_volume(self.content, self.path, self.data)
 
     @cached_property
     def labelmap(self) -> LabelMap:
         """The label map itself."""
-        return read_labelmap(self.path)
+        return labelmap_of(self.volume)
 
     @property
     def names(self) -> dict[int, str] | None:
         """The names that the file holds for its labels."""
-        return self.labelmap.names
+        return segment_names(parse_header(self.content, self.path).fields, self.path)
 
     def labels_present(self) -> tuple[int, ...]:
         """The labels that have a voxel, ascending."""
@@ -57,10 +66,10 @@ class VolumeSurfaces:
 
     def skin_of_ct(self) -> Skin:
         """The skin of the body found in a CT."""
-        return _to_skin(self._arrays("skin", lambda: _of_skin(skin_from_ct(read_volume(self.path)))))
+        return _to_skin(self._arrays("skin", lambda: _of_skin(skin_from_ct(self.volume))))
 
     def _arrays(self, what: str, make: Callable[[], Arrays]) -> Arrays:
-        return self.cache.arrays({"file": self.sha256, "what": what}, make)
+        return self.cache.arrays({"files": self.sha256, "what": what}, make)
 
 
 def _of_mesh(mesh: TriangleMesh) -> Arrays:

@@ -16,6 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from planning.errors import InputError
+from planning.formats.nifti_header import TYPES
+from planning.formats.nrrd_header import TYPES as NRRD_TYPES
 from planning.formats.orientation import canonical
 from planning.formats.volumes import read_volume
 
@@ -180,6 +182,78 @@ def test_files_that_simpleitk_writes_come_back(tmp_path: Path) -> None:
             assert np.allclose(place(volume.T_ct_index, *index), expected, atol=1e-3)
 
 
+def with_simpleitk(path: Path) -> np.ndarray:
+    """The values that SimpleITK reads, axis i first."""
+    reader = sitk.ImageFileReader()
+    reader.SetImageIO("NrrdImageIO" if "nrrd" in path.name or path.suffix == ".nhdr" else "NiftiImageIO")
+    reader.SetFileName(str(path))
+    return sitk.GetArrayFromImage(reader.Execute()).transpose(2, 1, 0)
+
+
+def stored_values(dtype: np.dtype[Any]) -> np.ndarray:
+    """120 values all over the range of a type, the ends included."""
+    rng = np.random.default_rng(5)
+    if dtype.kind == "f":
+        return (1000.0 * rng.normal(size=120)).astype(dtype)
+    ends = np.iinfo(dtype)
+    values = rng.integers(ends.min, ends.max, 120, dtype=dtype.newbyteorder("="), endpoint=True)
+    values[:2] = ends.min, ends.max
+    return values.astype(dtype)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("code", sorted(TYPES))
+@pytest.mark.parametrize(
+    ("slope", "intercept"), [(0, 0), (1, 0), (1, -1024), (2.5, -1024), (0.1, 0.3), (-1, 0), (1 + 1e-7, 0), (1, 1e-20)]
+)
+def test_nifti_values_are_simpleitks_bit_for_bit(
+    tmp_path: Path, order: str, code: int, slope: float, intercept: float
+) -> None:
+    """Every type in both byte orders, with slope and intercept, plain and compressed: the same values and type."""
+    dtype = np.dtype(order + TYPES[code])
+    data = stored_values(dtype).tobytes()
+    content = bytearray(nifti_bytes(order=order, datatype=(code, 8 * dtype.itemsize), data=data))
+    struct.pack_into(order + "2f", content, 112, slope, intercept)
+    plain, packed = write(tmp_path, "a.nii", content), write(tmp_path, "a.nii.gz", gzip.compress(content))
+    wanted = with_simpleitk(plain)
+    for path in (plain, packed):
+        values = read_volume(path).values
+        assert values.dtype == wanted.dtype
+        assert np.array_equal(values, wanted)
+
+
+@pytest.mark.parametrize("order", ["little", "big"])
+@pytest.mark.parametrize("name", sorted(NRRD_TYPES))
+def test_nrrd_values_are_simpleitks_bit_for_bit(tmp_path: Path, order: str, name: str) -> None:
+    """Every type by every name in both byte orders, raw, gzipped and as text, attached and detached."""
+    dtype = np.dtype({"little": "<", "big": ">"}[order] + NRRD_TYPES[name])
+    values = stored_values(dtype)
+    raw, text = values.tobytes(), " ".join(map(str, values.tolist())).encode()
+    typed = (("type", f"type: {name}"), ("endian", f"endian: {order}"))
+    write(tmp_path, "a.raw", raw)
+    contents = {
+        "raw.nrrd": nrrd_bytes(*typed, data=raw),
+        "gzip.nrrd": nrrd_bytes(*typed, ("encoding", "encoding: gzip"), data=gzip.compress(raw)),
+        "ascii.nrrd": nrrd_bytes(*typed, ("encoding", "encoding: ascii"), data=text),
+        "raw.nhdr": nrrd_bytes(*typed, ("data file", "data file: a.raw"), data=b""),
+    }
+    for file, content in contents.items():
+        path = write(tmp_path, file, content)
+        found, wanted = read_volume(path).values, with_simpleitk(path)
+        assert found.dtype == wanted.dtype, file
+        assert np.array_equal(found, wanted), file
+
+
+def test_members_and_padding_of_gzip_data(tmp_path: Path) -> None:
+    """Gzip data may come in members, with zeros behind; anything else behind is damage."""
+    cut = [gzip.compress(WHOLE[:100]), gzip.compress(WHOLE[100:351]), gzip.compress(b""), gzip.compress(WHOLE[351:])]
+    for end in (b"", bytes(1000)):
+        assert np.array_equal(read_volume(write(tmp_path, "a.nii.gz", b"".join(cut) + end)).values, VALUES)
+    for end in (b"x", bytes(1000) + b"x", cut[0]):
+        with pytest.raises(InputError, match="damaged|longer"):
+            read_volume(write(tmp_path, "a.nii.gz", b"".join(cut) + end))
+
+
 def test_canonical_order_is_right_handed_and_keeps_places() -> None:
     """Every voxel keeps its value and its place, for all 48 axis orders and flips of an oblique affine."""
     T = np.eye(4)
@@ -206,14 +280,14 @@ WHOLE = nifti_bytes()
 PACKED = gzip.compress(WHOLE)
 Q = {"codes": (1, 0)}
 BAD_NIFTI: dict[str, tuple[str, bytes, str]] = {
-    "empty": ("a.nii", b"", "ends inside the header"),
+    "empty": ("a.nii", b"", "file of 0 bytes"),
     "cut in the header": ("a.nii", WHOLE[:200], "ends inside the header"),
     "cut in the data": ("a.nii", WHOLE[:-1], "cut short"),
     "data missing": ("a.nii", WHOLE[:352], "cut short"),
     "too long": ("a.nii", WHOLE + b"\0", "longer than its header"),
     "gz cut": ("a.nii.gz", PACKED[:-12], "damaged or cut short|not a readable gzip"),
     "gz cut in the data only": ("a.nii.gz", gzip.compress(WHOLE[:-1]), "cut short"),
-    "gz with a wrong checksum": ("a.nii.gz", PACKED[:-8] + b"\1\2\3\4" + PACKED[-4:], "CRC"),
+    "gz with a wrong checksum": ("a.nii.gz", PACKED[:-8] + b"\1\2\3\4" + PACKED[-4:], "incorrect data check"),
     "gz bomb": ("a.nii.gz", gzip.compress(WHOLE + bytes(50_000_000)), "longer than its header"),
     "gz that is plain": ("a.nii.gz", WHOLE, "not a readable gzip"),
     "plain that is gz": ("a.nii", PACKED, "ends inside the header|no NIfTI-1 header"),
@@ -253,6 +327,13 @@ BAD_NIFTI: dict[str, tuple[str, bytes, str]] = {
     "NaN offset": ("a.nii", nifti_bytes(vox_offset=NAN), "vox_offset"),
     "offset past the end": ("a.nii", nifti_bytes(vox_offset=1e9), "cut short"),
     "NaN slope": ("a.nii", nifti_bytes(slope=NAN), "scl_slope"),
+    "slope of zero": ("a.nii", nifti_bytes(slope=0.0)[:116] + struct.pack("<f", 7.0) + WHOLE[120:], "some programs"),
+    "slope next to zero": ("a.nii", nifti_bytes(slope=1e-17), "some programs"),
+    "infinite voxel after scaling": (
+        "a.nii",
+        nifti_bytes(datatype=(16, 32), slope=1e30, data=np.full(120, 1e30, dtype="<f4").tobytes()),
+        "voxel is NaN or infinite",
+    ),
     "NaN voxel": (
         "a.nii",
         nifti_bytes(datatype=(16, 32), data=np.full(120, NAN, dtype="<f4").tobytes()),
@@ -262,7 +343,7 @@ BAD_NIFTI: dict[str, tuple[str, bytes, str]] = {
 SIZED = ("sizes", "sizes: 30000 30000 30000")
 FOUR_D = (("dimension", "dimension: 4"), ("sizes", "sizes: 2 4 5 3"))
 BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
-    "empty": ("a.nrrd", b"", "no NRRD header"),
+    "empty": ("a.nrrd", b"", "file of 0 bytes"),
     "garbage": ("a.nrrd", b"\xff\xfe" * 600, "no NRRD header"),
     "wrong magic": ("a.nrrd", nrrd_bytes().replace(b"NRRD0004", b"NRRD0009"), "no NRRD header"),
     "not text": ("a.nrrd", nrrd_bytes(("kinds", "kinds: \u00e9")).replace(b"\xc3\xa9", b"\xff"), "not text"),
@@ -306,6 +387,15 @@ BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
     "bzip2": ("a.nrrd", nrrd_bytes(("encoding", "encoding: bzip2")), "encoding"),
     "words as ascii": ("a.nrrd", nrrd_bytes(("encoding", "encoding: ascii"), data=b"one " * 120), "numbers"),
     "too few numbers": ("a.nrrd", nrrd_bytes(("encoding", "encoding: ascii"), data=b"1 " * 119), "cut short"),
+    "several values per voxel": ("a.nrrd", nrrd_bytes(("kinds", "kinds: vector domain domain")), "kinds"),
+    "two kinds": ("a.nrrd", nrrd_bytes(("kinds", "kinds: domain domain")), "kinds"),
+    "placed twice": ("a.nrrd", nrrd_bytes(("x", "axis mins: 1 2 3")), "axismins"),
+    "numbers out of range": (
+        "a.nrrd",
+        nrrd_bytes(("encoding", "encoding: ascii"), data=b"40000 " * 120),
+        "no number of their type",
+    ),
+    "halves as whole numbers": ("a.nrrd", nrrd_bytes(("encoding", "encoding: ascii"), data=b"1-2 " * 120), "no number"),
     "block type": ("a.nrrd", nrrd_bytes(("type", "type: block")), "type"),
 }
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from planning.errors import InputError
-from planning.formats.volumes import read_header, read_volume
+from planning.formats.volumes import Volume, read_volume
 
 MAX_LABEL = 65_535
 """Label maps are 8 or 16 bit; a larger value means that an image was given instead."""
@@ -60,9 +60,17 @@ def read_labelmap(path: Path) -> LabelMap:
         InputError: Whatever ``read_volume`` refuses; values that are negative, not whole or above
             ``MAX_LABEL``; a map with background only; segment names that contradict each other.
     """
-    volume = read_volume(path)
-    labels = _whole(volume.values, path)
-    return LabelMap(labels, volume.T_ct_index, _segment_names(read_header(path).fields, path), path)
+    return labelmap_of(read_volume(path))
+
+
+def labelmap_of(volume: Volume) -> LabelMap:
+    """The label map that a volume is.
+
+    Raises:
+        InputError: As `read_labelmap`, but for reading.
+    """
+    names = segment_names(volume.fields, volume.path)
+    return LabelMap(_whole(volume.values, volume.path), volume.T_ct_index, names, volume.path)
 
 
 def _whole(values: NDArray[Any], path: Path) -> NDArray[np.int32]:
@@ -79,8 +87,12 @@ def _whole(values: NDArray[Any], path: Path) -> NDArray[np.int32]:
     return labels
 
 
-def _segment_names(fields: dict[str, str], path: Path) -> dict[int, str] | None:
-    """Names from the remarks ``SegmentN_Name`` and ``SegmentN_LabelValue`` of a Slicer segmentation."""
+def segment_names(fields: dict[str, str], path: Path) -> dict[int, str] | None:
+    """Label to name from the remarks ``SegmentN_Name`` and ``SegmentN_LabelValue`` of a Slicer segmentation.
+
+    Raises:
+        InputError: Names that contradict each other.
+    """
     names: dict[int, str] = {}
     for key, name in fields.items():
         number = re.fullmatch(r"Segment(\d+)_Name", key)

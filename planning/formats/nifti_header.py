@@ -1,4 +1,4 @@
-"""NIfTI-1 headers, read by ourselves before any library opens the file.
+"""NIfTI-1 headers, checked before any voxel is looked at.
 
 Layout and meaning of the fields: NIfTI-1 standard, nifti1.h (DFWG, 2003), "methods" 2 (qform) and 3 (sform).
 A NIfTI affine maps to RAS; everything here leaves in LPS.
@@ -6,9 +6,7 @@ A NIfTI affine maps to RAS; everything here leaves in LPS.
 
 from __future__ import annotations
 
-import gzip
 import struct
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,23 +14,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.errors import InputError
+from planning.formats.inflate import first_bytes
 from planning.formats.volume_header import (
-    CHUNK_BYTES,
+    Cells,
     VolumeHeader,
     check_affine,
-    check_exact_size,
-    check_inflated_size,
     check_shape,
     corner_deviation_mm,
 )
 
 HEADER_BYTES = 348
 FIRST_VOXEL_BYTE = 352
-FLOAT_TYPES = {16: "f4", 64: "f8"}
-"""Datatype codes of floats. The NIfTI library inside SimpleITK turns NaN and infinity into 0, that is HU of water
-and label of background, and says nothing: so they are looked for before."""
-BITS_OF_DATATYPE = {2: 8, 4: 16, 8: 32, 16: 32, 64: 64, 256: 8, 512: 16, 768: 32, 1024: 64, 1280: 64}
-"""Datatype code to bits per voxel: signed and unsigned integers and floats; no colour, no complex numbers."""
+TYPES = {
+    2: "u1",
+    4: "i2",
+    8: "i4",
+    16: "f4",
+    64: "f8",
+    256: "i1",
+    512: "u2",
+    768: "u4",
+    1024: "i8",
+    1280: "u8",
+}
+"""Datatype code to type: signed and unsigned integers and floats; no colour, no complex numbers."""
+BITS_OF_DATATYPE = {code: 8 * np.dtype(name).itemsize for code, name in TYPES.items()}
+"""Datatype code to bits per voxel."""
+LEAST_SLOPE = float(np.finfo(np.float64).eps)
+"""A slope below means "none" to some programs, and is one to others."""
 MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
 """``xyzt_units`` to mm: unknown (taken as mm, and the spacing must then be plausible), metre, mm, micrometre."""
 QFORM_TOLERANCE_MM = 0.2
@@ -63,55 +72,49 @@ class _Fields:
     srow: tuple[float, ...]
 
 
-def read_nifti_header(path: Path) -> VolumeHeader:
-    """What the header says, held against the real size of the file (inflated and counted if it is a .nii.gz).
+def parse_nifti_header(content: bytes, path: Path) -> VolumeHeader:
+    """What the header of a file says; of a .nii.gz no more than the header is inflated.
 
     Where sform and qform are both given they must agree, so that it does not matter which one a program takes
-    (SimpleITK takes the sform if its code is 1, else the qform). Trailing bytes are refused as missing ones are.
+    (SimpleITK takes the sform if its code is 1, else the qform).
+
+    Args:
+        content: The whole file.
+        path: Its name.
 
     Raises:
-        InputError: Whatever is wrong with the header, or the file is shorter or longer than promised.
+        InputError: Whatever is wrong with the header.
     """
     compressed = path.name.lower().endswith(".gz")
-    fields = _parse(_first_bytes(path, compressed), path)
+    start = memoryview(content)
+    head = first_bytes(start, HEADER_BYTES, where=path, allowed=PLAIN) if compressed else content[:HEADER_BYTES]
+    fields = _parse(head, path)
     shape = _shape(fields, path)
     if BITS_OF_DATATYPE.get(fields.datatype) != fields.bitpix:
         what = f"datatype {fields.datatype} with {fields.bitpix} bits"
         raise InputError(what, where=path, allowed=f"(datatype: bits) {BITS_OF_DATATYPE}")
-    if not np.isfinite(fields.scaling).all():
-        raise InputError("scl_slope or scl_inter is not finite", where=path, allowed="finite numbers")
-    header = VolumeHeader(shape, check_affine(_affine(fields, shape, path), where=path), {})
+    slope, intercept = _scaling(fields, path)
+    T_ct_index = check_affine(_affine(fields, shape, path), where=path)
     offset = fields.vox_offset
     if not (np.isfinite(offset) and offset >= FIRST_VOXEL_BYTE and offset == int(offset)):
         raise InputError(f"vox_offset {offset}", where=path, allowed=f"a whole number >= {FIRST_VOXEL_BYTE}")
-    promised = int(offset) + shape[0] * shape[1] * shape[2] * fields.bitpix // 8
-    size = path.stat().st_size
-    if compressed:
-        with path.open("rb") as stream:
-            check_inflated_size(stream, size, promised, where=path)
-    else:
-        check_exact_size(size, promised, where=path)
-    if fields.datatype in FLOAT_TYPES:
-        _check_finite(path, compressed, int(offset), np.dtype(fields.order + FLOAT_TYPES[fields.datatype]))
-    return header
+    dtype = np.dtype(fields.order + TYPES[fields.datatype])
+    encoding = "gzip" if compressed else "raw"
+    cells = Cells(dtype, encoding, offset=int(offset), slope=slope, intercept=intercept)
+    return VolumeHeader(shape, T_ct_index, {}, cells, path)
 
 
-def _check_finite(path: Path, compressed: bool, offset: int, dtype: np.dtype[np.floating]) -> None:
-    """Looks at every voxel of a file whose size has been checked."""
-    with path.open("rb") as raw:
-        stream = gzip.GzipFile(fileobj=raw, mode="rb") if compressed else raw
-        stream.seek(offset)
-        while chunk := stream.read(CHUNK_BYTES):  # a multiple of 8: whole voxels, since neither kind reads short
-            if not np.isfinite(np.frombuffer(chunk, dtype=dtype)).all():
-                raise InputError("a voxel is NaN or infinite", where=path, allowed="finite values")
-
-
-def _first_bytes(path: Path, compressed: bool) -> bytes:
-    try:
-        with path.open("rb") as raw:
-            return gzip.GzipFile(fileobj=raw, mode="rb").read(HEADER_BYTES) if compressed else raw.read(HEADER_BYTES)
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise InputError(f"not a readable gzip file ({error})", where=path, allowed=PLAIN) from error
+def _scaling(fields: _Fields, path: Path) -> tuple[float, float]:
+    """What stored values are multiplied with, and what is added: 1 and 0 where the header says nothing."""
+    slope, intercept = fields.scaling
+    if not np.isfinite(fields.scaling).all():
+        raise InputError("scl_slope or scl_inter is not finite", where=path, allowed="finite numbers")
+    if slope == 0.0 and intercept == 0.0:
+        return 1.0, 0.0
+    if abs(slope) <= LEAST_SLOPE:
+        what = f"scl_slope {slope:g} with scl_inter {intercept:g}: some programs scale by it and others do not"
+        raise InputError(what, where=path, allowed="both 0, or a slope that is not")
+    return slope, intercept
 
 
 def _parse(data: bytes, path: Path) -> _Fields:

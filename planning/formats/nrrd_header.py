@@ -1,4 +1,4 @@
-"""NRRD headers, read by ourselves before any library opens the file.
+"""NRRD headers, checked before any voxel is looked at.
 
 Layout and meaning of the fields: "Definition of NRRD File Format" (Teem project). A NRRD header may name any
 file of the machine as its data; here it may only name one beside it.
@@ -9,18 +9,16 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from planning.errors import InputError
 from planning.formats.volume_header import (
-    CHUNK_BYTES,
+    Cells,
     VolumeHeader,
     check_affine,
-    check_exact_size,
-    check_inflated_size,
     check_shape,
 )
 
@@ -66,22 +64,22 @@ LPS_SIGNS = {
     "left-anterior-superior": (1.0, -1.0, 1.0),
     "las": (1.0, -1.0, 1.0),
 }
-BYTES_OF_TYPE = {
-    **dict.fromkeys(("signed char", "int8", "int8_t"), 1),
-    **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), 1),
-    **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), 2),
-    **dict.fromkeys(("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"), 2),
-    **dict.fromkeys(("int", "signed int", "int32", "int32_t"), 4),
-    **dict.fromkeys(("uint", "unsigned int", "uint32", "uint32_t"), 4),
-    **dict.fromkeys(("longlong", "long long", "long long int", "signed long long", "int64", "int64_t"), 8),
-    **dict.fromkeys(("ulonglong", "unsigned long long", "unsigned long long int", "uint64", "uint64_t"), 8),
-    "float": 4,
-    "double": 8,
+TYPES = {
+    **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
+    **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
+    **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"),
+    **dict.fromkeys(("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"), "u2"),
+    **dict.fromkeys(("int", "signed int", "int32", "int32_t"), "i4"),
+    **dict.fromkeys(("uint", "unsigned int", "uint32", "uint32_t"), "u4"),
+    **dict.fromkeys(("longlong", "long long", "long long int", "signed long long", "int64", "int64_t"), "i8"),
+    **dict.fromkeys(("ulonglong", "unsigned long long", "unsigned long long int", "uint64", "uint64_t"), "u8"),
+    "float": "f4",
+    "double": "f8",
 }
 GZIP = frozenset(("gzip", "gz"))
 ASCII = frozenset(("ascii", "text", "txt"))
-INTEGER_TEXT = re.compile(rb"[0-9+\-\s]*")
-FLOAT_TEXT = re.compile(rb"[0-9+\-.eE\s]*")
+AXIS_KINDS = frozenset(("domain", "space", "time", "none", "???"))
+"""What an axis may be that runs through space; others (vector, list, color) hold several values per voxel."""
 VECTOR = re.compile(r"\(([^()]*)\)")
 
 
@@ -95,28 +93,28 @@ class _Raw:
     data_offset: int
 
 
-def read_nrrd_header(path: Path) -> VolumeHeader:
-    """What the header says, held against the real size of its data.
+def parse_nrrd_header(content: bytes, path: Path) -> VolumeHeader:
+    """What the header of a file says.
+
+    Args:
+        content: The file that holds the header.
+        path: Its name.
 
     Raises:
-        InputError: A damaged header, an unknown field, a space that is not patient space, data elsewhere than
-            in the file or beside it, or data shorter or longer than promised.
+        InputError: A damaged header, an unknown field, a space that is not patient space, or data elsewhere than in
+            the file or beside it.
     """
-    with path.open("rb") as stream:
-        raw = _split(stream.read(MAX_HEADER_BYTES), path)
+    raw = _split(content[:MAX_HEADER_BYTES], path)
     fields = raw.fields
     if fields.get("dimension") != "3":
         layers = " (segments that overlap are stored in layers: export them as separate label maps)"
         what = f"dimension {fields.get('dimension')}{layers if fields.get('dimension') == '4' else ''}"
         raise InputError(what, where=path, allowed="dimension: 3")
     shape = check_shape(tuple(_whole(text, path) for text in _need(fields, "sizes", path).split()), where=path)
-    itemsize = BYTES_OF_TYPE.get(_need(fields, "type", path).lower())
-    if itemsize is None:
-        raise InputError(f"type {fields['type']!r}", where=path, allowed="an integer type, float or double")
     _check_units(fields, path)
+    _check_axes(fields, path)
     T_ct_index = check_affine(_affine(fields, path), where=path)
-    _check_data(raw, shape, itemsize, path)
-    return VolumeHeader(shape, T_ct_index, raw.remarks)
+    return VolumeHeader(shape, T_ct_index, raw.remarks, _cells(raw, path), raw.data_path)
 
 
 def data_file(content: bytes, path: Path) -> str | None:
@@ -233,35 +231,35 @@ def _vectors(text: str, count: int, path: Path) -> NDArray[np.float64]:
     return vectors
 
 
-def _check_data(raw: _Raw, shape: tuple[int, int, int], itemsize: int, path: Path) -> None:
+def _check_axes(fields: dict[str, str], path: Path) -> None:
+    """Refuse axes that hold several values per voxel, or that are placed in two ways."""
+    kinds = fields.get("kinds", "domain domain domain").lower().split()
+    if len(kinds) != 3 or not AXIS_KINDS.issuperset(kinds):
+        raise InputError(f"kinds {fields['kinds'][:80]!r}", where=path, allowed="domain domain domain")
+    for key in ("axismins", "axismaxs"):
+        if set(fields.get(key, "nan").lower().split()) != {"nan"}:
+            raise InputError(f"{key} beside a space", where=path, allowed="space origin and space directions alone")
+
+
+def _cells(raw: _Raw, path: Path) -> Cells:
     for key in ("byteskip", "lineskip"):
         if raw.fields.get(key, "0") != "0":
             raise InputError(f"{key} {raw.fields[key]!r}", where=path, allowed="0")
-    encoding = _need(raw.fields, "encoding", path).lower()
-    if encoding not in GZIP | ASCII | {"raw"}:
-        raise InputError(f"encoding {encoding!r}", where=path, allowed="raw, gzip, ascii")
-    if encoding not in ASCII and itemsize > 1 and raw.fields.get("endian", "").lower() not in ("little", "big"):
+    stated = _need(raw.fields, "encoding", path).lower()
+    encoding = "gzip" if stated in GZIP else "ascii" if stated in ASCII else stated
+    if encoding not in {"raw", "gzip", "ascii"}:
+        raise InputError(f"encoding {stated!r}", where=path, allowed="raw, gzip, ascii")
+    return Cells(_dtype(raw.fields, encoding, path), encoding, start=raw.data_offset)
+
+
+def _dtype(fields: dict[str, str], encoding: str, path: Path) -> np.dtype[Any]:
+    name = TYPES.get(_need(fields, "type", path).lower())
+    if name is None:
+        raise InputError(f"type {fields['type']!r}", where=path, allowed="an integer type, float or double")
+    dtype = np.dtype(name)
+    if encoding == "ascii" or dtype.itemsize == 1:
+        return dtype
+    order = {"little": "<", "big": ">"}.get(fields.get("endian", "").lower())
+    if order is None:
         raise InputError("the byte order is not said", where=path, allowed="endian: little or big")
-    count = shape[0] * shape[1] * shape[2]
-    available = raw.data_path.stat().st_size - raw.data_offset
-    if encoding == "raw":
-        check_exact_size(available, count * itemsize, where=raw.data_path)
-        return
-    with raw.data_path.open("rb") as stream:
-        stream.seek(raw.data_offset)
-        if encoding in GZIP:
-            check_inflated_size(stream, available, count * itemsize, where=raw.data_path)
-        else:
-            _check_numbers(stream, count, raw.fields["type"].lower() in ("float", "double"), raw.data_path)
-
-
-def _check_numbers(stream: BinaryIO, count: int, decimals: bool, path: Path) -> None:
-    """Counts the numbers of an ascii encoding."""
-    pattern = FLOAT_TEXT if decimals else INTEGER_TEXT
-    found, inside = 0, False
-    while chunk := stream.read(CHUNK_BYTES):
-        if pattern.fullmatch(chunk) is None:
-            raise InputError("the data hold something else than numbers", where=path, allowed="plain numbers")
-        found += len(chunk.split()) - int(inside and not chunk[:1].isspace())
-        inside = not chunk[-1:].isspace()
-    check_exact_size(found, count, where=path)
+    return np.dtype(order + name)

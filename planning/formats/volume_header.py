@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import gzip
 import itertools
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,24 +20,51 @@ SHEAR_TOLERANCE = 1e-4
 """Largest cosine between two axes; ITK accepts no more, and float32 headers stay below 1e-6."""
 MAX_ORIGIN_MM = 100_000.0
 """No scanner places a patient 100 m from its own origin."""
-DEFLATE_RATIO = 1033
-"""Deflate cannot shrink by more than 1032:1 (zlib's technical notes), so a tiny file cannot hold a large volume."""
-CHUNK_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class Cells:
+    """How a file stores its voxels, axis i first.
+
+    Attributes:
+        dtype: Of one voxel, with the file's byte order.
+        encoding: ``raw``, ``gzip`` or ``ascii``: of all that the file holds from byte ``start`` on.
+        start: Bytes of the file before the encoded data.
+        offset: Bytes of the decoded data before the first voxel.
+        slope: What a stored value is multiplied with; 1 and an intercept of 0 leave it as it is.
+        intercept: What is added then.
+    """
+
+    dtype: np.dtype[Any]
+    encoding: str
+    start: int = 0
+    offset: int = 0
+    slope: float = 1.0
+    intercept: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class VolumeHeader:
-    """One volume as its header describes it, already held against the size of the file.
+    """One volume as its header describes it; the data have not been looked at.
 
     Attributes:
         shape: Voxels along i, j, k.
         T_ct_index: Shape (4, 4), maps voxel index (i, j, k) to LPS mm.
         fields: The file's own key/value remarks (NRRD ``key:=value``), empty for NIfTI.
+        cells: How the voxels are stored.
+        data_path: The file that holds them: the header's own, or one beside it.
     """
 
     shape: tuple[int, int, int]
     T_ct_index: NDArray[np.float64]
     fields: dict[str, str]
+    cells: Cells
+    data_path: Path
+
+    @property
+    def count(self) -> int:
+        """Voxels in all."""
+        return self.shape[0] * self.shape[1] * self.shape[2]
 
     @property
     def spacing_mm(self) -> NDArray[np.float64]:
@@ -110,31 +135,3 @@ def check_exact_size(actual: int, promised: int, *, where: Path) -> None:
         kind = "cut short" if actual < promised else "longer than its header says"
         what = f"the file is {kind}: {actual} bytes where the header promises {promised}"
         raise InputError(what, where=where, allowed="a complete file")
-
-
-def check_inflated_size(stream: BinaryIO, compressed: int, promised: int, *, where: Path) -> None:
-    """Inflates a gzip stream, keeping nothing, and compares its length with the promise.
-
-    Stops one byte after the promised length, so what a bomb would inflate to is never made.
-
-    Args:
-        stream: Positioned at the start of the gzip data.
-        compressed: Bytes of gzip data in the file.
-        promised: Bytes that the header says it inflates to.
-        where: The file, for the message.
-
-    Raises:
-        InputError: Damaged, truncated, or of another length.
-    """
-    if promised > compressed * DEFLATE_RATIO:
-        what = f"{compressed} compressed bytes cannot hold the {promised} bytes that the header promises"
-        raise InputError(what, where=where, allowed="a complete file")
-    count = 0
-    try:
-        with gzip.GzipFile(fileobj=stream, mode="rb") as inflated:
-            while count <= promised and (chunk := inflated.read(min(CHUNK_BYTES, promised + 1 - count))):
-                count += len(chunk)
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        what = f"the compressed data are damaged or cut short after {count} of {promised} bytes ({error})"
-        raise InputError(what, where=where, allowed="a complete gzip file") from error
-    check_exact_size(count, promised, where=where)

@@ -1,0 +1,232 @@
+"""Every byte that decides a verdict is read once, hashed as it was read, and listed with its role."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
+import trimesh
+
+from planning.case import load_case
+from planning.prepared import Prepared, prepare
+from planning.provenance import differing_input, inputs_document
+
+CASE = """
+schema = 1
+name = "inputs"
+space = "LPS"
+# 1
+[target]
+points = "targets.csv"
+name = "T"
+structure = "organ"
+[needle]
+length_mm = 210.0
+shaft_mm = 150.0
+diameter_mm = 1.2
+[search]
+theta_deg = [0, 10]
+step_deg = 10.0
+[[structure]]
+name = "skin"
+ct = "ct.nhdr"
+role = "skin"
+[[structure]]
+name = "organ"
+mesh = "organ.stl"
+unit = "mm"
+role = "target"
+[[structure]]
+name = "rib"
+mesh = "rib.stl"
+unit = "mm"
+role = "avoid"
+[[structure]]
+name = "bowel"
+labelmap = "bowel.nii.gz"
+label = 3
+role = "avoid"
+[[structures]]
+labelmap = "vessels/labels.nhdr"
+naming = "names.csv"
+avoid = { "v*" = 2.0 }
+[registration]
+markers_ct = "markers_ct.csv"
+markers_base = "touch.csv"
+[rehearsal]
+truth_base = "truth.csv"
+"""
+
+MARKERS = "name,x_mm,y_mm,z_mm\nA,0,0,85\nB,50,0,70\nC,0,60,60\nD,-40,-30,72\n"
+
+IN_BASE = "name,x_mm,y_mm,z_mm\nA,0,400,85\nB,50,400,70\nC,0,460,60\nD,-40,370,72\n"
+
+ROLES = [
+    ("case", "case.toml"),
+    ("target", "targets.csv"),
+    ("ct", "ct.nhdr"),
+    ("ct data", "ct.raw"),
+    ("mesh organ", "organ.stl"),
+    ("mesh rib", "rib.stl"),
+    ("labelmap", "bowel.nii.gz"),
+    ("labelmap", "vessels/labels.nhdr"),
+    ("labelmap data", "vessels/labels.raw"),
+    ("naming", "names.csv"),
+    ("markers_ct", "markers_ct.csv"),
+    ("markers_base", "touch.csv"),
+    ("truth_base", "truth.csv"),
+]
+"""Of the case below, in the order of its sections."""
+
+CHANGES = {
+    "case.toml": (b"# 1", b"# 2"),
+    "targets.csv": (b"T,0", b"T,1"),
+    "ct.nhdr": (b"# written", b"# Written"),
+    "ct.raw": None,
+    "organ.stl": (bytes(80), bytes(79) + b"x"),
+    "rib.stl": (bytes(80), bytes(79) + b"x"),
+    "bowel.nii.gz": (b"\x1f\x8b\x08\x00\x00", b"\x1f\x8b\x08\x00\x01"),
+    "vessels/labels.nhdr": (b"# written", b"# Written"),
+    "vessels/labels.raw": None,
+    "names.csv": (b"v1", b"v2"),
+    "markers_ct.csv": (b"85", b"86"),
+    "touch.csv": (b"85", b"86"),
+    "truth.csv": (b"85", b"86"),
+}
+"""One byte of each file that may change without a refusal; None: the last one."""
+
+
+def image_of(values: np.ndarray) -> sitk.Image:
+    """An image of 2 mm voxels about the origin, from values with axis i first."""
+    image = sitk.GetImageFromArray(np.ascontiguousarray(values.transpose(2, 1, 0)))
+    image.SetSpacing((2.0, 2.0, 2.0))
+    image.SetOrigin((-99.0, -99.0, -99.0))
+    return image
+
+
+def detached(values: np.ndarray, header: Path) -> None:
+    """A NRRD header with its data beside it."""
+    sitk.WriteImage(image_of(values), str(header), useCompression=False)
+    text = header.read_bytes()
+    header.write_bytes(text.replace(b"\n", b"\n# written for a test\n", 1))
+
+
+def vessel(place: tuple[int, int, int]) -> np.ndarray:
+    """A label map with a short vessel, label 1, about a voxel."""
+    labels = np.zeros((100, 100, 100), np.uint8)
+    i, j, k = place
+    labels[i - 3 : i + 3, j - 3 : j + 3, k - 3 : k + 3] = 1
+    return labels
+
+
+def ball(path: Path, radius: float, center: tuple[float, float, float] = (0, 0, 0)) -> None:
+    """A closed sphere as binary STL with an empty header."""
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+    mesh.apply_translation(center)
+    mesh.export(path)
+    path.write_bytes(bytes(80) + path.read_bytes()[80:])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A case with every kind of source."""
+    here = tmp_path / "case"
+    (here / "vessels").mkdir(parents=True)
+    (here / "case.toml").write_text(CASE)
+    (here / "targets.csv").write_text("name,x_mm,y_mm,z_mm\nT,0,0,0\n")
+    (here / "names.csv").write_text("id,name\n1,v1\n")
+    (here / "truth.csv").write_text(IN_BASE + "T,0.5,400,0\n")
+    (here / "markers_ct.csv").write_text(MARKERS)
+    (here / "touch.csv").write_text(IN_BASE)
+    ball(here / "organ.stl", 20)
+    ball(here / "rib.stl", 5, (40, 0, 40))
+    place = np.indices((100, 100, 100)) * 2.0 - 99.0
+    detached(np.where(np.linalg.norm(place, axis=0) < 90, 40, -1000).astype(np.int16), here / "ct.nhdr")
+    detached(vessel((80, 50, 50)), here / "vessels" / "labels.nhdr")
+    sitk.WriteImage(image_of(3 * vessel((50, 80, 50))), str(here / "bowel.nii"))
+    (here / "bowel.nii.gz").write_bytes(gzip.compress((here / "bowel.nii").read_bytes(), mtime=0))
+    (here / "bowel.nii").unlink()
+    return here
+
+
+def places(prepared: Prepared) -> list[tuple[str, str]]:
+    """Role and path of each input."""
+    return [(one.role, one.path) for one in prepared.case.inputs]
+
+
+def test_every_file_is_listed_with_its_role(folder: Path) -> None:
+    """Also the data that a detached header names; every result carries the same list."""
+    prepared = prepare(folder, arm=False)
+    assert places(prepared) == ROLES
+    assert prepared.provenance()["inputs"] == inputs_document(prepared.case.inputs)
+    assert {path for _, path in ROLES} == {
+        str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file()
+    }
+
+
+def test_data_rewritten_beside_their_header_change_the_verdict(folder: Path) -> None:
+    """A vessel that enters the path is seen although header, names and cache are as before."""
+    before = prepare(folder, arm=False)
+    assert before.check(0.0, 0.0).safe[0]
+    header = (folder / "vessels" / "labels.nhdr").read_bytes()
+    across = vessel((50, 25, 50))  # half way to the skin in front
+    (folder / "vessels" / "labels.raw").write_bytes(across.tobytes(order="F"))
+    after = prepare(folder, arm=False)
+    found = after.check(0.0, 0.0)
+    assert (folder / "vessels" / "labels.nhdr").read_bytes() == header
+    assert (str(found.reason[0]), str(found.reason_structure[0])) == ("too_close", "v1")
+    assert found.min_clearance[0] < 0
+    assert differing_input(before.case.inputs, after.case.inputs) == "labelmap data (vessels/labels.raw)"
+    (folder / "vessels" / "labels.raw").write_bytes(vessel((80, 50, 50)).tobytes(order="F"))
+    assert prepare(folder, arm=False).check(0.0, 0.0).safe[0]
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_one_changed_byte_of_any_file_changes_its_hash_alone(folder: Path, name: str) -> None:
+    """A result made from it is not taken for one that was made before."""
+    before = load_case(folder).inputs
+    content = bytearray((folder / name).read_bytes())
+    change = CHANGES[name]
+    if change is None:
+        content[-1] ^= 1
+    else:
+        at = content.index(change[0])
+        content[at : at + len(change[0])] = change[1]
+    (folder / name).write_bytes(content)
+    after = load_case(folder).inputs
+    assert [old.path for old, new in zip(before, after, strict=True) if old != new] == [name]
+    said = differing_input(before, after)
+    assert said is not None
+    assert name in said or said == "case"
+
+
+OPENS = """
+import json, os, sys
+from collections import Counter
+folder, opened = sys.argv[1], Counter()
+def hook(event, arguments):
+    if event == "open" and isinstance(arguments[0], str) and arguments[0].startswith(folder):
+        opened[os.path.relpath(arguments[0], folder)] += 1
+sys.addaudithook(hook)
+from planning.prepared import prepare
+from twin.truth import draw_truth
+prepared = prepare(folder)
+draw_truth(prepared.case, prepared.placement.T_base_ct)
+print(json.dumps(opened))
+"""
+
+
+def test_each_file_is_opened_once(folder: Path, tmp_path: Path) -> None:
+    """So no file can be swapped between hashing and parsing; with an empty and with a full cache, the arm included."""
+    environment = os.environ | {"PUNCTURE_TWIN_CACHE": str(tmp_path / "cache")}
+    for _ in range(2):
+        command = [sys.executable, "-c", OPENS, str(folder)]
+        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        assert json.loads(run.stdout) == {path: 1 for _, path in ROLES}
