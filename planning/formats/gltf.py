@@ -1,4 +1,4 @@
-"""glTF 2.0, as one GLB file or as JSON with buffers: the triangles of its scene, placed by its nodes.
+"""glTF 2.0, as one GLB file or as JSON with its buffers in it: the triangles of its scene, placed by its nodes.
 
 Sizes and indices are checked in three steps before any array is made: chunks against the file, buffer views against
 buffers, accessors against views. Only geometry is read; materials, images, cameras and lights are never opened.
@@ -8,11 +8,8 @@ Source: Khronos glTF 2.0 specification, sections 3.5 (nodes), 3.6 (binary data),
 from __future__ import annotations
 
 import base64
-import binascii
 import json
-from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,23 +50,22 @@ def read_glb(data: bytes, where: str) -> RawMesh:
         if index == 0 and stated.uri is None:
             buffers.append(glb.binary or b"")
         else:
-            buffers.append(_buffer(stated.uri, None, f"{where}, buffer {index}"))
+            buffers.append(_buffer(stated.uri, f"{where}, buffer {index}"))
     return _read_document(document, buffers, where)
 
 
-def read_gltf(data: bytes, where: str, *, folder: Path) -> RawMesh:
-    """The triangles of a glTF file's scene; buffers inside it, or in files of the same folder.
+def read_gltf(data: bytes, where: str) -> RawMesh:
+    """The triangles of a glTF file's scene; its buffers stand in it as base64 data.
 
     Args:
         data: The whole JSON file.
         where: Its name, for the error.
-        folder: Where it lies. No file outside is opened.
 
     Raises:
         InputError: If it is cut, contradicts itself, or uses what is not supported.
     """
     document = _parse(data, where)
-    buffers = [_buffer(stated.uri, folder, f"{where}, buffer {index}") for index, stated in enumerate(document.buffers)]
+    buffers = [_buffer(stated.uri, f"{where}, buffer {index}") for index, stated in enumerate(document.buffers)]
     return _read_document(document, buffers, where)
 
 
@@ -110,22 +106,14 @@ def _parse(text: bytes, where: str) -> Document:
     return document
 
 
-def _buffer(uri: str | None, folder: Path | None, where: str) -> bytes:
-    allowed = "base64 data, or a file beside the .gltf"
-    if uri is not None and uri.startswith("data:"):
-        try:
-            return base64.b64decode(uri.partition(";base64,")[2], validate=True)
-        except binascii.Error as error:
-            raise InputError(f"base64 data is damaged ({error})", where=where, allowed=allowed) from error
-    if uri is None or folder is None or "://" in uri:
-        refuse(f"buffer address {str(uri)[:60]!r}", where, allowed)
+def _buffer(uri: str | None, where: str) -> bytes:
+    if uri is None or not uri.startswith("data:"):
+        allowed = "one whole file: a GLB, or base64 data in the .gltf"
+        refuse(f"the buffer lies in another file ({str(uri)[:60]!r})", where, allowed)
     try:
-        path = (folder / unquote(uri)).resolve()
-        if not path.is_relative_to(folder.resolve()) or not path.is_file():
-            refuse(f"buffer file {uri[:60]!r} is outside of the folder or missing", where, allowed)
-        return path.read_bytes()
-    except (OSError, ValueError) as error:  # unreadable, or a path with a NUL in it
-        raise InputError(f"buffer file cannot be read ({error})", where=where, allowed=allowed) from error
+        return base64.b64decode(uri.partition(";base64,")[2], validate=True)
+    except ValueError as error:  # damaged, or not ASCII
+        raise InputError(f"base64 data is damaged ({error})", where=where, allowed="base64 data") from error
 
 
 def _read_document(document: Document, buffers: list[bytes], where: str) -> RawMesh:

@@ -31,9 +31,9 @@ MAX_FILE_BYTES = 2_000_000_000
 """Twenty million triangles of binary STL are 1 GB; a file beyond twice that is refused before it is read."""
 
 _READERS: Mapping[str, Callable[[bytes, str], RawMesh]] = MappingProxyType(
-    {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".glb": read_glb, ".vtp": read_vtp}
+    {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".glb": read_glb, ".gltf": read_gltf, ".vtp": read_vtp}
 )
-MESH_SUFFIXES: tuple[str, ...] = (*_READERS, ".gltf")
+MESH_SUFFIXES: tuple[str, ...] = tuple(_READERS)
 """The file name endings that ``read_mesh`` takes, in lower case; upper case is the same."""
 
 
@@ -110,8 +110,6 @@ def _signed_volume(mesh: TriangleMesh) -> float:
 
 def _reader(path: Path, where: str) -> Callable[[bytes, str], RawMesh]:
     suffix = path.suffix.lower()
-    if suffix == ".gltf":
-        return lambda data, name: read_gltf(data, name, folder=path.parent)
     if suffix not in _READERS:
         allowed = "a file ending in " + ", ".join(MESH_SUFFIXES)
         raise InputError(f"unknown mesh format {path.suffix!r}", where=where, allowed=allowed)
