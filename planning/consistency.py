@@ -105,7 +105,8 @@ def volume_headers(case: Case) -> dict[str, VolumeHeader]:
     """
     named = {section.ct or section.labelmap for section in case.structure}
     named |= {section.labelmap for section in case.structures}
-    return {name: parse_header(case.files.content(name), case.folder / name) for name in sorted(name for name in named if name)}
+    files = sorted(name for name in named if name)
+    return {name: parse_header(case.files.content(name), case.folder / name) for name in files}
 
 
 def _refuse_open_around_target(case: Case, anatomy: Anatomy) -> None:
