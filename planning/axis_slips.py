@@ -34,6 +34,13 @@ HALF_TURNS: Mapping[str, Signs] = MappingProxyType(
 """The slips of axes that are proper rotations; a list with one or three axes negated is refused as mirrored."""
 
 
+REFUSING_DOUBT = 0.01
+"""A list is refused at 99 %. Honest lists less often: the more symmetric a body, the more alike are both lists' gaps."""
+
+EXCLUDING_DOUBT = 0.001
+"""A half turn is no more mentioned at 99.9 %."""
+
+
 @dataclass(frozen=True, eq=False)
 class MarkerList:
     """One reading of the CT markers.
@@ -57,11 +64,12 @@ class MarkerList:
 
     def explains(self, given: MarkerList) -> bool:
         """Whether the given list is likely this one, slipped."""
-        return self.plausible and (given.fit.worse_than(self.fit) or bool(given.behind))
+        return self.plausible and (given.fit.worse_than(self.fit, doubt=REFUSING_DOUBT) or bool(given.behind))
 
-    def does_as_well(self, given: MarkerList) -> bool:
-        """Whether nothing speaks for the given list and against this one."""
-        return self.plausible and not self.fit.worse_than(given.fit)
+    def excluded_by(self, given: MarkerList) -> bool:
+        """Whether this list is implausible, or so much farther off the skin than the given one that it is not meant."""
+        worse = self.fit.worse_than(given.fit, doubt=EXCLUDING_DOUBT) or self.fit.unusual_beside(given.fit)
+        return worse or not self.plausible
 
 
 def marker_list(case: Case, skin: Skin, registration: Registration, signs: Signs = (1.0, 1.0, 1.0)) -> MarkerList:
@@ -91,15 +99,16 @@ def check_axes(case: Case, skin: Skin, registration: Registration, given: Marker
             allowed="markers_ct in the axes (LPS, RAS) that the case or their file states",
         )
     return tuple(
-        f"markers_ct with {name} would lie on the skin as well ({slip.fit.scatter_mm:.1f} mm rms, as given "
-        f"{given.fit.scatter_mm:.1f} mm) and put the target {slip.target_mm:.0f} mm away: check the axes of their file"
+        f"markers_ct with {name} would lie on the skin to {slip.fit.scatter_mm:.1f} mm rms, as given to "
+        f"{given.fit.scatter_mm:.1f} mm: too alike to tell, and the target would be {slip.target_mm:.0f} mm away; "
+        "check the axes of their file"
         for name, slip in slips.items()
-        if slip.does_as_well(given)
+        if not slip.excluded_by(given)
     )
 
 
 def _as_given(registration: Registration, given: MarkerList, slip: MarkerList) -> str:
-    if given.fit.worse_than(slip.fit):
+    if given.fit.worse_than(slip.fit, doubt=REFUSING_DOUBT):
         return f"to {given.fit.scatter_mm:.1f} mm"
     row, obstacle = given.behind[0]
     return f"{registration.markers.names[row]} lies behind obstacle '{obstacle}', where no needle touches it"

@@ -20,8 +20,8 @@ MARKER_ON_SKIN_MM = 30.0
 SCATTER_MM = 0.25
 """No skin is known better: a third of a millimetre's voxel, and the marker's own reading."""
 
-DOUBT = 0.001
-"""Of two lists as close to the skin, one seems worse than the other once in 1,000."""
+USUAL_SCATTER_MM = 3.0
+"""Markers of one kind on the skin of their own CT scatter less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +47,20 @@ class SkinFit:
         height = np.clip(self.gaps_mm.mean(), 0.0, MARKER_ON_SKIN_MM)
         return float(np.sqrt(np.sum((self.gaps_mm - height) ** 2) / (len(self.gaps_mm) - 1)))
 
-    def worse_than(self, other: SkinFit) -> bool:
-        """Whether the same markers lie so much worse here that chance does not explain it (F-test, 99.9 %)."""
+    def worse_than(self, other: SkinFit, *, doubt: float) -> bool:
+        """Whether the same markers scatter more here than chance explains, by an F-test.
+
+        Args:
+            other: The same markers, read in other axes.
+            doubt: How often two lists of one scatter would seem so different.
+        """
         freedom = len(self.gaps_mm) - 1
-        limit = float(np.sqrt(fdtri(freedom, freedom, 1 - DOUBT)))
+        limit = float(np.sqrt(fdtri(freedom, freedom, 1 - doubt)))
         return self.scatter_mm > limit * max(other.scatter_mm, SCATTER_MM)
+
+    def unusual_beside(self, other: SkinFit) -> bool:
+        """Whether the markers scatter more here than markers do, and no more than that there."""
+        return self.scatter_mm > USUAL_SCATTER_MM >= other.scatter_mm
 
 
 def skin_fit(points_ct: Floats, skin: Skin) -> SkinFit:
