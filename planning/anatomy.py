@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -106,6 +107,7 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
         structures.extend(loader.many(section))
     skin = loader.skin(_skin_section(case))
     _check_names(case, structures)
+    _check_demands(case, structures)
     warnings = [*loader.warnings, *loader.unnamed_warnings(), *skin.warnings]
     for structure in structures:
         warnings.extend(mesh_warnings(structure.mesh, structure.name))
@@ -238,7 +240,7 @@ class _Loader:
 
 def _check_names(case: Case, structures: list[Structure]) -> None:
     names = [structure.name for structure in structures]
-    twice = sorted({name for name in names if names.count(name) > 1})
+    twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
         raise InputError(f"structure '{twice[0]}' stands twice", where=case.path, allowed="unique names")
     if case.target_structure not in names:
@@ -246,6 +248,16 @@ def _check_names(case: Case, structures: list[Structure]) -> None:
             f"target.structure '{case.target_structure}' is no structure of the case",
             where=case.path,
             allowed=", ".join(names),
+        )
+
+
+def _check_demands(case: Case, structures: list[Structure]) -> None:
+    """Where nothing demands a margin every path is "safe", which says nothing about a patient."""
+    if not any(structure.demands_margin for structure in structures):
+        raise InputError(
+            "no structure is to be avoided, so that no verdict would say anything about safety",
+            where=case.path,
+            allowed='at least one structure of role "avoid" or "unknown"',
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections import Counter
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -35,6 +36,12 @@ Degrees180 = Annotated[Number, Field(ge=0, le=180)]
 Yes = Annotated[bool, Strict()]
 Label = Annotated[int, Strict(), Field(ge=1, le=65535)]
 
+
+MAX_STRUCTURES = 1000
+"""Structures, or obstacles, of a case: TotalSegmentator knows 117 classes, and each structure costs a tree."""
+
+MAX_LABEL_MAPS = 100
+"""Tables ``[[structures]]``, each with a label map of its own."""
 
 MAX_DIRECTIONS = 1_000_000
 """Rows of a search: a hemisphere at 0.2 degrees; 2 GB of table with 60 structures."""
@@ -183,15 +190,18 @@ class StructureSection(Section):
         return self
 
 
+Patterns = Annotated[tuple[Text, ...], Field(max_length=MAX_STRUCTURES)]
+
+
 class StructuresSection(Section):
     """Many structures of one label map, by name pattern."""
 
     labelmap: str
     naming: str | None = None
-    target: tuple[Text, ...] = ()
-    avoid: dict[Text, Margin] = Field(default_factory=dict)
-    traverse: tuple[Text, ...] = ()
-    ignore: tuple[Text, ...] = ()
+    target: Patterns = ()
+    avoid: Annotated[dict[Text, Margin], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
+    traverse: Patterns = ()
+    ignore: Patterns = ()
 
 
 class RegistrationSection(Section):
@@ -306,11 +316,11 @@ class CaseFile(Section):
     needle: NeedleSection
     search: SearchSection = SearchSection()
     ranking: RankingSection = RankingSection()
-    structure: tuple[StructureSection, ...] = ()
-    structures: tuple[StructuresSection, ...] = ()
+    structure: Annotated[tuple[StructureSection, ...], Field(max_length=MAX_STRUCTURES)] = ()
+    structures: Annotated[tuple[StructuresSection, ...], Field(max_length=MAX_LABEL_MAPS)] = ()
     registration: RegistrationSection | None = None
     robot: RobotSection = RobotSection()
-    obstacle: tuple[ObstacleSection, ...] = ()
+    obstacle: Annotated[tuple[ObstacleSection, ...], Field(max_length=MAX_STRUCTURES)] = ()
     gantry: GantrySection | None = None
     place: PlaceSection = PlaceSection()
     rehearsal: RehearsalSection = RehearsalSection()
@@ -330,9 +340,8 @@ class CaseFile(Section):
             raise ValueError('cut names sides of a patient; space "local" has none')
         if self.space == "local" and self.search.frame not in {None, "ct"}:
             raise ValueError('search.frame must be "ct" for space "local": it has no head and no front')
-        names = [s.name for s in self.structure]
-        for name in names:
-            if names.count(name) > 1:
+        for name, count in Counter(s.name for s in self.structure).items():
+            if count > 1:
                 raise ValueError(f"structure '{name}' stands twice; names are unique")
         skins = [s.name for s in self.structure if s.role == "skin"]
         if len(skins) != 1:

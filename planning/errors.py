@@ -4,6 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+MOST_WHAT, MOST_WHERE, MOST_ALLOWED = 400, 300, 600
+"""Characters of an error's parts: what is longer loses its middle, so that the line can still be read."""
+
+MOST_MESSAGE = 1_500
+"""Characters of any other line."""
+
 
 class PlanningError(Exception):
     """Base of everything that the planner raises on purpose."""
@@ -19,9 +25,9 @@ class InputError(PlanningError):
     """
 
     def __init__(self, what: str, *, where: str | Path, allowed: str) -> None:
-        self.what = _one_line(what)
-        self.where = _one_line(str(where))
-        self.allowed = _one_line(allowed)
+        self.what = one_line(what, MOST_WHAT)
+        self.where = one_line(str(where), MOST_WHERE)
+        self.allowed = one_line(allowed, MOST_ALLOWED)
         super().__init__(f"{self.where}: {self.what}; allowed: {self.allowed}")
 
 
@@ -38,6 +44,15 @@ class NoAnswerError(PlanningError):
         super().__init__(message)
 
 
-def _one_line(text: str) -> str:
+def one_line(text: str, most: int = MOST_MESSAGE) -> str:
+    """A text as one printable line.
+
+    Args:
+        text: Any text.
+        most: Characters, from 3 on; a longer text loses its middle.
+    """
     words = " ".join(text.split())
+    if len(words) > most:
+        head = (most - 3) // 2
+        words = words[:head] + "..." + words[len(words) - (most - 3 - head) :]
     return "".join(c if c.isprintable() else "?" for c in words)

@@ -50,6 +50,22 @@ def sha256(path: Path) -> str:
         raise InputError(f"cannot be read ({error.strerror})", where=path, allowed="a readable file") from error
 
 
+def is_plain_file(path: Path) -> bool:
+    """Whether a file is there; also of a name too long, or with a NUL in it, for which the system raises."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """Whether a folder is there, whatever its name."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; move it there when the block ends without an exception.

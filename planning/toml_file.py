@@ -9,6 +9,7 @@ from typing import Annotated, TypeVar
 from pydantic import BaseModel, BeforeValidator, ValidationError
 
 from planning.errors import InputError
+from planning.toml_bounds import check_toml_bounds
 
 MAX_BYTES = 1_000_000
 """Such a file is written by hand; a larger one is something else."""
@@ -79,8 +80,10 @@ def parse_toml(content: bytes, path: Path, model: type[Model], *, allowed: str, 
         InputError: Not TOML, or not of the schema: names the first key that is wrong.
     """
     try:
-        data = tomllib.loads(content.decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        text = content.decode("utf-8")
+        check_toml_bounds(text, path, allowed)
+        data = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, a number that Python does not read
         raise InputError(f"is not TOML: {error}", where=path, allowed=allowed) from error
     try:
         return model.model_validate(data)
@@ -88,6 +91,6 @@ def parse_toml(content: bytes, path: Path, model: type[Model], *, allowed: str, 
         first = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in first["loc"]) or "top level"
         said = first["msg"].removeprefix("Value error, ")
-        value = "" if isinstance(first["input"], dict | list) else f" (given: {first['input']!r:.60})"
+        value = "" if isinstance(first["input"], dict | list | tuple) else f" (given: {first['input']!r:.60})"
         allowed = f"the keys, types and ranges of {keys}"
         raise InputError(f"{place}: {said}{value}", where=path, allowed=allowed) from error

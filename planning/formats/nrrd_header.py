@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.errors import InputError
+from planning.files import is_plain_file
 from planning.formats.volume_header import (
     Cells,
     VolumeHeader,
@@ -187,7 +188,7 @@ def _beside(name: str, path: Path) -> Path:
     if not name or re.search(r"[/\\%\s\0]", name) or name in (".", "..") or name.upper().startswith("LIST"):
         raise InputError(f"data file {name[:80]!r}", where=path, allowed=allowed)
     data_path = path.parent / name
-    if not data_path.is_file():
+    if not is_plain_file(data_path):
         raise InputError(f"data file {name!r} does not exist", where=path, allowed=allowed)
     if data_path.resolve().parent != path.parent.resolve():
         raise InputError(f"data file {name!r} is a link to another folder", where=path, allowed=allowed)
