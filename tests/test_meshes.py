@@ -460,7 +460,7 @@ BROKEN = [
     ("glb-index-out-of-range", ".glb", glb(gltf_document(), GLTF_BINARY[:-2] + b"\3\0"), r"index 3 out of range"),
     ("glb-nan-vertex", ".glb", glb(gltf_document(), NAN + GLTF_BINARY[4:]), r"vertex 0 is not finite"),
     ("glb-accessor-too-long", ".glb", broken_glb(accessors=accessors(0, count=4)), r"accessor 0 takes 48 bytes"),
-    ("glb-accessor-huge", ".glb", broken_glb(accessors=accessors(1, count=2**39)), r"at most 20000000"),
+    ("glb-accessor-huge", ".glb", broken_glb(accessors=accessors(1, count=2**39)), r"\d+ vertices in all places"),
     ("glb-accessor-sparse", ".glb", broken_glb(accessors=accessors(0, sparse={})), r"accessor 0 is sparse"),
     ("glb-accessor-missing", ".glb", broken_glb(meshes=primitive(indices=9)), r"accessor 9 of 2"),
     ("glb-indices-of-floats", ".glb", broken_glb(accessors=accessors(1, componentType=5126)), r"indices of type 5126"),

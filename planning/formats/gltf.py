@@ -118,7 +118,7 @@ def _buffer(uri: str | None, where: str) -> bytes:
 
 def _read_document(document: Document, buffers: list[bytes], where: str) -> RawMesh:
     _check_sizes(document, buffers, where)
-    placed = placed_meshes(document, where)
+    placed = placed_meshes(document, sum(len(buffer) for buffer in buffers), where)
     parts = [_part(document, buffers, each, where) for each in placed]
     return join([part for group in parts for part in group])
 

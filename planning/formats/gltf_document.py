@@ -16,6 +16,12 @@ _HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_")
 """Required extensions with these beginnings change colours only, not the surface."""
 _INSTANCING = "EXT_mesh_gpu_instancing"
 
+MAX_NODES = 10_000
+"""Nodes, accessors or views of a file; a scene of anatomy has some hundred, and each one costs its own time."""
+
+MAX_BUFFERS = 16
+"""A writer makes one, or one for each kind of data; each may name a file that is read."""
+
 Index = Annotated[int, Field(ge=0, le=2**53)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -89,7 +95,7 @@ class Node(_Part):
 class Scene(_Part):
     """The nodes at the top."""
 
-    nodes: list[Index] = []
+    nodes: Annotated[list[Index], Field(max_length=MAX_NODES)] = []
 
 
 class Document(_Part):
@@ -98,11 +104,11 @@ class Document(_Part):
     asset: Asset
     scene: Index | None = None
     scenes: list[Scene] = []
-    nodes: list[Node] = []
+    nodes: Annotated[list[Node], Field(max_length=MAX_NODES)] = []
     meshes: list[Mesh] = []
-    accessors: list[Accessor] = []
-    buffer_views: list[BufferView] = []
-    buffers: list[Buffer] = []
+    accessors: Annotated[list[Accessor], Field(max_length=MAX_NODES)] = []
+    buffer_views: Annotated[list[BufferView], Field(max_length=MAX_NODES)] = []
+    buffers: Annotated[list[Buffer], Field(max_length=MAX_BUFFERS)] = []
     extensions_required: list[str] = []
 
     def check_supported(self, where: str) -> None:

@@ -8,9 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from planning.formats.gltf_document import Document, Node
+from planning.formats.gltf_document import Document, Mesh, Node
 from planning.formats.guard import MAX_TRIANGLES
 from planning.formats.raw_mesh import MAX_VERTICES, refuse
+
+MAX_PARTS = 10_000
+"""Primitives in all places: each one is built by itself."""
+
+MAX_REPEATED_VERTICES = 3_000_000
+"""Beyond what the file's own data hold: what it may place again. They take 70 MB."""
+
+_VERTEX_BYTES, _TRIANGLE_BYTES = 12, 3
+"""Least size of a vertex, and of a triangle by indices of one byte."""
 
 
 class Placed(NamedTuple):
@@ -25,11 +34,17 @@ class Placed(NamedTuple):
     T_scene_mesh: NDArray[np.float64]
 
 
-def placed_meshes(document: Document, where: str) -> list[Placed]:
+def placed_meshes(document: Document, data_bytes: int, where: str) -> list[Placed]:
     """Every mesh of the document with its place, in the order of the nodes.
 
+    Args:
+        document: The file's geometry.
+        data_bytes: Bytes in its buffers, which bound what it may build.
+        where: Its name, for the error.
+
     Raises:
-        InputError: If the nodes are no tree, a transform is singular, or a mesh has no place in the scene.
+        InputError: If the nodes are no tree, a transform is singular, a mesh has no place in the scene, or the places
+            make more of the data than a file of its size may.
     """
     T_scene_node = _walk(document, where)
     placed = []
@@ -45,7 +60,7 @@ def placed_meshes(document: Document, where: str) -> list[Placed]:
     if lost or not placed:
         what = f"mesh {min(lost)} is placed by no node" if lost else "no mesh"
         refuse(what, where, "at least one mesh, each placed by a node of the scene")
-    _check_total(document, placed, where)
+    _check_total(document, placed, data_bytes, where)
     return placed
 
 
@@ -86,16 +101,32 @@ def _local(node: Node, where: str) -> NDArray[np.float64]:
     return T
 
 
-def _check_total(document: Document, placed: list[Placed], where: str) -> None:
-    """Count before building: a small file may place one large mesh many times."""
-    triangles = vertices = 0
-    for primitive in (p for each in placed for p in document.meshes[each.mesh].primitives):
+class _Size(NamedTuple):
+    parts: int
+    vertices: int
+    triangles: int
+
+
+def _check_total(document: Document, placed: list[Placed], data_bytes: int, where: str) -> None:
+    """Count before building: a small file may place one large mesh many times, or name one array in many parts."""
+    sizes = [_size(document, mesh) for mesh in document.meshes]
+    total = _Size(*(sum(sizes[each.mesh][kind] for each in placed) for kind in range(3)))
+    if total.parts > MAX_PARTS:
+        refuse(f"{total.parts} parts in all places", where, f"at most {MAX_PARTS}")
+    vertices = min(MAX_VERTICES, data_bytes // _VERTEX_BYTES + MAX_REPEATED_VERTICES)
+    triangles = min(MAX_TRIANGLES, data_bytes // _TRIANGLE_BYTES + MAX_REPEATED_VERTICES // 3)
+    if total.triangles > triangles or total.vertices > vertices:
+        what = f"{total.triangles} triangles and {total.vertices} vertices in all places"
+        refuse(what, where, f"at most {triangles} and {vertices} from {data_bytes} bytes of data")
+
+
+def _size(document: Document, mesh: Mesh) -> _Size:
+    vertices = triangles = 0
+    for primitive in mesh.primitives:
         corners = _count(document, primitive.attributes.get("POSITION"))
         vertices += corners
         triangles += (corners if primitive.indices is None else _count(document, primitive.indices)) // 3
-    if triangles > MAX_TRIANGLES or vertices > MAX_VERTICES:
-        what = f"{triangles} triangles and {vertices} vertices in all places"
-        refuse(what, where, f"at most {MAX_TRIANGLES} and {MAX_VERTICES}")
+    return _Size(len(mesh.primitives), vertices, triangles)
 
 
 def _count(document: Document, accessor: int | None) -> int:
