@@ -22,7 +22,7 @@ from typer._click.exceptions import ClickException  # typer carries its own clic
 from meshes import folder as meshes_folder
 from planning.batch import run_batch
 from planning.case import load_case
-from planning.errors import InputError, NoAnswerError, PlanningError
+from planning.errors import MOST_WHAT, InputError, NoAnswerError, PlanningError, one_line
 from planning.export import FORMATS
 from planning.files import check_writable
 from planning.prepared import prepare
@@ -31,6 +31,9 @@ from twin import main_job, words
 from twin.mirror import Mirror, connect, live_states, recorded_states
 from twin.place_words import mirror_line, place_text
 from twin.report.progress import progress_display
+
+MOST_SEEDS = 10_000
+"""Rooms or draws of one command; each takes seconds."""
 
 OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED = 0, 1, 2, 3
 
@@ -42,6 +45,9 @@ OutOption = Annotated[
     Path, typer.Option("--out", help="Folder for the files that are written.", callback=check_writable)
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, and nothing else there.")]
+JobsOption = Annotated[
+    int, typer.Option("--jobs", min=1, help="Processes, at most one a core; the answer is the same.")
+]
 EngineOption = Annotated[str, typer.Option("--engine", help="Who measures clearance: fast, or fcl, the reference.")]
 PicturesOption = Annotated[
     bool, typer.Option("--pictures/--no-pictures", help="Whether to draw the map, the scene and the page.")
@@ -149,7 +155,7 @@ def rehearse(
 def place(
     case: CaseArgument,
     out_dir: OutOption = Path("out"),
-    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Processes; the answer is the same.")] = 2,
+    jobs: JobsOption = 2,
     pictures: PicturesOption = True,
     as_json: JsonOption = False,
 ) -> None:
@@ -220,7 +226,7 @@ def register(case: CaseArgument, as_json: JsonOption = False) -> None:
 def batch(
     cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case files or folders.")],
     out_dir: OutOption = Path("out/batch"),
-    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Processes.")] = 1,
+    jobs: JobsOption = 1,
     arm: ArmOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -255,7 +261,7 @@ def selfcal(
 def servo(
     case: Annotated[Path, typer.Argument(metavar="CASE", help="Servo case, or the folder that holds servo.toml.")],
     out_dir: OutOption = Path("out"),
-    seeds: Annotated[int, typer.Option("--seeds", min=1, help="How many rooms to draw.")] = 1,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, max=MOST_SEEDS, help="How many rooms to draw.")] = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Servo the tool onto every target by two cameras, in rooms whose truth is drawn; pictures, plot and page."""
@@ -272,7 +278,7 @@ def servo(
 def reproduce(
     paper: Annotated[str, typer.Argument(metavar="chen2019|liu2007|axp-ybq", help="Which paper.")],
     out_dir: OutOption = Path("out"),
-    seeds: Annotated[int | None, typer.Option("--seeds", min=1, help="How many draws, if any.")] = None,
+    seeds: Annotated[int | None, typer.Option("--seeds", min=1, max=MOST_SEEDS, help="How many draws, if any.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Print a paper's numbers beside ours; exit 0 only if every one holds."""
@@ -310,9 +316,9 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         return _fail(str(error), BAD_INPUT)
     except NoAnswerError as error:
-        return _fail(str(error), ANSWER_IS_NO)
+        return _fail(one_line(str(error)), ANSWER_IS_NO)
     except ClickException as error:
-        return _fail(f"command line: {error.format_message()}; allowed: see --help", BAD_INPUT)
+        return _fail(f"command line: {one_line(error.format_message(), MOST_WHAT)}; allowed: see --help", BAD_INPUT)
     except PlanningError as error:
         return _fail(str(error), PROGRAM_FAILED)
     except Exception:  # the last line of defence: the user gets exit code 3 and the traceback, whatever broke

@@ -15,6 +15,7 @@ import numpy as np
 from planning.errors import InputError, PlanningError
 from planning.files import atomic
 from planning.prepared import Watcher, prepare
+from planning.processes import worker_count
 from planning.provenance import inputs_document
 from planning.table import write_table
 
@@ -42,7 +43,7 @@ def run_batch(
     Args:
         cases: Case files or folders.
         out: Folder for the results.
-        jobs: Processes; each case runs in one.
+        jobs: Processes, at most one a core; each case runs in one.
         arm: Whether the arm is checked too, see `prepare`.
         watcher: Whoever shows progress, in cases.
 
@@ -52,7 +53,7 @@ def run_batch(
     rows: list[dict[str, Any]] = [{} for _ in cases]
     folders = [f"{number:04d}" for number in range(1, len(cases) + 1)]
     context = multiprocessing.get_context("spawn")  # compiled libraries with threads do not survive a fork
-    with ProcessPoolExecutor(max_workers=min(jobs, max(len(cases), 1)), mp_context=context) as pool:
+    with ProcessPoolExecutor(max_workers=worker_count(jobs, len(cases)), mp_context=context) as pool:
         numbers = {
             pool.submit(search_one, case, out / folder, arm): number
             for number, (case, folder) in enumerate(zip(cases, folders, strict=True))

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from planning.cache import user_cache
 from planning.case import Case
 from planning.errors import InputError
+from planning.formats.input_file import read_input
+from planning.formats.raw_mesh import decode_text
 from planning.marker_check import checked_placement
 from planning.robot.kinematics import flange_pose
 from planning.robot.ur import UrModel, ur_model
@@ -27,11 +29,17 @@ JOINT_COLUMNS = tuple(f"q{joint}_rad" for joint in range(1, 7))
 
 INSTALL = "pip install 'puncture-twin[mirror]'"
 
+MAX_RECORDING_BYTES = 200_000_000
+"""An hour at 125 states a second is 60 MB."""
+
 RTDE_PORT = 30004
 """On which a controller tells its state; the only port that is used."""
 
 VARIABLES = ("timestamp", "actual_q")
 """What the controller is asked to tell."""
+
+MAX_HOST = 253
+"""Characters of a name on a network (RFC 1035)."""
 
 ANSWER_S = 5.0
 """A controller that does not take the call within this time is not there."""
@@ -134,13 +142,20 @@ def connect(host: str) -> Receiver:
         from rtde_receive import RTDEReceiveInterface
     except ImportError as error:
         raise InputError("mirroring a robot needs ur-rtde, an extra", where="mirror", allowed=INSTALL) from error
+    _check_host(host)
     try:  # first by ourselves: the library waits for minutes, and cannot be interrupted
         socket.create_connection((host, RTDE_PORT), timeout=ANSWER_S).close()
         receiver: Receiver = RTDEReceiveInterface(host, variables=list(VARIABLES))
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, ValueError) as error:  # ValueError: a name that no address can have
         where = f"mirror {host}, port {RTDE_PORT}"
         raise InputError(f"no robot answers: {error}", where=where, allowed="a UR that is on") from error
     return receiver
+
+
+def _check_host(host: str) -> None:
+    if not 0 < len(host) <= MAX_HOST or not host.isprintable() or any(c.isspace() for c in host):
+        what = f"host of {len(host)} characters, or with spaces in it"
+        raise InputError(what, where=f"mirror {host}", allowed=f"a name or address of 1 to {MAX_HOST} characters")
 
 
 def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -> Iterator[JointState]:
@@ -176,11 +191,15 @@ def recorded_states(path: Path) -> Iterator[JointState]:
     Raises:
         InputError: The file cannot be read, lacks a column, or holds something that is no number.
     """
+    lines = decode_text(read_input(path, max_bytes=MAX_RECORDING_BYTES, where=str(path)), str(path)).splitlines()
+    table = csv.DictReader((line for line in lines if line.strip() and not line.startswith("#")), strict=True)
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read ({error})", where=path, allowed="a CSV of joint angles") from error
-    table = csv.DictReader(line for line in lines if line.strip() and not line.startswith("#"))
+        yield from _states(table, path)
+    except csv.Error as error:
+        raise InputError(f"is no CSV ({error})", where=path, allowed="a CSV of joint angles") from error
+
+
+def _states(table: csv.DictReader[str], path: Path) -> Iterator[JointState]:
     wanted = ("time_s", *JOINT_COLUMNS)
     missing = [name for name in wanted if name not in (table.fieldnames or ())]
     if missing:

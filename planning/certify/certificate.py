@@ -223,7 +223,7 @@ def parse_certificate(content: bytes, path: Path) -> Certificate:
     document = _document(content, path)
     try:
         certificate = _certificate(document, path)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         what = f"not a certificate: {type(error).__name__} {error}"
         raise InputError(what, where=path, allowed="a file that search --certify wrote") from error
     stated, counted = document.get("summary"), json.loads(json.dumps(certificate.summary()))

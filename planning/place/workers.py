@@ -7,6 +7,8 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from typing import TypeVar
 
+from planning.processes import worker_count
+
 Thing = TypeVar("Thing")
 Answer = TypeVar("Answer")
 
@@ -26,9 +28,10 @@ def ask_all(
     Args:
         ask: The question; with several jobs it and its answers must be such as can be pickled.
         things: What is asked about.
-        jobs: Processes; 1 asks in this one.
+        jobs: Processes, at most one a core; 1 asks in this one.
         progress: Called with (answered, to answer).
     """
+    jobs = worker_count(jobs, len(things))
     size = max(1, min(BATCH, len(things) // (4 * jobs)))
     batches = [things[start : start + size] for start in range(0, len(things), size)]
     answers: list[Answer] = []

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.errors import NoAnswerError
+from planning.processes import worker_count
 from planning.robot.state_checker import StateChecker
 from twin.stereo.room import room_checker
 from twin.stereo.servo_case import ServoCase
@@ -121,7 +122,7 @@ def run_trials(
     Args:
         case: The case.
         seeds: Which.
-        jobs: Processes.
+        jobs: Processes, at most one a core.
         done: Told how many of how many are done.
     """
     tell = done or (lambda at, of: None)
@@ -134,7 +135,7 @@ def run_trials(
         return found
     shares = [seeds[i : i + SHARE] for i in range(0, len(seeds), SHARE)]
     context = multiprocessing.get_context("spawn")  # compiled libraries with threads do not survive a fork
-    with ProcessPoolExecutor(max_workers=jobs, mp_context=context) as pool:
+    with ProcessPoolExecutor(max_workers=worker_count(jobs, len(shares)), mp_context=context) as pool:
         for share in pool.map(partial(run_trials, case), shares):
             found += share
             tell(len(found), len(seeds))
