@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.errors import InputError
-from planning.files import atomic
+from planning.files import atomic, is_folder
 from planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE
 from planning.formats.input_file import read_input
 from planning.formats.raw_mesh import decode_text
@@ -108,6 +108,11 @@ class Recording:
         return Recording(A, B, P, v, (), self.pixels)
 
 
+def recording_file(path: Path) -> Path:
+    """The CSV itself, also of a folder that holds ``recording.csv``."""
+    return path / FILE_NAME if is_folder(path) else path
+
+
 def read_recording(path: Path) -> Recording:
     """Read a recording from its CSV, or from ``recording.csv`` in a folder.
 
@@ -117,7 +122,7 @@ def read_recording(path: Path) -> Recording:
     Raises:
         InputError: Another header, a field that is no finite number, or a matrix that is no rigid motion.
     """
-    file = path / FILE_NAME if path.is_dir() else path
+    file = recording_file(path)
     return parse_recording(read_input(file, max_bytes=MAX_BYTES, where=str(file)), file)
 
 
@@ -128,7 +133,10 @@ def parse_recording(content: bytes, file: Path) -> Recording:
         InputError: As `read_recording`, but for reading.
     """
     text = decode_text(content, str(file))
-    rows = [row for row in csv.reader(io.StringIO(text)) if row and not row[0].startswith("#")]
+    try:
+        rows = [row for row in csv.reader(io.StringIO(text), strict=True) if row and not row[0].startswith("#")]
+    except csv.Error as error:
+        raise InputError(f"is no CSV ({error})", where=file, allowed="one line per pose, fields of numbers") from error
     header = tuple(cell.strip() for cell in rows[0]) if rows else ()
     kinds = {_columns(pixels, width): (pixels, width) for pixels in (False, True) for width in (0, 2, 3)}
     if header not in kinds:

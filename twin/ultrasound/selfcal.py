@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,17 @@ from twin.ultrasound.calibration import Calibration, calibrate
 from twin.ultrasound.candidate_poses import Candidates, drawing, find_candidates
 from twin.ultrasound.pose_choice import expected_tre_mm
 from twin.ultrasound.puncture import Puncture, held_out_errors_mm, punctures
-from twin.ultrasound.recording import FILE_NAME, MAX_BYTES, Recording, parse_recording, write_recording
+from twin.ultrasound.recording import (
+    FILE_NAME,
+    MAX_BYTES,
+    Recording,
+    parse_recording,
+    recording_file,
+    write_recording,
+)
 from twin.ultrasound.selfcal_case import SelfcalCase
 from twin.ultrasound.selfcal_truth import draw_room
+from twin.ultrasound.slips import checked_calibration
 from twin.ultrasound.summaries import calibration_summary, choice_summary, puncture_summary, trial_summary
 from twin.ultrasound.trial import Choice, Trial
 from twin.ultrasound.two_arms import TwoArms
@@ -127,16 +136,16 @@ def selfcal_recording(path: Path, case: SelfcalCase | None) -> SelfcalRun:
     """Calibrate from a recording's CSV, or a folder with ``recording.csv``; a case says noise and needle length.
 
     Raises:
-        InputError: A recording that cannot be used.
+        InputError: A recording that cannot be used, or that fits only in another reading (inverse, swapped, metres).
         Degenerate: The poses cannot show every unknown.
     """
-    file = path / FILE_NAME if path.is_dir() else path
+    file = recording_file(path)
     stages = Stages()
     with stages.time("read"):
         content = read_input(file, max_bytes=MAX_BYTES, where=str(file))
         recording = parse_recording(content, file)
     with stages.time("calibrate"):
-        calibration = calibrate_case(recording, case)
+        calibration = checked_calibration(recording, partial(calibrate_case, recording, case), file)
     inputs = (content_input("recording", file.name, content), *(() if case is None else case.inputs))
     return SelfcalRun(file.stem, calibration, recording, inputs, case=case, stages=stages)
 

@@ -1,0 +1,93 @@
+"""Hostile inputs, each with its story in hostile/cases.toml: one line, no traceback, no hang, no gigabytes."""
+
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from hostile.makers import MAKERS
+
+from planning.place.workers import ask_all
+from planning.processes import worker_count
+
+HERE = Path(__file__).parent
+CASES = tomllib.loads((HERE / "hostile" / "cases.toml").read_text())["case"]
+SECONDS, MEGABYTES = 10, 1000
+"""Bounds of a case that states none, generous: the machine may be shared."""
+SPAN_MEGABYTES = 6000
+"""Address space beyond what the imports hold: libraries reserve more than they use. It protects the machine; what is
+used is compared afterwards."""
+LONGEST_LINE = 1500
+
+
+@pytest.fixture(scope="module")
+def runner():
+    """A process that has imported the program, and forks for each case."""
+    here = HERE.parent
+    path = os.pathsep.join([str(here), str(HERE), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(HERE / "hostile" / "runner.py")]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment, cwd=here
+    ) as process:
+
+        def run(task):
+            process.stdin.write(json.dumps(task) + "\n")
+            process.stdin.flush()
+            return json.loads(process.stdout.readline())
+
+        yield run
+        process.stdin.close()
+
+
+def task_of(case, folder, out):
+    """What the runner is told."""
+    task = {"seconds": case.get("seconds", SECONDS), "megabytes": SPAN_MEGABYTES}
+    if "reader" in case:
+        return {**task, "reader": case["reader"], "path": str(folder / case["file"])}
+    longer = {word: text[0] * int(text[2:]) for word, text in case.get("replace", {}).items()}
+    words = [longer.get(word, word).replace("{folder}", str(folder)).replace("{out}", str(out)) for word in case["run"]]
+    return {**task, "argv": words}
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case["name"])
+def test_a_hostile_input_costs_one_line(case, runner, tmp_path):
+    """The exit code and the line that the story's case states, in time and memory, and nothing is written."""
+    folder, out = tmp_path / "in", tmp_path / "out"
+    folder.mkdir()
+    MAKERS[case["make"]](folder)
+    done = runner(task_of(case, folder, out))
+    assert done["exit"] == case.get("exit", 2), done
+    assert case["expect"] in done["err"]
+    assert done["megabytes"] < case.get("megabytes", MEGABYTES)
+    if done["exit"] == 2:
+        lines = done["err"].splitlines()
+        assert len(lines) == 1
+        assert len(lines[0]) <= LONGEST_LINE
+        assert "allowed: " in lines[0]
+        assert not out.exists() or not any(out.iterdir())
+
+
+def test_every_maker_has_a_story():
+    """Nothing is made that no case tells of, and every story says something."""
+    assert {case["make"] for case in CASES} == set(MAKERS)
+    assert len({case["name"] for case in CASES}) == len(CASES)
+    assert all(len(case["story"]) > 3 for case in CASES)
+
+
+def test_a_million_jobs_are_as_many_processes_as_cores():
+    """``place --jobs 1000000`` started 3,136 processes before it was stopped; the answers stay in order."""
+    cores = len(os.sched_getaffinity(0))
+    assert worker_count(1_000_000, 1_000_000) == cores
+    assert worker_count(1_000_000, 1) == 1
+    assert worker_count(1_000_000, 0) == 1
+    answers = ask_all(_process, range(400), jobs=1_000_000, progress=lambda done, of: None)
+    assert [number for number, _ in answers] == list(range(400))
+    assert len({process for _, process in answers}) <= cores
+
+
+def _process(number):
+    return number, os.getpid()
