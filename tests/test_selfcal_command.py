@@ -63,7 +63,7 @@ def test_the_calibration_is_the_truth_within_what_it_claims(case_folder, done):
         # the arms' own errors do not average out as noise does: the claim holds to a factor
         assert np.linalg.norm(ours[part] - value) < 5.0 * np.linalg.norm(sigma)
     assert np.array(found["needle_direction_end2"]) @ truth.V > np.cos(np.radians(0.3))
-    assert found["version"] == 1
+    assert found["version"] == 2
     assert found["seed"] == 3
     assert len(found["residuals_mm"]) == 20
     assert [(one["role"], one["path"]) for one in found["inputs"]] == [("case", "selfcal.toml")]
