@@ -42,8 +42,8 @@ STRAIGHT_TOLERANCE_MM = 0.1
 BETWEEN_RAD = 0.002
 """Joint step at which an insertion is looked at between its rows: up to 1.3 mm at the tip, bent by far less."""
 
-MOST_STATES = 2_000_000
-"""Joints that turn through more steps than this during one insertion do something else."""
+MOST_STATES = 100_000
+"""Joints that turn through more steps than this (200 rad) during one insertion do something else."""
 
 SAME_PEAK = 1e-6
 """Share by which a stated peak may differ from the samples' own: rounding."""

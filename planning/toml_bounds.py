@@ -23,6 +23,9 @@ MAX_WORD = 100
 MAX_LINE = 20_000
 """Characters of a line: a rule for each of a thousand organs fits."""
 
+MAX_TABLES = 20_000
+"""Lines that begin with a bracket: each may be a table of eight levels."""
+
 _TOKEN = re.compile(
     r'(?P<text>"""(?:[^\\]|\\.)*?(?:"""|\Z)|\'\'\'.*?(?:\'\'\'|\Z)|"(?:[^"\\\n]|\\.)*"?|\'[^\'\n]*\'?)'
     r"|(?P<comment>#[^\n]*)|(?P<open>[\[{])|(?P<close>[\]}])|(?P<dot>\.)|(?P<word>[^\s\"'#\[\]{}.=,]+)"
@@ -42,9 +45,13 @@ def check_toml_bounds(text: str, where: Path | str, allowed: str) -> None:
     Raises:
         InputError: Says which line goes beyond which bound.
     """
+    tables = 0
     for number, line in enumerate(text.split("\n"), start=1):
+        tables += line.lstrip().startswith("[")
         if len(line) > MAX_LINE:
             _refuse(f"has {len(line)} characters, more than {MAX_LINE}", where, number, allowed)
+        if tables > MAX_TABLES:
+            _refuse(f"begins more than {MAX_TABLES} tables", where, number, allowed)
     depth = parts = 0
     for token in _TOKEN.finditer(text):
         kind, found = str(token.lastgroup), token.group()

@@ -210,7 +210,7 @@ MAKERS = {
     "dotted key": case_with(before=".".join(["a"] * 20_000) + " = 1\n"),
     "dotted key over lines": case_with(before="[" + ".".join(["a"] * 9000) + "]\nb = 1\n"),
     "dotted keys of quoted parts": case_with(before='""' + '.""' * 5000 + " = 1\n"),
-    "many tables": case_with(after="".join(f"[t{i}.b.c.d.e.f]\n" for i in range(45_000))),
+    "many tables": case_with(after="".join(f"[t{i}.b.c.d.e.f]\n" for i in range(40_000))),
     "many structures": case_with(after="".join(STRUCTURE.format(i) for i in range(12_000))),
     "many patterns": case_with(
         after='[[structures]]\nlabelmap = "x.nii"\nignore = [\n' + '"*a*b*c",\n' * 60_000 + "]\n"

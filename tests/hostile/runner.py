@@ -1,7 +1,8 @@
 """A process that runs what it is told, line by line, each in a child with bounds on time and memory.
 
-A line on stdin is JSON: ``argv`` of the command line, or ``reader`` with ``path``; ``seconds``; ``megabytes``. The
-answer is a line too: ``exit`` (null if the child was stopped), ``out``, ``err``, ``seconds``, ``megabytes``.
+A line on stdin is JSON: ``argv`` of the command line, or ``reader`` with ``path``; ``seconds`` of the processor;
+``megabytes``. The answer is a line too: ``exit`` (null if the child was stopped), ``out``, ``err``, ``seconds`` by the
+clock, ``megabytes``.
 """
 
 import json
@@ -29,6 +30,10 @@ READERS = {
 }
 
 
+WALL = 20
+"""By the clock a task may take so many times its processor's seconds: the machine may be shared."""
+
+
 def do(task):
     """The exit code of what a task asks for."""
     if "argv" in task:
@@ -48,6 +53,7 @@ def child(task, out, err):
         os.dup2(out.fileno(), 1)
         os.dup2(err.fileno(), 2)
         most = task["megabytes"] << 20
+        resource.setrlimit(resource.RLIMIT_CPU, (task["seconds"], task["seconds"]))
         resource.setrlimit(resource.RLIMIT_AS, (virtual_bytes() + most, resource.RLIM_INFINITY))
         code = do(task)
         sys.stdout.flush()
@@ -73,7 +79,7 @@ def answer(task):
             done, code, usage = os.wait4(pid, os.WNOHANG)
             if done:
                 status = code
-            elif time.monotonic() - start > task["seconds"]:
+            elif time.monotonic() - start > WALL * task["seconds"]:
                 os.kill(pid, signal.SIGKILL)
                 os.waitpid(pid, 0)
                 break
