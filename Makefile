@@ -4,8 +4,10 @@ PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out/demo
+RUNS ?= 100000
+FIRST ?= 0
 
-.PHONY: demo test lint install pictures meshes clean
+.PHONY: demo test fuzz lint install pictures meshes clean
 
 demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
@@ -17,6 +19,10 @@ lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# Mutated files and command lines; RUNS=1000 FIRST=500000 for fewer, and other, ones.
+fuzz: install
+	cd tests && PYTHONPATH=..:. ../$(BIN)/python -m fuzz --runs $(RUNS) --first $(FIRST) --keep ../out/fuzz
 
 install: $(VENV)/installed
 

@@ -1,0 +1,79 @@
+"""Command lines that nobody would type: numbers, paths and hosts of every bad kind, in any order."""
+
+import contextlib
+import io
+
+from fuzz.mutate import NUMBERS, pick
+
+COMMANDS = [
+    *["search", "verify", "check", "plan", "rehearse", "place", "mirror", "export", "register", "batch"],
+    *["selfcal", "servo", "reproduce", "", "serch", "x" * 3000, "--help", "-h", "--version"],
+]
+"""Not ``demo``, which needs nothing and takes a minute."""
+
+OPTIONS = {
+    "--theta": "number",
+    "--beta": "number",
+    "--case": "path",
+    "--from": "path",
+    "--recording": "path",
+    "--out": "out",
+    "--jobs": "number",
+    "--seeds": "number",
+    "--seconds": "number",
+    "--rate": "number",
+    "--certify-size": "number",
+    "--cross-check": "number",
+    "--engine": "word",
+    "--format": "word",
+    "--json": None,
+    "--arm": None,
+    "--no-arm": None,
+    "--no-pictures": None,
+    "--certify": None,
+    "--nonsense": "word",
+    "-": None,
+    "--": None,
+}
+WORDS = [
+    *["", "fast", "fcl", "ros2", "csv", "urscript", "x" * 3000, "\0", "\u202e", "a b", "-1", "é", "liu1999"],
+    *["\udcff"],
+]
+PATHS = [
+    *["", ".", "/", "/dev/null", "/proc/self/mem", "nothing", "no/thing.toml", "x" * 5000, "a\0b", "\udcff"],
+    *["~", "*", "-", "/root/../x", "é.toml", "case.toml/x", "https://example.org/case.toml"],
+]
+
+
+def command_line(rng, files):
+    """The arguments of one command.
+
+    Args:
+        rng: Decides everything.
+        files: Paths that exist, none of which is a whole case: a command that succeeds would take minutes.
+    """
+    paths = [*PATHS, *files, *files]
+    words = [pick(rng, COMMANDS)]  # none at all would be the demo
+    positional = [pick(rng, paths), pick(rng, paths), pick(rng, paths), pick(rng, WORDS), pick(rng, NUMBERS)]
+    words += positional[: int(rng.choice([0, 1, 1, 1, 1, 2, 4]))]
+    for _ in range(int(rng.integers(5))):
+        option = pick(rng, list(OPTIONS))
+        value = {"number": pick(rng, NUMBERS), "path": pick(rng, paths), "out": pick(rng, [*PATHS, *files]), None: None}
+        given = value.get(OPTIONS[option], pick(rng, WORDS))
+        words += [option] if given is None or rng.random() < 0.05 else [option, given]
+    return words if words[:1] != ["batch"] or rng.random() < 0.1 else words[:1]  # each starts a process
+
+
+def run(main, words):
+    """Run a command line in this process; asserts what must hold of any."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main(words)
+    said = err.getvalue()
+    assert code in (0, 1, 2), f"exit {code}: {said[-2000:]}"
+    if code == 2:
+        if words[:1] == ["batch"] and (not said or said.startswith("cases: ")):
+            return  # a refused case is a row of its table, beside the progress
+        lines = [line for line in said.splitlines() if line.strip()]
+        assert len(lines) == 1 and "allowed: " in lines[0] and len(lines[0]) <= 1500, said[:3000]
+        assert lines[0].isprintable(), ascii(lines[0])

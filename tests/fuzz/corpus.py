@@ -1,0 +1,204 @@
+"""Small valid files of every kind that the program reads, made here: what the mutators start from."""
+
+import base64
+import gzip
+import json
+import struct
+import zlib
+
+import numpy as np
+import SimpleITK
+import trimesh
+from hostile.makers import CASE, MOUNT, RIB, certificate, glb, recording, sound_case
+
+from meshes import folder as embedded
+from planning.case import load_case
+from planning.export.csv_times import csv_text
+from planning.placement import load_placement
+from planning.plan import Plan, write_plan
+from planning.provenance import Input
+from planning.reach import ReachRequest, assess_reach
+from planning.robot.cell import CellChecker
+from planning.robot.ur import ur_model
+from planning.room import case_tool
+from planning.trajectory import Trajectory
+
+MARKERS = "name,x_mm,y_mm,z_mm\nA,0,0,80\nB,50,0,75\nC,0,60,70\nD,-40,-30,72\n"
+REGISTRATION = '[registration]\nmarkers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"\n'
+TABLE = '[[obstacle]]\nname = "table"\nframe = "ct"\ncenter_mm = [0.0, 160.0, 0.0]\nsize_mm = [600.0, 40.0, 2000.0]\n'
+LABELS = (
+    '[[structures]]\nlabelmap = "labels.seg.nrrd"\navoid = { "ves*" = 2.0 }\nignore = ["bone"]\n'
+    '[[structure]]\nname = "lesion"\nlabelmap = "labels.nii.gz"\nlabel = 2\nrole = "unknown"\nmargin_mm = 1.0\n'
+)
+CHECKS = (
+    'case = "case.toml"\n[[check]]\ntheta_deg = 20\nbeta_deg = 135\nverdict = "rejected"\nreason = "too_close"\n'
+    'structure = "rib"\nclearance_mm = { rib = 41.2 }\ntolerance_mm = 0.1\n[[check]]\ntheta_deg = 0\nbeta_deg = 0\n'
+    'verdict = "safe"\n'
+)
+FCSV = (
+    "# Markups fiducial file version = 4.11\n# CoordinateSystem = LPS\n# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,"
+    "label,desc,associatedNodeID\n1,0,0,80,0,0,0,1,1,1,0,A,,\n2,50,0,75,0,0,0,1,1,1,0,B,,\n3,0,60,70,0,0,0,1,1,1,0,C,,\n"
+)
+
+
+def make_corpus(folder):
+    """Write every file into a folder."""
+    make_meshes(folder)
+    make_volumes(folder)
+    make_points(folder)
+    sound_case(folder, CASE + RIB)
+    text = CASE + RIB + LABELS + REGISTRATION + TABLE
+    (folder / "full.toml").write_text(text)
+    (folder / "mount.toml").write_text(CASE + RIB + MOUNT)
+    (folder / "x.collision.toml").write_text(CHECKS)
+    for name in ("head/servo.toml", "head/head.ply", "head/markers.csv", "head/targets.csv", "selfcal/selfcal.toml"):
+        (folder / name.split("/")[1]).write_bytes((embedded() / name).read_bytes())
+    certificate(folder)
+    recording()(folder)
+    plan = straight_plan()
+    write_plan(plan, folder / "plan.json")
+    (folder / "times.csv").write_text(csv_text(plan, case_checked=True))
+    joints = [f"{number / 10},{','.join(map(repr, row))}" for number, row in enumerate(plan.insertion.q.tolist())]
+    (folder / "joints.csv").write_text("\n".join(["time_s," + ",".join(f"q{j}_rad" for j in range(1, 7)), *joints]))
+
+
+def make_meshes(folder):
+    """Two balls as one surface, in every format."""
+    balls = [trimesh.creation.icosphere(subdivisions=1, radius=radius) for radius in (20.0, 9.0)]
+    balls[1].apply_translation([60.0, 0.0, 0.0])
+    mesh = trimesh.util.concatenate(balls)
+    mesh.export(folder / "a.stl")
+    mesh.export(folder / "ascii.stl", file_type="stl_ascii")
+    mesh.export(folder / "a.obj", include_normals=False, include_texture=False)
+    mesh.export(folder / "a.ply", encoding="binary", vertex_normal=False)
+    mesh.export(folder / "ascii.ply", encoding="ascii", vertex_normal=False)
+    vertices, faces = mesh.vertices.astype("<f4"), mesh.faces.astype("<u4")
+    glb(folder, gltf(vertices, faces, {}), vertices.tobytes() + faces.tobytes())
+    (folder / "rib.glb").rename(folder / "a.glb")
+    data = "data:application/octet-stream;base64," + base64.b64encode(vertices.tobytes() + faces.tobytes()).decode()
+    (folder / "a.gltf").write_text(json.dumps(gltf(vertices, faces, {"uri": data})))
+    (folder / "ascii.vtp").write_text(
+        vtp(mesh, lambda array: ("ascii", " ".join(map(str, array.reshape(-1).tolist()))))
+    )
+    (folder / "base64.vtp").write_text(vtp(mesh, lambda array: ("binary", packed(array))))
+
+
+def gltf(vertices, faces, buffer):
+    """A glTF document of one mesh, placed twice."""
+    return {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [
+            {"mesh": 0, "children": [1]},
+            {"mesh": 0, "translation": [0.0, 50.0, 0.0], "rotation": [0.0, 0.6, 0.0, 0.8], "scale": [1.0, 2.0, 1.0]},
+        ],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"componentType": 5126, "count": len(vertices), "type": "VEC3", "bufferView": 0},
+            {"componentType": 5125, "count": faces.size, "type": "SCALAR", "bufferView": 1},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": vertices.nbytes},
+            {"buffer": 0, "byteLength": faces.nbytes, "byteOffset": vertices.nbytes},
+        ],
+        "buffers": [{"byteLength": vertices.nbytes + faces.nbytes, **buffer}],
+    }
+
+
+def vtp(mesh, encode):
+    """VTK PolyData; ``encode`` gives the format and the text of an array."""
+
+    def array(values, kind, name, extra=""):
+        how, text = encode(values)
+        return f'<DataArray type="{kind}" Name="{name}" format="{how}"{extra}>{text}</DataArray>\n'
+
+    faces = mesh.faces.astype("<i8")
+    offsets = np.arange(3, 3 * len(faces) + 1, 3, dtype="<i8")
+    return (
+        '<?xml version="1.0"?>\n<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt32" '
+        'compressor="vtkZLibDataCompressor">\n<PolyData>\n'
+        f'<Piece NumberOfPoints="{len(mesh.vertices)}" NumberOfPolys="{len(faces)}">\n<Points>\n'
+        + array(mesh.vertices.astype("<f4"), "Float32", "Points", ' NumberOfComponents="3"')
+        + "</Points>\n<Polys>\n"
+        + array(faces, "Int64", "connectivity")
+        + array(offsets, "Int64", "offsets")
+        + "</Polys>\n</Piece>\n</PolyData>\n</VTKFile>\n"
+    )
+
+
+def packed(array):
+    """An array in one zlib block, with its header, in base64."""
+    raw = array.tobytes()
+    block = zlib.compress(raw)
+    header = struct.pack("<IIII", 1, len(raw), 0, len(block))
+    return base64.b64encode(header).decode() + base64.b64encode(block).decode()
+
+
+def make_volumes(folder):
+    """A label map and a CT, in every format and encoding."""
+    labels = np.zeros((14, 12, 10), np.uint8)
+    labels[3:8, 3:8, 3:8] = 1
+    labels[9:12, 4:9, 4:8] = 2
+    image = SimpleITK.GetImageFromArray(labels)
+    image.SetSpacing((2.0, 2.5, 3.0))
+    image.SetOrigin((-10.0, -15.0, 30.0))
+    SimpleITK.WriteImage(image, folder / "labels.nii.gz")
+    (folder / "labels.nii").write_bytes(gzip.decompress((folder / "labels.nii.gz").read_bytes()))
+    SimpleITK.WriteImage(image, folder / "raw.nrrd", useCompression=False)
+    SimpleITK.WriteImage(image, folder / "gzip.nrrd", useCompression=True)
+    SimpleITK.WriteImage(image, folder / "labels.nhdr", useCompression=False)
+    named = (folder / "raw.nrrd").read_bytes()
+    names = b"Segment0_Name:=vessel\nSegment0_LabelValue:=1\nSegment1_Name:=bone\nSegment1_LabelValue:=2\n"
+    (folder / "labels.seg.nrrd").write_bytes(named.replace(b"\n\n", b"\n" + names + b"\n", 1))
+    hu = SimpleITK.Cast(image, SimpleITK.sitkFloat32) * 100.0 - 50.0
+    hu.CopyInformation(image)
+    SimpleITK.WriteImage(hu, folder / "ct.nii.gz")
+    SimpleITK.WriteImage(hu, folder / "ct.nrrd", useCompression=False)
+
+
+def make_points(folder):
+    """Four markers in every format, and the names of labels."""
+    for name in ("markers_ct.csv", "touch.csv"):
+        (folder / name).write_text(MARKERS)
+    (folder / "kinds.csv").write_text("name,kind,x_cm,y_cm,z_cm\nA,fid,0,0,8\nB,fid,5,0,7.5\nC,bone,0,6,7\n")
+    rows = [line.split(",") for line in MARKERS.splitlines()[1:]]
+    points = [{"label": name, "position": [float(x) for x in xyz], "positionStatus": "defined"} for name, *xyz in rows]
+    markup = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
+    (folder / "a.mrk.json").write_text(json.dumps({"markups": [markup]}, indent=1))
+    (folder / "a.fcsv").write_text(FCSV)
+    (folder / "names.csv").write_text("id,name\n1,vessel\n2,bone\n3,liver\n")
+
+
+def straight_plan():
+    """A plan of the embedded abdomen's arm: no approach, and a straight insertion that some roll can reach."""
+    case = load_case(embedded() / "abdomen")
+    T = load_placement(case).T_base_ct
+    target = T[:3, :3] @ case.target_ct + T[:3, 3]
+    checker = CellChecker(ur_model("ur3"), case_tool(case))
+    for tilt in np.linspace(-0.6, 0.6, 13):
+        outward_ct = np.array([-np.sin(abs(tilt)), -np.cos(tilt), 0.0])
+        outward_ct /= np.linalg.norm(outward_ct)
+        answer = assess_reach(checker, ReachRequest(target, T[:3, :3] @ outward_ct, case.needle.length_mm, 120.0))
+        if answer.reachable:
+            break
+    q, depth = answer.insertion_q, np.asarray(answer.insertion_depth_mm)
+    return Plan(
+        case_name=case.name,
+        inputs=(Input("case", "case.toml", "0" * 64),),
+        seed=1,
+        model="ur3",
+        T_base_ct=T,
+        expected_target_error_mm=0.5,
+        theta=0.3,
+        beta=0.2,
+        entry_ct=case.target_ct + 100.0 * outward_ct,
+        target_ct=case.target_ct,
+        outward_ct=outward_ct,
+        roll=0.0,
+        standoff_mm=120.0,
+        needle_length_mm=case.needle.length_mm,
+        approach=Trajectory(np.zeros(1), q[:1]),
+        insertion=Trajectory((depth - depth[0]) / 5.0, q),
+        clearance_mm={"approach": 20.0, "insertion": 10.0, "needle": 5.0},
+    )

@@ -1,0 +1,198 @@
+"""What is fuzzed: each reader with the files it starts from, and what must hold of whatever it accepts."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from planning.anatomy import load_anatomy
+from planning.case import load_case
+from planning.certify.certificate import read_certificate
+from planning.export.csv_times import read_csv
+from planning.formats.labelmaps import read_labelmap
+from planning.formats.meshes import mesh_warnings, read_mesh
+from planning.formats.naming import names_for
+from planning.formats.points import read_points
+from planning.formats.spaces import Space, Unit
+from planning.formats.volumes import read_volume
+from planning.placement import load_placement
+from planning.plan import read_plan
+from planning.pytest_plugin import read_checks
+from twin.mirror import recorded_states
+from twin.stereo.servo_case import load_servo_case
+from twin.ultrasound.recording import read_recording
+from twin.ultrasound.selfcal_case import load_selfcal_case
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader and its files.
+
+    Attributes:
+        name: Unique.
+        files: File name in the corpus to the kind of its mutators.
+        read: Takes the path of a file.
+        check: Takes what was read; asserts what holds of it, whatever the file held.
+        heavy: Drawn less often: it reads other files too.
+    """
+
+    name: str
+    files: dict[str, str]
+    read: object
+    check: object
+    heavy: bool = False
+
+
+def whole_mesh(mesh):
+    """Finite, indices in range, at least a triangle; and what is open says so."""
+    assert mesh.vertices.shape[1:] == (3,) and mesh.faces.shape[1:] == (3,) and len(mesh.faces) > 0
+    assert np.isfinite(mesh.vertices).all() and np.abs(mesh.vertices).max() <= 1e6
+    assert mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)
+    assert mesh.closed or any("open mesh" in line for line in mesh_warnings(mesh, "a"))
+
+
+def whole_volume(volume):
+    """Finite values, and a regular place in the patient."""
+    assert volume.values.ndim == 3 and min(volume.values.shape) >= 2 and np.isfinite(volume.values).all()
+    assert volume.T_ct_index.shape == (4, 4) and np.isfinite(volume.T_ct_index).all()
+    assert abs(np.linalg.det(volume.T_ct_index[:3, :3])) > 1e-6
+
+
+def whole_labelmap(labelmap):
+    """Whole labels from 0 on, one of them at least above."""
+    assert labelmap.labels.dtype.kind == "i" and labelmap.labels.min() >= 0 and labelmap.labels.max() > 0
+
+
+def whole_points(points):
+    """As many finite points as names, each name once and not empty."""
+    assert points.points.shape == (len(points.names), 3) and np.isfinite(points.points).all()
+    assert len(set(points.names)) == len(points.names) > 0 and all(points.names)
+
+
+def whole_names(names):
+    """Each label has a name of its own."""
+    assert names and len(set(names.values())) == len(names) and all(0 < label <= 65535 for label in names)
+
+
+def whole_recording(recording):
+    """Rigid motions and unit directions."""
+    for T in (recording.A, recording.B):
+        R = T[:, :3, :3]
+        assert np.isfinite(T).all() and np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max() < 1e-5
+    assert np.isfinite(recording.P).all() and len(set(recording.names)) == len(recording)
+    assert recording.v is None or np.allclose(np.linalg.norm(recording.v, axis=1), 1)
+
+
+def whole_states(states):
+    """Six finite angles at a finite time."""
+    assert all(np.isfinite(state.time_s) and np.isfinite(state.q).all() and state.q.shape == (6,) for state in states)
+
+
+def whole_plan(plan):
+    """Finite numbers, a rigid pose, and joined phases."""
+    assert np.isfinite([plan.theta, plan.beta, plan.roll, plan.standoff_mm, plan.needle_length_mm]).all()
+    R = plan.T_base_ct[:3, :3]
+    assert np.abs(R.T @ R - np.eye(3)).max() < 1e-5 and np.linalg.det(R) > 0
+    assert np.allclose(plan.approach.q[-1], plan.insertion.q[0], rtol=0, atol=1e-9)
+    assert all((np.diff(part.times_s) > 0).all() for part in (plan.approach, plan.insertion))
+
+
+def whole_motion(motion):
+    """Times that rise."""
+    assert all((np.diff(part.times_s) > 0).all() and np.isfinite(part.q).all() for part in motion)
+
+
+def whole_certificate(certificate):
+    """Leaves, verdicts and witnesses of one number."""
+    count = len(certificate.leaves)
+    assert all(len(part) == count for part in (certificate.verdict, certificate.reason, certificate.triangle))
+    assert np.isfinite(certificate.size) and np.isfinite(certificate.question.length)
+
+
+def whole_case(read):
+    """Finite numbers, one skin, something to avoid, unique names, a target inside; meshes that are whole."""
+    case, anatomy = read
+    assert np.isfinite(case.target_ct).all() and np.isfinite(case.T_ct_entry).all()
+    names = [structure.name for structure in anatomy.structures]
+    assert len(set(names)) == len(names) and any(s.demands_margin for s in anatomy.structures)
+    for structure in anatomy.structures:
+        assert 0 <= structure.margin_mm <= 1000
+        whole_mesh(structure.mesh)
+
+
+def whole_checks(checks):
+    """At least one check, of finite angles."""
+    assert checks.check and all(0 <= check.theta_deg <= 180 for check in checks.check)
+
+
+def whole_anything(value):
+    """Something was read."""
+    assert value is not None
+
+
+def read_case(path):
+    """A case with its placement and its structures."""
+    case = load_case(path)
+    load_placement(case)
+    return case, load_anatomy(case)
+
+
+def read_own_mesh(path):
+    """A mesh in mm, LPS."""
+    return read_mesh(path, unit=Unit.MM, space=Space.LPS)
+
+
+def read_own_points(path):
+    """Points of a case in LPS."""
+    return read_points(path, default_space=Space.LPS, default_unit=Unit.MM)
+
+
+def read_names(path):
+    """The names of a naming table; no label map is asked."""
+    return names_for(path.name, path.parent, lambda name: (path.parent / name).read_bytes(), None)
+
+
+def read_times(path):
+    """The export's own table; it is read back as text."""
+    return read_csv(path.read_bytes().decode("utf-8", "replace"), where=path)
+
+
+MESHES = {
+    "a.stl": "stl",
+    "ascii.stl": "text",
+    "a.obj": "text",
+    "a.ply": "headed",
+    "ascii.ply": "text",
+    "a.glb": "glb",
+    "a.gltf": "tree",
+    "ascii.vtp": "text",
+    "base64.vtp": "text",
+}
+LABELS = {
+    "labels.nii.gz": "gzip",
+    "labels.nii": "nifti",
+    "raw.nrrd": "headed",
+    "gzip.nrrd": "headed",
+    "labels.seg.nrrd": "headed",
+    "labels.nhdr": "text",
+}
+TARGETS = [
+    Target("mesh", MESHES, read_own_mesh, whole_mesh),
+    Target("volume", {"ct.nii.gz": "gzip", "ct.nrrd": "headed", **LABELS}, read_volume, whole_volume),
+    Target("label map", LABELS, read_labelmap, whole_labelmap),
+    Target(
+        "points",
+        {"markers_ct.csv": "table", "kinds.csv": "table", "a.mrk.json": "tree", "a.fcsv": "table"},
+        read_own_points,
+        whole_points,
+    ),
+    Target("naming", {"names.csv": "table"}, read_names, whole_names),
+    Target("case", {"full.toml": "text", "case.toml": "text", "mount.toml": "text"}, read_case, whole_case, heavy=True),
+    Target("servo case", {"servo.toml": "text"}, load_servo_case, whole_anything, heavy=True),
+    Target("selfcal case", {"selfcal.toml": "text"}, load_selfcal_case, whole_anything),
+    Target("collision file", {"x.collision.toml": "text"}, read_checks, whole_checks),
+    Target("certificate", {"certificate.json": "tree"}, read_certificate, whole_certificate),
+    Target("plan", {"plan.json": "tree"}, read_plan, whole_plan),
+    Target("recording", {"recording.csv": "table"}, read_recording, whole_recording),
+    Target("joints", {"joints.csv": "table"}, lambda path: list(recorded_states(path)), whole_states),
+    Target("times", {"times.csv": "table"}, read_times, whole_motion),
+]

@@ -1,0 +1,47 @@
+"""Structure-aware fuzzing of every reader and of the command line: a few thousand runs; `make fuzz` does 100,000.
+
+Each run may end in an `InputError` (one line, exit 2) or in a value that is whole; in 2 s and 1 GB at most.
+"""
+
+import pytest
+from fuzz.runner import Fuzzer
+
+RUNS = 900
+"""Of each of the four parts, which run side by side."""
+
+
+@pytest.fixture(scope="module")
+def fuzzer(tmp_path_factory):
+    """The corpus, and what is made of it."""
+    return Fuzzer(tmp_path_factory.mktemp("fuzz"))
+
+
+def test_every_file_of_the_corpus_is_whole(fuzzer):
+    """What the mutators start from is accepted: what they break was right."""
+    fuzzer.check_corpus()
+
+
+@pytest.mark.parametrize("part", range(4))
+def test_mutated_files_and_command_lines(fuzzer, part):
+    """Readers refuse by InputError alone, commands exit 0, 1 or 2 with one line, and what is accepted is whole."""
+    wrong = [(number, fuzzer.run(number)) for number in range(part * RUNS, (part + 1) * RUNS)]
+    assert not [(number, what) for number, what in wrong if what is not None]
+
+
+def test_the_runs_reach_the_readers(fuzzer):
+    """Some mutated files are accepted and most are refused: runs that all ended one way would show nothing."""
+    before = sum(fuzzer.accepted.values()), sum(fuzzer.refused.values())
+    for number in range(100_000, 100_150):
+        fuzzer.run(number)
+    accepted, refused = sum(fuzzer.accepted.values()) - before[0], sum(fuzzer.refused.values()) - before[1]
+    assert accepted >= 5
+    assert refused >= 75
+
+
+def test_a_run_is_decided_by_its_number(fuzzer):
+    """A run that failed can be repeated."""
+    fuzzer.run(7)
+    first = fuzzer.last
+    fuzzer.run(8)
+    fuzzer.run(7)
+    assert fuzzer.last == first
