@@ -9,6 +9,7 @@ import trimesh
 from planning.certify.cells import Cells
 from planning.certify.certificate import Certificate, write_certificate
 from planning.certify.question import Question
+from planning.plan import write_plan
 from twin.ultrasound.recording import Recording, write_recording
 from twin.ultrasound.simulate import simulate_recording
 
@@ -193,6 +194,16 @@ def joints(text):
     return make
 
 
+def turning_plan(folder):
+    """A plan whose insertion turns a joint by 1,000 rad and back, on its way through one row."""
+    from fuzz.corpus import straight_plan
+
+    write_plan(straight_plan(), folder / "plan.json")
+    document = json.loads((folder / "plan.json").read_text())
+    document["insertion"]["q_rad"][1][0] = 1000.0
+    (folder / "plan.json").write_text(json.dumps(document))
+
+
 MAKERS = {
     "sound case": sound_case,
     "sound case with an arm": joints(JOINTS),
@@ -249,6 +260,7 @@ MAKERS = {
     "joints lone CR": joints(JOINTS.replace("\n0,", "\n0\r,")),
     "joints long field": joints(JOINTS + "1" * 140_000 + ",0,0,0,0,0,0\n"),
     "joints NUL": joints(JOINTS + "1\0,0,0,0,0,0,0\n"),
+    "plan that turns": turning_plan,
     "GLB placed often": glb_placed_often,
     "GLB of one array": glb_of_one_array,
 }
