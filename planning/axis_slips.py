@@ -35,7 +35,7 @@ HALF_TURNS: Mapping[str, Signs] = MappingProxyType(
 
 
 REFUSING_DOUBT = 0.01
-"""A list is refused at 99 %. Honest lists less often: the more symmetric a body, the more alike are both lists' gaps."""
+"""A list is refused at 99 %. Honest lists less often: the more symmetric a body, the more alike are both lists."""
 
 EXCLUDING_DOUBT = 0.001
 """A half turn is no more mentioned at 99.9 %."""
