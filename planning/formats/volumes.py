@@ -8,7 +8,7 @@ against what is there, and nothing is inflated beyond it. The tests hold every v
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +46,7 @@ class Volume:
     values: NDArray[Any]
     T_ct_index: NDArray[np.float64]
     path: Path
-    fields: dict[str, str]
+    fields: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("values", "T_ct_index"):
