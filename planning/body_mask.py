@@ -1,4 +1,4 @@
-"""Which voxels of a CT are the patient: without table and sheets, and solid, lungs and bowel gas included."""
+"""Which voxels of a CT are the patient: trunk and limbs without table and sheets, solid, lungs and gas included."""
 
 from __future__ import annotations
 
@@ -9,16 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from planning.detached_parts import detached_limbs, largest_component, limb_warnings, thick_parts
 from planning.errors import InputError
 
 BODY_HU = -500.0
 """Half way between air (-1000) and water (0): where a voxel is half skin, half air."""
 UNSCANNED_HU = -1500.0
 """Nothing real is less dense than air at -1000; scanners write -2000 or -3024 where they did not look."""
-OPENING_MM = 6.0
-"""Parts thinner than twice this are not the trunk or head: table tops, sheets, tubes."""
-SAMPLING_MM = 3.0
-"""Spacing at which the opening is done: half its radius."""
 OUTSIDE_AIR_HU = -940.0
 """Room air has -1000, inflated lung rarely less than -920: an air region that the border cuts is the room only
 if its median is below this."""
@@ -35,7 +32,7 @@ class BodyMask:
     """What was found.
 
     Attributes:
-        body: Shape (nx, ny, nz), the solid body.
+        body: Shape (nx, ny, nz), the solid body: the trunk, and parts of the patient that do not touch it.
         unscanned: Same shape, voxels that the scanner did not measure.
         warnings: What the user should know.
     """
@@ -48,9 +45,9 @@ class BodyMask:
 def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where: str | Path) -> BodyMask:
     """Finds the patient in a CT.
 
-    Threshold, opening, largest component; then air that the body encloses in an axial slice is filled, and so
-    is air at the border of the volume that does not look like the room's. Filling too much is the safe side:
-    it turns "air" at the border into "unknown".
+    Threshold, opening, largest component, and every other component that looks like a limb; then air that each of
+    them encloses in an axial slice is filled, and so is air at the border of the volume that does not look like the
+    room's. Filling too much is the safe side: it turns "air" at the border into "unknown".
 
     Args:
         hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient.
@@ -62,14 +59,18 @@ def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where
     """
     voxel_ml = float(np.prod(spacing_mm)) / 1000.0
     dense = hu > BODY_HU
-    trunk = _largest(_opened(dense, spacing_mm))
+    solids = thick_parts(dense, spacing_mm)
+    trunk = largest_component(solids == 1)
     if np.count_nonzero(trunk) * voxel_ml < MIN_BODY_ML:
         what = f"no body found: {np.count_nonzero(trunk) * voxel_ml:.3g} ml above {BODY_HU:g} HU hold together"
         raise InputError(
             what, where=where, allowed=f"a CT in Hounsfield units with at least {MIN_BODY_ML:g} ml of body"
         )
+    limbs = detached_limbs(hu, solids, spacing_mm)
+    warnings = list(limb_warnings(limbs, trunk, voxel_ml))
     filled = filled_slices(trunk)
-    warnings: list[str] = []
+    for limb in limbs:
+        filled |= filled_slices(limb)
     body = _with_cut_lungs(filled, hu, voxel_ml, warnings)
     if body.all():
         raise InputError("no air around the body", where=where, allowed="a CT that shows the skin somewhere")
@@ -82,33 +83,6 @@ def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where
 def filled_slices(mask: Mask) -> Mask:
     """The mask with every hole filled that it encloses in a slice across axis 2."""
     return np.stack([ndimage.binary_fill_holes(mask[:, :, k]) for k in range(mask.shape[2])], axis=2)
-
-
-def _opened(mask: Mask, spacing_mm: NDArray[np.float64]) -> Mask:
-    """What holds together with the largest part that a ball of ``OPENING_MM`` fits into, and lies near it.
-
-    The border counts as body. Fine images are sampled: where table and sheets are is a coarse question.
-    """
-    stride = np.maximum(1, (SAMPLING_MM / spacing_mm).astype(int))
-    coarse = mask[:: stride[0], :: stride[1], :: stride[2]]
-    coarse_mm = spacing_mm * stride
-    reach = np.ceil(OPENING_MM / coarse_mm).astype(int)
-    padded = np.pad(coarse, [(r, r) for r in reach], mode="edge")
-    core = ndimage.distance_transform_edt(padded, sampling=coarse_mm) > OPENING_MM
-    if not core.any():
-        return np.zeros_like(mask)
-    near = ndimage.distance_transform_edt(~_largest(core), sampling=coarse_mm) <= OPENING_MM + coarse_mm.max()
-    near = near[tuple(slice(r, -r) for r in reach)]
-    for axis, times in enumerate(stride):
-        near = np.repeat(near, times, axis=axis)
-    return np.asarray(near[tuple(slice(0, n) for n in mask.shape)] & mask)
-
-
-def _largest(mask: Mask) -> Mask:
-    labels, count = ndimage.label(mask)
-    if count == 0:
-        return mask
-    return np.asarray(labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:])))
 
 
 def _with_cut_lungs(body: Mask, hu: NDArray[np.float32], voxel_ml: float, warnings: list[str]) -> Mask:
