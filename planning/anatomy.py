@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -23,6 +23,8 @@ from planning.formats.naming import RuleKind, names_for, select
 from planning.formats.spaces import Space, parse_space, parse_unit
 from planning.formats.volumes import NRRD_ENDINGS
 from planning.mesh import TriangleMesh
+from planning.scan import Scan
+from planning.second_witness import Named
 from planning.skin import Skin, flat_ends, skin_from_mesh
 from planning.surfaces import VolumeSurfaces
 
@@ -30,6 +32,14 @@ Progress = Callable[[str], None]
 
 UNNAMED_SHOWN = 8
 """Labels that a warning lists; a person looks at the map for the rest."""
+OUTSIDE_BODY, UNNAMED_DENSE, UNNAMED_GAS = "outside_body", "unnamed_dense", "unnamed_gas"
+"""Names of the structures that the CT adds."""
+
+OUTSIDE_NOT_KNOWN = (
+    "outside of the body: not known (no CT; [ct] file names one), so table, clothes and arms count as air"
+)
+
+LABELS_TRUSTED = "search.trust_labels: what the CT shows inside the body beside the structures is not checked"
 
 ON_SURFACE_MM = 1e-3
 """A target this close to its structure's surface lies on it: meshes in single precision round to 1e-5 mm."""
@@ -55,6 +65,8 @@ class Structure:
         margin_mm: The clearance that it demands, where its role demands one.
         mesh: In the CT frame, mm.
         source: The file it comes from, and the label in it.
+        outside: Whether it is outside of the body, where the needle waits at its standoff: it is then checked
+            against the needle's axis up to where the flange waits, not only to where the flange ends.
     """
 
     name: str
@@ -62,6 +74,7 @@ class Structure:
     margin_mm: float
     mesh: TriangleMesh
     source: str
+    outside: bool = False
 
     @property
     def demands_margin(self) -> bool:
@@ -71,11 +84,26 @@ class Structure:
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """All structures of a case but the skin, the skin, and what could not be known."""
+    """What a needle must be checked against, and what could not be known.
+
+    Attributes:
+        structures: All structures of the body but the skin; the CT's unnamed dense components and gas among them.
+        skin: The body's surface.
+        warnings: One sentence each.
+        surroundings: Solids outside of the body: what the CT shows there, obstacles, the gantry.
+        scan: The CT of the case, or None.
+    """
 
     structures: tuple[Structure, ...]
     skin: Skin
     warnings: tuple[str, ...]
+    surroundings: tuple[Structure, ...] = ()
+    scan: Scan | None = None
+
+    @property
+    def checked(self) -> tuple[Structure, ...]:
+        """Everything that a direction is checked against, structures first."""
+        return self.structures + self.surroundings
 
     def structure(self, name: str) -> Structure:
         """The structure of this name.
@@ -105,14 +133,43 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
     structures = [loader.one(section) for section in case.structure if section.role != "skin"]
     for section in case.structures:
         structures.extend(loader.many(section))
-    skin = loader.skin(_skin_section(case))
-    _check_names(case, structures)
+    skin_section = _skin_section(case)
+    skin = loader.skin(skin_section)
     _check_demands(case, structures)
+    outside: tuple[Structure, ...] = ()
+    scan = loader.scan(skin_section, skin)
+    if scan is None:
+        loader.warnings.append(OUTSIDE_NOT_KNOWN)
+    else:
+        outside = _outside(case, scan)
+        if case.ct.trust_labels:
+            loader.warnings.append(LABELS_TRUSTED)
+        structures.extend(_unnamed(case, scan, structures))
+    _check_names(case, [*structures, *outside])
     warnings = [*loader.warnings, *loader.unnamed_warnings(), *skin.warnings]
     for structure in structures:
         warnings.extend(mesh_warnings(structure.mesh, structure.name))
     _check_target(case, structures, skin)
-    return Anatomy(tuple(structures), skin, tuple(warnings))
+    return Anatomy(tuple(structures), skin, tuple(warnings), outside, scan)
+
+
+def _outside(case: Case, scan: Scan) -> tuple[Structure, ...]:
+    """What the CT shows outside of the body that is not air."""
+    mesh = scan.outside(case.ct.air_hu)
+    if mesh is None:
+        return ()
+    return (Structure(OUTSIDE_BODY, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: outside", outside=True),)
+
+
+def _unnamed(case: Case, scan: Scan, structures: Sequence[Structure]) -> Iterator[Structure]:
+    """What the CT shows inside the body that no structure names, unless the labels are trusted."""
+    if case.ct.trust_labels:
+        return
+    named = [Named(structure.name, structure.mesh) for structure in structures]
+    unnamed = scan.unnamed(named, case.ct.dense_hu)
+    for name, mesh in ((UNNAMED_DENSE, unnamed.dense), (UNNAMED_GAS, unnamed.gas)):
+        if mesh is not None:
+            yield Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: {name}")
 
 
 def load_skin(case: Case, cache: Cache = NO_CACHE) -> Skin:
@@ -205,6 +262,21 @@ class _Loader:
                 allowed=f"cut = {json.dumps(ends)} where no skin is, or cut = [] if all of it is skin",
             )
         return skin_from_mesh(mesh, section.cut or ())
+
+    def scan(self, skin_section: StructureSection, skin: Skin) -> Scan | None:
+        """The CT of the case: of its skin, or the one that ``[ct]`` names; None where there is none."""
+        own, named = skin_section.ct, self._case.ct.file
+        if own is not None and named not in {None, own}:
+            raise InputError(
+                f"[ct] file '{named}' is not the CT of the skin, '{own}'",
+                where=self._case.path,
+                allowed="one CT: leave out [ct] file where the skin comes from a CT",
+            )
+        name = own or named
+        if name is None:
+            return None
+        self._progress("CT beside the structures")
+        return Scan(name, self._volume(name), None if own else skin)
 
     def _mesh(self, section: StructureSection) -> TriangleMesh:
         where = f"{self._case.path}: structure '{section.name}'"

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from planning.case_file import (
+    AIR_HU,
+    DENSE_HU,
     Anatomical,
     CaseFile,
     EntryAxes,
@@ -69,6 +71,25 @@ class SearchSettings:
     beta: tuple[float, float]
     step: float
     max_skin_angle: float
+
+
+@dataclass(frozen=True)
+class CtSettings:
+    """The CT beside the structures.
+
+    Attributes:
+        file: Where the skin does not come from a CT, the CT's file, or None.
+        air_hu: Outside of the body, what is denser is not air.
+        dense_hu: Inside the body, what is at least so dense must belong to a structure.
+        margin_mm: Clearance that these structures demand.
+        trust_labels: Whether the inside is left to the structures alone.
+    """
+
+    file: str | None = None
+    air_hu: float = AIR_HU
+    dense_hu: float = DENSE_HU
+    margin_mm: float = 2.0
+    trust_labels: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +155,7 @@ class Case:
     obstacles: tuple[Obstacle, ...]
     rehearsal: RehearsalSection
     files: InputFiles
+    ct: CtSettings = CtSettings()
     gantry: Gantry | None = None
     place: PlaceSection = field(default_factory=PlaceSection)
 
@@ -199,6 +221,7 @@ def load_case(path: Path | str) -> Case:
         ),
         rehearsal=content.rehearsal,
         files=files,
+        ct=CtSettings(**content.ct.model_dump(), trust_labels=settings.trust_labels),
         gantry=None if content.gantry is None else _gantry(content.gantry, space, path),
         place=content.place,
     )
@@ -300,6 +323,8 @@ def _named_files(content: CaseFile) -> Iterator[_Named]:
         yield _Named("labelmap", many.labelmap, f"structures.{number}.labelmap", volumes.MAX_FILE_BYTES)
         if many.naming is not None and naming.is_naming_file(many.naming):
             yield _Named("naming", many.naming, f"structures.{number}.naming", naming.MAX_CSV_BYTES)
+    if content.ct.file is not None:
+        yield _Named("ct", content.ct.file, "ct.file", volumes.MAX_FILE_BYTES)
     if content.registration is not None:
         for side in ("markers_ct", "markers_base"):
             yield _Named(side, getattr(content.registration, side), f"registration.{side}", points.MAX_FILE_BYTES)

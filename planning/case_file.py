@@ -43,6 +43,12 @@ MAX_STRUCTURES = 1000
 MAX_LABEL_MAPS = 100
 """Tables ``[[structures]]``, each with a label map of its own."""
 
+AIR_HU = -900.0
+"""Air is -1000; its noise in a mean over 3 mm is some 15, so that 100 is more than six times that. Foam of a mattress
+has -970 to -900: what is less dense than this is not told from air."""
+DENSE_HU = 250.0
+"""Cancellous bone starts at about 200; soft tissue with contrast in the venous phase ends at about 200."""
+
 MAX_DIRECTIONS = 1_000_000
 """Rows of a search: a hemisphere at 0.2 degrees; 2 GB of table with 60 structures."""
 
@@ -115,6 +121,7 @@ class SearchSection(Section):
     step_deg: Annotated[Number, Field(ge=0.05, le=45)] = 1.0
     max_skin_angle_deg: Annotated[Number, Field(gt=0, le=90)] = 60.0
     frame: Literal["ct", "bed"] | EntryAxes | None = None
+    trust_labels: Annotated[bool, Strict()] = False
 
     @model_validator(mode="after")
     def _grid_fits(self) -> Self:
@@ -202,6 +209,15 @@ class StructuresSection(Section):
     avoid: Annotated[dict[Text, Margin], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
     traverse: Patterns = ()
     ignore: Patterns = ()
+
+
+class CtSection(Section):
+    """The CT beside the structures: what it shows that they do not name. Hounsfield units."""
+
+    file: str | None = None
+    air_hu: Annotated[Number, Field(ge=-990, le=-300)] = AIR_HU
+    dense_hu: Annotated[Number, Field(ge=100, le=3000)] = DENSE_HU
+    margin_mm: Margin = 2.0
 
 
 class RegistrationSection(Section):
@@ -318,6 +334,7 @@ class CaseFile(Section):
     ranking: RankingSection = RankingSection()
     structure: Annotated[tuple[StructureSection, ...], Field(max_length=MAX_STRUCTURES)] = ()
     structures: Annotated[tuple[StructuresSection, ...], Field(max_length=MAX_LABEL_MAPS)] = ()
+    ct: CtSection = CtSection()
     registration: RegistrationSection | None = None
     robot: RobotSection = RobotSection()
     obstacle: Annotated[tuple[ObstacleSection, ...], Field(max_length=MAX_STRUCTURES)] = ()
@@ -336,6 +353,8 @@ class CaseFile(Section):
     def _no_contradiction(self) -> Self:
         if self.registration is not None and self.robot.mount is not None:
             raise ValueError("[registration] and [robot.mount] both say where the base is; keep one")
+        if self.space == "local" and self.ct.file is not None:
+            raise ValueError('ct.file: a CT says its own patient space; space "local" has none')
         if self.space == "local" and any(s.cut for s in self.structure):
             raise ValueError('cut names sides of a patient; space "local" has none')
         if self.space == "local" and self.search.frame not in {None, "ct"}:

@@ -27,6 +27,8 @@ from planning.provenance import inputs_document
 from planning.room import case_checker
 from planning.search import Reach, case_directions, one_direction, search
 from planning.stages import Stages
+from planning.standoff import axis_lengths
+from planning.surroundings import with_surroundings
 
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
 """Who measures clearance: the fast exact engine, or FCL alone as the plain reference."""
@@ -109,8 +111,8 @@ class Prepared:
         """
         with self.stages.time("cross-check"):
             case, outward = self.case, case_directions(self.case).outward_ct
-            meshes = tuple(structure.mesh for structure in self.anatomy.structures)
-            length, rng = case.needle.length_mm, np.random.default_rng(case.rehearsal.seed)
+            meshes = tuple(structure.mesh for structure in self.anatomy.checked)
+            length, rng = axis_lengths(case, self.anatomy.checked), np.random.default_rng(case.rehearsal.seed)
             found = self.engine.measure(case.target_ct, outward, length)
             return cross_check(found, meshes, case.target_ct, outward, length, count=count, rng=rng)
 
@@ -153,10 +155,11 @@ def prepare(
         raise InputError(f"the arm is to be checked, but {NO_BASE}", where=case.path, allowed=ALLOWED_BASE)
     with stages.time("anatomy"):
         anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), user_cache())
+        anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
         anatomy = replace(anatomy, warnings=(*anatomy.warnings, *check_consistency(case, anatomy, placement)))
         case.files.release()
     with stages.time("trees"):
-        meshes = [structure.mesh for structure in anatomy.structures]
+        meshes = [structure.mesh for structure in anatomy.checked]
         measurer = ENGINES[engine](meshes, partial(watcher.count, "directions"))
         reach = None
         if arm is not False and placement is not None:

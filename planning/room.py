@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.anatomy import Anatomy
+from planning.anatomy import Anatomy, Role
 from planning.cache import user_cache
 from planning.case import Case, Gantry, Obstacle
 from planning.errors import InputError
 from planning.mesh import TriangleMesh
+from planning.outside_body import joined
 from planning.robot.fast_checker import FastChecker
 from planning.robot.gantry import gantry_boxes
 from planning.robot.tool import Box, Tool
@@ -33,6 +34,11 @@ def case_boxes(case: Case, T_base_ct: Floats) -> tuple[Box, ...]:
     """The obstacles and the gantry, in the base frame; the gantry's boxes are called ``gantry_0`` ..."""
     boxes = tuple(_box(obstacle, T_base_ct) for obstacle in case.obstacles)
     return boxes if case.gantry is None else (*boxes, *_gantry_boxes(case.gantry, T_base_ct))
+
+
+def gantry_in_ct(gantry: Gantry) -> tuple[Box, ...]:
+    """The gantry's boxes in the CT frame, which stands in for their base frame."""
+    return _gantry_boxes(gantry, np.eye(4))
 
 
 def _gantry_boxes(gantry: Gantry, T_base_ct: Floats) -> tuple[Box, ...]:
@@ -81,6 +87,12 @@ def check_gantry(case: Case, skin: TriangleMesh) -> None:
         raise InputError(what, where=f"{case.path}: gantry", allowed="a bore about the body: see center_mm, tilt_deg")
 
 
+def patient_surface(anatomy: Anatomy) -> TriangleMesh:
+    """What the arm must not touch as the patient, CT frame: the skin, and what the CT shows outside of it."""
+    outside = [one.mesh for one in anatomy.surroundings if one.role is Role.UNKNOWN]
+    return joined([anatomy.skin.mesh, *outside]) if outside else anatomy.skin.mesh
+
+
 def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats) -> FastChecker:
     """The collision checker of the case's room, with the patient where ``T_base_ct`` says.
 
@@ -88,10 +100,10 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats) -> FastChecker
         InputError: The robot's base stands in the patient, or the gantry's wall does.
     """
     check_gantry(case, anatomy.skin.mesh)
-    patient = anatomy.skin.mesh.transformed(T_base_ct)
+    patient, skin = (mesh.transformed(T_base_ct) for mesh in (patient_surface(anatomy), anatomy.skin.mesh))
     boxes = case_boxes(case, T_base_ct)
     model, tool = ur_model(case.robot.model), case_tool(case)
-    return FastChecker(model, tool, boxes, patient, padding_mm=ARM_PADDING_MM, cache=user_cache())
+    return FastChecker(model, tool, boxes, patient, skin=skin, padding_mm=ARM_PADDING_MM, cache=user_cache())
 
 
 def home_configuration(case: Case) -> Floats:

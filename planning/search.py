@@ -20,7 +20,7 @@ from planning.reach import ReachRequest, assess_reach_all
 from planning.reasons import Reason
 from planning.robot.cell import CellChecker
 from planning.skin_entry import skin_paths
-from planning.standoff import standoffs
+from planning.standoff import axis_lengths, farthest_flange, standoffs
 from planning.tissue import tissue_crossed
 
 Floats = NDArray[np.float64]
@@ -60,7 +60,7 @@ def search(
     Args:
         case: The validated case.
         anatomy: Its structures.
-        engine: Prepared for the meshes of ``anatomy.structures``, in that order.
+        engine: Prepared for the meshes of ``anatomy.checked``, in that order.
         directions: What to judge.
         reach: Who answers for the arm; None leaves ``reachable`` unasked.
         progress: Called with (candidates asked, candidates to ask) while the arm is checked.
@@ -74,12 +74,12 @@ def search(
 def organ_candidates(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> Candidates:
     """Judge every direction against skin and organs alone; nothing is ranked yet."""
     needle, outward = case.needle, directions.outward_ct
-    paths = skin_paths(anatomy.skin, case.target_ct, outward, needle.length_mm)
-    clearances = measure(
-        engine, anatomy.structures, case.target_ct, outward, length=needle.length_mm, radius=needle.radius_mm
-    )
-    verdicts = judge(paths, clearances, anatomy.structures, needle=needle, max_skin_angle=case.search.max_skin_angle)
-    demanding = np.array([s.demands_margin for s in anatomy.structures], bool)
+    checked, farthest = anatomy.checked, farthest_flange(needle, case.search.max_skin_angle)
+    paths = skin_paths(anatomy.skin, case.target_ct, outward, needle.length_mm, farthest)
+    lengths = axis_lengths(case, checked)
+    clearances = measure(engine, checked, case.target_ct, outward, length=lengths, radius=needle.radius_mm)
+    verdicts = judge(paths, clearances, checked, needle=needle, max_skin_angle=case.search.max_skin_angle)
+    demanding = np.array([s.demands_margin for s in checked], bool)
     count = len(directions)
     return Candidates(
         theta=directions.theta,
@@ -93,11 +93,11 @@ def organ_candidates(case: Case, anatomy: Anatomy, engine: ClearanceEngine, dire
         entry_ct=paths.entry_ct,
         path_length=paths.path_length,
         skin_angle=paths.skin_angle,
-        structures=tuple(s.name for s in anatomy.structures),
-        margins=np.array([s.margin_mm if s.demands_margin else np.nan for s in anatomy.structures]),
+        structures=tuple(s.name for s in checked),
+        margins=np.array([s.margin_mm if s.demands_margin else np.nan for s in checked]),
         clearance=clearances.clearance,
         min_clearance=clearances.clearance[:, demanding].min(axis=1, initial=np.inf),
-        tissue=tissue_crossed(anatomy.structures, case.target_structure, case.target_ct, outward, paths.path_length),
+        tissue=tissue_crossed(checked, case.target_structure, case.target_ct, outward, paths.path_length),
         reachable=np.full(count, -1, np.int8),
         reach_margin=np.full(count, np.nan),
         safe_cone=np.full(count, np.nan),

@@ -26,7 +26,7 @@ class SkinPaths:
         entry_ct: Shape (n, 3), where the path from outside first meets the skin for good, seen from the target.
         path_length: Shape (n,), target to entry.
         skin_angle: Shape (n,), between the path and the skin's inward normal.
-        reentry_depth: Shape (n,), where the needle would meet skin again, before its top.
+        reentry_depth: Shape (n,), where the needle would meet skin again, before where its flange waits.
         unknown_depth: Shape (n,), where the path leaves what the scan shows through a face that cuts the body, or
             where the skin's crossings do not add up.
     """
@@ -38,14 +38,17 @@ class SkinPaths:
     unknown_depth: Floats
 
 
-def skin_paths(skin: Skin, target_ct: Floats, outward_ct: Floats, length: float) -> SkinPaths:
+def skin_paths(
+    skin: Skin, target_ct: Floats, outward_ct: Floats, length: float, farthest: float | None = None
+) -> SkinPaths:
     """Follow every path from the target outward.
 
     Args:
         skin: The body's surface.
         target_ct: Shape (3,).
         outward_ct: Shape (n, 3), unit vectors.
-        length: Needle length, tip to flange: how far skin and unknown regions matter, mm.
+        length: Needle length, tip to flange: how far unknown regions matter, mm.
+        farthest: How far skin matters, mm: to where the flange can be while the tip waits; ``length`` if left out.
     """
     found, odd = settled_crossings(skin.mesh, target_ct, outward_ct)
     has = found.count > 0
@@ -55,7 +58,7 @@ def skin_paths(skin: Skin, target_ct: Floats, outward_ct: Floats, length: float)
     again = found.count > 1
     reentry = np.full(len(outward_ct), np.nan)
     reentry[again] = found.depth[found.first[again] + 1]
-    reentry[reentry > length] = np.nan
+    reentry[reentry > (length if farthest is None else farthest)] = np.nan
     cut = has & skin.cut_faces[face]
     unknown = _unknown_depth(skin, target_ct, outward_ct, length)
     unknown[cut] = depth[cut]

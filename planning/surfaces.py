@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -68,8 +69,12 @@ class VolumeSurfaces:
         """The skin of the body found in a CT."""
         return _to_skin(self._arrays("skin", lambda: _of_skin(skin_from_ct(self.volume))))
 
+    def kept(self, made_from: Mapping[str, Any], make: Callable[[], Arrays]) -> Arrays:
+        """Arrays that are made from this file and from what ``made_from`` says, from the cache where they are there."""
+        return self.cache.arrays({"files": self.sha256, **made_from}, make)
+
     def _arrays(self, what: str, make: Callable[[], Arrays]) -> Arrays:
-        return self.cache.arrays({"files": self.sha256, "what": what}, make)
+        return self.kept({"what": what}, make)
 
 
 def _of_mesh(mesh: TriangleMesh) -> Arrays:

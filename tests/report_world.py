@@ -95,7 +95,9 @@ def make_anatomy(*, warnings=()):
         for name, role, margin, mesh in parts
     )
     skin = SimpleNamespace(mesh=_ball(SKIN_RADIUS, TARGET, 4), cut_faces=np.zeros(0, int), field_of_view=None)
-    return SimpleNamespace(structures=structures, skin=skin, warnings=tuple(warnings))
+    return SimpleNamespace(
+        structures=structures, surroundings=(), checked=structures, skin=skin, scan=None, warnings=tuple(warnings)
+    )
 
 
 def make_plan(case, candidates):

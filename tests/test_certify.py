@@ -65,7 +65,7 @@ def _directions(case, theta, beta):
 
 def _judged(prepared, anatomy, directions):
     """The search's verdicts, with FCL."""
-    engine = FclEngine([structure.mesh for structure in anatomy.structures])
+    engine = FclEngine([structure.mesh for structure in anatomy.checked])
     return organ_candidates(prepared.case, anatomy, engine, directions)
 
 
@@ -157,7 +157,7 @@ def test_what_is_said_of_a_cell_holds_for_its_axes(seed):
     corners = rng.normal(0, 40, (6, 1, 3)) + rng.normal(0, 10 ** rng.uniform(-1, 1.5), (6, 3, 3))
     cell, limit, length = _random_cell(rng, 10 ** rng.uniform(-3, -0.5)), rng.uniform(0.1, 8), 90.0
     shape, group, first = cell.cones(np.eye(3)), np.zeros(6, np.int64), np.zeros(1, np.int64)
-    organs = Organs(corners.reshape(6, 9), group, np.array([limit]), zones(corners, limit), length)
+    organs = Organs(corners.reshape(6, 9), group, np.array([limit]), zones(corners, limit), np.array([length]))
     witness = np.array([rng.integers(-1, 6)])
     found = organ_facts(organs, Lists.one(np.arange(6)), first, witness, shape, wide=9.0, pad=0.0)
     plain = _apart(corners, np.full(6, limit), _Cell(tuple(cell.theta[0]), tuple(cell.beta[0]), np.eye(3)), length)
@@ -183,7 +183,7 @@ def test_bounds_are_not_idle(rng):
         cell, length = _random_cell(rng, 0.005), 90.0
         shape, first = cell.cones(np.eye(3)), np.zeros(1, np.int64)
         corners = 60 * shape.centres[0] + rng.normal(0, 1, 3) + rng.normal(0, 0.3, (1, 3, 3))
-        organs = Organs(corners.reshape(1, 9), first, np.ones(1), zones(corners, 1.0), length)
+        organs = Organs(corners.reshape(1, 9), first, np.ones(1), zones(corners, 1.0), np.array([length]))
         found = organ_facts(organs, Lists.one(first), first, first - 1, shape, wide=9.0, pad=0.0)
         decided += bool(found.rejected[0]) or not len(found.near.items)
     assert decided > 150

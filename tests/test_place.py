@@ -259,7 +259,8 @@ def test_turning_the_base_about_its_own_axis_changes_no_share(ball):
     u[:, 2] = np.abs(u[:, 2])
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     wanted = WantedDirections(u, np.full(30, 110.0), np.full(30, 1 / 30))
-    judge = Judge("ur3", TOOL, ball(80.0, subdivisions=2), (), (), 5.0, np.zeros(3), wanted, np.zeros(6))
+    skin = ball(80.0, subdivisions=2)
+    judge = Judge("ur3", TOOL, skin, skin, (), (), 5.0, np.zeros(3), wanted, np.zeros(6))
     T = Site(Region("floor", "", (0, 0, 1), ANYWHERE, ANYWHERE), (300.0, 0.0, -250.0)).T_bed_base()
     shares = set()
     for turn in (0.0, 2.5):

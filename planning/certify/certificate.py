@@ -24,7 +24,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 CERTIFICATE_VERSION = 3
-"""Version of the file's layout. 3: lists its inputs with their roles, files that a file names included."""
+"""Version of the file's layout. 3: lists its inputs with their roles, files that a file names included; a length each
+structure is checked to."""
 
 MAX_CERTIFICATE_BYTES = 500_000_000
 """A certificate has some ten thousand cells; a larger file is something else."""
@@ -182,10 +183,12 @@ def write_certificate(certificate: Certificate, path: Path) -> None:
         "theta_rad": list(question.theta),
         "beta_rad": list(question.beta),
         "length_mm": question.length,
+        "farthest_flange_mm": question.farthest,
         "radius_mm": question.radius,
         "longest_path_mm": question.longest,
         "max_skin_angle_rad": question.max_skin_angle,
         "margins_mm": dict(zip(question.structures, question.margins.tolist(), strict=True)),
+        "lengths_mm": dict(zip(question.structures, question.lengths.tolist(), strict=True)),
         "size_rad": certificate.size,
         "queries": certificate.queries,
         "summary": certificate.summary(),
@@ -254,11 +257,15 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
         theta=_range(document["theta_rad"]),
         beta=_range(document["beta_rad"]),
         length=_number(document["length_mm"]),
+        farthest=_number(document["farthest_flange_mm"]),
         radius=_number(document["radius_mm"]),
         longest=_number(document["longest_path_mm"]),
         max_skin_angle=_number(document["max_skin_angle_rad"]),
         structures=tuple(map(str, document["margins_mm"])),
         margins=_numbers(list(document["margins_mm"].values()), (len(document["margins_mm"]),)),
+        lengths=_numbers(
+            [document["lengths_mm"][name] for name in document["margins_mm"]], (len(document["margins_mm"]),)
+        ),
     )
     tree = tuple(str(level) for level in document["tree"])
     leaves = leaves_of(question.cap(), tree, path)

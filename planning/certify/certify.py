@@ -140,15 +140,15 @@ class _Judge:
         self._question = question
         self._view = anatomy.skin.field_of_view
         self._skin: SkinSurface = skin_surface(anatomy.skin, question.target_ct)
-        demanding = [s for s in anatomy.structures if s.demands_margin]
+        demanding = [s for s in anatomy.checked if s.demands_margin]
         self._organs = _organs([s.mesh for s in demanding], question)
         self._inside = [_is_inside(s.mesh, question.target_ct) for s in demanding]
 
     def start(self) -> _State:
         """What the whole cap knows: nothing, but which triangles a needle can come to at all."""
-        limit = self._organs.limits.max(initial=0.0) + self._question.length
+        limit = self._organs.limits.max(initial=0.0) + self._organs.lengths.max(initial=0.0)
         organs = np.flatnonzero(self._organs.zones.nearest <= limit)
-        skin = np.flatnonzero(self._skin.zones.nearest <= self._question.length + LENGTH_PAD_MM)
+        skin = np.flatnonzero(self._skin.zones.nearest <= self._question.farthest + LENGTH_PAD_MM)
         first, no = np.zeros(1, np.int64), np.zeros(1, bool)
         return _State(first, Lists.one(skin), Lists.one(organs), first - 1, no, no)
 
@@ -213,7 +213,7 @@ class _Judge:
             cones.centres[rows],
             cones.radius[rows],
             cells.take(rows).at(*OFF_CENTRE) @ question.R_ct_entry.T,
-            length=question.length,
+            length=question.farthest,
             longest=question.longest,
         )
         state.skin_good[rows] = (
@@ -239,7 +239,7 @@ def _organs(meshes: list[TriangleMesh], question: Question) -> Organs:
     corners = np.concatenate([mesh.triangles for mesh in meshes] or [np.empty((0, 3, 3))]) - question.target_ct
     limits = question.margins + question.radius
     return Organs(
-        corners.reshape(-1, 9), group, limits, zones(corners, limits[group] + CLEARANCE_PAD_MM), question.length
+        corners.reshape(-1, 9), group, limits, zones(corners, limits[group] + CLEARANCE_PAD_MM), question.lengths
     )
 
 

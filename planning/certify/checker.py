@@ -130,11 +130,12 @@ class _Checker:
         self._view = anatomy.skin.field_of_view
         self._skin = PlainSkin(anatomy.skin, case.target_ct)
         self._even = self._skin.closed and not self._skin.odd()
-        meshes = [s.mesh for s in anatomy.structures if s.demands_margin]
+        meshes = [s.mesh for s in anatomy.checked if s.demands_margin]
         self._organs = np.concatenate([m.triangles for m in meshes] or [np.empty((0, 3, 3))]) - case.target_ct
         self._first = np.cumsum([0, *(len(mesh.faces) for mesh in meshes)])
         self._limits = self._question.margins + self._question.radius
         self._limit = np.repeat(self._limits, np.diff(self._first))
+        self._length = np.repeat(self._question.lengths, np.diff(self._first))
         self._inside = [side_of(mesh, case.target_ct) is Side.INSIDE for mesh in meshes]
 
     def run(self, progress: Progress | None) -> Verification:
@@ -163,11 +164,13 @@ class _Checker:
         if cell.rho > WIDEST:
             return whole
         skin, organs, facts, good, leaves = whole.skin, whole.organs, None, whole.skin_good, whole.leaves
-        organs = organs[~_apart(self._organs[organs], self._limit[organs] + CLEARANCE_PAD_MM, cell, question.length)]
+        limit = self._limit[organs] + CLEARANCE_PAD_MM
+        organs = organs[~_apart(self._organs[organs], limit, cell, self._length[organs])]
         if not good:
-            skin = skin[~_apart(self._skin.corners[skin], np.full(len(skin), MET_MM), cell, question.length)]
+            everywhere = np.full(len(skin), MET_MM), cell, np.full(len(skin), question.farthest)
+            skin = skin[~_apart(self._skin.corners[skin], *everywhere)]
             if cell.rho <= SKIN_BELOW:
-                lengths = {"length": question.length, "longest": question.longest}
+                lengths = {"length": question.farthest, "longest": question.longest}
                 facts = self._skin.facts(skin, cell.u, cell.rho, cell.ray(0.4142, 0.5432), **lengths)
                 good = self._skin_good(facts)
         if leaves is None:
@@ -206,10 +209,11 @@ class _Checker:
         if not self._first[column] <= row < self._first[column + 1] or cell.rho > WIDEST:
             return False
         surface = _bvh(self._organs[row], np.array([[0, 1, 2]]))
-        ends = cell.corners * self._question.length
+        length = self._question.lengths[column]
+        ends = cell.corners * length
         axes = [_bvh(np.stack([np.zeros(3), end]), np.array([[0, 1, 1]])) for end in ends]
         worst = max(max(0.0, fcl.distance(axis, surface)) for axis in axes)
-        more = 3 * self._question.length * cell.bulge
+        more = 3 * length * cell.bulge
         return bool(worst + more < self._limits[column] - CLEARANCE_PAD_MM)
 
     def _skin_good(self, facts: SkinFacts) -> bool:
@@ -234,17 +238,18 @@ class _Checker:
         return reason == "skin_angle" and facts.least_angle > self._question.max_skin_angle + ANGLE_PAD_RAD
 
 
-def _apart(corners: Floats, limit: Floats, cell: _Cell, length: float) -> Bools:
+def _apart(corners: Floats, limit: Floats, cell: _Cell, length: Floats) -> Bools:
     """Which triangles a plane proves to keep their limit from every axis of a cell (lemmas 3 and 4), shape (k,).
 
-    However a plane was found, it is proof. Tried are planes across the cell's middle, across the triangle's, and
-    those through the target that look from the middle axis to the triangle's middle or to the feet on its edges.
+    However a plane was found, it is proof. Tried are planes across the cell's middle, across the triangle's, the
+    triangle's own, and those through the target that look from the middle axis to the triangle's middle or to the feet
+    on its edges.
 
     Args:
         corners: Shape (k, 3, 3), triangles, mm from the target.
         limit: Shape (k,), mm.
         cell: With a cone below a right angle.
-        length: Needle, mm.
+        length: Shape (k,), how far the axis goes, mm.
     """
     depth = corners @ cell.u
     found = (depth.min(axis=1) >= limit + length) | (depth.max(axis=1) <= -limit)  # beyond the top, behind the target
@@ -252,6 +257,7 @@ def _apart(corners: Floats, limit: Floats, cell: _Cell, length: float) -> Bools:
     behind = np.flatnonzero(~found & (middle @ cell.u <= -np.sin(cell.rho)))
     found[behind] = np.einsum("kci,ki->kc", corners[behind], middle[behind]).min(axis=1) >= limit[behind]
     found |= _separated(corners, depth, limit, middle - (middle @ cell.u)[:, None] * cell.u, cell)
+    found |= _behind_own_plane(corners, limit, cell)
     rest = np.flatnonzero(~found) if cell.rho <= NEAR_BELOW else np.empty(0, np.int64)
     beside = corners[rest] - depth[rest, :, None] * cell.u
     edge = beside[:, [1, 2, 0]] - beside
@@ -260,6 +266,16 @@ def _apart(corners: Floats, limit: Floats, cell: _Cell, length: float) -> Bools:
     for side in range(3):
         found[rest] |= _separated(corners[rest], depth[rest], limit[rest], feet[:, side], cell)
     return np.asarray(found)
+
+
+def _behind_own_plane(corners: Floats, limit: Floats, cell: _Cell) -> Bools:
+    """Where the triangle's own plane, moved through the target, has every direction of the cell on its other side."""
+    normal = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    height = np.einsum("kci,ki->kc", corners, normal)
+    side = np.where(height[:, :1] >= 0.0, 1.0, -1.0)
+    normal, height = normal * side, height * side
+    away = (normal @ cell.corners.T).max(axis=1) + cell.bulge <= 0.0
+    return np.asarray(away & (height.min(axis=1) >= limit))
 
 
 def _separated(corners: Floats, depth: Floats, limit: Floats, aside: Floats, cell: _Cell) -> Bools:

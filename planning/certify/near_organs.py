@@ -41,14 +41,14 @@ class Organs:
         group: Shape (m,), the structure of each, 0 to k - 1.
         limits: Shape (k,), needle radius plus margin, mm.
         zones: The directions to which each triangle matters.
-        length: Needle, mm.
+        lengths: Shape (k,), how far the needle's axis is checked against each structure, mm.
     """
 
     corners: Floats
     group: Ints
     limits: Floats
     zones: Zones
-    length: float
+    lengths: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ def organ_facts(
     zone = organs.zones.axis, organs.zones.cosine, organs.zones.sine, organs.zones.nearest
     shape = cones.centres, cones.corners, cones.radius, cones.bulge
     start, items, measured = _judge(
-        organs.corners, organs.group, organs.limits, zone, organs.length, lists.start, lists.items, parent, witness,
+        organs.corners, organs.group, organs.limits, zone, organs.lengths, lists.start, lists.items, parent, witness,
         shape, wide, pad, (found, rejected, largest),
     )  # fmt: skip
     return OrganFacts(Lists(start, items), found, rejected, largest, measured)
@@ -97,7 +97,7 @@ def organ_facts(
 
 @nb.njit(cache=True)
 def _judge(  # type: ignore[no-untyped-def]  # numba infers
-    corners, group, limits, zone, length, start, items, parent, witness, shape, wide, pad, out
+    corners, group, limits, zone, lengths, start, items, parent, witness, shape, wide, pad, out
 ):
     axis, cosine, sine, nearest = zone
     centres, ends, radius, bulge = shape
@@ -113,6 +113,7 @@ def _judge(  # type: ignore[no-untyped-def]  # numba infers
         if filled + last - first > len(kept):
             kept = _grown(kept, filled, 2 * (filled + last - first))
         if ask and witness[i] >= 0:
+            length = lengths[group[witness[i]]]
             more, limit = BULGES * length * bulge[i], limits[group[witness[i]]] - pad
             hit, worst = _corners(corners[witness[i]], four, length, limit - more)
             if hit == 4:
@@ -131,7 +132,7 @@ def _judge(  # type: ignore[no-untyped-def]  # numba infers
                     continue
             if ask:
                 asked = True
-                limit = limits[group[t]]
+                limit, length = limits[group[t]], lengths[group[t]]
                 width, side = _beside(u, corners[t])
                 if _apart(corners[t], side, u, four, bulge[i], limit + pad, length):
                     continue
@@ -242,7 +243,31 @@ def _apart(t, n, u, four, bulge, limit, length):  # type: ignore[no-untyped-def]
     least = np.inf
     for corner in (0, 3, 6):
         least = min(least, _along(n, t, corner) - tilt * _along(u, t, corner))
-    return least >= need
+    return least >= need or _behind_own_plane(t, four, bulge, limit)
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _behind_own_plane(t, four, bulge, limit):  # type: ignore[no-untyped-def]  # numba infers
+    """Whether every axis of a cell leads away from the plane of a triangle, or along it, at the limit or farther.
+
+    A large triangle (a table) lies beside the axis as a ray and across it as a line: no plane along the axis helps.
+    """
+    ax, ay, az = t[3] - t[0], t[4] - t[1], t[5] - t[2]
+    bx, by, bz = t[6] - t[0], t[7] - t[1], t[8] - t[2]
+    m = (ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
+    size = np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+    if size <= 0.0:
+        return False
+    size = size if _along(m, t, 0) >= 0.0 else -size
+    m = (m[0] / size, m[1] / size, m[2] / size)
+    toward = max(
+        m[0] * four[0, 0] + m[1] * four[0, 1] + m[2] * four[0, 2],
+        m[0] * four[1, 0] + m[1] * four[1, 1] + m[2] * four[1, 2],
+        m[0] * four[2, 0] + m[1] * four[2, 1] + m[2] * four[2, 2],
+        m[0] * four[3, 0] + m[1] * four[3, 1] + m[2] * four[3, 2],
+    )
+    nearest = min(_along(m, t, 0), _along(m, t, 3), _along(m, t, 6))
+    return toward + bulge <= 0.0 and nearest >= limit
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)

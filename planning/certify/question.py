@@ -13,6 +13,7 @@ from planning.certify.cells import Cells
 from planning.constraints import longest_path
 from planning.errors import InputError
 from planning.provenance import Input
+from planning.standoff import axis_lengths, farthest_flange
 
 Floats = NDArray[np.float64]
 
@@ -28,11 +29,13 @@ class Question:
         R_ct_entry: Shape (3, 3).
         theta, beta: The cap: lowest and highest angle.
         length: Needle, tip to flange.
+        farthest: The flange's greatest distance from the target while the tip waits: how far skin matters.
         radius: Needle radius.
         longest: The longest path.
         max_skin_angle: The largest angle at the skin.
         structures: Names of the k structures that demand a margin.
         margins: Shape (k,), their margins.
+        lengths: Shape (k,), how far the needle's axis is checked against each.
     """
 
     case_name: str
@@ -42,11 +45,13 @@ class Question:
     theta: tuple[float, float]
     beta: tuple[float, float]
     length: float
+    farthest: float
     radius: float
     longest: float
     max_skin_angle: float
     structures: tuple[str, ...]
     margins: Floats
+    lengths: Floats
 
     def cap(self) -> Cells:
         """The whole cap as one cell."""
@@ -64,7 +69,7 @@ def question_of(
     theta, beta = theta or case.search.theta, beta or case.search.beta
     if not (0 <= theta[0] <= theta[1] <= np.pi + 1e-12 and beta[0] <= beta[1] <= beta[0] + 2 * np.pi + 1e-12):
         raise InputError("the cap is no range of angles", where="certify", allowed="theta 0 to 180, beta 0 to 360")
-    demanding = [s for s in anatomy.structures if s.demands_margin]
+    demanding = [s for s in anatomy.checked if s.demands_margin]
     return Question(
         case_name=case.name,
         inputs=case.inputs,
@@ -73,9 +78,11 @@ def question_of(
         theta=(float(theta[0]), float(theta[1])),
         beta=(float(beta[0]), float(beta[1])),
         length=case.needle.length_mm,
+        farthest=farthest_flange(case.needle, case.search.max_skin_angle),
         radius=case.needle.radius_mm,
         longest=longest_path(case.needle),
         max_skin_angle=float(case.search.max_skin_angle),
         structures=tuple(s.name for s in demanding),
         margins=np.array([s.margin_mm for s in demanding]),
+        lengths=axis_lengths(case, demanding),
     )

@@ -33,7 +33,7 @@ def cross_check(
     meshes: tuple[TriangleMesh, ...],
     target_ct: Floats,
     outward_ct: Floats,
-    length: float,
+    length: Floats | float,
     *,
     count: int,
     rng: np.random.Generator,
@@ -45,7 +45,7 @@ def cross_check(
         meshes: The k surfaces.
         target_ct: Shape (3,).
         outward_ct: Shape (n, 3), unit vectors.
-        length: Of the axes, mm.
+        length: Of the axes, one number or shape (k,), mm.
         count: How many directions to judge again; all of them if there are fewer.
         rng: Chooses them.
 

@@ -32,8 +32,11 @@ class ClearanceEngine(Protocol):
     decided by the target alone, because every axis starts there (see `planning.clearance.measure`).
     """
 
-    def measure(self, target_ct: Floats, outward_ct: Floats, length: float) -> AxisDistances:
-        """Exact distances of the axes from ``target_ct`` (3,) along ``outward_ct`` (n, 3), ``length`` mm long."""
+    def measure(self, target_ct: Floats, outward_ct: Floats, length: Floats | float) -> AxisDistances:
+        """Exact distances of the axes from ``target_ct`` (3,) along ``outward_ct`` (n, 3).
+
+        ``length`` is one number or shape (k,), mm: as long is an axis for each structure.
+        """
         ...
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:

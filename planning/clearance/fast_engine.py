@@ -62,7 +62,7 @@ class FastEngine:
         self._progress = progress
         self.counts = np.zeros(len(COUNTED), np.int64)
 
-    def measure(self, target_ct: Floats, outward_ct: Floats, length: float) -> AxisDistances:
+    def measure(self, target_ct: Floats, outward_ct: Floats, length: Floats | float) -> AxisDistances:
         """Exact distances of n axes from all k structures; see `ClearanceEngine`."""
         return self._search(target_ct, outward_ct, length, cap=np.inf, enough=-1.0)
 
@@ -113,19 +113,21 @@ class FastEngine:
         return self._judges[structure].collides(0, target_ct, outward_ct, length, radius)
 
     def _search(
-        self, target: Floats, outward: Floats, length: float, *, cap: Floats | float, enough: Floats | float
+        self, target: Floats, outward: Floats, length: Floats | float, *, cap: Floats | float, enough: Floats | float
     ) -> AxisDistances:
         target = np.ascontiguousarray(target, dtype=np.float64)
         outward = np.ascontiguousarray(outward, dtype=np.float64).reshape(-1, 3)
-        if not (np.isfinite(target).all() and np.isfinite(outward).all() and 0.0 <= length <= LONGEST_MM):
-            raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
         shape = (len(self._meshes), len(outward))
-        caps, enoughs = (np.broadcast_to(np.asarray(x, dtype=np.float64), shape[:1]) for x in (cap, enough))
+        values = (length, cap, enough)
+        lengths, caps, enoughs = (np.broadcast_to(np.asarray(x, dtype=np.float64), shape[:1]) for x in values)
+        sound = np.isfinite(target).all() and np.isfinite(outward).all()
+        if not (sound and np.all((lengths >= 0.0) & (lengths <= LONGEST_MM))):
+            raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
         distance, depth = np.empty(shape), np.empty(shape)
         tiles = bundle(outward)
         for row, blocks in enumerate(self._blocks):
             _one_structure(
-                blocks, tiles, target, length, caps[row], enoughs[row], distance[row], depth[row], self.counts
+                blocks, tiles, target, lengths[row], caps[row], enoughs[row], distance[row], depth[row], self.counts
             )
             if self._progress is not None:
                 self._progress((row + 1) * len(outward), len(self._blocks) * len(outward))

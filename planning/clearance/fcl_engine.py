@@ -33,27 +33,32 @@ class FclEngine:
         self._objects = tuple(fcl.CollisionObject(_tree(mesh.vertices, mesh.faces)) for mesh in self._meshes)
         self._progress = progress
 
-    def measure(self, target_ct: Floats, outward_ct: Floats, length: float) -> AxisDistances:
+    def measure(self, target_ct: Floats, outward_ct: Floats, length: Floats | float) -> AxisDistances:
         """Exact distances of n axes from all k structures; see `ClearanceEngine`."""
         shape = (len(outward_ct), len(self._objects))
         distance, depth = np.empty(shape), np.empty(shape)
+        lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), shape[1:])
         for row, outward in enumerate(outward_ct):
-            distance[row], depth[row] = self._one_axis(target_ct, target_ct + length * outward)
+            distance[row], depth[row] = self._one_direction(target_ct, outward, lengths)
             if self._progress is not None:
                 self._progress(row + 1, len(outward_ct))
         for column, mesh in enumerate(self._meshes):
             met = distance[:, column] <= 0
             distance[met, column] = 0.0
             if met.any():
-                depth[met, column] = first_crossing(mesh, target_ct, outward_ct[met], length)
+                depth[met, column] = first_crossing(mesh, target_ct, outward_ct[met], float(lengths[column]))
         return AxisDistances(distance, depth)
 
-    def _one_axis(self, tip: Floats, top: Floats) -> tuple[list[float], list[float]]:
-        axis = fcl.CollisionObject(_tree(np.stack([tip, top]), _SEGMENT_FACE))
+    def _one_direction(self, tip: Floats, outward: Floats, lengths: Floats) -> tuple[list[float], list[float]]:
+        axes = {
+            length: fcl.CollisionObject(_tree(np.stack([tip, tip + length * outward]), _SEGMENT_FACE))
+            for length in set(lengths.tolist())
+        }
         distances, depths = [], []
-        for structure in self._objects:
+        for structure, length in zip(self._objects, lengths.tolist(), strict=True):
             result = fcl.DistanceResult()  # a reused result keeps its old minimum
-            distances.append(fcl.distance(axis, structure, fcl.DistanceRequest(enable_nearest_points=True), result))
+            request = fcl.DistanceRequest(enable_nearest_points=True)
+            distances.append(fcl.distance(axes[length], structure, request, result))
             depths.append(float(np.linalg.norm(result.nearest_points[0] - tip)))
         return distances, depths
 

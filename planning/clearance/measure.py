@@ -40,7 +40,7 @@ def measure(
     target_ct: Floats,
     outward_ct: Floats,
     *,
-    length: float,
+    length: Floats | float,
     radius: float,
 ) -> Clearances:
     """Measure all candidates.
@@ -53,10 +53,11 @@ def measure(
         structures: The k structures.
         target_ct: Shape (3,).
         outward_ct: Shape (n, 3), unit vectors.
-        length: Needle, tip to flange, mm.
+        length: How far the needle's axis goes from the target, one number or shape (k,), mm.
         radius: Needle radius, mm.
     """
-    axes = engine.measure(target_ct, outward_ct, length)
+    lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), len(structures))
+    axes = engine.measure(target_ct, outward_ct, lengths)
     distance, depth = axes.distance.copy(), axes.depth.copy()
     violated = np.zeros(distance.shape, bool)
     for column, structure in enumerate(structures):
@@ -67,7 +68,7 @@ def measure(
             violated[:, column] = distance[:, column] < limit
             for row in np.flatnonzero(np.abs(distance[:, column] - limit) < NEAR_THRESHOLD_MM):
                 violated[row, column] = distance[row, column] < limit - ROUNDING_MM or engine.collides(
-                    column, target_ct, outward_ct[row], length, limit
+                    column, target_ct, outward_ct[row], float(lengths[column]), limit
                 )
     distance -= radius
     return Clearances(distance, depth, violated)

@@ -50,6 +50,7 @@ class Judge:
         model: Name of the arm.
         tool: What its flange carries.
         skin: CT frame.
+        patient: CT frame, the skin and what the CT shows outside of it.
         fixed: Boxes that stand with the patient; their ``T_base_box`` is in the CT frame.
         carried: Boxes that stand with the arm, base frame.
         padding_mm: Of the arm.
@@ -61,6 +62,7 @@ class Judge:
     model: str
     tool: Tool
     skin: TriangleMesh
+    patient: TriangleMesh
     fixed: tuple[Box, ...]
     carried: tuple[Box, ...]
     padding_mm: float
@@ -94,8 +96,11 @@ class Judge:
 
     def _checker(self, T_base_ct: Floats) -> FastChecker:
         boxes = [Box(box.name, T_base_ct @ box.T_base_box, box.size_mm) for box in self.fixed]
-        patient, model, everything = self.skin.transformed(T_base_ct), ur_model(self.model), (*boxes, *self.carried)
-        return FastChecker(model, self.tool, everything, patient, padding_mm=self.padding_mm, cache=user_cache())
+        patient, skin = (mesh.transformed(T_base_ct) for mesh in (self.patient, self.skin))
+        model, everything = ur_model(self.model), (*boxes, *self.carried)
+        return FastChecker(
+            model, self.tool, everything, patient, skin=skin, padding_mm=self.padding_mm, cache=user_cache()
+        )
 
 
 def _words(contact: Contact | None) -> str:

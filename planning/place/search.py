@@ -25,7 +25,7 @@ from planning.place.needle_start import needle_can_start
 from planning.place.room_field import Boxes, SkinField
 from planning.place.workers import ask_all
 from planning.placement import Placement
-from planning.room import ARM_PADDING_MM, case_boxes, case_tool, check_gantry, home_configuration
+from planning.room import ARM_PADDING_MM, case_boxes, case_tool, check_gantry, home_configuration, patient_surface
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
@@ -122,9 +122,9 @@ def search_placements(
     check_gantry(case, anatomy.skin.mesh)
     T_ct_bed = bed_frame(case)
     judge = _judge(case, anatomy, found)
-    room = Surroundings(SkinField.of(anatomy.skin.mesh), Boxes.of(judge.fixed), Boxes.of(judge.carried), ARM_PADDING_MM)
+    room = Surroundings(SkinField.of(judge.patient), Boxes.of(judge.fixed), Boxes.of(judge.carried), ARM_PADDING_MM)
     startable = judge.wanted.only(
-        needle_can_start(judge.tool, judge.skin, case.target_ct, judge.wanted, ARM_PADDING_MM)
+        needle_can_start(judge.tool, judge.patient, case.target_ct, judge.wanted, ARM_PADDING_MM)
     )
     if not len(startable):
         raise NoAnswerError("in every organ-safe direction the needle would start too near the skin")
@@ -176,6 +176,7 @@ def _judge(case: Case, anatomy: Anatomy, found: Candidates) -> Judge:
         model=case.robot.model,
         tool=case_tool(case),
         skin=anatomy.skin.mesh,
+        patient=patient_surface(anatomy),
         fixed=tuple(box for box in boxes if box.name not in carried),
         carried=tuple(box for box in boxes if box.name in carried),
         padding_mm=ARM_PADDING_MM,

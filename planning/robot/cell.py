@@ -81,6 +81,7 @@ class CellChecker:
         tool: What the flange carries.
         boxes: Solids of the room, base frame. The base link is not tested against them: it is bolted to one.
         patient: The skin, base frame, mm; None for an empty room.
+        skin: The skin alone, where ``patient`` holds more: the base may touch the rest (a table), not the skin.
         padding_mm: How much fuller the arm is for contacts with patient and boxes (not for distances, nor with itself):
             room for what robot and registration get wrong. With 1 mm or more, free states between which no body moves
             more than 2 mm prove that the way between them meets neither patient nor box.
@@ -97,6 +98,7 @@ class CellChecker:
         boxes: Sequence[Box] = (),
         patient: TriangleMesh | None = None,
         *,
+        skin: TriangleMesh | None = None,
         padding_mm: float = 0.0,
     ) -> None:
         if not (np.isfinite(padding_mm) and padding_mm >= 0.0):
@@ -111,7 +113,7 @@ class CellChecker:
         self.patient_closed = patient is not None and patient.closed
         if patient is not None:
             self._bounds[PATIENT] = patient.bounds
-            self._refuse_base_in(patient)
+            self._refuse_base_in(patient, patient if skin is None else skin)
         self._checks = tuple(self._room_checks()) + tuple(self._self_checks())
 
     def contact(self, q: Array, *, needle_may_touch_patient: bool) -> Contact | None:
@@ -218,11 +220,15 @@ class CellChecker:
         for body in self._bodies[1:]:
             body.place(poses)
 
-    def _refuse_base_in(self, patient: TriangleMesh) -> None:
+    def _refuse_base_in(self, patient: TriangleMesh, skin: TriangleMesh) -> None:
         base = self._bodies[0]
         centre = collision_links(self.model)[0].mesh.bounds.mean(axis=0)
-        if touch(self._patient, base.bare.surface) or abs(winding_number(patient, centre)) > 0.5:
+        surface = skin_surface(skin, PATIENT)
+        if touch(surface, base.bare.surface) or abs(winding_number(skin, centre)) > 0.5:
             raise InputError("the robot's base stands in the patient", where="cell", allowed="a base outside the skin")
+        if patient is not skin and abs(winding_number(patient, centre)) > 0.5:
+            what = "the robot's base stands in what the CT shows outside of the body (its table?)"
+            raise InputError(what, where="cell", allowed="a base outside of it")
 
 
 def require_finite(q: Array) -> None:

@@ -34,6 +34,7 @@ class FastChecker(CellChecker):
         tool: The same.
         boxes: The same.
         patient: The same.
+        skin: The same.
         padding_mm: The same.
         cache: Where the enclosures of the arm's bodies are kept.
 
@@ -48,10 +49,11 @@ class FastChecker(CellChecker):
         boxes: Sequence[Box] = (),
         patient: TriangleMesh | None = None,
         *,
+        skin: TriangleMesh | None = None,
         padding_mm: float = 0.0,
         cache: Cache = NO_CACHE,
     ) -> None:
-        super().__init__(model, tool, boxes, patient, padding_mm=padding_mm)
+        super().__init__(model, tool, boxes, patient, skin=skin, padding_mm=padding_mm)
         self._swept_full = SweptBodies.of(model, tool, padding_mm)
         self._proofs = Proofs(model, self._checks, boxes, patient, cache)
         self._asked = without_neighbours(model, self._checks, self._proofs, cache)

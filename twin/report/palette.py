@@ -33,6 +33,7 @@ NEEDLE: Rgb = (20, 20, 24)
 HOLDER: Rgb = (70, 74, 82)
 ARM: Rgb = (173, 183, 196)
 TABLE: Rgb = (120, 110, 98)
+OUTSIDE: Rgb = (128, 128, 140)
 SKIN: Rgb = (226, 176, 148)
 TARGET_POINT: Rgb = (214, 0, 30)
 
@@ -59,7 +60,7 @@ REASON_WORDS = MappingProxyType(
         Reason.TOO_LONG: "path longer than the needle's shaft",
         Reason.SKIN_ANGLE: "too oblique at the skin",
         Reason.TOO_CLOSE: "hits a structure or its margin",
-        Reason.UNKNOWN_REGION: "unknown region (image ends)",
+        Reason.UNKNOWN_REGION: "unknown region (image ends, or not named)",
         Reason.UNREACHABLE: "arm cannot reach the pose",
         Reason.ARM_COLLISION: "arm would collide",
         Reason.INSERTION_BLOCKED: "straight insertion not drivable",

@@ -26,6 +26,8 @@ ORGAN_VEIL = 0.38
 """Opacity of the organ that holds the target, so that the lesion and its vessels show."""
 
 UNKNOWN_VEIL = 0.30
+OUTSIDE_SHOWN_MM = np.array([150.0, 150.0, 0.0])
+"""How far beyond the skin's box what is outside of the body is drawn: to the sides, front and back, along the bed."""
 SKIN_VEIL = 0.20
 GANTRY_VEIL = 0.15
 """Opacity of the gantry, so that it does not hide the patient in its bore."""
@@ -84,9 +86,20 @@ def patient(anatomy: Any, case: Any) -> tuple[Body, ...]:
     structures = anatomy.structures
     colours = palette.organ_colours(tuple(s.name for s in structures))
     bodies = [Body(s.name, "organ", s.mesh, colours[s.name], _opacity(s, case)) for s in structures]
+    bodies += [
+        Body(s.name, "organ", _near(s.mesh, anatomy.skin.mesh), palette.OUTSIDE, UNKNOWN_VEIL)
+        for s in anatomy.surroundings
+        if str(s.role) == "unknown"
+    ]
     bodies.append(Body("skin", "skin", anatomy.skin.mesh, palette.SKIN, SKIN_VEIL))
     bodies.append(Body("target", "target", ball(case.target_ct, TARGET_BALL_MM), palette.TARGET_POINT))
     return tuple(bodies)
+
+
+def _near(mesh: TriangleMesh, skin: TriangleMesh) -> TriangleMesh:
+    """What is drawn of a surface that goes on beyond the image: its part about the skin, flattened at the rest."""
+    low, high = skin.bounds
+    return TriangleMesh(np.clip(mesh.vertices, low - OUTSIDE_SHOWN_MM, high + OUTSIDE_SHOWN_MM), mesh.faces)
 
 
 def _opacity(structure: Any, case: Any) -> float:

@@ -1,0 +1,128 @@
+"""The CT of a case as a witness: what it shows outside of the body, and what inside that no structure names."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from planning.body_mask import body_mask
+from planning.cache import Arrays
+from planning.formats.orientation import Oriented, canonical
+from planning.mesh import TriangleMesh
+from planning.outside_body import OutsideImage, outside_surface
+from planning.second_witness import BodyImage, Named, Unnamed, unnamed_surfaces
+from planning.skin import Skin
+from planning.surfaces import VolumeSurfaces
+from planning.voxelize import voxels_inside
+
+SKIN_TOLERANCE_MM = 3.0
+"""A skin from elsewhere (a label, a mesh) is off the CT's by so much, or by one voxel and a half: nearer to it what is
+dense counts as body. Beyond, it is outside, as an arm is that the skin lacks."""
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A CT beside the skin of its case. Its voxels are decoded only if something is not in the cache.
+
+    Attributes:
+        name: As the case writes it.
+        source: The file.
+        skin: The skin, where it does not come from this CT.
+    """
+
+    name: str
+    source: VolumeSurfaces
+    skin: Skin | None
+
+    def outside(self, air_hu: float) -> TriangleMesh | None:
+        """The surface of what is denser than air outside of the body, LPS mm; None for air alone."""
+
+        def make() -> TriangleMesh | None:
+            ct = self._ct
+            image = OutsideImage(self._hu, self._body, ct.T_ct_index, ct.spacing_mm)
+            return outside_surface(image, air_hu=air_hu, where=self.source.path)
+
+        return self._kept({"what": "outside", "air_hu": air_hu}, lambda: [make()])[0]
+
+    def unnamed(self, structures: Sequence[Named], dense_hu: float) -> Unnamed:
+        """What is dense, or gas, inside the body and in no structure.
+
+        Args:
+            structures: Every structure of the case but the skin.
+            dense_hu: From here on a voxel is dense.
+        """
+
+        def make() -> Unnamed:
+            ct = self._ct
+            image = BodyImage(self._hu, self._body, ct.T_ct_index, ct.spacing_mm)
+            return unnamed_surfaces(image, structures, dense_hu=dense_hu, where=self.source.path)
+
+        named = {"structures": [f"{one.name} {_digest(one.mesh)}" for one in structures]}
+        return Unnamed(*self._kept({"what": "unnamed", "dense_hu": dense_hu, **named}, lambda: list(make())))
+
+    def hu_at(self, points_ct: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Hounsfield units of the nearest voxel, NaN outside of the image.
+
+        Args:
+            points_ct: Shape (n, 3), LPS mm.
+        """
+        T = np.linalg.inv(self._ct.T_ct_index)
+        index = np.round(points_ct @ T[:3, :3].T + T[:3, 3]).astype(np.int64)
+        inside = np.all((index >= 0) & (index < self._hu.shape), axis=1)
+        found = np.full(len(points_ct), np.nan)
+        found[inside] = self._hu[tuple(index[inside].T)]
+        return found
+
+    @cached_property
+    def _ct(self) -> Oriented:
+        volume = self.source.volume
+        return canonical(volume.values, volume.T_ct_index)
+
+    @cached_property
+    def _hu(self) -> NDArray[np.float32]:
+        return self._ct.values.astype(np.float32)
+
+    @cached_property
+    def _body(self) -> Mask:
+        """The body's voxels: as found in the CT, or inside the skin that the case gives."""
+        ct = self._ct
+        if self.skin is None:
+            return body_mask(self._hu, ct.spacing_mm, where=self.source.path).body
+        inside = voxels_inside(self.skin.mesh, ct.T_ct_index, ct.values.shape)
+        near = max(SKIN_TOLERANCE_MM, 1.5 * float(ct.spacing_mm.max()))
+        return np.asarray(ndimage.distance_transform_edt(~inside, sampling=ct.spacing_mm) <= near)
+
+    def _kept(
+        self, made_from: dict[str, Any], make: Callable[[], list[TriangleMesh | None]]
+    ) -> list[TriangleMesh | None]:
+        """Meshes from the cache, made where they are not there; None is kept too."""
+        skin = None if self.skin is None else _digest(self.skin.mesh)
+        return _to_meshes(self.source.kept({"skin": skin, **made_from}, lambda: _of_meshes(make())))
+
+
+def _digest(mesh: TriangleMesh) -> str:
+    return hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).hexdigest()
+
+
+def _of_meshes(meshes: list[TriangleMesh | None]) -> Arrays:
+    arrays: Arrays = {"count": np.array(len(meshes))}
+    for number, mesh in enumerate(meshes):
+        if mesh is not None:
+            arrays |= {f"vertices{number}": mesh.vertices, f"faces{number}": mesh.faces}
+    return arrays
+
+
+def _to_meshes(stored: Arrays) -> list[TriangleMesh | None]:
+    return [
+        TriangleMesh(stored[f"vertices{n}"], stored[f"faces{n}"]) if f"faces{n}" in stored else None
+        for n in range(int(stored["count"]))
+    ]

@@ -1,0 +1,114 @@
+"""The CT as a second witness of the segmentation: what it shows inside the body that no structure of the case names.
+
+A rib that a segmentation lost, a stent, a calcified vessel: dense, and part of no structure. Gas outside of what may
+hold gas: a loop of bowel or a piece of lung that nobody labelled. Both become structures of role ``unknown``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from planning.formats.label_surface import field_surface
+from planning.mesh import TriangleMesh
+from planning.voxelize import voxels_inside
+
+GAS_HU = -300.0
+"""Half way between fat (-100) and a voxel that is half gas, half tissue (-500)."""
+MIN_COMPONENT_MM3 = 100.0
+"""Smaller components are noise and edges of labels: half a voxel of a 6 mm grid."""
+SKIN_VOXELS = 2
+"""So deep below the body's surface voxels are partly air: no gas there."""
+GAS_HOLDERS = (
+    "lung", "trachea", "bronch", "airway", "pharynx", "larynx", "esophag", "oesophag", "stomach", "duoden",
+    "bowel", "intestin", "jejun", "ileum", "colon", "sigmoid", "rectum", "caecum", "cecum", "appendix", "sinus",
+    "nasal", "nose", "mastoid", "oral", "mouth", "gas", "air", "cavity",
+)  # fmt: skip
+"""Parts of names of structures that hold gas in a healthy body."""
+
+Mask = NDArray[np.bool_]
+FULL = np.ones((3, 3, 3), bool)
+
+
+class Named(NamedTuple):
+    """A structure of the case."""
+
+    name: str
+    mesh: TriangleMesh
+
+    @property
+    def may_hold_gas(self) -> bool:
+        """Whether its name is that of lung, bowel or another hollow organ that air gets into."""
+        return any(part in self.name.lower() for part in GAS_HOLDERS)
+
+
+@dataclass(frozen=True, eq=False)
+class BodyImage:
+    """A CT with its body.
+
+    Attributes:
+        hu: Shape (nx, ny, nz), Hounsfield units.
+        body: Same shape.
+        T_ct_index: Shape (4, 4), voxel index to LPS mm.
+        spacing_mm: Shape (3,).
+    """
+
+    hu: NDArray[np.float32]
+    body: Mask
+    T_ct_index: NDArray[np.float64]
+    spacing_mm: NDArray[np.float64]
+
+
+class Unnamed(NamedTuple):
+    """What no structure names: closed surfaces in LPS mm, or None where there is nothing."""
+
+    dense: TriangleMesh | None
+    gas: TriangleMesh | None
+
+
+def unnamed_surfaces(image: BodyImage, structures: Sequence[Named], *, dense_hu: float, where: str | Path) -> Unnamed:
+    """Find dense components and gas inside the body outside of all structures grown by one voxel.
+
+    Args:
+        image: The CT and its body.
+        structures: Every structure of the case but the skin.
+        dense_hu: From here on a voxel is dense.
+        where: The CT's file, for messages.
+    """
+    named = _grown_union(structures, image)
+    dense = image.body & (image.hu >= dense_hu) & ~named
+    gas = image.hu < GAS_HU
+    if gas.any():
+        inner = ndimage.binary_erosion(image.body, FULL, iterations=SKIN_VOXELS, border_value=1)
+        gas &= inner & ~_grown_union([one for one in structures if one.may_hold_gas], image)
+    return Unnamed(_surface(dense, image, where), _surface(gas, image, where))
+
+
+def _grown_union(structures: Sequence[Named], image: BodyImage) -> Mask:
+    """Voxels of all structures, dilated by one voxel."""
+    union = np.zeros(image.hu.shape, bool)
+    for structure in structures:
+        union |= voxels_inside(structure.mesh, image.T_ct_index, image.hu.shape)
+    return np.asarray(ndimage.binary_dilation(union))
+
+
+def _surface(mask: Mask, image: BodyImage, where: str | Path) -> TriangleMesh | None:
+    """The surface of the components that are large enough."""
+    kept = np.zeros_like(mask)
+    least = MIN_COMPONENT_MM3 / float(np.prod(image.spacing_mm))
+    for box, component in _components(mask):
+        if np.count_nonzero(component) >= least:
+            kept[box] |= component
+    return field_surface(kept.astype(np.float32) - 0.5, image.T_ct_index, where=where) if kept.any() else None
+
+
+def _components(mask: Mask) -> Iterator[tuple[tuple[slice, ...], Mask]]:
+    labels, _ = ndimage.label(mask, FULL)
+    for number, box in enumerate(ndimage.find_objects(labels), start=1):
+        yield box, labels[box] == number

@@ -1,0 +1,70 @@
+"""Solids outside of the body that a needle is checked against, with and without an arm: obstacles and the gantry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.anatomy import Anatomy, Role, Structure
+from planning.case import Case
+from planning.errors import InputError
+from planning.mesh import TriangleMesh
+from planning.outside_body import joined
+from planning.robot.tool import Box
+from planning.room import case_boxes, gantry_in_ct
+
+Floats = NDArray[np.float64]
+
+GANTRY = "gantry"
+
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+"""Of a cube with edges of 1."""
+FACES = np.array(
+    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
+     [1, 5, 7], [1, 7, 3]]
+)  # fmt: skip
+"""Its triangles, outward."""
+
+
+def with_surroundings(anatomy: Anatomy, case: Case, T_base_ct: Floats | None) -> Anatomy:
+    """The anatomy with the case's obstacles and gantry beside what the CT shows outside of the body.
+
+    Raises:
+        InputError: An obstacle has the name of a structure.
+    """
+    solids = surroundings(case, T_base_ct)
+    taken = {structure.name for structure in anatomy.checked}
+    for solid in solids:
+        if solid.name in taken:
+            what = f"obstacle '{solid.name}' has the name of a structure"
+            raise InputError(what, where=case.path, allowed="a name of its own")
+    return replace(anatomy, surroundings=anatomy.surroundings + solids)
+
+
+def surroundings(case: Case, T_base_ct: Floats | None) -> tuple[Structure, ...]:
+    """Obstacles and gantry as structures of role ``avoid`` without a margin, CT frame.
+
+    Args:
+        case: The case.
+        T_base_ct: Shape (4, 4); None where nothing says where the arm is: obstacles of the frame ``base`` are then
+            nowhere, and are left out.
+    """
+    T = np.eye(4) if T_base_ct is None else T_base_ct
+    fixed = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "ct" or T_base_ct is not None}
+    boxes = [box for box in case_boxes(case, T) if box.name in fixed]
+    T_ct_base = np.asarray(np.linalg.inv(T), dtype=np.float64)
+    structures = [_structure(box.name, _mesh(box, T_ct_base)) for box in boxes]
+    if case.gantry is not None:
+        structures.append(_structure(GANTRY, joined([_mesh(box, np.eye(4)) for box in gantry_in_ct(case.gantry)])))
+    return tuple(structures)
+
+
+def _structure(name: str, mesh: TriangleMesh) -> Structure:
+    return Structure(name, Role.AVOID, 0.0, mesh, "case file", outside=True)
+
+
+def _mesh(box: Box, T_ct_base: Floats) -> TriangleMesh:
+    T = T_ct_base @ box.T_base_box
+    return TriangleMesh((CORNERS * box.size_mm) @ T[:3, :3].T + T[:3, 3], FACES)

@@ -1,0 +1,289 @@
+"""What counts as body and as air: patients on a table, with arms, mattress, sheet and line, whose truth is known."""
+
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813
+
+from planning.anatomy import OUTSIDE_NOT_KNOWN
+from planning.case import load_case
+from planning.certify import certify, verify
+from planning.errors import InputError
+from planning.prepared import prepare
+from planning.reasons import Reason
+from planning.standoff import standoffs
+from twin.phantoms import supine
+from twin.phantoms.ct_image import rendered
+
+STEP_DEG = 6.0
+NEEDLE = "length_mm = 210.0\nshaft_mm = 150.0\ndiameter_mm = 1.2"
+
+CASE = """
+schema = 1
+name = "supine"
+space = "LPS"
+[target]
+position_mm = [-55.0, 20.0, 0.0]
+structure = "lesion"
+[needle]
+{needle}
+[search]
+theta_deg = [0, 180]
+step_deg = {step}
+max_skin_angle_deg = 75
+{search}
+[[structure]]
+name = "skin"
+role = "skin"
+{skin}
+[[structure]]
+name = "lesion"
+labelmap = "labels.nii.gz"
+label = 1
+role = "target"
+{structures}
+{more}
+"""
+SPINE = '[[structure]]\nname = "spine"\nlabelmap = "labels.nii.gz"\nlabel = 2\nrole = "avoid"\nmargin_mm = 2.0\n'
+HUMERI = "".join(
+    f'[[structure]]\nname = "humerus_{side}"\nlabelmap = "labels.nii.gz"\nlabel = {label}\nrole = "avoid"\n'
+    f"margin_mm = 2.0\n"
+    for label, side in ((3, "left"), (4, "right"))
+)
+
+
+def write_scene(folder, parts, grid, seed=3):
+    """``ct.nii.gz`` of the scene, and ``labels.nii.gz`` of lesion (1), spine (2) and humeri (3, 4)."""
+    hu = rendered(parts, grid, noise_hu=15.0, rng=np.random.default_rng(seed))
+    labels = np.zeros(grid.shape, np.uint8)
+    fields = {part.name: part.field for part in parts}
+    for label, name in enumerate(("lesion", "spine", "humerus_left", "humerus_right"), start=1):
+        if name in fields:
+            labels[(fields[name](grid.centres()) < 0).reshape(grid.shape)] = label
+    for name, values in (("ct", hu.astype(np.int16)), ("labels", labels)):
+        image = sitk.GetImageFromArray(values.transpose(2, 1, 0))
+        image.SetSpacing(grid.spacing_mm)
+        image.SetOrigin(grid.low_mm)
+        sitk.WriteImage(image, str(folder / f"{name}.nii.gz"))
+
+
+def write_case(folder, *, skin='ct = "ct.nii.gz"', structures=SPINE, search="", more="", step=STEP_DEG, name="case"):
+    """A case beside the scene."""
+    path = folder / f"{name}.toml"
+    path.write_text(CASE.format(needle=NEEDLE, step=step, search=search, skin=skin, structures=structures, more=more))
+    return path
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A function: the folder of a scene of these parts."""
+    made = {}
+
+    def make(name):
+        if name not in made:
+            parts = {
+                "arms": supine.trunk_parts() + supine.arm_parts("down"),
+                "bed": supine.trunk_parts() + supine.bed_parts(),
+                "all": [
+                    *supine.trunk_parts(),
+                    *supine.arm_parts("down"),
+                    *supine.bed_parts(),
+                    supine.line_part(),
+                    supine.sheet_part(),
+                ],
+                "alone": supine.trunk_parts() + supine.arm_parts("up"),
+            }[name]
+            folder = tmp_path_factory.mktemp(name)
+            write_scene(folder, parts, supine.grid())
+            made[name] = folder, parts
+        return made[name]
+
+    return make
+
+
+def hit_parts(prepared, found, parts, names):
+    """Rows of safe needles whose axis enters a part's truth between skin and flange at standoff, by the part's name."""
+    case, hit = prepared.case, {}
+    for row in np.flatnonzero(found.safe):
+        standoff = float(standoffs(case.needle, found.path_length[row], found.skin_angle[row]))
+        depths = np.arange(found.path_length[row] + 1.0, standoff + case.needle.length_mm, 0.5)
+        points = case.target_ct + depths[:, None] * found.outward_ct[row]
+        for part in parts:
+            if part.name in names and part.field(points).min() < 0.0:
+                hit.setdefault(part.name, []).append(int(row))
+    return hit
+
+
+def through(found, case, part, first_mm=0.0):
+    """Rows whose straight line from the target to the flange at its farthest passes a part's truth."""
+    depths = np.arange(first_mm, case.needle.length_mm, 1.0)
+    points = case.target_ct + depths[:, None, None] * found.outward_ct
+    return (part.field(points.reshape(-1, 3)).reshape(points.shape[:2]) < -3.0).any(axis=0)
+
+
+OUTER = ("arm_left", "arm_right", "humerus_left", "humerus_right", "mattress", "table", "line", "sheet")
+
+
+@pytest.mark.parametrize("name", ["arms", "bed", "all"])
+def test_no_safe_needle_passes_what_the_scan_shows_outside_of_the_trunk(scene, name):
+    """Arms, table, mattress, sheet and line: none is entered by a safe needle, inserted or at its standoff."""
+    folder, parts = scene(name)
+    prepared = prepare(write_case(folder), arm=False)
+    found = prepared.search()
+
+    assert hit_parts(prepared, found, parts, OUTER) == {}
+    assert found.safe.sum() > 40
+
+
+def test_a_detached_arm_is_body(scene):
+    """A path into an arm enters skin again; a warning names both arms, and a labelled humerus lies inside the skin."""
+    folder, parts = scene("arms")
+    prepared = prepare(write_case(folder, structures=SPINE + HUMERI), arm=False)
+    found = prepared.search()
+    arm = next(part for part in parts if part.name == "arm_right")
+
+    rows = through(found, prepared.case, arm)
+    assert rows.sum() > 20
+    assert not found.safe[rows].any()
+    assert (found.reason[rows] == Reason.REENTERS_SKIN).sum() > 10
+    said = " ".join(prepared.anatomy.warnings)
+    assert "do not touch the trunk" in said
+    assert "left of it" in said
+    assert "right of it" in said
+
+
+def test_the_table_below_a_posterior_target_is_no_air(scene):
+    """Every direction through the back meets mattress and table: none is safe, and the reason names the structure."""
+    folder, parts = scene("bed")
+    prepared = prepare(write_case(folder), arm=False)
+    found = prepared.search()
+    table = next(part for part in parts if part.name == "table")
+
+    rows = through(found, prepared.case, table)
+    assert rows.sum() > 100
+    assert not found.safe[rows].any()
+    beyond_skin = rows & (found.reason == Reason.UNKNOWN_REGION) & (found.reason_structure == "outside_body")
+    assert beyond_skin.sum() > 50
+
+
+def test_a_trunk_alone_has_nothing_outside(scene):
+    """Arms up: no surface outside of the body, no warning of detached parts, and the same safe front as with a bed."""
+    folder, _ = scene("alone")
+    prepared = prepare(write_case(folder), arm=False)
+
+    assert prepared.anatomy.surroundings == ()
+    assert "do not touch" not in " ".join(prepared.anatomy.warnings)
+
+
+def test_a_skin_from_elsewhere_with_the_ct_beside_it(scene):
+    """The skin is a label of the trunk alone: with ``[ct] file`` arms, table and line are unknown all the same."""
+    folder, parts = scene("all")
+    grid = supine.grid()
+    trunk = (parts[0].field(grid.centres()) < 0).reshape(grid.shape)
+    image = sitk.GetImageFromArray(trunk.astype(np.uint8).transpose(2, 1, 0))
+    image.SetSpacing(grid.spacing_mm)
+    image.SetOrigin(grid.low_mm)
+    sitk.WriteImage(image, str(folder / "trunk.nii.gz"))
+    skin = 'labelmap = "trunk.nii.gz"\nlabel = 1'
+    blind = prepare(write_case(folder, skin=skin, name="blind"), arm=False)
+    seeing = prepare(write_case(folder, skin=skin, more='[ct]\nfile = "ct.nii.gz"', name="seeing"), arm=False)
+
+    assert OUTSIDE_NOT_KNOWN in blind.anatomy.warnings
+    assert len(hit_parts(blind, blind.search(), parts, OUTER)) > 3
+    assert OUTSIDE_NOT_KNOWN not in seeing.anatomy.warnings
+    assert hit_parts(seeing, seeing.search(), parts, OUTER) == {}
+    assert "ct.nii.gz" in str(seeing.case.inputs)
+
+
+def test_a_bone_that_nobody_labelled_is_unknown(scene):
+    """Without its label the spine is ``unnamed_dense``; ``trust_labels`` takes it for soft tissue, and says so."""
+    folder, parts = scene("alone")
+    spine = next(part for part in parts if part.name == "spine")
+    found = prepare(write_case(folder, structures=""), arm=False).search()
+    trusted = prepare(write_case(folder, structures="", search="trust_labels = true", name="trust"), arm=False)
+
+    rows = through(found, trusted.case, spine)
+    assert rows.sum() > 20
+    assert not found.safe[rows].any()
+    assert "unnamed_dense" in found.structures
+    assert trusted.search().safe[rows].any()
+    assert any("trust_labels" in warning for warning in trusted.anatomy.warnings)
+
+
+def test_a_named_bone_leaves_nothing_unnamed(scene):
+    """With the spine's label no dense voxel and no gas is left in the body."""
+    folder, _ = scene("alone")
+    names = [s.name for s in prepare(write_case(folder), arm=False).anatomy.structures]
+    assert names == ["lesion", "spine"]
+
+
+def test_gas_outside_of_hollow_organs_is_unknown(tmp_path):
+    """A bubble of gas of 30 mm in the trunk that no bowel's label covers: no safe path through it."""
+    from twin.phantoms.ct_image import Part
+    from twin.phantoms.implicit import ellipsoid
+
+    bubble = Part("bubble", ellipsoid((-55.0, -50.0, 0.0), (15, 15, 15)), -1000.0)
+    write_scene(tmp_path, [*supine.trunk_parts(), bubble], supine.grid())
+    prepared = prepare(write_case(tmp_path), arm=False)
+    found = prepared.search()
+
+    rows = through(found, prepared.case, bubble)
+    assert rows.sum() > 3
+    assert not found.safe[rows].any()
+    assert set(found.reason_structure[rows & (found.reason == Reason.UNKNOWN_REGION)]) == {"unnamed_gas"}
+
+
+def test_an_obstacle_stops_the_needle_without_an_arm_too(scene):
+    """A box in front of the trunk, within the needle's length outside: refused with its name, with no arm asked."""
+    folder, _ = scene("alone")
+    box = '[[obstacle]]\nname = "monitor"\nframe = "ct"\ncenter_mm = [-55, -260, 0]\nsize_mm = [60, 60, 60]'
+    free = prepare(write_case(folder), arm=False).check(0.0, 0.0)
+    stopped = prepare(write_case(folder, more=box, name="boxed"), arm=False).check(0.0, 0.0)
+
+    assert free.safe[0]
+    assert stopped.reason[0] == Reason.TOO_CLOSE
+    assert stopped.reason_structure[0] == "monitor"
+
+
+def test_the_flange_at_standoff_counts(scene):
+    """A box that only the waiting needle's upper end reaches, 60 mm beyond the inserted flange, stops it."""
+    folder, _ = scene("alone")
+    box = '[[obstacle]]\nname = "lamp"\nframe = "ct"\ncenter_mm = [-55, -280, 0]\nsize_mm = [40, 40, 40]'
+    stopped = prepare(write_case(folder, more=box, name="lamp"), arm=False).check(0.0, 0.0)
+
+    assert stopped.reason_structure[0] == "lamp"
+    assert stopped.reason_depth[0] > 210.0
+
+
+def test_a_certificate_holds_outside_of_the_body_too(scene):
+    """Between the grid points: no cell that is proven safe holds a direction that the search refuses."""
+    folder, _ = scene("all")
+    path = write_case(folder, step=3.0, name="certified")
+    prepared = prepare(path, arm=False)
+    found = prepared.search()
+    certificate = certify(prepared.case, prepared.anatomy, size=np.radians(2.0))
+    verify(certificate, prepared.case, prepared.anatomy)
+
+    low_theta, high_theta = certificate.leaves.theta.T
+    low_beta, high_beta = certificate.leaves.beta.T
+    for theta, beta, safe in zip(found.theta, found.beta, found.safe, strict=True):
+        holds = (low_theta <= theta) & (theta <= high_theta) & (low_beta <= beta) & (beta <= high_beta)
+        letters = set(certificate.verdict[holds])
+        assert safe or "S" not in letters
+        assert not safe or "R" not in letters
+
+
+def test_two_cts_are_refused(scene):
+    """``[ct] file`` beside a skin from another CT: which one is right cannot be known."""
+    folder, _ = scene("alone")
+    (folder / "other.nii.gz").write_bytes((folder / "ct.nii.gz").read_bytes())
+    path = write_case(folder, more='[ct]\nfile = "other.nii.gz"', name="two")
+    with pytest.raises(InputError, match="is not the CT of the skin"):
+        prepare(path, arm=False)
+
+
+@pytest.mark.parametrize("level", [-1000, -200, "high"])
+def test_a_level_of_air_that_cannot_be_is_refused(scene, level):
+    """``air_hu`` between air and fat."""
+    folder, _ = scene("alone")
+    with pytest.raises(InputError, match="air_hu"):
+        load_case(write_case(folder, more=f"[ct]\nair_hu = {level!r}".replace("'", '"'), name="level"))

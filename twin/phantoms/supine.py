@@ -1,0 +1,92 @@
+"""A patient on a CT table, with what else a scan shows: arms, mattress, table, sheet and line, each of known shape.
+
+LPS, mm; z along the bed, the patient on the back. The trunk is that of the embedded abdomen, cut by the image at head
+and feet.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from twin.phantoms import torso
+from twin.phantoms.ct_image import Grid, Part
+from twin.phantoms.implicit import Array, Field, capsule, ellipsoid, offset, within
+
+LESION_LPS_MM = (-55.0, 20.0, 0.0)
+"""In the right half of the trunk, nearer to the back."""
+BACK_MM = 106.0
+"""Where the back ends: here the mattress begins, mm along y."""
+TABLE_MM = BACK_MM + 32.0
+"""Where the table begins."""
+LINE_GAP_MM = 14.0
+"""How far the line runs in front of the trunk, mm."""
+
+Arms = Literal["down", "up", "none"]
+
+
+def slab(low: tuple[float, float, float], high: tuple[float, float, float]) -> Field:
+    """A box with edges along the axes."""
+    a, b = np.array(low), np.array(high)
+
+    def field(points: Array) -> Array:
+        return np.asarray(np.maximum(a - points, points - b).max(axis=1))
+
+    return field
+
+
+def trunk_parts() -> list[Part]:
+    """Fat, muscle, spine and lesion of the trunk."""
+    return [
+        Part("trunk", torso.skin, -100.0),
+        Part("muscle", offset(torso.skin, -22.0), 45.0),
+        Part("spine", capsule((0, 36, -300), (0, 36, 300), 21.0), 420.0),
+        Part("lesion", ellipsoid(LESION_LPS_MM, (12, 12, 12)), 90.0),
+    ]
+
+
+def arm_parts(arms: Arms) -> list[Part]:
+    """Both arms beside the trunk (with a gap), or over the head, where this scan does not see them; skin and bone."""
+    if arms != "down":
+        return []
+    parts = []
+    for side, x in (("left", 215.0), ("right", -215.0)):
+        limb = capsule((x, 30, -320), (0.97 * x, 20, 320), 44.0, 40.0)
+        bone = capsule((x, 30, -320), (0.97 * x, 20, 320), 12.0)
+        parts += [Part(f"arm_{side}", limb, 20.0), Part(f"humerus_{side}", bone, 700.0)]
+    return parts
+
+
+def bed_parts() -> list[Part]:
+    """A mattress of foam in a cover, and a table of two shells about foam."""
+    wide, long = 280.0, 400.0
+    mattress = slab((-wide, BACK_MM, -long), (wide, TABLE_MM - 2.0, long))
+    table = slab((-wide, TABLE_MM, -long), (wide, TABLE_MM + 40.0, long))
+    return [
+        Part("mattress", mattress, -120.0),
+        Part("mattress_foam", offset(mattress, -2.0), -960.0),
+        Part("table", table, 60.0),
+        Part("table_foam", offset(table, -3.0), -930.0),
+    ]
+
+
+def line_part() -> Part:
+    """An infusion line of 5 mm across the front of the trunk."""
+    front = -112.0 - LINE_GAP_MM
+    return Part("line", capsule((-150, front, 30), (150, front, 30), 2.5), 80.0)
+
+
+def sheet_part() -> Part:
+    """A folded sheet of 6 mm over the front of the trunk, on its left."""
+    band = within(offset(torso.skin, 18.0), [slab((20, -200, -400), (150, 0, 400))], 0.5)
+    hollow = offset(torso.skin, 12.0)
+    return Part("sheet", within(band, [lambda points: -hollow(points)], 0.5), -550.0)
+
+
+def grid(spacing_mm: float = 4.0, slice_mm: float = 4.0) -> Grid:
+    """A field of view of 600 x 380 x 160 mm: the whole width of patient and arms, part of the trunk's length."""
+    spacing = (spacing_mm, spacing_mm, slice_mm)
+    size = (600.0, 380.0, 160.0)
+    shape = tuple(round(length / step) for length, step in zip(size, spacing, strict=True))
+    return Grid((-300.0 + spacing_mm / 2, -190.0, -80.0), spacing, (shape[0], shape[1], shape[2]))
