@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from planning.along_path import Stretch, stretches
 from planning.anatomy import Anatomy
 from planning.candidates import Candidates
 from planning.case import Case
@@ -65,8 +67,23 @@ class Explanation:
             "reach_margin": finite(row.reach_margin[0]),
             "safe_cone_deg": finite(np.degrees(row.safe_cone[0])),
             "cost": finite(row.cost[0]),
+            "along_path": [
+                {
+                    "start_mm": part.start_mm,
+                    "end_mm": part.end_mm,
+                    "structures": list(part.structures),
+                    "hu": [finite(part.hu_low), finite(part.hu_median), finite(part.hu_high)],
+                }
+                for part in self.along_path
+            ],
             "warnings": list(self.anatomy.warnings),
         }
+
+    @cached_property
+    def along_path(self) -> tuple[Stretch, ...]:
+        """The CT along the path, beside the structures; empty without a CT."""
+        row = self.candidates
+        return stretches(self.anatomy, self.case.target_ct, row.outward_ct[0], float(row.path_length[0]))
 
     def text(self) -> str:
         """The same for a person."""
@@ -74,7 +91,15 @@ class Explanation:
         verdict = row.safe_text if self.safe else self.verdict
         head = f"theta {np.degrees(row.theta[0]):g} deg, beta {np.degrees(row.beta[0]):g} deg: {verdict}"
         return "\n".join(
-            [f"case {self.case.name}", head, *self._reason(), *self._path(), *self._table(), *self._rest()]
+            [
+                f"case {self.case.name}",
+                head,
+                *self._reason(),
+                *self._path(),
+                *self._scan(),
+                *self._table(),
+                *self._rest(),
+            ]
         )
 
     def _reason(self) -> list[str]:
@@ -95,11 +120,23 @@ class Explanation:
             f"  tissue crossed {row.tissue[0]:8.2f} mm",
         ]
 
+    def _scan(self) -> list[str]:
+        """Depths, Hounsfield units and structures, from the target outward."""
+        if not self.along_path:
+            return []
+        lines = ["  along the path, mm from the target:   HU least, median, most   inside of"]
+        for part in self.along_path:
+            hu = f"{part.hu_low:8.0f} {part.hu_median:8.0f} {part.hu_high:8.0f}"
+            lines.append(
+                f"    {part.start_mm:6.0f} to {part.end_mm:4.0f} {hu:>41s}   {', '.join(part.structures) or '-'}"
+            )
+        return lines
+
     def _table(self) -> list[str]:
         lines = ["  structure                        role       clearance mm   margin mm"]
         clearances = self.candidates.clearance[0]
         for column in np.argsort(clearances, kind="stable"):
-            structure = self.anatomy.structures[column]
+            structure = self.anatomy.checked[column]
             margin = f"{structure.margin_mm:11.2f}" if structure.demands_margin else "          -"
             short = structure.demands_margin and clearances[column] < structure.margin_mm
             lines.append(
