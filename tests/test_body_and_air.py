@@ -12,9 +12,11 @@ from planning.prepared import prepare
 from planning.reasons import Reason
 from planning.standoff import standoffs
 from twin.phantoms import supine
-from twin.phantoms.ct_image import rendered
+from twin.phantoms.ct_image import Part, rendered
+from twin.phantoms.implicit import ellipsoid
 
 STEP_DEG = 6.0
+KIDNEY_FIELD = ellipsoid((75.0, 40.0, 0.0), (20, 15, 40))
 NEEDLE = "length_mm = 210.0\nshaft_mm = 150.0\ndiameter_mm = 1.2"
 
 CASE = """
@@ -44,6 +46,7 @@ role = "target"
 {more}
 """
 SPINE = '[[structure]]\nname = "spine"\nlabelmap = "labels.nii.gz"\nlabel = 2\nrole = "avoid"\nmargin_mm = 2.0\n'
+KIDNEY = SPINE.replace("spine", "kidney").replace("label = 2", "label = 5")
 HUMERI = "".join(
     f'[[structure]]\nname = "humerus_{side}"\nlabelmap = "labels.nii.gz"\nlabel = {label}\nrole = "avoid"\n'
     f"margin_mm = 2.0\n"
@@ -52,13 +55,14 @@ HUMERI = "".join(
 
 
 def write_scene(folder, parts, grid, seed=3):
-    """``ct.nii.gz`` of the scene, and ``labels.nii.gz`` of lesion (1), spine (2) and humeri (3, 4)."""
+    """``ct.nii.gz`` of the scene, and ``labels.nii.gz`` of lesion (1), spine (2), humeri (3, 4) and kidney (5)."""
     hu = rendered(parts, grid, noise_hu=15.0, rng=np.random.default_rng(seed))
     labels = np.zeros(grid.shape, np.uint8)
     fields = {part.name: part.field for part in parts}
     for label, name in enumerate(("lesion", "spine", "humerus_left", "humerus_right"), start=1):
         if name in fields:
             labels[(fields[name](grid.centres()) < 0).reshape(grid.shape)] = label
+    labels[(KIDNEY_FIELD(grid.centres()) < 0).reshape(grid.shape)] = 5
     for name, values in (("ct", hu.astype(np.int16)), ("labels", labels)):
         image = sitk.GetImageFromArray(values.transpose(2, 1, 0))
         image.SetSpacing(grid.spacing_mm)
@@ -198,8 +202,8 @@ def test_a_bone_that_nobody_labelled_is_unknown(scene):
     """Without its label the spine is ``unnamed_dense``; ``trust_labels`` takes it for soft tissue, and says so."""
     folder, parts = scene("alone")
     spine = next(part for part in parts if part.name == "spine")
-    found = prepare(write_case(folder, structures=""), arm=False).search()
-    trusted = prepare(write_case(folder, structures="", search="trust_labels = true", name="trust"), arm=False)
+    found = prepare(write_case(folder, structures=KIDNEY), arm=False).search()
+    trusted = prepare(write_case(folder, structures=KIDNEY, search="trust_labels = true", name="trust"), arm=False)
 
     rows = through(found, trusted.case, spine)
     assert rows.sum() > 20
@@ -218,9 +222,6 @@ def test_a_named_bone_leaves_nothing_unnamed(scene):
 
 def test_gas_outside_of_hollow_organs_is_unknown(tmp_path):
     """A bubble of gas of 30 mm in the trunk that no bowel's label covers: no safe path through it."""
-    from twin.phantoms.ct_image import Part
-    from twin.phantoms.implicit import ellipsoid
-
     bubble = Part("bubble", ellipsoid((-55.0, -50.0, 0.0), (15, 15, 15)), -1000.0)
     write_scene(tmp_path, [*supine.trunk_parts(), bubble], supine.grid())
     prepared = prepare(write_case(tmp_path), arm=False)
