@@ -83,7 +83,7 @@ def outside_surface(image: OutsideImage, *, air_hu: float, where: str | Path) ->
     """The closed surface of what is dense outside of the body, LPS mm; None where there is only air.
 
     Where the border of the image cuts it, it goes on beyond: every cut section is drawn out by ``BEYOND_MM``, and of
-    bulky pieces also the convex hull of all cut sections at one face.
+    bulky pieces also the convex hull of all cut sections at one side.
 
     Args:
         image: The CT and its body.
@@ -131,13 +131,16 @@ def _drawn_out(surface: TriangleMesh, image: OutsideImage) -> TriangleMesh:
 
 
 def _hulls_beyond(mask: Mask, image: OutsideImage) -> list[TriangleMesh]:
-    """Prisms beyond each face of the image, over the convex hull of the bulky pieces that the face cuts."""
+    """Prisms beyond the sides of the image, over the convex hull of the bulky pieces that a side cuts.
+
+    Not beyond head and feet: there a table goes on as it is cut.
+    """
     labels, _ = ndimage.label(mask, FULL)
     sizes = np.bincount(labels.ravel()) * float(np.prod(image.spacing_mm)) / 1000.0
     sizes[0] = 0.0
     bulky = (sizes >= BULKY_ML)[labels]
     prisms = []
-    for axis, end in itertools.product(range(3), (0, -1)):
+    for axis, end in itertools.product((0, 1), (0, -1)):
         cut = np.argwhere(bulky.take(end, axis=axis))
         corners = (cut[:, None] + np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])).reshape(-1, 2)
         if len(corners):
