@@ -10,6 +10,8 @@ from __future__ import annotations
 import json
 import sys
 import traceback
+import warnings
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -22,7 +24,7 @@ from typer._click.exceptions import ClickException  # typer carries its own clic
 from meshes import folder as meshes_folder
 from planning.batch import run_batch
 from planning.case import load_case
-from planning.errors import MOST_WHAT, InputError, NoAnswerError, PlanningError, one_line
+from planning.errors import MOST_WHAT, CacheWarning, InputError, NoAnswerError, PlanningError, one_line
 from planning.export import FORMATS
 from planning.files import check_writable
 from planning.prepared import prepare
@@ -311,6 +313,26 @@ def _print(summary: dict[str, Any], text: str, as_json: bool) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
+    with warnings.catch_warnings():
+        warnings.showwarning = _notes(warnings.showwarning)
+        return _run(arguments)
+
+
+def _notes(usual: Callable[..., None]) -> Callable[..., None]:
+    """Says in one line, once, what was made anew; other warnings are Python's."""
+    said: set[str] = set()
+
+    def show(message: Warning | str, category: type[Warning], *rest: Any) -> None:
+        if not issubclass(category, CacheWarning):
+            usual(message, category, *rest)
+        elif str(message) not in said:
+            said.add(str(message))
+            print(f"note: {message}", file=sys.stderr)
+
+    return show
+
+
+def _run(arguments: list[str] | None) -> int:
     try:
         result = app(arguments, standalone_mode=False)
     except InputError as error:

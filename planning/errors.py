@@ -44,6 +44,10 @@ class NoAnswerError(PlanningError):
         super().__init__(message)
 
 
+class CacheWarning(UserWarning):
+    """Something kept from an earlier run could not be trusted and was made anew: the answer is the same."""
+
+
 def one_line(text: str, most: int = MOST_MESSAGE) -> str:
     """A text as one printable line.
 

@@ -19,7 +19,7 @@ from planning.mesh import TriangleMesh
 from planning.outside_body import OutsideImage, outside_surface
 from planning.second_witness import BodyImage, Named, Unnamed, unnamed_surfaces
 from planning.skin import Skin
-from planning.surfaces import VolumeSurfaces
+from planning.surfaces import VolumeSurfaces, kept_mesh
 from planning.voxelize import voxels_inside
 
 SKIN_TOLERANCE_MM = 3.0
@@ -106,7 +106,8 @@ class Scan:
     ) -> list[TriangleMesh | None]:
         """Meshes from the cache, made where they are not there; None is kept too."""
         skin = None if self.skin is None else _digest(self.skin.mesh)
-        return _to_meshes(self.source.kept({"skin": skin, **made_from}, lambda: _of_meshes(make())))
+        made_from = {"skin": skin, **made_from}
+        return _to_meshes(self.source.kept(made_from, lambda: _of_meshes(make()), by=__name__, check=_to_meshes))
 
 
 def _digest(mesh: TriangleMesh) -> str:
@@ -122,7 +123,4 @@ def _of_meshes(meshes: list[TriangleMesh | None]) -> Arrays:
 
 
 def _to_meshes(stored: Arrays) -> list[TriangleMesh | None]:
-    return [
-        TriangleMesh(stored[f"vertices{n}"], stored[f"faces{n}"]) if f"faces{n}" in stored else None
-        for n in range(int(stored["count"]))
-    ]
+    return [kept_mesh(stored, n) if f"faces{n}" in stored else None for n in range(int(stored["count"]))]

@@ -11,11 +11,14 @@ from typing import Any
 import numpy as np
 
 from planning.cache import Arrays, Cache
+from planning.formats.guard import guard_mesh
 from planning.formats.label_surface import label_mesh
 from planning.formats.labelmaps import LabelMap, labelmap_of, segment_names
 from planning.formats.volumes import Volume, parse_header, parse_volume
 from planning.mesh import TriangleMesh
 from planning.skin import FieldOfView, Skin, skin_from_ct, skin_from_label
+
+LABELS_PRESENT = "labels present"
 
 
 @dataclass(frozen=True)
@@ -53,13 +56,13 @@ class VolumeSurfaces:
 
     def labels_present(self) -> tuple[int, ...]:
         """The labels that have a voxel, ascending."""
-        stored = self._arrays("labels present", lambda: {"labels": np.array(self.labelmap.labels_present(), np.int64)})
+        stored = self._arrays(LABELS_PRESENT, lambda: {"labels": np.array(self.labelmap.labels_present(), np.int64)})
         return tuple(int(label) for label in stored["labels"])
 
     def label(self, label: int) -> TriangleMesh:
         """The surface of one label, LPS mm."""
         stored = self._arrays(f"label {label}", lambda: _of_mesh(label_mesh(self.labelmap, label, where=self.path)))
-        return TriangleMesh(stored["vertices"], stored["faces"])
+        return kept_mesh(stored)
 
     def skin_of_label(self, label: int) -> Skin:
         """The skin of a label that is the body."""
@@ -69,12 +72,20 @@ class VolumeSurfaces:
         """The skin of the body found in a CT."""
         return _to_skin(self._arrays("skin", lambda: _of_skin(skin_from_ct(self.volume))))
 
-    def kept(self, made_from: Mapping[str, Any], make: Callable[[], Arrays]) -> Arrays:
-        """Arrays that are made from this file and from what ``made_from`` says, from the cache where they are there."""
-        return self.cache.arrays({"files": self.sha256, **made_from}, make)
+    def kept(
+        self,
+        made_from: Mapping[str, Any],
+        make: Callable[[], Arrays],
+        *,
+        by: str,
+        check: Callable[[Arrays], object] | None = None,
+    ) -> Arrays:
+        """Arrays that are made from this file and from what ``made_from`` says; see `Cache.arrays`."""
+        return self.cache.arrays({"files": self.sha256, **made_from}, make, by=by, check=check)
 
     def _arrays(self, what: str, make: Callable[[], Arrays]) -> Arrays:
-        return self.kept({"what": what}, make)
+        check = _to_skin if what.startswith("skin") else _check_labels if what == LABELS_PRESENT else kept_mesh
+        return self.kept({"what": what}, make, by=__name__, check=check)
 
 
 def _of_mesh(mesh: TriangleMesh) -> Arrays:
@@ -90,5 +101,29 @@ def _of_skin(skin: Skin) -> Arrays:
 
 def _to_skin(stored: Arrays) -> Skin:
     view = FieldOfView(stored["T_ct_box"], stored["size_mm"], stored["cut"]) if "T_ct_box" in stored else None
-    mesh = TriangleMesh(stored["vertices"], stored["faces"])
-    return Skin(mesh, stored["cut_faces"], view, tuple(str(warning) for warning in stored["warnings"]))
+    mesh, cut_faces = kept_mesh(stored), stored["cut_faces"]
+    if cut_faces.shape != (len(mesh.faces),):
+        raise ValueError("one flag for each triangle")
+    return Skin(mesh, cut_faces, view, tuple(str(warning) for warning in stored["warnings"]))
+
+
+def kept_mesh(stored: Arrays, number: int | str = "") -> TriangleMesh:
+    """A surface, which went through the guard before it was stored, and does again: kept files may be anything.
+
+    Args:
+        stored: With ``vertices`` and ``faces``.
+        number: Behind these two names, where there are several.
+
+    Raises:
+        KeyError, TypeError, InputError: It is none.
+    """
+    vertices, faces = stored[f"vertices{number}"], stored[f"faces{number}"]
+    if vertices.dtype != np.float64 or faces.dtype != np.int32:
+        raise TypeError("a mesh of other types than ours")
+    return guard_mesh(vertices, faces, where="cache")
+
+
+def _check_labels(stored: Arrays) -> None:
+    labels = stored["labels"]
+    if labels.ndim != 1 or labels.dtype != np.int64 or not len(labels):
+        raise ValueError("a list of labels")

@@ -1,9 +1,30 @@
 """The cache: right when it is right, and never trusted when it is not."""
 
+import os
+import pickle
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from planning.cache import Cache, user_cache
+from planning import cache as cache_module
+from planning.cache import LIBRARIES, Cache, user_cache
+from planning.cache_entry import packed
+from planning.errors import CacheWarning, InputError
+from planning.source_stamp import IMPORTED, NAME, PROJECT, closure, source_stamp
+
+BY = "planning.surfaces"
+MAKERS = (
+    "planning.surfaces",
+    "planning.scan",
+    "planning.robot.proofs",
+    "planning.robot.neighbours",
+    "twin.report.lighter_mesh",
+)
+"""Every module whose results are kept."""
 
 
 @pytest.fixture
@@ -17,73 +38,303 @@ def counted(calls):
 
     def make():
         calls.append(1)
-        return {"vertices": np.arange(12.0).reshape(4, 3), "names": np.array(["a", "bc"])}
+        return {
+            "vertices": np.arange(12.0).reshape(4, 3),
+            "names": np.array(["a", "bc"]),
+            "none": np.zeros((0, 3)),
+            "n": np.array(3),
+        }
 
     return make
 
 
+def entries(cache):
+    """The entries' files, in no order."""
+    return list(cache.folder.glob("*.arrays"))
+
+
 def test_the_second_time_nothing_is_made(cache):
-    """The same inputs give the stored arrays, bit for bit."""
+    """The same inputs give the stored arrays, bit for bit, with shape and type; nothing is said."""
     calls = []
-    first = cache.arrays({"file": "abc", "what": "label 5"}, counted(calls))
-    second = cache.arrays({"file": "abc", "what": "label 5"}, counted(calls))
+    first = cache.arrays({"file": "abc", "what": "label 5"}, counted(calls), by=BY)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        second = cache.arrays({"file": "abc", "what": "label 5"}, counted(calls), by=BY)
     assert len(calls) == 1
     assert set(second) == set(first)
     for name in first:
         np.testing.assert_array_equal(second[name], first[name])
+        assert (second[name].dtype, second[name].shape) == (first[name].dtype, first[name].shape)
+        assert not second[name].flags.writeable
 
 
 @pytest.mark.parametrize("other", [{"file": "abd"}, {"what": "label 6"}, {"extra": 1}])
 def test_other_inputs_are_made_anew(cache, other):
     """Any difference in what it was made from is another entry."""
     calls = []
-    cache.arrays({"file": "abc", "what": "label 5"}, counted(calls))
-    cache.arrays({"file": "abc", "what": "label 5"} | other, counted(calls))
+    cache.arrays({"file": "abc", "what": "label 5"}, counted(calls), by=BY)
+    cache.arrays({"file": "abc", "what": "label 5"} | other, counted(calls), by=BY)
     assert len(calls) == 2
 
 
-@pytest.mark.parametrize("spoil", [b"", b"PK garbage", None, "half", "flip"])
-def test_a_spoiled_file_is_made_anew_and_replaced(cache, spoil):
-    """Empty, foreign, missing, cut or with one bit turned: not used, and whole again afterwards."""
+def test_another_maker_is_another_entry(cache):
+    """What one module has made is not what another makes of the same inputs."""
     calls = []
-    made = cache.arrays({"file": "abc"}, counted(calls))
-    (path,) = cache.folder.glob("*.npz")
-    content = bytearray(path.read_bytes())
-    if spoil is None:
-        path.unlink()
-    elif spoil == "half":
-        path.write_bytes(content[: len(content) // 2])
-    elif spoil == "flip":
-        place = content.index(np.float64(7.0).tobytes())
-        content[place + 1] ^= 1
-        path.write_bytes(content)
-    else:
-        path.write_bytes(spoil)
-    again = cache.arrays({"file": "abc"}, counted(calls))
+    for by in MAKERS:
+        cache.arrays({"file": "abc"}, counted(calls), by=by)
+    assert len(calls) == len(MAKERS)
+
+
+def flipped(content, place):
+    """With one bit turned."""
+    changed = bytearray(content)
+    changed[place] ^= 1
+    return bytes(changed)
+
+
+SPOILS = {
+    "empty": lambda content: b"",
+    "foreign": lambda content: b"PK garbage",
+    "a pickle": lambda content: pickle.dumps({"vertices": np.zeros(3)}),
+    "half": lambda content: content[: len(content) // 2],
+    "one byte short": lambda content: content[:-1],
+    "one byte more": lambda content: content + b"\0",
+    "first bit": lambda content: flipped(content, 0),
+    "digest": lambda content: flipped(content, 30),
+    "header": lambda content: flipped(content, 60),
+    "last bit": lambda content: flipped(content, -1),
+    "a later layout": lambda content: content.replace(b"arrays 2", b"arrays 3"),
+}
+
+
+@pytest.mark.parametrize("spoil", SPOILS)
+def test_a_spoiled_file_is_made_anew_said_and_replaced(cache, spoil):
+    """Empty, foreign, a pickle, cut, longer, of another layout or with one bit turned: made anew, whole afterwards."""
+    calls = []
+    made = cache.arrays({"file": "abc"}, counted(calls), by=BY)
+    (path,) = entries(cache)
+    path.write_bytes(SPOILS[spoil](path.read_bytes()))
+    with pytest.warns(CacheWarning, match=r"cache: a kept result is cut, damaged, or another's; it is made anew"):
+        again = cache.arrays({"file": "abc"}, counted(calls), by=BY)
     np.testing.assert_array_equal(again["vertices"], made["vertices"])
     assert len(calls) == 2
-    cache.arrays({"file": "abc"}, counted(calls))
+    cache.arrays({"file": "abc"}, counted(calls), by=BY)
+    assert len(calls) == 2
+
+
+def test_every_flipped_byte_is_seen(cache):
+    """No byte of an entry is without the digest's protection."""
+    calls = []
+    cache.arrays({"file": "abc"}, counted(calls), by=BY)
+    (path,) = entries(cache)
+    content = path.read_bytes()
+    for place in range(0, len(content), 3):
+        path.write_bytes(flipped(content, place))
+        with pytest.warns(CacheWarning):
+            cache.arrays({"file": "abc"}, counted(calls), by=BY)
+
+
+@pytest.mark.parametrize("kind", ["folder", "full folder", "pipe", "link", "dangling link"])
+def test_something_else_in_an_entrys_place_is_replaced(cache, kind, tmp_path):
+    """A directory, a pipe (which is not waited for) and a link, even to the right content, are no entries."""
+    calls = []
+    cache.arrays({"file": "abc"}, counted(calls), by=BY)
+    (path,) = entries(cache)
+    (tmp_path / "elsewhere").write_bytes(path.read_bytes())
+    path.unlink()
+    if "folder" in kind:
+        path.mkdir()
+        if kind == "full folder":
+            (path / "x").write_text("x")
+    elif kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to(tmp_path / ("elsewhere" if kind == "link" else "nowhere"))
+    with pytest.warns(CacheWarning, match="is no plain file"):
+        cache.arrays({"file": "abc"}, counted(calls), by=BY)
+    assert len(calls) == 2
+    cache.arrays({"file": "abc"}, counted(calls), by=BY)
+    assert len(calls) == 2
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_an_unreadable_entry_is_replaced(cache):
+    """Its folder can be written to, so the next run has it again."""
+    calls = []
+    cache.arrays({"file": "abc"}, counted(calls), by=BY)
+    (path,) = entries(cache)
+    path.chmod(0)
+    with pytest.warns(CacheWarning, match="cannot be read"):
+        cache.arrays({"file": "abc"}, counted(calls), by=BY)
+    cache.arrays({"file": "abc"}, counted(calls), by=BY)
     assert len(calls) == 2
 
 
 def test_a_file_of_another_key_is_not_believed(cache):
     """An honest file under the wrong name would give one label another's surface; its digest says whose it is."""
     calls = []
-    cache.arrays({"file": "one"}, lambda: {"vertices": np.zeros((1, 3))})
-    (path,) = cache.folder.glob("*.npz")
-    cache.arrays({"file": "two"}, counted(calls))
-    (other,) = set(cache.folder.glob("*.npz")) - {path}
+    cache.arrays({"file": "one"}, lambda: {"vertices": np.zeros((1, 3))}, by=BY)
+    (path,) = entries(cache)
+    cache.arrays({"file": "two"}, counted(calls), by=BY)
+    (other,) = set(entries(cache)) - {path}
     other.write_bytes(path.read_bytes())
-    np.testing.assert_array_equal(cache.arrays({"file": "two"}, counted(calls))["vertices"].shape, (4, 3))
+    with pytest.warns(CacheWarning):
+        found = cache.arrays({"file": "two"}, counted(calls), by=BY)
+    np.testing.assert_array_equal(found["vertices"].shape, (4, 3))
+    assert len(calls) == 2
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"vertices": np.zeros((4, 2))}, {"vertices": np.zeros((4, 3), np.float32)}, {"other": np.zeros((4, 3))}],
+    ids=["shape", "type", "name"],
+)
+def test_a_whole_entry_with_other_arrays_is_made_anew(cache, wrong):
+    """A forged digest does not help: whoever uses the arrays says what they must be."""
+
+    def check(arrays):
+        if arrays["vertices"].shape[1] != 3 or arrays["vertices"].dtype != np.float64:
+            raise ValueError
+
+    calls = []
+    cache.arrays({"file": "abc"}, counted(calls), by=BY, check=check)
+    (path,) = entries(cache)
+    path.write_bytes(packed(wrong, path.name.split(".")[-2]))
+    with pytest.warns(CacheWarning, match="does not hold what it should"):
+        found = cache.arrays({"file": "abc"}, counted(calls), by=BY, check=check)
+    assert found["vertices"].shape == (4, 3)
     assert len(calls) == 2
 
 
 def test_a_folder_that_cannot_be_written_costs_nothing_but_time(tmp_path):
-    """A file stands where the folder should be: the result is made all the same."""
+    """A file stands where the folder should be: the result is made all the same, and nothing is said."""
     (tmp_path / "taken").write_text("")
     calls = []
-    Cache(tmp_path / "taken" / "cache").arrays({"file": "abc"}, counted(calls))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Cache(tmp_path / "taken" / "cache").arrays({"file": "abc"}, counted(calls), by=BY)
     assert len(calls) == 1
+
+
+def test_the_least_recently_used_goes_when_the_folder_is_full(tmp_path):
+    """The folder never holds more than its bound, and what was used last stays."""
+    cache = Cache(tmp_path, most_bytes=30_000)
+    calls = []
+
+    def ask(name):
+        def make():
+            calls.append(name)
+            return {"values": np.zeros(1000)}
+
+        cache.arrays({"name": name}, make, by=BY)
+        for age, path in enumerate(sorted(entries(cache), key=lambda p: p.stat().st_mtime_ns, reverse=True)):
+            os.utime(path, ns=(0, 10**18 - age * 10**9))  # file systems may keep time to a second only
+
+    for name in "abcab":
+        ask(name)
+    assert calls == ["a", "b", "c"]
+    ask("d")  # the fourth does not fit: c is the oldest
+    assert sum(path.stat().st_size for path in entries(cache)) <= 30_000
+    for name in "abd":
+        ask(name)
+    assert calls == ["a", "b", "c", "d"]
+    cache.arrays({"name": "large"}, lambda: {"values": np.zeros(10_000)}, by=BY)
+    assert len(entries(cache)) == 3  # what does not fit at all drives nothing out
+
+
+def test_what_older_versions_left_is_cleared(cache, monkeypatch):
+    """Another version of a library or of the code: made anew, and what can never be used again is removed."""
+    calls = []
+    cache.arrays({"file": "abc"}, counted(calls), by=BY)
+    cache.arrays({"file": "abc"}, counted(calls), by=MAKERS[1])
+    (cache.folder / ("0" * 64 + ".npz")).write_bytes(b"of layout 1")
+    (cache.folder / "notes.txt").write_text("a user's own")
+    dead, alive = cache.folder / ".x.arrays", cache.folder / ".y.arrays"
+    for temporary in (dead, alive):
+        temporary.write_bytes(b"half")
+    os.utime(dead, (0, 0))
+    cache_module._generation.cache_clear()
+    monkeypatch.setattr(cache_module, "library_versions", lambda names: dict.fromkeys(names, "next"))
+    cache.arrays({"file": "abc"}, counted(calls), by=BY)
+    cache_module._generation.cache_clear()
+    assert len(calls) == 3
+    left = {path.name for path in cache.folder.iterdir()}
+    assert len(entries(cache)) == 2 + alive.exists()
+    assert {"notes.txt", ".y.arrays"} <= left
+    assert not {"0" * 64 + ".npz", ".x.arrays"} & left
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_the_libraries_of_every_maker_are_in_the_key(maker):
+    """Whatever its code imports is this project, Python's own or a library whose version counts."""
+    files = closure([PROJECT / (maker.replace(".", "/") + ".py")])
+    imports = [found for path in files for found in IMPORTED.findall(path.read_bytes())]
+    modules = {name for module, _, listed in imports for name in ([module] if module else NAME.findall(listed))}
+    tops = {module.decode().split(".")[0] for module in modules}
+    packages = {"skimage": "scikit-image", "fcl": "python-fcl", "fast_simplification": "fast-simplification"}
+    foreign = tops - set(sys.stdlib_module_names) - {"planning", "twin"}
+    assert {packages.get(name, name) for name in foreign} <= set(LIBRARIES)
+    assert len(source_stamp(maker)) == 64
+
+
+def test_the_code_that_makes_a_surface_is_in_its_stamp():
+    """From reading a file to the surface: each of these modules decides what is kept."""
+    names = {str(path.relative_to(PROJECT)) for path in closure([PROJECT / "planning" / "surfaces.py"])}
+    wanted = ("skin", "body_mask", "formats/label_surface", "formats/nifti_header", "formats/inflate", "formats/voxels")
+    assert {f"planning/{name}.py" for name in wanted} <= names
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from planning.made.inner import make",
+        "from planning.made import inner",
+        "from planning.made import (\n    inner as other,\n)",
+        "import planning.made.inner",
+        "def late():\n    from planning.made.inner import make",
+        "from planning.made import make  # handed on by the package without an import statement",
+    ],
+)
+def test_an_edit_behind_any_kind_of_import_changes_the_stamp(tmp_path, line):
+    """A module, a name of a module, a package that hands on names, inside a function or not."""
+    made = tmp_path / "planning" / "made"
+    made.mkdir(parents=True)
+    source = Path(cache_module.__file__).with_name("source_stamp.py")
+    (tmp_path / "planning" / "source_stamp.py").write_bytes(source.read_bytes())
+    (tmp_path / "planning" / "__init__.py").write_text("")
+    (made / "__init__.py").write_text("")
+    (tmp_path / "planning" / "maker.py").write_text(line + "\n")
+    stamps = []
+    for size in (1, 1, 2):
+        (made / "inner.py").write_text(f"SIZE = {size}\n")
+        code = "from planning.source_stamp import source_stamp; print(source_stamp('planning.maker'))"
+        environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+        options = {"cwd": tmp_path, "capture_output": True, "text": True, "check": True}
+        run = subprocess.run([sys.executable, "-c", code], env=environment, **options)
+        stamps.append(run.stdout)
+    assert stamps[0] == stamps[1] != stamps[2]
+
+
+SHARED = """
+import sys
+import numpy as np
+from pathlib import Path
+from planning.cache import Cache
+cache = Cache(Path(sys.argv[1]), most_bytes=400_000)
+for turn in range(200):
+    name = turn % 17
+    found = cache.arrays({"name": name}, lambda: {"values": np.full(5000, float(name))}, by="planning.surfaces")
+    assert np.all(found["values"] == name)
+"""
+
+
+def test_many_processes_may_share_a_folder(tmp_path):
+    """Each gets what it asked for, while all write and the oldest is driven out; nobody has to say anything."""
+    command = [sys.executable, "-W", "error", "-c", SHARED, str(tmp_path)]
+    running = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(4)]
+    assert [one.communicate()[1] for one in running] == [""] * 4
+    assert [one.returncode for one in running] == [0] * 4
+    assert sum(path.stat().st_size for path in tmp_path.glob("*.arrays")) <= 400_000
 
 
 def test_the_environment_names_the_folder(monkeypatch, tmp_path):
@@ -95,3 +346,15 @@ def test_the_environment_names_the_folder(monkeypatch, tmp_path):
     assert user_cache().folder == tmp_path / "own"
     monkeypatch.setenv("PUNCTURE_TWIN_CACHE", "")
     assert user_cache().folder is None
+
+
+def test_the_environment_bounds_the_size(monkeypatch):
+    """2 GB unless it says otherwise, in megabytes; anything else is refused in one line."""
+    monkeypatch.delenv("PUNCTURE_TWIN_CACHE_MB", raising=False)
+    assert user_cache().most_bytes == 2_000_000_000
+    monkeypatch.setenv("PUNCTURE_TWIN_CACHE_MB", "150")
+    assert user_cache().most_bytes == 150_000_000
+    for wrong in ("-1", "many", "1e3", "9" * 50):
+        monkeypatch.setenv("PUNCTURE_TWIN_CACHE_MB", wrong)
+        with pytest.raises(InputError, match="PUNCTURE_TWIN_CACHE_MB: .* is no size"):
+            user_cache()

@@ -15,7 +15,17 @@ from planning.cache import Cache
 from planning.case_file import EntryAxes
 from planning.entry import ANATOMICAL_LPS
 from planning.place.directions import ring_weights
-from twin.report import annotate, draw_film, draw_map, draw_scene, film, page, page_scene, scene_picture, write_page
+from twin.report import (
+    annotate,
+    draw_film,
+    draw_map,
+    draw_scene,
+    film,
+    lighter_mesh,
+    page,
+    scene_picture,
+    write_page,
+)
 from twin.report.camera import Camera, camera_around
 from twin.report.compositing import Shot, compose, empty_veil
 from twin.report.map_picture import FIGURE_INCHES, MAP_BOX, RIM
@@ -579,7 +589,7 @@ def test_lightened_meshes_are_kept(ball, tmp_path, monkeypatch):
     cache = Cache(tmp_path)
     (first,) = lightened(bodies, 2_000, cache)
     with monkeypatch.context() as patch:
-        patch.setattr(page_scene.fast_simplification, "simplify", None)
+        patch.setattr(lighter_mesh.fast_simplification, "simplify", None)
         (again,) = lightened(bodies, 2_000, cache)
         with pytest.raises(TypeError):
             lightened(bodies, 1_000, cache)

@@ -42,6 +42,7 @@ def without_neighbours(model: UrModel, checks: Sequence[Check], proofs: Proofs, 
     stored = cache.arrays(
         made_from("never touching", [model.lengths, proofs.joint_spans[between], *pieces]),
         lambda: {"never": never_touching(model, proofs, lambda check, frames: ask_fcl(checks[check], frames))[between]},
+        by=__name__,
     )
     never = between.copy()
     never[between] = stored["never"]

@@ -42,9 +42,6 @@ ROOM_FRAME = 0
 NO_BOX = -1.0
 """Half sizes of what is no box."""
 
-ENCLOSURES = 2
-"""Raised whenever what is kept about convex pieces is made in another way."""
-
 FIELD_MARGIN_MM = 500.0
 """How far around the skin distances are kept: beyond, they are seldom asked for."""
 
@@ -225,7 +222,7 @@ class _Hulls:
         """``hulls``, ``T_box_base`` and ``halves`` of :class:`Scene`."""
         count = len(self._boxes)
         boxes, bodies = _enclosed(self._corners[:count]), self._corners[count:]
-        arm = cache.arrays(made_from("hulls", bodies), lambda: _enclosed(bodies))
+        arm = cache.arrays(made_from("hulls", bodies), lambda: _enclosed(bodies), by=__name__)
         centres, radii, slack, sizes, few, degrees = (
             np.concatenate([boxes[key], arm[key]]) for key in ("centres", "radii", "slack", "sizes", "few", "degrees")
         )
@@ -264,7 +261,7 @@ def made_from(what: str, pieces: Sequence[NDArray[Any]]) -> dict[str, object]:
     for corners in pieces:
         digest.update(f"{corners.shape}".encode())
         digest.update(np.ascontiguousarray(corners).tobytes())
-    return {"what": what, "layout": ENCLOSURES, "pieces": digest.hexdigest(), **enclosures.settings()}
+    return {"what": what, "pieces": digest.hexdigest(), **enclosures.settings()}
 
 
 def _starts(sizes: Sequence[int] | Indices) -> Indices:
@@ -301,7 +298,7 @@ def _trees(bodies: Sequence[Body], cache: Cache) -> tuple[dict[str, int], tuple[
     centres, radii, children = [np.empty((0, 3))], [np.empty(0)], [np.empty((0, 2), np.int64)]
     for body in bodies:
         pieces = [_in_frame(hull, body) for hull in body.full.hulls]
-        tree = BallTree(**cache.arrays(made_from("balls", pieces), partial(_tree_arrays, pieces)))
+        tree = BallTree(**cache.arrays(made_from("balls", pieces), partial(_tree_arrays, pieces), by=__name__))
         start = sum(len(part) for part in radii)
         roots[body.name] = start
         centres.append(tree.centres)

@@ -5,16 +5,14 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from dataclasses import replace
-from hashlib import sha256
 from typing import Any
 
-import fast_simplification
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.cache import NO_CACHE, Arrays, Cache
+from planning.cache import NO_CACHE, Cache
 from planning.candidates import Candidates
-from planning.mesh import TriangleMesh
+from twin.report.lighter_mesh import lighter_mesh
 from twin.report.map_view import body_directions
 from twin.report.palette import css
 from twin.report.render import Layer
@@ -37,9 +35,6 @@ VIEW = (1200, 640)
 
 LEAST_TRIANGLES = 300
 """A body is never cut below this."""
-
-WELDED = 0.75
-"""Corners per triangle; a closed surface that shares its corners has half a corner per triangle."""
 
 LABEL_OUT_MM = 45.0
 LEGEND_SHARE = 0.14
@@ -78,35 +73,8 @@ def scene_figure(
 def lightened(bodies: Sequence[Body], triangles: int, cache: Cache = NO_CACHE) -> list[Body]:
     """The bodies with about so many triangles altogether, each cut by the same share."""
     share = min(1.0, triangles / max(1, sum(len(b.mesh.faces) for b in bodies)))
-    light = []
-    for body in bodies:
-        wanted = max(LEAST_TRIANGLES, int(share * len(body.mesh.faces)))
-        light.append(body if wanted >= len(body.mesh.faces) else _lighter(body, wanted, cache))
-    return light
-
-
-def _lighter(body: Body, wanted: int, cache: Cache) -> Body:
-    mesh = body.mesh
-    made_from = {
-        "what": "lighter mesh",
-        "vertices": sha256(mesh.vertices.tobytes()).hexdigest(),
-        "faces": sha256(mesh.faces.tobytes()).hexdigest(),
-        "triangles": wanted,
-        "by": fast_simplification.__version__,
-    }
-    found = cache.arrays(made_from, lambda: _simplified(mesh, wanted))
-    if len(found["faces"]) == 0:  # nothing may vanish from a picture
-        return body
-    return replace(body, mesh=TriangleMesh(found["vertices"], found["faces"]))
-
-
-def _simplified(mesh: TriangleMesh, wanted: int) -> Arrays:
-    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
-    if len(vertices) > WELDED * len(faces):  # a robot's STL shares no corners
-        vertices, welded = np.unique(vertices, axis=0, return_inverse=True)
-        faces = np.ascontiguousarray(welded.reshape(-1)[faces], dtype=np.int32)
-    vertices, faces = fast_simplification.simplify(vertices, faces, target_count=wanted)
-    return {"vertices": np.asarray(vertices, dtype=np.float64), "faces": np.asarray(faces, dtype=np.int32)}
+    wanted = [max(LEAST_TRIANGLES, int(share * len(body.mesh.faces))) for body in bodies]
+    return [replace(body, mesh=lighter_mesh(body.mesh, most, cache)) for body, most in zip(bodies, wanted, strict=True)]
 
 
 def _bodies(case: Any, anatomy: Any, candidates: Candidates, plan: Any | None) -> tuple[list[Body], list[Body]]:
