@@ -13,8 +13,6 @@ Files outside the project are left to numba.
 
 from __future__ import annotations
 
-import hashlib
-import re
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,14 +20,14 @@ from typing import Any
 from numba.core import config as numba_config
 from numba.core.caching import InTreeCacheLocator, UserProvidedCacheLocator, UserWideCacheLocator
 
+from planning.kernel_files import ProjectStamp, use_checked_files
+from planning.source_stamp import PACKAGES, PROJECT, library_versions, stamp_of
+
 config: Any = numba_config
 """It makes its attributes when it is loaded."""
 
-PROJECT = Path(__file__).resolve().parents[1]
-PACKAGES = ("planning", "twin")
-
-IMPORTED = re.compile(rb"^ *(?:from|import) ((?:planning|twin)[\w.]*)", re.MULTILINE)
-"""The module of an import from the project."""
+COMPILERS = ("numba", "llvmlite", "numpy")
+"""Whose versions decide what is compiled."""
 
 NUMBAS = (
     "UserProvidedCacheLocator",
@@ -42,24 +40,15 @@ NUMBAS = (
 
 
 @cache
-def kernels_stamp() -> str:
+def kernels_stamp() -> ProjectStamp:
     """A hash of every source file of the project that speaks of numba, and of all that they import from the project.
 
-    What they import counts too: numba freezes a constant into the kernel that names it.
+    What they import counts too: numba freezes a constant into the kernel that names it. So do the compilers' versions.
     """
-    sources = {path: path.read_bytes() for package in PACKAGES for path in (PROJECT / package).rglob("*.py")}
-    waiting = [path for path, source in sources.items() if b"numba" in source]
-    taken: set[Path] = set()
-    while waiting:
-        path = waiting.pop()
-        if path not in taken and path in sources:
-            taken.add(path)
-            named = (PROJECT / name.decode().replace(".", "/") for name in IMPORTED.findall(sources[path]))
-            waiting += [file for module in named for file in (module.with_suffix(".py"), module / "__init__.py")]
-    stamp = hashlib.sha256()
-    for path in sorted(taken):
-        stamp.update(str(path.relative_to(PROJECT)).encode() + hashlib.sha256(sources[path]).digest())
-    return stamp.hexdigest()
+    files = [
+        path for package in PACKAGES for path in (PROJECT / package).rglob("*.py") if b"numba" in path.read_bytes()
+    ]
+    return ProjectStamp(f"{stamp_of(files)} {library_versions(COMPILERS)}")
 
 
 class _OfTheProject:
@@ -70,7 +59,7 @@ class _OfTheProject:
         ours = any(Path(py_file).resolve().is_relative_to(PROJECT / package) for package in PACKAGES)
         return super().from_function(py_func, py_file) if ours else None
 
-    def get_source_stamp(self) -> str:
+    def get_source_stamp(self) -> ProjectStamp:
         return kernels_stamp()
 
 
@@ -90,4 +79,5 @@ def use_kernel_cache() -> None:
     """Let numba try these places first; a user's own setting stays in force behind them."""
     ours = [f"{__name__}.{place.__name__}" for place in (SetFolder, BesideSource, UserFolder)]
     theirs = config.CACHE_LOCATOR_CLASSES.split(",") if config.CACHE_LOCATOR_CLASSES else list(NUMBAS)
+    use_checked_files()
     config.CACHE_LOCATOR_CLASSES = ",".join([*ours, *(place for place in theirs if place not in ours)])

@@ -1,6 +1,7 @@
-"""Compiled kernels are made anew when any kernel's source has changed, also one that they only take in."""
+"""Compiled kernels are made anew when any kernel's source has changed, or a file of theirs is not whole."""
 
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -9,6 +10,9 @@ from pathlib import Path
 import pytest
 
 import planning
+
+COPIED = (*("__init__.py", "kernel_cache.py", "kernel_files.py", "source_stamp.py", "cache_entry.py", "errors.py"),)
+"""What a project needs to keep its kernels as ours does."""
 
 CALLEE = (
     "import numba as nb\nfrom planning.room import SIZE\n\n"
@@ -19,28 +23,39 @@ CALLER = (
 )
 
 
-def _answer(project, own):
-    """What the kernel says in a process of its own, and how often it came from the cache."""
+def _run(project, own=True):
+    """Let a process of its own ask the kernel, and say how often it came from the cache."""
     lines = ["import planning, numba", "" if own else "numba.core.config.CACHE_LOCATOR_CLASSES = ''"]
     lines += ["from planning.caller import judge", "print(judge(1), sum(judge.stats.cache_hits.values()))"]
     code = "\n".join(lines)
     environment = os.environ | {"PYTHONPATH": str(project), "NUMBA_CACHE_DIR": str(project / "cache")}
-    run = subprocess.run(
+    return subprocess.run(
         [sys.executable, "-c", code], env=environment, cwd=project, capture_output=True, text=True, check=True
     )
-    return tuple(int(word) for word in run.stdout.split())
 
 
-@pytest.mark.parametrize("own", [True, False], ids=["ours", "numba's"])
-def test_an_edit_of_a_kernel_that_is_taken_in_reaches_its_callers(tmp_path, own):
-    """Numba alone goes on answering by the old rule: then this module is not needed any more."""
+def _answer(project, own=True):
+    """What the kernel says in a process of its own, and how often it came from the cache."""
+    return tuple(int(word) for word in _run(project, own).stdout.split())
+
+
+@pytest.fixture
+def project(tmp_path):
+    """A project with a kernel that takes in another."""
     folder = tmp_path / "planning"
     folder.mkdir()
-    for name in ("__init__.py", "kernel_cache.py"):
+    for name in COPIED:
         shutil.copy(Path(planning.__file__).parent / name, folder)
     (folder / "caller.py").write_text(CALLER)
     (folder / "room.py").write_text("SIZE = 1\n")
     (folder / "callee.py").write_text(CALLEE.format(1))
+    return tmp_path
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["ours", "numba's"])
+def test_an_edit_of_a_kernel_that_is_taken_in_reaches_its_callers(project, own):
+    """Numba alone goes on answering by the old rule: then this module is not needed any more."""
+    tmp_path, folder = project, project / "planning"
     assert _answer(tmp_path, own) == (2, 0)
     assert _answer(tmp_path, own) == (2, 1)
     (folder / "callee.py").write_text(CALLEE.format(10))
@@ -51,17 +66,97 @@ def test_an_edit_of_a_kernel_that_is_taken_in_reaches_its_callers(tmp_path, own)
     assert _answer(tmp_path, own) == ((21, 1) if own else (2, 1))
 
 
+def _kept(project, ending):
+    """The files of the kernel that is asked."""
+    return [path for path in (project / "cache").rglob(f"*{ending}") if path.name.startswith("caller.")]
+
+
+SPOILS = {
+    "empty": lambda content: b"",
+    "half": lambda content: content[: len(content) // 2],
+    "one byte short": lambda content: content[:-1],
+    "a pickle": lambda content: pickle.dumps({}),
+    "garbage": lambda content: b"garbage",
+    "a bit in the middle": lambda content: content[: len(content) // 2] + b"\xa5" + content[len(content) // 2 + 1 :],
+    "a bit at the end": lambda content: content[:-1] + bytes([content[-1] ^ 1]),
+}
+
+
+@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
+def test_a_damaged_file_is_compiled_anew_said_once_and_replaced(project, ending):
+    """Index and data, cut, changed or foreign: the same answer, one line, and the next run has it again."""
+    assert _answer(project) == (2, 0)
+    assert _answer(project) == (2, 1)
+    (path,) = _kept(project, ending)
+    whole = path.read_bytes()
+    for name, spoil in SPOILS.items():
+        assert spoil(whole) != whole, name
+        path.write_bytes(spoil(whole))
+        run = _run(project)
+        assert run.stdout.split() == ["2", "0"], name
+        assert run.stderr.count("CacheWarning: cache: a compiled kernel is cut, damaged, or another's") == 1, name
+        again = _run(project)
+        assert (again.stdout.split(), again.stderr) == (["2", "1"], ""), name
+
+
+@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
+def test_a_folder_in_a_files_place_is_replaced(project, ending):
+    """Numba alone would end in an error."""
+    assert _answer(project) == (2, 0)
+    (path,) = _kept(project, ending)
+    path.unlink()
+    path.mkdir()
+    (path / "x").write_text("")
+    run = _run(project)
+    assert run.stdout.split() == ["2", "0"]
+    assert "a compiled kernel is no plain file" in run.stderr
+    assert _answer(project) == (2, 1)
+
+
+def test_machine_code_of_another_kernel_is_not_run(project):
+    """Swapped data files are honest, but under the wrong name."""
+    other = CALLER.replace("judge", "other").replace("rule(x)", "rule(x) + 100")
+    (project / "planning" / "caller.py").write_text(CALLER + other.split("\n\n", 1)[1])
+    (project / "both.py").write_text(
+        "import planning\nfrom planning.caller import judge, other\nprint(judge(1), other(1))\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(project), "NUMBA_CACHE_DIR": str(project / "cache")}
+    command = [sys.executable, str(project / "both.py")]
+    options = {"env": environment, "cwd": project, "capture_output": True, "text": True, "check": True}
+    assert subprocess.run(command, **options).stdout.split() == ["2", "102"]
+    one, two = _kept(project, ".nbc")
+    contents = one.read_bytes(), two.read_bytes()
+    one.write_bytes(contents[1])
+    two.write_bytes(contents[0])
+    run = subprocess.run(command, **options)
+    assert run.stdout.split() == ["2", "102"]
+    assert "CacheWarning" in run.stderr
+
+
+def test_what_a_function_left_under_older_sources_is_cleared(project):
+    """Numba names its files by the function's line: after an edit above, the old ones would stay for ever."""
+    assert _answer(project) == (2, 0)
+    before = {path.name for ending in (".nbi", ".nbc") for path in _kept(project, ending)}
+    (project / "planning" / "caller.py").write_text("# one line more\n" + CALLER)
+    assert _answer(project) == (2, 0)
+    after = {path.name for ending in (".nbi", ".nbc") for path in _kept(project, ending)}
+    assert len(before) == len(after) == 2
+    assert not before & after
+
+
 def test_kernels_of_others_are_left_to_numba(tmp_path):
     """A function outside the project is stamped with its own file."""
     project, other = tmp_path / "project", tmp_path / "other"
     (project / "planning").mkdir(parents=True)
     other.mkdir()
-    for name in ("__init__.py", "kernel_cache.py"):
+    for name in COPIED:
         shutil.copy(Path(planning.__file__).parent / name, project / "planning")
     (other / "stranger.py").write_text("import numba as nb\n\n@nb.njit(cache=True)\ndef f(x):\n    return x\n")
-    code = "import planning, stranger; print(type(stranger.f._cache._impl.locator).__module__)"
+    lines = ("import planning, stranger", "cache = stranger.f._cache")
+    lines += ("print(type(cache._impl.locator).__module__, type(cache._cache_file).__name__)",)
+    code = "; ".join(lines)
     environment = os.environ | {"PYTHONPATH": f"{project}{os.pathsep}{other}"}
     run = subprocess.run(
         [sys.executable, "-c", code], env=environment, cwd=other, capture_output=True, text=True, check=True
     )
-    assert run.stdout.strip() == "numba.core.caching"
+    assert run.stdout.split() == ["numba.core.caching", "IndexDataCacheFile"]

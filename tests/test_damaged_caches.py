@@ -1,0 +1,99 @@
+"""Whatever lies in the caches, a command gives the same answer and says in one line what it made anew."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
+import trimesh
+
+CASE = """
+schema = 1
+name = "kept"
+space = "LPS"
+[target]
+position_mm = [0.0, 0.0, 0.0]
+structure = "organ"
+[needle]
+length_mm = 210.0
+shaft_mm = 150.0
+diameter_mm = 1.2
+[search]
+theta_deg = [0, 20]
+step_deg = 10.0
+[[structure]]
+name = "skin"
+mesh = "skin.stl"
+unit = "mm"
+role = "skin"
+[[structure]]
+name = "organ"
+mesh = "organ.stl"
+unit = "mm"
+role = "target"
+[[structure]]
+name = "vessel"
+labelmap = "labels.nii.gz"
+label = 3
+role = "avoid"
+"""
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small case beside two empty cache folders."""
+    here = tmp_path_factory.mktemp("kept")
+    for name, radius in (("skin", 90), ("organ", 20)):
+        trimesh.creation.icosphere(subdivisions=2, radius=radius).export(here / f"{name}.stl")
+    labels = np.zeros((100, 100, 100), np.uint8)
+    labels[48:52, 28:32, 48:52] = 3
+    image = sitk.GetImageFromArray(labels)
+    image.SetSpacing((2.0, 2.0, 2.0))
+    image.SetOrigin((-99.0, -99.0, -99.0))
+    sitk.WriteImage(image, str(here / "labels.nii.gz"))
+    (here / "case.toml").write_text(CASE)
+    return here
+
+
+def search(world: Path) -> tuple[dict[str, object], list[str]]:
+    """The summary of a search in a process of its own, without times, and what stderr says."""
+    folders = {"NUMBA_CACHE_DIR": str(world / "kernels"), "PUNCTURE_TWIN_CACHE": str(world / "surfaces")}
+    options = ["--no-arm", "--no-pictures", "--json", "--out", str(world / "out")]
+    root = Path(__file__).parents[1]
+    command = [sys.executable, str(root / "run_twin.py"), "search", str(world), *options]
+    environment = os.environ | folders | {"PYTHONPATH": str(root)}
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert run.returncode in (0, 1), run.stderr
+    found = json.loads(run.stdout)
+    del found["seconds"]
+    return found, [line for line in run.stderr.splitlines() if "cache" in line or "Error" in line]
+
+
+def damage(folder: Path, ending: str, every: int = 1) -> int:
+    """Cut files in half, all or some; how many."""
+    files = sorted(path for path in folder.rglob("*") if path.name.endswith(ending))[::every]
+    for path in files:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    return len(files)
+
+
+def test_a_search_survives_damage_of_what_is_kept(world: Path) -> None:
+    """Kernels and surfaces cut in half: no error, the same numbers, a line for each kind, and then silence again."""
+    first, said = search(world)
+    assert said == []
+    assert damage(world / "kernels", ".nbi", every=7) > 1
+    assert damage(world / "kernels", ".nbc", every=5) > 1
+    assert damage(world / "surfaces", ".arrays") > 0
+    again, said = search(world)
+    assert again == first
+    assert sorted(said) == [
+        "note: cache: a compiled kernel is cut, damaged, or another's; it is compiled anew and replaced",
+        "note: cache: a kept result is cut, damaged, or another's; it is made anew and replaced",
+    ]
+    assert search(world) == (first, [])
