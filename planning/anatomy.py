@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from planning.cache import NO_CACHE, Cache
 from planning.case import Case
 from planning.case_file import StructureSection, StructuresSection
+from planning.case_schema import count_difference
 from planning.clearance.containment import Side, side_of
 from planning.errors import InputError
 from planning.formats.decimation import squared_distance
@@ -99,6 +100,7 @@ class Anatomy:
     warnings: tuple[str, ...]
     surroundings: tuple[Structure, ...] = ()
     scan: Scan | None = None
+    ignored: tuple[str, ...] = ()
 
     @property
     def checked(self) -> tuple[Structure, ...]:
@@ -135,6 +137,7 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
         structures.extend(loader.many(section))
     skin_section = _skin_section(case)
     skin = loader.skin(skin_section)
+    _check_count(case, structures)
     _check_demands(case, structures)
     outside: tuple[Structure, ...] = ()
     scan = loader.scan(skin_section, skin)
@@ -150,7 +153,7 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
     for structure in structures:
         warnings.extend(mesh_warnings(structure.mesh, structure.name))
     _check_target(case, structures, skin)
-    return Anatomy(tuple(structures), skin, tuple(warnings), outside, scan)
+    return Anatomy(tuple(structures), skin, tuple(warnings), outside, scan, tuple(loader.ignored))
 
 
 def _outside(case: Case, scan: Scan) -> tuple[Structure, ...]:
@@ -194,6 +197,7 @@ class _Loader:
         self._cache = cache
         self._volumes: dict[str, VolumeSurfaces] = {}
         self.warnings: list[str] = []
+        self.ignored: list[str] = []
 
     def one(self, section: StructureSection) -> Structure:
         """One structure from a mesh or a label."""
@@ -220,6 +224,7 @@ class _Loader:
         structures = []
         for rule in rules.rules:
             if rule.kind is RuleKind.IGNORE:
+                self.ignored.append(rule.name)
                 continue
             self._progress(rule.name)
             source = f"{section.labelmap}:{rule.label}"
@@ -308,6 +313,13 @@ class _Loader:
 
     def _file(self, name: str) -> Path:
         return self._case.folder / name
+
+
+def _check_count(case: Case, structures: list[Structure]) -> None:
+    """Of a case that states how many structures it has; before the CT adds others."""
+    wrong = "" if case.stated_structures is None else count_difference(case.stated_structures, len(structures) + 1)
+    if wrong:
+        raise InputError(wrong, where=case.path, allowed="the number of structures that are read")
 
 
 def _check_names(case: Case, structures: list[Structure]) -> None:

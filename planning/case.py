@@ -25,6 +25,7 @@ from planning.case_file import (
     StructureSection,
     StructuresSection,
 )
+from planning.case_whole import wholeness_warnings
 from planning.entry import entry_frame, view_frame
 from planning.errors import InputError
 from planning.formats import meshes, naming, points, volumes
@@ -34,7 +35,7 @@ from planning.provenance import CASE_ROLE, Input, InputFiles
 from planning.robot.ur import ur_model
 from planning.toml_file import find_toml, parse_toml, read_toml_bytes
 
-ALLOWED_CASE = "a TOML case file with schema = 1, or a folder with case.toml"
+ALLOWED_CASE = "a TOML case file with schema = 1 or 2, or a folder with case.toml"
 
 Matrix = NDArray[np.float64]
 
@@ -136,6 +137,9 @@ class Case:
         target_ct: Shape (3,), the point to reach.
         T_ct_entry: Shape (4, 4), the entry frame, its origin on the target.
         files: The case file and all that it names, read once.
+        stated_structures: How many structures the case says that it has, the skin among them; None in schema 1.
+        region: Which part of the body it shows; None in schema 1.
+        warnings: What the case file itself leaves open, one sentence each.
     """
 
     path: Path
@@ -158,6 +162,9 @@ class Case:
     ct: CtSettings = CtSettings()
     gantry: Gantry | None = None
     place: PlaceSection = field(default_factory=PlaceSection)
+    stated_structures: int | None = None
+    region: str | None = None
+    warnings: tuple[str, ...] = ()
 
     @property
     def folder(self) -> Path:
@@ -224,6 +231,9 @@ def load_case(path: Path | str) -> Case:
         ct=CtSettings(**content.ct.model_dump(), trust_labels=settings.trust_labels),
         gantry=None if content.gantry is None else _gantry(content.gantry, space, path),
         place=content.place,
+        stated_structures=content.stated_structures,
+        region=content.region,
+        warnings=wholeness_warnings(content, files, path),
     )
 
 

@@ -1,4 +1,4 @@
-"""What a case file may hold: the TOML schema, version 1, key by key. See docs/case.md for the words."""
+"""What a case file may hold: the TOML schema, key by key. See docs/case.md for the words."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from pydantic import (
     model_validator,
 )
 
+from planning.case_schema import CaseSchema, Region, check_statement, count_difference, with_count
 from planning.formats.names import MAX_NAME, unprintable_texts
-from planning.toml_file import SchemaOne
 
 Number = Annotated[float, Strict(), AllowInfNan(False)]
 Positive = Annotated[Number, Field(gt=0)]
@@ -322,10 +322,18 @@ class RehearsalSection(Section):
     joint_offset_deg: NotNegative = 0.02
 
 
+class EndSection(Section):
+    """The last table of the file, which every cut loses."""
+
+    structures: Annotated[int, Strict(), Field(ge=1)]
+
+
 class CaseFile(Section):
     """The whole file."""
 
-    schema_: SchemaOne = Field(alias="schema")
+    schema_: CaseSchema = Field(alias="schema")
+    structure_count: Annotated[int, Strict(), Field(ge=1)] | None = Field(None, alias="structures = N")
+    region: Region | None = None
     name: Name
     space: Literal["LPS", "RAS", "local"]
     target: TargetSection
@@ -341,6 +349,27 @@ class CaseFile(Section):
     gantry: GantrySection | None = None
     place: PlaceSection = PlaceSection()
     rehearsal: RehearsalSection = RehearsalSection()
+    end: EndSection | None = None
+
+    @property
+    def stated_structures(self) -> int | None:
+        """How many structures the file says that it has, the skin among them; None in schema 1."""
+        return self.structure_count if self.end is None else self.end.structures
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_count(cls, data: Any) -> Any:
+        return with_count(data)
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        at_end = None if self.end is None else self.end.structures
+        check_statement(self.schema_, self.region, self.structure_count, at_end)
+        stated = self.stated_structures
+        wrong = "" if stated is None or self.structures else count_difference(stated, len(self.structure))
+        if wrong:
+            raise ValueError(wrong)
+        return self
 
     @model_validator(mode="before")
     @classmethod

@@ -15,6 +15,7 @@ from planning.formats.volumes import parse_header
 from planning.inside_skin import LEAST_TOLERANCE_MM, inside_skin
 from planning.marker_check import check_markers
 from planning.placement import Placement
+from planning.regions import absent_organs
 from planning.resolution import resolution_warnings
 from planning.skin import Skin
 from planning.winding import winding_number
@@ -54,7 +55,12 @@ def check_consistency(case: Case, anatomy: Anatomy, placement: Placement | None)
     outside = _outside_warnings(case, anatomy, headers)
     _refuse_open_around_target(case, anatomy)
     _refuse_short_maps(case, anatomy, headers)
-    return (*outside, *_marker_warnings(case, anatomy, placement), *resolution_warnings(case, anatomy, headers))
+    return (
+        *outside,
+        *_marker_warnings(case, anatomy, placement),
+        *resolution_warnings(case, anatomy, headers),
+        *_region_warnings(case, anatomy),
+    )
 
 
 def _outside_warnings(case: Case, anatomy: Anatomy, headers: Headers) -> tuple[str, ...]:
@@ -141,6 +147,17 @@ def _refuse_short_maps(case: Case, anatomy: Anatomy, headers: Headers) -> None:
                 where=case.path,
                 allowed="a label map of the whole body about the target",
             )
+
+
+def _region_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
+    """The usual organs of the case's region that nobody named: they count as free."""
+    if case.region is None:
+        return ()
+    absent = absent_organs(case.region, [*(structure.name for structure in anatomy.structures), *anatomy.ignored])
+    if not absent:
+        return ()
+    like = ", ".join(absent)
+    return (f"region {case.region}: no structure is named like {like}; what has no structure counts as free",)
 
 
 def _marker_warnings(case: Case, anatomy: Anatomy, placement: Placement | None) -> tuple[str, ...]:

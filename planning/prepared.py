@@ -156,7 +156,8 @@ def prepare(
     with stages.time("anatomy"):
         anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), user_cache())
         anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
-        anatomy = replace(anatomy, warnings=(*anatomy.warnings, *check_consistency(case, anatomy, placement)))
+        warnings = (*case.warnings, *anatomy.warnings, *check_consistency(case, anatomy, placement))
+        anatomy = replace(anatomy, warnings=warnings)
         case.files.release()
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]

@@ -112,7 +112,7 @@ BAD = {
         ("length_mm = 210.0", "length_mm = 0.21"),
         "needle.length_mm: .*greater than or equal to 20",
     ),
-    "another schema": (("schema = 1", "schema = 2"), "schema 2 is not known"),
+    "another schema": (("schema = 1", "schema = 3"), "schema 3 is not known"),
     "no schema": (("schema = 1", ""), "schema: Field required"),
     "text for a number": (
         ("diameter_mm = 1.2", 'diameter_mm = "1.2"'),

@@ -1,0 +1,183 @@
+"""Schema 2 of the case: a file or a list that was cut is refused wherever it was cut; schema 1 is read as before."""
+
+import numpy as np
+import pytest
+
+from meshes import folder
+from planning.case import load_case
+from planning.case_schema import NOT_LAST_NOTE, SCHEMA_ONE_NOTE, TOP_COUNT_NOTE
+from planning.errors import InputError
+from planning.formats.totalsegmentator import V2
+from planning.prepared import prepare
+from planning.regions import USUAL, absent_organs
+from run_twin import BAD_INPUT, OK, main
+from tests.case_world import CASE, MARKERS, write_case, write_labels
+
+TWO = CASE.replace("schema = 1", 'schema = 2\nregion = "other"') + "[end]\nstructures = 4\n"
+TOP = CASE.replace("schema = 1", 'schema = 2\nstructures = 4\nregion = "other"')
+BOX = '[[obstacle]]\nname = "table"\nframe = "ct"\ncenter_mm = [0, 150, 0]\nsize_mm = [400, 20, 400]\n'
+
+
+def test_a_case_that_states_its_structures_is_read_without_a_note(tmp_path):
+    """The count includes the skin; region and count are the case's."""
+    case = load_case(write_case(tmp_path, text=TWO))
+    assert (case.stated_structures, case.region, case.warnings) == (4, "other", ())
+    assert prepare(tmp_path, arm=False).anatomy.warnings == ()
+
+
+@pytest.mark.parametrize(
+    "name", ["abdomen/case.toml", "carton/case_l.toml", "carton/case_m.toml", "carton/case_h.toml"]
+)
+def test_the_embedded_cases_are_of_schema_two(name):
+    """No note, and no usual organ is missing."""
+    prepared = prepare(folder() / name, arm=False)
+    assert prepared.case.region in {"abdomen", "phantom"}
+    assert not [w for w in prepared.anatomy.warnings if "schema" in w or "region" in w or "[end]" in w]
+
+
+def test_a_case_cut_anywhere_is_refused(tmp_path):
+    """Every shorter file, byte by byte, with an obstacle behind the structures: none is read as a smaller case."""
+    text = TWO.replace("[end]", BOX + "[end]")
+    path = write_case(tmp_path, text=text)
+    load_case(path)
+    whole = text.rstrip("\n")
+    for length in range(len(whole)):
+        path.write_text(whole[:length])
+        with pytest.raises(InputError):
+            load_case(path)
+
+
+def test_the_abdomen_cut_at_a_line_is_refused(tmp_path):
+    """Every line of the embedded case file, its last one too."""
+    lines = (folder() / "abdomen" / "case.toml").read_text().splitlines(keepends=True)
+    path = tmp_path / "case.toml"
+    for count in range(len(lines)):
+        path.write_text("".join(lines[:count]))
+        with pytest.raises(InputError, match=r"case.toml"):
+            load_case(path)
+
+
+@pytest.mark.parametrize("kept", [1, 2, 3])
+def test_a_lost_structure_is_refused_with_a_count_at_the_top_too(kept, tmp_path, capfd):
+    """structures = N at the top: the command says both numbers, in one line, exit code 2."""
+    pieces = TOP.split("[[structure]]")
+    path = write_case(tmp_path, text="[[structure]]".join(pieces[: kept + 1]))
+    assert main(["check", str(path), "--theta", "0", "--beta", "0", "--no-arm"]) == BAD_INPUT
+    said = capfd.readouterr()
+    assert said.out == ""
+    assert len(said.err.strip().splitlines()) == 1
+    assert f"structures = 4 is stated, and the case has {kept}, the skin among them; was the file cut?" in said.err
+
+
+def test_what_a_count_at_the_top_does_not_show_is_said(tmp_path):
+    """A margin on the last line, an obstacle behind: one note, and the case is read."""
+    assert load_case(write_case(tmp_path, text=TOP)).warnings == (TOP_COUNT_NOTE,)
+    assert load_case(write_case(tmp_path, text=TWO + BOX)).warnings == (NOT_LAST_NOTE,)
+
+
+def test_schema_one_is_read_as_before_with_one_note(tmp_path, capfd):
+    """Never refused for its schema: also where it was cut between two tables."""
+    path = write_case(tmp_path)
+    assert load_case(path).warnings == (SCHEMA_ONE_NOTE,)
+    assert main(["check", str(path), "--theta", "0", "--beta", "0", "--no-arm"]) == OK
+    assert capfd.readouterr().out.count("schema = 1") == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('region = "other"\n', ""), "schema = 2 needs region, one of abdomen, chest"),
+        (('region = "other"', 'region = "belly"'), "region: Input should be 'abdomen'"),
+        (("[end]\nstructures = 4\n", ""), r"schema = 2 needs its last table, \[end\] with structures = N"),
+        (("structures = 4", "structures = 5"), "structures = 5 is stated, and the case has 4"),
+        (("structures = 4", "structures = 0"), "end.structures"),
+        (("structures = 4", "structures = true"), "end.structures"),
+        (("schema = 2", "schema = 2\nstructures = 5"), r"structures = 5 at the top and 4 in \[end\]; keep one"),
+        (('schema = 2\nregion = "other"', "schema = 1"), r"region and \[end\] belong to schema = 2"),
+        (("schema = 2", "schema = true"), "schema True is not known"),
+    ],
+)
+def test_what_schema_two_states_must_be_right(change, message, tmp_path):
+    """Each defect in one line that says what is allowed."""
+    with pytest.raises(InputError, match=message):
+        load_case(write_case(tmp_path, change, text=TWO))
+
+
+def test_labels_that_rules_name_count_each(tmp_path):
+    """Beside [[structures]] the count stands in [end]; ignored labels are no structures."""
+    many = (
+        '[[structures]]\nlabelmap = "many.nrrd"\nnaming = "names.csv"\navoid = { "vein*" = 1.0 }\nignore = ["fold"]\n'
+    )
+    labels = np.zeros((100, 100, 100), np.uint8)
+    for number, at in enumerate((60, 64, 68), start=1):
+        labels[40:60, at, at] = number
+    (tmp_path / "names.csv").write_text("id,name\n1,vein_left\n2,vein_right\n3,fold\n")
+    path = write_case(tmp_path, ("[end]\nstructures = 4", many + "[end]\nstructures = 6"), text=TWO)
+    write_labels(tmp_path / "many.nrrd", labels)
+    assert prepare(path, arm=False).anatomy.ignored == ("fold",)
+    path.write_text(path.read_text().replace("structures = 6", "structures = 7"))
+    with pytest.raises(InputError, match="structures = 7 is stated, and the case has 6"):
+        prepare(path, arm=False)
+
+
+@pytest.mark.parametrize("name", ["touch.csv", "markers_ct.csv", "targets.csv"])
+def test_a_list_that_ends_within_a_line_is_a_warning_and_in_schema_two_a_refusal(name, tmp_path):
+    """Cut within its last number a list is whole CSV with another number: 70 became 7."""
+    target = ("position_mm = [0.0, 0.0, 0.0]", 'points = "targets.csv"')
+    for text, refused in ((CASE, False), (TWO, True)):
+        path = write_case(tmp_path, target, text=text)
+        (tmp_path / "targets.csv").write_text("name,x_mm,y_mm,z_mm\ntarget,0,0,10\n")
+        load_case(path)
+        (tmp_path / name).write_text((tmp_path / name).read_text().rstrip("\n")[:-1])
+        said = f"{name}: its last line does not end with a line break; was the file cut?"
+        if refused:
+            with pytest.raises(InputError, match="its last line does not end") as caught:
+                load_case(path)
+            assert said in str(caught.value)
+        else:
+            assert said in load_case(path).warnings
+
+
+@pytest.mark.parametrize("content", [MARKERS, MARKERS.replace("\n", "\r\n"), MARKERS + "  \n", MARKERS + " \t"])
+def test_a_list_whose_last_line_ends_is_whole(content, tmp_path):
+    """Line breaks of every system; spaces after the last one are no line."""
+    path = write_case(tmp_path, text=TWO)
+    (tmp_path / "touch.csv").write_bytes(content.encode())
+    assert load_case(path).warnings == ()
+
+
+def test_usual_organs_that_are_absent_are_listed_once(tmp_path):
+    """By name, with the side of a paired organ; those that the case ignores are named, not forgotten."""
+    path = write_case(tmp_path, ('region = "other"', 'region = "pelvis"'), text=TWO)
+    found = [warning for warning in prepare(path, arm=False).anatomy.warnings if "region" in warning]
+    assert len(found) == 1
+    assert found[0].startswith(
+        "region pelvis: no structure is named like urinary bladder, rectum or colon, small bowel"
+    )
+    assert found[0].endswith("femurs; what has no structure counts as free")
+
+
+@pytest.mark.parametrize(
+    ("region", "names", "absent"),
+    [
+        ("spine", ["vertebrae_L3", "spinal_cord", "aorta", "IVC", "kidney_left", "lungs"], ["kidneys (right)"]),
+        (
+            "spine",
+            ["Spine", "spinalCord", "Aorta", "vena cava inf", "VH_M_Kidney_L", "KidneyR", "lung l"],
+            ["lungs (right)"],
+        ),
+        ("limb", ["humerus_left", "brachial artery", "Vena basilica"], ["nerve"]),
+        ("spine", ["vertebrae", "spinal_cord", "aorta", "ivc", "adrenal_gland_left", "lungs"], ["kidneys"]),
+        ("phantom", [], []),
+    ],
+)
+def test_organs_are_known_by_their_common_names(region, names, absent):
+    """TotalSegmentator's names, other spellings, sides; an adrenal gland is no kidney."""
+    assert absent_organs(region, names) == absent
+
+
+def test_totalsegmentator_names_every_usual_organ_of_the_trunk():
+    """Its second version has a class for each organ of abdomen and chest."""
+    for region in ("abdomen", "chest"):
+        assert absent_organs(region, V2.values()) == []
+    assert set(USUAL) >= {"abdomen", "chest", "pelvis", "brain", "head", "neck", "spine", "limb", "phantom"}
