@@ -345,7 +345,8 @@ def _check_demands(case: Case, structures: list[Structure]) -> None:
         )
 
 
-def _distance(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
+def surface_distance(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
+    """Distance of a point (3,) from a surface, on either side, mm."""
     return float(np.sqrt(squared_distance(point, mesh.triangles).min()))
 
 
@@ -377,9 +378,9 @@ def _check_target(case: Case, structures: list[Structure], skin: Skin) -> None:
                 where=case.path,
                 allowed='role "target" for the structure that holds the target',
             )
-        if side is Side.OUTSIDE and _distance(structure.mesh, case.target_ct) > ON_SURFACE_MM:
+        if side is Side.OUTSIDE and (gap := surface_distance(structure.mesh, case.target_ct)) > ON_SURFACE_MM:
             raise InputError(
-                f"target ({point}) lies outside its structure '{structure.name}'",
+                f"target ({point}) lies {gap:.1f} mm outside its structure '{structure.name}'",
                 where=case.path,
                 allowed="a point inside target.structure",
             )

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from planning.anatomy import Anatomy, Role, Structure
 from planning.case import Case
+from planning.constraints import longest_path
 from planning.errors import InputError
+from planning.formats.decimation import squared_distance
 from planning.formats.volume_header import VolumeHeader
 from planning.formats.volumes import parse_header
 from planning.inside_skin import LEAST_TOLERANCE_MM, inside_skin
@@ -58,6 +60,7 @@ def check_consistency(case: Case, anatomy: Anatomy, placement: Placement | None)
     return (
         *outside,
         *_marker_warnings(case, anatomy, placement),
+        *_needle_warnings(case, anatomy.skin),
         *resolution_warnings(case, anatomy, headers),
         *_region_warnings(case, anatomy),
     )
@@ -147,6 +150,19 @@ def _refuse_short_maps(case: Case, anatomy: Anatomy, headers: Headers) -> None:
                 where=case.path,
                 allowed="a label map of the whole body about the target",
             )
+
+
+def _needle_warnings(case: Case, skin: Skin) -> tuple[str, ...]:
+    """A needle that is shorter than the shortest way from the target to the skin."""
+    triangles = skin.mesh.triangles[~skin.cut_faces]
+    if len(triangles) == 0:
+        return ()
+    nearest = float(np.sqrt(squared_distance(case.target_ct, triangles).min()))
+    longest = longest_path(case.needle)
+    if longest >= nearest:
+        return ()
+    said = f"the needle's longest path is {longest:g} mm, and the skin is {nearest:.1f} mm away"
+    return (f"{said}: every path is too long",)
 
 
 def _region_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:

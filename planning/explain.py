@@ -9,12 +9,16 @@ from typing import Any
 import numpy as np
 
 from planning.along_path import Stretch, stretches
-from planning.anatomy import Anatomy
+from planning.anatomy import Anatomy, surface_distance
 from planning.candidates import Candidates
 from planning.case import Case
 from planning.constraints import longest_path
 from planning.provenance import inputs_document
+from planning.reasons import Reason
 from planning.standoff import standoffs
+
+MOST = 0.5
+"""Of all directions: a needle that is too short for more of them was likely not meant for this target."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +43,11 @@ class Explanation:
         """``safe`` or ``rejected``; for the organs alone where ``candidates.arm`` says that the arm was not checked."""
         return "safe" if self.safe else "rejected"
 
+    @property
+    def target_depth_mm(self) -> float:
+        """How far the target lies from the surface of its own structure, mm."""
+        return surface_distance(self.anatomy.structure(self.case.target_structure).mesh, self.case.target_ct)
+
     def clearances(self) -> dict[str, float]:
         """Structure to clearance, mm."""
         return dict(zip(self.candidates.structures, map(float, self.candidates.clearance[0]), strict=True))
@@ -59,6 +68,7 @@ class Explanation:
             "reason_amount": finite(row.reason_amount[0]),
             "reason_detail": str(row.reason_detail[0]),
             "entry_ct_mm": [finite(x) for x in row.entry_ct[0]],
+            "target_depth_mm": self.target_depth_mm,
             "path_length_mm": finite(row.path_length[0]),
             "skin_angle_deg": finite(np.degrees(row.skin_angle[0])),
             "tissue_mm": finite(row.tissue[0]),
@@ -96,11 +106,15 @@ class Explanation:
                 head,
                 *self._reason(),
                 *self._path(),
+                self._target(),
                 *self._scan(),
                 *self._table(),
                 *self._rest(),
             ]
         )
+
+    def _target(self) -> str:
+        return f"  target         {self.target_depth_mm:8.2f} mm below the surface of {self.case.target_structure}"
 
     def _reason(self) -> list[str]:
         return [] if self.safe else ["  because " + reason_text(self.candidates, 0)]
@@ -155,6 +169,17 @@ class Explanation:
         no_need = "not computed, the organs reject the direction"
         reached = {-1: no_need, 0: "no", 1: f"yes, margin {row.reach_margin[0]:.2f}"}
         return f"arm reaches it: {reached[int(row.reachable[0])]}"
+
+
+def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
+    """What to say where the needle is too short for most of the directions."""
+    short = int((candidates.reason == Reason.TOO_LONG.value).sum())
+    if short <= MOST * len(candidates):
+        return []
+    return [
+        f"the needle is too short for {short} of {len(candidates)} directions: its longest path is "
+        f"{longest_path(case.needle):g} mm"
+    ]
 
 
 def reason_text(candidates: Candidates, row: int) -> str:

@@ -17,7 +17,7 @@ from planning.certify import Certificate, certify, verify, with_safe_cone, write
 from planning.certify.certificate import MAX_CERTIFICATE_BYTES, parse_certificate
 from planning.clearance.cross_check import CrossChecked
 from planning.errors import InputError, NoAnswerError
-from planning.explain import Explanation, finite
+from planning.explain import Explanation, finite, needle_warnings
 from planning.export import Exported, export_plan
 from planning.files import atomic
 from planning.formats.input_file import read_input
@@ -55,9 +55,10 @@ class Run:
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees."""
-        found = self.candidates
+        found, provenance = self.candidates, self.prepared.provenance()
         return {
-            **self.prepared.provenance(),
+            **provenance,
+            "warnings": [*provenance["warnings"], *needle_warnings(self.prepared.case, found)],
             "inputs": inputs_document(self.inputs),
             "directions": len(found),
             "counts": found.counts(),
@@ -209,7 +210,8 @@ def registration_report(path: Path) -> dict[str, Any]:
     report["expected_tre_target_mm"] = placement.target_error_mm
     report["expected_tre_target_interval_mm"] = list(registration.expected_tre_interval_mm(case.target_ct))
     report["expected_tre_along_shaft_mm"] = registration.expected_tre_mm(along).tolist()
-    report["warnings"], report["notes"] = list(checked.findings.warnings), list(checked.findings.notes)
+    report["warnings"] = [*case.warnings, *checked.findings.warnings]
+    report["notes"] = list(checked.findings.notes)
     return report
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from planning.explain import reason_text
+from planning.explain import needle_warnings, reason_text
 from planning.export import Exported
 from planning.search import closest_miss
 from twin.ct.chen2019 import Reproduction
@@ -32,6 +32,7 @@ def _search(run: Run) -> list[str]:
     lines = [f"case {run.prepared.case.name}: {len(found)} direction{'s' if len(found) != 1 else ''}"]
     counts = ((found.safe_text if reason == "safe" else reason, count) for reason, count in found.counts().items())
     lines += [f"  {count:7d}  {reason}" for reason, count in counts]
+    lines += needle_warnings(run.prepared.case, found)
     lines += [] if found.arm_checked else [f"arm {found.arm}"]
     return lines + (_best(run) if found.safe.any() else _nothing_safe(run))
 
