@@ -30,7 +30,7 @@ from planning.files import check_writable
 from planning.prepared import prepare
 from planning.provenance import inputs_document
 from twin import main_job, words
-from twin.mirror import Mirror, connect, live_states, recorded_states
+from twin.mirror import Mirror, connect, live_states, recorded_states, recording_warnings
 from twin.place_words import mirror_line, place_text
 from twin.report.progress import progress_display
 
@@ -189,6 +189,8 @@ def mirror(
     mirrored = Mirror.of(followed)
     if recorded is not None:
         states = recorded_states(recorded)
+        for warning in recording_warnings(recorded):
+            print(f"warning: {warning}", file=sys.stderr)
     else:
         states = live_states(connect(str(host)), period_s=1.0 / rate, seconds=seconds)
     shown = []

@@ -7,6 +7,7 @@ from pathlib import Path
 from planning.case_file import CaseFile
 from planning.case_schema import NOT_LAST_NOTE, SCHEMA_ONE_NOTE, TOP_COUNT_NOTE, ends_with_end
 from planning.errors import InputError
+from planning.formats.whole_lines import unfinished_warnings
 from planning.provenance import InputFiles
 
 LINE_FILES = (".csv", ".fcsv")
@@ -24,7 +25,7 @@ def wholeness_warnings(content: CaseFile, files: InputFiles, path: Path) -> tupl
     Raises:
         InputError: A list whose last line does not end, in schema 2.
     """
-    unfinished = [unfinished_text(name) for name in _line_files(files) if not ends_its_last_line(files.content(name))]
+    unfinished = [said for name in _line_files(files) for said in unfinished_warnings(files.content(name), name)]
     if unfinished and content.schema_ == 2:
         raise InputError(unfinished[0], where=path, allowed="files of which every line ends with a line break")
     return (*_notes(content, files.content(path.name).decode("utf-8")), *unfinished)
@@ -36,16 +37,6 @@ def _notes(content: CaseFile, text: str) -> list[str]:
     if content.end is None:
         return [TOP_COUNT_NOTE]
     return [] if ends_with_end(text) else [NOT_LAST_NOTE]
-
-
-def ends_its_last_line(content: bytes) -> bool:
-    """Whether a text ends with a line break; spaces after it are no line."""
-    return content.rstrip(b" \t").endswith((b"\n", b"\r"))
-
-
-def unfinished_text(name: str) -> str:
-    """What to say of a list that ends within a line."""
-    return f"{name}: its last line does not end with a line break; was the file cut?"
 
 
 def _line_files(files: InputFiles) -> list[str]:

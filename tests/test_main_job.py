@@ -82,7 +82,7 @@ def test_a_plan_whose_marker_file_changed_is_refused(carton, rehearsed, tmp_path
         main(["rehearse", str(rehearsed / "plan.json"), "--case", str(other / "case_m.toml"), "--out", str(out)])
         == BAD_INPUT
     )
-    assert "input 'touch.csv' is not the one" in capfd.readouterr().err
+    assert "(touch.csv)' is not the one" in capfd.readouterr().err
     assert not out.exists()
 
 

@@ -188,7 +188,9 @@ def test_a_recording_is_mirrored(drive, tmp_path, capsys):
     rows = [f"insertion,{i * 0.1},{','.join(map(repr, map(float, q)))}" for i, q in enumerate(drive.insertion_q[-3:])]
     path.write_text("\n".join(["# a comment", "phase,time_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad", *rows]))
     assert run_twin.main(["mirror", "--case", str(ABDOMEN), "--from", str(path)]) == 0
-    lines = capsys.readouterr().out.strip().splitlines()
+    captured = capsys.readouterr()
+    assert "joints.csv: its last line does not end with a line break; was the file cut?" in captured.err
+    lines = captured.out.strip().splitlines()
     assert len(lines) == 3 and "to target    0.00 mm" in lines[-1]
     assert run_twin.main(["mirror", "--case", str(ABDOMEN), "--from", str(path), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)["states"]

@@ -91,6 +91,15 @@ def test_a_recording_gives_the_same_calibration(done, tmp_path, capsys):
     assert {path.name for path in tmp_path.iterdir()} == {"calibration.json", "report.html"}
 
 
+def test_a_recording_that_ends_within_a_line_is_a_warning(done, tmp_path, capsys):
+    """Cut within its last number a recording is whole CSV with another number; JSON says that its end is missing."""
+    (tmp_path / "cut.csv").write_text((done / "recording.csv").read_text().rstrip("\n"))
+    arguments = ["selfcal", "--recording", str(tmp_path / "cut.csv"), "--out", str(tmp_path / "out"), "--json"]
+    assert main(arguments) == OK
+    said = "cut.csv: its last line does not end with a line break; was the file cut?"
+    assert json.loads(capsys.readouterr().out)["warnings"] == [said]
+
+
 def test_poses_of_constant_insertion_are_refused(tmp_path, capsys):
     """What a needle guide does: one line that names the motion, exit code 2, and no calibration."""
     steep = float(np.radians(45.0))

@@ -18,6 +18,7 @@ from planning.case import Case
 from planning.errors import InputError
 from planning.formats.input_file import read_input
 from planning.formats.raw_mesh import decode_text
+from planning.formats.whole_lines import unfinished_warnings
 from planning.marker_check import checked_placement
 from planning.robot.kinematics import flange_pose
 from planning.robot.ur import UrModel, ur_model
@@ -43,6 +44,9 @@ MAX_HOST = 253
 
 ANSWER_S = 5.0
 """A controller that does not take the call within this time is not there."""
+
+MAX_RECORDING_BYTES = 200_000_000
+"""An hour at 125 states a second is 60 MB."""
 
 SILENCE_S = 1.0
 """A controller that tells nothing new for so long has stopped: it tells its state at least every 8 ms."""
@@ -210,6 +214,15 @@ def _states(table: csv.DictReader[str], path: Path) -> Iterator[JointState]:
         except (TypeError, ValueError) as error:
             raise InputError(f"row {number} holds no number", where=path, allowed="numbers: s and rad") from error
         yield checked(t, q, f"{path}: row {number}")
+
+
+def recording_warnings(path: Path) -> tuple[str, ...]:
+    """What a recording's end leaves open, one sentence each.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    return unfinished_warnings(read_input(path, max_bytes=MAX_RECORDING_BYTES, where=str(path)), path.name)
 
 
 def checked(time_s: float, q: list[float], where: str) -> JointState:

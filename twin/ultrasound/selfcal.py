@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from planning.files import atomic
 from planning.formats.input_file import read_input
+from planning.formats.whole_lines import unfinished_warnings
 from planning.prepared import Watcher
 from planning.provenance import Input, content_input, inputs_document
 from planning.stages import Stages
@@ -64,6 +65,7 @@ class SelfcalRun:
         choice: The same.
         stages: Seconds.
         files: What was written.
+        warnings: What the recording leaves open, one sentence each.
     """
 
     name: str
@@ -76,6 +78,7 @@ class SelfcalRun:
     choice: Choice | None = None
     stages: Stages = field(default_factory=Stages)
     files: tuple[Path, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def punctures(self) -> tuple[Puncture, ...]:
@@ -94,6 +97,7 @@ class SelfcalRun:
             "punctures": puncture_summary(self.punctures),
             "seconds": {stage: round(seconds, 3) for stage, seconds in self.stages.seconds.items()},
             "files": [str(path) for path in self.files],
+            "warnings": list(self.warnings),
         }
 
     def with_files(self, *files: Path) -> SelfcalRun:
@@ -147,7 +151,8 @@ def selfcal_recording(path: Path, case: SelfcalCase | None) -> SelfcalRun:
     with stages.time("calibrate"):
         calibration = checked_calibration(recording, partial(calibrate_case, recording, case), file)
     inputs = (content_input("recording", file.name, content), *(() if case is None else case.inputs))
-    return SelfcalRun(file.stem, calibration, recording, inputs, case=case, stages=stages)
+    warnings = unfinished_warnings(content, file.name)
+    return SelfcalRun(file.stem, calibration, recording, inputs, case=case, stages=stages, warnings=warnings)
 
 
 def calibrate_case(recording: Recording, case: SelfcalCase | None) -> Calibration:

@@ -48,6 +48,7 @@ def deviations(found: Calibration) -> dict[str, float]:
 def selfcal_text(run: SelfcalRun) -> str:
     """Poses, calibration, what it cannot show, punctures; then the files."""
     lines = [*_poses(run), *_calibration(run), *_trials(run), *_punctures(run)]
+    lines += [f"warning: {warning}" for warning in run.warnings]
     stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in run.stages.seconds.items())
     return "\n".join([*lines, f"seconds: {stages}", "look at:", *(f"  {path}" for path in run.files)])
 
