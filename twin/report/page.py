@@ -108,7 +108,7 @@ def _verdict(candidates: Candidates, plan: Any | None, rehearsal: Any | None) ->
         )
     cards = [
         (
-            f"directions {candidates.safe_text}",
+            "safe directions" if candidates.arm_checked else f"directions {candidates.safe_text}",
             f"{safe:,} of {len(candidates):,}",
             f"{100 * safe / len(candidates):.1f} % of the grid",
         )
