@@ -15,7 +15,8 @@ from run_twin import BAD_INPUT, main
 from twin.mirror import Mirror
 
 CASE = """
-schema = 1
+schema = 2
+region = "other"
 name = "slips"
 space = "{space}"
 [target]
@@ -49,6 +50,8 @@ mesh = "rib.stl"
 unit = "mm"
 role = "avoid"
 {more}
+[end]
+structures = 3
 """
 
 TABLE = '[[obstacle]]\nname = "table"\nframe = "ct"\ncenter_mm = [0.0, 150.0, 0.0]\nsize_mm = [600.0, 40.0, 1200.0]\n'
