@@ -45,9 +45,6 @@ MAX_HOST = 253
 ANSWER_S = 5.0
 """A controller that does not take the call within this time is not there."""
 
-MAX_RECORDING_BYTES = 200_000_000
-"""An hour at 125 states a second is 60 MB."""
-
 SILENCE_S = 1.0
 """A controller that tells nothing new for so long has stopped: it tells its state at least every 8 ms."""
 
