@@ -93,6 +93,7 @@ class Anatomy:
         warnings: One sentence each.
         surroundings: Solids outside of the body: what the CT shows there, obstacles, the gantry.
         scan: The CT of the case, or None.
+        ignored: Names of labels that the case leaves out on purpose.
     """
 
     structures: tuple[Structure, ...]

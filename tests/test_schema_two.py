@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from meshes import folder
+from planning.anatomy import OUTSIDE_NOT_KNOWN
 from planning.case import load_case
 from planning.case_schema import NOT_LAST_NOTE, SCHEMA_ONE_NOTE, TOP_COUNT_NOTE
 from planning.errors import InputError
@@ -22,7 +23,7 @@ def test_a_case_that_states_its_structures_is_read_without_a_note(tmp_path):
     """The count includes the skin; region and count are the case's."""
     case = load_case(write_case(tmp_path, text=TWO))
     assert (case.stated_structures, case.region, case.warnings) == (4, "other", ())
-    assert prepare(tmp_path, arm=False).anatomy.warnings == ()
+    assert prepare(tmp_path, arm=False).anatomy.warnings == (OUTSIDE_NOT_KNOWN,)
 
 
 @pytest.mark.parametrize(
