@@ -21,7 +21,7 @@ SECONDS = 2.0
 MEGABYTES = 1000
 """By which one run may raise the process's peak."""
 
-COMMAND_SHARE = 0.06
+COMMAND_SHARE = 0.03
 """Part of the runs that are command lines."""
 
 
