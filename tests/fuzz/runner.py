@@ -5,6 +5,7 @@ import resource
 import shutil
 import time
 import traceback
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +59,9 @@ class Fuzzer:
         """One run; returns what went wrong, in words, or None."""
         rng = np.random.default_rng([2026, number])
         start, peak = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        wrong = self._command(rng) if rng.random() < COMMAND_SHARE else self._reader(rng)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # a warning is a second line on stderr
+            wrong = self._command(rng) if rng.random() < COMMAND_SHARE else self._reader(rng)
         seconds = time.process_time() - start
         more = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak) / 1024
         if wrong is None and seconds > SECONDS:
