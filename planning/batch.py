@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from planning.errors import InputError, PlanningError
+from planning.errors import InputError, PlanningError, one_line
 from planning.files import atomic
 from planning.prepared import Watcher, prepare
 from planning.processes import worker_count
@@ -73,13 +73,19 @@ def _failed(path: Path, error: BaseException) -> dict[str, Any]:
     """The row of a case at which the program itself failed."""
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
     said = f"{type(error).__name__}: {error}"
-    return row | {"case": str(path), "directions": 0, "safe": 0, "exit_code": 3, "said": " ".join(said.split())}
+    return row | {
+        "case": one_line(str(path)),
+        "directions": 0,
+        "safe": 0,
+        "exit_code": 3,
+        "said": " ".join(said.split()),
+    }
 
 
 def search_one(path: Path, out: Path, arm: bool | None) -> dict[str, Any]:
     """Search one case and write its table; a refusal becomes a row."""
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
-    row |= {"case": str(path), "folder": out.name, "directions": 0, "safe": 0}
+    row |= {"case": one_line(str(path)), "folder": out.name, "directions": 0, "safe": 0}
     try:
         prepared = prepare(path, arm=arm)
         found = prepared.search()

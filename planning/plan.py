@@ -42,6 +42,9 @@ STRAIGHT_TOLERANCE_MM = 0.1
 BETWEEN_RAD = 0.002
 """Joint step at which an insertion is looked at between its rows: up to 1.3 mm at the tip, bent by far less."""
 
+MAX_NUMBER = 1e6
+"""Of millimetres, degrees, radians and seconds: products of larger ones overflow."""
+
 MOST_STATES = 100_000
 """Joints that turn through more steps than this (200 rad) during one insertion do something else."""
 
@@ -328,13 +331,19 @@ def _plan(document: dict[str, Any], path: Path) -> Plan:
 def _number(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"{value!r} is no number")
-    return float(value)
+    return _within(float(value))
+
+
+def _within(value: float) -> float:
+    if not abs(value) <= MAX_NUMBER:
+        raise ValueError(f"{value:.3g} is beyond {MAX_NUMBER:g}")
+    return value
 
 
 def _array(value: Any, shape: tuple[int, ...]) -> Floats:
     array = np.array(value, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"an array of shape {array.shape} where {shape} finite numbers belong")
+    if array.shape != shape or not np.all(np.abs(array) <= MAX_NUMBER):
+        raise ValueError(f"an array of shape {array.shape} where {shape} numbers within {MAX_NUMBER:g} belong")
     array.setflags(write=False)
     return array
 

@@ -30,6 +30,9 @@ structure is checked to."""
 MAX_CERTIFICATE_BYTES = 500_000_000
 """A certificate has some ten thousand cells; a larger file is something else."""
 
+MAX_NUMBER = 1e6
+"""Of millimetres and radians: products of larger ones overflow."""
+
 CONE_ROUNDING_RAD = 1e-7
 """Taken from a safe cone: arccos near 1 rounds to 1e-8."""
 
@@ -289,8 +292,8 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
 
 def _number(value: Any) -> float:
     number = float(value)
-    if not np.isfinite(number):
-        raise ValueError(f"{value} is not a finite number")
+    if not abs(number) <= MAX_NUMBER:
+        raise ValueError(f"{value} is not a finite number within {MAX_NUMBER:g}")
     return number
 
 
@@ -300,8 +303,8 @@ def _numbers_or_nan(values: tuple[Any, ...]) -> Floats:
 
 def _numbers(values: Any, shape: tuple[int, ...]) -> Floats:
     array = np.array(values, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"{shape} finite numbers expected")
+    if array.shape != shape or not np.all(np.abs(array) <= MAX_NUMBER):
+        raise ValueError(f"{shape} finite numbers within {MAX_NUMBER:g} expected")
     return array
 
 

@@ -230,11 +230,18 @@ def _any_area(surface: _Surface) -> bool:
 
 
 def _check_rotation(R: NDArray[np.float64], *, where: str | Path) -> None:
+    largest = float(np.abs(R).max())
+    if not largest <= MAX_ROTATION_ENTRY:  # squares of huge entries are infinite, and their differences NaN
+        _refuse(f"not a rotation: an entry of {largest:.3g}", where, _TRANSFORM_ALLOWED)
     determinant = float(np.linalg.det(R))
     if determinant < 0.0:
         what = f"the transform is mirrored (determinant {determinant:.4g}): it exchanges left and right"
         _refuse(what, where, _TRANSFORM_ALLOWED)
     error = float(np.abs(R.T @ R - np.eye(3)).max())
-    if error > ROTATION_TOLERANCE:
+    if not error <= ROTATION_TOLERANCE:
         what = f"not a rotation: R^T R is off by {error:.3g}, determinant {determinant:.6g}"
         _refuse(what, where, _TRANSFORM_ALLOWED)
+
+
+MAX_ROTATION_ENTRY = 1e3
+"""Far above 1, so that what is a scaled or sheared matrix is named by its error; far below what overflows."""

@@ -194,14 +194,38 @@ def joints(text):
     return make
 
 
-def turning_plan(folder):
-    """A plan whose insertion turns a joint by 1,000 rad and back, on its way through one row."""
-    from fuzz.corpus import straight_plan
+def plan_with(change):
+    """A maker of a straight plan whose document is changed."""
 
-    write_plan(straight_plan(), folder / "plan.json")
-    document = json.loads((folder / "plan.json").read_text())
+    def make(folder):
+        from fuzz.corpus import straight_plan
+
+        write_plan(straight_plan(), folder / "plan.json")
+        document = json.loads((folder / "plan.json").read_text())
+        change(document)
+        (folder / "plan.json").write_text(json.dumps(document))
+
+    return make
+
+
+def turn(document):
+    """A joint turns by 1,000 rad and back, on its way through one row."""
     document["insertion"]["q_rad"][1][0] = 1000.0
-    (folder / "plan.json").write_text(json.dumps(document))
+
+
+def overflow(document):
+    """A joint at 1e308 rad."""
+    document["insertion"]["q_rad"][1][0] = 1e308
+
+
+def vast_rotation(document):
+    """Columns of 1e200, whose products are infinite of both signs."""
+    document["T_base_ct"] = [
+        [1e200, 1e200, 1e200, 0],
+        [1e200, -1e200, 1e200, 0],
+        [1e200, 1e200, -1e200, 0],
+        [0, 0, 0, 1],
+    ]
 
 
 MAKERS = {
@@ -260,7 +284,10 @@ MAKERS = {
     "joints lone CR": joints(JOINTS.replace("\n0,", "\n0\r,")),
     "joints long field": joints(JOINTS + "1" * 140_000 + ",0,0,0,0,0,0\n"),
     "joints NUL": joints(JOINTS + "1\0,0,0,0,0,0,0\n"),
-    "plan that turns": turning_plan,
+    "plan that turns": plan_with(turn),
+    "plan that overflows": plan_with(overflow),
+    "plan of a vast rotation": plan_with(vast_rotation),
+    "certificate of a vast size": certificate_with('"size_rad": 0.5', '"size_rad": 1e308'),
     "GLB placed often": glb_placed_often,
     "GLB of one array": glb_of_one_array,
 }
