@@ -34,15 +34,17 @@ def load_surface(
     *,
     solid: bool,
     rgba: Rgba = SKIN_RGBA,
+    max_faces: int = MAX_PHYSICS_FACES,
 ) -> int:
     """A surface that does not move: triangle by triangle, hollows included.
 
     Args:
         client: Physics client id.
-        mesh: The surface, mm; thinned to `MAX_PHYSICS_FACES`.
+        mesh: The surface, mm; thinned to ``max_faces``.
         T_world_mesh: Its pose, shape (4, 4), mm.
         solid: Whether bodies collide with it, or it is only seen.
         rgba: Colour, each 0..1.
+        max_faces: How many triangles physics and pictures bear.
 
     Returns:
         Body id.
@@ -50,7 +52,7 @@ def load_surface(
     position, quaternion = pose_to_m(T_world_mesh)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "surface.obj"
-        write_obj(thinned(mesh), path)
+        write_obj(thinned(mesh, max_faces), path)
         collision = -1
         if solid:
             collision = pybullet.createCollisionShape(
@@ -83,6 +85,27 @@ def load_ball(client: int, center_mm: Floats, radius_mm: float, rgba: Rgba) -> i
         pybullet.GEOM_SPHERE, radius=float(to_m(radius_mm)), rgbaColor=rgba, physicsClientId=client
     )
     return int(pybullet.createMultiBody(0.0, -1, visual, to_m(center_mm).tolist(), physicsClientId=client))
+
+
+def load_capsule(client: int, length_mm: float, radius_mm: float, T_world_capsule: Floats) -> int:
+    """All points within a radius of a segment: a needle with its margin, for contacts only. Returns the body id.
+
+    Args:
+        client: Physics client id.
+        length_mm: Of the segment, along z, its middle at the pose's origin.
+        radius_mm: Above 0.
+        T_world_capsule: Shape (4, 4), mm.
+    """
+    position, quaternion = pose_to_m(T_world_capsule)
+    shape = pybullet.createCollisionShape(
+        pybullet.GEOM_CAPSULE, radius=float(to_m(radius_mm)), height=float(to_m(length_mm)), physicsClientId=client
+    )
+    return int(pybullet.createMultiBody(0.0, shape, -1, position, quaternion, physicsClientId=client))
+
+
+def remove(client: int, body: int) -> None:
+    """Take a body out of the world."""
+    pybullet.removeBody(body, physicsClientId=client)
 
 
 def let_pass(client: int, body: int, link: int, other: int) -> None:

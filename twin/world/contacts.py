@@ -1,4 +1,4 @@
-"""Who touches the arm, according to the physics."""
+"""Who touches the arm, and how near two bodies are, according to the physics."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from twin.world.arm import Arm
 from twin.world.engine import pybullet
-from twin.world.units import to_mm
+from twin.world.units import to_m, to_mm
 
 
 class Touch(NamedTuple):
@@ -32,3 +32,12 @@ def touches(arm: Arm) -> tuple[Touch, ...]:
             key = (link, other)
             deepest[key] = max(deepest.get(key, 0.0), -float(to_mm(distance_m)))
     return tuple(Touch(arm.link_name(link), other, depth) for (link, other), depth in sorted(deepest.items()))
+
+
+def gap_mm(client: int, first: int, second: int, within_mm: float) -> float:
+    """How far two bodies are apart, mm; negative where they overlap, infinite beyond ``within_mm``.
+
+    Of a surface triangle by triangle: a body wholly inside a closed one is apart from it.
+    """
+    points = pybullet.getClosestPoints(first, second, float(to_m(within_mm)), physicsClientId=client)
+    return min((float(to_mm(point[8])) for point in points), default=float("inf"))
