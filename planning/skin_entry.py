@@ -108,26 +108,24 @@ def _unknown_depth(skin: Skin, target_ct: Floats, outward_ct: Floats, length: fl
 
 def _normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) -> Floats:
     """Unit normals at points of triangles: the corners' normals (area weighted), blended; shape (n, 3)."""
-    corners = mesh.triangles
-    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    a, b, c = np.moveaxis(mesh.triangles, 1, 0)
+    areas = np.cross(b - a, c - a)
     at_vertex = np.zeros_like(mesh.vertices)
-    for corner in range(3):
-        np.add.at(at_vertex, mesh.faces[:, corner], areas)
-    weights = _barycentric(corners[face], points)
-    normal = np.einsum("ij,ijk->ik", weights, _unit(at_vertex)[mesh.faces[face]])
-    return _unit(normal)
+    for corner in mesh.faces.T:
+        np.add.at(at_vertex, corner, areas)
+    weights = _corner_weights(mesh.triangles[face], points)
+    return _unit(np.einsum("ij,ijk->ik", weights, _unit(at_vertex)[mesh.faces[face]]))
 
 
-def _barycentric(triangles: Floats, points: Floats) -> Floats:
-    """Barycentric coordinates (n, 3) of points in their triangles (n, 3, 3), by the areas opposite to each corner."""
+def _corner_weights(triangles: Floats, points: Floats) -> Floats:
+    """How much corners count (n, 3) at points of triangles (n, 3, 3): the areas opposite; alike where there is none."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = np.cross(b - a, c - a)
     parts = [np.cross(c - b, points - b), np.cross(a - c, points - c), np.cross(b - a, points - a)]
     weights = np.stack([np.einsum("ij,ij->i", part, normal) for part in parts], axis=1)
-    total = weights.sum(axis=1, keepdims=True)
-    return np.where(total > 0, weights / np.where(total > 0, total, 1.0), 1 / 3)
+    return np.where(weights.sum(axis=1, keepdims=True) > 0, weights, 1.0)
 
 
 def _unit(vectors: Floats) -> Floats:
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.where(lengths > 0, lengths, 1.0)
+    return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)

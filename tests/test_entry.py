@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import planning.entry
 from planning.case_file import EntryAxes
-from planning.entry import angles, direction, entry_frame, grid, needle_pose, outward
+from planning.entry import angles, direction, entry_frame, grid, needle_pose, outward, view_frame
 from planning.errors import InputError
 from planning.formats.spaces import Space
 
@@ -57,10 +58,115 @@ def test_explicit_axes_are_made_orthonormal():
     np.testing.assert_allclose(R, np.eye(3), atol=1e-15)
 
 
-def test_parallel_axes_are_refused():
-    """Axes that do not span a frame are named."""
+@pytest.mark.parametrize("space", [Space.LPS, Space.RAS, Space.LOCAL])
+def test_oblique_axes_give_an_orthonormal_frame(rng, space):
+    """Axes of any length and angle: orthonormal, right-handed, z kept, x in the plane of both."""
+    for _ in range(50):
+        z, x = rng.normal(0, [[30.0], [0.2]], (2, 3))
+        R = entry_frame(EntryAxes(z=tuple(z), x=tuple(x)), space)
+        signs = np.array([-1.0, -1.0, 1.0]) if space is Space.RAS else np.ones(3)
+        z, x = z * signs / np.linalg.norm(z), x * signs / np.linalg.norm(x)
+        np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
+        assert np.linalg.det(R) == pytest.approx(1, abs=1e-12)
+        np.testing.assert_allclose(R[:, 2], z, atol=1e-12)
+        assert R[:, 0] @ x > 0
+        assert R[:, 1] @ x == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("x", [(0, 0, -3), (0, 0, 0), (np.sin(np.radians(2)), 0, np.cos(np.radians(2)))])
+def test_parallel_axes_are_refused(x):
+    """Axes that do not span a frame are named: opposite, zero, or 2 degrees apart, of any length."""
+    for length in (0.01, 1.0, 70.0):
+        with pytest.raises(InputError, match="parallel"):
+            entry_frame(EntryAxes(z=(0, 0, length), x=x), Space.LPS)
     with pytest.raises(InputError, match="parallel"):
-        entry_frame(EntryAxes(z=(0, 0, 1), x=(0, 0, -3)), Space.LPS)
+        entry_frame(EntryAxes(z=(0, 0, 0), x=(1, 0, 0)), Space.LPS)
+
+
+@pytest.mark.parametrize("length", [0.01, 1.0, 70.0])
+def test_axes_three_degrees_apart_span_a_frame(length):
+    """Badly chosen, but a frame."""
+    z = (0.0, 0.0, length)
+    R = entry_frame(EntryAxes(z=z, x=(-np.sin(np.radians(3)), 0, np.cos(np.radians(3)))), Space.LPS)
+    np.testing.assert_allclose(R.T, [[-1, 0, 0], [0, -1, 0], [0, 0, 1]], atol=1e-12)
+
+
+def test_a_frame_that_is_not_known_is_refused():
+    """And what is allowed is named; without a frame a patient has the bed's, a local case its own axes."""
+    with pytest.raises(InputError, match="frame 'table' is not known.*ct, bed"):
+        entry_frame("table", Space.LPS)
+    np.testing.assert_array_equal(entry_frame(None, Space.LPS), entry_frame("bed", Space.LPS))
+    np.testing.assert_array_equal(entry_frame(None, Space.LOCAL), np.eye(3))
+
+
+def test_the_bodys_directions_are_those_of_lps():
+    """L, P and S are +x, +y and +z; unit vectors, each opposite to its counterpart."""
+    expected = {"left": (1, 0, 0), "posterior": (0, 1, 0), "head": (0, 0, 1)}
+    expected |= {"right": (-1, 0, 0), "anterior": (0, -1, 0), "feet": (0, 0, -1)}
+    assert dict(planning.entry.ANATOMICAL_LPS) == expected
+
+
+def test_the_view_frame_stands_on_the_target():
+    """T_ct_entry maps the entry frame's origin to the target and its axes to the columns; nobody can write to it."""
+    R, target = entry_frame("bed", Space.LPS), np.array([10.0, -20.0, 30.0])
+    T = view_frame(R, target)
+    np.testing.assert_array_equal(T, [[0, -1, 0, 10], [0, 0, -1, -20], [1, 0, 0, 30], [0, 0, 0, 1]])
+    assert not T.flags.writeable
+
+
+def test_angles_of_many_directions():
+    """One angle pair per row, whatever the shape; the azimuth is 0 at the poles, for any sign of zero."""
+    u = np.array([[0.0, 0, 1], [-0.0, 0, 1], [0, -0.0, -1], [1, 0, 0], [0, -1, 0]])
+    theta, beta = angles(u)
+    np.testing.assert_allclose(np.degrees(theta), [0, 0, 180, 90, 90], atol=1e-12)
+    np.testing.assert_allclose(np.degrees(beta), [0, 0, 0, 0, 270], atol=1e-12)
+    for shape in ((1, 5, 3), (5, 1, 3)):
+        np.testing.assert_array_equal(angles(u.reshape(shape))[1].ravel(), beta)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "step", "expected"),
+    [
+        (200, 340, 70, [200, 270, 340]),
+        (0, 180, 90, [0, 90, 180]),
+        (90, 450, 180, [90, 270]),
+        (0, 360, 360, [0]),
+        (30, 30, 10, [30]),
+        (10, 35, 10, [10, 20, 30]),
+        (-90, 270, 120, [-90, 30, 150]),
+        (0, 359.9, 359.9, [0, 359.9]),
+    ],
+)
+def test_azimuths_of_a_range(low, high, step, expected):
+    """From the lower end by steps, the upper end where a step meets it, and a full circle without its repetition."""
+    found = grid((0.3, 0.3), (np.radians(low), np.radians(high)), np.radians(step), np.eye(3))
+    np.testing.assert_allclose(np.degrees(found.beta), expected, atol=1e-9)
+    np.testing.assert_array_equal(found.theta, 0.3)
+
+
+def test_puncture_angles_of_a_range_are_outermost_and_read_only():
+    """Each puncture angle with all azimuths, then the next; directions are those of the angles in the CT frame."""
+    R = entry_frame("bed", Space.LPS)
+    found = grid((0.5, 0.7), (0, 1), 0.1, R)
+    assert len(found) == 33
+    np.testing.assert_allclose(found.theta[::11], [0.5, 0.6, 0.7])
+    np.testing.assert_allclose(found.beta[:11], np.linspace(0, 1, 11))
+    np.testing.assert_allclose(found.outward_ct, outward(found.theta, found.beta) @ R.T, atol=1e-15)
+    assert not any(column.flags.writeable for column in (found.theta, found.beta, found.outward_ct))
+
+
+@pytest.mark.parametrize(("short", "count"), [(0.7e-9, 11), (1.5e-9, 10), (-0.7e-9, 11)])
+def test_rounding_of_a_billionth_of_a_step_loses_no_end(short, count):
+    """A range that lacks less than 1e-9 of a step to its last point has it; one that lacks more does not."""
+    assert len(grid((0, 10 - short), (0, 0), 1.0, np.eye(3))) == count
+
+
+def test_each_needle_has_its_own_standoff():
+    """Standoffs by row go with directions by row; the top is one length beyond the tip."""
+    u = direction(0.4, 1.1, np.eye(3)).outward_ct.repeat(3, axis=0)
+    pose = needle_pose(np.zeros(3), u, standoff=np.array([10.0, 20.0, 30.0]), length=100.0)
+    np.testing.assert_allclose(np.linalg.norm(pose.tip_ct, axis=1), [10, 20, 30])
+    np.testing.assert_allclose(np.linalg.norm(pose.top_ct, axis=1), [110, 120, 130])
 
 
 def test_grid_counts_every_cell_once():

@@ -1,0 +1,70 @@
+"""Inside, outside or not known: points against shapes whose inside is known by formula."""
+
+import numpy as np
+import pytest
+
+from planning.clearance.containment import RAYS, Side, side_of
+from planning.mesh import TriangleMesh
+
+
+def mixed(mesh, rng, fraction=0.5):
+    """The same surface, some of its triangles wound the other way."""
+    flip = rng.random((len(mesh.faces), 1)) < fraction
+    return TriangleMesh(mesh.vertices, np.where(flip, mesh.faces[:, ::-1], mesh.faces))
+
+
+@pytest.mark.parametrize("winding", ["alike", "mixed"])
+def test_points_about_a_box_are_on_the_side_where_they_lie(rng, box, winding):
+    """Within each half width inside, beyond it outside, along every axis and toward every corner."""
+    size, center = np.array([40.0, 20.0, 10.0]), np.array([5.0, -7.0, 3.0])
+    mesh = box(size, center) if winding == "alike" else mixed(box(size, center), rng)
+    assert mesh.closed and mesh.wound_alike == (winding == "alike")
+    for way in np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z]):
+        assert side_of(mesh, center + 0.49 * size * way) is Side.INSIDE
+        assert side_of(mesh, center + 0.51 * size * way) is Side.OUTSIDE
+
+
+@pytest.mark.parametrize("winding", ["alike", "mixed"])
+def test_a_point_in_the_box_of_a_surface_may_lie_outside(rng, ball, winding):
+    """Near a corner of a ball's bounding box there is no ball; behind a face and before it are different sides."""
+    mesh = ball(50, subdivisions=2) if winding == "alike" else mixed(ball(50, subdivisions=2), rng)
+    assert side_of(mesh, np.array([40.0, 40, 40])) is Side.OUTSIDE
+    for triangle in mesh.triangles[::9]:
+        middle = triangle.mean(axis=0)
+        assert side_of(mesh, 0.99 * middle) is Side.INSIDE
+        assert side_of(mesh, 1.01 * middle) is Side.OUTSIDE
+
+
+def test_a_ring_of_mixed_winding_has_a_hole(rng):
+    """In the hole of a torus rays leave through two walls or none: outside; in its tube through one or three."""
+    import trimesh
+
+    ring = trimesh.creation.torus(30, 10, major_sections=24, minor_sections=12)
+    mesh = mixed(TriangleMesh(ring.vertices, ring.faces), rng)
+    assert side_of(mesh, np.array([1.0, 2, 3])) is Side.OUTSIDE
+    assert side_of(mesh, np.array([30.0, 1, 2])) is Side.INSIDE
+    assert side_of(mesh, np.array([-2.0, -29, 3])) is Side.INSIDE
+
+
+def test_one_ray_that_meets_an_edge_is_outvoted(ball):
+    """From a point from which one of the rays runs exactly into a corner, the others still tell."""
+    mesh = ball(50, subdivisions=1)
+    flipped = TriangleMesh(mesh.vertices, np.concatenate([mesh.faces[:7, ::-1], mesh.faces[7:]]))
+    for ray in np.array(RAYS):
+        for corner in mesh.vertices[::5]:
+            for reach in (5.0, 20.0):
+                point = corner - reach * ray
+                away = np.linalg.norm(point)
+                if away < 40 or away > 51:
+                    assert side_of(flipped, point) is (Side.INSIDE if away < 50 else Side.OUTSIDE)
+
+
+def test_a_triangle_given_twice_closes_nothing_and_crosses_once(ball):
+    """Duplicates do not make two crossings of one wall."""
+    mesh = ball(50, subdivisions=1)
+    doubled = TriangleMesh(mesh.vertices, np.concatenate([mesh.faces, mesh.faces[::2]]))
+    assert doubled.closed and not doubled.wound_alike
+    assert side_of(doubled, np.array([1.0, 2, 3])) is Side.INSIDE
+    assert side_of(doubled, np.array([30.0, 30, 45])) is Side.OUTSIDE
+    opened = TriangleMesh(mesh.vertices, np.concatenate([mesh.faces[1:], mesh.faces[1:]]))
+    assert side_of(opened, np.array([1.0, 2, 3])) is Side.UNKNOWN
