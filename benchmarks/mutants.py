@@ -65,7 +65,7 @@ KERNELS = MappingProxyType(
 
 SAMPLE, SEED = 150, 20191104
 
-SLOW_S = 1.5
+SLOW_S = 3.0
 """Tests that take longer without a fault are left out."""
 
 TIMEOUT_S = 30.0

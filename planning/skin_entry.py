@@ -66,9 +66,9 @@ def skin_paths(
         unknown[~odd] = 0.0
     depth[cut] = np.nan
     entry = target_ct + depth[:, None] * outward_ct
-    normal = _normals(skin.mesh, face, entry)
-    cosine = np.abs(np.einsum("ij,ij->i", normal, outward_ct))
-    return SkinPaths(entry, depth, np.arccos(np.clip(cosine, 0, 1)), reentry, unknown)
+    cosine = np.abs(np.einsum("ij,ij->i", _normals(skin.mesh, face, entry), outward_ct))
+    angle = np.where(np.isnan(depth), np.nan, np.arccos(np.minimum(cosine, 1)))
+    return SkinPaths(entry, depth, angle, reentry, unknown)
 
 
 def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) -> tuple[Crossings, Bools]:
@@ -118,12 +118,11 @@ def _normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) -> Flo
 
 
 def _corner_weights(triangles: Floats, points: Floats) -> Floats:
-    """How much corners count (n, 3) at points of triangles (n, 3, 3): the areas opposite; alike where there is none."""
+    """How much corners count (n, 3) at points of triangles (n, 3, 3): as the areas opposite, in one measure per row."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = np.cross(b - a, c - a)
     parts = [np.cross(c - b, points - b), np.cross(a - c, points - c), np.cross(b - a, points - a)]
-    weights = np.stack([np.einsum("ij,ij->i", part, normal) for part in parts], axis=1)
-    return np.where(weights.sum(axis=1, keepdims=True) > 0, weights, 1.0)
+    return np.stack([np.einsum("ij,ij->i", part, normal) for part in parts], axis=1)
 
 
 def _unit(vectors: Floats) -> Floats:

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from planning.clearance.containment import RAYS, Side, side_of
+from planning.clearance import containment
+from planning.clearance.containment import RAYS, SEED, Side, side_of
 from planning.mesh import TriangleMesh
 
 
@@ -13,10 +14,11 @@ def mixed(mesh, rng, fraction=0.5):
     return TriangleMesh(mesh.vertices, np.where(flip, mesh.faces[:, ::-1], mesh.faces))
 
 
+@pytest.mark.parametrize("scale", [0.02, 1.0, 50.0])
 @pytest.mark.parametrize("winding", ["alike", "mixed"])
-def test_points_about_a_box_are_on_the_side_where_they_lie(rng, box, winding):
-    """Within each half width inside, beyond it outside, along every axis and toward every corner."""
-    size, center = np.array([40.0, 20.0, 10.0]), np.array([5.0, -7.0, 3.0])
+def test_points_about_a_box_are_on_the_side_where_they_lie(rng, box, winding, scale):
+    """Within each half width inside, beyond it outside, along every axis and toward every corner, at any scale."""
+    size, center = scale * np.array([40.0, 20.0, 10.0]), scale * np.array([5.0, -7.0, 3.0])
     mesh = box(size, center) if winding == "alike" else mixed(box(size, center), rng)
     assert mesh.closed and mesh.wound_alike == (winding == "alike")
     for way in np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z]):
@@ -47,13 +49,13 @@ def test_a_ring_of_mixed_winding_has_a_hole(rng):
 
 
 def test_one_ray_that_meets_an_edge_is_outvoted(ball):
-    """From a point from which one of the rays runs exactly into a corner, the others still tell."""
-    mesh = ball(50, subdivisions=1)
+    """From points from which one of the rays runs exactly into a corner, the others still tell."""
+    mesh, few = ball(50, subdivisions=1), np.random.default_rng(SEED).normal(size=(3, RAYS)).T
     flipped = TriangleMesh(mesh.vertices, np.concatenate([mesh.faces[:7, ::-1], mesh.faces[7:]]))
-    for ray in np.array(RAYS):
+    for ray in few:
         for corner in mesh.vertices[::5]:
             for reach in (5.0, 20.0):
-                point = corner - reach * ray
+                point = corner - reach * ray / np.linalg.norm(ray)
                 away = np.linalg.norm(point)
                 if away < 40 or away > 51:
                     assert side_of(flipped, point) is (Side.INSIDE if away < 50 else Side.OUTSIDE)
@@ -68,3 +70,8 @@ def test_a_triangle_given_twice_closes_nothing_and_crosses_once(ball):
     assert side_of(doubled, np.array([30.0, 30, 45])) is Side.OUTSIDE
     opened = TriangleMesh(mesh.vertices, np.concatenate([mesh.faces[1:], mesh.faces[1:]]))
     assert side_of(opened, np.array([1.0, 2, 3])) is Side.UNKNOWN
+
+
+def test_there_is_no_tie():
+    """An odd number of rays votes."""
+    assert containment.RAYS % 2 == 1

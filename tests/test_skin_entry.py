@@ -93,7 +93,7 @@ def test_crossings_that_never_add_up_are_unknown_from_the_target_on(box):
     opened = box([100, 100, 100])
     opened = TriangleMesh(opened.vertices, opened.faces[:-1])
     away = skin_paths(skin_from_mesh(opened), np.array([0.0, 1, -80]), -UP, 200.0)
-    assert np.isnan(away.unknown_depth[0]) and np.isnan(away.path_length[0])
+    assert np.isnan([away.unknown_depth[0], away.path_length[0], away.skin_angle[0]]).all()
 
 
 def test_through_a_corner_the_entry_is_the_corner():
@@ -124,13 +124,13 @@ def test_reentry_is_the_second_crossing_and_counts_up_to_the_needles_top(box):
 
 
 def test_a_cut_face_is_no_entry_and_the_unknown_begins_there(box):
-    """Through a face at which the body was cut there is no path length and no entry point."""
+    """Through a face at which the body was cut there is no path length, no entry point and no angle."""
     mesh = box([100, 100, 100])
     top = np.all(mesh.triangles[:, :, 2] == 50, axis=1)
     paths = skin_paths(Skin(mesh, top, None, ()), np.array([1.0, 2, 0]), np.vstack([UP, -UP]), 200.0)
     np.testing.assert_allclose(paths.unknown_depth, [50, np.nan])
     np.testing.assert_allclose(paths.path_length, [np.nan, 50])
-    assert np.isnan(paths.entry_ct[0]).all()
+    assert np.isnan(paths.entry_ct[0]).all() and np.isnan(paths.skin_angle[0])
     np.testing.assert_allclose(paths.entry_ct[1], [1, 2, -50])
 
 
@@ -145,9 +145,16 @@ def test_a_cut_field_of_view_is_unknown_before_the_needles_top_only(box):
 
 
 def tent(left, right):
-    """An open roof over the x axis with its ridge at z = 50 along y, of two slopes of these widths, 40 mm long."""
+    """An open roof with its ridge at z = 50 along y, 40 mm long, of two unlike slopes of these widths."""
     vertices = np.array(
-        [[0.0, -20, 50], [0, 20, 50], [-left, -20, 20], [-left, 20, 20], [right, -20, 20], [right, 20, 20]]
+        [
+            [0.0, -20, 50],
+            [0, 20, 50],
+            [-left, -20, 20],
+            [-left, 20, 20],
+            [right, -20, 50 - 0.2 * right],
+            [right, 20, 50 - 0.2 * right],
+        ]
     )
     return TriangleMesh(vertices, np.array([[0, 1, 3], [0, 3, 2], [0, 4, 5], [0, 5, 1]]))
 
@@ -200,3 +207,23 @@ def test_a_corner_whose_faces_cancel_has_no_say():
     sheet = TriangleMesh(flat, np.array([[0, 1, 2], [0, 4, 3]]))
     found = skin_paths(Skin(sheet, np.zeros(2, bool), None, ()), np.zeros(3), np.array([[0.1, 0.1, 0.99]]), 200.0)
     assert found.skin_angle[0] == pytest.approx(np.arccos(0.99), abs=1e-9)
+
+
+def test_the_angle_does_not_depend_on_how_fine_the_skin_is():
+    """A skin of triangles far smaller than a square millimetre is a skin."""
+    angles = []
+    for scale in (1.0, 0.01):
+        mesh = TriangleMesh(scale * tent(10.0, 90.0).vertices, tent(10.0, 90.0).faces)
+        angles.append(skin_paths(Skin(mesh, np.zeros(4, bool), None, ()), np.zeros(3), UP, 200.0).skin_angle[0])
+    assert angles[0] > 0.1
+    assert angles[1] == pytest.approx(angles[0], abs=1e-9)
+
+
+def test_straight_in_is_an_angle_of_zero_at_any_tilt(rng):
+    """A cosine that rounding makes a little more than one is an angle of zero, not of nothing."""
+    for _ in range(60):
+        R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        corners = np.array([[-9.0, -9, 30], [9, -9, 30], [0, 9, 30]]) @ R.T
+        sheet = Skin(TriangleMesh(corners, np.array([[0, 1, 2]])), np.zeros(1, bool), None, ())
+        found = skin_paths(sheet, np.zeros(3), R[:, 2][None], 200.0)
+        assert found.skin_angle[0] == pytest.approx(0, abs=1e-6)

@@ -1,0 +1,229 @@
+"""The kernels of one axis and one triangle, asked directly: against the triangle-by-triangle oracle, and by hand.
+
+They run compiled, or as plain Python where NUMBA_DISABLE_JIT=1 (as the mutants do).
+"""
+
+import numpy as np
+import pytest
+from oracles import ray_crossings, segment_triangle_distance
+
+from planning.clearance.blocks import pack
+from planning.clearance.crossings import crossings
+from planning.clearance.fast_engine import _placed
+from planning.clearance.segment_triangle import axis_triangle
+from planning.clearance.side_by_side import ASK, BEYOND, ROWS, bring_into_frame, measure_beside, measure_other
+from planning.mesh import TriangleMesh
+
+LENGTH = 40.0
+TIGHT_MM = 1e-9
+
+
+def unit(rng):
+    """A random direction."""
+    u = rng.normal(size=3)
+    return u / np.linalg.norm(u)
+
+
+def triangles(rng, count):
+    """Triangles of many shapes about an axis of 40 mm: near, far, long, thin, flat, behind and beyond."""
+    middle = rng.normal(0, 1, (count, 1, 3)) * rng.choice([2.0, 15.0, 60.0], (count, 1, 1))
+    found = middle + rng.normal(0, 1, (count, 3, 3)) * rng.choice([0.5, 8.0, 50.0], (count, 1, 1))
+    found[::9, 2] = 0.3 * found[::9, 0] + 0.7 * found[::9, 1]
+    found[4::9, 2] = found[4::9, 1]
+    found[7::9, 1:] = found[7::9, :1]
+    return found
+
+
+def depth_distance(u, s, triangle):
+    """Distance of the axis point at a depth from a triangle."""
+    return segment_triangle_distance(s * u, s * u, triangle)
+
+
+def asked(u, length, triangle):
+    """`axis_triangle` of one triangle: distance and depth."""
+    square, depth = axis_triangle(tuple(u), np.float64(length), *(tuple(corner) for corner in triangle))
+    return np.sqrt(square), depth
+
+
+def test_axis_triangle_equals_the_oracle(rng):
+    """Any triangle, degenerate ones too: the oracle's distance, and a depth at which the axis is that near."""
+    for triangle in triangles(rng, 250):
+        u = unit(rng)
+        distance, depth = asked(u, LENGTH, triangle)
+        assert distance == pytest.approx(segment_triangle_distance(np.zeros(3), LENGTH * u, triangle), abs=TIGHT_MM)
+        assert -TIGHT_MM <= depth <= LENGTH + TIGHT_MM
+        assert depth_distance(u, depth, triangle) == pytest.approx(distance, abs=1e-7)
+
+
+def test_axis_triangle_of_a_point_is_its_distance_from_the_start(rng):
+    """An axis without length is the target itself."""
+    for triangle in triangles(rng, 60):
+        distance, depth = asked(np.array([0.0, 0, 1]), 0.0, triangle)
+        assert distance == pytest.approx(segment_triangle_distance(np.zeros(3), np.zeros(3), triangle), abs=TIGHT_MM)
+        assert depth == 0.0
+
+
+def square_on(z, half=5.0):
+    """A triangle across the z axis at a height."""
+    return np.array([[-half, -half, z], [half, -half, z], [0.0, half, z]])
+
+
+@pytest.mark.parametrize(
+    ("triangle", "distance", "depth"),
+    [
+        (square_on(7.0), 0.0, 7.0),
+        (square_on(LENGTH), 0.0, LENGTH),
+        (square_on(0.0), 0.0, 0.0),
+        (square_on(-3.0), 3.0, 0.0),
+        (square_on(LENGTH + 3.0), 3.0, LENGTH),
+        ([[2.0, 0, 5], [2, 0, 15], [9, 0, 10]], 2.0, None),
+        ([[0.0, 0, 9], [0, 0, 15], [9, 0, 12]], 0.0, 9.0),
+        ([[0.0, 0, 15], [0, 0, 9], [0, 9, 12]], 0.0, 9.0),
+        ([[-4.0, 0, 12], [4, 0, 6], [0, 9, 20]], 0.0, 9.0),
+        ([[3.0, 4, -5], [3, 4, 50], [60, 80, 20]], 5.0, None),
+        ([[1.0, 0, -9], [-1, 0, -9], [0, 0, -2]], 2.0, 0.0),
+        ([[1.0, 0, 49], [-1, 0, 49], [0, 0, 43]], 3.0, LENGTH),
+        ([[0.0, 0, -9], [0, 0, -2], [0, 0, -5]], 2.0, 0.0),
+        ([[6.0, 8, 20], [6, 8, 20], [6, 8, 20]], 10.0, 20.0),
+        ([[-5.0, 3, 10], [5, 3, 10], [0, 3, 10]], 3.0, 10.0),
+        ([[5e-11, 0, 10], [9, 0, 10], [9, 1, 10]], 0.0, 10.0),
+        ([[2e-10, 0, 10], [9, 0, 10], [9, 1, 10]], 2e-10, 10.0),
+    ],
+)
+def test_cases_by_hand(triangle, distance, depth):
+    """Through the face, at its ends, beside it, along it, behind and beyond, for any order of corners."""
+    triangle, z = np.array(triangle), np.array([0.0, 0, 1])
+    for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [2, 1, 0], [1, 0, 2]):
+        found = asked(z, LENGTH, triangle[order])
+        assert found[0] == pytest.approx(distance, abs=1e-13)
+        assert depth is None or found[1] == pytest.approx(depth, abs=1e-9)
+
+
+def frame(rng):
+    """A direction and two that complete it to a frame."""
+    u = unit(rng)
+    e = np.cross(u, unit(rng))
+    e /= np.linalg.norm(e)
+    return u, e, np.cross(u, e)
+
+
+def beside(rows, length, frames, origin, count=None):
+    """`measure_beside`, and `measure_other` where it marks a pair, of one triangle each: distances, depths, marks."""
+    count = len(rows) if count is None else count
+    pairs = np.full((ROWS, len(rows)), 7.0)
+    for k, (u, e, f) in enumerate(frames):
+        bring_into_frame(tuple(u), tuple(e), tuple(f), rows, k, tuple(origin), pairs, k)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        measure_beside(pairs, count, np.float64(length))
+    marks, found = pairs[9].copy(), np.empty((len(rows), 2))
+    for k in range(count):
+        square, depth = pairs[9, k], pairs[10, k]
+        if square < 0.0:
+            square, depth = measure_other(pairs, k, np.float64(length))
+        found[k] = np.sqrt(square), depth
+    return found[:, 0], found[:, 1], marks
+
+
+def test_side_by_side_equals_the_oracle(rng):
+    """Every pair in its own frame: the oracle's distance and a depth that near; all three kinds of answer occur."""
+    shapes = np.concatenate([triangles(rng, 300), [square_on(z) for z in (5.0, 20.0, 39.0, -2.0, 44.0)]])
+    origin = np.array([3.0, -2.0, 5.0])
+    frames = [frame(rng) for _ in shapes[:-5]] + [(np.eye(3)[2], np.eye(3)[0], np.eye(3)[1])] * 5
+    distance, depth, marks = beside((shapes + origin).reshape(-1, 9), LENGTH, frames, origin)
+    for k, (triangle, (u, _, _)) in enumerate(zip(shapes, frames, strict=True)):
+        assert distance[k] == pytest.approx(segment_triangle_distance(np.zeros(3), LENGTH * u, triangle), abs=TIGHT_MM)
+        assert depth_distance(u, depth[k], triangle) == pytest.approx(distance[k], abs=1e-7)
+    np.testing.assert_allclose(distance[-5:], [0, 0, 0, 2, 4], atol=TIGHT_MM)
+    np.testing.assert_allclose(depth[-5:], [5, 20, 39, 0, 40], atol=TIGHT_MM)
+    assert (marks >= 0).sum() > 50 and (marks == ASK).sum() > 50 and (marks == BEYOND).sum() > 10
+
+
+Z_FRAME = (np.eye(3)[2], np.eye(3)[0], np.eye(3)[1])
+
+
+def test_pairs_beside_the_axis_need_no_second_answer():
+    """Between start and end, ends included, and not around the axis a triangle is answered in the loop."""
+    shapes = np.array(
+        [
+            [[2.0, 0, 5], [6, 1, 15], [9, 0, 10]],
+            [[3.0, 1, 0], [4, 1, 20], [9, 0, 40]],
+            [[3.0, 1, -1e-9], [4, 1, 20], [9, 0, 10]],
+            [[3.0, 1, 5], [4, 1, LENGTH + 1e-9], [9, 0, 10]],
+            [[3.0, 1, 41], [4, 1, 40.5], [9, 0, 42]],
+            [[3.0, 1, 41], [4, 1, 40.0], [9, 0, 42]],
+            square_on(10.0),
+            [[0.0, -5, 4], [0, 5, 6], [9, 0, 10]],
+        ]
+    )
+    _, _, marks = beside(shapes.reshape(-1, 9), LENGTH, [Z_FRAME] * len(shapes), np.zeros(3))
+    np.testing.assert_allclose(marks[:2], [4.0, 10.0])
+    np.testing.assert_array_equal(marks[2:], [ASK, ASK, BEYOND, ASK, 0.0, ASK])
+
+
+def test_only_the_pairs_that_are_there_are_answered():
+    """What lies behind the count in the buffer stays as it is."""
+    shapes = np.array([square_on(10.0), square_on(12.0), square_on(14.0)])
+    marks = beside(shapes.reshape(-1, 9), LENGTH, [Z_FRAME] * 3, np.zeros(3), count=2)[2]
+    np.testing.assert_array_equal(marks, [0.0, 0.0, 7.0])
+
+
+@pytest.mark.parametrize("place", ["amid", "aside", "far", "on a corner"])
+def test_the_nearest_triangle_of_a_packed_surface(rng, place):
+    """Of some hundreds of triangles, in blocks under a tree: the least distance of all, and the row of who has it."""
+    corners = rng.normal(0, 30, (300, 1, 3)) + rng.normal(0, 4, (300, 3, 3))
+    mesh = TriangleMesh(corners.reshape(-1, 3), np.arange(900).reshape(-1, 3))
+    spots = {"amid": [1.0, 2, 3], "aside": [70.0, -20, 9], "far": [900.0, 0, -400], "on a corner": corners[17, 1]}
+    target, blocks = np.array(spots[place]), pack(mesh)
+    placed = _placed(blocks, target)
+    each = [segment_triangle_distance(target, target, t.reshape(3, 3)) for t in blocks.triangles]
+    assert placed.distance == pytest.approx(min(each), abs=TIGHT_MM)
+    assert each[placed.nearest] == pytest.approx(min(each), abs=TIGHT_MM)
+
+
+def test_a_surface_of_one_triangle_has_a_nearest_one():
+    """The smallest surface: one block, filled up with one triangle."""
+    placed = _placed(pack(TriangleMesh(square_on(7.0), np.array([[0, 1, 2]]))), np.array([0.0, 0, 3]))
+    assert placed.distance == pytest.approx(4.0, abs=TIGHT_MM)
+
+
+def test_every_crossing_of_a_small_surface(rng):
+    """Rays from amid a dozen triangles, narrow and wide, near the poles and all around: depths, faces and counts."""
+    corners = rng.normal(0, 20, (12, 1, 3)) + rng.normal(0, 1, (12, 3, 3)) * rng.choice([3.0, 30.0], (12, 1, 1))
+    corners[0] = [[5.0, 0, 20], [-5, 5, 20], [-5, -5, 20]]
+    corners[1] = [[5.0, 0, -20], [-5, 5, -20], [-5, -5, -20]]
+    mesh = TriangleMesh(corners.reshape(-1, 3), np.arange(36).reshape(-1, 3))
+    rays = np.concatenate([[unit(rng) for _ in range(60)], np.eye(3), -np.eye(3), [[-1.0, 1e-9, 0], [-1.0, -1e-9, 0]]])
+    middles = corners.mean(axis=1)
+    rays = np.concatenate([rays, middles / np.linalg.norm(middles, axis=1, keepdims=True)])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    origin = np.array([0.5, -0.25, 0.125])
+    found = crossings(mesh, origin, rays)
+    assert found.count.sum() > 15
+    for row, ray in enumerate(rays):
+        depths = found.depth[found.first[row] : found.first[row] + found.count[row]] if found.count[row] else []
+        np.testing.assert_allclose(depths, ray_crossings(origin, ray, mesh), atol=1e-9)
+    points = origin + found.depth[:, None] * rays[found.ray]
+    for point, face in zip(points, found.face, strict=True):
+        assert segment_triangle_distance(point, point, corners[face]) < 1e-9
+
+
+def test_crossings_behind_beyond_and_at_the_length():
+    """Nothing is crossed behind the origin or beyond the length; at the length it is; an edge counts once."""
+    sheets = np.concatenate([square_on(10.0), square_on(-10.0), square_on(30.0), square_on(10.0) - [0, 10.0, 0]])
+    mesh = TriangleMesh(sheets, np.arange(12).reshape(-1, 3))
+    up = np.array([[0.0, 0, 1]])
+    for length, depths in ((np.inf, [10, 30]), (30.0, [10, 30]), (29.9, [10]), (10.0, [10]), (9.9, [])):
+        np.testing.assert_allclose(crossings(mesh, np.zeros(3), up, length).depth, depths)
+    quad = TriangleMesh([[-5.0, -5, 8], [5, -5, 8], [5, 5, 8], [-5, 5, 8]], [[0, 1, 2], [0, 2, 3]])
+    assert crossings(quad, np.zeros(3), up).count.tolist() == [1]
+
+
+def test_rays_from_a_corner_of_the_surface():
+    """From a corner rays into the solid leave once more; the corner's own triangles have no bounding cone."""
+    corners = np.array([[0.0, 0, 0], [20, 0, 0], [0, 20, 0], [0, 0, 20]])
+    mesh = TriangleMesh(corners, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    inward = np.array([[1.0, 1, 1], [3.0, 1, 1], [1.0, 4, 2]])
+    inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+    found = crossings(mesh, np.zeros(3), inward)
+    last = [found.depth[found.ray == row].max() for row in range(3)]
+    np.testing.assert_allclose(last, 20 / inward.sum(axis=1), atol=1e-9)
