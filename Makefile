@@ -1,4 +1,5 @@
 # make demo: the main job on the embedded abdomen.  make test: everything that must hold.
+# make mutants: which faults in the plain modules and kernels the tests notice (an hour).
 
 PYTHON ?= python3.11
 VENV := .venv
@@ -7,7 +8,7 @@ OUT ?= out/demo
 RUNS ?= 100000
 FIRST ?= 0
 
-.PHONY: demo test fuzz lint install pictures meshes clean
+.PHONY: demo test fuzz lint mutants install pictures meshes clean
 
 demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
@@ -23,6 +24,9 @@ lint: install
 # Mutated files and command lines; RUNS=1000 FIRST=500000 for fewer, and other, ones.
 fuzz: install
 	cd tests && PYTHONPATH=..:. ../$(BIN)/python -m fuzz --runs $(RUNS) --first $(FIRST) --keep ../out/fuzz
+
+mutants: install
+	$(BIN)/python benchmarks/mutants.py --out out/mutants.json
 
 install: $(VENV)/installed
 

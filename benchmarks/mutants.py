@@ -41,6 +41,17 @@ STANDOFF = (
 )
 """Without those that prepare a whole case or an arm."""
 
+RESIDUALS = tuple(
+    f"tests/test_registration_residuals.py::{name}"
+    for name in (
+        "test_residuals_of_11_mm_are_refused",
+        "test_accepted_residuals_are_flagged",
+        "test_a_declared_noise_that_does_not_explain_the_residuals_is_refused_or_scaled",
+        "test_a_triad_is_tested_by_its_rigid_fit",
+    )
+)
+"""Without those that draw thousands of registrations."""
+
 PLAIN = MappingProxyType(
     {
         "planning.entry": ("tests/test_entry.py",),
@@ -48,7 +59,7 @@ PLAIN = MappingProxyType(
         "planning.standoff": tuple(f"tests/test_standoff.py::{name}" for name in STANDOFF),
         "planning.clearance.containment": ("tests/test_containment.py",),
         "planning.constraints": ("tests/test_constraints.py",),
-        "planning.registration": ("tests/test_registration.py",),
+        "planning.registration": ("tests/test_registration_limits.py", "tests/test_registration.py", *RESIDUALS),
     }
 )
 """All mutants of these, and the tests that must notice them."""

@@ -48,6 +48,16 @@ def test_a_ring_of_mixed_winding_has_a_hole(rng):
     assert side_of(mesh, np.array([-2.0, -29, 3])) is Side.INSIDE
 
 
+def test_three_walls_are_as_good_as_one(rng, ball):
+    """Amid three shells every ray crosses three walls: inside; between two shells it is one or two."""
+    shells = [mixed(ball(radius, subdivisions=1), rng) for radius in (60, 40, 20)]
+    offsets = np.cumsum([0, *(len(shell.vertices) for shell in shells[:-1])])
+    faces = np.concatenate([shell.faces + offset for shell, offset in zip(shells, offsets, strict=True)])
+    mesh = TriangleMesh(np.concatenate([shell.vertices for shell in shells]), faces)
+    for x, side in ((1.0, Side.INSIDE), (28.0, Side.OUTSIDE), (47.0, Side.INSIDE), (61.0, Side.OUTSIDE)):
+        assert side_of(mesh, np.array([x, 2.0, 3.0])) is side
+
+
 def test_one_ray_that_meets_an_edge_is_outvoted(ball):
     """From points from which one of the rays runs exactly into a corner, the others still tell."""
     mesh, few = ball(50, subdivisions=1), np.random.default_rng(SEED).normal(size=(3, RAYS)).T
