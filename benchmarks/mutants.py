@@ -58,7 +58,7 @@ PLAIN = MappingProxyType(
         "planning.skin_entry": ("tests/test_skin_entry.py", "tests/test_constraints.py"),
         "planning.standoff": tuple(f"tests/test_standoff.py::{name}" for name in STANDOFF),
         "planning.clearance.containment": ("tests/test_containment.py",),
-        "planning.constraints": ("tests/test_constraints.py",),
+        "planning.constraints": ("tests/test_verdict_order.py",),
         "planning.registration": ("tests/test_registration_limits.py", "tests/test_registration.py", *RESIDUALS),
     }
 )

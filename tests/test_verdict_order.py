@@ -1,0 +1,146 @@
+"""Which reason is given, and with which numbers: paths and clearances made by hand, many rows at once."""
+
+import numpy as np
+import pytest
+
+from planning.anatomy import Role, Structure
+from planning.case import Needle
+from planning.clearance.measure import Clearances
+from planning.constraints import judge, longest_path, worst_violation
+from planning.mesh import TriangleMesh
+from planning.reasons import Reason
+from planning.skin_entry import SkinPaths
+
+NEEDLE = Needle(200.0, 150.0, 1.0, None, 10.0, 30.0)
+DOT = TriangleMesh([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+NAN = np.nan
+MAX_ANGLE = np.radians(60)
+
+
+def paths(rows):
+    """Skin paths of (length, angle in degrees, re-entry, unknown) per row."""
+    length, angle, reentry, unknown = np.array(rows, float).T
+    entry = np.zeros((len(length), 3))
+    return SkinPaths(entry, length, np.radians(angle), reentry, unknown)
+
+
+def structure(name, margin=2.0, role=Role.AVOID):
+    """A structure of no matter which shape."""
+    return Structure(name, role, margin, DOT, "made")
+
+
+def nothing(count):
+    """No structure, so no clearance."""
+    empty = np.empty((count, 0))
+    return Clearances(empty, empty, empty.astype(bool))
+
+
+def judged(skin_rows, clearances=None, structures=(), needle=NEEDLE, **settings):
+    """Verdicts as rows of (reason, structure, depth, amount)."""
+    skin = paths(skin_rows)
+    clearances = nothing(len(skin_rows)) if clearances is None else clearances
+    found = judge(skin, clearances, tuple(structures), needle=needle, max_skin_angle=MAX_ANGLE, **settings)
+    return list(zip(found.reason, found.structure, found.depth, found.amount, strict=True))
+
+
+def same(found, expected):
+    """Rows equal, NaN where NaN is expected."""
+    for row, wanted in zip(found, expected, strict=True):
+        assert tuple(row[:2]) == tuple(wanted[:2])
+        np.testing.assert_allclose(np.array(row[2:], float), wanted[2:], atol=1e-12)
+
+
+def test_each_reason_of_the_skin_and_its_numbers():
+    """One row for each, in one call: what the reason names, where, and what fell short."""
+    rows = [
+        (100, 10, NAN, NAN),
+        (100, 10, NAN, 70),
+        (NAN, NAN, NAN, NAN),
+        (100, 10, 130, NAN),
+        (151, 10, NAN, NAN),
+        (100, 61, NAN, NAN),
+    ]
+    same(
+        judged(rows),
+        [
+            ("", "", NAN, NAN),
+            (Reason.UNKNOWN_REGION, "skin", 70, NAN),
+            (Reason.NO_SKIN_ENTRY, "skin", NAN, NAN),
+            (Reason.REENTERS_SKIN, "skin", 130, NAN),
+            (Reason.TOO_LONG, "skin", 151, 151),
+            (Reason.SKIN_ANGLE, "skin", 100, 61),
+        ],
+    )
+    assert judged([(151, 10, NAN, NAN)], skin="carton_wall")[0][1] == "carton_wall"
+
+
+def test_the_first_broken_constraint_gives_the_reason():
+    """Whatever else is broken after it, down to the structures."""
+    near = Clearances(np.array([[0.5]] * 6), np.array([[40.0]] * 6), np.ones((6, 1), bool))
+    rows = [
+        (NAN, NAN, 90, 70),
+        (NAN, NAN, 90, NAN),
+        (160, 70, 90, NAN),
+        (160, 70, NAN, NAN),
+        (100, 70, NAN, NAN),
+        (100, 10, NAN, NAN),
+    ]
+    reasons = [row[0] for row in judged(rows, near, [structure("vessel")])]
+    assert reasons == [
+        Reason.UNKNOWN_REGION, Reason.NO_SKIN_ENTRY, Reason.REENTERS_SKIN, Reason.TOO_LONG, Reason.SKIN_ANGLE,
+        Reason.TOO_CLOSE,
+    ]  # fmt: skip
+
+
+def test_limits_themselves_are_kept():
+    """A path of exactly the shaft, an angle of exactly the largest."""
+    assert [row[0] for row in judged([(150, 10, NAN, NAN), (100, 60, NAN, NAN)])] == ["", ""]
+
+
+@pytest.mark.parametrize(("standoff", "longest"), [(None, 150), (100.0, 90), (170.0, 150), (160.0, 150), (159.0, 149)])
+def test_the_longest_path(standoff, longest):
+    """The shaft; with a fixed standoff no more than leaves the tip its gap outside."""
+    assert longest_path(Needle(200.0, 150.0, 1.0, standoff, 10.0, 30.0)) == longest
+
+
+def scene():
+    """Four candidates and three structures: who is violated, by how much, and where."""
+    clearance = np.array([[1.0, 4.0, -0.5], [1.0, 4.0, 0.5], [9.0, 9.0, 9.0], [1.5, 2.0, 0.9]])
+    depth = np.array([[30.0, 20, 50], [30, 20, 10], [1, 2, 3], [30, 20, 10]])
+    violated = np.array([[True, True, True], [True, False, False], [False, False, False], [True, True, False]])
+    return Clearances(clearance, depth, violated)
+
+
+def test_the_structure_that_lacks_most_is_named_with_its_depth_and_clearance():
+    """Margin less clearance decides, not the least clearance; what is not violated has no say."""
+    structures = [structure("a", 2.0), structure("b", 7.0), structure("c", 1.0)]
+    rows = [(100, 10, NAN, NAN)] * 4
+    same(
+        judged(rows, scene(), structures),
+        [
+            (Reason.TOO_CLOSE, "b", 20, 4),
+            (Reason.TOO_CLOSE, "a", 30, 1),
+            ("", "", NAN, NAN),
+            (Reason.TOO_CLOSE, "b", 20, 2),
+        ],
+    )
+
+
+def test_of_equal_lacks_the_one_met_first_is_named():
+    """Along the needle, whatever the order of the structures; without a structure there is column 0."""
+    structures = tuple(structure(name, margin) for name, margin in (("a", 2.0), ("b", 5.0), ("c", 1.0)))
+    clearances = Clearances(
+        np.array([[1.0, 4.0, 0.0]] * 2), np.array([[30.0, 20, 50], [5, 20, 4]]), np.ones((2, 3), bool)
+    )
+    assert worst_violation(clearances, structures).tolist() == [1, 2]
+    assert worst_violation(nothing(3), ()).tolist() == [0, 0, 0]
+
+
+def test_the_worst_structure_decides_between_unknown_and_too_close():
+    """Of a role unknown and one to avoid, whichever lacks more gives the reason."""
+    clearances = Clearances(np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([[30.0, 20], [30, 20]]), np.ones((2, 2), bool))
+    structures = [structure("fog", 2.0, Role.UNKNOWN), structure("vessel", 2.0)]
+    same(
+        judged([(100, 10, NAN, NAN)] * 2, clearances, structures),
+        [(Reason.UNKNOWN_REGION, "fog", 30, 0), (Reason.TOO_CLOSE, "vessel", 20, 0)],
+    )
