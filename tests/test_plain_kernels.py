@@ -45,13 +45,15 @@ def asked(u, length, triangle):
     return np.sqrt(square), depth
 
 
-def test_axis_triangle_equals_the_oracle(rng):
-    """Any triangle, degenerate ones too: the oracle's distance, and a depth at which the axis is that near."""
-    for triangle in triangles(rng, 250):
+@pytest.mark.parametrize(("scale", "count"), [(1.0, 250), (0.005, 120)])
+def test_axis_triangle_equals_the_oracle(rng, scale, count):
+    """Any triangle, degenerate and tiny ones too: the oracle's distance, and a depth at which the axis is that near."""
+    length = scale * LENGTH
+    for triangle in scale * triangles(rng, count):
         u = unit(rng)
-        distance, depth = asked(u, LENGTH, triangle)
-        assert distance == pytest.approx(segment_triangle_distance(np.zeros(3), LENGTH * u, triangle), abs=TIGHT_MM)
-        assert -TIGHT_MM <= depth <= LENGTH + TIGHT_MM
+        distance, depth = asked(u, length, triangle)
+        assert distance == pytest.approx(segment_triangle_distance(np.zeros(3), length * u, triangle), abs=TIGHT_MM)
+        assert -TIGHT_MM <= depth <= length + TIGHT_MM
         assert depth_distance(u, depth, triangle) == pytest.approx(distance, abs=1e-7)
 
 
@@ -138,6 +140,20 @@ def test_side_by_side_equals_the_oracle(rng):
     assert (marks >= 0).sum() > 50 and (marks == ASK).sum() > 50 and (marks == BEYOND).sum() > 10
 
 
+def test_triangles_beyond_the_top_over_it_and_beside_it(rng):
+    """Tilted faces over the axis' end are as far as their foot, those beside it as far as their rim."""
+    shapes = rng.normal(0, 12, (80, 3, 3)) * [1, 1, 0.3] + [0, 0, LENGTH + 15.0]
+    shapes = shapes[shapes[:, :, 2].min(axis=1) > LENGTH]
+    distance, depth, marks = beside(shapes.reshape(-1, 9), LENGTH, [Z_FRAME] * len(shapes), np.zeros(3))
+    top = np.array([0.0, 0, LENGTH])
+    expected = [segment_triangle_distance(top, top, triangle) for triangle in shapes]
+    rims = [min(segment_triangle_distance(top, top, t[[i, j, j]]) for i, j in ((0, 1), (1, 2), (2, 0))) for t in shapes]
+    np.testing.assert_allclose(distance, expected, atol=TIGHT_MM)
+    np.testing.assert_array_equal(marks, BEYOND)
+    np.testing.assert_array_equal(depth, LENGTH)
+    assert 5 < np.sum(np.array(rims) > distance + 1e-6) < len(shapes)
+
+
 Z_FRAME = (np.eye(3)[2], np.eye(3)[0], np.eye(3)[1])
 
 
@@ -180,6 +196,15 @@ def test_the_nearest_triangle_of_a_packed_surface(rng, place):
     assert each[placed.nearest] == pytest.approx(min(each), abs=TIGHT_MM)
 
 
+def test_the_row_of_the_nearest_triangle_is_its_own(rng):
+    """From beside each of the first triangles of the packed order, that row is the nearest one."""
+    corners = rng.normal(0, 60, (40, 1, 3)) + rng.normal(0, 1, (40, 3, 3))
+    blocks = pack(TriangleMesh(corners.reshape(-1, 3), np.arange(120).reshape(-1, 3)))
+    for row in range(4):
+        placed = _placed(blocks, blocks.triangles[row].reshape(3, 3).mean(axis=0) + 0.01)
+        assert placed.nearest == row and placed.distance < 0.02
+
+
 def test_a_surface_of_one_triangle_has_a_nearest_one():
     """The smallest surface: one block, filled up with one triangle."""
     placed = _placed(pack(TriangleMesh(square_on(7.0), np.array([[0, 1, 2]]))), np.array([0.0, 0, 3]))
@@ -207,6 +232,60 @@ def test_every_crossing_of_a_small_surface(rng):
         assert segment_triangle_distance(point, point, corners[face]) < 1e-9
 
 
+def wide_and_narrow(rng, scale):
+    """Triangles from a degree to over ninety wide, each with near and far corners: at the poles, along -x, elsewhere."""
+    axes = np.concatenate([np.eye(3), -np.eye(3), [[-1.0, 0.02, 0.3], [-1, -0.02, -0.6]], rng.normal(0, 1, (12, 3))])
+    found = []
+    for axis in axes:
+        for width in (0.02, 0.3, 1.2):
+            corners = axis / np.linalg.norm(axis) + width * rng.normal(0, 1, (3, 3))
+            found.append(corners * scale * rng.uniform(1.0, 30.0, (3, 1)))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("scale", [0.01, 10.0])
+def test_a_ray_into_a_triangle_crosses_it_however_near_its_rim(rng, scale):
+    """Rays just within each corner, just within each edge and through the middle: the crossing is where they aim."""
+    corners = wide_and_narrow(rng, scale)
+    near = 1e-6
+    weights = np.array([[1 - 2 * near, near, near], [0.5 - near, 0.5 - near, 2 * near], [1 / 3, 1 / 3, 1 / 3]])
+    weights = np.concatenate([np.roll(weights[:2], k, axis=1) for k in range(3)] + [weights[2:]])
+    points = np.einsum("wk,tkx->twx", weights, corners)
+    away = np.linalg.norm(points, axis=-1)
+    mesh = TriangleMesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+    found = crossings(mesh, np.zeros(3), (points / away[..., None]).reshape(-1, 3))
+    met = {(int(ray), int(face)): depth for ray, face, depth in zip(found.ray, found.face, found.depth, strict=True)}
+    for triangle in range(len(corners)):
+        for w in range(len(weights)):
+            depth = met.get((triangle * len(weights) + w, triangle))
+            assert depth == pytest.approx(away[triangle, w], rel=1e-6)
+    beyond = np.einsum("wk,tkx->twx", np.array([[1.02, -0.01, -0.01], [0.51, 0.51, -0.02]]), corners[::3])
+    out = crossings(mesh, np.zeros(3), (beyond / np.linalg.norm(beyond, axis=-1)[..., None]).reshape(-1, 3))
+    assert not any(face == 3 * (ray // 2) for ray, face in zip(out.ray.tolist(), out.face.tolist(), strict=True))
+
+
+def test_triangles_about_the_poles(rng):
+    """Three corners evenly about the z axis: their mean direction is z to rounding, and the axis crosses them all."""
+    corners = []
+    for turn, height in zip(rng.uniform(0, 2, 40), rng.choice([-1.0, 1.0], 40) * rng.uniform(1, 9, 40), strict=True):
+        angles = turn + np.radians([0.0, 120, 240])
+        corners.append(np.stack([np.cos(angles), np.sin(angles), np.full(3, height)], axis=1))
+    mesh = TriangleMesh(np.concatenate(corners), np.arange(120).reshape(-1, 3))
+    found = crossings(mesh, np.zeros(3), np.array([[0.0, 0, 1], [0, 0, -1]]))
+    heights = np.array([c[0, 2] for c in corners])
+    expected = [np.sort(heights[heights > 0]), np.sort(-heights[heights < 0])]
+    np.testing.assert_allclose(found.depth, np.concatenate(expected), atol=1e-12)
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2], [0, 2, 1]])
+def test_an_edge_is_crossed_whichever_way_the_faces_are_wound(order):
+    """Rays through the three edges and corners of a single triangle cross it."""
+    corners = np.array([[4.0, 0, 8], [-4, 4, 8], [-4, -4, 8]])
+    at = np.concatenate([corners, [[-4, 0, 8.0], [0, 2, 8], [0, -2, 8]]])
+    found = crossings(TriangleMesh(corners, [order]), np.zeros(3), at / np.linalg.norm(at, axis=1, keepdims=True))
+    assert found.count.tolist() == [1] * 6
+
+
 def test_crossings_behind_beyond_and_at_the_length():
     """Nothing is crossed behind the origin or beyond the length; at the length it is; an edge counts once."""
     sheets = np.concatenate([square_on(10.0), square_on(-10.0), square_on(30.0), square_on(10.0) - [0, 10.0, 0]])
@@ -227,3 +306,4 @@ def test_rays_from_a_corner_of_the_surface():
     found = crossings(mesh, np.zeros(3), inward)
     last = [found.depth[found.ray == row].max() for row in range(3)]
     np.testing.assert_allclose(last, 20 / inward.sum(axis=1), atol=1e-9)
+    np.testing.assert_array_equal(found.depth[found.first], 0.0)
