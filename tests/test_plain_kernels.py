@@ -233,7 +233,7 @@ def test_every_crossing_of_a_small_surface(rng):
 
 
 def wide_and_narrow(rng, scale):
-    """Triangles from a degree to over ninety wide, each with near and far corners: at the poles, along -x, elsewhere."""
+    """Triangles from a degree to over ninety wide, corners near and far: at the poles, along -x, elsewhere."""
     axes = np.concatenate([np.eye(3), -np.eye(3), [[-1.0, 0.02, 0.3], [-1, -0.02, -0.6]], rng.normal(0, 1, (12, 3))])
     found = []
     for axis in axes:
