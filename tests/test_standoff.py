@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import fcl
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from planning.robot.kinematics import inverse
 from planning.robot.ur import ur_model
 from planning.room import ARM_PADDING_MM, case_tool
 from planning.search import case_directions, organ_candidates
-from planning.standoff import MAX_GAP_MM, UNEVEN_SKIN_MM, skin_gaps, standoffs
+from planning.standoff import MAX_GAP_MM, UNEVEN_SKIN_MM, axis_lengths, farthest_flange, skin_gaps, standoffs
 
 DEG = np.pi / 180.0
 
@@ -99,3 +101,17 @@ def test_no_direction_of_the_abdomen_is_lost_to_its_own_needle():
     assert needle_can_start(tool, skin, case.target_ct, wanted, ARM_PADDING_MM).all()
     oblique = found.skin_angle[found.safe] > 43.0 * DEG
     assert oblique.sum() > 100 and (wanted.standoff_mm - found.path_length[found.safe])[oblique].min() > 10.0
+
+
+def test_the_farthest_flange():
+    """Shaft or stated standoff, the needle, and the gap at the steepest angle that the case allows."""
+    assert farthest_flange(needle(standoff=60.0), 1.0) == 260.0
+    assert farthest_flange(needle(), 0.0) == 200.0 + 150.0 + 10.0
+    assert farthest_flange(needle(), 45.0 * DEG) == pytest.approx(200.0 + 150.0 + 11.6)
+
+
+def test_axes_are_as_long_as_what_they_are_checked_against_demands():
+    """Against the body up to an inserted needle's flange, against what is outside of it up to a waiting one's."""
+    case = SimpleNamespace(needle=needle(), search=SimpleNamespace(max_skin_angle=45.0 * DEG))
+    structures = [SimpleNamespace(outside=outside) for outside in (False, True, False)]
+    np.testing.assert_allclose(axis_lengths(case, structures), [200.0, 361.6, 200.0])
