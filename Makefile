@@ -1,5 +1,5 @@
 # make demo: the main job on the embedded abdomen.  make test: everything that must hold.
-# make mutants: which faults in the plain modules and kernels the tests notice (an hour).
+# make mutants: which faults in the plain modules and kernels the tests notice (a quarter of an hour).
 
 PYTHON ?= python3.11
 VENV := .venv
