@@ -122,11 +122,13 @@ def certificate(folder):
         theta=(0.2, 0.4),
         beta=(0.1, 0.3),
         length=210.0,
+        farthest=360.0,
         radius=0.6,
         longest=150.0,
         max_skin_angle=1.0,
         structures=("rib",),
         margins=np.zeros(1),
+        lengths=np.array([210.0]),
     )
     empty = np.array([""])
     one = Certificate(
