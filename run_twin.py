@@ -1,6 +1,6 @@
 """The command line: parses, calls, prints.
 
-Exit codes: 0 done, 1 done and the answer is no, 2 bad input, 3 the program failed.
+Exit codes: 0 done, 1 done and the answer is no, 2 bad input, 3 the program failed, 130 interrupted.
 
 Commands that stand apart from the main job import what they need themselves: it would cost all others a second.
 """
@@ -37,7 +37,7 @@ from twin.report.progress import progress_display
 MOST_SEEDS = 10_000
 """Rooms or draws of one command; each takes seconds."""
 
-OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED = 0, 1, 2, 3
+OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
 
 app = typer.Typer(add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False)
 out = Console(soft_wrap=True)
@@ -214,7 +214,7 @@ def export(
         raise InputError(f"format '{format_name}' is not known", where="--format", allowed=", ".join(FORMATS))
     with progress_display() as progress:
         prepared = None if case is None else prepare(case, watcher=progress)
-        done = main_job.export(plan, format_name, out_dir, prepared)
+        done = main_job.export(plan, format_name, out_dir, prepared, progress.note)
     summary = {"format": format_name, "notes": list(done.notes), "case_checked": case is not None}
     _print({**summary, "files": [str(done.path)]}, words.export_text(done, case is not None), as_json)
 
@@ -272,7 +272,7 @@ def servo(
     from twin.stereo.servo_job import run_servo
 
     with progress_display() as progress:
-        job = run_servo(case, out_dir, seeds, partial(progress.count, "seeds"))
+        job = run_servo(case, out_dir, seeds, partial(progress.count, "seeds"), progress.note)
     _print(job.summary, job.text, as_json)
     if not job.holds:
         raise typer.Exit(ANSWER_IS_NO)
@@ -341,6 +341,8 @@ def _run(arguments: list[str] | None) -> int:
         return _fail(str(error), BAD_INPUT)
     except NoAnswerError as error:
         return _fail(one_line(str(error)), ANSWER_IS_NO)
+    except (KeyboardInterrupt, typer.Abort):
+        return _fail("interrupted", INTERRUPTED)
     except ClickException as error:
         return _fail(f"command line: {one_line(error.format_message(), MOST_WHAT)}; allowed: see --help", BAD_INPUT)
     except PlanningError as error:

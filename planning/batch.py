@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import multiprocessing
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ import numpy as np
 
 from planning.errors import InputError, PlanningError, one_line
 from planning.files import atomic
+from planning.output_set import writing
 from planning.prepared import Watcher, prepare
 from planning.processes import worker_count
-from planning.provenance import inputs_document
+from planning.provenance import inputs_document, read_inputs
 from planning.table import write_table
 
 COLUMNS = (
@@ -28,11 +30,11 @@ COLUMNS = (
     "safe",
     "best_theta_deg",
     "best_beta_deg",
-    "seconds",
     "said",
     "inputs",
 )
-"""Columns of ``batch.csv``; ``inputs`` is the list of role, path and sha256 as JSON, empty where a case was refused."""
+"""Columns of ``batch.csv``; ``inputs`` is the list of role, path and sha256 as JSON, empty where a case was refused.
+How long a case took is in ``timings.json``: the table is reproducible."""
 
 
 def run_batch(
@@ -48,33 +50,57 @@ def run_batch(
         watcher: Whoever shows progress, in cases.
 
     Returns:
-        One row per case, in the order given, with the keys `COLUMNS`; ``exit_code`` as the command line's.
+        One row per case, in the order given, with the keys `COLUMNS` and ``seconds``; ``exit_code`` as the command
+        line's.
     """
     rows: list[dict[str, Any]] = [{} for _ in cases]
-    folders = [f"{number:04d}" for number in range(1, len(cases) + 1)]
+    seconds: dict[str, float] = {}
+    with writing(out, "batch", seconds=seconds, names=("batch.csv",), note=watcher.note) as draft:
+        for number, row in _searched(cases, draft.folder, jobs, arm, watcher):
+            rows[number] = row
+        draft.inputs = [
+            replace(one, role=f"{row['folder']} {one.role}") for row in rows for one in read_inputs(row["inputs"] or [])
+        ]
+        seconds |= {row["folder"]: row["seconds"] or 0.0 for row in rows}
+        with atomic(draft.folder / "batch.csv") as temporary:
+            _write_rows(rows, temporary)
+    return rows
+
+
+def _searched(
+    cases: Sequence[Path], out: Path, jobs: int, arm: bool, watcher: Watcher
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Each case's number and row, as they are done."""
+    folders = [out / f"{number:04d}" for number in range(1, len(cases) + 1)]
     context = multiprocessing.get_context("spawn")  # compiled libraries with threads do not survive a fork
-    with ProcessPoolExecutor(max_workers=worker_count(jobs, len(cases)), mp_context=context) as pool:
+    pool = ProcessPoolExecutor(max_workers=worker_count(jobs, len(cases)), mp_context=context)
+    try:
         numbers = {
-            pool.submit(search_one, case, out / folder, arm): number
+            pool.submit(search_one, case, folder, arm): number
             for number, (case, folder) in enumerate(zip(cases, folders, strict=True))
         }
         for done, future in enumerate(as_completed(numbers), start=1):
             number, failed = numbers[future], future.exception()
-            rows[number] = future.result() if failed is None else _failed(cases[number], failed)
+            yield number, future.result() if failed is None else _failed(cases[number], folders[number].name, failed)
             watcher.count("cases", done, len(cases))
-    with atomic(out / "batch.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, COLUMNS)
+    finally:
+        pool.shutdown(cancel_futures=True)  # after Ctrl-C nothing more begins
+
+
+def _write_rows(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, COLUMNS, extrasaction="ignore")
         writer.writeheader()
         writer.writerows({**row, "inputs": json.dumps(row["inputs"] or [])} for row in rows)
-    return rows
 
 
-def _failed(path: Path, error: BaseException) -> dict[str, Any]:
+def _failed(path: Path, folder: str, error: BaseException) -> dict[str, Any]:
     """The row of a case at which the program itself failed."""
-    row: dict[str, Any] = dict.fromkeys(COLUMNS)
+    row: dict[str, Any] = dict.fromkeys((*COLUMNS, "seconds"))
     said = f"{type(error).__name__}: {error}"
     return row | {
         "case": one_line(str(path)),
+        "folder": folder,
         "directions": 0,
         "safe": 0,
         "exit_code": 3,
@@ -84,7 +110,7 @@ def _failed(path: Path, error: BaseException) -> dict[str, Any]:
 
 def search_one(path: Path, out: Path, arm: bool | None) -> dict[str, Any]:
     """Search one case and write its table; a refusal becomes a row."""
-    row: dict[str, Any] = dict.fromkeys(COLUMNS)
+    row: dict[str, Any] = dict.fromkeys((*COLUMNS, "seconds"))
     row |= {"case": one_line(str(path)), "folder": out.name, "directions": 0, "safe": 0}
     try:
         prepared = prepare(path, arm=arm)

@@ -48,6 +48,10 @@ class Watcher(Protocol):
         """A stage has done so many of so many."""
         ...
 
+    def note(self, line: str) -> None:
+        """Something happened that whoever watches should know."""
+        ...
+
 
 class Silent:
     """Shows nothing."""
@@ -56,6 +60,9 @@ class Silent:
         """Nothing."""
 
     def count(self, stage: str, done: int, total: int) -> None:
+        """Nothing."""
+
+    def note(self, line: str) -> None:
         """Nothing."""
 
 

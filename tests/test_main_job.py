@@ -48,6 +48,8 @@ def test_a_rehearsal_writes_every_file(rehearsed):
         "rehearsal.json",
         "rehearsal.mp4",
         "report.html",
+        "manifest.json",
+        "timings.json",
     }
     assert {path.name for path in rehearsed.iterdir()} == names
     assert all(path.stat().st_size > 0 for path in rehearsed.iterdir())
@@ -100,7 +102,7 @@ def test_pictures_can_be_left_out(carton, tmp_path, capfd):
     """The table alone, for those who only want numbers."""
     assert main(["search", str(carton), "--no-arm", "--no-pictures", "--out", str(tmp_path)]) == OK
     capfd.readouterr()
-    assert [path.name for path in tmp_path.iterdir()] == ["candidates.parquet"]
+    assert {path.name for path in tmp_path.iterdir()} == {"candidates.parquet", "manifest.json", "timings.json"}
 
 
 def test_nothing_safe_is_exit_code_1_with_the_closest_miss(carton, tmp_path, capfd):

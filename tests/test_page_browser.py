@@ -152,7 +152,7 @@ def browser(case, candidates, tmp_path_factory):
     path = folder / "report.html"
     plan = world.make_plan(case, candidates)
     registration = world.make_registration()
-    write_page(case, world.make_anatomy(), candidates, plan, world.make_rehearsal(plan), registration, {}, path)
+    write_page(case, world.make_anatomy(), candidates, plan, world.make_rehearsal(plan), registration, path)
     with Browser(folder / "profile") as browser:
         browser.open(path)
         yield browser

@@ -40,8 +40,8 @@ def done(case_folder, tmp_path_factory):
 def test_every_file_is_written(done):
     """The calibration, the recording, the pictures and the page."""
     names = {"calibration.json", "recording.csv", "bmode.png", "room.png", "report.html"}
-    assert {path.name for path in done.iterdir()} == names
-    assert all(path.stat().st_size > 1000 for path in done.iterdir())
+    assert {path.name for path in done.iterdir()} == {*names, "manifest.json", "timings.json"}
+    assert all((done / name).stat().st_size > 1000 for name in names)
 
 
 def test_the_calibration_is_the_truth_within_what_it_claims(case_folder, done):
@@ -88,7 +88,8 @@ def test_a_recording_gives_the_same_calibration(done, tmp_path, capsys):
     assert summary["T_end1_image"] == pytest.approx(np.array(found["T_end1_image"]), abs=1e-6)
     assert summary["predicted_tre_mm"] == pytest.approx(found["predicted_tre_mm"], rel=1e-4)
     assert summary["trials"] == []
-    assert {path.name for path in tmp_path.iterdir()} == {"calibration.json", "report.html"}
+    names = {"calibration.json", "report.html", "manifest.json", "timings.json"}
+    assert {path.name for path in tmp_path.iterdir()} == names
 
 
 def test_a_recording_that_ends_within_a_line_is_a_warning(done, tmp_path, capsys):

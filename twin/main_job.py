@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,25 +15,29 @@ import numpy as np
 from planning.cache import user_cache
 from planning.candidates import Candidates
 from planning.case import load_case
-from planning.certify import Certificate, certify, verify, with_safe_cone, write_certificate
-from planning.certify.certificate import MAX_CERTIFICATE_BYTES, parse_certificate
+from planning.certify import Certificate, certify, parse_certificate, verify, with_safe_cone, write_certificate
+from planning.certify.certificate import MAX_CERTIFICATE_BYTES
 from planning.clearance.cross_check import CrossChecked
 from planning.errors import InputError, NoAnswerError
 from planning.explain import Explanation, finite, needle_warnings
-from planning.export import Exported, export_plan
+from planning.export import Exported, export_name, export_plan
 from planning.files import atomic
-from planning.formats.input_file import read_input
 from planning.marker_check import checked_placement
+from planning.output_manifest import read_output
+from planning.output_set import Draft, writing
 from planning.plan import MAX_PLAN_BYTES, Plan, parse_plan, write_plan
 from planning.plan_check import check_plan
 from planning.planner import make_plan
 from planning.prepared import Prepared
-from planning.provenance import Input, content_input, inputs_document
+from planning.provenance import Input, inputs_document
 from planning.registration import Registration
 from planning.table import write_table
 from twin.rehearsal import Rehearsal, rehearse
 from twin.report import draw_film, draw_map, draw_scene, write_page
 from twin.truth import draw_truth
+
+PICTURES = ("map.png", "scene.png", "report.html")
+CERTIFICATE, FILM = "certificate.json", "rehearsal.mp4"
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +87,14 @@ def search_case(
     certify_deg: float | None = None,
 ) -> Run:
     """Search; write ``candidates.parquet`` and, if wanted, the certificate, the pictures and the page."""
-    run = Run(prepared, prepared.search(), (), checked=checked)
-    if certify_deg is not None:
-        run = _certified(run, certify_deg, out)
-    run = _with_table(run, out)
-    return _with_pictures(run, out) if pictures else run
+    names = ("candidates.parquet", *(PICTURES if pictures else ()), *(() if certify_deg is None else (CERTIFICATE,)))
+    with _writing(out, "search", prepared, names) as draft:
+        run = Run(prepared, prepared.search(), (), checked=checked)
+        if certify_deg is not None:
+            run = _certified(run, certify_deg, draft.folder)
+        run = _with_table(run, draft.folder)
+        run = _with_pictures(run, draft.folder) if pictures else run
+    return _final(run, draft)
 
 
 def plan_case(prepared: Prepared, out: Path) -> Run:
@@ -95,7 +104,10 @@ def plan_case(prepared: Prepared, out: Path) -> Run:
         InputError: The case does not say where the arm stands.
         NoAnswerError: No plan; the search's files are written all the same.
     """
-    return _with_pictures(_searched_and_planned(prepared, out), out)
+    _refuse_without_arm(prepared)
+    with _writing(out, "plan", prepared, ("candidates.parquet", "plan.json", *PICTURES)) as draft:
+        run = _with_pictures(_searched_and_planned(prepared, draft.folder), draft.folder)
+    return _answered(_final(run, draft), out)
 
 
 def rehearse_case(prepared: Prepared, out: Path) -> Run:
@@ -105,37 +117,94 @@ def rehearse_case(prepared: Prepared, out: Path) -> Run:
         InputError: The case does not say where the arm stands.
         NoAnswerError: No plan; the search's files are written all the same.
     """
-    return _with_pictures(_rehearsed(_searched_and_planned(prepared, out), out), out)
+    _refuse_without_arm(prepared)
+    names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, *PICTURES)
+    with _writing(out, "plan", prepared, names) as draft:
+        run = _searched_and_planned(prepared, draft.folder)
+        planned = run.files
+        run = run if run.plan is None else _rehearsed(run, draft.folder)
+        run = _with_pictures(run, draft.folder)
+        if run.rehearsal is not None:  # the page shows it: it goes with it
+            shown = {draft.folder / "map.png", draft.folder / "scene.png"}
+            draft.split("rehearse", *(path for path in run.files if path not in {*planned, *shown}))
+    return _answered(_final(run, draft), out)
 
 
-def _searched_and_planned(prepared: Prepared, out: Path) -> Run:
+def _refuse_without_arm(prepared: Prepared) -> None:
     if prepared.reach is None:
         raise InputError(
             "the case does not say where the robot stands, so nothing can be planned",
             where=prepared.case.path,
             allowed="[registration] with markers_ct and markers_base, or [robot.mount]",
         )
-    _remove_stale(out)
-    run = _with_table(_planned(Run(prepared, prepared.search(), ()), out), out)
+
+
+def _writing(
+    out: Path,
+    command: str,
+    prepared: Prepared,
+    names: Iterable[str],
+    source: Input | None = None,
+) -> AbstractContextManager[Draft]:
+    """A draft of a command's files, with the case's inputs and the run's times."""
+    read = () if source is None else (source,)
+    return writing(
+        out,
+        command,
+        inputs=(*read, *prepared.case.inputs),
+        seconds=prepared.stages.seconds,
+        names=names,
+        made_from={one.path: one.sha256 for one in read},
+        note=prepared.watcher.note,
+    )
+
+
+def _final(run: Run, draft: Draft) -> Run:
+    """The run with its files where they lie now."""
+    return replace(run, files=draft.final(run.files))
+
+
+def _answered(run: Run, out: Path) -> Run:
+    """The run, if it has a plan.
+
+    Raises:
+        NoAnswerError: It has none.
+    """
     if run.plan is None:
-        _with_pictures(run, out)
         raise NoAnswerError(f"{run.refusal}; see {out / 'report.html'}", counts=run.candidates.counts())
     return run
+
+
+def _searched_and_planned(prepared: Prepared, out: Path) -> Run:
+    return _with_table(_planned(Run(prepared, prepared.search(), ()), out), out)
 
 
 def rehearse_plan(prepared: Prepared, plan_path: Path, out: Path) -> Run:
     """Load a plan, check it again, rehearse it; write the rehearsal's files and the scene, but no map of one direction.
 
+    The scene is left out where the plan's own stands beside it: it shows the same.
+
     Raises:
         InputError: A plan that does not belong to the case or does not hold any more.
     """
-    source, plan = _read_plan(plan_path)
+    source, plan = _read_plan(plan_path, prepared.watcher.note)
     with prepared.stages.time("plan"):
-        candidates = check_plan(plan, prepared, plan_path)
-    run = _rehearsed(Run(prepared, candidates, (), plan, read=(source,)), out)
-    with prepared.stages.time("scene"):
-        draw_scene(prepared.case, prepared.anatomy, candidates, plan, out / "scene.png")
-    return _with(run, out / "scene.png")
+        candidates = check_plan(plan, prepared, plan_path, seed=prepared.case.rehearsal.seed)
+    with _writing(out, "rehearse", prepared, ("rehearsal.json", FILM), source) as draft:
+        run = _rehearsed(Run(prepared, candidates, (), plan, read=(source,)), draft.folder)
+        if not draft.source_has("scene.png"):
+            with prepared.stages.time("scene"):
+                draw_scene(prepared.case, prepared.anatomy, candidates, plan, draft.folder / "scene.png")
+            run = _with(run, draft.folder / "scene.png")
+    return _final(run, draft)
+
+
+def _read_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Plan]:
+    """A plan of a whole set, or with a warning from outside of any, and the hash of the bytes that it was read from."""
+    found = read_output(path, max_bytes=MAX_PLAN_BYTES)
+    if found.note:
+        note(f"warning: {found.note}")
+    return found.input("plan"), parse_plan(found.data, path)
 
 
 def _rehearsed(run: Run, out: Path) -> Run:
@@ -153,36 +222,29 @@ def _rehearsed(run: Run, out: Path) -> Run:
             run.plan,
             prepared.case,
             prepared.anatomy,
-            out / "rehearsal.mp4",
+            out / FILM,
             progress=partial(prepared.watcher.count, "film"),
         )
     return _with(run, film)
 
 
-def _remove_stale(out: Path) -> None:
-    """What an earlier run planned and rehearsed must not stand beside a new search that may end without a plan."""
-    for name in ("plan.json", "rehearsal.json", "rehearsal.mp4"):
-        (out / name).unlink(missing_ok=True)
-
-
-def export(plan_path: Path, format_name: str, out: Path, prepared: Prepared | None) -> Exported:
+def export(
+    plan_path: Path, format_name: str, out: Path, prepared: Prepared | None, note: Callable[[str], None]
+) -> Exported:
     """Write a plan for a robot; with its case, after it has been checked again, and with rounded corners where free.
 
     Raises:
         InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
     """
-    _, plan = _read_plan(plan_path)
-    if prepared is None:
-        return export_plan(plan, format_name, out, source=plan_path)
-    check_plan(plan, prepared, plan_path)
-    assert prepared.reach is not None  # the check has refused this
-    return export_plan(plan, format_name, out, source=plan_path, checker=prepared.reach.checker)
-
-
-def _read_plan(path: Path) -> tuple[Input, Plan]:
-    """A plan, and the hash of the bytes that it was read from."""
-    content = read_input(path, max_bytes=MAX_PLAN_BYTES, where=str(path))
-    return content_input("plan", path.name, content), parse_plan(content, path)
+    source, plan = _read_plan(plan_path, note)
+    if prepared is not None:
+        check_plan(plan, prepared, plan_path, seed=prepared.case.rehearsal.seed)
+    checker = None if prepared is None or prepared.reach is None else prepared.reach.checker
+    name = export_name(plan_path, format_name)
+    inputs, made_from = (source, *plan.inputs), {source.path: source.sha256}
+    with writing(out, f"export {name}", inputs=inputs, names=(name,), made_from=made_from, note=note) as draft:
+        done = export_plan(plan, format_name, draft.folder, source=plan_path, checker=checker)
+    return replace(done, path=draft.final((done.path,))[0])
 
 
 def check_candidate(prepared: Prepared, theta_deg: float, beta_deg: float) -> Explanation:
@@ -288,8 +350,10 @@ def verify_certificate(path: Path, prepared: Prepared) -> dict[str, Any]:
     Raises:
         InputError: Not a certificate, not of this case, or a cell whose verdict does not follow.
     """
-    content = read_input(path, max_bytes=MAX_CERTIFICATE_BYTES, where=str(path))
-    stated, certificate = content_input("certificate", path.name, content), parse_certificate(content, path)
+    found = read_output(path, max_bytes=MAX_CERTIFICATE_BYTES)
+    if found.note:
+        prepared.watcher.note(f"warning: {found.note}")
+    stated, certificate = found.input("certificate"), parse_certificate(found.data, path)
     done = verify(certificate, prepared.case, prepared.anatomy, partial(prepared.watcher.count, "cells"))
     inputs = inputs_document((stated, *prepared.case.inputs))
     return {"certificate": str(path), "inputs": inputs, **certificate.summary(), "verified": asdict(done)}
@@ -302,8 +366,8 @@ def _certified(run: Run, size_deg: float, out: Path) -> Run:
         certificate = certify(prepared.case, prepared.anatomy, size=float(np.radians(size_deg)))
     with prepared.stages.time("safe cones"):
         found = with_safe_cone(prepared.case, run.candidates, certificate)
-    write_certificate(certificate, out / "certificate.json")
-    return _with(replace(run, candidates=found, certificate=certificate), out / "certificate.json")
+    write_certificate(certificate, out / CERTIFICATE)
+    return _with(replace(run, candidates=found, certificate=certificate), out / CERTIFICATE)
 
 
 def _planned(run: Run, out: Path) -> Run:
@@ -334,9 +398,9 @@ def _with_pictures(run: Run, out: Path) -> Run:
         draw_scene(case, anatomy, found, run.plan, out / "scene.png")
     registration = prepared.placement.registration if prepared.placement is not None else None
     shown = None if registration is None else registration_summary(registration)
-    so_far = dict(stages.seconds)
+    film = next((path.name for path in run.files if path.stem == Path(FILM).stem and path.suffix != ".json"), None)
     with stages.time("page"):
-        write_page(case, anatomy, found, run.plan, run.rehearsal, shown, so_far, out / "report.html")
+        write_page(case, anatomy, found, run.plan, run.rehearsal, shown, out / "report.html", film=film)
     return _with(run, out / "map.png", out / "scene.png", out / "report.html")
 
 

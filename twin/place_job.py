@@ -11,6 +11,7 @@ import numpy as np
 from planning.candidates import ARM_CHECKED
 from planning.case import mount_pose
 from planning.errors import NoAnswerError
+from planning.output_set import withdraw, writing
 from planning.place.document import place_document, write_place_document, write_placements
 from planning.place.search import PlaceSearch, search_placements
 from planning.prepared import Prepared
@@ -28,6 +29,8 @@ class PlaceRun:
     found: PlaceSearch
     document: dict[str, Any]
     files: tuple[Path, ...]
+    directions: int
+    """That the organs allow."""
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm; shares 0..1."""
@@ -43,6 +46,27 @@ def place_case(prepared: Prepared, out: Path, *, jobs: int, pictures: bool = Tru
         NoAnswerError: No direction is safe for the organs, or no placement holds one; the files are written in the
             second case.
     """
+    names = ("placements.csv", "place.json", *(("placements.png", "map_best_place.png") if pictures else ()))
+    try:
+        with writing(
+            out,
+            "place",
+            inputs=prepared.case.inputs,
+            seconds=prepared.stages.seconds,
+            names=names,
+            note=prepared.watcher.note,
+        ) as draft:
+            run = _placed(prepared, draft.folder, jobs, pictures)
+    except NoAnswerError:
+        withdraw(out, "place")
+        raise
+    if not any(one.verdict.held for one in run.found.judged):
+        raise NoAnswerError(f"no placement holds any of the {run.directions} organ-safe directions")
+    return replace(run, files=draft.final(run.files))
+
+
+def _placed(prepared: Prepared, out: Path, jobs: int, pictures: bool) -> PlaceRun:
+    """Search, and write everything into a folder."""
     case, stages = prepared.case, prepared.stages
     with stages.time("organs"):
         candidates = organ_candidates(case, prepared.anatomy, prepared.engine, case_directions(case))
@@ -63,13 +87,11 @@ def place_case(prepared: Prepared, out: Path, *, jobs: int, pictures: bool = Tru
         with stages.time("pictures"):
             draw_placements(found, case, prepared.anatomy.skin.mesh, out / "placements.png")
             files.append(out / "placements.png")
-    if not any(one.verdict.held for one in found.judged):
-        raise NoAnswerError(f"no placement holds any of the {int(candidates.safe.sum())} organ-safe directions")
-    if pictures:
+    if pictures and any(one.verdict.held for one in found.judged):
         T_base_ct = mount_pose(found.judged[0].mount, case.space, case.path)
         with stages.time("map"):
             reach = Reach(case_checker(case, prepared.anatomy, T_base_ct), np.asarray(T_base_ct))
             held = ranked(case, with_reach(case, candidates, reach))
             draw_map(held, replace(case, name=f"{case.name}, arm at the best place"), out / "map_best_place.png")
             files.append(out / "map_best_place.png")
-    return PlaceRun(prepared, found, document, tuple(files))
+    return PlaceRun(prepared, found, document, tuple(files), int(candidates.safe.sum()))

@@ -1,6 +1,6 @@
 """The map between the grid points: cells of directions that are proven safe or rejected, and the proof as a file."""
 
-from planning.certify.certificate import Certificate, read_certificate, write_certificate
+from planning.certify.certificate import Certificate, parse_certificate, read_certificate, write_certificate
 from planning.certify.certify import certify
 from planning.certify.checker import Verification, verify
 from planning.certify.cone_column import with_safe_cone
@@ -11,6 +11,7 @@ __all__ = [
     "Question",
     "Verification",
     "certify",
+    "parse_certificate",
     "read_certificate",
     "verify",
     "with_safe_cone",

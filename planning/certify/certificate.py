@@ -16,7 +16,7 @@ from planning.certify.question import Question
 from planning.entry import angles
 from planning.errors import InputError
 from planning.files import atomic
-from planning.formats.input_file import read_input
+from planning.output_manifest import read_output
 from planning.provenance import inputs_document, read_inputs
 from planning.reasons import Reason
 
@@ -32,6 +32,8 @@ MAX_CERTIFICATE_BYTES = 500_000_000
 
 MAX_NUMBER = 1e6
 """Of millimetres and radians: products of larger ones overflow."""
+
+CERTIFICATE_ALLOWED = "a file that search --certify wrote"
 
 CONE_ROUNDING_RAD = 1e-7
 """Taken from a safe cone: arccos near 1 rounds to 1e-8."""
@@ -212,26 +214,31 @@ def _witnesses(certificate: Certificate) -> list[list[Any]]:
 
 
 def read_certificate(path: Path) -> Certificate:
-    """Read a certificate and check that it is whole and agrees with itself; `checker.verify` proves it.
+    """Read a certificate, from a whole output set or from outside of any, and check it as `parse_certificate` does.
+
+    Raises:
+        InputError: It cannot be read, its folder's manifest lists other bytes, or see `parse_certificate`.
+    """
+    source = read_output(path, max_bytes=MAX_CERTIFICATE_BYTES)
+    return parse_certificate(source.data, path)
+
+
+def parse_certificate(data: bytes, path: Path) -> Certificate:
+    """Check that a certificate's bytes are whole and agree with themselves; `checker.verify` proves it.
+
+    Args:
+        data: The file's bytes.
+        path: The file, for errors.
 
     Raises:
         InputError: Not a certificate, another version, missing or contradicting parts.
     """
-    return parse_certificate(read_input(path, max_bytes=MAX_CERTIFICATE_BYTES, where=str(path)), path)
-
-
-def parse_certificate(content: bytes, path: Path) -> Certificate:
-    """The same of a file that has been read; it is not opened again.
-
-    Raises:
-        InputError: As `read_certificate`, but for reading.
-    """
-    document = _document(content, path)
+    document = _document(data, path)
     try:
         certificate = _certificate(document, path)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         what = f"not a certificate: {type(error).__name__} {error}"
-        raise InputError(what, where=path, allowed="a file that search --certify wrote") from error
+        raise InputError(what, where=path, allowed=CERTIFICATE_ALLOWED) from error
     stated, counted = document.get("summary"), json.loads(json.dumps(certificate.summary()))
     if stated != counted:
         wrong = [key for key in counted if not isinstance(stated, dict) or stated.get(key) != counted[key]]
@@ -240,11 +247,11 @@ def parse_certificate(content: bytes, path: Path) -> Certificate:
     return certificate
 
 
-def _document(content: bytes, path: Path) -> dict[str, Any]:
+def _document(data: bytes, path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(content.decode("utf-8"))
+        document = json.loads(data.decode("utf-8"))
     except (ValueError, RecursionError) as error:
-        raise InputError(f"no JSON ({error})", where=path, allowed="a file that search --certify wrote") from error
+        raise InputError(f"no JSON ({error})", where=path, allowed=CERTIFICATE_ALLOWED) from error
     if not isinstance(document, dict) or document.get("version") != CERTIFICATE_VERSION:
         version = document.get("version") if isinstance(document, dict) else None
         raise InputError(f"certificate version {version}", where=path, allowed=f"version {CERTIFICATE_VERSION}")

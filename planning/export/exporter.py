@@ -63,17 +63,25 @@ def export_plan(
         InputError: Another format, a plan that contradicts itself, or a number beyond the arm's limits; then nothing
             is written.
     """
-    if format_name not in FORMATS:
-        raise InputError(f"format '{format_name}'", where="export", allowed=", ".join(FORMATS))
+    path = folder / export_name(source, format_name)
     check_geometry(plan, source)
     if len(plan.insertion.q) < 2:
         raise InputError("the insertion is a single state", where=source, allowed="a motion")
-    suffix, draft = FORMATS[format_name]
-    checked = draft(plan, source, checker)
-    path = folder / f"{source.stem}{suffix}"
+    checked = FORMATS[format_name][1](plan, source, checker)
     with atomic(path) as temporary:
         temporary.write_bytes(checked.text.encode("ascii"))
     return Exported(path, format_name, checked.notes)
+
+
+def export_name(source: Path, format_name: str) -> str:
+    """The file's name: that of the plan's file, with the format's end.
+
+    Raises:
+        InputError: Another format.
+    """
+    if format_name not in FORMATS:
+        raise InputError(f"format '{format_name}'", where="export", allowed=", ".join(FORMATS))
+    return f"{source.stem}{FORMATS[format_name][0]}"
 
 
 def _urscript(plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:

@@ -208,7 +208,7 @@ def _write_mp4(frames: list[NDArray[np.uint8]], path: Path) -> None:
             codec="libx264",
             quality=None,
             output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"],
-            ffmpeg_log_level="error",
+            ffmpeg_log_level="quiet",
         )
         writer.send(None)
         try:
@@ -216,8 +216,9 @@ def _write_mp4(frames: list[NDArray[np.uint8]], path: Path) -> None:
                 writer.send(np.ascontiguousarray(frame))
         finally:
             writer.close()
-        if temporary.stat().st_size == 0:
-            raise RuntimeError("the encoder wrote nothing")
+        written, _ = imageio_ffmpeg.count_frames_and_secs(str(temporary))  # an encoder on a full disk says nothing
+        if written != len(frames):
+            raise RuntimeError(f"the encoder wrote {written} of {len(frames)} frames")
 
 
 def _write_gif(frames: list[NDArray[np.uint8]], path: Path) -> None:

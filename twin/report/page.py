@@ -28,8 +28,9 @@ def write_page(
     plan: Any | None,
     rehearsal: Any | None,
     registration: Mapping[str, Any] | None,
-    stages: Mapping[str, float],
     path: Path,
+    *,
+    film: str | None = None,
 ) -> None:
     """Write the page.
 
@@ -40,8 +41,8 @@ def write_page(
         plan: The plan, or None.
         rehearsal: What was measured, or None.
         registration: The registration as plain values, or None.
-        stages: Seconds that each stage took.
         path: The HTML to write; it appears whole or not at all.
+        film: Name of the rehearsal's film, which lies beside the page and is linked; None without one.
     """
     data = {
         "map": map_data(case, candidates),
@@ -59,10 +60,10 @@ def write_page(
         "best": tables.best_table(candidates),
         "plan": tables.plan_section(plan),
         "registration": tables.registration_section(registration, plan),
-        "rehearsal": tables.rehearsal_section(rehearsal, demanding(anatomy)),
+        "rehearsal": tables.rehearsal_section(rehearsal, demanding(anatomy), film),
         "warnings": tables.warnings_section(anatomy.warnings),
         "inputs": tables.inputs_table(case.inputs),
-        "origin": tables.origin_section(seed, stages),
+        "origin": tables.origin_section(seed),
         "style": _part("page.css"),
         "data": _json(data),
         "script": _part("page.js"),

@@ -159,8 +159,8 @@ def plan_section(plan: Any | None) -> str:
     return pairs(rows)
 
 
-def rehearsal_section(rehearsal: Any | None, keep_away: frozenset[str]) -> str:
-    """The rehearsal's numbers; clearances of the structures that the needle must keep away from."""
+def rehearsal_section(rehearsal: Any | None, keep_away: frozenset[str], film: str | None = None) -> str:
+    """The rehearsal's numbers; clearances of the structures that the needle must keep away from; a link to the film."""
     if rehearsal is None:
         return "<p>Not rehearsed.</p>"
     depth = f"{number(abs(rehearsal.depth_mm), 2, 'mm')} too {'deep' if rehearsal.depth_mm >= 0 else 'shallow'}"
@@ -181,6 +181,7 @@ def rehearsal_section(rehearsal: Any | None, keep_away: frozenset[str]) -> str:
         ("their limits, °/s", ", ".join(f"{v:.0f}" for v in np.degrees(rehearsal.speed_limits))),
         ("truth", escape(getattr(rehearsal, "truth_source", "–"))),
         ("seed", str(rehearsal.seed)),
+        *([("film", f'<a href="{escape(film)}">{escape(film)}</a>')] if film else ()),
     ]
     least = sorted(
         ((name, float(np.min(mm))) for name, mm in rehearsal.clearance_mm.items() if name in keep_away and len(mm)),
@@ -210,13 +211,14 @@ def inputs_table(inputs: Iterable[Input]) -> str:
     return table(("role", "file", "SHA-256"), rows)
 
 
-def origin_section(seed: int, stages: Mapping[str, float]) -> str:
-    """Versions, seed, and how long each stage took."""
+TIMES = '<p class="faint">When it ran, and how long each stage took: <a href="timings.json">timings.json</a>.</p>'
+
+
+def origin_section(seed: int) -> str:
+    """Versions and seed, and where the times are: they differ from run to run, and the page does not."""
     versions = [(name, escape(_version(name))) for name in PARTS]
     rows = [("seed", str(seed)), ("Python", escape(platform.python_version())), *versions]
-    times = [(escape(name), f"{seconds:.2f}") for name, seconds in stages.items()]
-    shown = table(("stage", "seconds"), times, kind="numbers") if times else ""
-    return f'<div class="two"><div>{pairs(rows)}</div><div>{shown}</div></div>'
+    return f"{pairs(rows)}{TIMES}"
 
 
 def _version(name: str) -> str:

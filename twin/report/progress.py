@@ -46,6 +46,11 @@ class LineDisplay:
         rate = done / max(time.monotonic() - started, 1e-9)
         self._say(f"{stage}: {done}/{total}, {rate:,.0f}/s, {(total - done) / rate:.0f} s left")
 
+    def note(self, line: str) -> None:
+        """Write a line now: it is said once."""
+        self._stream.write(line + "\n")
+        self._stream.flush()
+
     def _say(self, line: str) -> None:
         if time.monotonic() - self._last >= LINE_EVERY_S:
             self._last = time.monotonic()
@@ -86,6 +91,10 @@ class BarDisplay:
         task = self._task(stage, total)
         speed = self._bars.tasks[task].speed
         self._bars.update(task, completed=done, total=total, rate="" if speed is None else f"{speed:,.0f}/s")
+
+    def note(self, line: str) -> None:
+        """Write a line above the bars."""
+        self._bars.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def _task(self, stage: str, total: int | None) -> TaskID:
         if stage not in self._tasks:

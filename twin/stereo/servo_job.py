@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from planning.files import check_writable
+from planning.output_set import writing
 from twin.stereo import liu2007, servo_words
 from twin.stereo.experiment import Statistics, Trial
 from twin.stereo.liu2007 import Reproduction, held_sessions
@@ -14,6 +14,8 @@ from twin.stereo.servo_case import ServoCase, load_servo_case
 from twin.stereo.servo_page import write_servo_page
 from twin.stereo.servo_pictures import draw_cameras, draw_convergence
 from twin.stereo.session import Session
+
+NAMES = ("servo.html", "convergence.png", "camera_1.png", "camera_2.png")
 
 
 class ServoJob(NamedTuple):
@@ -27,7 +29,13 @@ class ServoJob(NamedTuple):
     """For a person."""
 
 
-def run_servo(path: Path, out_dir: Path, seeds: int, done: Callable[[int, int], None] | None = None) -> ServoJob:
+def run_servo(
+    path: Path,
+    out_dir: Path,
+    seeds: int,
+    done: Callable[[int, int], None] | None = None,
+    note: Callable[[str], None] | None = None,
+) -> ServoJob:
     """Hold the sessions of a case and write pictures, plot and page.
 
     Args:
@@ -35,15 +43,17 @@ def run_servo(path: Path, out_dir: Path, seeds: int, done: Callable[[int, int], 
         out_dir: Folder for the files.
         seeds: How many, from the case's own on.
         done: Told how many of how many are done.
+        note: Told what was removed that nobody might expect.
 
     Raises:
         InputError: The case cannot be used.
         NoAnswerError: The first session could not be held.
     """
-    check_writable(out_dir)
     case = load_servo_case(path)
-    result = held_sessions(case, seeds, done)
-    files = _files(case, result.first, result.trials, result.ours, out_dir)
+    with writing(out_dir, "servo", inputs=case.inputs, names=NAMES, note=note) as draft:
+        result = held_sessions(case, seeds, done)
+        written = _files(case, result.first, result.trials, result.ours, draft.folder)
+    files = [str(path) for path in draft.final(written)]
     summary = {**servo_words.servo_summary(case, result.trials, result.ours), "files": files}
     text = servo_words.servo_text(case, result.trials, result.ours, files)
     return ServoJob(result.ours.not_confirmed == 0.0 and result.ours.refused == 0, summary, text)
@@ -51,9 +61,11 @@ def run_servo(path: Path, out_dir: Path, seeds: int, done: Callable[[int, int], 
 
 def reproduce_paper(out_dir: Path, seeds: int | None) -> ServoJob:
     """Print the paper's tables beside ours, and write pictures, plot and page."""
-    check_writable(out_dir)
-    result = liu2007.reproduce(seeds)
-    files = _files(result.case, result.first, result.trials, result.ours, out_dir, result)
+    with writing(out_dir, "reproduce", names=NAMES) as draft:
+        result = liu2007.reproduce(seeds)
+        draft.inputs = result.case.inputs
+        written = _files(result.case, result.first, result.trials, result.ours, draft.folder, result)
+    files = [str(path) for path in draft.final(written)]
     summary = {**servo_words.reproduction_summary(result), "files": files}
     return ServoJob(result.holds, summary, servo_words.reproduction_text(result, files))
 
@@ -65,10 +77,10 @@ def _files(
     ours: Statistics,
     out_dir: Path,
     paper: Reproduction | None = None,
-) -> list[str]:
+) -> list[Path]:
     """Write everything; returns the paths."""
     pictures = draw_cameras(first, out_dir)
     convergence, page = out_dir / "convergence.png", out_dir / "servo.html"
     draw_convergence(first, convergence)
     write_servo_page(case, trials, ours, pictures, convergence, page, () if paper is None else paper.columns)
-    return [str(path) for path in (page, convergence, *pictures)]
+    return [page, convergence, *pictures]

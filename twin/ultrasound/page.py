@@ -15,7 +15,7 @@ from plotly.utils import PlotlyJSONEncoder
 from planning.files import atomic
 from twin.report.numbers import number
 from twin.report.page import fill
-from twin.report.page_tables import escape, inputs_table, origin_section, pairs, table
+from twin.report.page_tables import TIMES, escape, inputs_table, origin_section, pairs, table
 from twin.ultrasound.page_charts import puncture_chart, residual_charts
 from twin.ultrasound.selfcal import SelfcalRun
 from twin.ultrasound.summaries import noise_summary, predicted_tre, puncture_summary, trial_summary
@@ -50,7 +50,7 @@ target.</p>
 {{twin}}
 <h2>Inputs</h2>
 {{inputs}}
-<h2>Versions, seed, times</h2>
+<h2>Versions and seed</h2>
 {{origin}}
 <script type="application/json" id="data">{{data}}</script>
 <script>{{plotly}}</script>
@@ -116,11 +116,10 @@ def write_page(run: SelfcalRun, sheet: Path | None, room: Path | None, path: Pat
 
 
 def _origin(run: SelfcalRun) -> str:
-    """Seed, versions and times; a recording has no seed."""
+    """Seed and versions; a recording has no seed."""
     if run.trials:
-        return origin_section(run.trials[0].seed, run.stages.seconds)
-    times = [(stage, f"{seconds:.2f} s") for stage, seconds in run.stages.seconds.items()]
-    return pairs([("seed", "none: nothing was drawn"), *times])
+        return origin_section(run.trials[0].seed)
+    return pairs([("seed", "none: nothing was drawn")]) + TIMES
 
 
 def _cards(run: SelfcalRun) -> str:

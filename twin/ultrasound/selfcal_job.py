@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+from planning.errors import PlanningError
+from planning.output_set import Draft, withdraw, writing
 from planning.prepared import Watcher
 from twin.ultrasound.page import write_page
 from twin.ultrasound.pictures import detection_sheet, room_picture
+from twin.ultrasound.recording import FILE_NAME
 from twin.ultrasound.selfcal import SelfcalRun, selfcal_recording, selfcal_twin, write_run
-from twin.ultrasound.selfcal_case import load_selfcal_case
+from twin.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
 
-ANSWERS = ("calibration.json", "report.html", "bmode.png", "room.png")
-"""Files that hold an answer. Not the recording, which may be the input."""
+COMMAND = "selfcal"
+ANSWERS = ("calibration.json", "report.html")
+PICTURES = ("bmode.png", "room.png")
 
 
 def run_selfcal(case_path: Path | None, recording: Path | None, seeds: int, out: Path, watcher: Watcher) -> SelfcalRun:
@@ -29,16 +34,34 @@ def run_selfcal(case_path: Path | None, recording: Path | None, seeds: int, out:
         NoAnswerError: Not enough poses can be taken or show the needle.
     """
     case = None if case_path is None else load_selfcal_case(case_path)
-    for name in ANSWERS:  # an earlier answer must not stand beside a refusal
-        (out / name).unlink(missing_ok=True)
-    if recording is not None:
-        run = write_run(selfcal_recording(recording, case), out)
-        return run.with_files(write_page(run, None, None, out / "report.html"))
-    assert case is not None  # the command line gives one of the two
-    run = write_run(selfcal_twin(case, seeds, watcher), out)
+    names = ANSWERS if recording is not None else (*ANSWERS, *PICTURES, FILE_NAME)
+    try:
+        with writing(out, COMMAND, names=names, note=watcher.note) as draft:
+            if recording is not None:
+                run = _calibrated(case, recording, draft)
+            else:
+                assert case is not None  # the command line gives one of the two
+                run = _simulated(case, seeds, draft, watcher)
+            draft.inputs, draft.seconds = run.inputs, run.stages.seconds
+    except PlanningError:
+        withdraw(out, COMMAND, keep=(FILE_NAME,))
+        raise
+    return replace(run, files=draft.final(run.files))
+
+
+def _calibrated(case: SelfcalCase | None, recording: Path, draft: Draft) -> SelfcalRun:
+    """Calibrate a recording. One that an earlier run wrote into the folder stays there: it may be this one."""
+    run = write_run(selfcal_recording(recording, case), draft.folder)
+    draft.keep(FILE_NAME)
+    return run.with_files(write_page(run, None, None, draft.folder / "report.html"))
+
+
+def _simulated(case: SelfcalCase, seeds: int, draft: Draft, watcher: Watcher) -> SelfcalRun:
+    """Run the twin, and draw what it saw."""
+    run = write_run(selfcal_twin(case, seeds, watcher), draft.folder)
     with run.stages.time("pictures"):
         trial = run.trials[0]
-        sheet = detection_sheet(case, trial, out / "bmode.png")
+        sheet = detection_sheet(case, trial, draft.folder / "bmode.png")
         shot = trial.acquisition.shots[0]
-        room = room_picture(case, shot.q_probe, shot.q_needle, out / "room.png")
-    return run.with_files(sheet, room, write_page(run, sheet, room, out / "report.html"))
+        room = room_picture(case, shot.q_probe, shot.q_needle, draft.folder / "room.png")
+    return run.with_files(sheet, room, write_page(run, sheet, room, draft.folder / "report.html"))

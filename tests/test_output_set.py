@@ -1,0 +1,363 @@
+"""An output folder is one set: what a command writes comes in whole, what it outdates goes, and readers can tell."""
+
+import errno
+import hashlib
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from planning.errors import InputError, NoAnswerError
+from planning.output_lock import locked
+from planning.output_manifest import MANIFEST_NAME, TIMINGS_NAME, problems, read_manifest, read_output
+from planning.output_set import withdraw, writing
+from planning.provenance import Input
+
+INPUTS = (Input("case", "case.toml", "ab"),)
+OURS = {MANIFEST_NAME, TIMINGS_NAME}
+
+
+def write(out, command, files, **options):
+    """Write files as a command does."""
+    with writing(out, command, inputs=INPUTS, **options) as draft:
+        for name, content in files.items():
+            path = draft.folder / name
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(content)
+    return draft
+
+
+def read(path):
+    """Read as rehearse, export and verify do."""
+    return read_output(path, max_bytes=1000)
+
+
+def names(folder):
+    """Every file of a folder, hidden ones too."""
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+
+
+def digest(text):
+    """SHA-256 of a text."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@pytest.fixture
+def planned(tmp_path):
+    """A folder with a plan, its export and its rehearsal."""
+    write(tmp_path, "plan", {"candidates.parquet": "c", "plan.json": "p", "map.png": "m"})
+    for command, name in (("export plan.csv", "plan.csv"), ("rehearse", "rehearsal.json")):
+        write(tmp_path, command, {name: "x"}, made_from={"plan.json": digest("p")})
+    return tmp_path
+
+
+def test_a_manifest_lists_every_file(planned):
+    """An entry a command, with version, inputs, what it depends on, and each file's hash; nothing else lies there."""
+    entries = json.loads((planned / MANIFEST_NAME).read_text())["entries"]
+    assert list(entries) == ["export plan.csv", "plan", "rehearse"]
+    assert entries["plan"]["files"]["map.png"] == digest("m")
+    assert entries["plan"]["inputs"] == [{"role": "case", "path": "case.toml", "sha256": "ab"}]
+    assert entries["rehearse"]["depends_on"] == ["plan"]
+    assert problems(planned) == ()
+    assert names(planned) == {"candidates.parquet", "plan.json", "map.png", "plan.csv", "rehearsal.json"} | OURS
+    assert set(json.loads((planned / TIMINGS_NAME).read_text())) == set(entries)
+
+
+def test_what_a_command_outdates_goes(planned):
+    """A search replaces the plan's table, so the plan goes, and with it what was made from the plan."""
+    said = []
+    write(planned, "search", {"candidates.parquet": "new"}, note=said.append)
+    assert names(planned) == {"candidates.parquet"} | OURS
+    assert problems(planned) == ()
+    assert len(said) == 1 and "export plan.csv, plan, rehearse were removed" in said[0]
+
+
+def test_a_smaller_set_leaves_nothing_of_the_larger(tmp_path):
+    """The same command without pictures: the old pictures go, without a word."""
+    said = []
+    write(tmp_path, "search", {"candidates.parquet": "1", "report.html": "72 safe", "map.png": "m"})
+    write(tmp_path, "search", {"candidates.parquet": "0"}, note=said.append)
+    assert names(tmp_path) == {"candidates.parquet"} | OURS
+    assert said == []
+
+
+def test_commands_that_have_nothing_to_do_with_each_other_share_a_folder(planned):
+    """A servo beside a plan: both entries stay whole; sub-folders work, and go when they are empty."""
+    write(planned, "servo", {"servo.html": "s", "0001/a.parquet": "a"})
+    assert problems(planned) == () and read(planned / "plan.json").note == ""
+    write(planned, "servo", {"servo.html": "t"})
+    assert problems(planned) == () and not (planned / "0001").exists()
+
+
+def test_own_files_are_never_touched(planned):
+    """Somebody's notes stay, whatever runs; a file of a name that is to be written is refused, before any work."""
+    (planned / "notes.txt").write_text("mine")
+    (planned / "report.html").write_text("mine too")
+    write(planned, "plan", {"candidates.parquet": "c", "plan.json": "q"})
+    assert (planned / "notes.txt").read_text() == "mine"
+    with pytest.raises(InputError, match=r"report.html is to be written, but"):
+        write(planned, "plan", {}, names=("report.html",))
+    with pytest.raises(InputError, match=r"report.html is to be written, but"):
+        write(planned, "plan", {"plan.json": "r", "report.html": "ours"})
+    assert (planned / "report.html").read_text() == "mine too"
+    assert read(planned / "plan.json").data == b"q"
+
+
+def test_files_of_a_version_without_manifests_are_an_old_set(tmp_path):
+    """They are removed, and named; a file that only sounds like one stays, and so does somebody's recording."""
+    for name in ("candidates.parquet", "report.html", "plan.json", "plan.script", "notes.txt", "recording.csv"):
+        (tmp_path / name).write_text("old")
+    said = []
+    write(tmp_path, "search", {"candidates.parquet": "new"}, note=said.append)
+    assert names(tmp_path) == {"candidates.parquet", "notes.txt", "recording.csv"} | OURS
+    assert len(said) == 1 and "plan.json, plan.script, report.html" in said[0]
+
+
+def test_a_map_that_no_version_wrote_is_not_overwritten(tmp_path):
+    """Without a table beside it, map.png is somebody's own."""
+    (tmp_path / "map.png").write_text("mine")
+    with pytest.raises(InputError, match=r"map.png is to be written"):
+        write(tmp_path, "search", {}, names=("map.png",))
+    assert names(tmp_path) == {"map.png"}
+
+
+@pytest.mark.parametrize("content", ['{"version": 1, "files": []}', "", "{", '{"format": "puncture-twin output set"}'])
+def test_another_manifest_is_not_overwritten(tmp_path, content):
+    """Of another program, or damaged: one line, and nothing changes."""
+    (tmp_path / MANIFEST_NAME).write_text(content)
+    with pytest.raises(InputError, match=MANIFEST_NAME):
+        write(tmp_path, "search", {"candidates.parquet": "c"})
+    assert (tmp_path / MANIFEST_NAME).read_text() == content
+    assert names(tmp_path) == {MANIFEST_NAME}
+
+
+@pytest.mark.parametrize("name", ["../mine.txt", "/tmp/mine.txt", "a/../../mine.txt", "", "a//b", "./a", "..\\b"])
+def test_a_manifest_cannot_name_a_file_elsewhere(tmp_path, name):
+    """What it lists is removed one day, so a name that leads out of the folder is refused."""
+    out = tmp_path / "out"
+    write(out, "search", {"a": "1"})
+    manifest = json.loads((out / MANIFEST_NAME).read_text())
+    manifest["entries"]["search"]["files"] = {name: digest("1")}
+    (out / MANIFEST_NAME).write_text(json.dumps(manifest))
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="damaged"):
+        write(out, "search", {"a": "2"})
+    assert (tmp_path / "mine.txt").exists()
+
+
+def test_readers_refuse_what_the_manifest_does_not_list(planned):
+    """An edited file, and one that was put there: one line each; outside of any set a file is read with a warning."""
+    assert read(planned / "plan.json").note == ""
+    (planned / "plan.json").write_text("edited")
+    with pytest.raises(InputError, match="has other bytes than are listed"):
+        read(planned / "plan.json")
+    (planned / "other.json").write_text("p")
+    with pytest.raises(InputError, match="is not listed"):
+        read(planned / "other.json")
+    loose = planned.parent / "loose.json"
+    loose.write_text("p")
+    assert "outside of any output set" in read(loose).note
+
+
+def test_a_reader_behind_a_link_finds_the_set(planned, tmp_path_factory):
+    """A link to a file of a set is the file of that set."""
+    link = tmp_path_factory.mktemp("elsewhere") / "my-plan.json"
+    link.symlink_to(planned / "plan.json")
+    assert read(link).note == ""
+    (planned / "plan.json").write_text("edited")
+    with pytest.raises(InputError, match="other bytes"):
+        read(link)
+
+
+def test_what_comes_from_another_plan_does_not_lie_beside_this_one(planned):
+    """A rehearsal of a plan from elsewhere would pass as this folder's plan's."""
+    with pytest.raises(InputError, match=r"holds another plan.json"):
+        write(planned, "rehearse", {"rehearsal.json": "y"}, made_from={"plan.json": digest("another")})
+    assert problems(planned) == ()
+
+
+def test_a_second_command_is_refused_while_one_writes(tmp_path):
+    """One line that names the process; the first goes on and ends well."""
+    with writing(tmp_path, "search") as draft:
+        (draft.folder / "a").write_text("1")
+        with pytest.raises(InputError, match=rf"another command is writing into this folder \(process {os.getpid()}\)"):
+            write(tmp_path, "plan", {"b": "2"})
+    assert names(tmp_path) == {"a"} | OURS
+
+
+def test_a_lock_of_the_dead_locks_nothing(tmp_path):
+    """The file that a killed process left is taken over and removed."""
+    (tmp_path / ".puncture-twin-lock").write_text("1")
+    with locked(tmp_path):
+        pass
+    assert names(tmp_path) == set()
+
+
+@pytest.mark.parametrize("failure", [InputError("x", where="y", allowed="z"), KeyboardInterrupt(), NoAnswerError("no")])
+def test_whatever_ends_a_run_early_leaves_the_old_set(planned, failure):
+    """A refusal, Ctrl-C, no answer: byte for byte what was there."""
+    before = {name: (planned / name).read_bytes() for name in names(planned)}
+    with pytest.raises(type(failure)), writing(planned, "search") as draft:
+        (draft.folder / "candidates.parquet").write_text("half")
+        raise failure
+    assert {name: (planned / name).read_bytes() for name in names(planned)} == before
+
+
+def test_a_folder_that_a_run_made_for_nothing_goes_again(tmp_path):
+    """No empty folders, as deep as they were made."""
+    with pytest.raises(KeyboardInterrupt), writing(tmp_path / "a" / "b", "search"):
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_while_the_set_is_put_in_place_waits_for_it(planned, monkeypatch):
+    """The renames take a millisecond: the interrupt comes after them, and the new set is whole."""
+    replace = Path.replace
+
+    def interrupted(self, target):
+        os.kill(os.getpid(), signal.SIGINT)
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write(planned, "plan", {"plan.json": "q"})
+    assert problems(planned) == ()
+    assert names(planned) == {"plan.json"} | OURS
+
+
+def test_an_answer_can_be_withdrawn(tmp_path):
+    """A refused run takes its command's old answer away, keeps what may be its input, and makes no folder for it."""
+    write(tmp_path, "selfcal", {"calibration.json": "c", "recording.csv": "r"})
+    withdraw(tmp_path, "selfcal", keep=("recording.csv",))
+    assert names(tmp_path) == {"recording.csv"} | OURS
+    assert problems(tmp_path) == ()
+    withdraw(tmp_path / "none", "selfcal")
+    assert not (tmp_path / "none").exists()
+
+
+def test_entries_split_from_a_command_go_with_it(tmp_path):
+    """A rehearsal that was planned in the same run is an entry of its own, and depends on the plan."""
+    with writing(tmp_path, "plan") as draft:
+        for name in ("plan.json", "report.html"):
+            (draft.folder / name).write_text(name)
+        draft.split("rehearse", draft.folder / "report.html")
+    manifest = read_manifest(tmp_path)
+    assert manifest.owner("report.html") == "rehearse"
+    assert manifest.entries["rehearse"].depends_on == ("plan",)
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
+def test_a_full_disk_is_bad_input(planned, number):
+    """One line, and the old set untouched, byte for byte."""
+    before = {name: (planned / name).read_bytes() for name in names(planned)}
+    with pytest.raises(InputError, match="cannot be written"), writing(planned, "plan") as draft:
+        (draft.folder / "plan.json").write_text("half")
+        raise OSError(number, os.strerror(number))
+    assert {name: (planned / name).read_bytes() for name in names(planned)} == before
+
+
+def test_a_file_that_may_not_grow_is_bad_input(planned):
+    """The system's own limit on file sizes, as a quota sets it."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = {name: (planned / name).read_bytes() for name in names(planned)}
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+        with pytest.raises(InputError, match="cannot be written"):
+            write(planned, "plan", {"plan.json": "p" * 100_000})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert {name: (planned / name).read_bytes() for name in names(planned)} == before
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 256 kB, where the system lets us make one."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    done = (
+        subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)], capture_output=True, check=False
+        )
+        if shutil.which("mount")
+        else None
+    )
+    if done is None or done.returncode != 0:
+        pytest.skip("may not mount a file system")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_a_disk_that_is_really_full_is_bad_input(small_disk):
+    """A real file system without space, at every fill level around what a set needs: old or new, never between."""
+    out = small_disk / "out"
+    write(out, "plan", {"plan.json": "p" * 50_000})
+    before = {name: (out / name).read_bytes() for name in names(out)}
+    refused = 0
+    for size in range(40_000, 240_000, 20_000):
+        try:
+            write(out, "plan", {"plan.json": "q" * size, "b": "b" * 10_000})
+        except InputError as error:
+            assert "cannot be written" in str(error)
+            assert {name: (out / name).read_bytes() for name in names(out)} == before
+            refused += 1
+        else:
+            before = {name: (out / name).read_bytes() for name in names(out)}
+        assert problems(out) == ()
+    assert refused > 0
+
+
+def die_at(count):
+    """Make the process kill itself at the count-th time that it moves or removes a file."""
+    left = iter(range(count))
+    for name in ("replace", "unlink", "rmdir"):
+        plain = getattr(Path, name)
+
+        def counted(self, *arguments, plain=plain, **options):
+            if next(left, None) is None:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return plain(self, *arguments, **options)
+
+        setattr(Path, name, counted)
+
+
+def test_a_kill_between_any_two_steps_leaves_old_new_or_unfinished(tmp_path):
+    """At every single move and removal: no mix passes, and the next run leaves a whole set and no temporaries."""
+    ended = set()
+    for count in range(40):
+        out = tmp_path / str(count)
+        write(out, "plan", {"plan.json": "old", "map.png": "old", "report.html": "old"})
+        write(out, "export plan.csv", {"plan.csv": "old"}, made_from={"plan.json": digest("old")})
+        child = os.fork()
+        if child == 0:
+            die_at(count)
+            write(out, "plan", {"plan.json": "new", "map.png": "new"})
+            os._exit(0)
+        status = os.waitpid(child, 0)[1]
+        state = what_passes(out)
+        assert state in ({"old"}, {"new"}, set()), f"killed at step {count}: {state}"
+        ended.add(frozenset(state))
+        write(out, "plan", {"plan.json": "next"})
+        assert names(out) == {"plan.json"} | OURS
+        assert problems(out) == ()
+        assert not [path for path in out.iterdir() if path.name.startswith(".")]
+        if os.WIFEXITED(status):
+            break
+    assert os.WIFEXITED(status), "the run has more steps than were tried"
+    assert ended == {frozenset({"old"}), frozenset({"new"}), frozenset()}
+
+
+def what_passes(out):
+    """The contents of all files that a reader would accept."""
+    passing = set()
+    for name in ("plan.json", "map.png", "report.html", "plan.csv"):
+        if (out / name).exists():
+            try:
+                passing.add(read(out / name).data.decode())
+            except InputError:
+                continue
+    return passing
