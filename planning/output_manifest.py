@@ -117,7 +117,7 @@ def read_output(path: Path, *, max_bytes: int) -> Output:
         InputError: It cannot be read, is too large, or lies in a set that does not list these bytes: the set is
             unfinished, or the file was edited.
     """
-    data = read_input(path, max_bytes=most_bytes, where=str(path))
+    data = read_input(path, max_bytes=max_bytes, where=str(path))
     digest = hashlib.sha256(data).hexdigest()
     home = path.resolve()
     manifest = _set_of(home.parent)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,17 +18,21 @@ from planning.entry import needle_pose
 from planning.errors import InputError
 from planning.files import atomic
 from planning.formats.guard import guard_transform
-from planning.formats.input_file import read_input
+from planning.output_manifest import read_output
 from planning.provenance import Input, differing_input, inputs_document, read_inputs
+from planning.robot.insertion import flange_at, needle_lines
 from planning.robot.kinematics import flange_pose
 from planning.robot.ur import ur_model
-from planning.trajectory import Peaks, Trajectory
+from planning.trajectory import SAMPLE_S, Peaks, Trajectory
 
 Floats = NDArray[np.float64]
+Value = TypeVar("Value")
 
 PLAN_VERSION = 3
 """Version of the file's layout. 2: states the peaks of both phases beside the limits; the approach is smooth. 3: lists
 its inputs with their roles, files that a file names included."""
+
+PLAN_ALLOWED = f"a plan.json of version {PLAN_VERSION}; plan again"
 
 POSE_TOLERANCE_MM = 0.01
 """How far the tip of the stored joint angles may be from the stored pose: well above rounding, far below any error."""
@@ -47,6 +51,27 @@ MAX_NUMBER = 1e6
 
 MOST_STATES = 100_000
 """Joints that turn through more steps than this (200 rad) during one insertion do something else."""
+
+ROLL_TOLERANCE_RAD = 1e-4
+"""How far the stated roll may be from that of the joint angles: what the pose's tolerance lets the flange turn."""
+
+ANGLE_ROUNDING = 1e-12
+"""Share of a turn by which degrees and radians round."""
+
+SAME_TIME_S = 1e-9
+"""Rounding of the samples' times."""
+
+AGREE = "T_base_ct, target_ct_mm, outward_ct, needle_length_mm, standoff_mm and joint angles must agree"
+
+NAMES = (
+    *("version", "case", "inputs", "seed", "robot", "T_base_ct", "expected_target_error_mm", "theta_deg", "beta_deg"),
+    *("entry_ct_mm", "target_ct_mm", "outward_ct", "roll_deg", "standoff_mm", "needle_length_mm", "limits"),
+    *("approach", "insertion", "clearance_mm"),
+)
+PHASE_NAMES = ("times_s", "q_rad", "peaks")
+CLEARANCE_NAMES = ("approach", "insertion", "needle")
+INPUT_NAMES = ("role", "path", "sha256")
+"""The keys of a plan and of its parts."""
 
 SAME_PEAK = 1e-6
 """Share by which a stated peak may differ from the samples' own: rounding."""
@@ -133,29 +158,34 @@ def write_plan(plan: Plan, path: Path) -> None:
 
 
 def read_plan(path: Path) -> Plan:
-    """Read a plan and check that it is whole and agrees with itself.
+    """Read a plan, from a whole output set or from outside of any, and check it as `parse_plan` does.
+
+    Raises:
+        InputError: It cannot be read, its folder's manifest lists other bytes, or see `parse_plan`.
+    """
+    return parse_plan(read_output(path, max_bytes=MAX_PLAN_BYTES).data, path)
+
+
+def parse_plan(data: bytes, path: Path) -> Plan:
+    """Check that a plan's bytes are whole and agree with themselves.
+
+    Args:
+        data: The file's bytes.
+        path: The file, for errors.
 
     Raises:
         InputError: Not a plan, another version, missing keys, numbers that do not fit, or a pose that the stored
             joint angles do not reach.
     """
-    return parse_plan(read_input(path, max_bytes=MAX_PLAN_BYTES, where=str(path)), path)
-
-
-def parse_plan(content: bytes, path: Path) -> Plan:
-    """The same of a file that has been read; it is not opened again.
-
-    Raises:
-        InputError: As `read_plan`, but for reading.
-    """
-    document = _document(content, path)
+    document = _document(data, path)
     try:
         plan = _plan(document, path)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         what = f"key {error} is missing" if isinstance(error, KeyError) else f"does not fit: {error}"
-        raise InputError(what, where=path, allowed=f"a plan.json of version {PLAN_VERSION}") from error
+        raise InputError(what, where=path, allowed=PLAN_ALLOWED) from error
     check_geometry(plan, path)
     _check_stated(document, plan, path)
+    _check_names(document, path)
     return plan
 
 
@@ -180,6 +210,7 @@ def check_geometry(plan: Plan, path: Path) -> None:
         raise InputError("the insertion does not start where the approach ends", where=path, allowed="joined phases")
     _check_straight(plan, path)
     _check_speeds(plan, path)
+    _check_angles(plan, path)
     model = ur_model(plan.model)
     for name, q, standoff in (
         ("standoff", plan.insertion.q[0], plan.standoff_mm),
@@ -194,8 +225,24 @@ def check_geometry(plan: Plan, path: Path) -> None:
                 raise InputError(
                     f"the {what} at {name} is {error:.3g} mm off the stored pose",
                     where=path,
-                    allowed=f"at most {POSE_TOLERANCE_MM} mm",
+                    allowed=f"at most {POSE_TOLERANCE_MM} mm: {AGREE}",
                 )
+
+
+def _check_angles(plan: Plan, path: Path) -> None:
+    """Refuse a roll that is not the one at standoff, and angles beyond their turn."""
+    for name, angle, turn in (("theta_deg", plan.theta, np.pi), ("beta_deg", plan.beta, 2 * np.pi)):
+        if not 0.0 <= angle <= turn * (1 + ANGLE_ROUNDING):
+            raise InputError(f"{name} = {np.degrees(angle):g}", where=path, allowed=f"0 to {np.degrees(turn):g}")
+    R, t = plan.T_base_ct[:3, :3], plan.T_base_ct[:3, 3]
+    line = needle_lines((R @ plan.target_ct + t)[None], (R @ plan.outward_ct)[None])[0]
+    unrolled = flange_at(line, plan.needle_length_mm + plan.standoff_mm)[:3, :3]
+    x_axis = unrolled.T @ flange_pose(ur_model(plan.model), plan.insertion.q[0])[:3, 0]
+    roll = float(np.arctan2(x_axis[1], x_axis[0])) % (2 * np.pi)
+    off = abs((plan.roll - roll + np.pi) % (2 * np.pi) - np.pi)
+    if off > ROLL_TOLERANCE_RAD or not 0.0 <= plan.roll < 2 * np.pi:
+        what = f"roll_deg is {np.degrees(plan.roll):g}, the joint angles at standoff give {np.degrees(roll):.4g}"
+        raise InputError(what, where=path, allowed="plan again")
 
 
 def _check_straight(plan: Plan, path: Path) -> None:
@@ -221,8 +268,8 @@ def _check_straight(plan: Plan, path: Path) -> None:
         ("insertion goes beyond standoff and target", deep),
     ):
         if not amount <= STRAIGHT_TOLERANCE_MM:
-            allowed = f"at most {STRAIGHT_TOLERANCE_MM} mm"
-            raise InputError(f"the {what} by {amount:.3g} mm", where=path, allowed=allowed)
+            allowed = f"at most {STRAIGHT_TOLERANCE_MM} mm: {AGREE}"
+            raise InputError(f"the {what} by {amount:.3g} mm", where=f"{path}: insertion", allowed=allowed)
 
 
 def _between(q: Floats, path: Path) -> Floats:
@@ -268,12 +315,35 @@ def _check_stated(document: dict[str, Any], plan: Plan, path: Path) -> None:
         ("peaks of the insertion", document["insertion"].get("peaks"), _rates_document(plan.insertion.peaks())),
     )
     for name, said, known in stated:
-        try:
-            same = all(np.allclose(said[rate], known[rate], rtol=SAME_PEAK, atol=SAME_PEAK) for rate in known)
-        except (KeyError, TypeError, ValueError):
-            same = False
-        if not same:
+        if not _same_rates(said, known):
             raise InputError(f"the {name} are not those of its numbers", where=path, allowed="plan again")
+    for phase, part in (("approach", plan.approach), ("insertion", plan.insertion)):
+        even = SAMPLE_S * np.arange(len(part.times_s))
+        if not np.allclose(part.times_s, even, rtol=0, atol=SAME_TIME_S):
+            raise InputError(f"the times of the {phase} are not even", where=path, allowed=f"a row every {SAMPLE_S} s")
+
+
+def _same_rates(said: Any, known: dict[str, list[float]]) -> bool:
+    try:
+        return set(said) == set(known) and all(
+            np.allclose(_array(said[rate], (6,)), known[rate], rtol=SAME_PEAK, atol=SAME_PEAK) for rate in known
+        )
+    except (TypeError, ValueError):
+        return False
+
+
+def _check_names(document: dict[str, Any], path: Path) -> None:
+    """Refuse keys that no plan has: nothing says whether what they state is so."""
+    for where, part, known in (
+        ("", document, NAMES),
+        ("approach.", document["approach"], PHASE_NAMES),
+        ("insertion.", document["insertion"], PHASE_NAMES),
+        ("clearance_mm.", document["clearance_mm"], CLEARANCE_NAMES),
+        *((f"inputs.{at}.", one, INPUT_NAMES) for at, one in enumerate(document["inputs"])),
+    ):
+        for name in sorted(set(part) ^ set(known)):
+            what = "is not known" if name in part else "is missing"
+            raise InputError(f"key '{where}{name}' {what}", where=path, allowed=", ".join(known))
 
 
 def _limits(model_name: str) -> Peaks:
@@ -286,15 +356,14 @@ def _rates_document(rates: Peaks) -> dict[str, list[float]]:
     return {unit: rate.tolist() for unit, rate in zip(units, rates, strict=True)}
 
 
-def _document(content: bytes, path: Path) -> dict[str, Any]:
-    allowed = f"a plan.json of version {PLAN_VERSION}; plan again"
+def _document(data: bytes, path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(content.decode("utf-8"), parse_constant=_refuse_constant)
+        document = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"is not JSON: {error}", where=path, allowed=allowed) from error
+        raise InputError(f"is not JSON: {error}", where=path, allowed=PLAN_ALLOWED) from error
     if not isinstance(document, dict) or document.get("version") != PLAN_VERSION:
         version = document.get("version") if isinstance(document, dict) else None
-        raise InputError(f"version {version!r}", where=path, allowed=allowed)
+        raise InputError(f"version {version!r}", where=path, allowed=PLAN_ALLOWED)
     return document
 
 
@@ -303,29 +372,50 @@ def _refuse_constant(name: str) -> float:
 
 
 def _plan(document: dict[str, Any], path: Path) -> Plan:
-    theta, beta = np.radians(_number(document["theta_deg"])), np.radians(_number(document["beta_deg"]))
-    error = document["expected_target_error_mm"]
     return Plan(
-        case_name=str(document["case"]),
-        inputs=read_inputs(document["inputs"]),
-        seed=int(document["seed"]),
-        model=str(document["robot"]),
+        case_name=_field(document, "case", _text),
+        inputs=_field(document, "inputs", read_inputs),
+        seed=_field(document, "seed", _whole),
+        model=_field(document, "robot", _text),
         T_base_ct=guard_transform(document["T_base_ct"], where=f"{path}: T_base_ct"),
-        expected_target_error_mm=float("nan") if error is None else _number(error),
-        theta=float(theta),
-        beta=float(beta),
-        entry_ct=_array(document["entry_ct_mm"], (3,)),
-        target_ct=_array(document["target_ct_mm"], (3,)),
-        outward_ct=_array(document["outward_ct"], (3,)),
-        roll=float(np.radians(_number(document["roll_deg"]))),
-        standoff_mm=_number(document["standoff_mm"]),
-        needle_length_mm=_number(document["needle_length_mm"]),
-        approach=_trajectory(document["approach"]),
-        insertion=_trajectory(document["insertion"]),
-        clearance_mm=MappingProxyType(
-            {str(k): float("nan") if v is None else _number(v) for k, v in document["clearance_mm"].items()}
-        ),
+        expected_target_error_mm=_field(document, "expected_target_error_mm", _number_or_nan),
+        theta=float(np.radians(_field(document, "theta_deg", _number))),
+        beta=float(np.radians(_field(document, "beta_deg", _number))),
+        entry_ct=_field(document, "entry_ct_mm", _point),
+        target_ct=_field(document, "target_ct_mm", _point),
+        outward_ct=_field(document, "outward_ct", _point),
+        roll=float(np.radians(_field(document, "roll_deg", _number))),
+        standoff_mm=_field(document, "standoff_mm", _number),
+        needle_length_mm=_field(document, "needle_length_mm", _number),
+        approach=_field(document, "approach", _trajectory),
+        insertion=_field(document, "insertion", _trajectory),
+        clearance_mm=_field(document, "clearance_mm", _numbers),
     )
+
+
+def _field(document: dict[str, Any], name: str, read: Callable[[Any], Value]) -> Value:
+    """A value by its key, which errors name."""
+    value = document[name]
+    try:
+        return read(value)
+    except InputError as error:
+        raise ValueError(f"{name}: {error.what}, not {error.allowed}") from error
+    except KeyError as error:
+        raise KeyError(f"{name}.{error.args[0]}") from error
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise ValueError(f"{name}: {error}") from error
+
+
+def _numbers(value: Any) -> Mapping[str, float]:
+    return MappingProxyType({_text(key): _number_or_nan(one) for key, one in value.items()})
+
+
+def _number_or_nan(value: Any) -> float:
+    return float("nan") if value is None else _number(value)
+
+
+def _point(value: Any) -> Floats:
+    return _array(value, (3,))
 
 
 def _number(value: Any) -> float:
@@ -340,7 +430,21 @@ def _within(value: float) -> float:
     return value
 
 
+def _whole(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError(f"{value!r} is no whole number")
+    return value
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} is no text")
+    return value
+
+
 def _array(value: Any, shape: tuple[int, ...]) -> Floats:
+    if np.asarray(value).dtype.kind not in "iuf":
+        raise ValueError("an array of something else than numbers")
     array = np.array(value, dtype=np.float64)
     if array.shape != shape or not np.all(np.abs(array) <= MAX_NUMBER):
         raise ValueError(f"an array of shape {array.shape} where {shape} numbers within {MAX_NUMBER:g} belong")
@@ -349,8 +453,8 @@ def _array(value: Any, shape: tuple[int, ...]) -> Floats:
 
 
 def _trajectory(document: Any) -> Trajectory:
-    times = np.array(document["times_s"], dtype=np.float64)
-    return Trajectory(_array(times, (len(times),)), _array(document["q_rad"], (len(times), 6)))
+    count = len(document["times_s"])
+    return Trajectory(_array(document["times_s"], (count,)), _array(document["q_rad"], (count, 6)))
 
 
 def _trajectory_document(trajectory: Trajectory) -> dict[str, Any]:

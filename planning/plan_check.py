@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.approach import FINER, RESOLUTION_RAD, dense_states
 from planning.candidates import Candidates
 from planning.errors import InputError
 from planning.explain import reason_text
 from planning.plan import Plan, check_inputs
+from planning.plan_motion import motion_contact, phase_clearances
 from planning.prepared import Prepared
-from planning.robot.cell import CellChecker
+from planning.room import home_configuration
 from planning.standoff import standoffs
 
 Floats = NDArray[np.float64]
@@ -27,8 +27,14 @@ SAME_NUMBER_MM = 1e-4
 """A number that is computed again may differ by this: FCL's own threshold."""
 
 
-def check_plan(plan: Plan, prepared: Prepared, path: Path) -> Candidates:
+def check_plan(plan: Plan, prepared: Prepared, path: Path, *, seed: int | None = None) -> Candidates:
     """Judge a loaded plan's direction and motion anew.
+
+    Args:
+        plan: What was read.
+        prepared: Its case.
+        path: The plan's file, for errors.
+        seed: That the plan must state: the command ``plan`` takes the case's. None where code chose another.
 
     Returns:
         The candidate of the plan, judged.
@@ -44,10 +50,14 @@ def check_plan(plan: Plan, prepared: Prepared, path: Path) -> Candidates:
         raise InputError("outward_ct is not the direction of theta_deg, beta_deg", where=path, allowed="plan again")
     if not candidates.safe[0]:
         raise InputError(f"its direction is rejected: {reason_text(candidates, 0)}", where=path, allowed="plan again")
+    if seed is not None:
+        _check_same("seed", plan.seed, seed, path)
     _check_labels(plan, prepared, candidates, path)
     touched = motion_contact(plan, prepared.reach.checker)
     if touched is not None:
         raise InputError(f"its {touched}", where=path, allowed="a motion that touches nothing")
+    for phase, known in phase_clearances(plan, prepared.reach.checker).items():
+        _check_same(f"clearance_mm.{phase}", plan.clearance_mm.get(phase, np.nan), known, path)
     return candidates
 
 
@@ -64,28 +74,22 @@ def _check_labels(plan: Plan, prepared: Prepared, candidates: Candidates, path: 
         ("standoff_mm", plan.standoff_mm, standoffs(case.needle, candidates.path_length[0], candidates.skin_angle[0])),
         ("expected_target_error_mm", plan.expected_target_error_mm, error),
         ("clearance_mm.needle", plan.clearance_mm.get("needle", np.nan), candidates.min_clearance[0]),
+        ("the approach's first row", plan.approach.q[0], home_configuration(case)),
     )
     for name, said, known in stated:
-        same = (
-            said == known if isinstance(known, str) else np.allclose(said, known, atol=SAME_NUMBER_MM, equal_nan=True)
-        )
-        if not same:
-            raise InputError(f"{name} is {said}, the case gives {known}", where=path, allowed="plan again")
+        _check_same(name, said, known, path)
 
 
-def motion_contact(plan: Plan, checker: CellChecker) -> str | None:
-    """What a plan's motion touches, in words, or None: FCL at ten times the planner's resolution."""
-    for phase, q, needle_free in (("approach", plan.approach.q, False), ("insertion", plan.insertion.q, True)):
-        contact = _contact(checker, q, needle_free)
-        if contact is not None:
-            return f"{phase} is not free: {contact}"
-    return None
+def _check_same(name: str, said: Any, known: Any, path: Path) -> None:
+    """Refuse a stated number that is another when it is computed again; no number in a file is null, whichever it is.
 
-
-def _contact(checker: CellChecker, q_path: Floats, needle_free: bool) -> str | None:
-    """What touches what along a motion, checked as densely as when it was planned; None if nothing does."""
-    for q in dense_states(checker, q_path, RESOLUTION_RAD / FINER):
-        contact = CellChecker.contact(checker, q, needle_may_touch_patient=needle_free)  # FCL alone, no bounds
-        if contact is not None:
-            return f"{contact.body} touches {contact.other}"
-    return None
+    Raises:
+        InputError: Names it.
+    """
+    if isinstance(known, str | int):
+        same = said == known
+    else:
+        said, known = (np.where(np.isfinite(value), value, np.nan) for value in (said, known))
+        same = np.allclose(said, known, rtol=0, atol=SAME_NUMBER_MM, equal_nan=True)
+    if not same:
+        raise InputError(f"{name} is {said}, the case gives {known}", where=path, allowed="plan again")

@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from planning.approach import least_clearance, plan_approach
+from planning.approach import plan_approach
 from planning.candidates import Candidates
 from planning.drive import drive_smoothly
 from planning.errors import InputError, NoAnswerError
 from planning.goals import approach_goals
 from planning.plan import INSERTION_MM_S, Plan
-from planning.plan_check import motion_contact
+from planning.plan_motion import motion_contact, phase_clearances
 from planning.prepared import Prepared
 from planning.reasons import Reason
 from planning.room import home_configuration
@@ -88,8 +88,6 @@ def _plan(prepared: Prepared, candidates: Candidates, row: int, seed: int) -> Pl
     goals = approach_goals(checker, request, home)
     approach = plan_approach(checker, home, np.array([goal.insertion_q[0] for goal in goals]), seed=seed)
     answer = goals[approach.goal_index]
-    approached = least_clearance(checker, approach.checked_q)
-    driven = least_clearance(checker, answer.insertion_q)
     plan = Plan(
         case_name=case.name,
         inputs=case.inputs,
@@ -109,13 +107,9 @@ def _plan(prepared: Prepared, candidates: Candidates, row: int, seed: int) -> Pl
         insertion=drive_smoothly(
             checker.model, answer.insertion_q, answer.insertion_depth_mm, max_tip_speed_mm_s=INSERTION_MM_S
         ),
-        clearance_mm={
-            "approach": min(approached.patient.mm, approached.boxes.mm),
-            "insertion": min(driven.patient.mm, driven.boxes.mm),
-            "needle": float(candidates.min_clearance[row]),
-        },
+        clearance_mm={"needle": float(candidates.min_clearance[row])},
     )
     touched = motion_contact(plan, checker)
     if touched is not None:
         raise NoAnswerError(touched)
-    return plan
+    return replace(plan, clearance_mm={**phase_clearances(plan, checker), **plan.clearance_mm})

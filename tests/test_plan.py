@@ -9,7 +9,8 @@ import pytest
 from meshes import folder
 from planning.errors import InputError, NoAnswerError
 from planning.plan import read_plan, write_plan
-from planning.plan_check import check_plan, motion_contact
+from planning.plan_check import check_plan
+from planning.plan_motion import motion_contact
 from planning.planner import make_plan
 from planning.prepared import prepare
 from planning.reasons import Reason
@@ -248,6 +249,83 @@ def test_a_plan_that_flatters_itself_is_refused(carton, planned, key, value):
     """Numbers that people read are computed again, and a plan that states others is refused."""
     with pytest.raises(InputError, match="the case gives"):
         check_plan(replace(planned.plan, **{key: value}), carton, "plan.json")
+
+
+def leaves(value, path=()):
+    """Every leaf of a JSON document by its path; of the two motions' rows, the ends and a few between."""
+    if isinstance(value, dict):
+        for key in value:
+            yield from leaves(value[key], (*path, key))
+    elif isinstance(value, list):
+        some = range(len(value)) if len(value) <= 6 else [0, 1, len(value) // 3, len(value) // 2, len(value) - 1]
+        for at in some:
+            yield from leaves(value[at], (*path, at))
+    else:
+        yield path
+
+
+def changed(value):
+    """A leaf that says something visibly different."""
+    if isinstance(value, str):
+        return value[:-1] + ("x" if value[-1:] != "x" else "y")
+    if isinstance(value, int):
+        return value + 1
+    return 1.0 if value is None else value + 0.01
+
+
+def parent(document, path):
+    """What holds the last step of a path."""
+    for step in path[:-1]:
+        document = document[step]
+    return document
+
+
+def refusal(path, carton):
+    """The line with which a plan's file is refused, or None."""
+    try:
+        check_plan(read_plan(path), carton, path, seed=1)
+    except InputError as error:
+        return str(error)
+    return None
+
+
+def test_every_leaf_of_a_plan_is_computed_again(carton, document):
+    """Whatever number or text is edited, the plan is refused in a line that names it; unedited it is accepted.
+
+    Numbers change by 0.01 (mm, degrees, rad, s), which is more than any tolerance of the check. The joint angles of a
+    motion are named by their phase.
+    """
+    content, write = document
+    assert refusal(write(), carton) is None
+    accepted, unnamed = [], []
+    for path in leaves(content):
+        edited = json.loads(json.dumps(content))
+        holder = parent(edited, path)
+        holder[path[-1]] = changed(holder[path[-1]])
+        line = refusal(write(**edited), carton)
+        if line is None:
+            accepted.append(path)
+        elif not any(step.removesuffix("_mm") in line for step in path if isinstance(step, str)):
+            unnamed.append((path, line))
+    assert accepted == []
+    assert unnamed == []
+
+
+def test_keys_that_come_or_go_are_refused(carton, document):
+    """A key that no plan has states what nobody checks; one that is gone leaves something unsaid."""
+    content, write = document
+    tables = [(), ("inputs",), ("limits",), ("approach",), ("approach", "peaks"), ("insertion",), ("clearance_mm",)]
+    for table in tables:
+        names = list(parent(content, (*table, "")))
+        for name in [*names, "extra"]:
+            edited = json.loads(json.dumps(content))
+            held = parent(edited, (*table, ""))
+            held.pop(name) if name in held else held.update({name: 1.0})
+            path = write()
+            path.write_text(json.dumps(edited))
+            line = refusal(path, carton)
+            assert line is not None, (table, name)
+            assert name in line or table[-1] in line, (table, name, line)
 
 
 def test_an_unsafe_direction_is_refused_on_loading(carton, planned):
