@@ -68,7 +68,7 @@ def run_batch(
 
 
 def _searched(
-    cases: Sequence[Path], out: Path, jobs: int, arm: bool, watcher: Watcher
+    cases: Sequence[Path], out: Path, jobs: int, arm: bool | None, watcher: Watcher
 ) -> Iterator[tuple[int, dict[str, Any]]]:
     """Each case's number and row, as they are done."""
     folders = [out / f"{number:04d}" for number in range(1, len(cases) + 1)]
