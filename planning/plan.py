@@ -210,7 +210,6 @@ def check_geometry(plan: Plan, path: Path) -> None:
         raise InputError("the insertion does not start where the approach ends", where=path, allowed="joined phases")
     _check_straight(plan, path)
     _check_speeds(plan, path)
-    _check_angles(plan, path)
     model = ur_model(plan.model)
     for name, q, standoff in (
         ("standoff", plan.insertion.q[0], plan.standoff_mm),
@@ -229,8 +228,12 @@ def check_geometry(plan: Plan, path: Path) -> None:
                 )
 
 
-def _check_angles(plan: Plan, path: Path) -> None:
-    """Refuse a roll that is not the one at standoff, and angles beyond their turn."""
+def check_angles(plan: Plan, path: Path) -> None:
+    """Refuse a roll that is not that of the joint angles at standoff, and angles beyond their turn.
+
+    Raises:
+        InputError: Names the angle.
+    """
     for name, angle, turn in (("theta_deg", plan.theta, np.pi), ("beta_deg", plan.beta, 2 * np.pi)):
         if not 0.0 <= angle <= turn * (1 + ANGLE_ROUNDING):
             raise InputError(f"{name} = {np.degrees(angle):g}", where=path, allowed=f"0 to {np.degrees(turn):g}")
@@ -341,7 +344,8 @@ def _check_names(document: dict[str, Any], path: Path) -> None:
         ("clearance_mm.", document["clearance_mm"], CLEARANCE_NAMES),
         *((f"inputs.{at}.", one, INPUT_NAMES) for at, one in enumerate(document["inputs"])),
     ):
-        for name in sorted(set(part) ^ set(known)):
+        # a phase whose clearance is not stated is for whoever has the case to miss
+        for name in sorted(set(part) - set(known) if part is document["clearance_mm"] else set(part) ^ set(known)):
             what = "is not known" if name in part else "is missing"
             raise InputError(f"key '{where}{name}' {what}", where=path, allowed=", ".join(known))
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from planning.candidates import Candidates
 from planning.errors import InputError
 from planning.explain import reason_text
-from planning.plan import Plan, check_inputs
+from planning.plan import Plan, check_angles, check_inputs
 from planning.plan_motion import motion_contact, phase_clearances
 from planning.prepared import Prepared
 from planning.room import home_configuration
@@ -53,6 +53,7 @@ def check_plan(plan: Plan, prepared: Prepared, path: Path, *, seed: int | None =
     if seed is not None:
         _check_same("seed", plan.seed, seed, path)
     _check_labels(plan, prepared, candidates, path)
+    check_angles(plan, path)
     touched = motion_contact(plan, prepared.reach.checker)
     if touched is not None:
         raise InputError(f"its {touched}", where=path, allowed="a motion that touches nothing")
