@@ -7,14 +7,18 @@ BIN := $(VENV)/bin
 OUT ?= out/demo
 RUNS ?= 100000
 FIRST ?= 0
+KILLS ?= 10
 
-.PHONY: demo test fuzz lint mutants install pictures meshes clean
+.PHONY: demo test fuzz kill lint mutants install pictures meshes clean
 
 demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
 
 test: install lint
 	$(BIN)/pytest -q -n auto
+
+kill: install
+	KILLS=$(KILLS) $(BIN)/python -m pytest -q -s tests/test_kill.py
 
 lint: install
 	$(BIN)/ruff check .

@@ -1,0 +1,125 @@
+"""Processes that write into an output folder and are killed: when, and what they leave."""
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from meshes import folder
+from planning.errors import InputError
+from planning.output_lock import LOCK_NAME
+from planning.output_manifest import MANIFEST_NAME, TIMINGS_NAME, problems, read_manifest, read_output
+from planning.output_set import DRAFT_PREFIX
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+RUN_TIMEOUT_S = 600.0
+
+SELFCAL = 'schema = 1\nname = "small"\nseed = 3\n[poses]\nsamples = 240\ncount = 20\n'
+PLACE = """
+[place]
+mounts = ["ceiling"]
+step_mm = 400.0
+[place.ceiling]
+along_mm = [-100.0, 0.0]
+across_mm = [400.0, 500.0]
+height_mm = [450.0, 550.0]
+"""
+
+
+def coarse_cases(here):
+    """The carton twice, coarse, with two grids: whose files lie in a folder can be told by the case's hash."""
+    cases = []
+    for name, step in (("a", "15.0"), ("b", "18.0")):
+        shutil.copytree(folder() / "carton", here / name)
+        case = here / name / "case_m.toml"
+        case.write_text(case.read_text().replace("step_deg = 2.0", f"step_deg = {step}"))
+        cases.append(case)
+    return cases
+
+
+def start(arguments):
+    """The command line in a process of its own."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")])}
+    program = [sys.executable, str(REPOSITORY / "run_twin.py"), *map(str, arguments)]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    return subprocess.Popen(program, cwd=REPOSITORY, env=environment, start_new_session=True, **quiet)
+
+
+def kill_while_writing(process, out, rng):
+    """Kill a process at random, half the time while it writes its files and half while they are put in place.
+
+    Returns:
+        Whether it was still running.
+    """
+    aimed = bool(rng.integers(2))
+    deadline = time.monotonic() + RUN_TIMEOUT_S
+    while process.poll() is None and time.monotonic() < deadline:
+        drafts = list(out.glob(f"{DRAFT_PREFIX}{process.pid}-*"))
+        if drafts and (not aimed or (drafts[0] / "state" / "before").exists()):
+            break
+        if not aimed:
+            time.sleep(0.005)
+    time.sleep(rng.uniform(0.0, 0.003) if aimed else rng.uniform(0.0, 3.0))
+    running = process.poll() is None
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)  # the session that `start` made: its workers and encoders too
+    process.wait()
+    return running
+
+
+def passing(out):
+    """Every file of a folder that a reader accepts, and the entry that lists it."""
+    manifest, found = (read_manifest(out) if out.is_dir() else None), {}
+    for path in sorted(out.rglob("*")) if manifest else ():
+        name = path.relative_to(out).as_posix()
+        if path.is_file() and name not in (MANIFEST_NAME, TIMINGS_NAME) and not name.startswith(".puncture"):
+            with contextlib.suppress(InputError):
+                if path.parent == out:
+                    read_output(path, max_bytes=1 << 30)
+                    assert manifest.owner(name) is not None
+                if manifest.owner(name) is not None:
+                    found[name] = manifest.owner(name)
+    return found
+
+
+def state_of(out, entry, old, new):
+    """``old``, ``new`` or ``unfinished``; fails on anything else.
+
+    Args:
+        out: The folder.
+        entry: The command's.
+        old: SHA-256 of an input that only the old set has, or None where there was none.
+        new: The same of the new set.
+    """
+    manifest = read_manifest(out) if out.is_dir() else None
+    if manifest is None or entry not in manifest.entries:
+        assert not [name for name, owner in passing(out).items() if owner == entry]
+        return "unfinished"
+    listed = manifest.entries[entry]
+    wrong = [line for line in problems(out) if "left over" not in line]
+    assert wrong == [], wrong
+    hashes = {one.sha256 for one in listed.inputs}
+    assert (old in hashes) != (new in hashes), "neither the old set nor the new one"
+    return "new" if new in hashes else "old"
+
+
+def temporaries(out):
+    """What only a running command may have in a folder."""
+    return [path.name for path in out.iterdir() if path.name.startswith(DRAFT_PREFIX) or path.name == LOCK_NAME]
+
+
+def said(command, counts: Counter):
+    """A row of the table in docs/validation.md."""
+    return f"| {command} | {sum(counts.values())} | {counts['old']} | {counts['unfinished']} | {counts['new']} |"
+
+
+def generator(name):
+    """Seeded by the command's name."""
+    return np.random.default_rng([ord(letter) for letter in name])

@@ -1,0 +1,213 @@
+"""SIGKILL at random moments: a folder then holds the old set, the new one, or one that every reader refuses.
+
+``make kill`` runs every command as a whole, with more kills, and prints the table of docs/validation.md.
+"""
+
+import os
+import shutil
+import signal
+import sys
+import time
+from collections import Counter
+
+import pytest
+from kill_world import (
+    PLACE,
+    SELFCAL,
+    coarse_cases,
+    generator,
+    kill_while_writing,
+    said,
+    start,
+    state_of,
+    temporaries,
+)
+
+from meshes import folder
+from planning.files import sha256
+from planning.output_manifest import problems, read_manifest
+from planning.output_set import writing
+from planning.provenance import Input
+from run_twin import ANSWER_IS_NO, OK, main
+
+KILLS = int(os.environ.get("KILLS", "3"))
+ALL = "KILLS" in os.environ
+needs_time = pytest.mark.skipif(not ALL, reason="make kill")
+
+WRITTEN = {
+    "search": ("certificate.json", "candidates.parquet", "map.png", "scene.png", "report.html"),
+    "plan": ("plan.json", "candidates.parquet", "map.png", "scene.png", "report.html"),
+    "rehearse": ("rehearsal.json", "rehearsal.mp4", "scene.png"),
+    "export plan.csv": ("plan.csv",),
+    "place": ("placements.csv", "place.json", "placements.png", "map_best_place.png"),
+    "servo": ("camera_1.png", "camera_2.png", "convergence.png", "servo.html"),
+    "selfcal": ("calibration.json", "recording.csv", "bmode.png", "room.png", "report.html"),
+    "batch": ("0001/candidates.parquet", "0002/candidates.parquet", "0003/candidates.parquet", "batch.csv"),
+    "reproduce": ("camera_1.png", "camera_2.png", "convergence.png", "servo.html"),
+}
+"""What each command writes; sizes do not matter, so a few hundred bytes stand for each."""
+
+
+def write_generation(out, command, generation):
+    """What the command writes, each file saying in which run it was written; some runs write a file less."""
+    inputs = (Input("case", "case.toml", str(generation)),)
+    with writing(out, command, inputs=inputs) as draft:
+        for name in WRITTEN[command][: None if generation % 2 else -1] or WRITTEN[command]:
+            path = draft.folder / name
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(f"{generation} " * 200)
+
+
+def generations(out, command):
+    """The runs from which files of a command's entry come; every one of them with the bytes that are listed."""
+    manifest = read_manifest(out)
+    if manifest is None or command not in manifest.entries:
+        return set()
+    assert [line for line in problems(out) if "left over" not in line] == []
+    entry = manifest.entries[command]
+    return {(out / name).read_text().split()[0] for name in entry.files} | {one.sha256 for one in entry.inputs}
+
+
+@pytest.mark.parametrize("command", WRITTEN)
+def test_a_writer_killed_at_random_leaves_no_mix(command, tmp_path):
+    """Run after run of the command's writing, killed within milliseconds: all that passes is of one run."""
+    rng, generation = generator(command), 0
+    for _ in range(KILLS * 10):
+        child = os.fork()
+        if child == 0:
+            for number in range(generation + 1, generation + 10_000):
+                write_generation(tmp_path, command, number)
+            os._exit(0)
+        time.sleep(rng.uniform(0.002, 0.03))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        assert len(generations(tmp_path, command)) <= 1
+        generation += 20_000 + int(rng.integers(2))
+        write_generation(tmp_path, command, generation)
+        assert generations(tmp_path, command) == {str(generation)}
+        assert problems(tmp_path) == () and temporaries(tmp_path) == []
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """Two coarse cases, and the plan of each."""
+    here = tmp_path_factory.mktemp("kill")
+    return here, coarse_cases(here)
+
+
+@pytest.fixture(scope="module")
+def plans(world):
+    """The plan of each case, in a set of its own."""
+    here, cases = world
+    for case in cases:
+        assert main(["plan", str(case), "--out", str(here / f"planned-{case.parent.name}")]) == OK
+    return [here / f"planned-{case.parent.name}" / "plan.json" for case in cases]
+
+
+def kills(command, entry, arguments, tells, out):
+    """Kill a command again and again, and run it to its end after each kill.
+
+    Args:
+        command: Its name.
+        entry: The name of its entry.
+        arguments: Of the run a and the run b, without the folder.
+        tells: A hash that is among the inputs of run a alone, and one for b.
+        out: The folder.
+    """
+    rng, counts = generator(command), Counter()
+    assert main([*map(str, arguments[0]), "--out", str(out)]) in (OK, ANSWER_IS_NO)
+    old = 0
+    for _ in range(KILLS):
+        new = 1 - old
+        process = start([*arguments[new], "--out", out])
+        kill_while_writing(process, out, rng)
+        counts[state_of(out, entry, tells[old], tells[new])] += 1
+        assert main([*map(str, arguments[new]), "--out", str(out)]) in (OK, ANSWER_IS_NO)
+        assert state_of(out, entry, tells[old], tells[new]) == "new"
+        assert problems(out) == () and temporaries(out) == []
+        old = new
+    sys.stdout.write(said(command, counts) + "\n")
+
+
+@pytest.mark.parametrize("command", ["search", "plan"])
+def test_a_command_killed_at_random(command, world, tmp_path):
+    """The whole command, as it is typed."""
+    cases = world[1]
+    options = ["--no-arm"] if command == "search" else []
+    kills(command, command, [[command, case, *options] for case in cases], [sha256(c) for c in cases], tmp_path / "out")
+
+
+@needs_time
+def test_rehearse_killed_at_random(world, plans, tmp_path):
+    """Of a plan from another folder."""
+    cases = world[1]
+    runs = [["rehearse", plan, "--case", case] for plan, case in zip(plans, cases, strict=True)]
+    kills("rehearse", "rehearse", runs, [sha256(plan) for plan in plans], tmp_path / "out")
+
+
+@needs_time
+def test_export_killed_at_random(plans, tmp_path):
+    """The same."""
+    runs = [["export", plan, "--format", "csv"] for plan in plans]
+    kills("export", "export plan.csv", runs, [sha256(plan) for plan in plans], tmp_path / "out")
+
+
+@needs_time
+def test_batch_killed_at_random(world, tmp_path):
+    """Two cases in two processes."""
+    cases = world[1]
+    runs = [["batch", case, "--no-arm", "--jobs", "2"] for case in cases]
+    kills("batch", "batch", runs, [sha256(case) for case in cases], tmp_path / "out")
+
+
+@needs_time
+def test_place_killed_at_random(tmp_path):
+    """The abdomen with few places to stand."""
+    cases = []
+    for name, step in (("a", "15.0"), ("b", "18.0")):
+        shutil.copytree(folder() / "abdomen", tmp_path / name)
+        case = tmp_path / name / "case.toml"
+        case.write_text(case.read_text().replace("step_deg = 2.0", f"step_deg = {step}") + PLACE)
+        cases.append(case)
+    kills("place", "place", [["place", case] for case in cases], [sha256(case) for case in cases], tmp_path / "out")
+
+
+@needs_time
+def test_servo_killed_at_random(tmp_path):
+    """The embedded head, with two seeds."""
+    cases = []
+    for name in ("a", "b"):
+        shutil.copytree(folder() / "head", tmp_path / name)
+        case = tmp_path / name / "servo.toml"
+        case.write_text(case.read_text() + f"# {name}\n")
+        cases.append(case)
+    kills("servo", "servo", [["servo", case] for case in cases], [sha256(case) for case in cases], tmp_path / "out")
+
+
+@needs_time
+def test_reproduce_killed_at_random(tmp_path):
+    """Liu 2007, the only paper that writes files; both runs have the same inputs, so old and new look alike."""
+    out, rng, counts = tmp_path / "out", generator("reproduce"), Counter()
+    run = ["reproduce", "liu2007", "--seeds", "2"]
+    for _ in range(KILLS):
+        kill_while_writing(start([*run, "--out", out]), out, rng)
+        manifest = read_manifest(out) if out.is_dir() else None
+        whole = manifest is not None and "reproduce" in manifest.entries
+        assert not whole or [line for line in problems(out) if "left over" not in line] == []
+        counts["old" if whole else "unfinished"] += 1
+        assert main([*run, "--out", str(out)]) in (OK, ANSWER_IS_NO)
+        assert problems(out) == () and temporaries(out) == []
+    sys.stdout.write(said("reproduce", counts) + "\n")
+
+
+@needs_time
+def test_selfcal_killed_at_random(tmp_path):
+    """Simulated, small; the seed tells the runs apart."""
+    cases = []
+    for seed in (3, 4):
+        case = tmp_path / str(seed) / "selfcal.toml"
+        case.parent.mkdir()
+        case.write_text(SELFCAL.replace("seed = 3", f"seed = {seed}"))
+        cases.append(case)
+    runs = [["selfcal", case, "--seeds", "1"] for case in cases]
+    kills("selfcal", "selfcal", runs, [sha256(case) for case in cases], tmp_path / "out")
