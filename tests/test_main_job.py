@@ -9,7 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from meshes import folder
-from run_twin import ANSWER_IS_NO, BAD_INPUT, OK, PROGRAM_FAILED, main
+from planning.output_manifest import problems
+from run_twin import ANSWER_IS_NO, BAD_INPUT, INTERRUPTED, OK, PROGRAM_FAILED, main
 from twin.report.progress import BarDisplay, LineDisplay, progress_display
 
 
@@ -103,6 +104,60 @@ def test_pictures_can_be_left_out(carton, tmp_path, capfd):
     assert main(["search", str(carton), "--no-arm", "--no-pictures", "--out", str(tmp_path)]) == OK
     capfd.readouterr()
     assert {path.name for path in tmp_path.iterdir()} == {"candidates.parquet", "manifest.json", "timings.json"}
+
+
+def test_a_new_search_leaves_nothing_of_an_old_one(carton, tmp_path, capfd):
+    """Pictures and page of an earlier search go with it; notes that somebody keeps there stay."""
+    assert main(["search", str(carton), "--no-arm", "--out", str(tmp_path)]) == OK
+    assert (tmp_path / "report.html").is_file()
+    (tmp_path / "notes.txt").write_text("mine")
+    assert main(["search", str(carton), "--no-arm", "--no-pictures", "--out", str(tmp_path)]) == OK
+    names = {"candidates.parquet", "manifest.json", "timings.json", "notes.txt"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    assert problems(tmp_path) == ()
+
+
+def test_a_plan_of_a_set_is_read_only_as_it_was_written(rehearsed, tmp_path, capfd):
+    """Edited beside its manifest: refused, one line. Outside of any set: read, with one line of warning."""
+    copy = tmp_path / "copy"
+    shutil.copytree(rehearsed, copy)
+    plan = copy / "plan.json"
+    assert main(["export", str(plan), "--format", "csv", "--out", str(copy)]) == OK
+    assert capfd.readouterr().err == "" and problems(copy) == ()
+    plan.write_text(plan.read_text().replace('"roll_deg": ', '"roll_deg": 1'))
+    assert main(["export", str(plan), "--format", "csv", "--out", str(copy)]) == BAD_INPUT
+    said = capfd.readouterr().err
+    assert "other bytes than are listed" in said and len(said.splitlines()) == 1
+    loose = tmp_path / "loose.json"
+    shutil.copy(rehearsed / "plan.json", loose)
+    assert main(["export", str(loose), "--format", "csv", "--out", str(tmp_path / "out")]) == OK
+    said = capfd.readouterr().err
+    assert "outside of any output set" in said and len(said.splitlines()) == 1
+
+
+def test_a_rehearsal_beside_its_plan_keeps_the_plan(carton, rehearsed, tmp_path, capfd):
+    """Rehearsed again in its own folder: the plan and its pictures stay, the page of the older rehearsal goes."""
+    copy = tmp_path / "copy"
+    shutil.copytree(rehearsed, copy)
+    assert main(["rehearse", str(copy / "plan.json"), "--case", str(carton), "--out", str(copy)]) == OK
+    names = {"candidates.parquet", "plan.json", "map.png", "scene.png", "rehearsal.json", "rehearsal.mp4"}
+    assert {path.name for path in copy.iterdir()} == {*names, "manifest.json", "timings.json"}
+    assert problems(copy) == ()
+
+
+def test_ctrl_c_is_exit_code_130_and_leaves_the_old_set(carton, rehearsed, tmp_path, monkeypatch, capfd):
+    """In the middle of a search: one line, and nothing has changed."""
+
+    def interrupted(*arguments, **options):
+        raise KeyboardInterrupt
+
+    copy = tmp_path / "copy"
+    shutil.copytree(rehearsed, copy)
+    monkeypatch.setattr("twin.main_job.write_table", interrupted)
+    assert main(["search", str(carton), "--no-arm", "--out", str(copy)]) == INTERRUPTED
+    assert capfd.readouterr().err.strip() == "interrupted"
+    assert {path.name for path in copy.iterdir()} == {path.name for path in rehearsed.iterdir()}
+    assert problems(copy) == ()
 
 
 def test_nothing_safe_is_exit_code_1_with_the_closest_miss(carton, tmp_path, capfd):
