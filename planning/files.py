@@ -12,6 +12,8 @@ from pathlib import Path
 from planning.errors import InputError
 
 OUTPUT_NAMES = (
+    "manifest.json",
+    "timings.json",
     "candidates.parquet",
     "certificate.json",
     "map.png",
