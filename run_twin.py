@@ -342,7 +342,7 @@ def _run(arguments: list[str] | None) -> int:
     except NoAnswerError as error:
         return _fail(one_line(str(error)), ANSWER_IS_NO)
     except (KeyboardInterrupt, typer.Abort):
-        return _fail("interrupted", INTERRUPTED)
+        result = INTERRUPTED
     except ClickException as error:
         return _fail(f"command line: {one_line(error.format_message(), MOST_WHAT)}; allowed: see --help", BAD_INPUT)
     except PlanningError as error:
@@ -350,6 +350,8 @@ def _run(arguments: list[str] | None) -> int:
     except Exception:  # the last line of defence: the user gets exit code 3 and the traceback, whatever broke
         traceback.print_exc()
         return PROGRAM_FAILED
+    if result == INTERRUPTED:  # typer itself turns Ctrl-C into this, and says nothing
+        return _fail("interrupted", INTERRUPTED)
     return int(result or OK)
 
 
