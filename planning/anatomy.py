@@ -282,7 +282,14 @@ class _Loader:
         if name is None:
             return None
         self._progress("CT beside the structures")
-        return Scan(name, self._volume(name), None if own else skin)
+        scan = Scan(name, self._volume(name), None if own else skin)
+        if not scan.holds(self._case.target_ct):
+            raise InputError(
+                f"[ct] file '{name}' does not show the target: a slip of file or space?",
+                where=self._case.path,
+                allowed="a CT that holds the target, in the space of the structures",
+            )
+        return scan
 
     def _mesh(self, section: StructureSection) -> TriangleMesh:
         where = f"{self._case.path}: structure '{section.name}'"

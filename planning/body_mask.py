@@ -11,11 +11,16 @@ from scipy import ndimage
 
 from planning.detached_parts import detached_limbs, largest_component, limb_warnings, thick_parts
 from planning.errors import InputError
+from planning.flat_side import FlatSide, flat_sides
 
 BODY_HU = -500.0
 """Half way between air (-1000) and water (0): where a voxel is half skin, half air."""
 UNSCANNED_HU = -1500.0
 """Nothing real is less dense than air at -1000; scanners write -2000 or -3024 where they did not look."""
+CIRCLE_PIXELS = 2.0
+"""A circle of reconstruction is drawn to the pixel; the room's air never ends in one."""
+CIRCLE_FILLS = 0.9
+"""Of the image's width and height at least; a smaller disc in constant air may be a round phantom without noise."""
 OUTSIDE_AIR_HU = -940.0
 """Room air has -1000, inflated lung rarely less than -920: an air region that the border cuts is the room only
 if its median is below this."""
@@ -35,11 +40,13 @@ class BodyMask:
         body: Shape (nx, ny, nz), the solid body: the trunk, and parts of the patient that do not touch it.
         unscanned: Same shape, voxels that the scanner did not measure.
         warnings: What the user should know.
+        flat_sides: Where the body ends in a plane, as a table does that touches it.
     """
 
     body: Mask
     unscanned: Mask
     warnings: tuple[str, ...]
+    flat_sides: tuple[FlatSide, ...] = ()
 
 
 def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where: str | Path) -> BodyMask:
@@ -74,10 +81,44 @@ def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where
     body = _with_cut_lungs(filled, hu, voxel_ml, warnings)
     if body.all():
         raise InputError("no air around the body", where=where, allowed="a CT that shows the skin somewhere")
-    unscanned = hu < UNSCANNED_HU
+    unscanned = unscanned_voxels(hu)
     if (ndimage.binary_dilation(body) & unscanned & ~body).any():
         warnings.append("the scanner's field of view (a circle in the image) cuts the body; no skin is known there")
-    return BodyMask(body, unscanned, tuple(warnings))
+    sides = flat_sides(hu - BODY_HU, body, spacing_mm)
+    warnings.extend(side.warning for side in sides)
+    return BodyMask(body, unscanned, tuple(warnings), sides)
+
+
+def unscanned_voxels(hu: NDArray[np.float32]) -> Mask:
+    """Voxels that the scanner did not measure: far below air, or one least value that fills what is outside a circle.
+
+    Many scanners write the value of air, -1024, outside of their circle of reconstruction: what is there is no air.
+
+    Args:
+        hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient.
+    """
+    unscanned = hu < UNSCANNED_HU
+    measured = hu[~unscanned]
+    if len(measured) == 0:
+        return np.asarray(unscanned)
+    padding = np.all((hu == measured.min()) | unscanned, axis=2)
+    if _outside_a_circle(padding):
+        unscanned = unscanned | padding[:, :, None]
+    return np.asarray(unscanned)
+
+
+def _outside_a_circle(padding: Mask) -> bool:
+    """Whether pixels (nx, ny) are just those outside of a circle that fills the image."""
+    inside = np.argwhere(~padding)
+    if not padding.any() or len(inside) == 0:
+        return False
+    low, high = inside.min(axis=0), inside.max(axis=0)
+    if np.any(high - low + 1 < CIRCLE_FILLS * np.array(padding.shape)):
+        return False
+    middle = (low + high) / 2.0
+    farthest = np.linalg.norm(inside - middle, axis=1).max()
+    nearest = np.linalg.norm(np.argwhere(padding) - middle, axis=1).min()
+    return bool(farthest - nearest < CIRCLE_PIXELS)
 
 
 def filled_slices(mask: Mask) -> Mask:

@@ -7,6 +7,7 @@ checked by the same engine as every organ, along the whole needle while it waits
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +16,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
-from planning.body_mask import BODY_HU, UNSCANNED_HU
+from planning.body_mask import BODY_HU, unscanned_voxels
+from planning.flat_side import FlatSide
 from planning.formats.label_surface import field_surface
 from planning.mesh import TriangleMesh
 
@@ -36,6 +38,12 @@ RIM_MM = 50.0
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
+
+BOX_FACES = np.array(
+    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
+     [1, 5, 7], [1, 7, 3]]
+)  # fmt: skip
+"""Triangles of a box whose corners run with x slowest and z fastest, outward."""
 
 FULL = np.ones((3, 3, 3), bool)
 """Voxels that share a face, an edge or a corner are neighbours."""
@@ -69,7 +77,7 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Mask:
         air_hu: Voxels whose surroundings are denser than this are not air.
     """
     hu, body = image.hu, image.body
-    scanned = hu >= UNSCANNED_HU
+    scanned = ~unscanned_voxels(hu)
     size = np.maximum(1, np.round(SMOOTH_MM / image.spacing_mm)).astype(int)
     mean = ndimage.uniform_filter(np.maximum(hu, -1024.0), size=tuple(size), mode="nearest")
     dense = (mean > air_hu) | (hu > max(DENSE_HU, air_hu))
@@ -96,6 +104,32 @@ def outside_surface(image: OutsideImage, *, air_hu: float, where: str | Path) ->
     surface = field_surface(mask.astype(np.float32) - 0.5, image.T_ct_index, where=where)
     drawn = _drawn_out(surface, image)
     return joined([drawn, *_hulls_beyond(mask, image)])
+
+
+def beyond_body(image: OutsideImage) -> list[TriangleMesh]:
+    """Boxes beyond each face of the image that cuts the body: where the skin goes on and the image does not.
+
+    Of a skin that comes from the image itself the same is known from its cut triangles.
+    """
+    boxes = []
+    for axis, end in itertools.product(range(3), (0, -1)):
+        if image.body.take(end, axis=axis).any():
+            across = np.delete(image.hu.shape, axis) - 0.5
+            corners = np.array([[x, y] for x in (-0.5, across[0]) for y in (-0.5, across[1])])
+            boxes.append(_prism(corners, axis, end, image))
+    return [box for box in boxes if box is not None]
+
+
+def beyond_flat_sides(image: OutsideImage, sides: Sequence[FlatSide]) -> list[TriangleMesh]:
+    """Boxes beyond the planes in which a body ends that lies on something: to both sides and along the bed too."""
+    T, shape = image.T_ct_index, np.array(image.hu.shape)
+    boxes = []
+    for side in sides:
+        low, high = -np.array(BEYOND_MM) / image.spacing_mm, shape - 1.0 + np.array(BEYOND_MM) / image.spacing_mm
+        (high if side.end == 0 else low)[side.axis] = side.plane
+        index = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+        boxes.append(TriangleMesh(index @ T[:3, :3].T + T[:3, 3], BOX_FACES))
+    return boxes
 
 
 def joined(meshes: list[TriangleMesh]) -> TriangleMesh:

@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from planning.body_mask import body_mask
+from planning.body_mask import BodyMask, body_mask
 from planning.cache import Arrays
 from planning.formats.orientation import Oriented, canonical
+from planning.formats.volumes import parse_header
 from planning.mesh import TriangleMesh
-from planning.outside_body import OutsideImage, outside_surface
+from planning.outside_body import OutsideImage, beyond_body, beyond_flat_sides, joined, outside_surface
 from planning.second_witness import BodyImage, Named, Unnamed, unnamed_surfaces
 from planning.skin import Skin
 from planning.surfaces import VolumeSurfaces, kept_mesh
@@ -49,7 +50,10 @@ class Scan:
         def make() -> TriangleMesh | None:
             ct = self._ct
             image = OutsideImage(self._hu, self._body, ct.T_ct_index, ct.spacing_mm)
-            return outside_surface(image, air_hu=air_hu, where=self.source.path)
+            found = outside_surface(image, air_hu=air_hu, where=self.source.path)
+            beyond = beyond_flat_sides(image, self._found.flat_sides) if self.skin is None else beyond_body(image)
+            meshes = [*([] if found is None else [found]), *beyond]
+            return joined(meshes) if meshes else None
 
         return self._kept({"what": "outside", "air_hu": air_hu}, lambda: [make()])[0]
 
@@ -63,11 +67,18 @@ class Scan:
 
         def make() -> Unnamed:
             ct = self._ct
-            image = BodyImage(self._hu, self._body, ct.T_ct_index, ct.spacing_mm)
+            slack_mm = 0.0 if self.skin is None else 2.0 * self._tolerance_mm
+            image = BodyImage(self._hu, self._body, ct.T_ct_index, ct.spacing_mm, slack_mm)
             return unnamed_surfaces(image, structures, dense_hu=dense_hu, where=self.source.path)
 
         named = {"structures": [f"{one.name} {_digest(one.mesh)}" for one in structures]}
         return Unnamed(*self._kept({"what": "unnamed", "dense_hu": dense_hu, **named}, lambda: list(make())))
+
+    def holds(self, point_ct: NDArray[np.float64]) -> bool:
+        """Whether a point (3,), LPS mm, lies in the image; only the header is read."""
+        header = parse_header(self.source.content, self.source.path)
+        index = np.linalg.solve(header.T_ct_index, np.append(point_ct, 1.0))[:3]
+        return bool(np.all((index >= -0.5) & (index <= np.array(header.shape) - 0.5)))
 
     def hu_at(self, points_ct: NDArray[np.float64]) -> NDArray[np.float64]:
         """Hounsfield units of the nearest voxel, NaN outside of the image.
@@ -96,10 +107,19 @@ class Scan:
         """The body's voxels: as found in the CT, or inside the skin that the case gives."""
         ct = self._ct
         if self.skin is None:
-            return body_mask(self._hu, ct.spacing_mm, where=self.source.path).body
+            return self._found.body
         inside = voxels_inside(self.skin.mesh, ct.T_ct_index, ct.values.shape)
-        near = max(SKIN_TOLERANCE_MM, 1.5 * float(ct.spacing_mm.max()))
-        return np.asarray(ndimage.distance_transform_edt(~inside, sampling=ct.spacing_mm) <= near)
+        return np.asarray(ndimage.distance_transform_edt(~inside, sampling=ct.spacing_mm) <= self._tolerance_mm)
+
+    @cached_property
+    def _found(self) -> BodyMask:
+        """The body that this CT shows by itself."""
+        return body_mask(self._hu, self._ct.spacing_mm, where=self.source.path)
+
+    @property
+    def _tolerance_mm(self) -> float:
+        """How far a skin from elsewhere may be off."""
+        return max(SKIN_TOLERANCE_MM, 1.5 * float(self._ct.spacing_mm.max()))
 
     def _kept(
         self, made_from: dict[str, Any], make: Callable[[], list[TriangleMesh | None]]

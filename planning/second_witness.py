@@ -57,12 +57,15 @@ class BodyImage:
         body: Same shape.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
         spacing_mm: Shape (3,).
+        slack_mm: So deep below the body's surface there may still be the room's air, because the surface is from
+            elsewhere and was widened.
     """
 
     hu: NDArray[np.float32]
     body: Mask
     T_ct_index: NDArray[np.float64]
     spacing_mm: NDArray[np.float64]
+    slack_mm: float = 0.0
 
 
 class Unnamed(NamedTuple):
@@ -85,9 +88,16 @@ def unnamed_surfaces(image: BodyImage, structures: Sequence[Named], *, dense_hu:
     dense = image.body & (image.hu >= dense_hu) & ~named
     gas = image.hu < GAS_HU
     if gas.any():
-        inner = ndimage.binary_erosion(image.body, FULL, iterations=SKIN_VOXELS, border_value=1)
-        gas &= inner & ~_grown_union([one for one in structures if one.may_hold_gas], image)
+        gas &= _deep(image) & ~_grown_union([one for one in structures if one.may_hold_gas], image)
     return Unnamed(_surface(dense, image, where), _surface(gas, image, where))
+
+
+def _deep(image: BodyImage) -> Mask:
+    """Voxels so deep in the body that air in them is not the room's."""
+    deep = ndimage.binary_erosion(image.body, FULL, iterations=SKIN_VOXELS, border_value=1)
+    if image.slack_mm > 0.0 and not image.body.all():
+        deep &= ndimage.distance_transform_edt(image.body, sampling=image.spacing_mm) > image.slack_mm
+    return np.asarray(deep)
 
 
 def _grown_union(structures: Sequence[Named], image: BodyImage) -> Mask:

@@ -11,21 +11,19 @@ from planning.anatomy import Anatomy, Role, Structure
 from planning.case import Case
 from planning.errors import InputError
 from planning.mesh import TriangleMesh
-from planning.outside_body import joined
+from planning.outside_body import BOX_FACES, joined
 from planning.robot.tool import Box
 from planning.room import case_boxes, gantry_in_ct
 
 Floats = NDArray[np.float64]
 
 GANTRY = "gantry"
+NOWHERE = (
+    'obstacles of the frame "base" are not checked, since the case does not say where the robot\'s base is: {names}'
+)
 
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 """Of a cube with edges of 1."""
-FACES = np.array(
-    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
-     [1, 5, 7], [1, 7, 3]]
-)  # fmt: skip
-"""Its triangles, outward."""
 
 
 def with_surroundings(anatomy: Anatomy, case: Case, T_base_ct: Floats | None) -> Anatomy:
@@ -40,7 +38,9 @@ def with_surroundings(anatomy: Anatomy, case: Case, T_base_ct: Floats | None) ->
         if solid.name in taken:
             what = f"obstacle '{solid.name}' has the name of a structure"
             raise InputError(what, where=case.path, allowed="a name of its own")
-    return replace(anatomy, surroundings=anatomy.surroundings + solids)
+    nowhere = [obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"] if T_base_ct is None else []
+    warnings = (*anatomy.warnings, *([NOWHERE.format(names=", ".join(nowhere))] if nowhere else []))
+    return replace(anatomy, surroundings=anatomy.surroundings + solids, warnings=warnings)
 
 
 def surroundings(case: Case, T_base_ct: Floats | None) -> tuple[Structure, ...]:
@@ -67,4 +67,4 @@ def _structure(name: str, mesh: TriangleMesh) -> Structure:
 
 def _mesh(box: Box, T_ct_base: Floats) -> TriangleMesh:
     T = T_ct_base @ box.T_base_box
-    return TriangleMesh((CORNERS * box.size_mm) @ T[:3, :3].T + T[:3, 3], FACES)
+    return TriangleMesh((CORNERS * box.size_mm) @ T[:3, :3].T + T[:3, 3], BOX_FACES)

@@ -5,6 +5,7 @@ import pytest
 import SimpleITK as sitk  # noqa: N813
 
 from planning.anatomy import OUTSIDE_NOT_KNOWN
+from planning.body_mask import unscanned_voxels
 from planning.case import load_case
 from planning.certify import certify, verify
 from planning.errors import InputError
@@ -17,6 +18,8 @@ from twin.phantoms.implicit import ellipsoid
 
 STEP_DEG = 6.0
 KIDNEY_FIELD = ellipsoid((75.0, 40.0, 0.0), (20, 15, 40))
+PLANK = Part("plank", supine.slab((-250, supine.BACK_MM - 6, -400), (250, supine.BACK_MM + 30, 400)), 60.0)
+"""A solid table on which the back lies, with nothing between."""
 NEEDLE = "length_mm = 210.0\nshaft_mm = 150.0\ndiameter_mm = 1.2"
 
 CASE = """
@@ -47,6 +50,7 @@ role = "target"
 """
 SPINE = '[[structure]]\nname = "spine"\nlabelmap = "labels.nii.gz"\nlabel = 2\nrole = "avoid"\nmargin_mm = 2.0\n'
 KIDNEY = SPINE.replace("spine", "kidney").replace("label = 2", "label = 5")
+TRUNK_SKIN = 'labelmap = "trunk.nii.gz"\nlabel = 1'
 HUMERI = "".join(
     f'[[structure]]\nname = "humerus_{side}"\nlabelmap = "labels.nii.gz"\nlabel = {label}\nrole = "avoid"\n'
     f"margin_mm = 2.0\n"
@@ -77,6 +81,15 @@ def write_case(folder, *, skin='ct = "ct.nii.gz"', structures=SPINE, search="", 
     return path
 
 
+def write_trunk(folder, parts, grid):
+    """``trunk.nii.gz``: the label of the trunk alone."""
+    trunk = (parts[0].field(grid.centres()) < 0).reshape(grid.shape)
+    image = sitk.GetImageFromArray(trunk.astype(np.uint8).transpose(2, 1, 0))
+    image.SetSpacing(grid.spacing_mm)
+    image.SetOrigin(grid.low_mm)
+    sitk.WriteImage(image, str(folder / "trunk.nii.gz"))
+
+
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A function: the folder of a scene of these parts."""
@@ -95,6 +108,7 @@ def scene(tmp_path_factory):
                     supine.sheet_part(),
                 ],
                 "alone": supine.trunk_parts() + supine.arm_parts("up"),
+                "plank": [*supine.trunk_parts(), PLANK],
             }[name]
             folder = tmp_path_factory.mktemp(name)
             write_scene(folder, parts, supine.grid())
@@ -181,13 +195,8 @@ def test_a_trunk_alone_has_nothing_outside(scene):
 def test_a_skin_from_elsewhere_with_the_ct_beside_it(scene):
     """The skin is a label of the trunk alone: with ``[ct] file`` arms, table and line are unknown all the same."""
     folder, parts = scene("all")
-    grid = supine.grid()
-    trunk = (parts[0].field(grid.centres()) < 0).reshape(grid.shape)
-    image = sitk.GetImageFromArray(trunk.astype(np.uint8).transpose(2, 1, 0))
-    image.SetSpacing(grid.spacing_mm)
-    image.SetOrigin(grid.low_mm)
-    sitk.WriteImage(image, str(folder / "trunk.nii.gz"))
-    skin = 'labelmap = "trunk.nii.gz"\nlabel = 1'
+    write_trunk(folder, parts, supine.grid())
+    skin = TRUNK_SKIN
     blind = prepare(write_case(folder, skin=skin, name="blind"), arm=False)
     seeing = prepare(write_case(folder, skin=skin, more='[ct]\nfile = "ct.nii.gz"', name="seeing"), arm=False)
 
@@ -288,3 +297,86 @@ def test_a_level_of_air_that_cannot_be_is_refused(scene, level):
     folder, _ = scene("alone")
     with pytest.raises(InputError, match="air_hu"):
         load_case(write_case(folder, more=f"[ct]\nair_hu = {level!r}".replace("'", '"'), name="level"))
+
+
+def test_a_table_that_touches_the_back_is_no_body(scene):
+    """Back and solid table hold together; no path through the table is safe, the front stays free, it is said."""
+    folder, _ = scene("plank")
+    prepared = prepare(write_case(folder), arm=False)
+    found = prepared.search()
+
+    rows = through(found, prepared.case, PLANK)
+    assert rows.sum() > 100
+    assert not found.safe[rows].any()
+    assert found.safe.sum() > 40
+    assert any("flat at its back side" in warning for warning in prepared.anatomy.warnings)
+
+
+def test_air_beside_a_label_of_the_skin_is_no_gas(tmp_path):
+    """The tolerance of a skin from elsewhere, wider than two voxels of this scan, leaves the safe front as it is."""
+    grid = supine.grid(slice_mm=8.0)
+    write_scene(tmp_path, supine.trunk_parts(), grid)
+    write_trunk(tmp_path, supine.trunk_parts(), grid)
+    beside = write_case(tmp_path, skin=TRUNK_SKIN, more='[ct]\nfile = "ct.nii.gz"', name="beside")
+    prepared = prepare(beside, arm=False)
+
+    assert [structure.name for structure in prepared.anatomy.structures] == ["lesion", "spine"]
+    assert prepared.search().safe.sum() > 40
+
+
+def crop(folder, box, move_mm=(0.0, 0.0, 0.0)):
+    """``crop.nii.gz``: a part of the CT, in its place or moved."""
+    image = sitk.ReadImage(str(folder / "ct.nii.gz"))[box]
+    image.SetOrigin(np.add(image.GetOrigin(), move_mm))
+    sitk.WriteImage(image, str(folder / "crop.nii.gz"))
+
+
+def test_beyond_a_ct_that_ends_in_the_body_nothing_is_free(scene):
+    """A CT of the lesion's surroundings beside a skin from elsewhere shows neither table nor arms: nothing is safe."""
+    folder, parts = scene("alone")
+    write_trunk(folder, parts, supine.grid())
+    crop(folder, np.s_[52:72, 42:62, 10:30])
+    narrow = write_case(folder, skin=TRUNK_SKIN, more='[ct]\nfile = "crop.nii.gz"', name="narrow")
+
+    assert prepare(write_case(folder, skin=TRUNK_SKIN, name="none"), arm=False).search().safe.sum() > 40
+    assert prepare(narrow, arm=False).search().safe.sum() == 0
+
+
+def test_a_ct_of_another_place_is_refused(scene):
+    """A ``[ct] file`` that does not hold the target says nothing about it: another patient's, or a slip of space."""
+    folder, parts = scene("alone")
+    write_trunk(folder, parts, supine.grid())
+    crop(folder, np.s_[:, :, :], move_mm=(1000.0, 0.0, 0.0))
+    path = write_case(folder, skin=TRUNK_SKIN, more='[ct]\nfile = "crop.nii.gz"', name="elsewhere")
+    with pytest.raises(InputError, match="does not show the target"):
+        prepare(path, arm=False)
+
+
+def test_an_obstacle_that_is_nowhere_is_mentioned(scene):
+    """Without the base's place an obstacle of the frame ``base`` cannot be checked; a warning names it."""
+    folder, _ = scene("alone")
+    box = '[[obstacle]]\nname = "monitor"\nframe = "base"\ncenter_mm = [0, 0, 300]\nsize_mm = [60, 60, 60]'
+    prepared = prepare(write_case(folder, more=box, name="nowhere"), arm=False)
+    assert any("not checked" in warning and "monitor" in warning for warning in prepared.anatomy.warnings)
+
+
+def disc(radius, size=80):
+    """Pixels of a square image within a circle about its middle."""
+    across = np.arange(size) - (size - 1) / 2
+    return np.hypot(across[:, None], across) <= radius
+
+
+def test_what_is_padded_around_a_circle_was_not_scanned():
+    """One least value outside of the circle of reconstruction, be it that of air, is no air."""
+    hu = np.random.default_rng(1).normal(-1000.0, 15.0, (80, 80, 12)).clip(-1024)
+    for padding in (-3024.0, -1024.0):
+        padded = np.where(disc(39.0)[:, :, None], hu, padding)
+        assert np.array_equal(unscanned_voxels(padded), np.broadcast_to(~disc(39.0)[:, :, None], hu.shape))
+
+
+def test_constant_air_about_a_body_was_scanned():
+    """A round body in air without noise, and clipped air with noise, are no circle of reconstruction."""
+    still = np.where(disc(25.0)[:, :, None], 40.0, np.full((80, 80, 12), -1000.0))
+    clipped = np.random.default_rng(1).normal(-1024.0, 15.0, (80, 80, 12)).clip(-1024)
+    assert not unscanned_voxels(still).any()
+    assert not unscanned_voxels(clipped).any()
