@@ -270,7 +270,7 @@ def test_a_certificate_holds_outside_of_the_body_too(scene):
     path = write_case(folder, step=3.0, name="certified")
     prepared = prepare(path, arm=False)
     found = prepared.search()
-    certificate = certify(prepared.case, prepared.anatomy, size=np.radians(2.0))
+    certificate = certify(prepared.case, prepared.anatomy, size=np.radians(4.0))
     verify(certificate, prepared.case, prepared.anatomy)
 
     low_theta, high_theta = certificate.leaves.theta.T

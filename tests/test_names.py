@@ -37,7 +37,7 @@ def long_named():
     names = {"bolt_h": 199 * "v" + "h", "bolt_l": 199 * "v" + "l"}
     structures = tuple(replace(s, name=names.get(s.name, s.name)) for s in carton.anatomy.structures)
     anatomy = replace(carton.anatomy, structures=structures)
-    return replace(carton, anatomy=anatomy, engine=FastEngine([s.mesh for s in structures], lambda *_: None))
+    return replace(carton, anatomy=anatomy, engine=FastEngine([s.mesh for s in anatomy.checked], lambda *_: None))
 
 
 def test_a_long_name_is_whole_in_the_verdict_and_in_the_table(long_named, tmp_path):

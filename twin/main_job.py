@@ -202,9 +202,10 @@ def rehearse_plan(prepared: Prepared, plan_path: Path, out: Path) -> Run:
 def _read_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Plan]:
     """A plan of a whole set, or with a warning from outside of any, and the hash of the bytes that it was read from."""
     found = read_output(path, max_bytes=MAX_PLAN_BYTES)
+    plan = parse_plan(found.data, path)
     if found.note:
         note(f"warning: {found.note}")
-    return found.input("plan"), parse_plan(found.data, path)
+    return found.input("plan"), plan
 
 
 def _rehearsed(run: Run, out: Path) -> Run:
@@ -351,9 +352,9 @@ def verify_certificate(path: Path, prepared: Prepared) -> dict[str, Any]:
         InputError: Not a certificate, not of this case, or a cell whose verdict does not follow.
     """
     found = read_output(path, max_bytes=MAX_CERTIFICATE_BYTES)
+    stated, certificate = found.input("certificate"), parse_certificate(found.data, path)
     if found.note:
         prepared.watcher.note(f"warning: {found.note}")
-    stated, certificate = found.input("certificate"), parse_certificate(found.data, path)
     done = verify(certificate, prepared.case, prepared.anatomy, partial(prepared.watcher.count, "cells"))
     inputs = inputs_document((stated, *prepared.case.inputs))
     return {"certificate": str(path), "inputs": inputs, **certificate.summary(), "verified": asdict(done)}

@@ -17,6 +17,7 @@ import fcl
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.clearance.containment import Side, side_of
 from planning.errors import InputError
 from planning.mesh import TriangleMesh
 from planning.robot.bodies import BODY_NAMES, NEVER_TESTED, Body, arm_bodies
@@ -224,11 +225,17 @@ class CellChecker:
         base = self._bodies[0]
         centre = collision_links(self.model)[0].mesh.bounds.mean(axis=0)
         surface = skin_surface(skin, PATIENT)
-        if touch(surface, base.bare.surface) or abs(winding_number(skin, centre)) > 0.5:
+        if touch(surface, base.bare.surface) or _holds(skin, centre):
             raise InputError("the robot's base stands in the patient", where="cell", allowed="a base outside the skin")
-        if patient is not skin and abs(winding_number(patient, centre)) > 0.5:
+        if patient is not skin and _holds(patient, centre):
             what = "the robot's base stands in what the CT shows outside of the body (its table?)"
             raise InputError(what, where="cell", allowed="a base outside of it")
+
+
+def _holds(mesh: TriangleMesh, point: Array) -> bool:
+    """Whether a point lies inside a surface; more than half around an open one counts too."""
+    side = side_of(mesh, point)
+    return side is Side.INSIDE or (side is Side.UNKNOWN and abs(winding_number(mesh, point)) > 0.5)
 
 
 def require_finite(q: Array) -> None:

@@ -21,7 +21,7 @@ from planning.reach import ReachRequest, assess_reach
 from planning.robot.cell import CellChecker
 from planning.robot.ur import ur_model
 from planning.room import case_tool
-from planning.trajectory import Trajectory
+from planning.trajectory import SAMPLE_S, Trajectory
 
 MARKERS = "name,x_mm,y_mm,z_mm\nA,0,0,80\nB,50,0,75\nC,0,60,70\nD,-40,-30,72\n"
 REGISTRATION = '[registration]\nmarkers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"\n'
@@ -39,6 +39,9 @@ FCSV = (
     "# Markups fiducial file version = 4.11\n# CoordinateSystem = LPS\n# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,"
     "label,desc,associatedNodeID\n1,0,0,80,0,0,0,1,1,1,0,A,,\n2,50,0,75,0,0,0,1,1,1,0,B,,\n3,0,60,70,0,0,0,1,1,1,0,C,,\n"
 )
+
+STANDOFF_MM = 8.0
+"""Short, so that the plan has few rows."""
 
 
 def make_corpus(folder):
@@ -170,6 +173,13 @@ def make_points(folder):
     (folder / "names.csv").write_text("id,name\n1,vessel\n2,bone\n3,liver\n")
 
 
+def evenly(times_s, q):
+    """The same motion with a row every ``SAMPLE_S``."""
+    even = SAMPLE_S * np.arange(int(np.ceil(times_s[-1] / SAMPLE_S)) + 1)
+    stretched = times_s * (even[-1] / times_s[-1])
+    return Trajectory(even, np.stack([np.interp(even, stretched, joint) for joint in q.T], axis=1))
+
+
 def straight_plan():
     """A plan of the embedded abdomen's arm: no approach, and a straight insertion that some roll can reach."""
     case = load_case(embedded() / "abdomen")
@@ -179,7 +189,7 @@ def straight_plan():
     for tilt in np.linspace(-0.6, 0.6, 13):
         outward_ct = np.array([-np.sin(abs(tilt)), -np.cos(tilt), 0.0])
         outward_ct /= np.linalg.norm(outward_ct)
-        answer = assess_reach(checker, ReachRequest(target, T[:3, :3] @ outward_ct, case.needle.length_mm, 120.0))
+        answer = assess_reach(checker, ReachRequest(target, T[:3, :3] @ outward_ct, case.needle.length_mm, STANDOFF_MM))
         if answer.reachable:
             break
     q, depth = answer.insertion_q, np.asarray(answer.insertion_depth_mm)
@@ -196,9 +206,9 @@ def straight_plan():
         target_ct=case.target_ct,
         outward_ct=outward_ct,
         roll=0.0,
-        standoff_mm=120.0,
+        standoff_mm=STANDOFF_MM,
         needle_length_mm=case.needle.length_mm,
         approach=Trajectory(np.zeros(1), q[:1]),
-        insertion=Trajectory((depth - depth[0]) / 5.0, q),
+        insertion=evenly((depth - depth[0]) / 5.0, q),
         clearance_mm={"approach": 20.0, "insertion": 10.0, "needle": 5.0},
     )
