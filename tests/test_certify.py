@@ -28,6 +28,7 @@ from planning.entry import Directions, angles, entry_frame, outward
 from planning.errors import InputError
 from planning.formats.spaces import Space
 from planning.mesh import TriangleMesh
+from planning.outside_body import BOX_FACES
 from planning.prepared import prepare
 from planning.provenance import InputFiles
 from planning.search import organ_candidates
@@ -616,3 +617,9 @@ def test_the_real_ct_never_contradicts(rng, tmp_path):
     letters = found.at(theta, beta)
     assert judged.safe[letters == "S"].all()
     assert not judged.safe[letters == "R"].any()
+
+
+def test_a_ray_through_an_edge_does_not_turn_the_skin_inside_out():
+    """From a target on a scan's grid the direction (3, 5, 4) meets an edge of the flat end: it is inside still."""
+    corners = np.array([[x, y, z] for x in (-168.0, 258.0) for y in (-138.0, 288.0) for z in (-60.0, 60.0)])
+    assert skin_surface(skin_from_mesh(TriangleMesh(corners, BOX_FACES)), np.zeros(3)).odd
