@@ -33,11 +33,17 @@ Progress = Callable[[str], None]
 
 UNNAMED_SHOWN = 8
 """Labels that a warning lists; a person looks at the map for the rest."""
-OUTSIDE_BODY, UNNAMED_DENSE, UNNAMED_GAS = "outside_body", "unnamed_dense", "unnamed_gas"
+OUTSIDE_BODY, ATTACHED_LIMB = "outside_body", "attached_limb"
+UNNAMED_DENSE, UNNAMED_GAS = "unnamed_dense", "unnamed_gas"
 """Names of the structures that the CT adds."""
 
 OUTSIDE_NOT_KNOWN = (
     "outside of the body: not known (no CT; [ct] file names one), so table, clothes and arms count as air"
+)
+
+LIMB_ATTACHED = (
+    f"a limb seems to be pressed against the part of the body that holds the target; paths through it are "
+    f"unknown_region ({ATTACHED_LIMB})"
 )
 
 LABELS_TRUSTED = "search.trust_labels: what the CT shows inside the body beside the structures is not checked"
@@ -146,6 +152,8 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
         loader.warnings.append(OUTSIDE_NOT_KNOWN)
     else:
         outside = _outside(case, scan)
+        if any(structure.name == ATTACHED_LIMB for structure in outside):
+            loader.warnings.append(LIMB_ATTACHED)
         if case.ct.trust_labels:
             loader.warnings.append(LABELS_TRUSTED)
         structures.extend(_unnamed(case, scan, structures))
@@ -158,11 +166,13 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
 
 
 def _outside(case: Case, scan: Scan) -> tuple[Structure, ...]:
-    """What the CT shows outside of the body that is not air."""
-    mesh = scan.outside(case.ct.air_hu)
-    if mesh is None:
-        return ()
-    return (Structure(OUTSIDE_BODY, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: outside", outside=True),)
+    """What the CT shows outside of the body that is not air, and limbs that are pressed against it."""
+    found = ((OUTSIDE_BODY, scan.outside(case.ct.air_hu)), (ATTACHED_LIMB, scan.attached_limbs(case.target_ct)))
+    return tuple(
+        Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: {name}", outside=True)
+        for name, mesh in found
+        if mesh is not None
+    )
 
 
 def _unnamed(case: Case, scan: Scan, structures: Sequence[Structure]) -> Iterator[Structure]:

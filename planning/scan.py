@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from planning.attached_limbs import attached_limbs
 from planning.body_mask import BodyMask, body_mask
 from planning.cache import Arrays
+from planning.formats.label_surface import field_surface
 from planning.formats.orientation import Oriented, canonical
 from planning.formats.volumes import parse_header
 from planning.mesh import TriangleMesh
@@ -56,6 +58,19 @@ class Scan:
             return joined(meshes) if meshes else None
 
         return self._kept({"what": "outside", "air_hu": air_hu}, lambda: [make()])[0]
+
+    def attached_limbs(self, target_ct: NDArray[np.float64]) -> TriangleMesh | None:
+        """The surface of limbs that are pressed against the part of the body that holds the target, LPS mm, or None."""
+
+        def make() -> TriangleMesh | None:
+            ct = self._ct
+            at = np.linalg.solve(ct.T_ct_index, np.append(target_ct, 1.0))[:3]
+            limbs = attached_limbs(self._hu, self._body, ct.spacing_mm, at)
+            if not limbs.any():
+                return None
+            return field_surface(limbs.astype(np.float32) - 0.5, ct.T_ct_index, where=self.source.path)
+
+        return self._kept({"what": "attached limbs", "target": target_ct.tolist()}, lambda: [make()])[0]
 
     def unnamed(self, structures: Sequence[Named], dense_hu: float) -> Unnamed:
         """What is dense, or gas, inside the body and in no structure.

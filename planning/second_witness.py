@@ -6,6 +6,7 @@ hold gas: a loop of bowel or a piece of lung that nobody labelled. Both become s
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,11 +27,12 @@ MIN_COMPONENT_MM3 = 100.0
 SKIN_VOXELS = 2
 """So deep below the body's surface voxels are partly air: no gas there."""
 GAS_HOLDERS = (
-    "lung", "trachea", "bronch", "airway", "pharynx", "larynx", "esophag", "oesophag", "stomach", "duoden",
-    "bowel", "intestin", "jejun", "ileum", "colon", "sigmoid", "rectum", "caecum", "cecum", "appendix", "sinus",
-    "nasal", "nose", "mastoid", "oral", "mouth", "gas", "air", "cavity",
+    "lung", "trachea", "bronch", "airway", "pharyn", "laryn", "nasopharyn", "esophag", "oesophag", "stomach", "duoden",
+    "bowel", "intestin", "jejun", "ileum", "colon", "sigmoid", "rectum", "caecum", "cecum", "appendix", "mastoid",
 )  # fmt: skip
-"""Parts of names of structures that hold gas in a healthy body."""
+"""How words begin that name structures which hold gas in a healthy body."""
+GAS_WORDS = ("sinus", "sinuses", "nasal", "nose", "oral", "mouth", "gas", "air", "cavity")
+"""Whole words that do: "oral" is not to be found in "femoral"."""
 
 Mask = NDArray[np.bool_]
 FULL = np.ones((3, 3, 3), bool)
@@ -45,7 +47,8 @@ class Named(NamedTuple):
     @property
     def may_hold_gas(self) -> bool:
         """Whether its name is that of lung, bowel or another hollow organ that air gets into."""
-        return any(part in self.name.lower() for part in GAS_HOLDERS)
+        words = re.findall("[a-z]+", self.name.lower())
+        return any(word.startswith(GAS_HOLDERS) or word in GAS_WORDS for word in words)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,11 @@ from planning.certify import certify, verify
 from planning.errors import InputError
 from planning.prepared import prepare
 from planning.reasons import Reason
+from planning.second_witness import Named
 from planning.standoff import standoffs
 from twin.phantoms import supine
 from twin.phantoms.ct_image import Part, rendered
-from twin.phantoms.implicit import ellipsoid
+from twin.phantoms.implicit import capsule, ellipsoid
 
 STEP_DEG = 6.0
 KIDNEY_FIELD = ellipsoid((75.0, 40.0, 0.0), (20, 15, 40))
@@ -380,3 +381,31 @@ def test_constant_air_about_a_body_was_scanned():
     clipped = np.random.default_rng(1).normal(-1024.0, 15.0, (80, 80, 12)).clip(-1024)
     assert not unscanned_voxels(still).any()
     assert not unscanned_voxels(clipped).any()
+
+
+def test_an_arm_that_is_pressed_against_the_trunk_is_no_way_in(tmp_path):
+    """No air between arm and trunk: paths through the arm are unknown, a warning says so, and the front stays free."""
+    arm = Part("arm", capsule((-196.0, 30.0, -300.0), (-196.0, 30.0, 300.0), 44.0), 20.0)
+    bone = Part("humerus", capsule((-196.0, 30.0, -300.0), (-196.0, 30.0, 300.0), 12.0), 700.0)
+    lesion = Part("lesion", ellipsoid((-111.0, 11.0, 1.0), (12, 12, 12)), 90.0)
+    parts = [*supine.trunk_parts()[:3], lesion, arm, bone]
+    write_scene(tmp_path, parts, supine.grid())
+    path = write_case(tmp_path)
+    path.write_text(path.read_text().replace("[-55.0, 20.0, 0.0]", "[-110.0, 10.0, 0.0]"))
+    prepared = prepare(path, arm=False)
+    found = prepared.search()
+
+    assert hit_parts(prepared, found, parts, ("arm", "humerus")) == {}
+    assert "attached_limb" in found.reason_structure
+    assert any("pressed against" in warning for warning in prepared.anatomy.warnings)
+    assert found.safe.sum() > 40
+
+
+@pytest.mark.parametrize(
+    ("name", "holds"),
+    [("lung_upper_lobe_left", True), ("small_bowel", True), ("femoral_artery", False), ("pectoral_muscle", False),
+     ("oral_cavity", True), ("liver", False), ("hair", False), ("trachea", True)],
+)  # fmt: skip
+def test_whose_name_may_hold_gas(name, holds):
+    """Words, not letters within words."""
+    assert Named(name, None).may_hold_gas is holds
