@@ -19,6 +19,10 @@ UNSCANNED_HU = -1500.0
 """Nothing real is less dense than air at -1000; scanners write -2000 or -3024 where they did not look."""
 CIRCLE_PIXELS = 2.0
 """A circle of reconstruction is drawn to the pixel; the room's air never ends in one."""
+NEARLY_AIR_HU = -900.0
+"""Below this a voxel is air, with its noise."""
+STILL_AIR = 0.9
+"""Where so much of the air has one value, the image has no noise: that of a phantom, not of a scanner."""
 CIRCLE_FILLS = 0.9
 """Of the image's width and height at least; a smaller disc in constant air may be a round phantom without noise."""
 OUTSIDE_AIR_HU = -940.0
@@ -92,7 +96,8 @@ def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where
 def unscanned_voxels(hu: NDArray[np.float32]) -> Mask:
     """Voxels that the scanner did not measure: far below air, or one least value that fills what is outside a circle.
 
-    Many scanners write the value of air, -1024, outside of their circle of reconstruction: what is there is no air.
+    Many scanners write the value of air, -1024, outside of their circle of reconstruction: what is there is no air. In
+    an image without noise the air inside has the same value, and nothing tells the two apart: then it is air.
 
     Args:
         hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient.
@@ -101,8 +106,11 @@ def unscanned_voxels(hu: NDArray[np.float32]) -> Mask:
     measured = hu[~unscanned]
     if len(measured) == 0:
         return np.asarray(unscanned)
-    padding = np.all((hu == measured.min()) | unscanned, axis=2)
-    if _outside_a_circle(padding):
+    least = measured.min()
+    padding = np.all((hu == least) | unscanned, axis=2)
+    air = hu[(hu < NEARLY_AIR_HU) & ~padding[:, :, None]]
+    noisy = len(air) == 0 or np.mean(air == least) < STILL_AIR
+    if noisy and _outside_a_circle(padding):
         unscanned = unscanned | padding[:, :, None]
     return np.asarray(unscanned)
 

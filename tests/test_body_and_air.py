@@ -379,7 +379,9 @@ def test_constant_air_about_a_body_was_scanned():
     """A round body in air without noise, and clipped air with noise, are no circle of reconstruction."""
     still = np.where(disc(25.0)[:, :, None], 40.0, np.full((80, 80, 12), -1000.0))
     clipped = np.random.default_rng(1).normal(-1024.0, 15.0, (80, 80, 12)).clip(-1024)
+    ball = np.where(sum((np.indices((99, 99, 99)) - 49.0) ** 2) < 45.0**2, 40.0, -1000.0)
     assert not unscanned_voxels(still).any()
+    assert not unscanned_voxels(ball).any()
     assert not unscanned_voxels(clipped).any()
 
 
