@@ -44,7 +44,7 @@ pictures: demo
 	$(BIN)/python docs/readme_pictures.py $(OUT)
 
 meshes: install
-	$(BIN)/python -m twin.phantoms --out meshes
+	$(BIN)/python -m puncture_twin.twin.phantoms --out meshes
 
 clean:
 	rm -rf $(VENV) build out

@@ -21,18 +21,26 @@ import typer
 from rich.console import Console
 from typer._click.exceptions import ClickException  # typer carries its own click and re-exports no base class
 
-from meshes import folder as meshes_folder
-from planning.batch import run_batch
-from planning.case import load_case
-from planning.errors import MOST_WHAT, CacheWarning, InputError, NoAnswerError, PlanningError, one_line
-from planning.export import FORMATS
-from planning.files import check_writable
-from planning.prepared import prepare
-from planning.provenance import inputs_document
-from twin import main_job, words
-from twin.mirror import Mirror, connect, live_states, recorded_states, recording_warnings
-from twin.place_words import mirror_line, place_text
-from twin.report.progress import progress_display
+from puncture_twin.meshes import folder as meshes_folder
+from puncture_twin.planning.base.errors import (
+    MOST_WHAT,
+    CacheWarning,
+    InputError,
+    NoAnswerError,
+    PlanningError,
+    one_line,
+)
+from puncture_twin.planning.base.files import check_writable
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.batch.batch import run_batch
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.export.exporter import FORMATS
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.twin.jobs.patient import main_job
+from puncture_twin.twin.jobs.patient import text as words
+from puncture_twin.twin.jobs.patient.place_text import mirror_line, place_text
+from puncture_twin.twin.jobs.robot.mirror import Mirror, connect, live_states, recorded_states, recording_warnings
+from puncture_twin.twin.report.progress import progress_display
 
 MOST_SEEDS = 10_000
 """Rooms or draws of one command; each takes seconds."""
@@ -162,7 +170,7 @@ def place(
     as_json: JsonOption = False,
 ) -> None:
     """Find where the arm should stand to hold most of the organ-safe directions; write the placements and their map."""
-    from twin.place_job import place_case
+    from puncture_twin.twin.jobs.patient.place_job import place_case
 
     with progress_display() as progress:
         run = place_case(prepare(case, arm=False, watcher=progress), out_dir, jobs=jobs, pictures=pictures)
@@ -252,8 +260,8 @@ def selfcal(
     as_json: JsonOption = False,
 ) -> None:
     """Let two arms calibrate themselves by ultrasound, AXP = YBQ, and send the needle to targets in the image."""
-    from twin.ultrasound.selfcal_job import run_selfcal
-    from twin.ultrasound.words import selfcal_text
+    from puncture_twin.twin.jobs.selfcal.job import run_selfcal
+    from puncture_twin.twin.jobs.selfcal.text import selfcal_text
 
     case = meshes_folder() / "selfcal" if case is None and recording is None else case
     with progress_display() as progress:
@@ -269,7 +277,7 @@ def servo(
     as_json: JsonOption = False,
 ) -> None:
     """Servo the tool onto every target by two cameras, in rooms whose truth is drawn; pictures, plot and page."""
-    from twin.stereo.servo_job import run_servo
+    from puncture_twin.twin.jobs.servo.job import run_servo
 
     with progress_display() as progress:
         job = run_servo(case, out_dir, seeds, partial(progress.count, "seeds"), progress.note)
@@ -286,7 +294,7 @@ def reproduce(
     as_json: JsonOption = False,
 ) -> None:
     """Print a paper's numbers beside ours; exit 0 only if every one holds."""
-    from twin.papers import PAPERS
+    from puncture_twin.twin.jobs.papers.papers import PAPERS
 
     if paper not in PAPERS:
         raise InputError(f"paper '{paper}' is not known", where="reproduce", allowed=", ".join(PAPERS))

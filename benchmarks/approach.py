@@ -17,23 +17,23 @@ from typing import Any
 
 import numpy as np
 
-from meshes import folder
-from planning import approach
-from planning.approach import FINER, RESOLUTION_RAD, Approach, plan_approach
-from planning.cache import Cache
-from planning.drive import MAX_JERK, follow
-from planning.errors import NoAnswerError
-from planning.goals import approach_goals
-from planning.mesh import TriangleMesh
-from planning.path_check import dense_states, least_clearance, path_length
-from planning.prepared import Prepared, prepare
-from planning.reach_answer import ReachRequest
-from planning.robot.cell import Box, CellChecker, Tool
-from planning.robot.fast_checker import FastChecker
-from planning.robot.gantry import gantry_boxes
-from planning.robot.kinematics import flange_pose
-from planning.robot.ur import ur_model
-from planning.room import ARM_PADDING_MM, case_boxes, case_tool, home_configuration
+from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.gantry import gantry_boxes
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool, home_configuration
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.motion import approach
+from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, Approach, plan_approach
+from puncture_twin.planning.motion.follow import MAX_JERK, follow
+from puncture_twin.planning.motion.path_check import dense_states, least_clearance, path_length
+from puncture_twin.planning.reach.answer import ReachRequest
+from puncture_twin.planning.reach.goals import approach_goals
+from puncture_twin.planning.search.context import Prepared, prepare
 
 STANDOFF_MM = 100.0
 

@@ -31,13 +31,13 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, beside the package
 
 from benchmarks.approach import Scene, scenes
-from planning import approach
-from planning.path_check import dense_states, first_contact, path_length
-from planning.robot.bodies import NEVER_TESTED
-from planning.robot.cell import CellChecker
-from planning.robot.fast_checker import FastChecker
-from planning.robot.kinematics import wrapped_solutions
-from planning.rrt_connect import RANGE_RAD, Connected
+from puncture_twin.planning.arm.kinematics import wrapped_solutions
+from puncture_twin.planning.collision.bodies import NEVER_TESTED
+from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.motion import approach
+from puncture_twin.planning.motion.path_check import dense_states, first_contact, path_length
+from puncture_twin.planning.motion.rrt_connect import RANGE_RAD, Connected
 
 Array = np.ndarray
 RUNNER = Path(__file__).with_name("peer_planners.py")

@@ -20,14 +20,14 @@ from time import process_time
 import numpy as np
 import ur_analytic_ik
 
-from planning.prepared import prepare
-from planning.reach import assess_reach, assess_reach_all
-from planning.robot.cell import CellChecker
-from planning.robot.fast_checker import FastChecker
-from planning.robot.kinematics import flange_pose, inverse, wrap_to_pi
-from planning.robot.ur import UR_MODELS, ur_model
-from planning.room import ARM_PADDING_MM, case_boxes, case_tool
-from planning.search import case_directions, organ_candidates, reach_request
+from puncture_twin.planning.arm.kinematics import flange_pose, inverse, wrap_to_pi
+from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
+from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool
+from puncture_twin.planning.reach.reach import assess_reach, assess_reach_all
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.search import case_directions, organ_candidates, reach_request
 
 ROOT = Path(__file__).parents[1]
 CHUNK = 200

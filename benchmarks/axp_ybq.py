@@ -14,11 +14,17 @@ import time
 import numpy as np
 import scipy
 
-from twin.ultrasound.axp_ybq import reproduce, reproduction_text, truth_estimate
-from twin.ultrasound.calibration import calibrate
-from twin.ultrasound.estimate import N_PARAMETERS
-from twin.ultrasound.pose_choice import choose_poses, expected_tre_mm
-from twin.ultrasound.simulate import SPEC_NOISE, PoseRanges, draw_truth, simulate_recording, with_noise
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import N_PARAMETERS
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.pose_choice import choose_poses, expected_tre_mm
+from puncture_twin.twin.guidance.ultrasound.simulate import (
+    SPEC_NOISE,
+    PoseRanges,
+    draw_truth,
+    simulate_recording,
+    with_noise,
+)
+from puncture_twin.twin.jobs.papers.axp_ybq import reproduce, reproduction_text, truth_estimate
 
 SEED = 7
 CANDIDATES = 300

@@ -17,11 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from twin.stereo.ball_image import BallScene, render
-from twin.stereo.calibration import calibrate
-from twin.stereo.camera import Camera, stereo_pair
-from twin.stereo.tracker import Ball, LostBall, find_ball
-from twin.stereo.triangulation import triangulate
+from puncture_twin.twin.guidance.stereo.ball.ball_image import BallScene, render
+from puncture_twin.twin.guidance.stereo.ball.tracker import Ball, LostBall, find_ball
+from puncture_twin.twin.guidance.stereo.cameras.calibration import calibrate
+from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, stereo_pair
+from puncture_twin.twin.guidance.stereo.cameras.triangulation import triangulate
 
 SIZE, FOCAL, RADIUS_MM, SEARCH_PX = (1280, 960), 2560.0, 4.0, 12.0
 LENS = (-0.2, 0.05, 5e-4, -5e-4)

@@ -16,8 +16,14 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from twin.ultrasound.needle_detector import Detection, DetectorSettings, Missed, detect, search_score
-from twin.ultrasound.probe_image import Imager, NeedleEcho, NeedlePose, render
+from puncture_twin.twin.guidance.ultrasound.image.needle_detector import (
+    Detection,
+    DetectorSettings,
+    Missed,
+    detect,
+    search_score,
+)
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleEcho, NeedlePose, render
 
 IMAGER = Imager()
 

@@ -20,12 +20,14 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, beside the package
 
-from meshes import folder
-from planning.certify import Certificate, certify, verify
-from planning.clearance.fast_engine import FastEngine
-from planning.entry import Directions, grid, outward
-from planning.prepared import Prepared, prepare
-from planning.search import organ_candidates
+from puncture_twin.meshes import folder
+from puncture_twin.planning.case.entry import Directions, grid, outward
+from puncture_twin.planning.certify import certify
+from puncture_twin.planning.certify.certificate import Certificate
+from puncture_twin.planning.certify.checker import verify
+from puncture_twin.planning.clearance.fast_engine import FastEngine
+from puncture_twin.planning.search.context import Prepared, prepare
+from puncture_twin.planning.search.search import organ_candidates
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DATA = REPOSITORY.parent / "shared" / "data" / "totalseg_abdomen_3mm"

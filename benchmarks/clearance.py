@@ -22,8 +22,8 @@ from benchmarks import peers
 from benchmarks.proof import prove
 from benchmarks.scenes import Scene, dense, scenes
 from benchmarks.search_profile import profile
-from planning.clearance.fast_engine import FastEngine
-from planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.clearance.fast_engine import FastEngine
+from puncture_twin.planning.clearance.fcl_engine import FclEngine
 
 CAP_MM = 20.0
 SAMPLE, QUICK_SAMPLE = 300, 60
@@ -90,8 +90,9 @@ def measure_scene(scene: Scene, sample: int, step_deg: float) -> None:
 def compile_times() -> None:
     """Print the time of a first and a second small search in a fresh process with an empty cache."""
     script = (
-        "import time,sys;t=time.perf_counter();import numpy as np;from planning.mesh import TriangleMesh;"
-        "from planning.clearance.fast_engine import FastEngine;"
+        "import time,sys;t=time.perf_counter();import numpy as np;"
+        "from puncture_twin.planning.geometry.mesh import TriangleMesh;"
+        "from puncture_twin.planning.clearance.fast_engine import FastEngine;"
         "m=TriangleMesh(np.eye(3)*9,[[0,1,2]]);a=time.perf_counter();"
         "FastEngine([m]).measure(np.zeros(3),np.eye(3),99.);print(f'{a-t:.2f} {time.perf_counter()-a:.2f}')"
     )

@@ -33,14 +33,16 @@ REPEATS = 3
 
 FIRST_USE = {
     "exact search of three directions": (
-        "from planning.mesh import TriangleMesh;from planning.clearance.fast_engine import FastEngine;"
+        "from puncture_twin.planning.geometry.mesh import TriangleMesh;"
+        "from puncture_twin.planning.clearance.fast_engine import FastEngine;"
         "FastEngine([TriangleMesh(np.eye(3)*9,[[0,1,2]])]).measure(np.zeros(3),np.eye(3),99.)"
     ),
     "search of the carton, without the arm": (
-        "from planning.prepared import prepare;prepare('meshes/carton/case_m.toml',arm=False).search()"
+        "from puncture_twin.planning.search.context import prepare;"
+        "prepare('meshes/carton/case_m.toml',arm=False).search()"
     ),
     "certified map of the carton to 2 degrees": (
-        "from planning.prepared import prepare;from planning.certify import certify;"
+        "from puncture_twin.planning.search.context import prepare;from planning.certify import certify;"
         "p=prepare('meshes/carton/case_m.toml',arm=False);certify(p.case,p.anatomy,size=.035)"
     ),
 }
@@ -58,7 +60,7 @@ def spiral(count: int) -> np.ndarray:
 def point(rows: int, count: int) -> dict[str, float]:
     """Time and peak memory of one search, in this process."""
     from benchmarks.scenes import dense
-    from planning.clearance.fast_engine import FastEngine
+    from puncture_twin.planning.clearance.fast_engine import FastEngine
 
     scene, rays = dense(rows), spiral(count)
     FastEngine(dense(4).meshes).measure(scene.target, rays[:50], scene.length)  # loads what is compiled

@@ -11,8 +11,8 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from planning.formats.guard import guard_mesh
-from planning.mesh import TriangleMesh
+from puncture_twin.planning.formats.guard import guard_mesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 Floats = NDArray[np.float64]
 Surface = tuple[Floats, NDArray[np.int64]]

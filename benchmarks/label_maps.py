@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from planning.prepared import prepare
+from puncture_twin.planning.search.context import prepare
 
 CASES = Path(__file__).parents[1] / "tests" / "real"
 

@@ -29,9 +29,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script,
 
 from benchmarks.hostile_scenes import KINDS, HostileScene, make_scene
 from benchmarks.plain_distance import Inside, distances, exact_distance, least_distances
-from planning.anatomy import Role, Structure
-from planning.clearance.fast_engine import FastEngine
-from planning.clearance.measure import measure
+from puncture_twin.planning.anatomy.anatomy import Role, Structure
+from puncture_twin.planning.clearance.fast_engine import FastEngine
+from puncture_twin.planning.clearance.measure import measure
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

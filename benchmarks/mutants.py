@@ -56,22 +56,26 @@ RESIDUALS = tuple(
 
 PLAIN = MappingProxyType(
     {
-        "planning.entry": ("tests/test_entry.py",),
-        "planning.skin_entry": ("tests/test_skin_entry.py", "tests/test_constraints.py"),
-        "planning.standoff": tuple(f"tests/test_standoff.py::{name}" for name in STANDOFF),
-        "planning.clearance.containment": ("tests/test_containment.py",),
-        "planning.constraints": ("tests/test_verdict_order.py",),
-        "planning.registration": ("tests/test_registration_limits.py", "tests/test_registration.py", *RESIDUALS),
+        "puncture_twin.planning.case.entry": ("tests/test_entry.py",),
+        "puncture_twin.planning.anatomy.skin_entry": ("tests/test_skin_entry.py", "tests/test_constraints.py"),
+        "puncture_twin.planning.reach.standoff": tuple(f"tests/test_standoff.py::{name}" for name in STANDOFF),
+        "puncture_twin.planning.geometry.containment": ("tests/test_containment.py",),
+        "puncture_twin.planning.search.constraints": ("tests/test_verdict_order.py",),
+        "puncture_twin.planning.registration.registration": (
+            "tests/test_registration_limits.py",
+            "tests/test_registration.py",
+            *RESIDUALS,
+        ),
     }
 )
 """All mutants of these, and the tests that must notice them."""
 
 KERNELS = MappingProxyType(
     {
-        "planning.clearance.segment_triangle": ("tests/test_plain_kernels.py",),
-        "planning.clearance.side_by_side": ("tests/test_plain_kernels.py",),
-        "planning.clearance.nearest_triangle": ("tests/test_plain_kernels.py",),
-        "planning.clearance.crossings": ("tests/test_plain_kernels.py",),
+        "puncture_twin.planning.clearance.kernels.segment_triangle": ("tests/test_plain_kernels.py",),
+        "puncture_twin.planning.clearance.kernels.side_by_side": ("tests/test_plain_kernels.py",),
+        "puncture_twin.planning.clearance.kernels.nearest_triangle": ("tests/test_plain_kernels.py",),
+        "puncture_twin.planning.geometry.crossings": ("tests/test_plain_kernels.py",),
     }
 )
 """A sample of these."""
@@ -233,7 +237,12 @@ def report(results: list[Result], out: Path) -> None:
 def main() -> int:
     """Run what is asked for; the kernels in a process of their own, where numba compiles nothing."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("modules", nargs="*", metavar="MODULE", help="planning.entry, ... or kernels; all if left out")
+    parser.add_argument(
+        "modules",
+        nargs="*",
+        metavar="MODULE",
+        help="puncture_twin.planning.case.entry, ... or kernels; all if left out",
+    )
     parser.add_argument("--out", type=Path, default=Path("out/mutants.json"))
     parser.add_argument("--sample", type=int, default=SAMPLE, help="of the kernels' mutants")
     parser.add_argument("--seed", type=int, default=SEED)

@@ -21,7 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, beside the package
 
 from benchmarks.scenes import Scene, scenes
-from planning.clearance.fast_engine import FastEngine
+from puncture_twin.planning.clearance.fast_engine import FastEngine
 
 RADIUS_MM = 0.6
 SEED = 20190401

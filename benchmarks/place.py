@@ -7,19 +7,31 @@ Seconds are CPU seconds of this process and its children, so that other work on 
 
 import argparse
 import resource
+import sys
 from pathlib import Path
 from time import perf_counter
 
 import numpy as np
 
-from meshes import folder
-from planning.case import load_case
-from planning.place.mounts import Region, Site
-from planning.place.search import search_placements
-from planning.placement import load_placement
-from planning.prepared import prepare
-from planning.search import case_directions, organ_candidates
-from twin.chen2019_reach import AGAINST_Z, SHARES, TOWARD_AXIS, WINDOWS, cap, held_share, our_share, our_windows
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, beside the package
+
+from benchmarks.chen2019_reach import (
+    AGAINST_Z,
+    SHARES,
+    TOWARD_AXIS,
+    WINDOWS,
+    cap,
+    held_share,
+    our_share,
+    our_windows,
+)
+from puncture_twin.meshes import folder
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.place.mounts import Region, Site
+from puncture_twin.planning.place.search import search_placements
+from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.search import case_directions, organ_candidates
 
 AXIS_WORDS = {AGAINST_Z: "base -z", TOWARD_AXIS: "to base axis"}
 LESION_M_CT = np.array([50.0, 130.0, 63.0])

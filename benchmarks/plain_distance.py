@@ -12,7 +12,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 Floats = NDArray[np.float64]
 

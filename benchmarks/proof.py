@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.peers import pose, trees
 from benchmarks.scenes import Scene
-from planning.clearance.fast_engine import NEAR_THRESHOLD_MM, FastEngine
+from puncture_twin.planning.clearance.fast_engine import NEAR_THRESHOLD_MM, FastEngine
 
 RADII_MM = (0.5, 3.0, 5.5)
 PAIRS = 2000

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-import meshes
-from planning.entry import grid
-from planning.mesh import TriangleMesh
-from planning.prepared import prepare
+from puncture_twin import meshes
+from puncture_twin.planning.case.entry import grid
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.search.context import prepare
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DATA = REPOSITORY.parent / "shared" / "data"

@@ -9,12 +9,12 @@ import numba as nb
 import numpy as np
 
 from benchmarks.scenes import Scene
-from planning.clearance.bare import bare
-from planning.clearance.bounds import disc_bounds, line_distances
-from planning.clearance.fast_engine import FastEngine
-from planning.clearance.lanes import LANES
-from planning.clearance.side_by_side import ROWS, bring_into_frame, measure_beside
-from planning.clearance.tile_search import COUNTED
+from puncture_twin.planning.clearance.fast_engine import FastEngine
+from puncture_twin.planning.clearance.kernels.bare import bare
+from puncture_twin.planning.clearance.kernels.bounds import disc_bounds, line_distances
+from puncture_twin.planning.clearance.kernels.lanes import LANES
+from puncture_twin.planning.clearance.kernels.side_by_side import ROWS, bring_into_frame, measure_beside
+from puncture_twin.planning.clearance.kernels.tile_search import COUNTED
 
 TURNS = 300_000
 REPEATS = 7

@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from meshes import folder
-from twin.stereo.experiment import Statistics, run_trials, statistics, varied
-from twin.stereo.optimum_trial import OptimumTrial, optimum_trial
-from twin.stereo.room import Room
-from twin.stereo.servo_case import ServoCase, load_servo_case
-from twin.stereo.session import Eyes
-from twin.stereo.sight import Sight, picture_sight, pixel_sight
+from benchmarks.optimum_trial import OptimumTrial, optimum_trial
+from puncture_twin.meshes import folder
+from puncture_twin.twin.guidance.stereo.detection import Sight, picture_sight, pixel_sight
+from puncture_twin.twin.guidance.stereo.experiment import Statistics, run_trials, statistics, varied
+from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
+from puncture_twin.twin.guidance.stereo.session import Eyes
+from puncture_twin.twin.guidance.stereo.stereo_room import Room
 
 PIXEL_PX = 0.02
 """Error of a ball's centre, per axis, where the pictures are left out: what they give at noise 2."""

@@ -22,8 +22,8 @@ from statistics import median
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, beside the package
 
-from planning.cache import FOLDER_VARIABLE
-from planning.case import load_case
+from puncture_twin.planning.base.cache.array_cache import FOLDER_VARIABLE
+from puncture_twin.planning.case.case import load_case
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DATA = REPOSITORY.parent / "shared" / "data" / "totalseg_abdomen_3mm"

@@ -6,7 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Ellipse
 
-from planning.entry import outward
+from puncture_twin.planning.case.entry import outward
 
 COLORS = ("#c0392b", "#1e8449", "#1f4e8c")
 THETA, BETA = np.radians(40), np.radians(60)

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from hypothesis import settings
 
-from planning.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 settings.register_profile("shared machine", deadline=None)  # the first call of compiled code takes seconds
 settings.load_profile("shared machine")

@@ -12,11 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
-from meshes import folder
-from planning.errors import InputError
-from planning.output_lock import LOCK_NAME
-from planning.output_manifest import MANIFEST_NAME, TIMINGS_NAME, problems, read_manifest, read_output
-from planning.output_set import DRAFT_PREFIX
+from puncture_twin.meshes import folder
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.output.lock import LOCK_NAME
+from puncture_twin.planning.base.output.manifest import (
+    MANIFEST_NAME,
+    TIMINGS_NAME,
+    problems,
+    read_manifest,
+    read_output,
+)
+from puncture_twin.planning.base.output.output_set import DRAFT_PREFIX
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 RUN_TIMEOUT_S = 600.0

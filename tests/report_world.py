@@ -5,14 +5,14 @@ from types import SimpleNamespace
 import numpy as np
 import trimesh
 
-from planning.candidates import Candidates
-from planning.entry import entry_frame, grid, view_frame
-from planning.formats.spaces import Space
-from planning.mesh import TriangleMesh
-from planning.provenance import Input
-from planning.robot.kinematics import flange_pose, inverse
-from planning.robot.ur import ur_model
-from planning.trajectory import Trajectory
+from puncture_twin.planning.arm.kinematics import flange_pose, inverse
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.provenance import Input
+from puncture_twin.planning.case.entry import entry_frame, grid, view_frame
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.search.candidates import Candidates
 
 TARGET = np.array([10.0, -20.0, 30.0])
 SKIN_RADIUS = 100.0

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from twin.ultrasound.estimate import Estimate
-from twin.ultrasound.rotations import exp
-from twin.ultrasound.simulate import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import exp
+from puncture_twin.twin.guidance.ultrasound.simulate import (
     ImagePose,
     draw_image_poses,
     draw_probe_poses,

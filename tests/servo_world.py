@@ -5,15 +5,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshes import folder
-from planning.registration import apply, fit_rigid
-from planning.robot.ur import ur_model
-from twin.stereo.joint_model import LENS, Guess, Observed, Unknowns
-from twin.stereo.poses import configurations, rod_orientation
-from twin.stereo.robot_calibration import grid_points
-from twin.stereo.room import arm_errors, calibration_frame, draw_room, head_pose, planned_cameras
-from twin.stereo.servo_case import load_servo_case
-from twin.stereo.servo_law import Held, ball_base
+from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.registration.registration import apply, fit_rigid
+from puncture_twin.twin.guidance.stereo.joint_model import LENS, Guess, Observed, Unknowns
+from puncture_twin.twin.guidance.stereo.poses import configurations, rod_orientation
+from puncture_twin.twin.guidance.stereo.robot_calibration import grid_points
+from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
+from puncture_twin.twin.guidance.stereo.servo_law import Held, ball_base
+from puncture_twin.twin.guidance.stereo.stereo_room import (
+    arm_errors,
+    calibration_frame,
+    draw_room,
+    head_pose,
+    planned_cameras,
+)
 
 CASE = load_servo_case(folder() / "head")
 HELD = Held(ur_model("ur3"), CASE.file.tool.rod_mm, rod_orientation(np.radians(CASE.file.tool.tilt_deg)))

@@ -10,18 +10,24 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from planning.approach import APPROACH_SPEED, FINER, RESOLUTION_RAD, Approach, plan_approach
-from planning.drive import MAX_JERK, drive_smoothly, follow, rounded
-from planning.errors import InputError, NoAnswerError
-from planning.mesh import TriangleMesh
-from planning.path_check import CLEARANCE_STEP_MM, MAX_SWEEP_MM, dense_states, least_clearance, path_length
-from planning.robot.cell import Box, CellChecker, Contact, Tool
-from planning.robot.fast_checker import FastChecker
-from planning.robot.kinematics import flange_pose
-from planning.robot.ur import ur_model
-from planning.rrt_connect import STALLED, connect
-from planning.time_law import LENGTH_SLACK, Rates, reachable_speed, speed_change_length, time_law
-from planning.trajectory import SAMPLE_S, Trajectory
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.collision.checker import Box, CellChecker, Contact, Tool
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.motion.approach import APPROACH_SPEED, FINER, RESOLUTION_RAD, Approach, plan_approach
+from puncture_twin.planning.motion.follow import MAX_JERK, drive_smoothly, follow, rounded
+from puncture_twin.planning.motion.path_check import (
+    CLEARANCE_STEP_MM,
+    MAX_SWEEP_MM,
+    dense_states,
+    least_clearance,
+    path_length,
+)
+from puncture_twin.planning.motion.rrt_connect import STALLED, connect
+from puncture_twin.planning.motion.timing import LENGTH_SLACK, Rates, reachable_speed, speed_change_length, time_law
+from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=200.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)

@@ -5,23 +5,23 @@ import pytest
 from scipy.optimize import least_squares
 from selfcal_world import as_estimate
 
-from planning.errors import InputError
-from twin.ultrasound.calibration import calibrate
-from twin.ultrasound.closed_form import closed_form
-from twin.ultrasound.direction import direction_from_plane, mean_direction
-from twin.ultrasound.estimate import N_PARAMETERS, SCALE, T_X, W_X, W_Y, active_columns
-from twin.ultrasound.recording import Recording
-from twin.ultrasound.refine import Problem, refine
-from twin.ultrasound.residuals import (
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import closed_form
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import direction_from_plane, mean_direction
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import N_PARAMETERS, SCALE, T_X, W_X, W_Y, active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Problem, refine
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
     direction_residuals,
     directions_image,
     linearised_direction,
     linearised_tip,
     tip_residuals,
 )
-from twin.ultrasound.rotations import log
-from twin.ultrasound.simulate import SPEC_NOISE, PoseRanges, simulate_recording, with_noise
-from twin.ultrasound.weighting import UNWEIGHTED, covariances
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import log
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import UNWEIGHTED, covariances
+from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, PoseRanges, simulate_recording, with_noise
 
 ALL = active_columns(tip=True, scale=False, direction=False)
 

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.papers import PAPERS
-from twin.ultrasound.axp_ybq import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.pose_choice import expected_tre_mm
+from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording
+from puncture_twin.twin.jobs.papers.axp_ybq import (
     Reproduction,
     Row,
     reproduce,
@@ -15,8 +16,7 @@ from twin.ultrasound.axp_ybq import (
     reproduction_text,
     truth_estimate,
 )
-from twin.ultrasound.pose_choice import expected_tre_mm
-from twin.ultrasound.simulate import SPEC_NOISE, simulate_recording
+from puncture_twin.twin.jobs.papers.papers import PAPERS
 
 
 @pytest.fixture(scope="module")

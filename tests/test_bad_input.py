@@ -9,7 +9,7 @@ import pytest
 import SimpleITK
 import trimesh
 
-from run_twin import BAD_INPUT, main
+from puncture_twin.run_twin import BAD_INPUT, main
 
 CASE = """
 schema = 1

@@ -4,18 +4,19 @@ import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
 
-from planning.anatomy import OUTSIDE_NOT_KNOWN
-from planning.body_mask import unscanned_voxels
-from planning.case import load_case
-from planning.certify import certify, verify
-from planning.errors import InputError
-from planning.prepared import prepare
-from planning.reasons import Reason
-from planning.second_witness import Named
-from planning.standoff import standoffs
-from twin.phantoms import supine
-from twin.phantoms.ct_image import Part, rendered
-from twin.phantoms.implicit import capsule, ellipsoid
+from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
+from puncture_twin.planning.anatomy.body.body_mask import unscanned_voxels
+from puncture_twin.planning.anatomy.second_witness import Named
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.certify import certify
+from puncture_twin.planning.certify.checker import verify
+from puncture_twin.planning.reach.standoff import standoffs
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.twin.phantoms import supine
+from puncture_twin.twin.phantoms.ct_image import Part, rendered
+from puncture_twin.twin.phantoms.implicit import capsule, ellipsoid
 
 STEP_DEG = 6.0
 KIDNEY_FIELD = ellipsoid((75.0, 40.0, 0.0), (20, 15, 40))

@@ -10,19 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from planning import cache as cache_module
-from planning.cache import LIBRARIES, Cache, user_cache
-from planning.cache_entry import packed
-from planning.errors import CacheWarning, InputError
-from planning.source_stamp import IMPORTED, NAME, PROJECT, closure, source_stamp
+from puncture_twin.planning.base.cache import array_cache as cache_module
+from puncture_twin.planning.base.cache.array_cache import LIBRARIES, Cache, user_cache
+from puncture_twin.planning.base.cache.entry_file import packed
+from puncture_twin.planning.base.cache.source_stamp import IMPORTED, NAME, PROJECT, closure, source_stamp
+from puncture_twin.planning.base.errors import CacheWarning, InputError
 
-BY = "planning.surfaces"
+BY = "puncture_twin.planning.anatomy.surfaces"
 MAKERS = (
-    "planning.surfaces",
-    "planning.scan",
-    "planning.robot.proofs",
-    "planning.robot.neighbours",
-    "twin.report.lighter_mesh",
+    "puncture_twin.planning.anatomy.surfaces",
+    "puncture_twin.planning.anatomy.scan",
+    "puncture_twin.planning.collision.proofs",
+    "puncture_twin.planning.collision.never_touching",
+    "puncture_twin.twin.report.scene.lighter_mesh",
 )
 """Every module whose results are kept."""
 
@@ -272,42 +272,51 @@ def test_the_libraries_of_every_maker_are_in_the_key(maker):
     modules = {name for module, _, listed in imports for name in ([module] if module else NAME.findall(listed))}
     tops = {module.decode().split(".")[0] for module in modules}
     packages = {"skimage": "scikit-image", "fcl": "python-fcl", "fast_simplification": "fast-simplification"}
-    foreign = tops - set(sys.stdlib_module_names) - {"planning", "twin"}
+    foreign = tops - set(sys.stdlib_module_names) - {"puncture_twin"}
     assert {packages.get(name, name) for name in foreign} <= set(LIBRARIES)
     assert len(source_stamp(maker)) == 64
 
 
 def test_the_code_that_makes_a_surface_is_in_its_stamp():
     """From reading a file to the surface: each of these modules decides what is kept."""
-    names = {str(path.relative_to(PROJECT)) for path in closure([PROJECT / "planning" / "surfaces.py"])}
-    wanted = ("skin", "body_mask", "formats/label_surface", "formats/nifti_header", "formats/inflate", "formats/voxels")
-    assert {f"planning/{name}.py" for name in wanted} <= names
+    names = {
+        str(path.relative_to(PROJECT))
+        for path in closure([PROJECT / "puncture_twin" / "planning" / "anatomy" / "surfaces.py"])
+    }
+    volumes = (f"formats/volumes/{name}" for name in ("nifti_header", "inflate", "voxels"))
+    wanted = ("anatomy/skin", "anatomy/body/body_mask", "formats/labels/label_surface", *volumes)
+    assert {f"puncture_twin/planning/{name}.py" for name in wanted} <= names
 
 
 @pytest.mark.parametrize(
     "line",
     [
-        "from planning.made.inner import make",
-        "from planning.made import inner",
-        "from planning.made import (\n    inner as other,\n)",
-        "import planning.made.inner",
-        "def late():\n    from planning.made.inner import make",
-        "from planning.made import make  # handed on by the package without an import statement",
+        "from puncture_twin.planning.made.inner import make",
+        "from puncture_twin.planning.made import inner",
+        "from puncture_twin.planning.made import (\n    inner as other,\n)",
+        "import puncture_twin.planning.made.inner",
+        "def late():\n    from puncture_twin.planning.made.inner import make",
+        "from puncture_twin.planning.made import make  # handed on by the package without an import statement",
     ],
 )
 def test_an_edit_behind_any_kind_of_import_changes_the_stamp(tmp_path, line):
     """A module, a name of a module, a package that hands on names, inside a function or not."""
-    made = tmp_path / "planning" / "made"
-    made.mkdir(parents=True)
+    planning = tmp_path / "puncture_twin" / "planning"
+    made, stamps_folder = planning / "made", planning / "base" / "cache"
+    for folder in (made, stamps_folder):
+        folder.mkdir(parents=True)
     source = Path(cache_module.__file__).with_name("source_stamp.py")
-    (tmp_path / "planning" / "source_stamp.py").write_bytes(source.read_bytes())
-    (tmp_path / "planning" / "__init__.py").write_text("")
-    (made / "__init__.py").write_text("")
-    (tmp_path / "planning" / "maker.py").write_text(line + "\n")
+    (stamps_folder / "source_stamp.py").write_bytes(source.read_bytes())
+    for folder in (planning.parent, planning, made):
+        (folder / "__init__.py").write_text("")
+    (planning / "maker.py").write_text(line + "\n")
     stamps = []
     for size in (1, 1, 2):
         (made / "inner.py").write_text(f"SIZE = {size}\n")
-        code = "from planning.source_stamp import source_stamp; print(source_stamp('planning.maker'))"
+        code = (
+            "from puncture_twin.planning.base.cache.source_stamp import source_stamp; "
+            "print(source_stamp('puncture_twin.planning.maker'))"
+        )
         environment = os.environ | {"PYTHONPATH": str(tmp_path)}
         options = {"cwd": tmp_path, "capture_output": True, "text": True, "check": True}
         run = subprocess.run([sys.executable, "-c", code], env=environment, **options)
@@ -319,11 +328,12 @@ SHARED = """
 import sys
 import numpy as np
 from pathlib import Path
-from planning.cache import Cache
+from puncture_twin.planning.base.cache.array_cache import Cache
 cache = Cache(Path(sys.argv[1]), most_bytes=400_000)
 for turn in range(200):
     name = turn % 17
-    found = cache.arrays({"name": name}, lambda: {"values": np.full(5000, float(name))}, by="planning.surfaces")
+    by = "puncture_twin.planning.anatomy.surfaces"
+    found = cache.arrays({"name": name}, lambda: {"values": np.full(5000, float(name))}, by=by)
     assert np.all(found["values"] == name)
 """
 

@@ -6,9 +6,9 @@ import tomllib
 import numpy as np
 import pytest
 
-from planning.case import load_case
-from planning.errors import InputError
-from planning.formats.spaces import Space
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.geometry.spaces import Space
 
 GOOD = """
 schema = 1

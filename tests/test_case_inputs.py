@@ -14,9 +14,9 @@ import pytest
 import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
 import trimesh
 
-from planning.case import load_case
-from planning.prepared import Prepared, prepare
-from planning.provenance import differing_input, inputs_document
+from puncture_twin.planning.base.provenance import differing_input, inputs_document
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.search.context import Prepared, prepare
 
 CASE = """
 schema = 1
@@ -215,8 +215,8 @@ def hook(event, arguments):
     if event == "open" and isinstance(arguments[0], str) and arguments[0].startswith(folder):
         opened[os.path.relpath(arguments[0], folder)] += 1
 sys.addaudithook(hook)
-from planning.prepared import prepare
-from twin.truth import draw_truth
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.twin.plant.truth import draw_truth
 prepared = prepare(folder)
 draw_truth(prepared.case, prepared.placement.T_base_ct)
 print(json.dumps(opened))

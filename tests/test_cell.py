@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from planning.errors import InputError
-from planning.mesh import TriangleMesh
-from planning.robot.bodies import NEVER_TESTED
-from planning.robot.cell import Box, CellChecker, Contact, Tool
-from planning.robot.kinematics import flange_pose, link_poses
-from planning.robot.links import LINK_NAMES, collision_links, visual_links
-from planning.robot.shapes import convex, surface, touch
-from planning.robot.sweep import SweptBodies
-from planning.robot.tool import HOLDER_ROOT_MM
-from planning.robot.ur import UrModel, ur_model
-from planning.winding import winding_number
+from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
+from puncture_twin.planning.arm.links import LINK_NAMES, collision_links, visual_links
+from puncture_twin.planning.arm.tool import HOLDER_ROOT_MM
+from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.collision.bodies import NEVER_TESTED
+from puncture_twin.planning.collision.checker import Box, CellChecker, Contact, Tool
+from puncture_twin.planning.collision.shapes import convex, surface, touch
+from puncture_twin.planning.collision.sweep import SweptBodies
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.winding import winding_number
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)

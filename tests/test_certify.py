@@ -12,29 +12,30 @@ from hypothesis import strategies as st
 from oracles import segment_mesh_distance
 from scipy.optimize import nnls
 
-from meshes import folder
-from planning.anatomy import Anatomy, Role, Structure
-from planning.case_file import EntryAxes
-from planning.certify import certify, read_certificate, verify, write_certificate
-from planning.certify.bounds import view_bounds
-from planning.certify.cells import SQUARE_DEGREES, Cells, angle_between, nearest_cell, split
-from planning.certify.checker import _apart, _Cell
-from planning.certify.cones import Lists, zones
-from planning.certify.near_organs import Organs, organ_facts
-from planning.certify.skin_cones import skin_bounds
-from planning.certify.skin_surface import skin_surface
-from planning.clearance.fcl_engine import FclEngine
-from planning.entry import Directions, angles, entry_frame, outward
-from planning.errors import InputError
-from planning.formats.spaces import Space
-from planning.mesh import TriangleMesh
-from planning.outside_body import BOX_FACES
-from planning.prepared import prepare
-from planning.provenance import InputFiles
-from planning.search import organ_candidates
-from planning.skin import FieldOfView, Skin, skin_from_mesh
-from planning.skin_entry import skin_paths
-from run_twin import OK, main
+from puncture_twin.meshes import folder
+from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
+from puncture_twin.planning.anatomy.body.outside_body import BOX_FACES
+from puncture_twin.planning.anatomy.skin import FieldOfView, Skin, skin_from_mesh
+from puncture_twin.planning.anatomy.skin_entry import skin_paths
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.provenance import InputFiles
+from puncture_twin.planning.case.case_file import EntryAxes
+from puncture_twin.planning.case.entry import Directions, angles, entry_frame, outward
+from puncture_twin.planning.certify import certify
+from puncture_twin.planning.certify.bounds import view_bounds
+from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, angle_between, nearest_cell, split
+from puncture_twin.planning.certify.certificate import read_certificate, write_certificate
+from puncture_twin.planning.certify.checker import _apart, _Cell, verify
+from puncture_twin.planning.certify.cones import Lists, zones
+from puncture_twin.planning.certify.near_organs import Organs, organ_facts
+from puncture_twin.planning.certify.skin_cones import skin_bounds
+from puncture_twin.planning.certify.skin_surface import skin_surface
+from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.search import organ_candidates
+from puncture_twin.run_twin import OK, main
 
 REAL = Path(__file__).parent / "real"
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "totalseg_abdomen_3mm"

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from twin import chen2019_tables
-from twin.ct import chen2019
+from puncture_twin.twin.jobs.papers import chen2019
+from puncture_twin.twin.phantoms import chen2019_tables
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "chen2019"
 

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from oracles import segment_mesh_distance
 from scipy.spatial.transform import Rotation
 
-from planning.anatomy import Role, Structure
-from planning.clearance.fcl_engine import FclEngine
-from planning.clearance.measure import measure
-from planning.mesh import TriangleMesh
+from puncture_twin.planning.anatomy.anatomy import Role, Structure
+from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.clearance.measure import measure
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 LENGTH = 150.0
 

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from planning.anatomy import Anatomy, Role, Structure
-from planning.case import Needle, SearchSettings
-from planning.clearance.fcl_engine import FclEngine
-from planning.clearance.measure import measure
-from planning.constraints import judge, longest_path
-from planning.mesh import TriangleMesh
-from planning.reasons import Reason
-from planning.skin import FieldOfView, Skin, skin_from_mesh
-from planning.skin_entry import skin_paths
+from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
+from puncture_twin.planning.anatomy.skin import FieldOfView, Skin, skin_from_mesh
+from puncture_twin.planning.anatomy.skin_entry import skin_paths
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.case.case import Needle, SearchSettings
+from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.clearance.measure import measure
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.search.constraints import judge, longest_path
 
 NEEDLE = Needle(200.0, 150.0, 1.0, None, 10.0, 30.0)
 UP = np.array([[0.0, 0.0, 1.0]])

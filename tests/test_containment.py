@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from planning.clearance import containment
-from planning.clearance.containment import RAYS, SEED, Side, side_of
-from planning.mesh import TriangleMesh
+from puncture_twin.planning.geometry import containment
+from puncture_twin.planning.geometry.containment import RAYS, SEED, Side, side_of
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 
 def mixed(mesh, rng, fraction=0.5):

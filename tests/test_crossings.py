@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from oracles import ray_crossings
 
-from planning.clearance.containment import Side, side_of
-from planning.clearance.crossings import crossings, first_crossing
-from planning.entry import grid
-from planning.mesh import TriangleMesh
-from planning.winding import winding_number
+from puncture_twin.planning.case.entry import grid
+from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.crossings import crossings, first_crossing
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.winding import winding_number
 
 FULL = grid((0, np.pi), (0, 2 * np.pi), np.radians(7.3), np.eye(3)).outward_ct
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from planning.errors import NoAnswerError
-from planning.registration import apply, fit_rigid, fit_triad, leverage
-from planning.robot.kinematics import flange_pose
-from planning.robot.ur import ur_model
-from twin.ct.scanner import Scanner, draw_true_positions, read_positions, scan, slice_number
-from twin.ct.tip_touch import TouchProbe, touch, touching_configuration
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.registration.registration import apply, fit_rigid, fit_triad, leverage
+from puncture_twin.twin.plant.scanner import Scanner, draw_true_positions, read_positions, scan, slice_number
+from puncture_twin.twin.plant.tip_touch import TouchProbe, touch, touching_configuration
 
 MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [90, -10, 20], [20, 150, 147]])
 """A to E of the carton (Chen 2019, Table 1)."""

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import planning.entry
-from planning.case_file import EntryAxes
-from planning.entry import angles, direction, entry_frame, grid, needle_pose, outward, view_frame
-from planning.errors import InputError
-from planning.formats.spaces import Space
+import puncture_twin.planning.case.entry
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case_file import EntryAxes
+from puncture_twin.planning.case.entry import angles, direction, entry_frame, grid, needle_pose, outward, view_frame
+from puncture_twin.planning.geometry.spaces import Space
 
 polar = st.one_of(st.floats(0, np.pi), st.sampled_from([0.0, 1e-12, 1e-8, np.pi / 2, np.pi - 1e-8, np.pi]))
 azimuth = st.one_of(st.floats(0, 2 * np.pi, exclude_max=True), st.sampled_from([0.0, np.pi, 1.5 * np.pi]))
@@ -103,7 +103,7 @@ def test_the_bodys_directions_are_those_of_lps():
     """L, P and S are +x, +y and +z; unit vectors, each opposite to its counterpart."""
     expected = {"left": (1, 0, 0), "posterior": (0, 1, 0), "head": (0, 0, 1)}
     expected |= {"right": (-1, 0, 0), "anterior": (0, -1, 0), "feet": (0, 0, -1)}
-    assert dict(planning.entry.ANATOMICAL_LPS) == expected
+    assert dict(puncture_twin.planning.case.entry.ANATOMICAL_LPS) == expected
 
 
 def test_the_view_frame_stands_on_the_target():

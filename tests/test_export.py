@@ -13,27 +13,27 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.spatial.transform import Rotation
 
-from planning.drive import drive_smoothly, follow
-from planning.errors import InputError
-from planning.export import FORMATS, export_plan
-from planning.export.blends import blend_radii_mm
-from planning.export.corners import corner_rows, rests_at
-from planning.export.csv_times import csv_text, read_csv
-from planning.export.limits import check_trajectory
-from planning.export.motion import check_sampled
-from planning.export.program import program_of, waypoint_rows
-from planning.export.program_check import check_program
-from planning.export.ros2 import read_ros2, ros2_text, velocities
-from planning.export.text import PLAIN
-from planning.export.urscript import read_urscript, urscript_text
-from planning.plan import Plan, read_plan, write_plan
-from planning.provenance import Input
-from planning.robot.cell import Box, CellChecker, Tool
-from planning.robot.insertion import insertion_paths
-from planning.robot.kinematics import flange_pose, inverse, jacobian, nearest_within_limits
-from planning.robot.links import JOINT_NAMES
-from planning.robot.ur import UR_MODELS, ur_model
-from planning.trajectory import Trajectory
+from puncture_twin.planning.arm.insertion import insertion_paths
+from puncture_twin.planning.arm.kinematics import flange_pose, inverse, jacobian, nearest_within_limits
+from puncture_twin.planning.arm.links import JOINT_NAMES
+from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.provenance import Input
+from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.export.blends import blend_radii_mm
+from puncture_twin.planning.export.corners import corner_rows, rests_at
+from puncture_twin.planning.export.csv_times import csv_text, read_csv
+from puncture_twin.planning.export.exporter import FORMATS, export_plan
+from puncture_twin.planning.export.limits import check_trajectory
+from puncture_twin.planning.export.motion import check_sampled
+from puncture_twin.planning.export.program import program_of, waypoint_rows
+from puncture_twin.planning.export.program_check import check_program
+from puncture_twin.planning.export.ros2 import read_ros2, ros2_text, velocities
+from puncture_twin.planning.export.text import PLAIN
+from puncture_twin.planning.export.urscript import read_urscript, urscript_text
+from puncture_twin.planning.motion.follow import drive_smoothly, follow
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.plan.plan import Plan, read_plan, write_plan
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)

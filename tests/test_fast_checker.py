@@ -11,24 +11,24 @@ import numpy as np
 import pytest
 import trimesh
 
-from planning.cache import Cache
-from planning.errors import InputError
-from planning.mesh import TriangleMesh
-from planning.prepared import Prepared, prepare
-from planning.reach import ReachAnswer, assess_reach, assess_reach_all
-from planning.robot.bodies import arm_bodies
-from planning.robot.cell import Box, CellChecker, Tool
-from planning.robot.enclosures import ball_tree, coarse_hull, inscribed_prism, neighbours, prism
-from planning.robot.fast_checker import FastChecker
-from planning.robot.hull_kernels import TOUCHING, hull_gap
-from planning.robot.kinematics import link_poses
-from planning.robot.proofs import ask_fcl
-from planning.robot.shapes import convex
-from planning.robot.surface_kernels import STACK, to_surface, to_triangle
-from planning.robot.triangle_tree import TriangleTree
-from planning.robot.ur import ur_model
-from planning.room import ARM_PADDING_MM, case_boxes, case_tool
-from planning.search import case_directions, organ_candidates, reach_request
+from puncture_twin.planning.arm.kinematics import link_poses
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.collision.bodies import arm_bodies
+from puncture_twin.planning.collision.bounding_spheres import ball_tree, coarse_hull, inscribed_prism, neighbours, prism
+from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.kernels.hulls import TOUCHING, hull_gap
+from puncture_twin.planning.collision.kernels.surfaces import STACK, to_surface, to_triangle
+from puncture_twin.planning.collision.proofs import ask_fcl
+from puncture_twin.planning.collision.shapes import convex
+from puncture_twin.planning.collision.triangle_tree import TriangleTree
+from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.reach.reach import ReachAnswer, assess_reach, assess_reach_all
+from puncture_twin.planning.search.context import Prepared, prepare
+from puncture_twin.planning.search.search import case_directions, organ_candidates, reach_request
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)

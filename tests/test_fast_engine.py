@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from oracles import ray_crossings, segment_mesh_distance
 
-from planning.clearance.fast_engine import FastEngine
-from planning.clearance.fcl_engine import FclEngine
-from planning.clearance.kd_order import kd_order
-from planning.entry import grid
-from planning.errors import InputError
-from planning.mesh import TriangleMesh
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.entry import grid
+from puncture_twin.planning.clearance.fast_engine import FastEngine
+from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.clearance.kernels.kd_order import kd_order
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 LENGTH = 150.0
 TIGHT_MM = 1e-9

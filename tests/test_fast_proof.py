@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import segment_mesh_distance
 
-import meshes
-from planning.clearance.engine import AxisDistances
-from planning.clearance.fast_engine import FastEngine
-from planning.clearance.fcl_engine import FclEngine
-from planning.mesh import TriangleMesh
+from puncture_twin import meshes
+from puncture_twin.planning.clearance.engine import AxisDistances
+from puncture_twin.planning.clearance.fast_engine import FastEngine
+from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 LENGTH = 210.0
 RADII_MM = (0.5, 3.0, 5.5)

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from linear_wires import WireFrames, Wires, fit_image, point_to_wire_mm
+from plus_files import read_results, read_wires
 
-from planning.errors import InputError
-from twin.ultrasound.linear_wires import WireFrames, Wires, fit_image, point_to_wire_mm
-from twin.ultrasound.plus_files import read_results, read_wires
+from puncture_twin.planning.base.errors import InputError
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "plus_uscal_fcal12"
 DEVICE_SET = DATA / "PlusDeviceSet_fCal_Sim_SpatialCalibration_1.2.xml"

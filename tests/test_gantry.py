@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 import trimesh
 
-from meshes import folder
-from planning.case import load_case
-from planning.errors import InputError
-from planning.mesh import TriangleMesh
-from planning.place.bed import bed_frame
-from planning.placement import load_placement
-from planning.prepared import prepare
-from planning.reasons import Reason
-from planning.robot.cell import CellChecker, Tool
-from planning.robot.fast_checker import FastChecker
-from planning.robot.gantry import SIDES, gantry_boxes
-from planning.robot.ur import ur_model
-from planning.room import case_boxes, case_tool, home_configuration
-from twin.report.scene_parts import room
-from twin.world.execution import execute
-from twin.world.room import open_room
+from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.gantry import SIDES, gantry_boxes
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.collision.checker import CellChecker, Tool
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.workcell import case_boxes, case_tool, home_configuration
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.place.bed import bed_frame
+from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.twin.report.scene.scene_parts import room
+from puncture_twin.twin.world.execution import execute
+from puncture_twin.twin.world.workcell import open_room
 
 TILT = trimesh.transformations.rotation_matrix(0.35, [1.0, 0.2, 0.0])
 TILT[:3, 3] = (420.0, 30.0, 80.0)

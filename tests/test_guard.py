@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from planning.errors import InputError
-from planning.formats.guard import (
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.guard import (
     MAX_COORDINATE_MM,
     MAX_DIAGONAL_MM,
     MIN_DIAGONAL_MM,
@@ -17,7 +17,7 @@ from planning.formats.guard import (
     guard_points,
     guard_transform,
 )
-from planning.formats.spaces import Space, Unit, parse_space, parse_unit, to_lps
+from puncture_twin.planning.geometry.spaces import Space, Unit, parse_space, parse_unit, to_lps
 
 SQUARE = [[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [10.0, 10.0, 0.0], [0.0, 10.0, 0.0]]
 TWO = [[0, 1, 2], [0, 2, 3]]

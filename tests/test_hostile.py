@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from hostile.makers import MAKERS
 
-from planning.place.workers import ask_all
-from planning.processes import worker_count
+from puncture_twin.planning.base.processes import worker_count
+from puncture_twin.planning.place.workers import ask_all
 
 HERE = Path(__file__).parent
 CASES = tomllib.loads((HERE / "hostile" / "cases.toml").read_text())["case"]

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from meshes import folder
-from planning.anatomy import Role, Structure
-from planning.consistency import check_consistency
-from planning.errors import InputError
-from planning.inside_skin import SAMPLES, inside_skin, near_surface, spread_points
-from planning.mesh import TriangleMesh
-from planning.prepared import prepare
-from planning.skin import skin_from_mesh
+from puncture_twin.meshes import folder
+from puncture_twin.planning.anatomy.anatomy import Role, Structure
+from puncture_twin.planning.anatomy.inside_skin import SAMPLES, inside_skin, near_surface, spread_points
+from puncture_twin.planning.anatomy.skin import skin_from_mesh
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.search.consistency import check_consistency
+from puncture_twin.planning.search.context import prepare
 from tests.oracles import point_triangle_distance
 
 TARGET = np.array([3.0, -2.0, 5.0])

@@ -9,24 +9,42 @@ from pathlib import Path
 
 import pytest
 
-import planning
+import puncture_twin
 
-COPIED = (*("__init__.py", "kernel_cache.py", "kernel_files.py", "source_stamp.py", "cache_entry.py", "errors.py"),)
+BASE = "planning/base"
+COPIED = (
+    *("__init__.py", "planning/__init__.py", f"{BASE}/__init__.py", f"{BASE}/errors.py", f"{BASE}/numba_kernels.py"),
+    *(f"{BASE}/cache/{name}.py" for name in ("__init__", "kernel_cache", "kernel_files", "source_stamp", "entry_file")),
+)
 """What a project needs to keep its kernels as ours does."""
 
 CALLEE = (
-    "import numba as nb\nfrom planning.room import SIZE\n\n"
+    "from puncture_twin.planning.base.numba_kernels import nb\nfrom puncture_twin.planning.size import SIZE\n\n"
     "@nb.njit(cache=True, forceinline=True)\ndef rule(x):\n    return x + {} * SIZE\n"
 )
 CALLER = (
-    "import numba as nb\nfrom planning.callee import rule\n\n@nb.njit(cache=True)\ndef judge(x):\n    return rule(x)\n"
+    "from puncture_twin.planning.base.numba_kernels import nb\nfrom puncture_twin.planning.callee import rule\n\n"
+    "@nb.njit(cache=True)\ndef add(x):\n    return rule(x)\n"
 )
+
+
+def copy_package(project):
+    """The package with what it needs to keep its kernels, and nothing else."""
+    for name in COPIED:
+        copy = project / "puncture_twin" / name
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(Path(puncture_twin.__file__).parent / name, copy)
+        if name.endswith("__init__.py"):
+            copy.write_text("")  # what a room hands on is not there
 
 
 def _run(project, own=True):
     """Let a process of its own ask the kernel, and say how often it came from the cache."""
-    lines = ["import planning, numba", "" if own else "numba.core.config.CACHE_LOCATOR_CLASSES = ''"]
-    lines += ["from planning.caller import judge", "print(judge(1), sum(judge.stats.cache_hits.values()))"]
+    lines = [
+        "import puncture_twin.planning.base.numba_kernels, numba",
+        "" if own else "numba.core.config.CACHE_LOCATOR_CLASSES = ''",
+    ]
+    lines += ["from puncture_twin.planning.caller import add", "print(add(1), sum(add.stats.cache_hits.values()))"]
     code = "\n".join(lines)
     environment = os.environ | {"PYTHONPATH": str(project), "NUMBA_CACHE_DIR": str(project / "cache")}
     return subprocess.run(
@@ -42,12 +60,10 @@ def _answer(project, own=True):
 @pytest.fixture
 def project(tmp_path):
     """A project with a kernel that takes in another."""
-    folder = tmp_path / "planning"
-    folder.mkdir()
-    for name in COPIED:
-        shutil.copy(Path(planning.__file__).parent / name, folder)
+    copy_package(tmp_path)
+    folder = tmp_path / "puncture_twin" / "planning"
     (folder / "caller.py").write_text(CALLER)
-    (folder / "room.py").write_text("SIZE = 1\n")
+    (folder / "size.py").write_text("SIZE = 1\n")
     (folder / "callee.py").write_text(CALLEE.format(1))
     return tmp_path
 
@@ -55,12 +71,12 @@ def project(tmp_path):
 @pytest.mark.parametrize("own", [True, False], ids=["ours", "numba's"])
 def test_an_edit_of_a_kernel_that_is_taken_in_reaches_its_callers(project, own):
     """Numba alone goes on answering by the old rule: then this module is not needed any more."""
-    tmp_path, folder = project, project / "planning"
+    tmp_path, folder = project, project / "puncture_twin" / "planning"
     assert _answer(tmp_path, own) == (2, 0)
     assert _answer(tmp_path, own) == (2, 1)
     (folder / "callee.py").write_text(CALLEE.format(10))
     assert _answer(tmp_path, own) == ((11, 0) if own else (2, 1))
-    (folder / "room.py").write_text("SIZE = 2\n")
+    (folder / "size.py").write_text("SIZE = 2\n")
     assert _answer(tmp_path, own) == ((21, 0) if own else (2, 1))
     (folder / "beside.py").write_text("SIZE = 3\n")  # no kernel names it
     assert _answer(tmp_path, own) == ((21, 1) if own else (2, 1))
@@ -115,11 +131,9 @@ def test_a_folder_in_a_files_place_is_replaced(project, ending):
 
 def test_machine_code_of_another_kernel_is_not_run(project):
     """Swapped data files are honest, but under the wrong name."""
-    other = CALLER.replace("judge", "other").replace("rule(x)", "rule(x) + 100")
-    (project / "planning" / "caller.py").write_text(CALLER + other.split("\n\n", 1)[1])
-    (project / "both.py").write_text(
-        "import planning\nfrom planning.caller import judge, other\nprint(judge(1), other(1))\n"
-    )
+    other = CALLER.replace("add", "other").replace("rule(x)", "rule(x) + 100")
+    (project / "puncture_twin" / "planning" / "caller.py").write_text(CALLER + other.split("\n\n", 1)[1])
+    (project / "both.py").write_text("from puncture_twin.planning.caller import add, other\nprint(add(1), other(1))\n")
     environment = os.environ | {"PYTHONPATH": str(project), "NUMBA_CACHE_DIR": str(project / "cache")}
     command = [sys.executable, str(project / "both.py")]
     options = {"env": environment, "cwd": project, "capture_output": True, "text": True, "check": True}
@@ -137,7 +151,7 @@ def test_what_a_function_left_under_older_sources_is_cleared(project):
     """Numba names its files by the function's line: after an edit above, the old ones would stay for ever."""
     assert _answer(project) == (2, 0)
     before = {path.name for ending in (".nbi", ".nbc") for path in _kept(project, ending)}
-    (project / "planning" / "caller.py").write_text("# one line more\n" + CALLER)
+    (project / "puncture_twin" / "planning" / "caller.py").write_text("# one line more\n" + CALLER)
     assert _answer(project) == (2, 0)
     after = {path.name for ending in (".nbi", ".nbc") for path in _kept(project, ending)}
     assert len(before) == len(after) == 2
@@ -147,12 +161,10 @@ def test_what_a_function_left_under_older_sources_is_cleared(project):
 def test_kernels_of_others_are_left_to_numba(tmp_path):
     """A function outside the project is stamped with its own file."""
     project, other = tmp_path / "project", tmp_path / "other"
-    (project / "planning").mkdir(parents=True)
+    copy_package(project)
     other.mkdir()
-    for name in COPIED:
-        shutil.copy(Path(planning.__file__).parent / name, project / "planning")
     (other / "stranger.py").write_text("import numba as nb\n\n@nb.njit(cache=True)\ndef f(x):\n    return x\n")
-    lines = ("import planning, stranger", "cache = stranger.f._cache")
+    lines = ("import puncture_twin.planning.base.numba_kernels, stranger", "cache = stranger.f._cache")
     lines += ("print(type(cache._impl.locator).__module__, type(cache._cache_file).__name__)",)
     code = "; ".join(lines)
     environment = os.environ | {"PYTHONPATH": f"{project}{os.pathsep}{other}"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from planning.robot.insertion import (
+from puncture_twin.planning.arm.insertion import (
     FULL_MARGIN_RAD,
     branch_way,
     every_way,
@@ -17,10 +17,10 @@ from planning.robot.insertion import (
     reach_margin,
     survey,
 )
-from planning.robot.kinematics import flange_pose, inverse, nearest_within_limits, singularity, wrap_to_pi
-from planning.robot.sweep import SweptBodies
-from planning.robot.tool import Tool
-from planning.robot.ur import UR_MODELS, ur_model
+from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits, singularity, wrap_to_pi
+from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
+from puncture_twin.planning.collision.sweep import SweptBodies
 
 DEPTHS = np.linspace(0.0, 120.0, 61)
 DISTANCES = 320.0 - DEPTHS

@@ -23,12 +23,12 @@ from kill_world import (
     temporaries,
 )
 
-from meshes import folder
-from planning.files import sha256
-from planning.output_manifest import problems, read_manifest
-from planning.output_set import writing
-from planning.provenance import Input
-from run_twin import ANSWER_IS_NO, OK, main
+from puncture_twin.meshes import folder
+from puncture_twin.planning.base.files import sha256
+from puncture_twin.planning.base.output.manifest import problems, read_manifest
+from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.base.provenance import Input
+from puncture_twin.run_twin import ANSWER_IS_NO, OK, main
 
 KILLS = int(os.environ.get("KILLS", "3"))
 ALL = "KILLS" in os.environ

@@ -8,8 +8,7 @@ import ur_analytic_ik
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from planning.errors import InputError
-from planning.robot.kinematics import (
+from puncture_twin.planning.arm.kinematics import (
     flange_pose,
     inverse,
     jacobian,
@@ -20,8 +19,9 @@ from planning.robot.kinematics import (
     wrap_to_pi,
     wrapped_solutions,
 )
-from planning.robot.links import LINK_NAMES, collision_links, urdf_link_poses, visual_links
-from planning.robot.ur import UR_MODELS, ur_model
+from puncture_twin.planning.arm.links import LINK_NAMES, collision_links, urdf_link_poses, visual_links
+from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
+from puncture_twin.planning.base.errors import InputError
 
 EXACT = 1e-9
 """mm and radian parts alike: the kinematics' promise."""

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from planning.errors import InputError
-from planning.formats.decimation import decimated, squared_distance
-from planning.formats.label_surface import label_mesh
-from planning.formats.labelmaps import LabelMap, read_labelmap
-from planning.mesh import TriangleMesh
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.labels.label_surface import label_mesh
+from puncture_twin.planning.formats.labels.labelmaps import LabelMap, read_labelmap
+from puncture_twin.planning.geometry.decimation import decimated, squared_distance
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 REAL = Path(__file__).parents[1] / ".." / "shared" / "data" / "totalseg_abdomen_3mm"
 needs_real = pytest.mark.skipif(not REAL.is_dir(), reason=f"the real CT is not at {REAL}")

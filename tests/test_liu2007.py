@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from servo_world import NoContacts
 
-from meshes import folder
-from planning.errors import NoAnswerError
-from twin.stereo.experiment import run_trial, statistics, trial, varied
-from twin.stereo.liu2007 import TABLE_1, TABLE_2, paper_case, paper_columns, paper_servo_only_at_least
-from twin.stereo.servo_case import load_servo_case
-from twin.stereo.servo_words import servo_summary, statistics_lines
-from twin.stereo.session import run_session
-from twin.stereo.sight import pixel_sight
+from puncture_twin.meshes import folder
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.twin.guidance.stereo.detection import pixel_sight
+from puncture_twin.twin.guidance.stereo.experiment import run_trial, statistics, trial, varied
+from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
+from puncture_twin.twin.guidance.stereo.session import run_session
+from puncture_twin.twin.jobs.servo.liu2007 import TABLE_1, TABLE_2, paper_case, paper_columns, paper_servo_only_at_least
+from puncture_twin.twin.jobs.servo.text import servo_summary, statistics_lines
 
 SEED = 5
 

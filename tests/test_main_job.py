@@ -8,10 +8,10 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from meshes import folder
-from planning.output_manifest import problems
-from run_twin import ANSWER_IS_NO, BAD_INPUT, INTERRUPTED, OK, PROGRAM_FAILED, main
-from twin.report.progress import BarDisplay, LineDisplay, progress_display
+from puncture_twin.meshes import folder
+from puncture_twin.planning.base.output.manifest import problems
+from puncture_twin.run_twin import ANSWER_IS_NO, BAD_INPUT, INTERRUPTED, OK, PROGRAM_FAILED, main
+from puncture_twin.twin.report.progress import BarDisplay, LineDisplay, progress_display
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ def test_ctrl_c_is_exit_code_130_and_leaves_the_old_set(carton, rehearsed, tmp_p
 
     copy = tmp_path / "copy"
     shutil.copytree(rehearsed, copy)
-    monkeypatch.setattr("twin.main_job.write_table", interrupted)
+    monkeypatch.setattr("puncture_twin.twin.jobs.patient.main_job.write_table", interrupted)
     assert main(["search", str(carton), "--no-arm", "--out", str(copy)]) == INTERRUPTED
     assert capfd.readouterr().err.strip() == "interrupted"
     assert {path.name for path in copy.iterdir()} == {path.name for path in rehearsed.iterdir()}
@@ -275,7 +275,7 @@ def test_a_folder_that_only_looks_writable_is_refused(carton, capfd):
 
 def test_a_bug_is_exit_code_3(monkeypatch, capfd):
     """What nobody foresaw shows its traceback and the third code."""
-    monkeypatch.setattr("twin.papers.PAPERS", {"chen2019": lambda *_: 1 / 0})
+    monkeypatch.setattr("puncture_twin.twin.jobs.papers.papers.PAPERS", {"chen2019": lambda *_: 1 / 0})
     assert main(["reproduce", "chen2019"]) == PROGRAM_FAILED
     assert "ZeroDivisionError" in capfd.readouterr().err
 
@@ -284,7 +284,7 @@ def test_progress_in_a_log_is_a_line_now_and_then(monkeypatch):
     """No bars where nobody watches: a line with rate and remaining time, at most every few seconds."""
     stream = io.StringIO()
     clock = iter(range(0, 1000, 3))
-    monkeypatch.setattr("twin.report.progress.time.monotonic", lambda: float(next(clock)))
+    monkeypatch.setattr("puncture_twin.twin.report.progress.time.monotonic", lambda: float(next(clock)))
     display = progress_display(stream)
     assert isinstance(display, LineDisplay)
     with display:

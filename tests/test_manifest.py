@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
-import meshes
-from twin.phantoms import STRUCTURES, carton_meshes
-from twin.phantoms.manifest import ply_bytes, points_csv
+from puncture_twin import meshes
+from puncture_twin.twin.phantoms.abdomen import STRUCTURES
+from puncture_twin.twin.phantoms.carton import carton_meshes
+from puncture_twin.twin.phantoms.manifest import ply_bytes, points_csv
 
 FOLDER = meshes.folder()
 MANIFEST = json.loads((FOLDER / "manifest.json").read_text(encoding="utf-8"))
@@ -35,7 +36,7 @@ def test_file_has_the_stated_hash_unit_and_licence(path):
     assert len(data) == entry["bytes"]
     assert entry["unit"] == "mm"
     assert entry["space"] in {"LPS", "local", "base"}
-    assert entry["made_by"].startswith("twin.phantoms.")
+    assert entry["made_by"].startswith("puncture_twin.twin.phantoms.")
     assert entry["licence"] == "Apache-2.0"
 
 

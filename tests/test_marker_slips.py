@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from meshes import folder as meshes_folder
-from planning.anatomy import OUTSIDE_NOT_KNOWN
-from planning.case import load_case
-from planning.errors import InputError
-from planning.prepared import prepare
-from run_twin import BAD_INPUT, main
-from twin.mirror import Mirror
+from puncture_twin.meshes import folder as meshes_folder
+from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.run_twin import BAD_INPUT, main
+from puncture_twin.twin.jobs.robot.mirror import Mirror
 
 CASE = """
 schema = 2

@@ -15,11 +15,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from planning.errors import InputError
-from planning.formats.guard import guard_mesh
-from planning.formats.meshes import mesh_warnings, read_mesh
-from planning.formats.spaces import Space, Unit
-from planning.mesh import TriangleMesh
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.guard import guard_mesh
+from puncture_twin.planning.formats.meshes.mesh_files import mesh_warnings, read_mesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.spaces import Space, Unit
 
 BALL = trimesh.creation.icosphere(1, 30.0)
 BALL.apply_translation([5.0, -7.0, 11.0])

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from rtde_server import PERIOD_S, START_S, rtde_server
 
-import run_twin
-from meshes import folder
-from planning.case import load_case
-from planning.errors import InputError
-from planning.placement import load_placement
-from planning.reach import ReachRequest, assess_reach
-from planning.robot.cell import CellChecker
-from planning.robot.ur import ur_model
-from planning.room import case_tool
-from twin import mirror
+from puncture_twin import run_twin
+from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.workcell import case_tool
+from puncture_twin.planning.reach.reach import ReachRequest, assess_reach
+from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.twin.jobs.robot import mirror
 
 ABDOMEN = folder() / "abdomen"
 

@@ -7,16 +7,16 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from meshes import folder
-from planning.case import load_case
-from planning.clearance.fast_engine import FastEngine
-from planning.errors import InputError
-from planning.explain import Explanation
-from planning.formats.labelmaps import LabelMap
-from planning.formats.naming import names_for
-from planning.formats.points import read_points
-from planning.prepared import prepare
-from planning.table import to_table, write_table
+from puncture_twin.meshes import folder
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.clearance.fast_engine import FastEngine
+from puncture_twin.planning.formats.labels.labelmaps import LabelMap
+from puncture_twin.planning.formats.labels.naming import names_for
+from puncture_twin.planning.formats.points.point_files import read_points
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.explain import Explanation
+from puncture_twin.planning.search.table import to_table, write_table
 from tests.case_world import write_case
 
 HOSTILE = {

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from planning.errors import InputError
-from twin.ultrasound.line_search import brightest_segment
-from twin.ultrasound.needle_detector import Detection, DetectorSettings, Missed, detect
-from twin.ultrasound.probe_image import Imager, NeedlePose, render
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.image.line_search import brightest_segment
+from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, DetectorSettings, Missed, detect
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedlePose, render
 
 IMAGER = Imager()
 

@@ -4,11 +4,11 @@ import json
 
 import pytest
 
-from planning.anatomy import load_anatomy
-from planning.case import load_case
-from planning.errors import InputError
-from planning.prepared import prepare
-from run_twin import main
+from puncture_twin.planning.anatomy.anatomy import load_anatomy
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.run_twin import main
 from tests.case_world import write_case
 
 

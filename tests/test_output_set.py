@@ -12,11 +12,17 @@ from pathlib import Path
 
 import pytest
 
-from planning.errors import InputError, NoAnswerError
-from planning.output_lock import locked
-from planning.output_manifest import MANIFEST_NAME, TIMINGS_NAME, problems, read_manifest, read_output
-from planning.output_set import withdraw, writing
-from planning.provenance import Input
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.output.lock import locked
+from puncture_twin.planning.base.output.manifest import (
+    MANIFEST_NAME,
+    TIMINGS_NAME,
+    problems,
+    read_manifest,
+    read_output,
+)
+from puncture_twin.planning.base.output.output_set import withdraw, writing
+from puncture_twin.planning.base.provenance import Input
 
 INPUTS = (Input("case", "case.toml", "ab"),)
 OURS = {MANIFEST_NAME, TIMINGS_NAME}

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import report_world as world
 
-from twin.report import write_page
-from twin.report.map_view import map_view
+from puncture_twin.twin.report.map_view import map_view
+from puncture_twin.twin.report.page.page import write_page
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 

@@ -9,26 +9,24 @@ import numpy as np
 import pytest
 import trimesh
 
-import meshes
-from planning.mesh import TriangleMesh
-from twin.phantoms import (
-    STRUCTURES,
-    abdomen_field,
+from puncture_twin import meshes
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.twin.phantoms import bones, carton
+from puncture_twin.twin.phantoms.abdomen import STRUCTURES, abdomen_field, abdomen_mesh, lesion_centre_ct
+from puncture_twin.twin.phantoms.carton import carton_field, carton_meshes
+from puncture_twin.twin.phantoms.guidance import (
+    GUIDANCE_SEED,
+    IN_PLANE_MM,
+    SLICE_SPACING_MM,
+    TOUCH_SIGMA_MM,
     abdomen_guidance,
-    abdomen_mesh,
-    bones,
-    carton,
-    carton_field,
-    carton_meshes,
-    lesion_centre_ct,
     patient_placement,
     skin_markers_ct,
 )
-from twin.phantoms.guidance import GUIDANCE_SEED, IN_PLANE_MM, SLICE_SPACING_MM, TOUCH_SIGMA_MM
-from twin.phantoms.implicit import capsule, ellipsoid, smooth_max
-from twin.phantoms.manifest import ply_bytes
-from twin.phantoms.mesher import Box, mesh_field
-from twin.phantoms.sweep import tube
+from puncture_twin.twin.phantoms.implicit import capsule, ellipsoid, smooth_max
+from puncture_twin.twin.phantoms.manifest import ply_bytes
+from puncture_twin.twin.phantoms.mesher import Box, mesh_field
+from puncture_twin.twin.phantoms.sweep import tube
 
 FOLDER = meshes.folder()
 INSIDE_THE_LIVER = ("lesion", "portal_vein", "hepatic_veins")

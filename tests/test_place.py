@@ -12,31 +12,31 @@ import numpy as np
 import pytest
 import trimesh
 
-import run_twin
-from meshes import folder
-from planning.case import load_case, mount_pose
-from planning.errors import InputError
-from planning.mesh import TriangleMesh
-from planning.place.arm_balls import ArmBalls, Surroundings, base_is_clear, clear_ways, skin_distance
-from planning.place.bed import bed_frame
-from planning.place.directions import WantedDirections, ring_weights
-from planning.place.estimate import Estimator, insertion_ways
-from planning.place.judge import Judge
-from planning.place.mount_lines import mount_lines, mount_section
-from planning.place.mounts import Region, Site, regions
-from planning.place.needle_start import needle_can_start
-from planning.place.room_field import Boxes, SkinField
-from planning.place.search import search_placements
-from planning.place.workers import ask_all
-from planning.placement import load_placement
-from planning.prepared import prepare
-from planning.provenance import inputs_document
-from planning.robot.cell import Box, CellChecker, Tool
-from planning.robot.kinematics import link_poses
-from planning.robot.ur import ur_model
-from planning.search import Reach, case_directions, organ_candidates, with_reach
-from twin.chen2019_reach import SHARES, WINDOWS, our_share, our_windows
-from twin.place_words import needle_line
+from benchmarks.chen2019_reach import SHARES, WINDOWS, our_share, our_windows
+from puncture_twin import run_twin
+from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.kinematics import link_poses
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.case.case import load_case, mount_pose
+from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.place.arm_spheres import ArmBalls, Surroundings, base_is_clear, clear_ways, skin_distance
+from puncture_twin.planning.place.bed import bed_frame
+from puncture_twin.planning.place.directions import WantedDirections, ring_weights
+from puncture_twin.planning.place.estimate import Estimator, insertion_ways
+from puncture_twin.planning.place.evaluate import Judge
+from puncture_twin.planning.place.mount_lines import mount_lines, mount_section
+from puncture_twin.planning.place.mounts import Region, Site, regions
+from puncture_twin.planning.place.needle_start import needle_can_start
+from puncture_twin.planning.place.obstacle_field import Boxes, SkinField
+from puncture_twin.planning.place.search import search_placements
+from puncture_twin.planning.place.workers import ask_all
+from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.search import Reach, case_directions, organ_candidates, with_reach
+from puncture_twin.twin.jobs.patient.place_text import needle_line
 
 UR3 = ur_model("ur3")
 TOOL = Tool(200.0, 150.0, 1.2, 30.0)

@@ -7,12 +7,19 @@ import numpy as np
 import pytest
 from oracles import ray_crossings, segment_triangle_distance
 
-from planning.clearance.blocks import pack
-from planning.clearance.crossings import crossings
-from planning.clearance.fast_engine import _placed
-from planning.clearance.segment_triangle import axis_triangle
-from planning.clearance.side_by_side import ASK, BEYOND, ROWS, bring_into_frame, measure_beside, measure_other
-from planning.mesh import TriangleMesh
+from puncture_twin.planning.clearance.fast_engine import _placed
+from puncture_twin.planning.clearance.kernels.blocks import pack
+from puncture_twin.planning.clearance.kernels.segment_triangle import axis_triangle
+from puncture_twin.planning.clearance.kernels.side_by_side import (
+    ASK,
+    BEYOND,
+    ROWS,
+    bring_into_frame,
+    measure_beside,
+    measure_other,
+)
+from puncture_twin.planning.geometry.crossings import crossings
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 LENGTH = 40.0
 TIGHT_MM = 1e-9

@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from meshes import folder
-from planning.errors import InputError, NoAnswerError
-from planning.plan import read_plan, write_plan
-from planning.plan_check import check_plan
-from planning.plan_motion import motion_contact
-from planning.planner import make_plan
-from planning.prepared import prepare
-from planning.reasons import Reason
-from planning.robot.kinematics import flange_pose, inverse, nearest_within_limits
-from planning.robot.ur import ur_model
+from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.plan.motion import motion_contact
+from puncture_twin.planning.plan.plan import read_plan, write_plan
+from puncture_twin.planning.plan.planner import make_plan
+from puncture_twin.planning.plan.recheck import check_plan
+from puncture_twin.planning.search.context import prepare
 
 
 @pytest.fixture(scope="module")

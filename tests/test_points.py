@@ -9,10 +9,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from planning.errors import InputError
-from planning.formats.guard import guard_points
-from planning.formats.points import NamedPoints, read_points, write_points
-from planning.formats.spaces import Space, Unit
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.guard import guard_points
+from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points, write_points
+from puncture_twin.planning.geometry.spaces import Space, Unit
 
 CHEN_2019 = Path(__file__).parents[2] / "shared" / "data" / "chen2019"
 CSV = "name,x_mm,y_mm,z_mm\nA,10,20,147\nB,110,120.5,-1e2\n"

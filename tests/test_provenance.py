@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from planning.errors import InputError
-from planning.provenance import Input, InputFiles, differing_input, inputs_document, read_inputs
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.provenance import Input, InputFiles, differing_input, inputs_document, read_inputs
 
 LISTED = (Input("case", "case.toml", "a" * 64), Input("mesh liver", "liver.stl", "b" * 64))
 

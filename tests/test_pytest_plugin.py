@@ -4,8 +4,8 @@ import shutil
 
 import pytest
 
-from meshes import folder
-from planning.prepared import prepare
+from puncture_twin.meshes import folder
+from puncture_twin.planning.search.context import prepare
 
 pytest_plugins = ["pytester"]
 

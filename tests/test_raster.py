@@ -6,13 +6,13 @@ import report_world as world
 from embreex.mesh_construction import TriangleMesh as EmbreeMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from planning.mesh import TriangleMesh
-from twin.report.camera import Camera
-from twin.report.line_of_sight import blocked
-from twin.report.map_raster import map_raster, row_colours
-from twin.report.map_view import Cells, map_view, rows_at
-from twin.report.render import Layer, Surface, opaque_shot, picture, put_moving, veils_of
-from twin.report.shading import corner_normals
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.twin.report.map.map_raster import map_raster, row_colours
+from puncture_twin.twin.report.map_view import Cells, map_view, rows_at
+from puncture_twin.twin.report.raster.camera import Camera
+from puncture_twin.twin.report.raster.line_of_sight import blocked
+from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, picture, put_moving, veils_of
+from puncture_twin.twin.report.raster.shading import corner_normals
 
 SIZE = 90, 120
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from planning.errors import InputError
-from planning.mesh import TriangleMesh
-from planning.reach import MAX_SWEEP_MM, ReachRequest, assess_reach
-from planning.reasons import Reason
-from planning.robot.cell import Box, CellChecker, Tool
-from planning.robot.insertion import MIN_SINGULARITY, flange_poses, insertion_paths, reach_margin
-from planning.robot.kinematics import flange_pose, inverse, singularity
-from planning.robot.links import collision_links
-from planning.robot.ur import ur_model
-from twin.chen2019_reach import SHARES, WINDOWS, PublishedShare, cap, runs
+from benchmarks.chen2019_reach import SHARES, WINDOWS, PublishedShare, cap, runs
+from puncture_twin.planning.arm.insertion import MIN_SINGULARITY, flange_poses, insertion_paths, reach_margin
+from puncture_twin.planning.arm.kinematics import flange_pose, inverse, singularity
+from puncture_twin.planning.arm.links import collision_links
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.reach.reach import MAX_SWEEP_MM, ReachRequest, assess_reach
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=200.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from planning.prepared import prepare
-from planning.reasons import Reason
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.search.context import prepare
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "totalseg_abdomen_3mm"
 CASES = Path(__file__).parent / "real"

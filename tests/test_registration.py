@@ -6,11 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from planning.conditioning import conditioning, leverage
-from planning.errors import InputError
-from planning.formats.points import NamedPoints
-from planning.formats.spaces import Space
-from planning.registration import (
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.points.point_files import NamedPoints
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.conditioning import conditioning, leverage
+from puncture_twin.planning.registration.registration import (
     MarkerPairs,
     apply,
     fit_affine,
@@ -19,7 +19,7 @@ from planning.registration import (
     match,
     register,
 )
-from twin.chen2019_tables import TABLE_1, TABLE_2, TABLE_4
+from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_2, TABLE_4
 
 TARGET = np.array([50.0, 130.0, 63.0])
 MARKERS = np.array([TABLE_1[name] for name in "ABCE"], dtype=float)

@@ -7,11 +7,19 @@ fitted by the identity, and each marker misses by what it was moved.
 import numpy as np
 import pytest
 
-from planning.conditioning import leverage
-from planning.errors import InputError
-from planning.formats.points import NamedPoints
-from planning.formats.spaces import Space
-from planning.registration import MarkerPairs, apply, fit_affine, fit_rigid, fit_triad, match, register
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.points.point_files import NamedPoints
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.conditioning import leverage
+from puncture_twin.planning.registration.registration import (
+    MarkerPairs,
+    apply,
+    fit_affine,
+    fit_rigid,
+    fit_triad,
+    match,
+    register,
+)
 
 TARGET = np.array([10.0, 20.0, 30.0])
 NAMES = ("a", "b", "c", "d")

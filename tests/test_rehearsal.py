@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 import trimesh
 
-from planning.anatomy import Anatomy, Role, Structure
-from planning.case import Case, Needle, Obstacle, RobotSettings, SearchSettings
-from planning.case_file import RankingSection, RehearsalSection
-from planning.entry import view_frame
-from planning.formats.spaces import Space
-from planning.mesh import TriangleMesh
-from planning.place.bed import bed_frame
-from planning.plan import Plan
-from planning.provenance import InputFiles
-from planning.robot.kinematics import flange_pose, inverse, jacobian, nearest_within_limits
-from planning.robot.ur import ur_model
-from planning.skin import skin_from_mesh
-from planning.trajectory import Trajectory
-from twin.rehearsal import rehearse, split_error
-from twin.truth import Truth
+from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
+from puncture_twin.planning.anatomy.skin import skin_from_mesh
+from puncture_twin.planning.arm.kinematics import flange_pose, inverse, jacobian, nearest_within_limits
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.provenance import InputFiles
+from puncture_twin.planning.case.case import Case, Needle, Obstacle, RobotSettings, SearchSettings
+from puncture_twin.planning.case.case_file import RankingSection, RehearsalSection
+from puncture_twin.planning.case.entry import view_frame
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.place.bed import bed_frame
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.twin.plant.truth import Truth
+from puncture_twin.twin.rehearsal.rehearsal import rehearse, split_error
 
 UR3 = ur_model("ur3")
 HOME = np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])

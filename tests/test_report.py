@@ -11,35 +11,29 @@ import report_world as world
 from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
-from planning.cache import Cache
-from planning.case_file import EntryAxes
-from planning.entry import ANATOMICAL_LPS
-from planning.place.directions import ring_weights
-from twin.report import (
-    annotate,
-    draw_film,
-    draw_map,
-    draw_scene,
-    film,
-    lighter_mesh,
-    page,
-    scene_picture,
-    write_page,
-)
-from twin.report.camera import Camera, camera_around
-from twin.report.compositing import Shot, compose, empty_veil
-from twin.report.map_picture import FIGURE_INCHES, MAP_BOX, RIM
-from twin.report.map_raster import map_raster
-from twin.report.map_view import map_view, rows_at, step_of
-from twin.report.numbers import reason_counts
-from twin.report.page_map import map_data
-from twin.report.page_scene import TRIANGLES, lightened
-from twin.report.palette import REASON_COLOURS, SAFE_HIGH, SAFE_LOW
-from twin.report.render import Layer, Surface, opaque_shot, put_moving, veils_of
-from twin.report.scene_parts import Body, needle_bodies, patient
-from twin.report.scene_picture import families, render_bodies
-from twin.report.shapes import LIFT_MM, corridor_mouth, corridor_walls
-from twin.report.views import overview, up_ct
+from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.case.case_file import EntryAxes
+from puncture_twin.planning.case.entry import ANATOMICAL_LPS
+from puncture_twin.planning.place.directions import ring_weights
+from puncture_twin.twin.report import annotate
+from puncture_twin.twin.report.map.map_picture import FIGURE_INCHES, MAP_BOX, RIM, draw_map
+from puncture_twin.twin.report.map.map_raster import map_raster
+from puncture_twin.twin.report.map_view import map_view, rows_at, step_of
+from puncture_twin.twin.report.numbers import reason_counts
+from puncture_twin.twin.report.page import page
+from puncture_twin.twin.report.page.page import write_page
+from puncture_twin.twin.report.page.page_map import map_data
+from puncture_twin.twin.report.page.page_scene import TRIANGLES, lightened
+from puncture_twin.twin.report.palette import REASON_COLOURS, SAFE_HIGH, SAFE_LOW
+from puncture_twin.twin.report.raster.camera import Camera, camera_around
+from puncture_twin.twin.report.raster.compositing import Shot, compose, empty_veil
+from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, put_moving, veils_of
+from puncture_twin.twin.report.scene import film, lighter_mesh, scene_picture
+from puncture_twin.twin.report.scene.film import draw_film
+from puncture_twin.twin.report.scene.scene_parts import Body, needle_bodies, patient
+from puncture_twin.twin.report.scene.scene_picture import draw_scene, families, render_bodies
+from puncture_twin.twin.report.scene.shapes import LIFT_MM, corridor_mouth, corridor_walls
+from puncture_twin.twin.report.scene.views import overview, up_ct
 
 FRAMES = {
     "bed": ("LPS", None),

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from meshes import folder
-from planning.output_manifest import TIMINGS_NAME
+from puncture_twin.meshes import folder
+from puncture_twin.planning.base.output.manifest import TIMINGS_NAME
 
 COMMANDS = {
     "search": ["--no-arm", "--certify", "--certify-size", "4"],

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import SimpleITK
 
-from planning.case import load_case
-from planning.errors import InputError
-from planning.prepared import prepare
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.search.context import prepare
 from tests.case_world import write_case, write_labels
 
 

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from meshes import folder
-from planning.anatomy import OUTSIDE_NOT_KNOWN
-from planning.case import load_case
-from planning.case_schema import NOT_LAST_NOTE, SCHEMA_ONE_NOTE, TOP_COUNT_NOTE
-from planning.errors import InputError
-from planning.formats.totalsegmentator import V2
-from planning.prepared import prepare
-from planning.regions import USUAL, absent_organs
-from run_twin import BAD_INPUT, OK, main
+from puncture_twin.meshes import folder
+from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
+from puncture_twin.planning.anatomy.regions import USUAL, absent_organs
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.case_schema import NOT_LAST_NOTE, SCHEMA_ONE_NOTE, TOP_COUNT_NOTE
+from puncture_twin.planning.formats.labels.totalsegmentator import V2
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.run_twin import BAD_INPUT, OK, main
 from tests.case_world import CASE, MARKERS, write_case, write_labels
 
 TWO = CASE.replace("schema = 1", 'schema = 2\nregion = "other"') + "[end]\nstructures = 4\n"

@@ -9,21 +9,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from meshes import folder
-from planning.batch import search_one
-from planning.case_file import RankingSection
-from planning.clearance.cross_check import CrossCheckError
-from planning.clearance.engine import AxisDistances
-from planning.entry import outward
-from planning.errors import InputError
-from planning.prepared import prepare
-from planning.provenance import inputs_document
-from planning.ranking import pareto_front, rank
-from planning.reasons import Reason
-from planning.search import closest_miss, organ_candidates, ranked
-from planning.table import write_table
-from planning.tissue import inside_length
-from twin.phantoms import carton_field
+from puncture_twin.meshes import folder
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.batch.batch import search_one
+from puncture_twin.planning.case.case_file import RankingSection
+from puncture_twin.planning.case.entry import outward
+from puncture_twin.planning.clearance.cross_check import CrossCheckError
+from puncture_twin.planning.clearance.engine import AxisDistances
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.ranking import pareto_front, rank
+from puncture_twin.planning.search.search import closest_miss, organ_candidates, ranked
+from puncture_twin.planning.search.table import write_table
+from puncture_twin.planning.search.tissue import inside_length
+from puncture_twin.twin.phantoms.carton import carton_field
 
 
 @pytest.fixture(scope="module")
@@ -106,14 +106,14 @@ def test_when_nothing_is_safe_the_closest_miss_is_named(carton, found):
 
 
 def _directions(found):
-    from planning.entry import Directions
+    from puncture_twin.planning.case.entry import Directions
 
     return Directions(found.theta, found.beta, found.outward_ct)
 
 
 def test_tissue_is_the_length_inside(carton, found, ball):
     """Through a ball of radius 20 about a point 60 mm away: two radii where the path goes through its centre."""
-    from planning.anatomy import Role, Structure
+    from puncture_twin.planning.anatomy.anatomy import Role, Structure
 
     organ = Structure("organ", Role.TRAVERSE, 0, ball(20, (0, 0, 60), 5), "")
     up = np.array([[0, 0, 1.0], [0, 0, 1.0], [0, 0, 1.0], [1.0, 0, 0]])

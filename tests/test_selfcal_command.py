@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from run_twin import ANSWER_IS_NO, BAD_INPUT, OK, main
-from twin.ultrasound.recording import read_recording, write_recording
-from twin.ultrasound.selfcal_case import load_selfcal_case
-from twin.ultrasound.selfcal_truth import draw_room
-from twin.ultrasound.simulate import PoseRanges, simulate_recording
+from puncture_twin.run_twin import ANSWER_IS_NO, BAD_INPUT, OK, main
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import read_recording, write_recording
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import load_selfcal_case
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_room
+from puncture_twin.twin.guidance.ultrasound.simulate import PoseRanges, simulate_recording
 
 CASE = """
 schema = 1

@@ -4,13 +4,19 @@ import numpy as np
 import pytest
 from selfcal_world import DEGENERATE, as_estimate, cured, degenerate_set
 
-from planning.errors import InputError
-from twin.ultrasound.calibration import calibrate
-from twin.ultrasound.estimate import active_columns
-from twin.ultrasound.observability import LEAST_RATIO, observe, scaled_jacobian
-from twin.ultrasound.residuals import tip_residuals
-from twin.ultrasound.simulate import SPEC_NOISE, PoseRanges, exact_recording, simulate_recording, with_noise
-from twin.ultrasound.solve import Degenerate
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import LEAST_RATIO, observe, scaled_jacobian
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import tip_residuals
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.solve import Degenerate
+from puncture_twin.twin.guidance.ultrasound.simulate import (
+    SPEC_NOISE,
+    PoseRanges,
+    exact_recording,
+    simulate_recording,
+    with_noise,
+)
 
 ALL = active_columns(tip=True, scale=False, direction=False)
 

@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 from selfcal_world import as_estimate
 
-from planning.errors import InputError
-from twin.ultrasound.calibration import calibrate
-from twin.ultrasound.estimate import N_PARAMETERS
-from twin.ultrasound.pose_choice import choose_poses, expected_tre_mm
-from twin.ultrasound.simulate import SPEC_NOISE, PoseRanges, draw_truth, simulate_recording, with_noise
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import N_PARAMETERS
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.pose_choice import choose_poses, expected_tre_mm
+from puncture_twin.twin.guidance.ultrasound.simulate import (
+    SPEC_NOISE,
+    PoseRanges,
+    draw_truth,
+    simulate_recording,
+    with_noise,
+)
 
 
 @pytest.fixture
@@ -60,8 +66,8 @@ def test_the_choice_beats_every_other_near_it(world, criterion):
 
 def volume(recording, estimate):
     """Size of the confidence region per parameter, from scratch."""
-    from twin.ultrasound.residuals import linearised_tip
-    from twin.ultrasound.weighting import covariances
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import covariances
 
     J = linearised_tip(estimate, recording).jacobian[:, :, :15] * np.repeat([1, 100, 1, 100, 100], 3)
     S = covariances(estimate, recording, SPEC_NOISE)

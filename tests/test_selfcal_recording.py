@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from planning.errors import InputError
-from twin.ultrasound.recording import Recording, read_recording, write_recording
-from twin.ultrasound.simulate import simulate_recording
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording, read_recording, write_recording
+from puncture_twin.twin.guidance.ultrasound.simulate import simulate_recording
 
 
 @pytest.fixture

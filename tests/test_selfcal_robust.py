@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from planning.errors import InputError
-from twin.ultrasound.calibration import calibrate
-from twin.ultrasound.recording import Recording
-from twin.ultrasound.simulate import SPEC_NOISE, simulate_recording
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording
 
 
 def with_outliers(rng, recording, count, size_mm=5.0):

@@ -5,11 +5,11 @@ import pytest
 from scipy.stats import binom
 from selfcal_world import as_estimate
 
-from planning.errors import InputError
-from twin.ultrasound.calibration import SHAFT_BIAS, calibrate
-from twin.ultrasound.recording import Recording
-from twin.ultrasound.residuals import tip_residuals
-from twin.ultrasound.simulate import SPEC_NOISE, simulate_recording
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import SHAFT_BIAS, calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import tip_residuals
+from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording
 
 RUNS = 30
 
@@ -49,7 +49,7 @@ def test_the_prediction_is_the_mean_over_the_needles_orientations(rng):
     recording, _ = simulate_recording(rng, 20)
     found = calibrate(recording, noise=SPEC_NOISE, direction=False)
     A, p = recording.A[4], np.array([7.0, 33.0])
-    from twin.ultrasound.residuals import linearised_tip
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip
 
     squared = []
     for M in found.orientations:

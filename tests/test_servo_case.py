@@ -3,19 +3,18 @@
 import numpy as np
 import pytest
 
-from meshes import folder
-from planning.errors import InputError
-from planning.registration import apply
-from planning.robot.links import collision_links
-from planning.winding import winding_number
-from twin.phantoms import head_field, head_targets
-from twin.phantoms.head import FLOOR_MM, MARKERS_MM, RIM_MM
-from twin.stereo.experiment import varied
-from twin.stereo.poses import configurations, way_up
-from twin.stereo.robot_calibration import grid_points, held_rod
-from twin.stereo.room import Room, draw_room, head_pose, room_checker
-from twin.stereo.servo_case import load_servo_case
-from twin.stereo.servo_loop import way_contact
+from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.links import collision_links
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.winding import winding_number
+from puncture_twin.planning.registration.registration import apply
+from puncture_twin.twin.guidance.stereo.experiment import varied
+from puncture_twin.twin.guidance.stereo.poses import configurations, way_up
+from puncture_twin.twin.guidance.stereo.robot_calibration import grid_points, held_rod
+from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
+from puncture_twin.twin.guidance.stereo.servo_loop import way_contact
+from puncture_twin.twin.guidance.stereo.stereo_room import Room, draw_room, head_pose, room_checker
+from puncture_twin.twin.phantoms.head import FLOOR_MM, MARKERS_MM, RIM_MM, head_field, head_targets
 
 HEAD = folder() / "head"
 TEXT = (HEAD / "servo.toml").read_text(encoding="utf-8")

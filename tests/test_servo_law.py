@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from planning.robot.kinematics import flange_pose
-from planning.robot.ur import ur_model
-from twin.stereo.servo_law import (
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.twin.guidance.stereo.servo_law import (
     MIN_SIGMA,
     Held,
     StepLimits,

@@ -5,11 +5,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from servo_world import CASE, HELD, NoContacts, start_configurations
 
-from planning.robot.kinematics import flange_pose
-from planning.robot.state_checker import Contact, Met
-from twin.stereo.servo_law import StepLimits, Stop, ball_base
-from twin.stereo.servo_loop import Lost, Seen, Task, servo, way_contact
-from twin.true_arm import ArmErrors, draw_true_arm
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.collision.state_checker import Contact, Met
+from puncture_twin.twin.guidance.stereo.servo_law import StepLimits, Stop, ball_base
+from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen, Task, servo, way_contact
+from puncture_twin.twin.plant.true_arm import ArmErrors, draw_true_arm
 
 Q_START = start_configurations()[12]
 T_BASE_C = np.eye(4)

@@ -7,11 +7,11 @@ import pytest
 from PIL import Image
 from servo_world import CASE
 
-from planning.errors import NoAnswerError
-from twin.stereo.experiment import Row, Trial, statistics
-from twin.stereo.liu2007 import paper_columns
-from twin.stereo.servo_page import write_servo_page
-from twin.stereo.servo_words import servo_summary, servo_text
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.twin.guidance.stereo.experiment import Row, Trial, statistics
+from puncture_twin.twin.jobs.servo.liu2007 import paper_columns
+from puncture_twin.twin.jobs.servo.page import write_servo_page
+from puncture_twin.twin.jobs.servo.text import servo_summary, servo_text
 
 
 def trials():

@@ -4,9 +4,16 @@ import numba as nb
 import numpy as np
 import pytest
 
-from planning.clearance.lanes import LANES, at_most, least_of, lowest
-from planning.clearance.segment_triangle import axis_triangle
-from planning.clearance.side_by_side import ASK, BEYOND, ROWS, bring_into_frame, measure_beside, measure_other
+from puncture_twin.planning.clearance.kernels.lanes import LANES, at_most, least_of, lowest
+from puncture_twin.planning.clearance.kernels.segment_triangle import axis_triangle
+from puncture_twin.planning.clearance.kernels.side_by_side import (
+    ASK,
+    BEYOND,
+    ROWS,
+    bring_into_frame,
+    measure_beside,
+    measure_other,
+)
 
 LENGTH = 80.0
 COUNT = 4000

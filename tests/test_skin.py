@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from planning.errors import InputError
-from planning.formats.labelmaps import LabelMap
-from planning.formats.volumes import Volume, read_volume
-from planning.mesh import TriangleMesh
-from planning.skin import FieldOfView, Skin, skin_from_ct, skin_from_label, skin_from_mesh
+from puncture_twin.planning.anatomy.skin import FieldOfView, Skin, skin_from_ct, skin_from_label, skin_from_mesh
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.labels.labelmaps import LabelMap
+from puncture_twin.planning.formats.volumes.volume_files import Volume, read_volume
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 REAL = Path(__file__).parents[1] / ".." / "shared" / "data" / "totalseg_abdomen_3mm"
 SHAPE = (60, 56, 30)

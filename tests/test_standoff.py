@@ -9,19 +9,26 @@ import numpy as np
 import pytest
 import trimesh
 
-from meshes import folder
-from planning.case import Needle
-from planning.mesh import TriangleMesh
-from planning.place.directions import wanted_directions
-from planning.place.needle_start import needle_can_start
-from planning.prepared import prepare
-from planning.robot.cell import CellChecker, Tool
-from planning.robot.insertion import flange_poses
-from planning.robot.kinematics import inverse
-from planning.robot.ur import ur_model
-from planning.room import ARM_PADDING_MM, case_tool
-from planning.search import case_directions, organ_candidates
-from planning.standoff import MAX_GAP_MM, UNEVEN_SKIN_MM, axis_lengths, farthest_flange, skin_gaps, standoffs
+from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.insertion import flange_poses
+from puncture_twin.planning.arm.kinematics import inverse
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.case.case import Needle
+from puncture_twin.planning.collision.checker import CellChecker, Tool
+from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.place.directions import wanted_directions
+from puncture_twin.planning.place.needle_start import needle_can_start
+from puncture_twin.planning.reach.standoff import (
+    MAX_GAP_MM,
+    UNEVEN_SKIN_MM,
+    axis_lengths,
+    farthest_flange,
+    skin_gaps,
+    standoffs,
+)
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.search import case_directions, organ_candidates
 
 DEG = np.pi / 180.0
 

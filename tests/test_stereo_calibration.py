@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from planning.errors import InputError
-from twin.stereo.bundle import Observations, Spreads, _camera_slope, _Problem, adjust
-from twin.stereo.calibration import calibrate
-from twin.stereo.camera import looking_at, stereo_pair
-from twin.stereo.dlt import decompose, dlt
-from twin.stereo.triangulation import triangulate
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.stereo.cameras.bundle import Observations, Spreads, _camera_slope, _Problem, adjust
+from puncture_twin.twin.guidance.stereo.cameras.calibration import calibrate
+from puncture_twin.twin.guidance.stereo.cameras.camera import looking_at, stereo_pair
+from puncture_twin.twin.guidance.stereo.cameras.dlt import decompose, dlt
+from puncture_twin.twin.guidance.stereo.cameras.triangulation import triangulate
 
 GRID = np.stack(np.meshgrid([-80.0, 0, 80], [-60.0, 60], [-60.0, 60], indexing="ij"), -1).reshape(-1, 3)
 SIZE = (1280, 960)

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from planning.errors import InputError
-from twin.stereo.camera import Camera, looking_at, stereo_pair, tangent_axes
-from twin.stereo.lens import distort, distortion_slope, fold, undistort
-from twin.stereo.triangulation import triangulate
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, looking_at, stereo_pair, tangent_axes
+from puncture_twin.twin.guidance.stereo.cameras.lens import distort, distortion_slope, fold, undistort
+from puncture_twin.twin.guidance.stereo.cameras.triangulation import triangulate
 
 LENS = (-0.3, 0.1, 1e-3, -2e-3)
 

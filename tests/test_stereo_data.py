@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from planar import calibrate_planar
 
-from twin.stereo.dlt import dlt, project, reconstruct
-from twin.stereo.planar import calibrate_planar
+from puncture_twin.twin.guidance.stereo.cameras.dlt import dlt, project, reconstruct
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
 CUBE = DATA / "dlt_cube_kwon_duarte" / "dlt_cube.json"

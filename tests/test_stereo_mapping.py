@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from planning.conditioning import leverage
-from planning.errors import InputError
-from planning.registration import apply, fit_rigid, fit_triad
-from twin.stereo.mapping import SeenMarkers, map_head
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.registration.conditioning import leverage
+from puncture_twin.planning.registration.registration import apply, fit_rigid, fit_triad
+from puncture_twin.twin.guidance.stereo.mapping import SeenMarkers, map_head
 
 NAMES = ("M1", "M2", "M3", "M4", "M5")
 MARKERS = np.array([[-40.0, -80, 26], [40, -80, 26], [-76, 5, 26], [76, 5, 26], [0, -101, -12]])

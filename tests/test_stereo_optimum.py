@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from servo_world import CASE, HELD, IMAGE_MM, simulate
 
-from planning.errors import NoAnswerError
-from planning.registration import apply
-from twin.stereo.joint_model import JointModel, first_unknowns
-from twin.stereo.optimum import adjust, bound
-from twin.stereo.servo_law import ball_base
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.registration.registration import apply
+from puncture_twin.twin.guidance.stereo.joint_model import JointModel, first_unknowns
+from puncture_twin.twin.guidance.stereo.optimum import adjust, bound
+from puncture_twin.twin.guidance.stereo.servo_law import ball_base
 
 TARGET = CASE.targets.points[1]
 DRAWS = 40

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from planning.case import Case, Needle, RobotSettings, SearchSettings, load_case
-from planning.case_file import RankingSection, RegistrationSection, RehearsalSection
-from planning.entry import view_frame
-from planning.errors import InputError
-from planning.formats.spaces import Space
-from planning.placement import load_placement
-from planning.provenance import InputFiles
-from planning.registration import apply, fit_rigid, fit_triad, leverage
-from twin.truth import MarkerNoise, draw_truth, registration_error
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.provenance import InputFiles
+from puncture_twin.planning.case.case import Case, Needle, RobotSettings, SearchSettings, load_case
+from puncture_twin.planning.case.case_file import RankingSection, RegistrationSection, RehearsalSection
+from puncture_twin.planning.case.entry import view_frame
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.registration.registration import apply, fit_rigid, fit_triad, leverage
+from puncture_twin.twin.plant.truth import MarkerNoise, draw_truth, registration_error
 
 MESHES = Path(__file__).parents[1] / "meshes"
 MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [90, -10, 20], [20, 150, 147]])

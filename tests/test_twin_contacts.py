@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from planning.anatomy import Structure
-from planning.clearance.fcl_engine import FclEngine
-from planning.entry import outward
-from planning.mesh import TriangleMesh
-from planning.prepared import Prepared, prepare
-from planning.pytest_plugin import read_checks
-from twin.world.bodies import load_capsule, load_surface, remove
-from twin.world.client import physics_client
-from twin.world.contacts import gap_mm
+from puncture_twin.planning.anatomy.anatomy import Structure
+from puncture_twin.planning.case.entry import outward
+from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.collision_cases.pytest_plugin import read_checks
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.search.context import Prepared, prepare
+from puncture_twin.twin.world.bodies import load_capsule, load_surface, remove
+from puncture_twin.twin.world.client import physics_client
+from puncture_twin.twin.world.contacts import gap_mm
 
 CARDS = Path(__file__).parent / "collision"
 

@@ -6,19 +6,23 @@ import fcl
 import numpy as np
 import pytest
 
-from planning.errors import InputError, NoAnswerError
-from planning.robot.kinematics import flange_pose, link_poses
-from planning.robot.links import visual_links
-from planning.robot.shapes import surface, touch
-from planning.winding import winding_number
-from twin.report.shapes import bar, box
-from twin.ultrasound.candidate_poses import configurations, draw_geometry, drawing, find_candidates
-from twin.ultrasound.pose_choice import choose_poses, expected_tre_mm
-from twin.ultrasound.probe_image import NeedlePose
-from twin.ultrasound.selfcal_case import SelfcalCase, SelfcalFile, load_selfcal_case
-from twin.ultrasound.selfcal_truth import draw_room, jog_into_slice
-from twin.ultrasound.simulate import SPEC_NOISE
-from twin.ultrasound.two_arms import (
+from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
+from puncture_twin.planning.arm.links import visual_links
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.collision.shapes import surface, touch
+from puncture_twin.planning.geometry.winding import winding_number
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.pose_choice import choose_poses, expected_tre_mm
+from puncture_twin.twin.guidance.ultrasound.candidate_poses import (
+    configurations,
+    draw_geometry,
+    drawing,
+    find_candidates,
+)
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedlePose
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, SelfcalFile, load_selfcal_case
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_room, jog_into_slice
+from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE
+from puncture_twin.twin.guidance.ultrasound.two_arms import (
     BetweenArms,
     TwoArms,
     head_pose,
@@ -27,6 +31,7 @@ from twin.ultrasound.two_arms import (
     phantom_mesh,
     probe_tool,
 )
+from puncture_twin.twin.report.scene.shapes import bar, box
 
 
 def make_case(**sections):

@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from planning.errors import InputError
-from twin.ultrasound.probe_image import Imager, Lesion, NeedleEcho, NeedlePose, needle_signal, render
-from twin.ultrasound.speckle import RAYLEIGH_SNR, PointSpread, blurred_speckle
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import (
+    Imager,
+    Lesion,
+    NeedleEcho,
+    NeedlePose,
+    needle_signal,
+    render,
+)
+from puncture_twin.twin.guidance.ultrasound.image.speckle import RAYLEIGH_SNR, PointSpread, blurred_speckle
 
 IMAGER = Imager()
 PLAIN = NeedleEcho(roughness=0.0, tip_gain=1.0, reverberations=0, steep_loss_db=0.0)

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from planning.anatomy import Role, Structure
-from planning.case import Needle
-from planning.clearance.measure import Clearances
-from planning.constraints import judge, longest_path, worst_violation
-from planning.mesh import TriangleMesh
-from planning.reasons import Reason
-from planning.skin_entry import SkinPaths
+from puncture_twin.planning.anatomy.anatomy import Role, Structure
+from puncture_twin.planning.anatomy.skin_entry import SkinPaths
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.case.case import Needle
+from puncture_twin.planning.clearance.measure import Clearances
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.search.constraints import judge, longest_path, worst_violation
 
 NEEDLE = Needle(200.0, 150.0, 1.0, None, 10.0, 30.0)
 DOT = TriangleMesh([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])

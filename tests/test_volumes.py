@@ -15,11 +15,11 @@ import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation u
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from planning.errors import InputError
-from planning.formats.nifti_header import TYPES
-from planning.formats.nrrd_header import TYPES as NRRD_TYPES
-from planning.formats.orientation import canonical
-from planning.formats.volumes import read_volume
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.volumes.nifti_header import TYPES
+from puncture_twin.planning.formats.volumes.nrrd_header import TYPES as NRRD_TYPES
+from puncture_twin.planning.formats.volumes.orientation import canonical
+from puncture_twin.planning.formats.volumes.volume_files import read_volume
 
 SHAPE = (4, 5, 6)
 VALUES = np.arange(120, dtype="<i2").reshape(SHAPE)

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-import planning
-import twin
+from puncture_twin import planning, twin
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted(path for folder in ("planning", "twin") for path in (ROOT / folder).rglob("*.py"))

@@ -11,21 +11,21 @@ import numpy as np
 import pytest
 import trimesh
 
-from planning.errors import InputError
-from planning.mesh import TriangleMesh
-from planning.robot.cell import BODY_NAMES
-from planning.robot.kinematics import flange_pose
-from planning.robot.tool import Box, Tool
-from planning.robot.ur import ur_model
-from twin.world.arm import load_arm
-from twin.world.bodies import load_box, load_surface, thinned
-from twin.world.cameras import Camera, picture
-from twin.world.client import STANDARD_GRAVITY_MM_S2, physics_client, step
-from twin.world.contacts import touches
-from twin.world.engine import pybullet
-from twin.world.execution import execute
-from twin.world.room import open_room
-from twin.world.units import pose_to_m, pose_to_mm, to_m, to_mm
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.tool import Box, Tool
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.collision.checker import BODY_NAMES
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.twin.world.arm import load_arm
+from puncture_twin.twin.world.bodies import load_box, load_surface, thinned
+from puncture_twin.twin.world.cameras import Camera, picture
+from puncture_twin.twin.world.client import STANDARD_GRAVITY_MM_S2, physics_client, step
+from puncture_twin.twin.world.contacts import touches
+from puncture_twin.twin.world.engine import pybullet
+from puncture_twin.twin.world.execution import execute
+from puncture_twin.twin.world.units import pose_to_m, pose_to_mm, to_m, to_mm
+from puncture_twin.twin.world.workcell import open_room
 
 REPO = Path(__file__).parents[1]
 TOOL = Tool(210.0, 150.0, 1.2, 30.0)
@@ -240,7 +240,11 @@ def test_loading_prints_nothing_on_stdout(capfd):
 def test_importing_the_twin_writes_nothing_anywhere():
     """PyBullet's greeting is not heard: an error of ours stays the one line on standard error."""
     done = subprocess.run(
-        [sys.executable, "-c", "import twin.rehearsal"], cwd=REPO, capture_output=True, text=True, check=True
+        [sys.executable, "-c", "import puncture_twin.twin.rehearsal.rehearsal"],
+        cwd=REPO,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert (done.stdout, done.stderr) == ("", "")
 

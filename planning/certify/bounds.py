@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.skin import FieldOfView
+from puncture_twin.planning.anatomy.skin import FieldOfView
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

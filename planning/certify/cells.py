@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.entry import outward
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.case.entry import outward
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

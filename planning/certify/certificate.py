@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.certify.cells import SQUARE_DEGREES, Cells, nearest_cell, split
-from planning.certify.question import Question
-from planning.entry import angles
-from planning.errors import InputError
-from planning.files import atomic
-from planning.output_manifest import read_output
-from planning.provenance import inputs_document, read_inputs
-from planning.reasons import Reason
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.output.manifest import read_output
+from puncture_twin.planning.base.provenance import inputs_document, read_inputs
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.case.entry import angles
+from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, nearest_cell, split
+from puncture_twin.planning.certify.question import Question
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -52,7 +52,7 @@ NOT_CERTIFIED = ("reach of the arm", "approach of the arm")
 """What a certificate says nothing about."""
 
 SAFE, REJECTED, UNDECIDED = "SRU"
-"""Letters of the leaves in the tree; lower-case letters are splits (`planning.certify.cells.SPLITS`)."""
+"""Letters of the leaves in the tree; lower-case letters are splits (`puncture_twin.planning.certify.cells.SPLITS`)."""
 
 
 @dataclass(frozen=True, eq=False)

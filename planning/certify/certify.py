@@ -5,24 +5,24 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.anatomy import Anatomy
-from planning.case import Case
-from planning.certify.bounds import ANGLE_PAD_RAD, CLEARANCE_PAD_MM, DEPTH_PAD_MM, view_bounds
-from planning.certify.cells import OFF_CENTRE, Cells, Cones, split
-from planning.certify.certificate import REJECTED, SAFE, UNDECIDED, Certificate
-from planning.certify.cones import Lists, narrowed, zones
-from planning.certify.near_organs import Organs, organ_facts
-from planning.certify.question import Question, question_of
-from planning.certify.skin_cones import LENGTH_PAD_MM, skin_bounds
-from planning.certify.skin_surface import SkinSurface, skin_surface
-from planning.clearance.containment import Side, side_of
-from planning.errors import InputError
-from planning.mesh import TriangleMesh
-from planning.reasons import Reason
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.certify.bounds import ANGLE_PAD_RAD, CLEARANCE_PAD_MM, DEPTH_PAD_MM, view_bounds
+from puncture_twin.planning.certify.cells import OFF_CENTRE, Cells, Cones, split
+from puncture_twin.planning.certify.certificate import REJECTED, SAFE, UNDECIDED, Certificate
+from puncture_twin.planning.certify.cones import Lists, narrowed, zones
+from puncture_twin.planning.certify.near_organs import Organs, organ_facts
+from puncture_twin.planning.certify.question import Question, question_of
+from puncture_twin.planning.certify.skin_cones import LENGTH_PAD_MM, skin_bounds
+from puncture_twin.planning.certify.skin_surface import SkinSurface, skin_surface
+from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -13,14 +13,14 @@ import fcl
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.anatomy import Anatomy
-from planning.case import Case
-from planning.certify.certificate import Certificate
-from planning.certify.plain_skin import PlainSkin, SkinFacts, leaves_view
-from planning.certify.question import question_of
-from planning.clearance.containment import Side, side_of
-from planning.errors import InputError
-from planning.provenance import differing_input
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.provenance import differing_input
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.certify.certificate import Certificate
+from puncture_twin.planning.certify.plain_skin import PlainSkin, SkinFacts, leaves_view
+from puncture_twin.planning.certify.question import question_of
+from puncture_twin.planning.geometry.containment import Side, side_of
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

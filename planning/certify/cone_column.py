@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from planning.candidates import Candidates
-from planning.case import Case
-from planning.certify.certificate import Certificate
-from planning.search import ranked
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.certify.certificate import Certificate
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.search import ranked
 
 
 def with_safe_cone(case: Case, found: Candidates, certificate: Certificate) -> Candidates:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+
+from puncture_twin.planning.base.numba_kernels import nb
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.certify.cells import Cones
-from planning.certify.cones import Lists, Zones
-from planning.clearance.segment_triangle import axis_triangle
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.certify.cells import Cones
+from puncture_twin.planning.certify.cones import Lists, Zones
+from puncture_twin.planning.clearance.kernels.segment_triangle import axis_triangle
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

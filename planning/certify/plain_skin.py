@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.mesh import TriangleMesh
-from planning.skin import FieldOfView, Skin
+from puncture_twin.planning.anatomy.skin import FieldOfView, Skin
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -25,7 +25,7 @@ EDGE_ON = 0.9e-10
 
 @dataclass(frozen=True, eq=False)
 class SkinFacts:
-    """What holds for every ray of one cone; see `planning.certify.skin_cones.SkinBounds`."""
+    """What holds for every ray of one cone; see `puncture_twin.planning.certify.skin_cones.SkinBounds`."""
 
     count: int
     cut: bool

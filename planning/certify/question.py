@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.anatomy import Anatomy
-from planning.case import Case
-from planning.certify.cells import Cells
-from planning.constraints import longest_path
-from planning.errors import InputError
-from planning.provenance import Input
-from planning.standoff import axis_lengths, farthest_flange
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.provenance import Input
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.certify.cells import Cells
+from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange
+from puncture_twin.planning.search.constraints import longest_path
 
 Floats = NDArray[np.float64]
 

@@ -1,18 +1,18 @@
 """What every ray of a cone meets of the skin: bounds over all crossings, and their number where it is the same for all.
 
-docs/certificate.md derives each bound; `planning.certify.checker` holds the same lemmas in plain form.
+docs/certificate.md derives each bound; `puncture_twin.planning.certify.checker` holds the same lemmas in plain form.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.certify.cones import Lists
-from planning.certify.skin_surface import SkinSurface
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.certify.cones import Lists
+from puncture_twin.planning.certify.skin_surface import SkinSurface
 
 Floats = NDArray[np.float64]
 

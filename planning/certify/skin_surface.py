@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.certify.cones import Zones, zones
-from planning.mesh import TriangleMesh
-from planning.skin import Skin
+from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.certify.cones import Zones, zones
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -28,7 +28,7 @@ class SkinSurface:
 
     Attributes:
         corners: Shape (m, 3, 3), mm from the target.
-        normals: Shape (m, 3, 3), unit normal at each corner: what `planning.skin_entry` blends.
+        normals: Shape (m, 3, 3), unit normal at each corner: what `puncture_twin.planning.anatomy.skin_entry` blends.
         fold: Shape (m, 3), whether the number of crossings may change where a ray passes the edge from corner i to
             i + 1: it is not shared by exactly two triangles that lie on its two sides as seen from the target.
         cut: Shape (m,), triangles that are not skin.

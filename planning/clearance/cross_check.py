@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from planning.clearance.engine import AxisDistances, Floats
-from planning.clearance.fcl_engine import FclEngine
-from planning.errors import PlanningError
-from planning.mesh import TriangleMesh
+from puncture_twin.planning.base.errors import PlanningError
+from puncture_twin.planning.clearance.engine import AxisDistances, Floats
+from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 AGREE_MM = 1e-6
 """Two exact engines differ by rounding alone: 1e-12 of a metre and a thousand operations."""

@@ -29,7 +29,7 @@ class ClearanceEngine(Protocol):
     """Prepared once for a set of surfaces, asked for any target.
 
     An engine sees surfaces only. That a needle lies wholly inside a closed surface is the caller's to find, and is
-    decided by the target alone, because every axis starts there (see `planning.clearance.measure`).
+    decided by the target alone, because every axis starts there (see `puncture_twin.planning.clearance.measure`).
     """
 
     def measure(self, target_ct: Floats, outward_ct: Floats, length: Floats | float) -> AxisDistances:

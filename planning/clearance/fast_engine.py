@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.clearance.blocks import Blocks, pack
-from planning.clearance.engine import AxisDistances, Floats
-from planning.clearance.fcl_engine import FclEngine
-from planning.clearance.lanes import LANES
-from planning.clearance.nearest_triangle import nearest_triangle
-from planning.clearance.scratch import Found, scratch_for
-from planning.clearance.tile_search import COUNTED, search_tiles
-from planning.clearance.tiles import Tiles, bundle
-from planning.errors import InputError
-from planning.mesh import TriangleMesh
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.clearance.direction_tiles import Tiles, bundle
+from puncture_twin.planning.clearance.engine import AxisDistances, Floats
+from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
+from puncture_twin.planning.clearance.kernels.lanes import LANES
+from puncture_twin.planning.clearance.kernels.nearest_triangle import nearest_triangle
+from puncture_twin.planning.clearance.kernels.scratch import Found, scratch_for
+from puncture_twin.planning.clearance.kernels.tile_search import COUNTED, search_tiles
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 Progress = Callable[[int, int], None]
 

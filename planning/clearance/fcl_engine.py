@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 import fcl
 import numpy as np
 
-from planning.clearance.crossings import first_crossing
-from planning.clearance.engine import AxisDistances, Floats
-from planning.mesh import TriangleMesh
+from puncture_twin.planning.clearance.engine import AxisDistances, Floats
+from puncture_twin.planning.geometry.crossings import first_crossing
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 Progress = Callable[[int, int], None]
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.anatomy import Structure
-from planning.clearance.containment import Side, side_of
-from planning.clearance.engine import ClearanceEngine, Floats
+from puncture_twin.planning.anatomy.anatomy import Structure
+from puncture_twin.planning.clearance.engine import ClearanceEngine, Floats
+from puncture_twin.planning.geometry.containment import Side, side_of
 
 NEAR_THRESHOLD_MM = 1e-4
 """Within this of a margin FCL's capsule collision decides: its own tolerance is 1e-6 mm."""

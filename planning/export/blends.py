@@ -13,9 +13,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.approach import MAX_SWEEP_MM
-from planning.robot.cell import StateChecker
-from planning.robot.kinematics import flange_pose
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.collision.checker import StateChecker
+from puncture_twin.planning.motion.approach import MAX_SWEEP_MM
 
 Array = NDArray[np.float64]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.robot.ur import UrModel
-from planning.trajectory import Trajectory
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

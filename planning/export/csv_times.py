@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from planning.errors import InputError
-from planning.export.motion import SampledMotion
-from planning.export.text import heading
-from planning.plan import Plan
-from planning.trajectory import Trajectory
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.export.motion import SampledMotion
+from puncture_twin.planning.export.text import heading
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.plan.plan import Plan
 
 COLUMNS = ("phase", "time_s", *(f"q{joint}_rad" for joint in range(1, 7)))
 

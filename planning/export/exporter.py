@@ -10,18 +10,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from planning.errors import InputError
-from planning.export.blends import blend_radii_mm
-from planning.export.csv_times import csv_text, read_csv
-from planning.export.motion import check_sampled
-from planning.export.program import program_of, waypoint_rows
-from planning.export.program_check import check_program
-from planning.export.ros2 import TIME_RESOLUTION_S, read_ros2, ros2_text
-from planning.export.urscript import read_urscript, urscript_text
-from planning.files import atomic
-from planning.plan import Plan, check_geometry
-from planning.robot.cell import StateChecker
-from planning.robot.ur import ur_model
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.collision.checker import StateChecker
+from puncture_twin.planning.export.blends import blend_radii_mm
+from puncture_twin.planning.export.csv_times import csv_text, read_csv
+from puncture_twin.planning.export.motion import check_sampled
+from puncture_twin.planning.export.program import program_of, waypoint_rows
+from puncture_twin.planning.export.program_check import check_program
+from puncture_twin.planning.export.ros2 import TIME_RESOLUTION_S, read_ros2, ros2_text
+from puncture_twin.planning.export.urscript import read_urscript, urscript_text
+from puncture_twin.planning.plan.plan import Plan, check_geometry
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.errors import InputError
-from planning.robot.links import JOINT_NAMES
-from planning.robot.ur import UrModel
-from planning.trajectory import Trajectory
+from puncture_twin.planning.arm.links import JOINT_NAMES
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

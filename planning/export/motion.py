@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from planning.errors import InputError
-from planning.export.limits import check_trajectory
-from planning.plan import Plan
-from planning.robot.ur import ur_model
-from planning.trajectory import Trajectory
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.export.limits import check_trajectory
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.plan.plan import Plan
 
 ANGLE_TOLERANCE_RAD = 1e-9
 """How far an angle that was read back may be from the plan's."""

@@ -16,12 +16,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.errors import InputError
-from planning.export.corners import STRAIGHT_RAD, corner_rows, rests_at
-from planning.plan import POSE_TOLERANCE_MM, Plan
-from planning.robot.kinematics import flange_pose, inverse, wrap_to_pi
-from planning.robot.ur import UrModel, ur_model
-from planning.trajectory import SAMPLE_S, Trajectory
+from puncture_twin.planning.arm.kinematics import flange_pose, inverse, wrap_to_pi
+from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.export.corners import STRAIGHT_RAD, corner_rows, rests_at
+from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
+from puncture_twin.planning.plan.plan import POSE_TOLERANCE_MM, Plan
 
 Array = NDArray[np.float64]
 

@@ -9,14 +9,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.errors import InputError
-from planning.export.limits import check_positions, check_rates, check_trajectory
-from planning.export.motion import ANGLE_TOLERANCE_RAD
-from planning.export.program import Program, program_of, straight_move, stream_times, tip_poses, waypoint_rows
-from planning.plan import POSE_TOLERANCE_MM, STRAIGHT_TOLERANCE_MM, Plan
-from planning.robot.kinematics import flange_pose
-from planning.robot.ur import UrModel, ur_model
-from planning.trajectory import Trajectory
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.export.limits import check_positions, check_rates, check_trajectory
+from puncture_twin.planning.export.motion import ANGLE_TOLERANCE_RAD
+from puncture_twin.planning.export.program import (
+    Program,
+    program_of,
+    straight_move,
+    stream_times,
+    tip_poses,
+    waypoint_rows,
+)
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.plan.plan import POSE_TOLERANCE_MM, STRAIGHT_TOLERANCE_MM, Plan
 
 Array = NDArray[np.float64]
 

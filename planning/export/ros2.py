@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.errors import InputError
-from planning.export.corners import corner_rows, rests_at
-from planning.export.limits import check_rates
-from planning.export.motion import SampledMotion
-from planning.export.text import heading
-from planning.plan import Plan
-from planning.robot.links import JOINT_NAMES
-from planning.robot.ur import UrModel, ur_model
-from planning.trajectory import Trajectory
+from puncture_twin.planning.arm.links import JOINT_NAMES
+from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.export.corners import corner_rows, rests_at
+from puncture_twin.planning.export.limits import check_rates
+from puncture_twin.planning.export.motion import SampledMotion
+from puncture_twin.planning.export.text import heading
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.plan.plan import Plan
 
 Array = NDArray[np.float64]
 

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from planning.errors import InputError
-from planning.export.program import STREAM_S, JointMove, Program
-from planning.export.text import heading
-from planning.plan import Plan
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.export.program import STREAM_S, JointMove, Program
+from puncture_twin.planning.export.text import heading
+from puncture_twin.planning.plan.plan import Plan
 
 Array = NDArray[np.float64]
 

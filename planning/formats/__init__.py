@@ -1,11 +1,11 @@
 """What other programs write: meshes, label maps, CT volumes and named points, each through the guard."""
 
-from planning.formats.guard import guard_mesh, guard_points, guard_transform
-from planning.formats.labelmaps import LabelMap, read_labelmap
-from planning.formats.meshes import mesh_warnings, read_mesh
-from planning.formats.points import NamedPoints, read_points, write_points
-from planning.formats.spaces import Space, Unit, parse_space, parse_unit, to_lps
-from planning.formats.volumes import Volume, read_volume
+from puncture_twin.planning.formats.guard import guard_mesh, guard_points, guard_transform
+from puncture_twin.planning.formats.labels.labelmaps import LabelMap, read_labelmap
+from puncture_twin.planning.formats.meshes.mesh_files import mesh_warnings, read_mesh
+from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points, write_points
+from puncture_twin.planning.formats.volumes.volume_files import Volume, read_volume
+from puncture_twin.planning.geometry.spaces import Space, Unit, parse_space, parse_unit, to_lps
 
 __all__ = [
     "LabelMap",

@@ -15,9 +15,9 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from planning.errors import InputError
-from planning.formats.names import check_name
-from planning.mesh import TriangleMesh
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.text_names import check_name
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 MIN_DIAGONAL_MM = 0.5
 """Smallest bounding box diagonal of a structure: less than any vessel. An organ in metres is below."""
@@ -44,7 +44,7 @@ def guard_mesh(vertices: ArrayLike, faces: ArrayLike, *, where: str | Path) -> T
     """A mesh that may be trusted, or an error.
 
     Triangles of zero area are all kept: their corners still belong to the surface, and dropping them would
-    change counts; ``planning.formats.meshes.mesh_warnings`` counts them. Only a mesh without any area is refused.
+    change counts; ``mesh_files.mesh_warnings`` counts them. Only a mesh without any area is refused.
     Vertices that no triangle uses are left out, after they were checked like the others, so that the bounds
     are those of the surface; the order of the rest, and of the triangles, stays.
 

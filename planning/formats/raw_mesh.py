@@ -7,8 +7,8 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.errors import InputError
-from planning.formats.guard import MAX_TRIANGLES
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.guard import MAX_TRIANGLES
 
 MAX_TOKEN_LENGTH = 64
 """Longer than a double with all of its digits and exponent (24)."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.case import Axis, Case, axes_frame
-from planning.entry import ANATOMICAL_LPS, view_frame
-from planning.formats.spaces import Space, to_lps
+from puncture_twin.planning.case.case import Axis, Case, axes_frame
+from puncture_twin.planning.case.entry import ANATOMICAL_LPS, view_frame
+from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 Floats = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.candidates import Candidates
-from planning.case import Case
-from planning.standoff import standoffs
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.reach.standoff import standoffs
+from puncture_twin.planning.search.candidates import Candidates
 
 Floats = NDArray[np.float64]
 

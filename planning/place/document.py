@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from planning.files import atomic
-from planning.place.mount_lines import mount_lines
-from planning.place.search import Judged, PlaceSearch
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.place.mount_lines import mount_lines
+from puncture_twin.planning.place.search import Judged, PlaceSearch
 
 PLACE_VERSION = 1
 """Version of ``place.json``'s layout."""

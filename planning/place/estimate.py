@@ -9,15 +9,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.cache import user_cache
-from planning.place.arm_balls import ArmBalls, Surroundings, base_is_clear, clear_ways
-from planning.place.directions import WantedDirections
-from planning.place.mounts import Site
-from planning.robot.fast_checker import FastChecker
-from planning.robot.insertion import MIN_SINGULARITY, flange_poses
-from planning.robot.kinematics import N_BRANCHES, inverse, link_poses, singularity
-from planning.robot.tool import Tool
-from planning.robot.ur import UrModel, ur_model
+from puncture_twin.planning.arm.insertion import MIN_SINGULARITY, flange_poses
+from puncture_twin.planning.arm.kinematics import N_BRANCHES, inverse, link_poses, singularity
+from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.place.arm_spheres import ArmBalls, Surroundings, base_is_clear, clear_ways
+from puncture_twin.planning.place.directions import WantedDirections
+from puncture_twin.planning.place.mounts import Site
 
 Floats = NDArray[np.float64]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.case_file import MountSection
-from planning.formats.spaces import Space, to_lps
+from puncture_twin.planning.case.case_file import MountSection
+from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 Floats = NDArray[np.float64]
 

@@ -11,10 +11,10 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.case import Case, Obstacle
-from planning.case_file import MountBounds, MountName
-from planning.errors import InputError
-from planning.robot.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import Case, Obstacle
+from puncture_twin.planning.case.case_file import MountBounds, MountName
 
 Floats = NDArray[np.float64]
 Range = tuple[float, float]

@@ -6,12 +6,12 @@ import fcl
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.mesh import TriangleMesh
-from planning.place.directions import WantedDirections
-from planning.robot.insertion import flange_poses
-from planning.robot.shapes import skin_surface, touch
-from planning.robot.state_checker import PATIENT
-from planning.robot.tool import Tool
+from puncture_twin.planning.arm.insertion import flange_poses
+from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.collision.shapes import skin_surface, touch
+from puncture_twin.planning.collision.state_checker import PATIENT
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.place.directions import WantedDirections
 
 Floats = NDArray[np.float64]
 

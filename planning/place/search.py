@@ -9,23 +9,30 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.anatomy import Anatomy
-from planning.candidates import Candidates
-from planning.case import Case, mount_pose
-from planning.case_file import MountSection
-from planning.errors import NoAnswerError
-from planning.place.arm_balls import Surroundings
-from planning.place.bed import bed_frame
-from planning.place.directions import wanted_directions
-from planning.place.estimate import Estimate, Estimator
-from planning.place.judge import Judge, Verdict
-from planning.place.mount_lines import mount_section
-from planning.place.mounts import Site, regions
-from planning.place.needle_start import needle_can_start
-from planning.place.room_field import Boxes, SkinField
-from planning.place.workers import ask_all
-from planning.placement import Placement
-from planning.room import ARM_PADDING_MM, case_boxes, case_tool, check_gantry, home_configuration, patient_surface
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.case.case import Case, mount_pose
+from puncture_twin.planning.case.case_file import MountSection
+from puncture_twin.planning.collision.workcell import (
+    ARM_PADDING_MM,
+    case_boxes,
+    case_tool,
+    check_gantry,
+    home_configuration,
+    patient_surface,
+)
+from puncture_twin.planning.place.arm_spheres import Surroundings
+from puncture_twin.planning.place.bed import bed_frame
+from puncture_twin.planning.place.directions import wanted_directions
+from puncture_twin.planning.place.estimate import Estimate, Estimator
+from puncture_twin.planning.place.evaluate import Judge, Verdict
+from puncture_twin.planning.place.mount_lines import mount_section
+from puncture_twin.planning.place.mounts import Site, regions
+from puncture_twin.planning.place.needle_start import needle_can_start
+from puncture_twin.planning.place.obstacle_field import Boxes, SkinField
+from puncture_twin.planning.place.workers import ask_all
+from puncture_twin.planning.registration.placement import Placement
+from puncture_twin.planning.search.candidates import Candidates
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]

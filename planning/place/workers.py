@@ -7,7 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from typing import TypeVar
 
-from planning.processes import worker_count
+from puncture_twin.planning.base.processes import worker_count
 
 Thing = TypeVar("Thing")
 Answer = TypeVar("Answer")

@@ -11,17 +11,17 @@ import SimpleITK
 import trimesh
 from hostile.makers import CASE, MOUNT, RIB, certificate, glb, recording, sound_case
 
-from meshes import folder as embedded
-from planning.case import load_case
-from planning.export.csv_times import csv_text
-from planning.placement import load_placement
-from planning.plan import Plan, write_plan
-from planning.provenance import Input
-from planning.reach import ReachRequest, assess_reach
-from planning.robot.cell import CellChecker
-from planning.robot.ur import ur_model
-from planning.room import case_tool
-from planning.trajectory import SAMPLE_S, Trajectory
+from puncture_twin.meshes import folder as embedded
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.provenance import Input
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.workcell import case_tool
+from puncture_twin.planning.export.csv_times import csv_text
+from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
+from puncture_twin.planning.plan.plan import Plan, write_plan
+from puncture_twin.planning.reach.reach import ReachRequest, assess_reach
+from puncture_twin.planning.registration.placement import load_placement
 
 MARKERS = "name,x_mm,y_mm,z_mm\nA,0,0,80\nB,50,0,75\nC,0,60,70\nD,-40,-30,72\n"
 REGISTRATION = '[registration]\nmarkers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"\n'

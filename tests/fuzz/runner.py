@@ -14,7 +14,7 @@ from fuzz.command_lines import command_line, run
 from fuzz.corpus import make_corpus
 from fuzz.mutate import mutated
 from fuzz.targets import TARGETS
-from planning.errors import PlanningError
+from puncture_twin.planning.base.errors import PlanningError
 
 SECONDS = 2.0
 """Processor time of one run."""
@@ -91,7 +91,7 @@ class Fuzzer:
         return None
 
     def _command(self, rng):
-        from run_twin import main
+        from puncture_twin.run_twin import main
 
         words = command_line(rng, self.files)
         self._what, self.last = f"command line {words}", repr(words).encode()

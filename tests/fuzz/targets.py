@@ -4,23 +4,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from planning.anatomy import load_anatomy
-from planning.case import load_case
-from planning.certify.certificate import read_certificate
-from planning.export.csv_times import read_csv
-from planning.formats.labelmaps import read_labelmap
-from planning.formats.meshes import mesh_warnings, read_mesh
-from planning.formats.naming import names_for
-from planning.formats.points import read_points
-from planning.formats.spaces import Space, Unit
-from planning.formats.volumes import read_volume
-from planning.placement import load_placement
-from planning.plan import read_plan
-from planning.pytest_plugin import read_checks
-from twin.mirror import recorded_states
-from twin.stereo.servo_case import load_servo_case
-from twin.ultrasound.recording import read_recording
-from twin.ultrasound.selfcal_case import load_selfcal_case
+from puncture_twin.planning.anatomy.anatomy import load_anatomy
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.certify.certificate import read_certificate
+from puncture_twin.planning.collision_cases.pytest_plugin import read_checks
+from puncture_twin.planning.export.csv_times import read_csv
+from puncture_twin.planning.formats.labels.labelmaps import read_labelmap
+from puncture_twin.planning.formats.labels.naming import names_for
+from puncture_twin.planning.formats.meshes.mesh_files import mesh_warnings, read_mesh
+from puncture_twin.planning.formats.points.point_files import read_points
+from puncture_twin.planning.formats.volumes.volume_files import read_volume
+from puncture_twin.planning.geometry.spaces import Space, Unit
+from puncture_twin.planning.plan.plan import read_plan
+from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import read_recording
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import load_selfcal_case
+from puncture_twin.twin.jobs.robot.mirror import recorded_states
 
 
 @dataclass(frozen=True)

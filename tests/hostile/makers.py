@@ -6,12 +6,12 @@ import struct
 import numpy as np
 import trimesh
 
-from planning.certify.cells import Cells
-from planning.certify.certificate import Certificate, write_certificate
-from planning.certify.question import Question
-from planning.plan import write_plan
-from twin.ultrasound.recording import Recording, write_recording
-from twin.ultrasound.simulate import simulate_recording
+from puncture_twin.planning.certify.cells import Cells
+from puncture_twin.planning.certify.certificate import Certificate, write_certificate
+from puncture_twin.planning.certify.question import Question
+from puncture_twin.planning.plan.plan import write_plan
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording, write_recording
+from puncture_twin.twin.guidance.ultrasound.simulate import simulate_recording
 
 CASE = """schema = 1
 name = "hostile"

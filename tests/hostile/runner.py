@@ -14,13 +14,13 @@ import tempfile
 import time
 from pathlib import Path
 
-from planning.certify.certificate import read_certificate
-from planning.errors import InputError
-from planning.formats.meshes import read_mesh
-from planning.formats.spaces import Space, Unit
-from planning.plan import read_plan
-from planning.pytest_plugin import read_checks
-from run_twin import main
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.certify.certificate import read_certificate
+from puncture_twin.planning.collision_cases.pytest_plugin import read_checks
+from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
+from puncture_twin.planning.geometry.spaces import Space, Unit
+from puncture_twin.planning.plan.plan import read_plan
+from puncture_twin.run_twin import main
 
 READERS = {
     "certificate": read_certificate,

@@ -1,10 +1,10 @@
 """Bodies with known truth: the carton of Chen 2019, an abdomen and an open head of our own."""
 
-from twin.phantoms.abdomen import STRUCTURES, abdomen_field, abdomen_mesh, lesion_centre_ct
-from twin.phantoms.carton import carton_field, carton_meshes
-from twin.phantoms.guidance import abdomen_guidance, patient_placement, skin_markers_ct
-from twin.phantoms.head import head_field, head_mesh, head_targets
-from twin.phantoms.manifest import write_phantoms
+from puncture_twin.twin.phantoms.abdomen import STRUCTURES, abdomen_field, abdomen_mesh, lesion_centre_ct
+from puncture_twin.twin.phantoms.carton import carton_field, carton_meshes
+from puncture_twin.twin.phantoms.guidance import abdomen_guidance, patient_placement, skin_markers_ct
+from puncture_twin.twin.phantoms.head import head_field, head_mesh, head_targets
+from puncture_twin.twin.phantoms.manifest import write_phantoms
 
 __all__ = [
     "STRUCTURES",

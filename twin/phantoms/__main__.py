@@ -1,4 +1,4 @@
-"""``python -m twin.phantoms --out DIR``: make the embedded cases' meshes and point lists again."""
+"""``python -m puncture_twin.twin.phantoms --out DIR``: make the embedded cases' meshes and point lists again."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import argparse
 import sys
 from pathlib import Path
 
-from twin.phantoms.manifest import write_phantoms
+from puncture_twin.twin.phantoms.manifest import write_phantoms
 
 
 def main() -> int:
     """Parse the one option and write; progress goes to stderr."""
-    parser = argparse.ArgumentParser(prog="python -m twin.phantoms", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m puncture_twin.twin.phantoms", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder for abdomen/, carton/ and manifest.json")
     write_phantoms(parser.parse_args().out, _tell)
     return 0

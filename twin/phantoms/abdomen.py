@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from planning.mesh import TriangleMesh
-from twin.phantoms import bones, torso, vessels, viscera
-from twin.phantoms.implicit import Array, Field
-from twin.phantoms.mesher import Box, mesh_field
-from twin.phantoms.viscera import LESION_CENTRE_LPS_MM
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.twin.phantoms import bones, torso, vessels, viscera
+from puncture_twin.twin.phantoms.implicit import Array, Field
+from puncture_twin.twin.phantoms.mesher import Box, mesh_field
+from puncture_twin.twin.phantoms.viscera import LESION_CENTRE_LPS_MM
 
 __all__ = ["LESION_CENTRE_LPS_MM", "STRUCTURES", "Part", "abdomen_field", "abdomen_mesh", "lesion_centre_ct"]
 

@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 
-from twin.phantoms import torso
-from twin.phantoms.implicit import (
+from puncture_twin.twin.phantoms import torso
+from puncture_twin.twin.phantoms.implicit import (
     Array,
     Field,
     above,
@@ -19,7 +19,7 @@ from twin.phantoms.implicit import (
     union,
     within,
 )
-from twin.phantoms.sweep import ribbon
+from puncture_twin.twin.phantoms.sweep import ribbon
 
 RIBS = (4, 5, 6, 7, 8, 9, 10, 11, 12)
 RIB_HALF_HEIGHT_MM, RIB_HALF_THICKNESS_MM = 5.8, 3.4

@@ -13,9 +13,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from planning.mesh import TriangleMesh
-from twin.chen2019_tables import TABLE_1, TABLE_2
-from twin.phantoms.implicit import Array, Field
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_2
+from puncture_twin.twin.phantoms.implicit import Array, Field
 
 __all__ = ["LESIONS_CT_MM", "MARKERS_CT_MM", "TOUCHED_BASE_MM", "carton_field", "carton_meshes"]
 

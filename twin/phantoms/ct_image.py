@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from twin.phantoms.implicit import Array, Field
+from puncture_twin.twin.phantoms.implicit import Array, Field
 
 AIR_HU = -1000.0
 
@@ -33,7 +33,7 @@ class Grid:
 
     Attributes:
         low_mm: Centre of the first voxel, LPS.
-        spacing_mm: Along each axis, such as `twin.ct.scanner.Scanner.cell_mm`.
+        spacing_mm: Along each axis, such as `puncture_twin.twin.plant.scanner.Scanner.cell_mm`.
         shape: Voxels along each axis.
     """
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.phantoms import torso
-from twin.phantoms.implicit import Array
-from twin.phantoms.viscera import LESION_CENTRE_LPS_MM
+from puncture_twin.twin.phantoms import torso
+from puncture_twin.twin.phantoms.implicit import Array
+from puncture_twin.twin.phantoms.viscera import LESION_CENTRE_LPS_MM
 
 __all__ = ["GUIDANCE_SEED", "Guidance", "abdomen_guidance", "patient_placement", "skin_markers_ct"]
 

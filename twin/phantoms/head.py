@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from planning.mesh import TriangleMesh
-from twin.phantoms.implicit import Array, Field, above, below, capsule, carve, ellipsoid, union, within
-from twin.phantoms.mesher import Box, mesh_field
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.twin.phantoms.implicit import Array, Field, above, below, capsule, carve, ellipsoid, union, within
+from puncture_twin.twin.phantoms.mesher import Box, mesh_field
 
 __all__ = ["MARKERS_MM", "RIM_MM", "head_field", "head_mesh", "head_targets"]
 

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from planning.mesh import TriangleMesh
-from twin.phantoms import abdomen, carton, guidance, head
-from twin.phantoms.implicit import Array
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.twin.phantoms import abdomen, carton, guidance, head
+from puncture_twin.twin.phantoms.implicit import Array
 
 __all__ = ["ply_bytes", "points_csv", "write_phantoms"]
 
-_COMMAND = "python -m twin.phantoms --out DIR"
+_COMMAND = "python -m puncture_twin.twin.phantoms --out DIR"
 _LICENCE = "Apache-2.0"
 _PAPER = "DOI 10.7652/xjtuxb201904013"
 
@@ -84,7 +84,9 @@ def _entry(path: str, space: str, made_by: str, parameters: dict[str, Any]) -> d
 def _carton_files() -> list[tuple[dict[str, Any], bytes]]:
     files = []
     for name, mesh in carton.carton_meshes().items():
-        entry = _entry(f"carton/{name}.ply", "local", "twin.phantoms.carton.carton_meshes", {"structure": name})
+        entry = _entry(
+            f"carton/{name}.ply", "local", "puncture_twin.twin.phantoms.carton.carton_meshes", {"structure": name}
+        )
         files.append(({**entry, "triangles": len(mesh.faces)}, ply_bytes(mesh)))
     touched = carton.TOUCHED_BASE_MM
     markers = {name: touched[name] for name in carton.MARKERS_CT_MM}
@@ -93,7 +95,7 @@ def _carton_files() -> list[tuple[dict[str, Any], bytes]]:
         ("touch.csv", "base", markers, "Table 2"),
         ("truth.csv", "base", touched, "Table 2"),
     ):
-        entry = _entry(f"carton/{name}", space, "twin.phantoms.carton", {"source": f"{_PAPER}, {source}"})
+        entry = _entry(f"carton/{name}", space, "puncture_twin.twin.phantoms.carton", {"source": f"{_PAPER}, {source}"})
         files.append((entry, points_csv({key: np.array(value) for key, value in points.items()}, 2)))
     return files
 
@@ -103,7 +105,7 @@ def _abdomen_files() -> list[tuple[dict[str, Any], bytes]]:
     for name, part in abdomen.STRUCTURES.items():
         mesh = abdomen.abdomen_mesh(name)
         parameters = {"structure": name, "spacing_mm": part.spacing_mm}
-        entry = _entry(f"abdomen/{name}.ply", "LPS", "twin.phantoms.abdomen.abdomen_mesh", parameters)
+        entry = _entry(f"abdomen/{name}.ply", "LPS", "puncture_twin.twin.phantoms.abdomen.abdomen_mesh", parameters)
         files.append(({**entry, "triangles": len(mesh.faces)}, ply_bytes(mesh)))
     seed = guidance.GUIDANCE_SEED
     known = guidance.abdomen_guidance(np.random.default_rng(seed))
@@ -112,7 +114,9 @@ def _abdomen_files() -> list[tuple[dict[str, Any], bytes]]:
         ("touch.csv", "base", known.touched_base, 3),
         ("truth.csv", "base", known.truth_base, 6),
     ):
-        entry = _entry(f"abdomen/{name}", space, "twin.phantoms.guidance.abdomen_guidance", {"seed": seed})
+        entry = _entry(
+            f"abdomen/{name}", space, "puncture_twin.twin.phantoms.guidance.abdomen_guidance", {"seed": seed}
+        )
         files.append((entry, points_csv(points, decimals)))
     return files
 
@@ -120,13 +124,16 @@ def _abdomen_files() -> list[tuple[dict[str, Any], bytes]]:
 def _head_files() -> list[tuple[dict[str, Any], bytes]]:
     mesh = head.head_mesh()
     parameters = {"structure": "head", "spacing_mm": head.SPACING_MM}
-    entry = _entry("head/head.ply", "local", "twin.phantoms.head.head_mesh", parameters)
+    entry = _entry("head/head.ply", "local", "puncture_twin.twin.phantoms.head.head_mesh", parameters)
     markers = {name: np.array(point) for name, point in head.MARKERS_MM.items()}
     return [
         ({**entry, "triangles": len(mesh.faces)}, ply_bytes(mesh)),
-        (_entry("head/markers.csv", "local", "twin.phantoms.head.MARKERS_MM", {}), points_csv(markers, 3)),
         (
-            _entry("head/targets.csv", "local", "twin.phantoms.head.head_targets", {}),
+            _entry("head/markers.csv", "local", "puncture_twin.twin.phantoms.head.MARKERS_MM", {}),
+            points_csv(markers, 3),
+        ),
+        (
+            _entry("head/targets.csv", "local", "puncture_twin.twin.phantoms.head.head_targets", {}),
             points_csv(head.head_targets(), 3),
         ),
     ]

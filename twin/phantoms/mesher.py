@@ -9,8 +9,8 @@ from scipy.ndimage import zoom
 from scipy.sparse import csr_matrix
 from skimage.measure import marching_cubes
 
-from planning.mesh import Faces, TriangleMesh
-from twin.phantoms.implicit import Array, Field
+from puncture_twin.planning.geometry.mesh import Faces, TriangleMesh
+from puncture_twin.twin.phantoms.implicit import Array, Field
 
 _COARSE = 4
 """Grid nodes per coarse node. Far from the surface the coarse values, interpolated, are good enough."""

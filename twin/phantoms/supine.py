@@ -10,9 +10,9 @@ from typing import Literal
 
 import numpy as np
 
-from twin.phantoms import torso
-from twin.phantoms.ct_image import Grid, Part
-from twin.phantoms.implicit import Array, Field, capsule, ellipsoid, offset, within
+from puncture_twin.twin.phantoms import torso
+from puncture_twin.twin.phantoms.ct_image import Grid, Part
+from puncture_twin.twin.phantoms.implicit import Array, Field, capsule, ellipsoid, offset, within
 
 LESION_LPS_MM = (-55.0, 20.0, 0.0)
 """In the right half of the trunk, nearer to the back."""

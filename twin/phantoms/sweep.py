@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.spatial import cKDTree
 
-from twin.phantoms.implicit import Array, Field
+from puncture_twin.twin.phantoms.implicit import Array, Field
 
 _SAMPLE_MM = 1.5
 """Step of the polyline along the curve; with the spans beside the nearest node the distance errs below 0.01 mm."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from twin.phantoms.implicit import Array, Field, smooth_max, smooth_min
+from puncture_twin.twin.phantoms.implicit import Array, Field, smooth_max, smooth_min
 
 TOP_MM, BOTTOM_MM = 258.0, -192.0
 """The trunk ends here, with rounded rims; like the edge of a scan, these two ends are not real skin."""

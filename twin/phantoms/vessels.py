@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from functools import cache
 
-from twin.phantoms import bones, torso
-from twin.phantoms.implicit import Field, above, below, carve, union, within
-from twin.phantoms.sweep import tube
+from puncture_twin.twin.phantoms import bones, torso
+from puncture_twin.twin.phantoms.implicit import Field, above, below, carve, union, within
+from puncture_twin.twin.phantoms.sweep import tube
 
 _ENDS = (above(2, torso.CONTENT_BOTTOM_MM + 14.0), below(2, torso.CONTENT_TOP_MM))
 

@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from twin.phantoms import bones, torso, vessels
-from twin.phantoms.implicit import (
+from puncture_twin.twin.phantoms import bones, torso, vessels
+from puncture_twin.twin.phantoms.implicit import (
     Array,
     Field,
     above,
@@ -21,7 +21,7 @@ from twin.phantoms.implicit import (
     union,
     within,
 )
-from twin.phantoms.sweep import tube
+from puncture_twin.twin.phantoms.sweep import tube
 
 LESION_CENTRE_LPS_MM = (-90.0, -10.0, 60.0)
 """Middle of the lesion, at the border of segments 5 and 6, and the target of the case."""

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ImageDraw, ImageFont
 
-from twin.report.camera import Camera
-from twin.report.map_view import body_directions
-from twin.report.palette import Rgb
+from puncture_twin.twin.report.map_view import body_directions
+from puncture_twin.twin.report.palette import Rgb
+from puncture_twin.twin.report.raster.camera import Camera
 
 INK: Rgb = (25, 27, 32)
 FAINT: Rgb = (110, 114, 122)

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.candidates import Candidates
-from planning.entry import ANATOMICAL_LPS, angles
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.case.entry import ANATOMICAL_LPS, angles
+from puncture_twin.planning.search.candidates import Candidates
 
 Floats = NDArray[np.float64]
 

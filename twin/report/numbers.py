@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from planning.candidates import Candidates
-from planning.place.directions import ring_weights
-from twin.report.map_view import step_of
-from twin.report.palette import REASON_COLOURS, REASON_WORDS, SAFE, Rgb, reason_of
+from puncture_twin.planning.place.directions import ring_weights
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.twin.report.map_view import step_of
+from puncture_twin.twin.report.palette import REASON_COLOURS, REASON_WORDS, SAFE, Rgb, reason_of
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.reasons import Reason
+from puncture_twin.planning.base.reasons import Reason
 
 Rgb = tuple[int, int, int]
 

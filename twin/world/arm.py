@@ -11,13 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.errors import InputError
-from planning.robot.links import T_BASE_URDFBASE
-from planning.robot.tool import Tool
-from planning.robot.ur import UrModel
-from twin.world.arm_file import write_arm_urdf
-from twin.world.engine import pybullet
-from twin.world.units import pose_to_m, pose_to_mm
+from puncture_twin.planning.arm.links import T_BASE_URDFBASE
+from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.world.arm_file import write_arm_urdf
+from puncture_twin.twin.world.engine import pybullet
+from puncture_twin.twin.world.units import pose_to_m, pose_to_mm
 
 Floats = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ class Arm:
         client: Physics client id.
         body: Body id.
         joints: Indices of the six joints.
-        links: Name (as in `planning.robot.cell.BODY_NAMES`, and the flange) to index; the base is -1.
+        links: Name (as in `planning.collision.checker.BODY_NAMES`, and the flange) to index; the base is -1.
         max_torque: Shape (6,), N m.
     """
 

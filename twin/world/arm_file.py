@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from planning.robot.kinematics import link_poses
-from planning.robot.links import collision_links, resolve_package, urdf_link_poses, urdf_path
-from planning.robot.tool import Tool
-from planning.robot.ur import UrModel
-from twin.world.surface_file import write_obj
-from twin.world.units import to_m
+from puncture_twin.planning.arm.kinematics import link_poses
+from puncture_twin.planning.arm.links import collision_links, resolve_package, urdf_link_poses, urdf_path
+from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.twin.world.surface_file import write_obj
+from puncture_twin.twin.world.units import to_m
 
 UNUSED_LINKS = frozenset({"world", "base", "ee_link"})
 """A second root, a frame without a body, and a 1 cm box where the holder sits."""

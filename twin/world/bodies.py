@@ -9,10 +9,10 @@ import fast_simplification
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.mesh import TriangleMesh
-from twin.world.engine import pybullet
-from twin.world.surface_file import write_obj
-from twin.world.units import pose_to_m, to_m
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.twin.world.engine import pybullet
+from puncture_twin.twin.world.surface_file import write_obj
+from puncture_twin.twin.world.units import pose_to_m, to_m
 
 Floats = NDArray[np.float64]
 Rgba = tuple[float, float, float, float]

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.world.engine import pybullet
-from twin.world.units import to_m
+from puncture_twin.twin.world.engine import pybullet
+from puncture_twin.twin.world.units import to_m
 
 TIME_STEP_S = 1.0 / 240.0
 """Bullet's own default; its contact and motor parameters are tuned for it."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from twin.world.arm import Arm
-from twin.world.engine import pybullet
-from twin.world.units import to_m, to_mm
+from puncture_twin.twin.world.arm import Arm
+from puncture_twin.twin.world.engine import pybullet
+from puncture_twin.twin.world.units import to_m, to_mm
 
 
 class Touch(NamedTuple):

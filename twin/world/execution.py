@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.world.client import TIME_STEP_S, step
-from twin.world.contacts import touches
-from twin.world.room import Room
+from puncture_twin.twin.world.client import TIME_STEP_S, step
+from puncture_twin.twin.world.contacts import touches
+from puncture_twin.twin.world.workcell import Room
 
 Floats = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from planning.mesh import TriangleMesh
-from twin.world.units import to_m
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.twin.world.units import to_m
 
 
 def write_obj(mesh: TriangleMesh, path: Path) -> None:

@@ -1,0 +1,109 @@
+"""One session held against the Cramer-Rao bound: how far its estimates and its servo end from what was possible."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
+from puncture_twin.twin.guidance.stereo.detection import picture_sight
+from puncture_twin.twin.guidance.stereo.joint_model import LENS, Guess, Observed, Unknowns
+from puncture_twin.twin.guidance.stereo.optimum import Adjusted, bound
+from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
+from puncture_twin.twin.guidance.stereo.session import Eyes, run_session
+from puncture_twin.twin.guidance.stereo.stereo_room import (
+    CAMERA_AXIS_PX,
+    CAMERA_FOCAL,
+    CAMERA_SHIFT_MM,
+    CAMERA_TURN_RAD,
+    Room,
+)
+from puncture_twin.twin.plant.true_arm import ArmErrors, TrueArm
+
+Floats = NDArray[np.float64]
+
+
+class OptimumTrial(NamedTuple):
+    """Errors at the end of each target, and their bounds (rms); shape (targets,), mm."""
+
+    ball_mm: Floats
+    """Estimated ball to true ball."""
+    target_mm: Floats
+    """Estimated target to true target."""
+    offset_mm: Floats
+    """Error of target minus ball."""
+    after_mm: Floats
+    """True ball to true target: what the servo left."""
+    ball_bound_mm: Floats
+    target_bound_mm: Floats
+    offset_bound_mm: Floats
+
+
+def optimum_trial(case: ServoCase, seed: int, eyes: Eyes = picture_sight) -> OptimumTrial:
+    """Hold a session and bound it by all that was measured in it until each target's end."""
+    session = run_session(case, seed, eyes=eyes)
+    room = session.room
+    stays = [visit for one in session.reached for visit in one.servoed.visits]
+    ends = np.cumsum([len(one.servoed.visits) for one in session.reached])
+    q_true = np.concatenate([session.calibration.q_true, np.reshape([visit.q_true for visit in stays], (-1, 6))])
+    balls = room.ball_c(q_true)
+    observed = session.guide.observed()
+    rows = []
+    for one, end in zip(session.reached, ends, strict=True):
+        if not one.servoed.visits:
+            continue
+        index = case.targets.names.index(one.target)
+        until = len(session.calibration.q_command) + int(end)
+        floor = room_bound(room, first_stays(observed, until), balls[:until])
+        offset = floor.offset(-1, case.targets.points[index], case.file.head.target_mm)
+        seen, ball, target = one.servoed.visits[-1].seen, balls[until - 1], room.targets_c[index]
+        errors = (seen.ball_c - ball, seen.target_c - target, (seen.target_c - seen.ball_c) - (target - ball))
+        bounds = (offset.ball_covariance, offset.target_covariance, offset.covariance)
+        rows.append([*(np.linalg.norm(e) for e in errors), one.after_mm, *(np.sqrt(np.trace(b)) for b in bounds)])
+    return OptimumTrial(*np.array(rows).T)
+
+
+def first_stays(observed: Observed, count: int) -> Observed:
+    """What had been measured when the arm had stood so many times."""
+    return replace(
+        observed,
+        q_command=observed.q_command[:count],
+        pixels=observed.pixels[:, :count],
+        pixel_covariance=observed.pixel_covariance[:, :count],
+    )
+
+
+def room_bound(room: Room, observed: Observed, balls_c: Floats) -> Adjusted:
+    """The Cramer-Rao bound at the truth of a room, the ball having been at ``balls_c`` (s, 3)."""
+    guess = Guess(room.T_c_base, room.T_c_m, balls_c)
+    truth = Unknowns(
+        np.array([camera_errors(*pair) for pair in zip(observed.planned, room.cameras, strict=True)]),
+        np.zeros(6),
+        arm_spreads(room.arm, observed.arm),
+        np.zeros(6),
+        np.array(room.case.markers.points),
+        balls_c,
+    )
+    return bound(observed, guess, truth)
+
+
+def camera_errors(planned: Camera, true: Camera) -> Floats:
+    """A camera's errors (13,), in spreads: the inverse of ``camera_of`` for square pixels."""
+    moved = true.T_camera_c @ np.linalg.inv(planned.T_camera_c)
+    axis = np.array([true.cx - planned.cx, true.cy - planned.cy]) / CAMERA_AXIS_PX
+    turn = Rotation.from_matrix(moved[:3, :3]).as_rotvec() / CAMERA_TURN_RAD
+    focal = (true.fx / planned.fx - 1.0) / CAMERA_FOCAL
+    return np.concatenate([[focal], axis, true.distortion / LENS, turn, moved[:3, 3] / CAMERA_SHIFT_MM])
+
+
+def arm_spreads(arm: TrueArm, spreads: ArmErrors) -> Floats:
+    """An arm's errors (23,), in spreads: the inverse of ``arm_of``; 0 where the spread is."""
+    nominal = arm.nominal
+    lengths = np.concatenate([arm.a - nominal.a, np.delete(arm.d - nominal.d, 1)])
+    parts = [(lengths, spreads.link_mm), (arm.alpha - nominal.alpha, spreads.twist_rad),
+             (arm.joint_offsets, spreads.joint_rad)]  # fmt: skip
+    return np.concatenate([part / spread if spread > 0 else np.zeros_like(part) for part, spread in parts])

@@ -1,0 +1,76 @@
+"""Limbs that are pressed against the trunk: one body in the CT, but no way for a needle to go from one into the other.
+
+Between an arm and the trunk that it touches there is skin, which a CT does not show. What tells them apart is the neck:
+a ball that fits into either does not fit through where they touch.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from puncture_twin.planning.anatomy.body.detached_parts import BONE_HU, MIN_BONE_ML
+
+NECK_MM = 30.0
+"""Radius of a ball that fits into an adult's upper arm (35 to 50 mm) and thigh, and not through the place where an arm
+is pressed against the trunk, some 50 mm wide. A thinner arm, and one that is pressed flat, is not told apart."""
+SAMPLING_MM = 4.0
+"""Spacing at which necks are looked for."""
+
+Mask = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+
+
+def attached_limbs(hu: NDArray[np.float32], body: Mask, spacing_mm: Floats, target_index: Floats) -> Mask:
+    """Voxels of the body that belong to another part than the target, with bone, joined to it by a narrow neck.
+
+    Args:
+        hu: Shape (nx, ny, nz), Hounsfield units.
+        body: Same shape.
+        spacing_mm: Shape (3,).
+        target_index: Shape (3,), voxels, in the image.
+
+    Returns:
+        Shape of ``body``; all False where the body is one part.
+    """
+    stride = np.maximum(1, (SAMPLING_MM / spacing_mm).astype(int))
+    coarse = body[:: stride[0], :: stride[1], :: stride[2]]
+    at = tuple(np.clip(np.round(target_index / stride).astype(int), 0, np.array(coarse.shape) - 1))
+    owner = _nearest_core(_holding(coarse, at), spacing_mm * stride)
+    voxel_ml = float(np.prod(spacing_mm)) / 1000.0
+    parts = _spread(owner, stride, body.shape) * body
+    limbs = np.zeros(body.shape, bool)
+    for number in range(1, int(owner.max(initial=0)) + 1):
+        if number != owner[at]:
+            part = parts == number
+            if np.count_nonzero(hu[part] > BONE_HU) * voxel_ml >= MIN_BONE_ML:
+                limbs |= part
+    return limbs
+
+
+def _holding(body: Mask, at: tuple[int, ...]) -> Mask:
+    """The connected part of the body that holds a voxel; the others are limbs with a skin of their own."""
+    labels, _ = ndimage.label(body)
+    return np.asarray(labels == labels[at]) & body
+
+
+def _nearest_core(body: Mask, spacing_mm: Floats) -> NDArray[np.int32]:
+    """For every voxel of a body, the number of the nearest place into which the ball fits; 0 outside."""
+    reach = np.ceil(NECK_MM / spacing_mm).astype(int)
+    padded = np.pad(body, [(r, r) for r in reach], mode="edge")
+    cores, count = ndimage.label(ndimage.distance_transform_edt(padded, sampling=spacing_mm) > NECK_MM)
+    if count < 2:
+        return body.astype(np.int32)
+    nearest = ndimage.distance_transform_edt(
+        cores == 0, sampling=spacing_mm, return_distances=False, return_indices=True
+    )
+    owner = cores[tuple(nearest)][tuple(slice(r, -r) for r in reach)]
+    return np.asarray(np.where(body, owner, 0), dtype=np.int32)
+
+
+def _spread(owner: NDArray[np.int32], stride: NDArray[np.int_], shape: tuple[int, ...]) -> NDArray[np.int32]:
+    """A sampled array at the full image's voxels."""
+    for axis, times in enumerate(stride):
+        owner = np.repeat(owner, times, axis=axis)
+    return owner[tuple(slice(0, n) for n in shape)]

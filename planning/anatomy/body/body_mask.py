@@ -1,0 +1,154 @@
+"""Which voxels of a CT are the patient: trunk and limbs without table and sheets, solid, lungs and gas included."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from puncture_twin.planning.anatomy.body.detached_parts import (
+    detached_limbs,
+    largest_component,
+    limb_warnings,
+    thick_parts,
+)
+from puncture_twin.planning.anatomy.body.flat_side import FlatSide, flat_sides
+from puncture_twin.planning.base.errors import InputError
+
+BODY_HU = -500.0
+"""Half way between air (-1000) and water (0): where a voxel is half skin, half air."""
+UNSCANNED_HU = -1500.0
+"""Nothing real is less dense than air at -1000; scanners write -2000 or -3024 where they did not look."""
+CIRCLE_PIXELS = 2.0
+"""A circle of reconstruction is drawn to the pixel; the room's air never ends in one."""
+NEARLY_AIR_HU = -900.0
+"""Below this a voxel is air, with its noise."""
+STILL_AIR = 0.9
+"""Where so much of the air has one value, the image has no noise: that of a phantom, not of a scanner."""
+CIRCLE_FILLS = 0.9
+"""Of the image's width and height at least; a smaller disc in constant air may be a round phantom without noise."""
+OUTSIDE_AIR_HU = -940.0
+"""Room air has -1000, inflated lung rarely less than -920: an air region that the border cuts is the room only
+if its median is below this."""
+MIN_OUTSIDE_ML = 50.0
+"""A smaller air region at the border may be bowel gas that the field of view cuts."""
+MIN_BODY_ML = 100.0
+"""Less than a tenth of a newborn's head: something else was found."""
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class BodyMask:
+    """What was found.
+
+    Attributes:
+        body: Shape (nx, ny, nz), the solid body: the trunk, and parts of the patient that do not touch it.
+        unscanned: Same shape, voxels that the scanner did not measure.
+        warnings: What the user should know.
+        flat_sides: Where the body ends in a plane, as a table does that touches it.
+    """
+
+    body: Mask
+    unscanned: Mask
+    warnings: tuple[str, ...]
+    flat_sides: tuple[FlatSide, ...] = ()
+
+
+def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where: str | Path) -> BodyMask:
+    """Finds the patient in a CT.
+
+    Threshold, opening, largest component, and every other component that looks like a limb; then air that each of
+    them encloses in an axial slice is filled, and so is air at the border of the volume that does not look like the
+    room's. Filling too much is the safe side: it turns "air" at the border into "unknown".
+
+    Args:
+        hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient.
+        spacing_mm: Shape (3,).
+        where: For messages.
+
+    Raises:
+        InputError: No body, an implausibly small one, or no air around it.
+    """
+    voxel_ml = float(np.prod(spacing_mm)) / 1000.0
+    dense = hu > BODY_HU
+    solids = thick_parts(dense, spacing_mm)
+    trunk = largest_component(solids == 1)
+    if np.count_nonzero(trunk) * voxel_ml < MIN_BODY_ML:
+        what = f"no body found: {np.count_nonzero(trunk) * voxel_ml:.3g} ml above {BODY_HU:g} HU hold together"
+        raise InputError(
+            what, where=where, allowed=f"a CT in Hounsfield units with at least {MIN_BODY_ML:g} ml of body"
+        )
+    limbs = detached_limbs(hu, solids, spacing_mm)
+    warnings = list(limb_warnings(limbs, trunk, voxel_ml))
+    filled = filled_slices(trunk)
+    for limb in limbs:
+        filled |= filled_slices(limb)
+    body = _with_cut_lungs(filled, hu, voxel_ml, warnings)
+    if body.all():
+        raise InputError("no air around the body", where=where, allowed="a CT that shows the skin somewhere")
+    unscanned = unscanned_voxels(hu)
+    if (ndimage.binary_dilation(body) & unscanned & ~body).any():
+        warnings.append("the scanner's field of view (a circle in the image) cuts the body; no skin is known there")
+    sides = flat_sides(hu - BODY_HU, body, spacing_mm)
+    warnings.extend(side.warning for side in sides)
+    return BodyMask(body, unscanned, tuple(warnings), sides)
+
+
+def unscanned_voxels(hu: NDArray[np.float32]) -> Mask:
+    """Voxels that the scanner did not measure: far below air, or one least value that fills what is outside a circle.
+
+    Many scanners write the value of air, -1024, outside of their circle of reconstruction: what is there is no air. In
+    an image without noise the air inside has the same value, and nothing tells the two apart: then it is air.
+
+    Args:
+        hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient.
+    """
+    unscanned = hu < UNSCANNED_HU
+    measured = hu[~unscanned]
+    if len(measured) == 0:
+        return np.asarray(unscanned)
+    least = measured.min()
+    padding = np.all((hu == least) | unscanned, axis=2)
+    air = hu[(hu < NEARLY_AIR_HU) & ~padding[:, :, None]]
+    noisy = len(air) == 0 or np.mean(air == least) < STILL_AIR
+    if noisy and _outside_a_circle(padding):
+        unscanned = unscanned | padding[:, :, None]
+    return np.asarray(unscanned)
+
+
+def _outside_a_circle(padding: Mask) -> bool:
+    """Whether pixels (nx, ny) are just those outside of a circle that fills the image."""
+    inside = np.argwhere(~padding)
+    if not padding.any() or len(inside) == 0:
+        return False
+    low, high = inside.min(axis=0), inside.max(axis=0)
+    if np.any(high - low + 1 < CIRCLE_FILLS * np.array(padding.shape)):
+        return False
+    middle = (low + high) / 2.0
+    farthest = np.linalg.norm(inside - middle, axis=1).max()
+    nearest = np.linalg.norm(np.argwhere(padding) - middle, axis=1).min()
+    return bool(farthest - nearest < CIRCLE_PIXELS)
+
+
+def filled_slices(mask: Mask) -> Mask:
+    """The mask with every hole filled that it encloses in a slice across axis 2."""
+    return np.stack([ndimage.binary_fill_holes(mask[:, :, k]) for k in range(mask.shape[2])], axis=2)
+
+
+def _with_cut_lungs(body: Mask, hu: NDArray[np.float32], voxel_ml: float, warnings: list[str]) -> Mask:
+    """Fills air regions that are not the room: small ones, and those with the density of lung."""
+    labels, count = ndimage.label(~body)
+    if count == 0:
+        return body
+    numbers = np.arange(1, count + 1)
+    sizes_ml = np.bincount(labels.ravel())[1:] * voxel_ml
+    medians = np.asarray(ndimage.median(hu, labels, numbers))
+    inside = (sizes_ml < MIN_OUTSIDE_ML) | (medians > OUTSIDE_AIR_HU)
+    if inside.any():
+        total = sizes_ml[inside].sum()
+        warnings.append(f"{total:.1f} ml of air at the border of the volume were taken as lung or gas inside the body")
+    return np.asarray(body | np.isin(labels, numbers[inside]))

@@ -1,0 +1,167 @@
+"""The CT of a case as a witness: what it shows outside of the body, and what inside that no structure names."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from puncture_twin.planning.anatomy.body.attached_limbs import attached_limbs
+from puncture_twin.planning.anatomy.body.body_mask import BodyMask, body_mask
+from puncture_twin.planning.anatomy.body.outside_body import (
+    OutsideImage,
+    beyond_body,
+    beyond_flat_sides,
+    joined,
+    outside_surface,
+)
+from puncture_twin.planning.anatomy.second_witness import BodyImage, Named, Unnamed, unnamed_surfaces
+from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces, kept_mesh
+from puncture_twin.planning.base.cache.array_cache import Arrays
+from puncture_twin.planning.formats.labels.label_surface import field_surface
+from puncture_twin.planning.formats.volumes.orientation import Oriented, canonical
+from puncture_twin.planning.formats.volumes.volume_files import parse_header
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.voxelize import voxels_inside
+
+SKIN_TOLERANCE_MM = 3.0
+"""A skin from elsewhere (a label, a mesh) is off the CT's by so much, or by one voxel and a half: nearer to it what is
+dense counts as body. Beyond, it is outside, as an arm is that the skin lacks."""
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A CT beside the skin of its case. Its voxels are decoded only if something is not in the cache.
+
+    Attributes:
+        name: As the case writes it.
+        source: The file.
+        skin: The skin, where it does not come from this CT.
+    """
+
+    name: str
+    source: VolumeSurfaces
+    skin: Skin | None
+
+    def outside(self, air_hu: float) -> TriangleMesh | None:
+        """The surface of what is denser than air outside of the body, LPS mm; None for air alone."""
+
+        def make() -> TriangleMesh | None:
+            ct = self._ct
+            image = OutsideImage(self._hu, self._body, ct.T_ct_index, ct.spacing_mm)
+            found = outside_surface(image, air_hu=air_hu, where=self.source.path)
+            beyond = beyond_flat_sides(image, self._found.flat_sides) if self.skin is None else beyond_body(image)
+            meshes = [*([] if found is None else [found]), *beyond]
+            return joined(meshes) if meshes else None
+
+        return self._kept({"what": "outside", "air_hu": air_hu}, lambda: [make()])[0]
+
+    def attached_limbs(self, target_ct: NDArray[np.float64]) -> TriangleMesh | None:
+        """The surface of limbs that are pressed against the part of the body that holds the target, LPS mm, or None."""
+
+        def make() -> TriangleMesh | None:
+            ct = self._ct
+            at = np.linalg.solve(ct.T_ct_index, np.append(target_ct, 1.0))[:3]
+            limbs = attached_limbs(self._hu, self._body, ct.spacing_mm, at)
+            if not limbs.any():
+                return None
+            return field_surface(limbs.astype(np.float32) - 0.5, ct.T_ct_index, where=self.source.path)
+
+        return self._kept({"what": "attached limbs", "target": target_ct.tolist()}, lambda: [make()])[0]
+
+    def unnamed(self, structures: Sequence[Named], dense_hu: float) -> Unnamed:
+        """What is dense, or gas, inside the body and in no structure.
+
+        Args:
+            structures: Every structure of the case but the skin.
+            dense_hu: From here on a voxel is dense.
+        """
+
+        def make() -> Unnamed:
+            ct = self._ct
+            slack_mm = 0.0 if self.skin is None else 2.0 * self._tolerance_mm
+            image = BodyImage(self._hu, self._body, ct.T_ct_index, ct.spacing_mm, slack_mm)
+            return unnamed_surfaces(image, structures, dense_hu=dense_hu, where=self.source.path)
+
+        named = {"structures": [f"{one.name} {_digest(one.mesh)}" for one in structures]}
+        return Unnamed(*self._kept({"what": "unnamed", "dense_hu": dense_hu, **named}, lambda: list(make())))
+
+    def holds(self, point_ct: NDArray[np.float64]) -> bool:
+        """Whether a point (3,), LPS mm, lies in the image; only the header is read."""
+        header = parse_header(self.source.content, self.source.path)
+        index = np.linalg.solve(header.T_ct_index, np.append(point_ct, 1.0))[:3]
+        return bool(np.all((index >= -0.5) & (index <= np.array(header.shape) - 0.5)))
+
+    def hu_at(self, points_ct: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Hounsfield units of the nearest voxel, NaN outside of the image.
+
+        Args:
+            points_ct: Shape (n, 3), LPS mm.
+        """
+        T = np.linalg.inv(self._ct.T_ct_index)
+        index = np.round(points_ct @ T[:3, :3].T + T[:3, 3]).astype(np.int64)
+        inside = np.all((index >= 0) & (index < self._hu.shape), axis=1)
+        found = np.full(len(points_ct), np.nan)
+        found[inside] = self._hu[tuple(index[inside].T)]
+        return found
+
+    @cached_property
+    def _ct(self) -> Oriented:
+        volume = self.source.volume
+        return canonical(volume.values, volume.T_ct_index)
+
+    @cached_property
+    def _hu(self) -> NDArray[np.float32]:
+        return self._ct.values.astype(np.float32)
+
+    @cached_property
+    def _body(self) -> Mask:
+        """The body's voxels: as found in the CT, or inside the skin that the case gives."""
+        ct = self._ct
+        if self.skin is None:
+            return self._found.body
+        inside = voxels_inside(self.skin.mesh, ct.T_ct_index, ct.values.shape)
+        return np.asarray(ndimage.distance_transform_edt(~inside, sampling=ct.spacing_mm) <= self._tolerance_mm)
+
+    @cached_property
+    def _found(self) -> BodyMask:
+        """The body that this CT shows by itself."""
+        return body_mask(self._hu, self._ct.spacing_mm, where=self.source.path)
+
+    @property
+    def _tolerance_mm(self) -> float:
+        """How far a skin from elsewhere may be off."""
+        return max(SKIN_TOLERANCE_MM, 1.5 * float(self._ct.spacing_mm.max()))
+
+    def _kept(
+        self, made_from: dict[str, Any], make: Callable[[], list[TriangleMesh | None]]
+    ) -> list[TriangleMesh | None]:
+        """Meshes from the cache, made where they are not there; None is kept too."""
+        skin = None if self.skin is None else _digest(self.skin.mesh)
+        made_from = {"skin": skin, **made_from}
+        return _to_meshes(self.source.kept(made_from, lambda: _of_meshes(make()), by=__name__, check=_to_meshes))
+
+
+def _digest(mesh: TriangleMesh) -> str:
+    return hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).hexdigest()
+
+
+def _of_meshes(meshes: list[TriangleMesh | None]) -> Arrays:
+    arrays: Arrays = {"count": np.array(len(meshes))}
+    for number, mesh in enumerate(meshes):
+        if mesh is not None:
+            arrays |= {f"vertices{number}": mesh.vertices, f"faces{number}": mesh.faces}
+    return arrays
+
+
+def _to_meshes(stored: Arrays) -> list[TriangleMesh | None]:
+    return [kept_mesh(stored, n) if f"faces{n}" in stored else None for n in range(int(stored["count"]))]

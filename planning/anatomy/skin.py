@@ -1,0 +1,279 @@
+"""The patient's skin, and where it is not known because the field of view cuts the body."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, body_mask, filled_slices
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.labels.label_surface import field_surface
+from puncture_twin.planning.formats.labels.labelmaps import LabelMap
+from puncture_twin.planning.formats.volumes.orientation import Oriented, canonical
+from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.geometry.creases import split_at_creases
+from puncture_twin.planning.geometry.decimation import decimated
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+HU_RANGE = 500.0
+"""Values further from the threshold say no more about where the surface is: bone under the skin is as inside
+as water."""
+HU_LEAST = 50.0
+"""Keeps every vertex at least 1/11 of a voxel away from voxel centres, so that no triangle is a sliver."""
+BOX_TOLERANCE_MM = 1e-6
+"""Rounding in the position of a box face, relative to coordinates of a metre."""
+
+CUT_PLANE_MM = 0.5
+"""A triangle this close to the plane of a cut belongs to it: half a voxel of a fine scan."""
+FLAT_END_MM2 = 3000.0
+"""No skin is flat and square to the scanner over such an area; even a belly pressed on a table is rounder."""
+OPEN_AIR_MM = 2000.0
+"""Beyond the sides at which a body mesh was not cut there is air, farther than any needle reaches."""
+SIDES: Mapping[str, tuple[int, int]] = MappingProxyType(
+    {"right": (0, 0), "left": (0, 1), "front": (1, 0), "back": (1, 1), "feet": (2, 0), "head": (2, 1)}
+)
+"""The patient's sides: LPS axis, and whether its low (0) or high (1) end."""
+
+Directions = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FieldExit:
+    """Where rays leave the field of view.
+
+    Attributes:
+        depth_mm: Shape (n,), from the origin along the ray.
+        cut: Shape (n,), whether through a face that cuts the body, so that the body may go on there.
+    """
+
+    depth_mm: NDArray[np.float64]
+    cut: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class FieldOfView:
+    """The box that was imaged, up to the outer faces of its border voxels.
+
+    Attributes:
+        T_ct_box: Shape (4, 4), rigid; the box frame's origin is its low corner, its axes run mostly to the
+            patient's left, back and head.
+        size_mm: Shape (3,).
+        cut: Shape (3, 2), which low and high face the body reaches.
+    """
+
+    T_ct_box: NDArray[np.float64]
+    size_mm: NDArray[np.float64]
+    cut: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("T_ct_box", np.float64), ("size_mm", np.float64), ("cut", np.bool_)):
+            array = np.array(getattr(self, name), dtype=dtype)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    def to_box(self, points_ct: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (n, 3) from LPS mm to mm from the box's low corner along its axes."""
+        return np.asarray((points_ct - self.T_ct_box[:3, 3]) @ self.T_ct_box[:3, :3])
+
+    def exit(self, origin_ct: NDArray[np.float64], directions_ct: Directions) -> FieldExit:
+        """Where rays from a point inside the box leave it. An exit on an edge counts for both of its faces.
+
+        Args:
+            origin_ct: Shape (3,), LPS mm.
+            directions_ct: Shape (n, 3), any length but 0.
+
+        Raises:
+            InputError: If the origin lies outside the box, or a direction has no length.
+        """
+        start = self.to_box(np.reshape(origin_ct, (1, 3)))[0]
+        lengths = np.linalg.norm(directions_ct, axis=1, keepdims=True)
+        if not np.all((start >= -BOX_TOLERANCE_MM) & (start <= self.size_mm + BOX_TOLERANCE_MM)):
+            what = f"the point {np.ravel(origin_ct).round(2)} lies outside the image"
+            raise InputError(what, where="field of view", allowed="a point inside the imaged box")
+        if not np.all(np.isfinite(lengths) & (lengths > 0)):
+            raise InputError("a ray without direction", where="field of view", allowed="finite vectors, not 0")
+        rays = (directions_ct / lengths) @ self.T_ct_box[:3, :3]
+        faces = np.where(rays > 0, self.size_mm, 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):  # a ray along a face never reaches it
+            depths = np.where(rays == 0, np.inf, np.maximum((faces - start) / rays, 0.0))
+        depth = depths.min(axis=1)
+        reached = depths <= depth[:, None] + BOX_TOLERANCE_MM
+        cut_ahead = np.where(rays > 0, self.cut[:, 1], self.cut[:, 0])
+        return FieldExit(depth, np.any(reached & cut_ahead, axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """The closed surface of the body, and which of its triangles are skin.
+
+    Attributes:
+        mesh: In LPS mm, normals outward.
+        cut_faces: Shape (m,), triangles that are not skin: there the field of view ends, and the body goes on.
+        field_of_view: What was imaged, or None for a mesh that says nothing of that.
+        warnings: What cannot be known, or was assumed, one sentence each.
+    """
+
+    mesh: TriangleMesh
+    cut_faces: NDArray[np.bool_]
+    field_of_view: FieldOfView | None
+    warnings: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        cut_faces = np.array(self.cut_faces, dtype=np.bool_)
+        cut_faces.setflags(write=False)
+        object.__setattr__(self, "cut_faces", cut_faces)
+
+
+def skin_from_ct(volume: Volume, *, max_deviation_mm: float | None = None) -> Skin:
+    """The body's surface at ``BODY_HU``, between voxels, where air touches the body.
+
+    Every vertex lies between the centres of a voxel inside the body mask and one outside, so the surface is
+    never more than half a voxel (along any axis) from the mask's boundary, like that of a label.
+
+    Args:
+        volume: A CT in Hounsfield units.
+        max_deviation_mm: If given, triangles are merged as long as the two surfaces stay this close (mm).
+
+    Raises:
+        InputError: If no body is found, or no air around it.
+    """
+    oriented = canonical(volume.values, volume.T_ct_index)
+    hu = oriented.values.astype(np.float32)
+    found = body_mask(hu, oriented.spacing_mm, where=volume.path)
+    above = hu - BODY_HU
+    inside = np.clip(np.where(above > 0, above, HU_RANGE), HU_LEAST, HU_RANGE)
+    outside = np.clip(np.where(above < 0, above, -HU_RANGE), -HU_RANGE, -HU_LEAST)
+    return _skin(np.where(found.body, inside, outside), found, oriented, volume.path, max_deviation_mm)
+
+
+def skin_from_label(labelmap: LabelMap, label: int, *, max_deviation_mm: float | None = None) -> Skin:
+    """The outer surface of one label, holes filled in each axial slice (a label may be a shell of skin only).
+
+    Args:
+        labelmap: The map.
+        label: Its body or skin label.
+        max_deviation_mm: As in ``skin_from_ct``.
+
+    Raises:
+        InputError: If no voxel has this label, or every voxel is inside.
+    """
+    where = f"{labelmap.path}, label {label}"
+    if label not in labelmap.boxes:
+        allowed = f"the labels present: {', '.join(map(str, labelmap.labels_present()))}"
+        raise InputError("no voxel has the label of the skin", where=where, allowed=allowed)
+    oriented = canonical(labelmap.labels, labelmap.T_ct_index)
+    body = filled_slices(oriented.values == label)
+    if body.all():
+        raise InputError("no air around the body", where=where, allowed="a label with a border inside the image")
+    found = BodyMask(body, np.zeros_like(body), ())
+    return _skin(np.where(body, 0.5, -0.5), found, oriented, where, max_deviation_mm)
+
+
+def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
+    """A mesh that is the whole skin, or the skin of a body that was cut at some sides.
+
+    Args:
+        mesh: In LPS mm (or the local frame, without cuts).
+        cut: Sides at which the body was cut flat, as `SIDES` names them: there the mesh ends, and the body goes on.
+            Air beside a cut is unknown too, however far away: the box is open to all other sides.
+
+    Raises:
+        InputError: If no triangle lies in the plane where a side was cut.
+    """
+    mesh = split_at_creases(mesh)
+    warnings = (
+        () if mesh.closed else ("the skin mesh is open: what lies inside it, and where it is missing, is not known",)
+    )
+    if not cut:
+        return Skin(mesh, np.zeros(len(mesh.faces), dtype=np.bool_), None, warnings)
+    low, high = mesh.bounds
+    sides = np.zeros((3, 2), dtype=np.bool_)
+    cut_faces = np.zeros(len(mesh.faces), dtype=np.bool_)
+    for name in cut:
+        axis, end = SIDES[name]
+        sides[axis, end] = True
+        in_plane = np.all(np.abs(mesh.triangles[:, :, axis] - (low, high)[end][axis]) < CUT_PLANE_MM, axis=1)
+        if not in_plane.any():
+            raise InputError(f"no flat end at its {name}", where="skin mesh", allowed="a side where the body was cut")
+        cut_faces |= in_plane
+    T_ct_box = np.eye(4)
+    T_ct_box[:3, 3] = np.where(sides[:, 0], low, low - OPEN_AIR_MM)
+    size = np.where(sides[:, 1], high, high + OPEN_AIR_MM) - T_ct_box[:3, 3]
+    view = FieldOfView(T_ct_box, size, sides)
+    return Skin(mesh, cut_faces, view, warnings + _cut_warnings(view))
+
+
+def flat_ends(mesh: TriangleMesh) -> tuple[str, ...]:
+    """The sides at which a surface ends in a plane of its bounding box, as a body does that a scan has cut.
+
+    Args:
+        mesh: In LPS mm.
+    """
+    low, high = mesh.bounds
+    corners = mesh.triangles
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    ends = []
+    for name, (axis, end) in SIDES.items():
+        in_plane = np.all(np.abs(corners[:, :, axis] - (low, high)[end][axis]) < CUT_PLANE_MM, axis=1)
+        if areas[in_plane].sum() > FLAT_END_MM2:
+            ends.append(name)
+    return tuple(ends)
+
+
+def _skin(
+    field: NDArray[np.floating],
+    found: BodyMask,
+    oriented: Oriented,
+    where: str | Path,
+    max_deviation_mm: float | None,
+) -> Skin:
+    mesh = field_surface(field, oriented.T_ct_index, where=where)
+    if max_deviation_mm is not None:
+        mesh = decimated(mesh, max_deviation_mm)
+    view = _field_of_view(found.body, oriented)
+    centres = mesh.triangles.mean(axis=1)
+    cut_faces = _on_cut_border(view, oriented.spacing_mm, centres) | _at_unscanned(found, oriented, centres)
+    return Skin(mesh, cut_faces, view, found.warnings + _cut_warnings(view))
+
+
+def _field_of_view(body: NDArray[np.bool_], oriented: Oriented) -> FieldOfView:
+    spacing = oriented.spacing_mm
+    T_ct_box = np.eye(4)
+    T_ct_box[:3, :3] = oriented.T_ct_index[:3, :3] / spacing
+    T_ct_box[:3, 3] = oriented.T_ct_index[:3, 3] - 0.5 * oriented.T_ct_index[:3, :3].sum(axis=1)
+    cut = [[bool(body.take(side, axis=axis).any()) for side in (0, -1)] for axis in range(3)]
+    return FieldOfView(T_ct_box, spacing * body.shape, np.array(cut))
+
+
+def _on_cut_border(
+    view: FieldOfView, spacing_mm: NDArray[np.float64], centres_ct: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Triangles whose centre is within half a voxel of a face that cuts the body: the cap and its chamfer."""
+    low = view.to_box(centres_ct)
+    from_faces = np.stack([low, view.size_mm - low], axis=2)
+    return np.asarray(np.any((from_faces < 0.5 * spacing_mm[:, None]) & view.cut, axis=(1, 2)))
+
+
+def _at_unscanned(found: BodyMask, oriented: Oriented, centres_ct: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Triangles in whose cell of eight voxels one was not scanned."""
+    T = oriented.T_ct_index
+    index = np.linalg.solve(T[:3, :3], (centres_ct - T[:3, 3]).T).T
+    low = np.floor(index).astype(int)
+    near = np.zeros(len(centres_ct), dtype=np.bool_)
+    for step in itertools.product((0, 1), repeat=3):
+        cell = np.clip(low + step, 0, np.array(found.body.shape) - 1)
+        near |= found.unscanned[tuple(cell.T)] & ~found.body[tuple(cell.T)]
+    return near
+
+
+def _cut_warnings(view: FieldOfView) -> tuple[str, ...]:
+    cut = [name for name, (axis, end) in SIDES.items() if view.cut[axis, end]]
+    if not cut:
+        return ()
+    return (f"the body is cut at its {', '.join(cut)} side: no skin is known there",)

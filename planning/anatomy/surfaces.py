@@ -1,0 +1,129 @@
+"""Surfaces made from volumes, kept in the cache: they cost seconds to make and milliseconds to read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.skin import FieldOfView, Skin, skin_from_ct, skin_from_label
+from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
+from puncture_twin.planning.formats.guard import guard_mesh
+from puncture_twin.planning.formats.labels.label_surface import label_mesh
+from puncture_twin.planning.formats.labels.labelmaps import LabelMap, labelmap_of, segment_names
+from puncture_twin.planning.formats.volumes.volume_files import Volume, parse_header, parse_volume
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+LABELS_PRESENT = "labels present"
+
+
+@dataclass(frozen=True)
+class VolumeSurfaces:
+    """The surfaces of one label map or CT. Its voxels are decoded only if something is not in the cache.
+
+    Attributes:
+        path: The volume's name.
+        content: The file that was named.
+        data: The file that it names for its voxels, or None.
+        sha256: Of content and data.
+        cache: Where surfaces are kept.
+    """
+
+    path: Path
+    content: bytes
+    data: bytes | None
+    sha256: tuple[str, ...]
+    cache: Cache
+
+    @cached_property
+    def volume(self) -> Volume:
+        """The volume itself."""
+        return parse_volume(self.content, self.path, self.data)
+
+    @cached_property
+    def labelmap(self) -> LabelMap:
+        """The label map itself."""
+        return labelmap_of(self.volume)
+
+    @property
+    def names(self) -> dict[int, str] | None:
+        """The names that the file holds for its labels."""
+        return segment_names(parse_header(self.content, self.path).fields, self.path)
+
+    def labels_present(self) -> tuple[int, ...]:
+        """The labels that have a voxel, ascending."""
+        stored = self._arrays(LABELS_PRESENT, lambda: {"labels": np.array(self.labelmap.labels_present(), np.int64)})
+        return tuple(int(label) for label in stored["labels"])
+
+    def label(self, label: int) -> TriangleMesh:
+        """The surface of one label, LPS mm."""
+        stored = self._arrays(f"label {label}", lambda: _of_mesh(label_mesh(self.labelmap, label, where=self.path)))
+        return kept_mesh(stored)
+
+    def skin_of_label(self, label: int) -> Skin:
+        """The skin of a label that is the body."""
+        return _to_skin(self._arrays(f"skin {label}", lambda: _of_skin(skin_from_label(self.labelmap, label))))
+
+    def skin_of_ct(self) -> Skin:
+        """The skin of the body found in a CT."""
+        return _to_skin(self._arrays("skin", lambda: _of_skin(skin_from_ct(self.volume))))
+
+    def kept(
+        self,
+        made_from: Mapping[str, Any],
+        make: Callable[[], Arrays],
+        *,
+        by: str,
+        check: Callable[[Arrays], object] | None = None,
+    ) -> Arrays:
+        """Arrays that are made from this file and from what ``made_from`` says; see `Cache.arrays`."""
+        return self.cache.arrays({"files": self.sha256, **made_from}, make, by=by, check=check)
+
+    def _arrays(self, what: str, make: Callable[[], Arrays]) -> Arrays:
+        check = _to_skin if what.startswith("skin") else _check_labels if what == LABELS_PRESENT else kept_mesh
+        return self.kept({"what": what}, make, by=__name__, check=check)
+
+
+def _of_mesh(mesh: TriangleMesh) -> Arrays:
+    return {"vertices": mesh.vertices, "faces": mesh.faces}
+
+
+def _of_skin(skin: Skin) -> Arrays:
+    view = skin.field_of_view
+    box = {} if view is None else {"T_ct_box": view.T_ct_box, "size_mm": view.size_mm, "cut": view.cut}
+    warnings = np.array(skin.warnings, dtype=np.str_)
+    return {**_of_mesh(skin.mesh), **box, "cut_faces": skin.cut_faces, "warnings": warnings}
+
+
+def _to_skin(stored: Arrays) -> Skin:
+    view = FieldOfView(stored["T_ct_box"], stored["size_mm"], stored["cut"]) if "T_ct_box" in stored else None
+    mesh, cut_faces = kept_mesh(stored), stored["cut_faces"]
+    if cut_faces.shape != (len(mesh.faces),):
+        raise ValueError("one flag for each triangle")
+    return Skin(mesh, cut_faces, view, tuple(str(warning) for warning in stored["warnings"]))
+
+
+def kept_mesh(stored: Arrays, number: int | str = "") -> TriangleMesh:
+    """A surface, which went through the guard before it was stored, and does again: kept files may be anything.
+
+    Args:
+        stored: With ``vertices`` and ``faces``.
+        number: Behind these two names, where there are several.
+
+    Raises:
+        KeyError, TypeError, InputError: It is none.
+    """
+    vertices, faces = stored[f"vertices{number}"], stored[f"faces{number}"]
+    if vertices.dtype != np.float64 or faces.dtype != np.int32:
+        raise TypeError("a mesh of other types than ours")
+    return guard_mesh(vertices, faces, where="cache")
+
+
+def _check_labels(stored: Arrays) -> None:
+    labels = stored["labels"]
+    if labels.ndim != 1 or labels.dtype != np.int64 or not len(labels):
+        raise ValueError("a list of labels")

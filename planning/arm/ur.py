@@ -1,0 +1,140 @@
+"""The UR family as data: link lengths, joint limits and speeds of each model.
+
+Source of the Denavit-Hartenberg numbers: Universal Robots, "DH parameters for calculations of kinematics and
+dynamics"; joint ranges and speeds: the data sheets. An old manual prints d1 = 118 mm for the UR3: wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+
+ELBOW = 2
+"""Index of the elbow among the six joints."""
+
+DEFAULT_MAX_ACCELERATION = 1.4
+"""rad/s^2: what the controller itself takes for a joint move when the program names none (URScript ``movej``)."""
+
+
+@dataclass(frozen=True, eq=False)
+class UrModel:
+    """One arm of the family. Lengths in mm, angles in rad.
+
+    Attributes:
+        name: Such as ``ur3``.
+        d1: Height of the shoulder axis above the base, mm.
+        a2: Upper arm, mm, negative as in the DH table.
+        a3: Forearm, mm, negative as in the DH table.
+        d4: Sideways offset of the wrist, mm.
+        d5: From wrist 1 to wrist 2, mm.
+        d6: From wrist 2 to the flange, mm.
+        joint_limits: Shape (6, 2), rad: lowest and highest angle of each joint.
+        max_speeds: Shape (6,), rad/s.
+        max_acceleration: rad/s^2, for every joint.
+    """
+
+    name: str
+    d1: float
+    a2: float
+    a3: float
+    d4: float
+    d5: float
+    d6: float
+    joint_limits: NDArray[np.float64]
+    max_speeds: NDArray[np.float64]
+    max_acceleration: float = DEFAULT_MAX_ACCELERATION
+
+    def __post_init__(self) -> None:
+        for name in ("joint_limits", "max_speeds"):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @property
+    def a(self) -> tuple[float, ...]:
+        """DH link lengths a1..a6, mm."""
+        return (0.0, self.a2, self.a3, 0.0, 0.0, 0.0)
+
+    @property
+    def d(self) -> tuple[float, ...]:
+        """DH link offsets d1..d6, mm."""
+        return (self.d1, 0.0, 0.0, self.d4, self.d5, self.d6)
+
+    @property
+    def alpha(self) -> tuple[float, ...]:
+        """DH link twists, rad: the same for the whole family."""
+        return (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
+
+    @cached_property
+    def lengths(self) -> NDArray[np.float64]:
+        """(d1, a2, a3, d4, d5, d6), shape (6,), mm: the arm as compiled code takes it."""
+        lengths = np.array([self.d1, self.a2, self.a3, self.d4, self.d5, self.d6])
+        lengths.setflags(write=False)
+        return lengths
+
+    @property
+    def shoulder_base(self) -> NDArray[np.float64]:
+        """The shoulder point, where axes 1 and 2 meet, base frame, shape (3,), mm."""
+        return np.array([0.0, 0.0, self.d1])
+
+    def within_limits(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether each configuration keeps every joint within its limits.
+
+        Args:
+            q: Shape (..., 6), rad. NaN is outside.
+
+        Returns:
+            Shape (...).
+        """
+        return np.asarray(np.all((q >= self.joint_limits[:, 0]) & (q <= self.joint_limits[:, 1]), axis=-1))
+
+
+def _model(name: str, lengths_mm: tuple[float, ...], max_speeds_deg: tuple[float, ...]) -> UrModel:
+    d1, a2, a3, d4, d5, d6 = lengths_mm
+    turns = np.full(6, 2 * math.pi)
+    turns[ELBOW] = math.pi
+    limits = np.stack([-turns, turns], axis=1)
+    return UrModel(name, d1, a2, a3, d4, d5, d6, joint_limits=limits, max_speeds=np.radians(max_speeds_deg))
+
+
+_SMALL = (180.0, 180.0, 180.0, 360.0, 360.0, 360.0)
+_MEDIUM = (180.0,) * 6
+_LARGE = (120.0, 120.0, 180.0, 180.0, 180.0, 180.0)
+
+UR_MODELS: Mapping[str, UrModel] = MappingProxyType(
+    {
+        model.name: model
+        for model in (
+            _model("ur3", (151.9, -243.65, -213.25, 112.35, 85.35, 81.9), _SMALL),
+            _model("ur3e", (151.85, -243.55, -213.2, 131.05, 85.35, 92.1), _SMALL),
+            _model("ur5", (89.159, -425.0, -392.25, 109.15, 94.65, 82.3), _MEDIUM),
+            _model("ur5e", (162.5, -425.0, -392.2, 133.3, 99.7, 99.6), _MEDIUM),
+            _model("ur10", (127.3, -612.0, -572.3, 163.941, 115.7, 92.2), _LARGE),
+            _model("ur10e", (180.7, -612.7, -571.55, 174.15, 119.85, 116.55), _LARGE),
+        )
+    }
+)
+"""Every model that the planner knows, by name."""
+
+
+def ur_model(name: str) -> UrModel:
+    """The model of that name.
+
+    Args:
+        name: Such as ``ur3``; upper case is accepted.
+
+    Raises:
+        InputError: If no such model is known.
+    """
+    model = UR_MODELS.get(name.lower())
+    if model is None:
+        raise InputError(f"unknown robot model {name!r}", where="robot model", allowed=", ".join(UR_MODELS))
+    return model

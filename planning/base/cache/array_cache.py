@@ -1,0 +1,145 @@
+"""Arrays that cost time to make, kept by the hash of what they were made from and of the code that made them.
+
+The folder may be deleted at any time. An entry is used only if its digest covers its content and its key: the hashes
+of all inputs, the parameters, the source of the module that makes it with all that it imports, and the versions of the
+libraries. Anything else is made anew and replaced, and a `CacheWarning` says so.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from puncture_twin.planning.base.cache.cache_folder import Entry, store, touch
+from puncture_twin.planning.base.cache.entry_file import Arrays, DamagedError, packed, read_plain_file, unpacked
+from puncture_twin.planning.base.cache.source_stamp import library_versions, source_stamp
+from puncture_twin.planning.base.errors import CacheWarning, InputError
+
+__all__ = ["NO_CACHE", "Arrays", "Cache", "user_cache"]
+
+FOLDER_VARIABLE = "PUNCTURE_TWIN_CACHE"
+"""Environment variable that names the folder; empty switches the cache off."""
+
+SIZE_VARIABLE = "PUNCTURE_TWIN_CACHE_MB"
+"""Environment variable with the most megabytes (of 1,000,000 bytes) that the folder may hold."""
+
+MOST_BYTES = 2_000_000_000
+"""Where it says nothing: the surfaces of some twenty whole bodies."""
+
+LIBRARIES = ("puncture-twin", "numpy", "scipy", "scikit-image", "numba", "python-fcl", "trimesh", "fast-simplification")
+"""Whose versions decide what is made."""
+
+
+@dataclass(frozen=True)
+class Cache:
+    """A folder of arrays, or no folder at all.
+
+    Attributes:
+        folder: Where; None makes everything anew each time.
+        most_bytes: What it may hold.
+    """
+
+    folder: Path | None
+    most_bytes: int = MOST_BYTES
+
+    def arrays(
+        self,
+        made_from: Mapping[str, Any],
+        make: Callable[[], Arrays],
+        *,
+        by: str,
+        check: Callable[[Arrays], object] | None = None,
+    ) -> Arrays:
+        """The arrays that ``make`` gives, from the folder if they are there and whole.
+
+        Args:
+            made_from: Everything that decides the result: hashes of inputs, labels, options. Plain values.
+            make: Makes the arrays.
+            by: The module whose code makes them, such as ``puncture_twin.planning.anatomy.surfaces``.
+            check: Raises ValueError, KeyError, TypeError or InputError for arrays that cannot be what ``make`` gives.
+        """
+        if self.folder is None:
+            return make()
+        entry = _entry(made_from, by)
+        found = _kept(self.folder / entry.file, entry.key, check)
+        if found is None:
+            found = make()
+            self._store(entry, found)
+        return found
+
+    def _store(self, entry: Entry, arrays: Arrays) -> None:
+        """Store the arrays; a folder that cannot be written to costs time, not the result."""
+        assert self.folder is not None  # the caller has asked
+        try:
+            store(self.folder, entry, packed(arrays, entry.key), self.most_bytes)
+        except (OSError, InputError):
+            return
+
+
+NO_CACHE = Cache(None)
+"""Makes everything anew."""
+
+
+def user_cache() -> Cache:
+    """This user's cache: ``$PUNCTURE_TWIN_CACHE``, else ``puncture-twin`` under ``$XDG_CACHE_HOME`` or ``~/.cache``.
+
+    Raises:
+        InputError: ``$PUNCTURE_TWIN_CACHE_MB`` is no number.
+    """
+    named = os.environ.get(FOLDER_VARIABLE)
+    if named is not None:
+        return Cache(Path(named) if named else None, _most_bytes())
+    base = os.environ.get("XDG_CACHE_HOME")
+    return Cache((Path(base) if base else Path.home() / ".cache") / "puncture-twin", _most_bytes())
+
+
+def _most_bytes() -> int:
+    stated = os.environ.get(SIZE_VARIABLE)
+    if not stated:
+        return MOST_BYTES
+    if not (stated.isascii() and stated.isdigit() and len(stated) < 10):
+        raise InputError(
+            f"{stated[:40]!r} is no size", where=f"${SIZE_VARIABLE}", allowed="whole megabytes, such as 2000"
+        )
+    return int(stated) * 1_000_000
+
+
+def _entry(made_from: Mapping[str, Any], by: str) -> Entry:
+    generation = _generation(by)
+    key = hashlib.sha256(json.dumps({"generation": generation, **made_from}, sort_keys=True).encode()).hexdigest()
+    return Entry(by, generation[:16], key)
+
+
+@cache
+def _generation(by: str) -> str:
+    """Of all code that a module's results depend on, as a hash; reading it takes milliseconds, so once a process."""
+    parts = {
+        "source": source_stamp(by),
+        "python": platform.python_version(),
+        **library_versions(LIBRARIES),
+    }
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def _kept(path: Path, key: str, check: Callable[[Arrays], object] | None) -> Arrays | None:
+    """The arrays of an entry, or None where it is not there or, which is said, not to be trusted."""
+    try:
+        arrays = unpacked(read_plain_file(path), key)
+        if check is not None:
+            check(arrays)
+    except FileNotFoundError:
+        return None
+    except (DamagedError, ValueError, KeyError, TypeError, InputError) as error:
+        why = error if isinstance(error, DamagedError) else "does not hold what it should"
+        warnings.warn(f"cache: a kept result {why}; it is made anew and replaced", CacheWarning, stacklevel=1)
+        return None
+    touch(path)
+    return arrays

@@ -1,0 +1,81 @@
+"""Where numba keeps compiled kernels, and when it must not trust them: when any kernel's source has changed.
+
+Numba stamps what it has compiled with the source of the function's own file. A kernel that takes in another file's
+kernel would be reused after an edit of that file alone, and a search would go on judging by the old rule. Kernels of
+this project are stamped with the sources of all of them instead.
+
+The classes are numba's own places, tried in numba's own order; `CACHE_LOCATOR_CLASSES` is its setting for others'.
+Files outside the project are left to numba.
+"""
+
+# mypy: disable-error-code="no-untyped-call, misc"
+# numba has no types
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from numba.core import config as numba_config
+from numba.core.caching import InTreeCacheLocator, UserProvidedCacheLocator, UserWideCacheLocator
+
+from puncture_twin.planning.base.cache.kernel_files import ProjectStamp, use_checked_files
+from puncture_twin.planning.base.cache.source_stamp import PACKAGE, PARTS, library_versions, stamp_of
+
+config: Any = numba_config
+"""It makes its attributes when it is loaded."""
+
+COMPILERS = ("numba", "llvmlite", "numpy")
+"""Whose versions decide what is compiled."""
+
+NUMBAS = (
+    "UserProvidedCacheLocator",
+    "InTreeCacheLocator",
+    "UserWideCacheLocator",
+    "IPythonCacheLocator",
+    "ZipCacheLocator",
+)
+"""What numba tries where nothing is set."""
+
+
+@cache
+def kernels_stamp() -> ProjectStamp:
+    """A hash of every source file of the project that speaks of numba, and of all that they import from the project.
+
+    What they import counts too: numba freezes a constant into the kernel that names it. So do the compilers' versions.
+    """
+    files = [path for part in PARTS for path in (PACKAGE / part).rglob("*.py") if b"numba" in path.read_bytes()]
+    return ProjectStamp(f"{stamp_of(files)} {library_versions(COMPILERS)}")
+
+
+class _OfTheProject:
+    """Of two bases, the one that comes first: takes the project's files only, and stamps them with all kernels."""
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> Any:
+        ours = any(Path(py_file).resolve().is_relative_to((PACKAGE / part).resolve()) for part in PARTS)
+        return super().from_function(py_func, py_file) if ours else None
+
+    def get_source_stamp(self) -> ProjectStamp:
+        return kernels_stamp()
+
+
+class SetFolder(_OfTheProject, UserProvidedCacheLocator):
+    """In the folder that NUMBA_CACHE_DIR names."""
+
+
+class BesideSource(_OfTheProject, InTreeCacheLocator):
+    """In ``__pycache__``."""
+
+
+class UserFolder(_OfTheProject, UserWideCacheLocator):
+    """In the user's cache folder, where the source's folder cannot be written."""
+
+
+def use_kernel_cache() -> None:
+    """Let numba try these places first; a user's own setting stays in force behind them."""
+    ours = [f"{__name__}.{place.__name__}" for place in (SetFolder, BesideSource, UserFolder)]
+    theirs = config.CACHE_LOCATOR_CLASSES.split(",") if config.CACHE_LOCATOR_CLASSES else list(NUMBAS)
+    use_checked_files()
+    config.CACHE_LOCATOR_CLASSES = ",".join([*ours, *(place for place in theirs if place not in ours)])

@@ -1,0 +1,152 @@
+"""Numba's files of compiled kernels, behind digests: what is cut, damaged or swapped is compiled anew.
+
+Numba reads its files as pickles and runs the machine code in them without a check. Each file here starts with a digest
+of its name, its stamp and its content, which is checked before anything is unpickled.
+"""
+
+# mypy: disable-error-code="no-untyped-call, misc"
+# numba has no types
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import itertools
+import pickle
+import re
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+from numba.core import caching
+
+from puncture_twin.planning.base.cache.entry_file import DamagedError, read_plain_file
+from puncture_twin.planning.base.errors import CacheWarning
+
+NumbasFiles: Any = caching.IndexDataCacheFile
+"""Numba's own reader and writer of an index and its data files."""
+
+MAGIC = b"puncture-twin kernel 1\n"
+DIGEST_BYTES = 32
+OWN = ".checked"
+"""In the names of these files, so that numba's own, which have no digest, are never taken for them."""
+
+FUNCTION = re.compile(r"(?P<name>.*)-\d+\.py\w+\.checked")
+"""A file's name without its ending: the function, its line, the Python version."""
+
+
+class ProjectStamp(str):
+    """Of the sources of all kernels of this project; numba's own stamps are of one file's age and size."""
+
+    __slots__ = ()
+
+
+class CheckedFiles(NumbasFiles):
+    """The index and the data files of one function, each behind a digest."""
+
+    def __init__(self, cache_path: str, filename_base: str, source_stamp: ProjectStamp) -> None:
+        super().__init__(cache_path=cache_path, filename_base=filename_base + OWN, source_stamp=source_stamp)
+        self._folder = Path(cache_path)
+        self._base = filename_base + OWN
+
+    def load(self, key: Any) -> Any:
+        """What was saved under a key, or None."""
+        name = self._load_index().get(key)
+        content = None if name is None else self._content(name)
+        if content is None:
+            return None
+        stated, data = pickle.loads(content)
+        return data if stated == key else None
+
+    def save(self, key: Any, data: Any) -> None:
+        """Save under a key; a folder that cannot be written to costs time, not the result."""
+        overloads = self._load_index(say=False)
+        taken = set(overloads.values())
+        free = (self._data_name(number) for number in itertools.count(1))
+        name = overloads.get(key) or next(name for name in free if name not in taken)
+        try:
+            self._write(name, self._dump((key, data)))
+            self._save_index({**overloads, key: name})
+            self._remove_older()
+        except OSError:
+            return
+
+    def _load_index(self, *, say: bool = True) -> dict[Any, str]:
+        content = self._content(self._index_name, say=say)
+        return {} if content is None else pickle.loads(content)
+
+    def _save_index(self, overloads: dict[Any, str]) -> None:
+        self._write(self._index_name, self._dump(overloads))
+
+    def _content(self, name: str, *, say: bool = True) -> bytes | None:
+        """The content of a file, or None where it is not there, of other sources or, which is said, not whole."""
+        try:
+            stored = read_plain_file(self._folder / name)
+        except FileNotFoundError:
+            return None
+        except DamagedError as error:
+            _say(str(error), say)
+            return None
+        stamp, digest, content = _split(stored)
+        if digest != _digest(name, stamp, content):
+            _say("is cut, damaged, or another's", say)
+            return None
+        return content if stamp == self._stamp else None
+
+    @property
+    def _stamp(self) -> bytes:
+        return hashlib.sha256(str(self._source_stamp).encode()).digest()
+
+    def _write(self, name: str, content: bytes) -> None:
+        path = self._folder / name
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        with self._open_for_write(str(path)) as stream:
+            stream.write(MAGIC + self._stamp + _digest(name, self._stamp, content) + content)
+
+    def _remove_older(self) -> None:
+        """Remove what the same function has left at other lines and under other sources."""
+        function = FUNCTION.fullmatch(self._base)
+        if function is None:
+            return
+        for index in self._folder.glob(f"{glob.escape(function['name'])}-*.nbi"):
+            if index.name != self._index_name and not self._current(index):
+                for file in (index, *self._folder.glob(f"{glob.escape(index.stem)}.*.nbc")):
+                    file.unlink(missing_ok=True)
+
+    def _current(self, index: Path) -> bool:
+        try:
+            return _split(read_plain_file(index))[0] == self._stamp
+        except (FileNotFoundError, DamagedError):
+            return False
+
+
+def _split(stored: bytes) -> tuple[bytes, bytes, bytes]:
+    """Stamp, digest and content of a file; no digest where it is none of these files."""
+    if not stored.startswith(MAGIC):
+        return b"", b"", b""
+    stamp, digest, content = (len(MAGIC) + DIGEST_BYTES * parts for parts in range(3))
+    return stored[stamp:digest], stored[digest:content], stored[content:]
+
+
+def _digest(name: str, stamp: bytes, content: bytes) -> bytes:
+    digest = hashlib.sha256(name.encode() + b"\n" + stamp)
+    digest.update(content)
+    return digest.digest()
+
+
+def _say(why: str, say: bool) -> None:
+    if say:
+        warnings.warn(f"cache: a compiled kernel {why}; it is compiled anew and replaced", CacheWarning, stacklevel=1)
+
+
+def use_checked_files() -> None:
+    """Let numba keep this project's kernels in such files, and all others in its own."""
+    numbas: Any = caching  # its attribute is a class; what stands in for it makes an object of one of two
+    numbas.IndexDataCacheFile = _files
+
+
+def _files(cache_path: str, filename_base: str, source_stamp: Any) -> Any:
+    kind = CheckedFiles if isinstance(source_stamp, ProjectStamp) else NumbasFiles
+    return kind(cache_path=cache_path, filename_base=filename_base, source_stamp=source_stamp)

@@ -1,0 +1,120 @@
+"""Files: content hashes, and writing that leaves either the whole file or nothing."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from puncture_twin.planning.base.errors import InputError
+
+OUTPUT_NAMES = (
+    "manifest.json",
+    "timings.json",
+    "candidates.parquet",
+    "certificate.json",
+    "map.png",
+    "scene.png",
+    "report.html",
+    "plan.json",
+    "rehearsal.json",
+    "rehearsal.mp4",
+    "batch.csv",
+    "placements.csv",
+    "place.json",
+    "placements.png",
+    "map_best_place.png",
+    "calibration.json",
+    "recording.csv",
+    "bmode.png",
+    "room.png",
+    "servo.html",
+    "convergence.png",
+    "camera_1.png",
+    "camera_2.png",
+)
+"""The files that commands write into their output folder."""
+
+
+def sha256(path: Path) -> str:
+    """Hexadecimal SHA-256 of a file's bytes.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed="a readable file") from error
+
+
+def is_plain_file(path: Path) -> bool:
+    """Whether a file is there; also of a name too long, or with a NUL in it, for which the system raises."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """Whether a folder is there, whatever its name."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside ``path``; move it there when the block ends without an exception.
+
+    Raises:
+        InputError: Nothing can be created in that folder.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    except OSError as error:
+        what = f"cannot be written ({error.strerror})"
+        raise InputError(what, where=_shown(path), allowed="a folder that may be written to") from error
+    os.close(handle)
+    temporary = Path(name)
+    temporary.chmod(0o644)
+    try:
+        yield temporary
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def check_writable(folder: Path) -> Path:
+    """Refuse a folder into which nothing can be written, before any work is done; nothing is created.
+
+    Raises:
+        InputError: The name cannot be used, something else stands there, or it may not be written to.
+    """
+    allowed = "a folder that may be written to, or the name of a new one"
+    try:
+        str(folder).encode("utf-8")
+        nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists() or place.is_symlink())
+        usable = nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK) and _room_for_names(nearest, folder)
+    except (OSError, ValueError) as error:
+        raise InputError(f"output folder cannot be used ({error})", where=_shown(folder), allowed=allowed) from error
+    if not usable:
+        raise InputError("output folder cannot be written to", where=_shown(folder), allowed=allowed)
+    return folder
+
+
+def _room_for_names(nearest: Path, folder: Path) -> bool:
+    """Whether every part of the name fits the file system, and no folder of a file's name is in the way."""
+    longest = os.pathconf(nearest, "PC_NAME_MAX")
+    names = all(len(part.encode()) <= longest for part in folder.parts)
+    return names and not any((folder / name).is_dir() for name in OUTPUT_NAMES)
+
+
+def _shown(path: Path) -> str:
+    return str(path).encode("utf-8", "replace").decode("utf-8")[:200]

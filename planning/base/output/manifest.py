@@ -1,0 +1,215 @@
+"""What an output folder holds, written down beside it: ``manifest.json``, an entry a command, and who may read by it.
+
+A file belongs to the folder's set only if the manifest lists it with the hash of its bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
+
+MANIFEST_NAME = "manifest.json"
+TIMINGS_NAME = "timings.json"
+"""Wall times and dates of the runs: the one file of a set whose bytes differ from run to run, listed without a hash."""
+
+FORMAT = "puncture-twin output set"
+"""Tells this manifest from any other ``manifest.json``."""
+
+LAYOUT = 1
+"""Version of the manifest's layout."""
+
+MAX_MANIFEST_BYTES = 50_000_000
+"""A line for each of a hundred thousand files; a larger one is something else."""
+
+ANOTHER_FOLDER = "another output folder, or this one without that file"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What one command wrote.
+
+    Attributes:
+        version: Of this package.
+        inputs: Every file that decided the result, with role and hash.
+        depends_on: Entries of the same folder without which this one means nothing.
+        files: File name, relative to the folder with ``/``, to SHA-256.
+    """
+
+    version: str
+    inputs: tuple[Input, ...]
+    depends_on: tuple[str, ...]
+    files: Mapping[str, str]
+
+    def document(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "version": self.version,
+            "inputs": inputs_document(self.inputs),
+            "depends_on": list(self.depends_on),
+            "files": dict(self.files),
+        }
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The entries of a folder, and the names that an unfinished run may have left there.
+
+    Attributes:
+        entries: Name of the command to what it wrote.
+        unfinished: Files that belong to no entry any more, or not yet; the next run removes them.
+    """
+
+    entries: Mapping[str, Entry]
+    unfinished: tuple[str, ...] = ()
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Every listed file and its SHA-256."""
+        return {name: digest for entry in self.entries.values() for name, digest in entry.files.items()}
+
+    def owner(self, name: str) -> str | None:
+        """The entry that lists a file, or None."""
+        return next((key for key, entry in self.entries.items() if name in entry.files), None)
+
+    def text(self) -> str:
+        """As it is written: the same entries give the same bytes."""
+        document = {
+            "format": FORMAT,
+            "layout": LAYOUT,
+            "entries": {name: entry.document() for name, entry in self.entries.items()},
+            "unfinished": list(self.unfinished),
+            "not_hashed": [TIMINGS_NAME],
+        }
+        return json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n"
+
+
+class Output(NamedTuple):
+    """A file that some command wrote, read once."""
+
+    path: Path
+    data: bytes
+    sha256: str
+    note: str
+    """A warning where the file lies outside of any set, else empty."""
+
+    def input(self, role: str) -> Input:
+        """As an input of what is made from it."""
+        return Input(role, self.path.name, self.sha256)
+
+
+def read_output(path: Path, *, max_bytes: int) -> Output:
+    """Read what an earlier command wrote, and refuse it where its folder's manifest tells otherwise.
+
+    Args:
+        path: The file.
+        max_bytes: A larger file is something else.
+
+    Raises:
+        InputError: It cannot be read, is too large, or lies in a set that does not list these bytes: the set is
+            unfinished, or the file was edited.
+    """
+    data = read_input(path, max_bytes=max_bytes, where=str(path))
+    digest = hashlib.sha256(data).hexdigest()
+    home = path.resolve()
+    manifest = _set_of(home.parent)
+    if manifest is None:
+        return Output(path, data, digest, f"{path} lies outside of any output set: nothing tells whether it is whole")
+    if manifest.files.get(home.name) != digest:
+        wrong = "is not listed" if home.name not in manifest.files else "has other bytes than are listed"
+        raise InputError(
+            f"{wrong} in {MANIFEST_NAME} beside it: the folder's set is unfinished, or the file was edited",
+            where=path,
+            allowed="what the command wrote: run it again",
+        )
+    return Output(path, data, digest, "")
+
+
+def problems(folder: Path) -> tuple[str, ...]:
+    """What keeps a folder from being one whole set, a sentence each; empty if nothing does.
+
+    Raises:
+        InputError: The manifest cannot be read, or is another program's.
+    """
+    manifest = read_manifest(folder)
+    if manifest is None:
+        return (f"{MANIFEST_NAME} is missing",)
+    found = [f"{name} is left over from an unfinished run" for name in manifest.unfinished if (folder / name).exists()]
+    for name, digest in manifest.files.items():
+        path = folder / name
+        if not path.is_file():
+            found.append(f"{name} is missing")
+        elif file_digest(path) != digest:
+            found.append(f"{name} has other bytes than are listed")
+    return tuple(found)
+
+
+def read_manifest(folder: Path) -> Manifest | None:
+    """A folder's manifest; None where there is none.
+
+    Raises:
+        InputError: It cannot be read, is damaged, or is another program's.
+    """
+    path = folder / MANIFEST_NAME
+    if not path.exists():
+        return None
+    document = _document(path)
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise InputError("is not that of an output folder", where=path, allowed=ANOTHER_FOLDER)
+    try:
+        return _manifest(document)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"is damaged ({error})", where=path, allowed=ANOTHER_FOLDER) from error
+
+
+def file_digest(path: Path) -> str:
+    """Hexadecimal SHA-256 of a file's bytes."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _set_of(folder: Path) -> Manifest | None:
+    """The manifest of the set in a folder; None where there is none, or another program's."""
+    path = folder / MANIFEST_NAME
+    if path.exists():
+        document = _document(path)
+        if isinstance(document, dict) and document.get("format") == FORMAT:
+            return read_manifest(folder)
+    return None
+
+
+def _document(path: Path) -> Any:
+    data = read_input(path, max_bytes=MAX_MANIFEST_BYTES, where=str(path))
+    try:
+        return json.loads(data.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"is damaged ({error})", where=path, allowed=ANOTHER_FOLDER) from error
+
+
+def _manifest(document: dict[str, Any]) -> Manifest:
+    if document["layout"] != LAYOUT:
+        raise ValueError(f"layout {document['layout']}")
+    entries = {str(name): _entry(entry) for name, entry in document["entries"].items()}
+    return Manifest(MappingProxyType(entries), tuple(map(_name, document["unfinished"])))
+
+
+def _entry(document: dict[str, Any]) -> Entry:
+    files = {_name(name): str(digest) for name, digest in document["files"].items()}
+    depends_on = tuple(str(name) for name in document["depends_on"])
+    return Entry(str(document["version"]), read_inputs(document["inputs"]), depends_on, MappingProxyType(files))
+
+
+def _name(name: Any) -> str:
+    """A file's name that stays within the folder: what a manifest lists is removed one day."""
+    parts = PurePosixPath(name).parts
+    if not parts or "\\" in name or name != "/".join(parts) or {"..", "/", "."} & set(parts):
+        raise ValueError(f"the name {name!r}")
+    return str(name)

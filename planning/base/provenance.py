@@ -1,0 +1,162 @@
+"""What a result was made from: every file once, with its role and the hash of the bytes that were parsed.
+
+A path may name other bytes a moment later. So a file is read once, its hash is that of the bytes in memory, and
+whoever parses the file parses those bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import posixpath
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.input_file import read_input
+
+CASE_ROLE = "case"
+"""The file that names the others; what it is called decides nothing."""
+
+KEPT_BYTES = 10_000_000
+"""Files up to this size stay in memory with their case: points and names. Volumes are let go of once parsed."""
+
+
+@dataclass(frozen=True, order=True)
+class Input:
+    """A file that decided a result.
+
+    Attributes:
+        role: What it is to the result: ``case``, ``mesh liver``, ``labelmap``, ``labelmap data``, ``markers_ct``, ...
+        path: As the file that names it states it, relative to the case's folder.
+        sha256: Hexadecimal, of the bytes that were read.
+    """
+
+    role: str
+    path: str
+    sha256: str
+
+
+def inputs_document(inputs: Iterable[Input]) -> list[dict[str, str]]:
+    """The list that every result carries: role, path and sha256 of each file, as plain values."""
+    return [asdict(one) for one in inputs]
+
+
+def read_inputs(document: Any) -> tuple[Input, ...]:
+    """The list of a result that was read from a file.
+
+    Raises:
+        TypeError, KeyError, ValueError: It is no such list.
+    """
+    if not isinstance(document, list):
+        raise TypeError("inputs is no list")
+    return tuple(Input(*(_text(one[key]) for key in ("role", "path", "sha256"))) for one in document)
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} is no text")
+    return value
+
+
+def differing_input(stated: Sequence[Input], known: Sequence[Input]) -> str | None:
+    """The first input in which two lists differ, as its role and path; None where both list the same files.
+
+    The order does not matter, nor how a path is written (``./a.csv`` is ``a.csv``), nor what the case file is called.
+    """
+    hashes = [{_place(one): one.sha256 for one in some} for some in (stated, known)]
+    for role, path in sorted(hashes[0].keys() | hashes[1].keys()):
+        if hashes[0].get((role, path)) != hashes[1].get((role, path)):
+            return f"{role} ({path})" if path else role
+    return None
+
+
+def _place(one: Input) -> tuple[str, str]:
+    return one.role, "" if one.role == CASE_ROLE else posixpath.normpath(one.path)
+
+
+def content_input(role: str, name: str, content: bytes) -> Input:
+    """The input that these bytes are."""
+    return Input(role, name, hashlib.sha256(content).hexdigest())
+
+
+class InputFiles:
+    """The files of one folder that a result is made from: each is read once, and hashed as it was read.
+
+    Args:
+        folder: What names are relative to.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._inputs: dict[tuple[str, str], Input] = {}
+        self._held: dict[str, bytes] = {}
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """Every file in each of its roles, in the order of reading."""
+        return tuple(self._inputs.values())
+
+    def add(self, role: str, name: str, content: bytes) -> bytes:
+        """List bytes that were read already, and keep them."""
+        self._inputs[role, name] = content_input(role, name, content)
+        self._held[name] = content
+        return content
+
+    def read(self, role: str, name: str, *, max_bytes: int, key: str, where: Path) -> bytes:
+        """The content of a file, which is read where no role has asked for it before.
+
+        Args:
+            role: What the file is to the result.
+            name: As ``where`` states it.
+            max_bytes: A larger file is refused before it is read.
+            key: Of ``where``, for errors.
+            where: The file that names this one.
+
+        Raises:
+            InputError: It is missing, no plain file, empty, too large or not readable.
+        """
+        if name in self._held:
+            content = self._held[name]
+        else:
+            content = read_input(self._existing(name, key, where), max_bytes=max_bytes, where=str(self._folder / name))
+        return self.add(role, name, content)
+
+    def content(self, name: str) -> bytes:
+        """The bytes of a file that was read; one that was let go of is read again and must be the same.
+
+        Raises:
+            InputError: It has changed since.
+        """
+        if name in self._held:
+            return self._held[name]
+        known = self.sha256(name)
+        content = read_input(self._folder / name, max_bytes=1 << 40, where=str(self._folder / name))
+        if content_input("", name, content).sha256 != known:
+            raise InputError("has changed since it was read", where=self._folder / name, allowed="start again")
+        return content
+
+    def sha256(self, name: str) -> str:
+        """The hash of a file that was read."""
+        return next(one.sha256 for one in self._inputs.values() if one.path == name)
+
+    def release(self) -> None:
+        """Let go of large files; their hashes stay."""
+        self._held = {name: content for name, content in self._held.items() if len(content) <= KEPT_BYTES}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Another process is not sent gigabytes: it reads what it needs, and holds that against the hash."""
+        return {**self.__dict__, "_held": {}}
+
+    def _existing(self, name: str, key: str, where: Path) -> Path:
+        file = self._folder / name
+        try:
+            there = file.is_file()
+        except (OSError, ValueError):  # a name that no file system takes
+            there = False
+        if not there:
+            raise InputError(
+                f"{key}: file '{name[:200]}' is not there", where=where, allowed=f"a file in {self._folder}"
+            )
+        return file

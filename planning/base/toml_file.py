@@ -1,0 +1,96 @@
+"""TOML files of a stated schema: found, read and validated, with one line for whatever is wrong."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ValidationError
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.toml_bounds import check_toml_bounds
+
+MAX_BYTES = 1_000_000
+"""Such a file is written by hand; a larger one is something else."""
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def _one(value: object) -> object:
+    if value != 1 or not isinstance(value, int) or isinstance(value, bool):
+        raise ValueError(f"schema {value!r} is not known; this version reads schema = 1")
+    return value
+
+
+SchemaOne = Annotated[int, BeforeValidator(_one)]
+"""The key ``schema``: 1."""
+
+
+def find_toml(path: Path | str, usual_name: str) -> Path:
+    """The file itself, also of a folder that holds one of the usual name.
+
+    Raises:
+        InputError: A name that the system cannot look up, or something that is no plain file.
+    """
+    path = Path(path)
+    allowed = f"a TOML file, or a folder that holds {usual_name}"
+    try:
+        path = path / usual_name if path.is_dir() else path
+        if path.exists() and not path.is_file():
+            raise InputError("is no plain file", where=path, allowed=allowed)
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be looked up ({error})", where=str(path)[:80], allowed=allowed) from error
+    return path
+
+
+def read_toml(path: Path, model: type[Model], *, allowed: str, keys: str) -> Model:
+    """Read a file and validate it.
+
+    Args:
+        path: The file.
+        model: Its schema.
+        allowed: What would have been accepted in its place.
+        keys: Where its keys are described.
+
+    Raises:
+        InputError: Unreadable, too large, not TOML, or not of the schema: names the first key that is wrong.
+    """
+    return parse_toml(read_toml_bytes(path, allowed), path, model, allowed=allowed, keys=keys)
+
+
+def read_toml_bytes(path: Path, allowed: str) -> bytes:
+    """The bytes of such a file.
+
+    Raises:
+        InputError: Unreadable, or too large.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError("larger than 1 MB, not written by hand", where=path, allowed=allowed)
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed=allowed) from error
+
+
+def parse_toml(content: bytes, path: Path, model: type[Model], *, allowed: str, keys: str) -> Model:
+    """The same of a file that has been read; it is not opened again.
+
+    Raises:
+        InputError: Not TOML, or not of the schema: names the first key that is wrong.
+    """
+    try:
+        text = content.decode("utf-8")
+        check_toml_bounds(text, path, allowed)
+        data = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, a number that Python does not read
+        raise InputError(f"is not TOML: {error}", where=path, allowed=allowed) from error
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in first["loc"]) or "top level"
+        said = first["msg"].removeprefix("Value error, ")
+        value = "" if isinstance(first["input"], dict | list | tuple) else f" (given: {first['input']!r:.60})"
+        allowed = f"the keys, types and ranges of {keys}"
+        raise InputError(f"{place}: {said}{value}", where=path, allowed=allowed) from error

@@ -1,0 +1,366 @@
+"""A case: a validated case file, in LPS (or local) mm and radians, with the hash of every input."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
+from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
+from puncture_twin.planning.case.case_file import (
+    AIR_HU,
+    DENSE_HU,
+    Anatomical,
+    CaseFile,
+    EntryAxes,
+    GantrySection,
+    MountSection,
+    PlaceSection,
+    RankingSection,
+    RegistrationSection,
+    RehearsalSection,
+    StructureSection,
+    StructuresSection,
+)
+from puncture_twin.planning.case.entry import entry_frame, view_frame
+from puncture_twin.planning.case.whole_case import wholeness_warnings
+from puncture_twin.planning.formats.labels import naming
+from puncture_twin.planning.formats.meshes import mesh_files as meshes
+from puncture_twin.planning.formats.points import point_files as points
+from puncture_twin.planning.formats.points.point_files import parse_points
+from puncture_twin.planning.formats.volumes import volume_files as volumes
+from puncture_twin.planning.geometry.spaces import Space, to_lps
+
+ALLOWED_CASE = "a TOML case file with schema = 1 or 2, or a folder with case.toml"
+
+Matrix = NDArray[np.float64]
+
+AXES_PARALLEL = 0.999
+"""|cos| above which a mount's x and z axes do not span a frame (2.6 degrees)."""
+
+AXES_SQUARE_DEG = 1.0
+"""A mount's x and z axes may differ from a right angle by this much: what rounding to two digits leaves. More is
+another rotation than was meant, and 1 degree moves the needle's tip by 9 mm at the arm's reach of half a metre."""
+
+
+@dataclass(frozen=True)
+class Needle:
+    """The needle on the flange; lengths in mm, from the tip."""
+
+    length_mm: float
+    shaft_mm: float
+    diameter_mm: float
+    standoff_mm: float | None
+    skin_gap_mm: float
+    holder_diameter_mm: float
+
+    @property
+    def radius_mm(self) -> float:
+        """Half the diameter."""
+        return self.diameter_mm / 2
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """The grid of directions and the limit at the skin, all in radians."""
+
+    theta: tuple[float, float]
+    beta: tuple[float, float]
+    step: float
+    max_skin_angle: float
+
+
+@dataclass(frozen=True)
+class CtSettings:
+    """The CT beside the structures.
+
+    Attributes:
+        file: Where the skin does not come from a CT, the CT's file, or None.
+        air_hu: Outside of the body, what is denser is not air.
+        dense_hu: Inside the body, what is at least so dense must belong to a structure.
+        margin_mm: Clearance that these structures demand.
+        trust_labels: Whether the inside is left to the structures alone.
+    """
+
+    file: str | None = None
+    air_hu: float = AIR_HU
+    dense_hu: float = DENSE_HU
+    margin_mm: float = 2.0
+    trust_labels: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacle:
+    """A box in the room, axes parallel to its frame's."""
+
+    name: str
+    frame: str
+    center_mm: Matrix
+    size_mm: Matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Gantry:
+    """A wall with a round bore.
+
+    Attributes:
+        T_ct_gantry: Shape (4, 4), mm: the bore's centre; its axis is z, its top x.
+        bore_diameter_mm: Of the bore.
+        wall_mm: How far the wall reaches outward from the bore.
+        thickness_mm: Along the bore.
+    """
+
+    T_ct_gantry: Matrix
+    bore_diameter_mm: float
+    wall_mm: float
+    thickness_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class RobotSettings:
+    """The arm: model name, home configuration (rad) or None for the model's own, mount or None."""
+
+    model: str
+    home: Matrix | None
+    T_base_ct_mount: Matrix | None
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What a search, a plan and a rehearsal start from. A `Case` has been validated.
+
+    Attributes:
+        target_ct: Shape (3,), the point to reach.
+        T_ct_entry: Shape (4, 4), the entry frame, its origin on the target.
+        files: The case file and all that it names, read once.
+        stated_structures: How many structures the case says that it has, the skin among them; None in schema 1.
+        region: Which part of the body it shows; None in schema 1.
+        warnings: What the case file itself leaves open, one sentence each.
+    """
+
+    path: Path
+    name: str
+    space: Space
+    target_ct: Matrix
+    target_name: str
+    target_structure: str
+    needle: Needle
+    search: SearchSettings
+    ranking: RankingSection
+    T_ct_entry: Matrix
+    structure: tuple[StructureSection, ...]
+    structures: tuple[StructuresSection, ...]
+    registration: RegistrationSection | None
+    robot: RobotSettings
+    obstacles: tuple[Obstacle, ...]
+    rehearsal: RehearsalSection
+    files: InputFiles
+    ct: CtSettings = CtSettings()
+    gantry: Gantry | None = None
+    place: PlaceSection = field(default_factory=PlaceSection)
+    stated_structures: int | None = None
+    region: str | None = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def folder(self) -> Path:
+        """The folder to which every path of the case is relative."""
+        return self.path.parent
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """The case file and all that it names, each with its role and hash."""
+        return self.files.inputs
+
+    def data_beside(self, name: str) -> str | None:
+        """The file that a volume's detached header names for its voxels; None for a volume in one file."""
+        return _data_beside(self.files, self.path, name)
+
+
+def load_case(path: Path | str) -> Case:
+    """Read and validate a case file, or a folder that holds ``case.toml``.
+
+    Raises:
+        InputError: Anything unreadable, unknown, missing or contradictory; names the key.
+    """
+    path = find_toml(path, "case.toml")
+    files = InputFiles(path.parent)
+    stated = files.add(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE))
+    content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/case.md")
+    for one in _named_files(content):
+        files.read(one.role, one.name, max_bytes=one.max_bytes, key=one.key, where=path)
+        _read_data_beside(files, one, path)
+    space = Space(content.space)
+    target = _target(content, path, space, files)
+    settings = content.search
+    return Case(
+        path=path,
+        name=content.name,
+        space=space,
+        target_ct=target,
+        target_name=content.target.name,
+        target_structure=content.target.structure,
+        needle=Needle(**content.needle.model_dump()),
+        search=SearchSettings(
+            theta=(np.radians(settings.theta_deg[0]), np.radians(settings.theta_deg[1])),
+            beta=(np.radians(settings.beta_deg[0]), np.radians(settings.beta_deg[1])),
+            step=np.radians(settings.step_deg),
+            max_skin_angle=np.radians(settings.max_skin_angle_deg),
+        ),
+        ranking=content.ranking,
+        T_ct_entry=view_frame(entry_frame(settings.frame, space, where=path), target),
+        structure=content.structure,
+        structures=content.structures,
+        registration=content.registration,
+        robot=_robot(content, space, path),
+        obstacles=tuple(
+            Obstacle(
+                o.name,
+                o.frame,
+                np.asarray(o.center_mm) if o.frame == "base" else to_lps(np.asarray([o.center_mm]), space)[0],
+                np.asarray(o.size_mm),
+            )
+            for o in content.obstacle
+        ),
+        rehearsal=content.rehearsal,
+        files=files,
+        ct=CtSettings(**content.ct.model_dump(), trust_labels=settings.trust_labels),
+        gantry=None if content.gantry is None else _gantry(content.gantry, space, path),
+        place=content.place,
+        stated_structures=content.stated_structures,
+        region=content.region,
+        warnings=wholeness_warnings(content, files, path),
+    )
+
+
+def _target(content: CaseFile, path: Path, space: Space, files: InputFiles) -> Matrix:
+    target = content.target
+    if target.position_mm is not None:
+        return _read_only(to_lps(np.asarray([target.position_mm]), space)[0])
+    assert target.points is not None  # held by the schema
+    listed = parse_points(files.content(target.points), path.parent / target.points, default_space=space)
+    if target.name not in listed.names:
+        names = ", ".join(listed.names)
+        raise InputError(f"target.name '{target.name}' is not in {target.points}", where=path, allowed=names)
+    return _read_only(listed.points[listed.names.index(target.name)].copy())
+
+
+def _robot(content: CaseFile, space: Space, path: Path) -> RobotSettings:
+    robot = content.robot
+    home = None if robot.home_deg is None else _read_only(np.radians(np.asarray(robot.home_deg)))
+    mount = None if robot.mount is None else mount_pose(robot.mount, space, path)
+    return RobotSettings(ur_model(robot.model).name, home, mount)
+
+
+def mount_pose(mount: MountSection, space: Space, path: Path) -> Matrix:
+    """T_base_ct, shape (4, 4), from the base's origin and axes, as a case states them in its own space.
+
+    Raises:
+        InputError: The axes are parallel or zero, or not at a right angle.
+    """
+    x, z = (to_lps(np.asarray([v], dtype=float), space)[0] for v in (mount.x_axis, mount.z_axis))
+    lengths = np.linalg.norm(x), np.linalg.norm(z)
+    if min(lengths) == 0 or abs(x @ z) > AXES_PARALLEL * lengths[0] * lengths[1]:
+        raise InputError("robot.mount: x_axis and z_axis are parallel or zero", where=path, allowed="two axes")
+    angle = float(np.degrees(np.arccos(x @ z / (lengths[0] * lengths[1]))))
+    if abs(angle - 90.0) > AXES_SQUARE_DEG:
+        raise InputError(
+            f"robot.mount: x_axis and z_axis are {angle:.1f} degrees apart",
+            where=path,
+            allowed=f"a right angle, to {AXES_SQUARE_DEG:g} degree",
+        )
+    z = z / lengths[1]
+    x = x - z * (x @ z)
+    x = x / np.linalg.norm(x)
+    T_ct_base = np.eye(4)
+    T_ct_base[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    T_ct_base[:3, 3] = to_lps(np.asarray([mount.position_mm]), space)[0]
+    return _read_only(np.linalg.inv(T_ct_base))
+
+
+def _gantry(gantry: GantrySection, space: Space, path: Path) -> Gantry:
+    """The bore's pose: z along the axis, x to the top, and turned so that a positive tilt leans the top against z."""
+    T = np.eye(4)
+    T[:3, :3] = axes_frame(gantry.axis or "head", gantry.up or "anterior", space, path, "gantry: axis and up")
+    T[:3, 3] = to_lps(np.asarray([gantry.center_mm]), space)[0]
+    c, s = np.cos(np.radians(gantry.tilt_deg)), np.sin(np.radians(gantry.tilt_deg))
+    tilt = np.eye(4)
+    tilt[:3, :3] = [[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]
+    return Gantry(_read_only(T @ tilt), gantry.bore_diameter_mm, gantry.wall_mm, gantry.thickness_mm)
+
+
+Axis = Anatomical | tuple[float, float, float]
+
+
+def axes_frame(z: Axis, x: Axis, space: Space, path: Path, key: str) -> Matrix:
+    """R_ct_frame, shape (3, 3), of a frame whose z axis is given and whose x axis is what of ``x`` is square to it.
+
+    Raises:
+        InputError: The two are parallel or zero; names ``key``.
+    """
+    try:
+        return entry_frame(EntryAxes(z=z, x=x), space, where=path)
+    except InputError as error:
+        raise InputError(f"{key} are parallel or zero", where=path, allowed="two axes") from error
+
+
+class _Named(NamedTuple):
+    """A file that a case names."""
+
+    role: str
+    name: str
+    key: str
+    max_bytes: int
+
+
+def _named_files(content: CaseFile) -> Iterator[_Named]:
+    """Every file that a case names, in the order of its sections."""
+    if content.target.points is not None:
+        yield _Named("target", content.target.points, "target.points", points.MAX_FILE_BYTES)
+    for one in content.structure:
+        key = f"structure '{one.name}'"
+        if one.mesh is not None:
+            yield _Named(f"mesh {one.name}", one.mesh, key, meshes.MAX_FILE_BYTES)
+        if one.labelmap is not None:
+            yield _Named("labelmap", one.labelmap, key, volumes.MAX_FILE_BYTES)
+        if one.ct is not None:
+            yield _Named("ct", one.ct, key, volumes.MAX_FILE_BYTES)
+    for number, many in enumerate(content.structures):
+        yield _Named("labelmap", many.labelmap, f"structures.{number}.labelmap", volumes.MAX_FILE_BYTES)
+        if many.naming is not None and naming.is_naming_file(many.naming):
+            yield _Named("naming", many.naming, f"structures.{number}.naming", naming.MAX_CSV_BYTES)
+    if content.ct.file is not None:
+        yield _Named("ct", content.ct.file, "ct.file", volumes.MAX_FILE_BYTES)
+    if content.registration is not None:
+        for side in ("markers_ct", "markers_base"):
+            yield _Named(side, getattr(content.registration, side), f"registration.{side}", points.MAX_FILE_BYTES)
+    if content.rehearsal.truth_base is not None:
+        yield _Named("truth_base", content.rehearsal.truth_base, "rehearsal.truth_base", points.MAX_FILE_BYTES)
+
+
+def _read_data_beside(files: InputFiles, header: _Named, path: Path) -> None:
+    """Read the file that a volume's detached header names, which holds what decides."""
+    if header.role not in {"labelmap", "ct"}:
+        return
+    name = _data_beside(files, path, header.name)
+    if name is not None:
+        files.read(f"{header.role} data", name, max_bytes=volumes.MAX_FILE_BYTES, key=header.key, where=path)
+
+
+def _data_beside(files: InputFiles, path: Path, name: str) -> str | None:
+    """The data file of a detached header, as a name relative to the case's folder."""
+    beside = volumes.data_file(files.content(name), path.parent / name)
+    return None if beside is None else str(PurePosixPath(name).with_name(beside))
+
+
+def _read_only(array: ArrayLike) -> Matrix:
+    frozen = np.array(array, dtype=np.float64)
+    frozen.setflags(write=False)
+    return frozen

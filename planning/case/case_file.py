@@ -1,0 +1,408 @@
+"""What a case file may hold: the TOML schema, key by key. See docs/case.md for the words."""
+
+from __future__ import annotations
+
+import difflib
+from collections import Counter
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    AllowInfNan,
+    BaseModel,
+    ConfigDict,
+    Field,
+    Strict,
+    StringConstraints,
+    model_validator,
+)
+
+from puncture_twin.planning.base.text_names import MAX_NAME, unprintable_texts
+from puncture_twin.planning.case.case_schema import CaseSchema, Region, check_statement, count_difference, with_count
+
+Number = Annotated[float, Strict(), AllowInfNan(False)]
+Positive = Annotated[Number, Field(gt=0)]
+NotNegative = Annotated[Number, Field(ge=0)]
+Coordinate = Annotated[Number, Field(ge=-100_000, le=100_000)]
+Length = Annotated[Number, Field(gt=0, le=100_000)]
+Margin = Annotated[Number, Field(ge=0, le=1000)]
+Weight = Annotated[Number, Field(ge=0, le=1000)]
+JointDegrees = Annotated[Number, Field(ge=-360, le=360)]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+Sextuple = tuple[JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees]
+Text = Annotated[str, StringConstraints(min_length=1, max_length=MAX_NAME)]
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=80)]
+Degrees360 = Annotated[Number, Field(ge=0, le=360)]
+Degrees180 = Annotated[Number, Field(ge=0, le=180)]
+Yes = Annotated[bool, Strict()]
+Label = Annotated[int, Strict(), Field(ge=1, le=65535)]
+
+
+MAX_STRUCTURES = 1000
+"""Structures, or obstacles, of a case: TotalSegmentator knows 117 classes, and each structure costs a tree."""
+
+MAX_LABEL_MAPS = 100
+"""Tables ``[[structures]]``, each with a label map of its own."""
+
+AIR_HU = -900.0
+"""Air is -1000; its noise in a mean over 3 mm is some 15, so that 100 is more than six times that. Foam of a mattress
+has -970 to -900: what is less dense than this is not told from air."""
+DENSE_HU = 250.0
+"""Cancellous bone starts at about 200; soft tissue with contrast in the venous phase ends at about 200."""
+
+MAX_DIRECTIONS = 1_000_000
+"""Rows of a search: a hemisphere at 0.2 degrees; 2 GB of table with 60 structures."""
+
+
+class Section(BaseModel):
+    """A table of the file: frozen, and an unknown key is an error that names the nearest valid one."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_keys(cls, data: Any) -> Any:
+        if isinstance(data, dict):
+            known = [field.alias or name for name, field in cls.model_fields.items()]
+            for key in data:
+                if key not in known:
+                    near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+                    hint = f"did you mean '{near[0]}'? " if near else ""
+                    raise ValueError(f"unknown key '{key}'; {hint}keys here: {', '.join(known)}")
+        return data
+
+
+class TargetSection(Section):
+    """The point to reach: coordinates, or a name in a file of points."""
+
+    position_mm: Vector | None = None
+    points: str | None = None
+    name: Text = "target"
+    structure: Name
+
+    @model_validator(mode="after")
+    def _one_position(self) -> Self:
+        if (self.position_mm is None) == (self.points is None):
+            raise ValueError("needs either position_mm or points (a file, with the target's name), not both")
+        return self
+
+
+class NeedleSection(Section):
+    """The needle: lengths from the tip; the holder is what lies between shaft and flange."""
+
+    length_mm: Annotated[Number, Field(ge=20, le=1000)]
+    shaft_mm: Annotated[Number, Field(ge=10, le=1000)]
+    diameter_mm: Annotated[Number, Field(ge=0.1, le=20)]
+    standoff_mm: Annotated[Number, Field(ge=5, le=1000)] | None = None
+    skin_gap_mm: Annotated[Number, Field(ge=6, le=200)] = 10.0  # the least, along the needle; see standoff.py
+    holder_diameter_mm: Annotated[Number, Field(ge=1, le=200)] = 30.0
+
+    @model_validator(mode="after")
+    def _shaft_fits(self) -> Self:
+        if self.shaft_mm > self.length_mm:
+            raise ValueError(f"shaft_mm {self.shaft_mm:g} is longer than length_mm {self.length_mm:g}")
+        return self
+
+
+Anatomical = Literal["left", "right", "anterior", "posterior", "head", "feet"]
+
+
+class EntryAxes(Section):
+    """An entry frame of one's own: where its z and x axes point; y = z × x."""
+
+    z: Anatomical | Vector
+    x: Anatomical | Vector
+
+
+class SearchSection(Section):
+    """The grid of directions and the limits at the skin."""
+
+    theta_deg: tuple[Degrees180, Degrees180] = (0.0, 90.0)
+    beta_deg: tuple[Degrees360, Degrees360] = (0.0, 360.0)
+    step_deg: Annotated[Number, Field(ge=0.05, le=45)] = 1.0
+    max_skin_angle_deg: Annotated[Number, Field(gt=0, le=90)] = 60.0
+    frame: Literal["ct", "bed"] | EntryAxes | None = None
+    trust_labels: Annotated[bool, Strict()] = False
+
+    @model_validator(mode="after")
+    def _grid_fits(self) -> Self:
+        rows = 1.0
+        for low, high in (self.theta_deg, self.beta_deg):
+            rows *= (high - low) / self.step_deg + 1
+        if rows > MAX_DIRECTIONS:
+            raise ValueError(f"step_deg {self.step_deg:g} makes {rows:,.0f} directions; {MAX_DIRECTIONS:,} at most")
+        return self
+
+    @model_validator(mode="after")
+    def _ranges_ascend(self) -> Self:
+        for key in ("theta_deg", "beta_deg"):
+            low, high = getattr(self, key)
+            if low > high:
+                raise ValueError(f"{key} [{low:g}, {high:g}] descends; it is [lowest, highest]")
+            if 0 < high - low < self.step_deg:
+                raise ValueError(f"step_deg {self.step_deg:g} is larger than the range {key} [{low:g}, {high:g}]")
+        return self
+
+
+class RankingSection(Section):
+    """Weights of the cost terms; each term lies in 0..1, see planning/search/ranking.py."""
+
+    clearance: Weight = 1.0
+    path_length: Weight = 0.5
+    skin_angle: Weight = 0.3
+    tissue: Weight = 0.5
+    reach: Weight = 0.5
+    safe_cone: Weight = 0.5
+
+    @model_validator(mode="after")
+    def _one_counts(self) -> Self:
+        if not any(getattr(self, name) > 0 for name in type(self).model_fields):
+            raise ValueError("every weight is 0; one at least is above")
+        return self
+
+
+Role = Literal["avoid", "traverse", "target", "skin", "unknown"]
+
+
+class StructureSection(Section):
+    """One structure from one source."""
+
+    name: Name
+    role: Role
+    margin_mm: Margin | None = None
+    mesh: str | None = None
+    unit: str | None = None
+    space: str | None = None
+    labelmap: str | None = None
+    label: Label | None = None
+    ct: str | None = None
+    cut: tuple[Literal["right", "left", "front", "back", "feet", "head"], ...] | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        sources = [key for key in ("mesh", "labelmap", "ct") if getattr(self, key) is not None]
+        if len(sources) != 1:
+            raise ValueError(f"'{self.name}' needs exactly one of mesh, labelmap, ct; it has {sources or 'none'}")
+        if (self.labelmap is None) != (self.label is None):
+            raise ValueError(f"'{self.name}': labelmap and label go together")
+        if self.mesh is not None and self.unit is None:
+            raise ValueError(f'\'{self.name}\': a mesh needs unit = "mm", "cm" or "m"; no mesh file says it')
+        if self.mesh is None and (self.unit or self.space):
+            raise ValueError(f"'{self.name}': unit and space belong to a mesh; a volume says its own")
+        if self.ct is not None and self.role != "skin":
+            raise ValueError(f"'{self.name}': ct finds the body's skin only; role must be \"skin\"")
+        if self.cut is not None and (self.role != "skin" or self.mesh is None):
+            raise ValueError(f"'{self.name}': cut belongs to a skin mesh; a volume shows where it cuts the body")
+        if self.margin_mm is not None and self.role not in {"avoid", "unknown"}:
+            raise ValueError(f'\'{self.name}\': margin_mm belongs to role "avoid", not "{self.role}"')
+        return self
+
+
+Patterns = Annotated[tuple[Text, ...], Field(max_length=MAX_STRUCTURES)]
+
+
+class StructuresSection(Section):
+    """Many structures of one label map, by name pattern."""
+
+    labelmap: str
+    naming: str | None = None
+    target: Patterns = ()
+    avoid: Annotated[dict[Text, Margin], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
+    traverse: Patterns = ()
+    ignore: Patterns = ()
+
+
+class CtSection(Section):
+    """The CT beside the structures: what it shows that they do not name. Hounsfield units."""
+
+    file: str | None = None
+    air_hu: Annotated[Number, Field(ge=-990, le=-300)] = AIR_HU
+    dense_hu: Annotated[Number, Field(ge=100, le=3000)] = DENSE_HU
+    margin_mm: Margin = 2.0
+
+
+class RegistrationSection(Section):
+    """Markers seen in the CT and touched by the robot."""
+
+    method: Literal["triad", "rigid", "affine"] = "rigid"
+    markers_ct: str
+    markers_base: str
+    use: tuple[Text, ...] | None = None
+    fle_mm: Positive | None = None
+    accept_residuals: Yes = False
+    accept_symmetry: Yes = False
+
+
+class MountSection(Section):
+    """Where the robot's base stands in the CT, when no markers say it."""
+
+    position_mm: Vector
+    x_axis: Vector
+    z_axis: Vector
+
+
+class RobotSection(Section):
+    """The arm."""
+
+    model: str = "ur3"
+    home_deg: Sextuple | None = None
+    mount: MountSection | None = None
+
+
+class ObstacleSection(Section):
+    """A box in the room (table, gantry side), axes parallel to its frame's."""
+
+    name: Name
+    frame: Literal["ct", "base"]
+    center_mm: Vector
+    size_mm: tuple[Length, Length, Length]
+
+
+class GantrySection(Section):
+    """A CT gantry: a wall with a round bore. ``axis`` and ``up`` are the bore's directions before the tilt."""
+
+    bore_diameter_mm: Annotated[Number, Field(ge=200, le=5000)]
+    center_mm: Vector
+    thickness_mm: Annotated[Number, Field(ge=10, le=5000)]
+    wall_mm: Annotated[Number, Field(ge=10, le=5000)] = 600.0
+    tilt_deg: Annotated[Number, Field(ge=-45, le=45)] = 0.0
+    axis: Anatomical | Vector | None = None
+    up: Anatomical | Vector | None = None
+
+
+Range = tuple[Coordinate, Coordinate]
+MountName = Literal["floor", "rail", "ceiling", "side"]
+
+
+class MountBounds(Section):
+    """Where a base of one kind may stand, seen from the target; what is left out follows from the arm's length."""
+
+    along_mm: Range | None = None
+    across_mm: Range | None = None
+    height_mm: Range | None = None
+
+    @model_validator(mode="after")
+    def _ranges_ascend(self) -> Self:
+        for key in ("along_mm", "across_mm", "height_mm"):
+            bounds = getattr(self, key)
+            if bounds is not None and bounds[0] > bounds[1]:
+                raise ValueError(f"{key} [{bounds[0]:g}, {bounds[1]:g}] descends; it is [lowest, highest]")
+        return self
+
+
+class PlaceSection(Section):
+    """Where ``place`` may stand the arm."""
+
+    mounts: tuple[MountName, ...] | None = None
+    step_mm: Annotated[Number, Field(ge=20, le=500)] = 150.0
+    table: Name = "table"
+    rail_gap_mm: Annotated[Number, Field(ge=0, le=1000)] = 110.0
+    up: Anatomical | Vector | None = None
+    along: Anatomical | Vector | None = None
+    floor: MountBounds = MountBounds()
+    rail: MountBounds = MountBounds()
+    ceiling: MountBounds = MountBounds()
+    side: MountBounds = MountBounds()
+
+    @model_validator(mode="after")
+    def _mounts_make_sense(self) -> Self:
+        if self.mounts is not None and (not self.mounts or len(set(self.mounts)) < len(self.mounts)):
+            raise ValueError(f"mounts {list(self.mounts)}: at least one, each once")
+        if self.rail.across_mm is not None:
+            raise ValueError("rail.across_mm: a rail lies beside the table; rail_gap_mm says how far")
+        return self
+
+
+class RehearsalSection(Section):
+    """What the twin's truth is drawn from; the planner never reads it."""
+
+    seed: Annotated[int, Strict(), Field(ge=0, lt=2**31)] = 0
+    truth_base: str | None = None
+    fle_ct_mm: NotNegative = 0.5
+    fle_touch_mm: NotNegative = 0.1
+    joint_offset_deg: NotNegative = 0.02
+
+
+class EndSection(Section):
+    """The last table of the file, which every cut loses."""
+
+    structures: Annotated[int, Strict(), Field(ge=1)]
+
+
+class CaseFile(Section):
+    """The whole file."""
+
+    schema_: CaseSchema = Field(alias="schema")
+    structure_count: Annotated[int, Strict(), Field(ge=1)] | None = Field(None, alias="structures = N")
+    region: Region | None = None
+    name: Name
+    space: Literal["LPS", "RAS", "local"]
+    target: TargetSection
+    needle: NeedleSection
+    search: SearchSection = SearchSection()
+    ranking: RankingSection = RankingSection()
+    structure: Annotated[tuple[StructureSection, ...], Field(max_length=MAX_STRUCTURES)] = ()
+    structures: Annotated[tuple[StructuresSection, ...], Field(max_length=MAX_LABEL_MAPS)] = ()
+    ct: CtSection = CtSection()
+    registration: RegistrationSection | None = None
+    robot: RobotSection = RobotSection()
+    obstacle: Annotated[tuple[ObstacleSection, ...], Field(max_length=MAX_STRUCTURES)] = ()
+    gantry: GantrySection | None = None
+    place: PlaceSection = PlaceSection()
+    rehearsal: RehearsalSection = RehearsalSection()
+    end: EndSection | None = None
+
+    @property
+    def stated_structures(self) -> int | None:
+        """How many structures the file says that it has, the skin among them; None in schema 1."""
+        return self.structure_count if self.end is None else self.end.structures
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_count(cls, data: Any) -> Any:
+        return with_count(data)
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        at_end = None if self.end is None else self.end.structures
+        check_statement(self.schema_, self.region, self.structure_count, at_end)
+        stated = self.stated_structures
+        wrong = "" if stated is None or self.structures else count_difference(stated, len(self.structure))
+        if wrong:
+            raise ValueError(wrong)
+        return self
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unprintable(cls, data: Any) -> Any:
+        for text in unprintable_texts(data):
+            raise ValueError(f"{text[:60]!a} holds a control or format character; names and paths are plain text")
+        return data
+
+    @model_validator(mode="after")
+    def _no_contradiction(self) -> Self:
+        if self.registration is not None and self.robot.mount is not None:
+            raise ValueError("[registration] and [robot.mount] both say where the base is; keep one")
+        if self.space == "local" and self.ct.file is not None:
+            raise ValueError('ct.file: a CT says its own patient space; space "local" has none')
+        if self.space == "local" and any(s.cut for s in self.structure):
+            raise ValueError('cut names sides of a patient; space "local" has none')
+        if self.space == "local" and self.search.frame not in {None, "ct"}:
+            raise ValueError('search.frame must be "ct" for space "local": it has no head and no front')
+        for name, count in Counter(s.name for s in self.structure).items():
+            if count > 1:
+                raise ValueError(f"structure '{name}' stands twice; names are unique")
+        skins = [s.name for s in self.structure if s.role == "skin"]
+        if len(skins) != 1:
+            raise ValueError(f'one structure has role "skin"; here {skins or "none"}')
+        return self
+
+    @model_validator(mode="after")
+    def _local_has_no_head(self) -> Self:
+        if self.space != "local":
+            return self
+        gantry = self.gantry
+        if gantry is not None and not (isinstance(gantry.axis, tuple) and isinstance(gantry.up, tuple)):
+            raise ValueError('gantry: space "local" has no head and no front; give axis and up as vectors')
+        if isinstance(self.place.up, str) or isinstance(self.place.along, str):
+            raise ValueError('place: space "local" has no head and no front; give up and along as vectors')
+        return self

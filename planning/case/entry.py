@@ -1,0 +1,177 @@
+"""The two angles (θ, β) around the target, and the needle that they place (Chen 2019, Eq. 10-15)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case_file import EntryAxes
+from puncture_twin.planning.geometry.spaces import Space, to_lps
+
+Floats = NDArray[np.float64]
+
+ANATOMICAL_LPS = MappingProxyType(
+    {
+        "left": (1.0, 0.0, 0.0),
+        "right": (-1.0, 0.0, 0.0),
+        "posterior": (0.0, 1.0, 0.0),
+        "anterior": (0.0, -1.0, 0.0),
+        "head": (0.0, 0.0, 1.0),
+        "feet": (0.0, 0.0, -1.0),
+    }
+)
+"""Unit vectors of the body's directions in LPS."""
+
+AXES_PARALLEL = 0.999
+"""|cos| above which two axes do not span a frame (2.6 degrees)."""
+
+GRID_SLACK = 1e-9
+"""Fraction of a step by which rounding may miss the end of a range."""
+
+
+@dataclass(frozen=True, eq=False)
+class Directions:
+    """A set of entry directions.
+
+    Attributes:
+        theta: Shape (n,), puncture angle from the entry frame's +z, rad.
+        beta: Shape (n,), azimuth from +x in its xy plane, rad.
+        outward_ct: Shape (n, 3), unit vectors in the CT frame, from the target outward.
+    """
+
+    theta: Floats
+    beta: Floats
+    outward_ct: Floats
+
+    def __len__(self) -> int:
+        return len(self.theta)
+
+
+@dataclass(frozen=True, eq=False)
+class NeedlePose:
+    """Needle tip and top (flange end) in the CT frame, shape (..., 3), mm."""
+
+    tip_ct: Floats
+    top_ct: Floats
+
+
+def entry_frame(frame: str | EntryAxes | None, space: Space, *, where: str | Path = "search.frame") -> Floats:
+    """Rotation R_ct_entry of the entry frame.
+
+    Args:
+        frame: ``"ct"`` (axes of the case's space), ``"bed"`` (x to the head, z to the front), explicit axes, or
+            None for the space's default: ``"ct"`` for a local space, ``"bed"`` for a patient.
+        space: The case's space; explicit vectors are given in it.
+        where: What an error names.
+
+    Returns:
+        Shape (3, 3), columns x, y = z × x and z in LPS (or the local frame).
+
+    Raises:
+        InputError: The axes do not span a frame.
+    """
+    if frame is None:
+        frame = "ct" if space is Space.LOCAL else "bed"
+    if frame == "ct":
+        return to_lps(np.eye(3), space).T
+    axes = EntryAxes(z="anterior", x="head") if frame == "bed" else frame
+    if not isinstance(axes, EntryAxes):
+        raise InputError(f"frame '{frame}' is not known", where=where, allowed="ct, bed, or z and x axes")
+    z, x = (_axis(axis, space) for axis in (axes.z, axes.x))
+    lengths = np.linalg.norm(z), np.linalg.norm(x)
+    if min(lengths) == 0 or abs(z @ x) > AXES_PARALLEL * lengths[0] * lengths[1]:
+        raise InputError("search.frame: its axes are parallel or zero", where=where, allowed="two axes")
+    z = z / lengths[0]
+    x = x - z * (x @ z)
+    x = x / np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def _axis(axis: str | tuple[float, float, float], space: Space) -> Floats:
+    if isinstance(axis, str):
+        return np.array(ANATOMICAL_LPS[axis])
+    return to_lps(np.array([axis]), space)[0]
+
+
+def view_frame(R_ct_entry: Floats, target_ct: Floats) -> Floats:
+    """T_ct_entry: the entry frame with its origin on the target, shape (4, 4), read-only."""
+    T = np.eye(4)
+    T[:3, :3] = R_ct_entry
+    T[:3, 3] = target_ct
+    T.setflags(write=False)
+    return T
+
+
+def outward(theta: Floats | float, beta: Floats | float) -> Floats:
+    """u(θ, β) = (sin θ cos β, sin θ sin β, cos θ) in the entry frame (Chen 2019, Eq. 10-11), shape (..., 3).
+
+    >>> outward(0.0, 1.0).tolist()
+    [0.0, 0.0, 1.0]
+    """
+    theta, beta = np.broadcast_arrays(np.asarray(theta, dtype=float), np.asarray(beta, dtype=float))
+    sine = np.sin(theta)
+    return np.stack([sine * np.cos(beta), sine * np.sin(beta), np.cos(theta)], axis=-1)
+
+
+def angles(outward_entry: Floats) -> tuple[Floats, Floats]:
+    """The angles (θ in 0..π, β in 0..2π) of unit vectors in the entry frame; β is 0 at the poles."""
+    x, y, z = np.moveaxis(np.asarray(outward_entry, dtype=float), -1, 0)
+    sine = np.hypot(x, y)
+    beta = np.where(sine > 0, np.mod(np.arctan2(y, x), 2 * np.pi), 0.0)
+    return np.arctan2(sine, z), beta
+
+
+def needle_pose(target_ct: Floats, outward_ct: Floats, *, standoff: Floats | float, length: float) -> NeedlePose:
+    """Tip f + r u and top f + (r + l) u of a needle that points at f (Chen 2019, Eq. 12-15).
+
+    Args:
+        target_ct: Shape (3,), f, mm.
+        outward_ct: Shape (..., 3), u, unit.
+        standoff: r, mm, a number or shape (...,).
+        length: l, tip to flange, mm.
+    """
+    r = np.asarray(standoff, dtype=float)[..., None]
+    return NeedlePose(target_ct + r * outward_ct, target_ct + (r + length) * outward_ct)
+
+
+def direction(theta: float, beta: float, R_ct_entry: Floats) -> Directions:
+    """One direction."""
+    return _directions(np.array([theta], dtype=float), np.array([beta], dtype=float), R_ct_entry)
+
+
+def grid(
+    theta: tuple[float, float],
+    beta: tuple[float, float],
+    step: float,
+    R_ct_entry: Floats,
+) -> Directions:
+    """Every (θ, β) of a regular grid, θ outermost; β = 360° is left out where the range is the full circle.
+
+    Args:
+        theta: Lowest and highest puncture angle, rad; both belong to the grid where the step meets them.
+        beta: Lowest and highest azimuth, rad.
+        step: Grid step of both angles, rad.
+        R_ct_entry: Rotation of the entry frame, shape (3, 3).
+    """
+    azimuths = _steps(beta, step)
+    if len(azimuths) > 1 and azimuths[-1] - azimuths[0] >= 2 * np.pi - GRID_SLACK:
+        azimuths = azimuths[:-1]
+    polar = _steps(theta, step)
+    return _directions(np.repeat(polar, len(azimuths)), np.tile(azimuths, len(polar)), R_ct_entry)
+
+
+def _steps(limits: tuple[float, float], step: float) -> Floats:
+    count = int(np.floor((limits[1] - limits[0]) / step + GRID_SLACK)) + 1
+    return np.asarray(limits[0] + step * np.arange(count), dtype=np.float64)
+
+
+def _directions(theta: Floats, beta: Floats, R_ct_entry: Floats) -> Directions:
+    columns = (theta, beta, outward(theta, beta) @ R_ct_entry.T)
+    for column in columns:
+        column.setflags(write=False)
+    return Directions(*columns)

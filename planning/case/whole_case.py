@@ -1,0 +1,43 @@
+"""Whether a case and the lists that it names are whole, as far as their ends can tell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.provenance import InputFiles
+from puncture_twin.planning.base.whole_lines import unfinished_warnings
+from puncture_twin.planning.case.case_file import CaseFile
+from puncture_twin.planning.case.case_schema import NOT_LAST_NOTE, SCHEMA_ONE_NOTE, TOP_COUNT_NOTE, ends_with_end
+
+LINE_FILES = (".csv", ".fcsv")
+"""Endings of lists that are read line by line: one that was cut within a number is another number, and looks whole."""
+
+
+def wholeness_warnings(content: CaseFile, files: InputFiles, path: Path) -> tuple[str, ...]:
+    """What is left open about being whole, one sentence each.
+
+    Args:
+        content: The case file.
+        files: All that it names, read.
+        path: The case file, for the error.
+
+    Raises:
+        InputError: A list whose last line does not end, in schema 2.
+    """
+    unfinished = [said for name in _line_files(files) for said in unfinished_warnings(files.content(name), name)]
+    if unfinished and content.schema_ == 2:
+        raise InputError(unfinished[0], where=path, allowed="files of which every line ends with a line break")
+    return (*_notes(content, files.content(path.name).decode("utf-8")), *unfinished)
+
+
+def _notes(content: CaseFile, text: str) -> list[str]:
+    if content.schema_ == 1:
+        return [SCHEMA_ONE_NOTE]
+    if content.end is None:
+        return [TOP_COUNT_NOTE]
+    return [] if ends_with_end(text) else [NOT_LAST_NOTE]
+
+
+def _line_files(files: InputFiles) -> list[str]:
+    return list(dict.fromkeys(one.path for one in files.inputs if one.path.lower().endswith(LINE_FILES)))

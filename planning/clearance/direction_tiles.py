@@ -1,0 +1,85 @@
+"""Directions in bundles: neighbours on the sphere share one walk through the tree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.clearance.kernels.kd_order import kd_order
+
+Floats = NDArray[np.float64]
+
+TILE = 12
+"""Directions of a bundle at most."""
+
+WIDEST = 0.12
+"""Chord from a bundle's axis to its members above which it is divided: about 7 degrees."""
+
+CHORD_SLACK = 1e-6
+"""More than float32 takes from a chord or a unit vector."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tiles:
+    """Directions in an order in which neighbours follow each other, cut into bundles.
+
+    Attributes:
+        order: Shape (n,), row of each direction in the caller's order.
+        outward: Shape (n, 3), unit vectors in the new order.
+        starts: Shape (t + 1,), where each bundle starts.
+        middle: Shape (t,), row in ``outward`` of the member amid each bundle: its axis.
+        chord: Shape (t,), largest |u - axis| of its members, rounded up.
+    """
+
+    order: NDArray[np.int64]
+    outward: Floats
+    starts: NDArray[np.int64]
+    middle: NDArray[np.int64]
+    chord: Floats
+
+
+def bundle(outward: Floats) -> Tiles:
+    """Bundle directions, in any order and number, shape (n, 3), unit vectors."""
+    order = kd_order(outward, TILE)
+    sorted_outward = np.ascontiguousarray(outward[order], dtype=np.float64)
+    starts = _cut(sorted_outward, np.empty(len(outward) + 1, np.int64))
+    middle, chord = np.empty(len(starts) - 1, np.int64), np.empty(len(starts) - 1)
+    _axes(sorted_outward, starts, middle, chord)
+    return Tiles(order, sorted_outward, starts, middle, chord)
+
+
+@nb.njit(cache=True)
+def _cut(outward, starts):  # type: ignore[no-untyped-def]  # numba infers
+    """Runs of TILE directions, ended early where the next one is too far from the run's first."""
+    count, first = 0, 0
+    starts[0] = 0
+    for i in range(1, len(outward)):
+        d = outward[i] - outward[first]
+        if i % TILE == 0 or d @ d > WIDEST * WIDEST:
+            count += 1
+            first = i
+            starts[count] = i
+    count += 1 if len(outward) else 0
+    starts[count] = len(outward)
+    return starts[: count + 1].copy()
+
+
+@nb.njit(cache=True)
+def _axes(outward, starts, middle, chord):  # type: ignore[no-untyped-def]  # numba infers
+    """The member nearest to the mean of each bundle, and the widest chord from it."""
+    for tile in range(len(middle)):
+        mean = np.zeros(3)
+        for i in range(starts[tile], starts[tile + 1]):
+            mean += outward[i]
+        middle[tile] = starts[tile]
+        for i in range(starts[tile], starts[tile + 1]):
+            if np.dot(outward[i], mean) > np.dot(outward[middle[tile]], mean):
+                middle[tile] = i
+        widest = 0.0
+        for i in range(starts[tile], starts[tile + 1]):
+            d = outward[i] - outward[middle[tile]]
+            widest = max(widest, np.dot(d, d))
+        chord[tile] = np.sqrt(widest) * (1 + CHORD_SLACK) + CHORD_SLACK

@@ -1,0 +1,125 @@
+"""Exact distances of many axes from many triangles, in float64, pair by pair and side by side.
+
+Each pair is brought into the axis' own frame. Most triangles lie beside their axis, where the distance is that of their
+shadows in the plane across it; those are all done in one loop without a branch. The few others are told apart there.
+As in `segment_triangle.py` every answer is the distance of a point *of the triangle*.
+"""
+
+from __future__ import annotations
+
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.clearance.kernels.segment_triangle import CONTACT_MM, LEAST, axis_triangle
+
+ROWS = 11
+"""Of a buffer of pairs: nine coordinates, squared distance, depth."""
+
+ASK, BEYOND = -1.0, -2.0
+"""In place of a squared distance: `axis_triangle` must be asked; the triangle lies wholly beyond the axis' top."""
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def bring_into_frame(u, e, f, triangles, row, origin, pairs, k):  # type: ignore[no-untyped-def]  # numba infers
+    """Write a triangle's corners, seen from an axis, to ``pairs[:9, k]``: across (e, f) and along (u), mm."""
+    for corner in range(3):
+        x, y = triangles[row, 3 * corner] - origin[0], triangles[row, 3 * corner + 1] - origin[1]
+        z = triangles[row, 3 * corner + 2] - origin[2]
+        pairs[3 * corner, k] = x * e[0] + y * e[1] + z * e[2]
+        pairs[3 * corner + 1, k] = x * f[0] + y * f[1] + z * f[2]
+        pairs[3 * corner + 2, k] = x * u[0] + y * u[1] + z * u[2]
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def measure_beside(pairs, count, length):  # type: ignore[no-untyped-def]  # numba infers
+    """Answer the pairs whose triangle lies beside the axis or is pierced by it; mark the others.
+
+    Args:
+        pairs: Shape (11, m); rows 0 to 8 as `bring_into_frame` writes them; the squared distance (or `ASK`, `BEYOND`)
+            and the depth of the nearest axis point are written to rows 9 and 10, mm.
+        count: Pairs there are.
+        length: Of the axes, mm.
+    """
+    for k in range(count):
+        ax, ay, ta, bx, by, tb = pairs[0, k], pairs[1, k], pairs[2, k], pairs[3, k], pairs[4, k], pairs[5, k]
+        cx, cy, tc = pairs[6, k], pairs[7, k], pairs[8, k]
+        best, depth = _shadow(ax, ay, ta, bx, by, tb)
+        two, two_depth = _shadow(bx, by, tb, cx, cy, tc)
+        three, three_depth = _shadow(cx, cy, tc, ax, ay, ta)
+        depth, best = two_depth if two < best else depth, two if two < best else best
+        depth, best = three_depth if three < best else depth, three if three < best else best
+        wa, wb, wc = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
+        around = ((wa >= 0.0) & (wb >= 0.0) & (wc >= 0.0)) | ((wa <= 0.0) & (wb <= 0.0) & (wc <= 0.0))
+        outside = (ta < 0.0) | (tb < 0.0) | (tc < 0.0) | (ta > length) | (tb > length) | (tc > length)
+        share = 1.0 / (wa + wb + wc)
+        x, y = (wa * ax + wb * bx + wc * cx) * share, (wa * ay + wb * by + wc * cy) * share
+        pierced = (wa * ta + wb * tb + wc * tc) * share
+        met = around & (x * x + y * y < CONTACT_MM * CONTACT_MM) & (pierced >= 0.0) & (pierced <= length)
+        met &= best >= CONTACT_MM  # else the axis may run along the triangle's plane and meet it earlier
+        best = ASK if around | outside | (best < CONTACT_MM) else best
+        best = BEYOND if (ta > length) & (tb > length) & (tc > length) else best
+        pairs[9, k], pairs[10, k] = 0.0 if met else best, pierced if met else depth
+
+
+@nb.njit(cache=True, error_model="numpy")
+def measure_other(pairs, k, length):  # type: ignore[no-untyped-def]  # numba infers
+    """Squared distance and depth of a pair that `measure_beside` has marked."""
+    a, b, c = (pairs[0, k], pairs[1, k], pairs[2, k]), (pairs[3, k], pairs[4, k], pairs[5, k]), (
+        pairs[6, k], pairs[7, k], pairs[8, k],
+    )  # fmt: skip
+    if pairs[9, k] == BEYOND:
+        top = (0.0, 0.0, length)
+        return _origin_triangle(_minus(a, top), _minus(b, top), _minus(c, top)), length
+    return axis_triangle((0.0, 0.0, 1.0), length, a, b, c)
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _shadow(px, py, tp, qx, qy, tq):  # type: ignore[no-untyped-def]  # numba infers
+    """Squared distance of the origin from an edge's shadow p-q, and the depth there (at p and q ``tp`` and ``tq``)."""
+    dx, dy = qx - px, qy - py
+    t = -(px * dx + py * dy) / (dx * dx + dy * dy + LEAST)
+    t = t if t > 0.0 else 0.0
+    t = t if t < 1.0 else 1.0
+    x, y = px + t * dx, py + t * dy
+    return x * x + y * y, tp + t * (tq - tp)
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _origin_triangle(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
+    """Squared distance of the origin from a triangle: from its nearest edge, or its face where the foot is inside."""
+    best = min(_origin_edge(a, b), _origin_edge(b, c), _origin_edge(c, a))
+    n = _cross(_minus(b, a), _minus(c, a))
+    wa, wb, wc = _inner(n, _cross(b, c)), _inner(n, _cross(c, a)), _inner(n, _cross(a, b))
+    total = wa + wb + wc
+    if not (wa >= 0.0 and wb >= 0.0 and wc >= 0.0 and total > 0.0):
+        return best
+    wa, wb, wc = wa / total, wb / total, wc / total
+    x, y = wa * a[0] + wb * b[0] + wc * c[0], wa * a[1] + wb * b[1] + wc * c[1]
+    z = wa * a[2] + wb * b[2] + wc * c[2]
+    return min(best, x * x + y * y + z * z)
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _origin_edge(p, q):  # type: ignore[no-untyped-def]  # numba infers
+    """Squared distance of the origin from an edge."""
+    d = _minus(q, p)
+    t = -_inner(p, d) / (_inner(d, d) + LEAST)
+    t = min(max(t, 0.0), 1.0)
+    x, y, z = p[0] + t * d[0], p[1] + t * d[1], p[2] + t * d[2]
+    return x * x + y * y + z * z
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _minus(p, q):  # type: ignore[no-untyped-def]  # numba infers
+    """Difference of two vectors."""
+    return p[0] - q[0], p[1] - q[1], p[2] - q[2]
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _inner(p, q):  # type: ignore[no-untyped-def]  # numba infers
+    """Inner product of two vectors."""
+    return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _cross(p, q):  # type: ignore[no-untyped-def]  # numba infers
+    """Cross product of two vectors."""
+    return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]

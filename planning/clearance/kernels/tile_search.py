@@ -1,0 +1,156 @@
+"""The search of one structure: bundles of directions against the packed surface, exact distances out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.clearance.kernels.bare import bare
+from puncture_twin.planning.clearance.kernels.bounds import ZERO, disc_bounds, lower_upper_bounds
+from puncture_twin.planning.clearance.kernels.bundle_search import FOUR, GROWN, direction, measure_bundle
+from puncture_twin.planning.clearance.kernels.lanes import LANES, at_most, lowest
+from puncture_twin.planning.clearance.kernels.scratch import NODE_ROWS, Found, Needle, Scratch
+
+BEHIND = np.float32(-1e6)
+"""Radius of what only fills up the last group of found blocks: the disc bound takes it as behind the target, mm."""
+
+COUNTED = ("bundles", "nodes", "blocks found", "axes", "filters", "block tests", "triangle tests")
+"""What `search_tiles` counts: the times it went through each of its stages, a node and a filter being 16 discs."""
+
+
+@nb.njit(cache=True, error_model="numpy")
+def search_tiles(  # type: ignore[no-untyped-def]  # numba infers
+    surface, all_nodes, slack, origin, length, at_target, nearest, cap, enough, tiles, scratch, found, lanes
+):
+    """Distance and depth of every axis; a structure's whole search.
+
+    Args:
+        surface: `Blocks.triangles`, ``local`` and ``base``.
+        all_nodes: See `bounds.disc_bounds`, made for this target.
+        slack: Rounding of a node's coordinate, mm.
+        origin: Shape (3,), the target, where the axes start.
+        length: Of the axes, mm.
+        at_target: Distance of the target itself from the surface, mm; bounds every answer from above.
+        nearest: Row of the triangle that is nearest to the target.
+        cap: Distances at or beyond need not be found: they are given as ``cap``, mm.
+        enough: An axis nearer than this need not be measured further, mm; negative to measure all.
+        tiles: `Tiles.outward`, ``starts``, ``middle`` and ``chord``.
+        scratch: `Scratch`, for this structure's groups.
+        found: `Found`, written in the tiles' order; the counts are raised.
+        lanes: `LANES`, as an argument: a constant would be unrolled to scalar code.
+    """
+    triangles, local, base = bare(surface[0]), bare(surface[1]), bare(surface[2])
+    outward, starts, middle, chords = bare(tiles[0]), bare(tiles[1]), bare(tiles[2]), bare(tiles[3])
+    nodes, room, answer = bare(all_nodes), _bare_scratch(scratch), _bare_found(found)
+    target, seed, start = (origin[0], origin[1], origin[2]), nearest, min(at_target, cap)
+    needle = Needle(target, length, np.float32(length), np.float32(slack), np.float32(enough))
+    for tile in range(len(middle)):
+        low, high = starts[tile], starts[tile + 1]
+        _begin(outward, low, high, start, lanes, room, answer)
+        if seed != nearest:
+            corners = _corners(triangles, seed, target)
+            lower_upper_bounds(room.frames32, lanes, corners, needle.short, FOUR * needle.slack, room.upper)
+        worst = ZERO
+        for k in range(high - low):
+            worst = max(worst, room.upper[k])
+        axis = direction(room.frames32, middle[tile] - low)
+        count = _collect(nodes, base, axis, np.float32(chords[tile]), needle, worst, room, answer)
+        seed = nearest
+        if count > 0:
+            _gather(nodes, count, room)
+            seed = measure_bundle((triangles, local), needle, count, low, high, lanes, room, answer, nearest)
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _bare_scratch(s):  # type: ignore[no-untyped-def]  # numba infers
+    """The same arrays without their reference counts."""
+    return Scratch(
+        bare(s.found), bare(s.chosen), bare(s.bounds), bare(s.stack), bare(s.frames), bare(s.frames32), bare(s.upper),
+        bare(s.pairs), bare(s.squares), bare(s.least), bare(s.errors), bare(s.tried), bare(s.corners),
+    )  # fmt: skip
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _bare_found(f):  # type: ignore[no-untyped-def]  # numba infers
+    """Likewise."""
+    return Found(bare(f.square), bare(f.depth), bare(f.counts))
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _single(u):  # type: ignore[no-untyped-def]  # numba infers
+    """Three numbers as float32."""
+    return np.float32(u[0]), np.float32(u[1]), np.float32(u[2])
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _across(u):  # type: ignore[no-untyped-def]  # numba infers
+    """Two unit vectors that make a frame with u (Duff et al., J. Comput. Graph. Tech. 6, 2017, the revised frame)."""
+    sign = 1.0 if u[2] >= 0.0 else -1.0
+    a = -1.0 / (sign + u[2])
+    b = u[0] * u[1] * a
+    return (1.0 + sign * u[0] * u[0] * a, sign * b, -sign * u[0]), (b, sign + u[1] * u[1] * a, -u[1])
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _begin(outward, low, high, start, lanes, room, answer):  # type: ignore[no-untyped-def]  # numba infers
+    """Set up a bundle: its members' frames and the first upper bound; lanes to spare repeat the last member."""
+    for i in range(low, high):
+        answer.square[i], answer.depth[i] = start * start, 0.0
+    for k in range(lanes):
+        i = min(low + k, high - 1)
+        u = (outward[i, 0], outward[i, 1], outward[i, 2])
+        e, f = _across(u)
+        room.frames[0, k], room.frames[1, k], room.frames[2, k] = u
+        room.frames[3, k], room.frames[4, k], room.frames[5, k] = e
+        room.frames[6, k], room.frames[7, k], room.frames[8, k] = f
+        room.upper[k] = np.float32(start) * GROWN
+    for row in range(9):
+        for k in range(lanes):
+            room.frames32[row, k] = np.float32(room.frames[row, k])
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _corners(triangles, row, o):  # type: ignore[no-untyped-def]  # numba infers
+    """A triangle's corners from the target, nine float32 numbers."""
+    x, y, z = o
+    t = triangles[row]
+    a, b, c = (t[0] - x, t[1] - y, t[2] - z), (t[3] - x, t[4] - y, t[5] - z), (t[6] - x, t[7] - y, t[8] - z)
+    return _single(a) + _single(b) + _single(c)
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _collect(nodes, base, axis, chord, needle, worst, room, answer):  # type: ignore[no-untyped-def]  # numba infers
+    """Walk the tree: the blocks that may be nearer than ``worst`` to some axis of a bundle."""
+    stack, bounds, top = room.stack, room.bounds, len(base) - 1
+    stack[0, 0], stack[0, 1] = base[top], top
+    waiting, count = 1, 0
+    while waiting > 0:
+        waiting -= 1
+        first, level = stack[waiting, 0], stack[waiting, 1]
+        disc_bounds(nodes, first, axis, chord, needle.short, needle.slack, bounds, 0)
+        answer.counts[1] += 1
+        bits, above = at_most(bounds, 0, worst), (first - base[level]) * LANES
+        while bits != 0:
+            child = above + lowest(bits)
+            bits &= bits - 1
+            if level == 0:
+                room.found[count] = child
+                count += 1
+            else:
+                stack[waiting, 0], stack[waiting, 1] = base[level - 1] + child, level - 1
+                waiting += 1
+    answer.counts[0] += 1
+    answer.counts[2] += count
+    return count
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _gather(nodes, count, room):  # type: ignore[no-untyped-def]  # numba infers
+    """Copy the nodes of the found blocks side by side; what else the last group holds counts as behind the target."""
+    for k in range(count):
+        group, lane = room.found[k] // LANES, room.found[k] % LANES
+        for row in range(NODE_ROWS):
+            room.chosen[k // LANES, row, k % LANES] = nodes[group, row, lane]
+    for k in range(count, (count + LANES - 1) // LANES * LANES):
+        for row in range(NODE_ROWS):
+            room.chosen[k // LANES, row, k % LANES] = BEHIND if row == 8 else ZERO

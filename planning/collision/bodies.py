@@ -1,0 +1,127 @@
+"""The bodies of an arm with its tool, as FCL objects that move with the joints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NamedTuple
+
+import fcl
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.links import LINK_NAMES, Link, collision_links, joined
+from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.collision.bounding_spheres import prism
+from puncture_twin.planning.collision.shapes import convex, padded, surface
+
+Array = NDArray[np.float64]
+
+BODY_NAMES = (*LINK_NAMES, "holder", "needle")
+"""The bodies of the arm, from the base on."""
+
+NEVER_TESTED: Mapping[tuple[str, str], str] = MappingProxyType(
+    {
+        ("base", "shoulder"): "joined by a joint: they overlap at every angle",
+        ("shoulder", "upper_arm"): "joined by a joint",
+        ("upper_arm", "forearm"): "joined by a joint",
+        ("forearm", "wrist_1"): "joined by a joint",
+        ("wrist_1", "wrist_2"): "joined by a joint",
+        ("wrist_2", "wrist_3"): "joined by a joint",
+        ("wrist_3", "holder"): "bolted together",
+        ("wrist_3", "needle"): "bolted together",
+        ("holder", "needle"): "bolted together",
+        ("wrist_2", "holder"): "the holder begins at the flange, beyond wrist 2, and leads away from it at every angle",
+        ("wrist_2", "needle"): "as the holder",
+    }
+)
+"""Pairs that touch by construction, or cannot touch at all, with the reason."""
+
+
+class Shape(NamedTuple):
+    """A body for FCL: solid convex pieces, and one surface for the test against the skin."""
+
+    solids: tuple[fcl.CollisionObject, ...]
+    surface: fcl.CollisionObject
+    hulls: tuple[Array, ...]
+    """For each solid, corners (n, 3), mm, of a convex hull that contains it, in the frame of the shapes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """One body of the arm.
+
+    Attributes:
+        name: One of ``BODY_NAMES``.
+        frame: Index of its frame among ``link_poses``.
+        T_frame_body: Shape (4, 4), mm: its shapes in that frame.
+        bare: The body as it is.
+        full: The body grown by the padding; ``bare`` itself where there is none.
+        radius_mm: Every point of ``bare`` lies within this distance of the shapes' origin.
+    """
+
+    name: str
+    frame: int
+    T_frame_body: Array
+    bare: Shape
+    full: Shape
+    radius_mm: float
+
+    def pose(self, poses: Array) -> fcl.Transform:
+        """Where ``link_poses`` (7, 4, 4) has the body's shapes."""
+        T = poses[self.frame] @ self.T_frame_body
+        return fcl.Transform(T[:3, :3], T[:3, 3])
+
+    def place(self, poses: Array) -> None:
+        """Move the shapes to where ``link_poses`` (7, 4, 4) has them."""
+        transform = self.pose(poses)
+        for shape in (self.bare,) if self.full is self.bare else (self.bare, self.full):
+            for item in (*shape.solids, shape.surface):
+                item.setTransform(transform)
+
+
+def arm_bodies(model: UrModel, tool: Tool, padding_mm: float) -> tuple[Body, ...]:
+    """All bodies, in the order of ``BODY_NAMES``, at the zero configuration of their own frames.
+
+    Args:
+        model: The arm.
+        tool: What its flange carries.
+        padding_mm: How much fuller ``full`` is than ``bare``.
+
+    Raises:
+        InputError: If the model's meshes do not ship.
+    """
+    return (
+        *(_link_body(link, padding_mm) for link in collision_links(model)),
+        _round_body("holder", tool.holder_diameter_mm, tool.holder_span_mm, padding_mm),
+        _round_body("needle", tool.needle_diameter_mm, tool.needle_span_mm, padding_mm),
+    )
+
+
+def _link_body(link: Link, padding_mm: float) -> Body:
+    bare = _link_shape(link, 0.0)
+    full = _link_shape(link, padding_mm) if padding_mm else bare
+    return Body(link.name, link.frame, np.eye(4), bare, full, float(np.linalg.norm(link.mesh.vertices, axis=1).max()))
+
+
+def _link_shape(link: Link, padding_mm: float) -> Shape:
+    pieces = [padded(piece, padding_mm) for piece in link.pieces]
+    solids = tuple(fcl.CollisionObject(convex(piece)) for piece in pieces)
+    hulls = tuple(np.asarray(piece.vertices) for piece in pieces)
+    return Shape(solids, fcl.CollisionObject(surface(joined(pieces))), hulls)
+
+
+def _round_body(name: str, diameter_mm: float, span_mm: tuple[float, float], padding_mm: float) -> Body:
+    length = span_mm[1] - span_mm[0]
+    T_flange_body = np.eye(4)
+    T_flange_body[2, 3] = (span_mm[0] + span_mm[1]) / 2.0
+    bare = _cylinder(diameter_mm / 2.0, length)
+    full = _cylinder(diameter_mm / 2.0 + padding_mm, length + 2.0 * padding_mm) if padding_mm else bare
+    return Body(name, 6, T_flange_body, bare, full, float(np.hypot(diameter_mm, length)) / 2.0)
+
+
+def _cylinder(radius_mm: float, length_mm: float) -> Shape:
+    solid = fcl.CollisionObject(fcl.Cylinder(radius_mm, length_mm))
+    return Shape((solid,), solid, (prism(radius_mm, length_mm),))

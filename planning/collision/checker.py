@@ -1,0 +1,279 @@
+"""What the arm may touch: collision answers of FCL for an arm with its needle, the patient's skin and the room.
+
+FCL sees the surfaces of triangle meshes, not their insides. Links, holder, needle and boxes are therefore solid
+convex shapes here, and two of them never hide in one another. The skin is a triangle mesh, and the arm cannot hide in
+it either: neighbouring bodies of the chain overlap (a test holds this), the base stands outside (checked once), so if
+no body meets a closed skin every body is on the base's side of it. For an open skin there is no inside, and only its
+surface counts (``patient_closed``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations, product
+from typing import NamedTuple
+
+import fcl
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.kinematics import link_poses
+from puncture_twin.planning.arm.links import collision_links
+from puncture_twin.planning.arm.tool import Box, Tool
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.collision.bodies import BODY_NAMES, NEVER_TESTED, Body, arm_bodies
+from puncture_twin.planning.collision.shapes import skin_surface, touch
+from puncture_twin.planning.collision.state_checker import (
+    DISTANCE_PAIRS,
+    NEEDLE_IN_PATIENT,
+    PATIENT,
+    Contact,
+    Distances,
+    Met,
+    Nearest,
+    StateChecker,
+)
+from puncture_twin.planning.collision.sweep import SweptBodies
+from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.winding import winding_number
+
+__all__ = [
+    "BODY_NAMES",
+    "DISTANCE_PAIRS",
+    "NEEDLE_IN_PATIENT",
+    "Box",
+    "CellChecker",
+    "Check",
+    "Contact",
+    "Distances",
+    "Met",
+    "Nearest",
+    "StateChecker",
+    "Tool",
+]
+
+Array = NDArray[np.float64]
+
+
+class Check(NamedTuple):
+    """One question to FCL: do two shapes touch."""
+
+    contact: Contact
+    """What it means if they do."""
+    first: fcl.CollisionObject
+    """The skin, a box, or a piece of a body."""
+    second: fcl.CollisionObject
+    first_body: Body | None
+    """The body that ``first`` moves with; None for skin and boxes."""
+    second_body: Body
+    hulls: tuple[Array | None, Array] | None
+    """Corners that enclose either, in the frames of their shapes; None for a box, and for the pair with the skin."""
+
+
+class CellChecker:
+    """FCL's verdict on configurations of one arm, tool, room and patient. Holds no state but its FCL objects.
+
+    Not for several threads at once: the FCL objects are moved for each question.
+
+    Args:
+        model: The arm; its meshes must ship (UR3, UR5, UR10).
+        tool: What the flange carries.
+        boxes: Solids of the room, base frame. The base link is not tested against them: it is bolted to one.
+        patient: The skin, base frame, mm; None for an empty room.
+        skin: The skin alone, where ``patient`` holds more: the base may touch the rest (a table), not the skin.
+        padding_mm: How much fuller the arm is for contacts with patient and boxes (not for distances, nor with itself):
+            room for what robot and registration get wrong. With 1 mm or more, free states between which no body moves
+            more than 2 mm prove that the way between them meets neither patient nor box.
+
+    Raises:
+        InputError: If the padding is negative, two boxes share a name, the patient's mesh is unusable, or the base
+            stands in the patient.
+    """
+
+    def __init__(
+        self,
+        model: UrModel,
+        tool: Tool,
+        boxes: Sequence[Box] = (),
+        patient: TriangleMesh | None = None,
+        *,
+        skin: TriangleMesh | None = None,
+        padding_mm: float = 0.0,
+    ) -> None:
+        if not (np.isfinite(padding_mm) and padding_mm >= 0.0):
+            raise InputError(f"padding_mm = {padding_mm}", where="cell", allowed="0 or more")
+        self.model = model
+        self.tool = tool
+        self._bodies = arm_bodies(model, tool, padding_mm)
+        self._swept = SweptBodies.of(model, tool)
+        self._boxes = _boxes(boxes)
+        self._bounds = {box.name: box.bounds for box in boxes}
+        self._patient = None if patient is None else skin_surface(patient, PATIENT)
+        self.patient_closed = patient is not None and patient.closed
+        if patient is not None:
+            self._bounds[PATIENT] = patient.bounds
+            self._refuse_base_in(patient, patient if skin is None else skin)
+        self._checks = tuple(self._room_checks()) + tuple(self._self_checks())
+
+    def contact(self, q: Array, *, needle_may_touch_patient: bool) -> Contact | None:
+        """The first contact found, or None when the arm is clear.
+
+        Args:
+            q: Shape (6,), rad.
+            needle_may_touch_patient: True while the needle goes in. The holder may never touch.
+
+        Raises:
+            InputError: If ``q`` is not finite: FCL would call it free.
+        """
+        self._place(q)
+        for check in self._checks:
+            allowed = needle_may_touch_patient and check.contact == NEEDLE_IN_PATIENT
+            if not allowed and touch(check.first, check.second):
+                return check.contact
+        return None
+
+    def first_contact(self, q_path: Array, *, needle_may_touch_patient: bool) -> Met | None:
+        """The first state of a path with a contact, and the contact; None when all are clear.
+
+        Args:
+            q_path: Shape (m, 6), rad.
+            needle_may_touch_patient: See :meth:`contact`.
+
+        Raises:
+            InputError: If a state is not finite.
+        """
+        for index, q in enumerate(q_path):
+            contact = self.contact(q, needle_may_touch_patient=needle_may_touch_patient)
+            if contact is not None:
+                return Met(index, contact)
+        return None
+
+    def nearest(self, q: Array, pair: str, body: str | None = None) -> Nearest:
+        """The smallest of one kind of distance.
+
+        Args:
+            q: Shape (6,), rad.
+            pair: One of ``DISTANCE_PAIRS``.
+            body: Only from this one of the pair's bodies.
+
+        Raises:
+            InputError: If ``q`` is not finite, or there is no such kind or body.
+        """
+        names = DISTANCE_PAIRS.get(pair, ())
+        if not names or (body is not None and body not in names):
+            where, allowed = f"distance {pair!r} of {body!r}", ", ".join(names or DISTANCE_PAIRS)
+            raise InputError("no such distance", where=where, allowed=allowed)
+        self._place(q)
+        bodies = [b for b in self._bodies if (b.name in names if body is None else b.name == body)]
+        skin = {} if self._patient is None else {PATIENT: self._patient}
+        return _nearest(bodies, self._boxes if pair == "boxes" else skin, self._bounds)
+
+    def distances(self, q: Array) -> Distances:
+        """How close the moving links and the tool are to patient and boxes.
+
+        Args:
+            q: Shape (6,), rad.
+
+        Raises:
+            InputError: If ``q`` is not finite.
+        """
+        return Distances(*(self.nearest(q, pair) for pair in DISTANCE_PAIRS))
+
+    def sweep_mm(self, q_path: Array) -> Array:
+        """Bound on every body's motion along each segment of a path.
+
+        Args:
+            q_path: Shape (m, 6), rad.
+
+        Returns:
+            Shape (m - 1,), mm; see :meth:`SweptBodies.bounds_mm`.
+        """
+        return np.asarray(self._swept.bounds_mm(q_path).max(axis=1))
+
+    def body_sweeps_mm(self, q_path: Array) -> dict[str, Array]:
+        """The same for each moving body by name; the tool counts with wrist 3 as one."""
+        bounds = self._swept.bounds_mm(q_path)
+        return {body.name: bounds[:, body.frame - 1] for body in self._bodies[1:]}
+
+    def _room_checks(self) -> Iterator[Check]:
+        """Every moving body against the patient, then the boxes."""
+        for body in self._bodies[1:]:
+            if self._patient is not None:
+                yield Check(Contact(body.name, PATIENT), self._patient, body.full.surface, None, body, None)
+            for name, box in self._boxes.items():
+                for solid, hull in zip(body.full.solids, body.full.hulls, strict=True):
+                    yield Check(Contact(body.name, name), box, solid, None, body, (None, hull))
+
+    def _self_checks(self) -> Iterator[Check]:
+        """Every pair of bodies that might touch, piece by piece."""
+        for first, second in combinations(self._bodies, 2):
+            if (first.name, second.name) in NEVER_TESTED:
+                continue
+            shapes = product(*(zip(body.bare.solids, body.bare.hulls, strict=True) for body in (first, second)))
+            for (a, hull_a), (b, hull_b) in shapes:
+                yield Check(Contact(second.name, first.name), a, b, first, second, (hull_a, hull_b))
+
+    def _place(self, q: Array) -> None:
+        require_finite(q)
+        poses = link_poses(self.model, q)
+        for body in self._bodies[1:]:
+            body.place(poses)
+
+    def _refuse_base_in(self, patient: TriangleMesh, skin: TriangleMesh) -> None:
+        base = self._bodies[0]
+        centre = collision_links(self.model)[0].mesh.bounds.mean(axis=0)
+        surface = skin_surface(skin, PATIENT)
+        if touch(surface, base.bare.surface) or _holds(skin, centre):
+            raise InputError("the robot's base stands in the patient", where="cell", allowed="a base outside the skin")
+        if patient is not skin and _holds(patient, centre):
+            what = "the robot's base stands in what the CT shows outside of the body (its table?)"
+            raise InputError(what, where="cell", allowed="a base outside of it")
+
+
+def _holds(mesh: TriangleMesh, point: Array) -> bool:
+    """Whether a point lies inside a surface; more than half around an open one counts too."""
+    side = side_of(mesh, point)
+    return side is Side.INSIDE or (side is Side.UNKNOWN and abs(winding_number(mesh, point)) > 0.5)
+
+
+def require_finite(q: Array) -> None:
+    """Refuse joint angles that are not finite: FCL would call them free.
+
+    Raises:
+        InputError: If one is not.
+    """
+    if not np.isfinite(q).all():
+        raise InputError(f"joint angles {q} are not finite", where="collision check", allowed="six angles in rad")
+
+
+def _nearest(bodies: Sequence[Body], others: Mapping[str, fcl.CollisionObject], bounds: Mapping[str, Array]) -> Nearest:
+    """The closest pair; pairs whose spheres cannot beat the best so far are passed over."""
+    pairs = []
+    for body in bodies:
+        centre = np.asarray(body.bare.surface.getTranslation())
+        for name, other in others.items():
+            low, high = bounds[name]
+            gap = float(np.linalg.norm(np.maximum(0.0, np.maximum(low - centre, centre - high))))
+            pairs.append((gap - body.radius_mm, body, name, other))
+    best = Nearest(np.inf, "", "")
+    for at_least, body, name, other in sorted(pairs, key=lambda pair: pair[0]):
+        if at_least >= best.mm:
+            break
+        shapes = (body.bare.surface,) if name == PATIENT else body.bare.solids
+        mm = min(fcl.distance(other, shape, fcl.DistanceRequest(), fcl.DistanceResult()) for shape in shapes)
+        best = min(best, Nearest(max(0.0, float(mm)), body.name, name))  # FCL says -1 for contact
+    return best
+
+
+def _boxes(boxes: Sequence[Box]) -> dict[str, fcl.CollisionObject]:
+    names = [box.name for box in boxes]
+    if len(set(names)) < len(names) or set(names) & {PATIENT, *BODY_NAMES}:
+        raise InputError(f"box names {names}", where="cell", allowed="each once, and none a body's or the patient's")
+    return {
+        box.name: fcl.CollisionObject(
+            fcl.Box(*box.size_mm), fcl.Transform(box.T_base_box[:3, :3], box.T_base_box[:3, 3])
+        )
+        for box in boxes
+    }

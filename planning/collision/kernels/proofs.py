@@ -1,0 +1,239 @@
+"""Compiled proofs that parts of an arm are clear, check by check, at states and all about them.
+
+Each answer is a lower bound on a distance, in mm: above 0 it proves that nothing touches; at or below, nothing is said.
+The bounds themselves are those of `surfaces` and `hulls` beside this file.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+# numba infers the types
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.collision.kernels.hulls import Hulls, hull_gap
+from puncture_twin.planning.collision.kernels.surfaces import STACK, moved, skin_gap
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+SKIN, BOX, PAIR = 0, 1, 2
+"""Kinds of checks: body against skin, hull against a box of the room, hull against hull."""
+
+MIN_GAP_MM = 1e-3
+"""What a gap must exceed to prove anything: far above the rounding of these sums (1e-10 mm) and FCL's tolerance."""
+
+ENOUGH_MM = 12.0
+"""Along a path a larger gap saves questions; beyond this it is not worth a closer look."""
+
+FAR_MM = 200.0
+"""Larger distances to the skin are not told apart."""
+
+
+class Skin(NamedTuple):
+    """The patient's surface."""
+
+    tree: tuple[Array, Array, Array]
+    """Lowest and highest corners of its boxes and the triangles' corners: see :class:`TriangleTree`."""
+    field: NDArray[np.float32]
+    """Shape (i, j, k), mm: distances of the middles of cells; NaN where nobody has asked yet."""
+    origin: Array
+    """Shape (3,), mm: the lowest corner of the field."""
+
+
+class Scene(NamedTuple):
+    """The checks of a cell and what they are about."""
+
+    checks: Indices
+    """Shape (k, 5): kind, first, second, and the frames of both. For ``SKIN`` the second is the row of the body's root
+    among the balls, else both are rows of hulls."""
+    skin: Skin
+    balls: tuple[Array, Array, Indices]
+    """Centres, radii and children of all bodies' trees of balls, each in the frame of its body."""
+    hulls: Hulls
+    T_box_base: Array
+    """Shape (h, 4, 4): by hull, where it is a box."""
+    halves: Array
+    """Shape (h, 3), mm: the box's half sizes; -1 where it is none."""
+
+
+class Movers(NamedTuple):
+    """What moves in each check, and a ball about it in the frame that it moves with."""
+
+    of_check: Indices
+    frames: Indices
+    centres: Array
+    radii: Array
+
+
+class Scratch(NamedTuple):
+    """What the search for a proof remembers and where it works: see :func:`scratch`."""
+
+    axes: Array
+    """Shape (k, 3): the last direction of each check; zero to begin anew."""
+    corners: Indices
+    """Shape (k, 2): the last corners."""
+    balls: Array
+    """Shape (h, 3), mm: where the centres of the hulls' balls stand."""
+    stack: Indices
+    inner_stack: Indices
+    M: Array
+    S: Array
+
+
+@nb.njit(cache=True)
+def scratch(checks, hulls):
+    """Room to work in for so many checks and hulls."""
+    axes, corners, balls = np.zeros((checks, 3)), np.zeros((checks, 2), np.int64), np.empty((hulls, 3))
+    stacks = np.empty(STACK, np.int64), np.empty(STACK, np.int64)
+    return Scratch(axes, corners, balls, stacks[0], stacks[1], np.empty((3, 4)), np.empty((4, 3)))
+
+
+@nb.njit(cache=True)
+def stand_balls(hulls, frames, balls):
+    """Fill ``balls`` (h, 3) with the centres of the hulls' balls, the arm standing at ``frames`` (7, 4, 4)."""
+    for hull in range(len(balls)):
+        frame = hulls.frames[hull]
+        x, y, z = hulls.centres[hull, 0], hulls.centres[hull, 1], hulls.centres[hull, 2]
+        for i in range(3):
+            along = frames[frame, i, 0] * x + frames[frame, i, 1] * y + frames[frame, i, 2] * z
+            balls[hull, i] = along + frames[frame, i, 3]
+
+
+@nb.njit(cache=True)
+def ball_gap(is_box, first, second, balls, radii, T_box_base, halves):
+    """Lower bound on the distance of two hulls: of their balls, or of a box and a ball."""
+    x, y, z = balls[second, 0], balls[second, 1], balls[second, 2]
+    squared = 0.0
+    if is_box:
+        for i in range(3):
+            along = T_box_base[first, i, 0] * x + T_box_base[first, i, 1] * y + T_box_base[first, i, 2] * z
+            squared += max(0.0, abs(along + T_box_base[first, i, 3]) - halves[first, i]) ** 2
+        return math.sqrt(squared) - radii[second]
+    squared = (x - balls[first, 0]) ** 2 + (y - balls[first, 1]) ** 2 + (z - balls[first, 2]) ** 2
+    return math.sqrt(squared) - radii[first] - radii[second]
+
+
+@nb.njit(cache=True)
+def _between(A, B, M):
+    """Fill ``M`` (3, 4) with frame B (4, 4) as frame A sees it."""
+    for i in range(3):
+        M[i, 3] = 0.0
+        for k in range(3):
+            M[i, 3] += A[k, i] * (B[k, 3] - A[k, 3])
+            M[i, k] = A[0, i] * B[0, k] + A[1, i] * B[1, k] + A[2, i] * B[2, k]
+
+
+@nb.njit(cache=True)
+def near_gap(scene, work, at, frames, enough, far, needed):
+    """Lower bound on the distance of check ``at``, the arm standing at ``frames`` (7, 4, 4); of use above ``needed``.
+
+    See :func:`skin_gap` and :func:`hull_gap`; ``TOUCHING`` is certain.
+    """
+    kind, second, frame_a, frame_b = scene.checks[at, 0], scene.checks[at, 2], scene.checks[at, 3], scene.checks[at, 4]
+    if kind == SKIN:
+        stacks = work.stack, work.inner_stack
+        gap = skin_gap(scene.skin, scene.balls, second, frames[frame_b], enough, far, needed, stacks[0], stacks[1])
+        return gap if gap > needed else 0.0
+    _between(frames[frame_a], frames[frame_b], work.M)
+    return hull_gap(scene.hulls, scene.checks[at, 1], second, work.M, work.axes[at], work.corners[at], needed, work.S)
+
+
+@nb.njit(cache=True)
+def first_unproven(scene, levers, motion, work, proven, state, check, asked, clear_mm):
+    """The first state and check, in order, that the bounds do not prove to be more than ``clear_mm`` apart.
+
+    A check whose gap was g stays clear until its two bodies have moved by g - ``clear_mm`` against one another.
+
+    Args:
+        scene: See :class:`Scene`.
+        levers: Shape (k, 6), mm: how far a radian of each joint may move the two bodies of a PAIR.
+        motion: (frames, moved, turned), with
+            frames: Shape (m, 7, 4, 4), mm: the states;
+            moved: Shape (m, 7), mm: how far each frame's bodies may have moved since the first state; rising;
+            turned: Shape (m, 6), rad: how far each joint has turned since the first state; rising.
+        work: See :class:`Scratch`.
+        proven: Shape (k,): scratch, mm: what the motion must stay below; -inf at the beginning.
+        state: Where to begin.
+        check: The first check there.
+        asked: Shape (k,): which checks.
+        clear_mm: ``MIN_GAP_MM``, or any other distance that is asked for.
+
+    Returns:
+        state * k + check; -1 where all is clear.
+    """
+    checks, radii, T_box_base, halves = scene.checks, scene.hulls.radii, scene.T_box_base, scene.halves
+    frames, ways, turned = motion
+    count, stood = len(checks), -1
+    enough, far = (clear_mm + ENOUGH_MM, clear_mm + FAR_MM) if len(frames) > 1 else (clear_mm, clear_mm + MIN_GAP_MM)
+    for row in range(state, len(frames)):
+        for at in range(check if row == state else 0, count):
+            kind, first, second, frame_a, frame_b = checks[at]
+            way = ways[row, frame_b]
+            if kind == PAIR:
+                way = 0.0
+                for joint in range(frame_a, frame_b):
+                    way += levers[at, joint] * turned[row, joint]
+            if way < proven[at] or not asked[at]:
+                continue
+            if stood < row:
+                stood = row
+                stand_balls(scene.hulls, frames[row], work.balls)
+            gap = -math.inf
+            if kind != SKIN:
+                gap = ball_gap(kind == BOX, first, second, work.balls, radii, T_box_base, halves)
+            if gap <= enough:
+                gap = near_gap(scene, work, at, frames[row], enough, far, clear_mm)
+            if gap <= clear_mm:
+                proven[at] = -math.inf
+                return row * count + at
+            proven[at] = way + gap - clear_mm
+    return -1
+
+
+@nb.njit(cache=True)
+def ways_about(frames, body_frame, centre, radius, turns, share, ways):
+    """How far a body may move while each joint turns by no more than a share of ``turns`` (6,), rad, either way.
+
+    Fills ``ways`` (7,), mm: entry j bounds the motion against the frame before joint j, the arm standing at ``frames``
+    (7, 4, 4) in the middle. A point's distance from axis j is at most that of the body's ball, plus what the joints
+    beyond have moved it against that axis.
+    """
+    x, y, z = moved(frames[body_frame], centre)
+    ways[body_frame] = 0.0
+    for joint in range(body_frame - 1, -1, -1):
+        dx, dy, dz = x - frames[joint, 0, 3], y - frames[joint, 1, 3], z - frames[joint, 2, 3]
+        ax, ay, az = frames[joint, 0, 2], frames[joint, 1, 2], frames[joint, 2, 2]
+        cx, cy, cz = dy * az - dz * ay, dz * ax - dx * az, dx * ay - dy * ax
+        lever = math.sqrt(cx * cx + cy * cy + cz * cz) + radius + ways[joint + 1]
+        ways[joint] = ways[joint + 1] + share * turns[joint] * lever
+
+
+@nb.njit(cache=True)
+def clear_about(scene, movers, frames, turns, work, gaps, unproven):
+    """Which checks are not proven clear at some states and wherever each joint turns by ``turns`` either way from them.
+
+    Args:
+        scene: See :class:`Scene`.
+        movers: See :class:`Movers`.
+        frames: Shape (m, 7, 4, 4), mm: the states.
+        turns: Shape (6,), rad.
+        work: See :class:`Scratch`.
+        gaps: Shape (m, k): filled with the bound at the state itself, ``TOUCHING`` included, for what is asked.
+        unproven: Shape (m, k): True where a check is asked; left so where nothing is proven.
+    """
+    ways = np.empty(7)
+    for row in range(len(frames)):
+        for at in range(len(scene.checks)):
+            if unproven[row, at]:
+                mover = movers.of_check[at]
+                ball = movers.centres[mover], movers.radii[mover]
+                ways_about(frames[row], movers.frames[mover], ball[0], ball[1], turns, 1.0, ways)
+                way = ways[scene.checks[at, 3]] + MIN_GAP_MM
+                gaps[row, at] = near_gap(scene, work, at, frames[row], way, way + MIN_GAP_MM, way)
+                unproven[row, at] = gaps[row, at] <= way

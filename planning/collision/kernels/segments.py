@@ -1,0 +1,194 @@
+"""Compiled judgement of one straight joint segment: what surely touches, what is surely clear, and what is left to ask.
+
+It calls the kernels of :mod:`puncture_twin.planning.collision.kernels.proofs`, of those that they call and of
+:mod:`puncture_twin.planning.arm.kernels`.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+# numba infers the types
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.kernels import link_frames
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.collision.kernels.hulls import TOUCHING
+from puncture_twin.planning.collision.kernels.proofs import (
+    BOX,
+    MIN_GAP_MM,
+    SKIN,
+    ball_gap,
+    near_gap,
+    scratch,
+    stand_balls,
+    ways_about,
+)
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+CLEAR, CONTACT, ASK, NOT_FINITE = 0, 1, 2, 3
+"""What a segment came to: proven but for the questions, a contact, a question to be asked at once, no numbers."""
+
+STATUS, CHECK, GO_ON, ASKED = 0, 1, 2, 3
+"""Where in an answer's status stand: one of the above; the check that touches; where to go on after a question; how
+many questions."""
+
+PARTS = 256
+"""Room for parts of a segment that wait: one more for each halving, and 64 of them leave nothing of a segment."""
+
+
+class Answer(NamedTuple):
+    """What a segment came to, filled by :func:`judge_segment`."""
+
+    status: Indices
+    """Shape (4,)."""
+    shares: Array
+    """Shape (q,): of each question, the share of the way at which its state stands."""
+    checks: Indices
+    """Shape (q,): the checks asked about."""
+
+
+class Way(NamedTuple):
+    """A segment, and where the arm stands on it."""
+
+    lengths: Array
+    start: Array
+    step: Array
+    turns: Array
+    """Shape (6,), rad: how far each joint turns."""
+    q: Array
+    """Shape (1, 6): scratch."""
+    frames: Array
+    """Shape (1, 7, 4, 4), mm: filled by :func:`_stand`."""
+
+
+@nb.njit(cache=True)
+def _stand(way, share):
+    """Put the arm at a share of the way."""
+    for joint in range(6):
+        way.q[0, joint] = way.start[joint] + share * way.step[joint]
+    link_frames(way.lengths, way.q, way.frames)
+
+
+@nb.njit(cache=True)
+def _not_far(scene, movers, frames, turns, order, work, near):
+    """Fills ``near`` with the checks, in order, that the balls in the middle of a segment do not clear all over it."""
+    checks, hulls, T_box_base, halves = scene.checks, scene.hulls, scene.T_box_base, scene.halves
+    stand_balls(hulls, frames, work.balls)
+    ways, known = np.empty((len(movers.frames), 7)), np.zeros(len(movers.frames), np.bool_)
+    count = 0
+    for at in order:
+        mover = movers.of_check[at]
+        if not known[mover]:
+            known[mover] = True
+            ball = movers.centres[mover], movers.radii[mover]
+            ways_about(frames, movers.frames[mover], ball[0], ball[1], turns, 0.5, ways[mover])
+        way = ways[mover, checks[at, 3]] + MIN_GAP_MM
+        if checks[at, 0] == SKIN:
+            gap = near_gap(scene, work, at, frames, way, way + MIN_GAP_MM, way)
+        else:
+            is_box = checks[at, 0] == BOX
+            gap = ball_gap(is_box, checks[at, 1], checks[at, 2], work.balls, hulls.radii, T_box_base, halves)
+        if gap <= way:
+            near[count] = at
+            count += 1
+    return count
+
+
+@nb.njit(cache=True)
+def _look(scene, way, shares, near, begin, work, answer):
+    """Whether a check finds something at the states looked at first, from ``begin`` (state * checks + check) on."""
+    checks, hulls, T_box_base, halves = scene.checks, scene.hulls, scene.T_box_base, scene.halves
+    frames = way.frames[0]
+    for position in range(begin, len(shares) * len(near)):
+        look, row = divmod(position, len(near))
+        if row == 0 or position == begin:
+            _stand(way, shares[look])
+            stand_balls(hulls, frames, work.balls)
+        at, gap = near[row], 0.0
+        if checks[at, 0] != SKIN:
+            is_box = checks[at, 0] == BOX
+            gap = ball_gap(is_box, checks[at, 1], checks[at, 2], work.balls, hulls.radii, T_box_base, halves)
+        if gap <= MIN_GAP_MM:
+            gap = near_gap(scene, work, at, frames, MIN_GAP_MM, 2.0 * MIN_GAP_MM, MIN_GAP_MM)
+        if gap <= MIN_GAP_MM:
+            answer.status[STATUS], answer.status[CHECK] = CONTACT if gap == TOUCHING else ASK, at
+            answer.status[GO_ON], answer.status[ASKED] = position + 1, 1
+            answer.shares[0], answer.checks[0] = shares[look], at
+            return True
+    return False
+
+
+@nb.njit(cache=True)
+def _prove(scene, movers, way, at, fine_mm, work, parts, answer):
+    """Whether a check surely finds something; else it is clear, or what is left to ask joins the answer.
+
+    The middle of a part clears what lies nearer to it than its gap allows to move; the rest is judged in the same way,
+    by the middles of what is left on either side (after Schwarzer, Saha and Latombe 2005, "Adaptive dynamic collision
+    checking for single and multiple articulated robots in complex environments").
+    """
+    mover, frame_a, frames, ways = movers.of_check[at], scene.checks[at, 3], way.frames[0], np.empty(7)
+    parts[0, 0], parts[0, 1], top = 0.0, 1.0, 1
+    while top > 0:
+        top -= 1
+        low, high = parts[top, 0], parts[top, 1]
+        middle, half = (low + high) / 2.0, (high - low) / 2.0
+        _stand(way, middle)
+        ball = movers.centres[mover], movers.radii[mover]
+        ways_about(frames, movers.frames[mover], ball[0], ball[1], way.turns, half, ways)
+        needed = ways[frame_a] + MIN_GAP_MM
+        gap = near_gap(scene, work, at, frames, needed, needed + MIN_GAP_MM, needed)
+        if gap > needed:
+            continue
+        if gap == TOUCHING:
+            answer.status[STATUS], answer.status[CHECK] = CONTACT, at
+            return True
+        if ways[frame_a] > fine_mm:
+            clear = half * max(0.0, gap - MIN_GAP_MM) / needed
+            parts[top, 0], parts[top, 1] = low, middle - clear
+            parts[top + 1, 0], parts[top + 1, 1] = middle + clear, high
+            top += 2
+        elif gap <= MIN_GAP_MM:
+            asked = answer.status[ASKED]
+            if asked < len(answer.shares):
+                answer.shares[asked], answer.checks[asked] = middle, at
+            answer.status[ASKED] += 1
+    return False
+
+
+@nb.njit(cache=True)
+def judge_segment(scene, movers, lengths, start, end, shares, begin, fine_mm, order, answer):
+    """Judge a straight joint segment: fills ``answer``.
+
+    Args:
+        scene: See :class:`Scene`.
+        movers: See :class:`Movers`.
+        lengths: Of the arm, see :mod:`puncture_twin.planning.arm.kernels`.
+        start: Shape (6,), rad.
+        end: The same.
+        shares: Shape (m,): of the way, where states stand that are looked at first.
+        begin: 0; after a question whose answer was no, where the answer says to go on.
+        fine_mm: Where the bodies of a check move no farther than this within a part, its middle decides.
+        order: Shape (k,): the checks in the order in which they are asked.
+        answer: See :class:`Answer`.
+    """
+    step, frames = end - start, np.empty((1, 7, 4, 4))
+    way = Way(lengths, start, step, np.abs(step), np.empty((1, 6)), frames)
+    answer.status[STATUS], answer.status[ASKED] = CLEAR, 0
+    _stand(way, 0.5)
+    if not np.isfinite(frames).all():
+        answer.status[STATUS] = NOT_FINITE
+        return
+    work, every = scratch(len(scene.checks), len(scene.hulls.radii)), np.empty(len(order), np.int64)
+    near = every[: _not_far(scene, movers, frames[0], way.turns, order, work, every)]
+    if _look(scene, way, shares, near, begin, work, answer):
+        return
+    parts = np.empty((PARTS, 2))
+    for at in near:
+        if _prove(scene, movers, way, at, fine_mm, work, parts, answer):
+            return

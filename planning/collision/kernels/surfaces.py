@@ -1,0 +1,180 @@
+"""Compiled distances to a surface of triangles: of points, and of a tree of balls that encloses a body.
+
+Each answer for a body is a lower bound, in mm: above 0 it proves that nothing touches; at or below, nothing is said.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+# numba infers the types
+
+from __future__ import annotations
+
+import math
+
+from puncture_twin.planning.base.numba_kernels import nb
+
+CELL_MM = 16.0
+"""Of the field of distances to the skin."""
+
+HALF_CELL_MM = CELL_MM * math.sqrt(3.0) / 2.0 + 1e-3
+"""No point of a cell is farther from its middle; the rounding of float32 included."""
+
+STACK = 64
+"""Of the descents: deeper than any tree here (a balanced one of 2^40 triangles needs 41)."""
+
+ROUNDS_TO_ZERO = 1e-30
+"""Squared lengths, mm^2, below which a segment has no direction."""
+
+
+@nb.njit(cache=True, inline="always")
+def _to_box(low, high, x, y, z):
+    """Squared distance of a point to an axis-aligned box."""
+    dx = max(low[0] - x, 0.0, x - high[0])
+    dy = max(low[1] - y, 0.0, y - high[1])
+    dz = max(low[2] - z, 0.0, z - high[2])
+    return dx * dx + dy * dy + dz * dz
+
+
+@nb.njit(cache=True)
+def _to_segment(ax, ay, az, bx, by, bz):
+    """Squared distance of the origin to the segment a b."""
+    ux, uy, uz = bx - ax, by - ay, bz - az
+    squared = ux * ux + uy * uy + uz * uz
+    share = 0.0
+    if squared > ROUNDS_TO_ZERO:
+        share = min(1.0, max(0.0, -(ax * ux + ay * uy + az * uz) / squared))
+    x, y, z = ax + share * ux, ay + share * uy, az + share * uz
+    return x * x + y * y + z * z
+
+
+@nb.njit(cache=True)
+def to_triangle(t, x, y, z):
+    """Squared distance of a point to a triangle (3, 3): its edges', or its plane's where the foot lies inside.
+
+    The edges always count, so that a triangle without area, whose normal means nothing, is not lost.
+    """
+    ax, ay, az = t[0, 0] - x, t[0, 1] - y, t[0, 2] - z
+    bx, by, bz = t[1, 0] - x, t[1, 1] - y, t[1, 2] - z
+    cx, cy, cz = t[2, 0] - x, t[2, 1] - y, t[2, 2] - z
+    squared = min(
+        _to_segment(ax, ay, az, bx, by, bz), _to_segment(bx, by, bz, cx, cy, cz), _to_segment(cx, cy, cz, ax, ay, az)
+    )
+    # b x c, c x a, a x b seen from the point; their sum is the normal, and each part's sign along it the side.
+    px, py, pz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+    qx, qy, qz = cy * az - cz * ay, cz * ax - cx * az, cx * ay - cy * ax
+    rx, ry, rz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    nx, ny, nz = px + qx + rx, py + qy + ry, pz + qz + rz
+    area = nx * nx + ny * ny + nz * nz
+    inside = (
+        px * nx + py * ny + pz * nz >= 0.0 and qx * nx + qy * ny + qz * nz >= 0.0 and rx * nx + ry * ny + rz * nz >= 0.0
+    )
+    if inside and area > ROUNDS_TO_ZERO:
+        height = ax * nx + ay * ny + az * nz
+        squared = min(squared, height * height / area)
+    return squared
+
+
+@nb.njit(cache=True)
+def farthest_from(triangles, points):
+    """The largest distance of points (n, 3) to triangles (m, 3, 3); 0 without points."""
+    farthest = 0.0
+    for i in range(len(points)):
+        nearest = math.inf
+        for k in range(len(triangles)):
+            nearest = min(nearest, to_triangle(triangles[k], points[i, 0], points[i, 1], points[i, 2]))
+        farthest = max(farthest, nearest)
+    return math.sqrt(farthest)
+
+
+@nb.njit(cache=True)
+def to_surface(lows, highs, corners, x, y, z, cutoff, stack, stop=0.0):
+    """Distance of a point to a surface in a :class:`TriangleTree`, or ``cutoff`` where it is no nearer.
+
+    Where it is no farther than ``stop`` any distance up to that may be returned. ``stack`` is scratch, of ``STACK``
+    integers.
+    """
+    best = cutoff * cutoff
+    inner = len(lows) - len(corners)
+    stack[0] = 0
+    top = 1 if _to_box(lows[0], highs[0], x, y, z) < best else 0
+    while top > 0 and best > stop * stop:
+        top -= 1
+        node = stack[top]
+        if _to_box(lows[node], highs[node], x, y, z) >= best:
+            continue
+        if node >= inner:
+            for k in range(corners.shape[1]):
+                best = min(best, to_triangle(corners[node - inner, k], x, y, z))
+            continue
+        left, right = 2 * node + 1, 2 * node + 2
+        to_left = _to_box(lows[left], highs[left], x, y, z)
+        to_right = _to_box(lows[right], highs[right], x, y, z)
+        near, far, to_near, to_far = left, right, to_left, to_right
+        if to_right < to_left:
+            near, far, to_near, to_far = right, left, to_right, to_left
+        if to_far < best:
+            stack[top] = far
+            top += 1
+        if to_near < best:
+            stack[top] = near
+            top += 1
+    return math.sqrt(best)
+
+
+@nb.njit(cache=True)
+def moved(T, c):
+    """A point (3,) where the frame ``T`` (4, 4) takes it."""
+    x = T[0, 0] * c[0] + T[0, 1] * c[1] + T[0, 2] * c[2] + T[0, 3]
+    y = T[1, 0] * c[0] + T[1, 1] * c[1] + T[1, 2] * c[2] + T[1, 3]
+    z = T[2, 0] * c[0] + T[2, 1] * c[1] + T[2, 2] * c[2] + T[2, 3]
+    return x, y, z
+
+
+@nb.njit(cache=True)
+def _field_distance(tree, field, origin, x, y, z, stack):
+    """Distance to the skin of the middle of the cell that a point lies in: kept in ``field`` once known; -1 outside."""
+    i, j, k = (x - origin[0]) / CELL_MM, (y - origin[1]) / CELL_MM, (z - origin[2]) / CELL_MM
+    if not (0.0 <= i < field.shape[0] and 0.0 <= j < field.shape[1] and 0.0 <= k < field.shape[2]):
+        return -1.0
+    i, j, k = int(i), int(j), int(k)
+    if math.isnan(field[i, j, k]):
+        lows, highs, corners = tree
+        mx, my, mz = (i + 0.5) * CELL_MM, (j + 0.5) * CELL_MM, (k + 0.5) * CELL_MM
+        field[i, j, k] = to_surface(lows, highs, corners, origin[0] + mx, origin[1] + my, origin[2] + mz, 1e9, stack)
+    return field[i, j, k]
+
+
+@nb.njit(cache=True)
+def skin_gap(skin, balls, root, T, enough, far, needed, stack, inner_stack):
+    """Lower bound on the distance of a body's balls to the skin, the body's frame standing at ``T`` (4, 4).
+
+    The field is asked first: a ball's centre is no farther from the middle of its cell than half of its diagonal. A
+    ball as clear as ``enough``, mm, is not divided further; no bound exceeds ``far``; the first part that is not clear
+    by ``needed`` ends the search, and then the answer is no bound, only no more than ``needed``. Both stacks are
+    scratch.
+    """
+    tree, field, origin = skin
+    centres, radii, children = balls
+    best = far
+    stack[0], top = root, 1
+    while top > 0 and best > needed:
+        top -= 1
+        node = stack[top]
+        c, r = centres[node], radii[node]
+        x, y, z = moved(T, c)
+        about, cutoff = _field_distance(tree, field, origin, x, y, z, inner_stack), best + r
+        if about >= 0.0:
+            if about - HALF_CELL_MM - r >= best:
+                continue
+            if about + HALF_CELL_MM + r <= needed:  # no part of the body in this ball is clear by as much
+                return 0.0
+            cutoff = min(cutoff, about + HALF_CELL_MM)
+        stop = max(0.0, needed + r)
+        gap = to_surface(tree[0], tree[1], tree[2], x, y, z, cutoff, inner_stack, stop) - r
+        if gap >= best:
+            continue
+        if gap > enough or children[node, 0] < 0:
+            best = gap
+        else:
+            stack[top], stack[top + 1] = children[node, 0], children[node, 1]
+            top += 2
+    return best

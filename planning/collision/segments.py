@@ -1,0 +1,105 @@
+"""Straight joint segments, judged by compiled proofs; FCL has the word where they say nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.kinematics import link_poses
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.collision.checker import Check, Contact, require_finite
+from puncture_twin.planning.collision.kernels import segments as segment_kernels
+from puncture_twin.planning.collision.kernels.segments import ASK, CONTACT, NOT_FINITE, Answer
+from puncture_twin.planning.collision.proofs import Proofs, ask_fcl
+
+Array = NDArray[np.float64]
+
+LOOK_FIRST_RAD = 0.125
+"""States of a segment so far apart are looked at before it is proven: what it touches is found soonest so."""
+
+FINE_MM = 1.0
+"""A state answers for a part of a segment within which no body moves farther from it. So states that were judged are no
+more than 2 mm of motion apart, which with 1 mm of padding proves the way between them (see :class:`CellChecker`)."""
+
+QUESTIONS = 256
+"""Room for what one segment leaves to FCL, at first."""
+
+
+class SegmentJudge:
+    """Says of straight joint segments whether they are free. Not for several threads.
+
+    What touched last is asked first. That decides which contact is named where there are several, and never whether a
+    segment is free: each segment's proof begins anew.
+
+    Args:
+        model: The arm.
+        checks: The questions that may find a contact.
+        proofs: The same, packed.
+    """
+
+    def __init__(self, model: UrModel, checks: Sequence[Check], proofs: Proofs) -> None:
+        self._model, self._checks = model, checks
+        self._packed = (proofs.scene, proofs.movers, model.lengths)
+        self._order = np.arange(len(checks), dtype=np.int64)
+        self._answer = _room_for(QUESTIONS)
+
+    def __call__(self, start: Array, end: Array) -> Contact | None:
+        """A contact on the segment between two states (6,), rad, the needle being outside the patient; None if free.
+
+        The end, and states ``LOOK_FIRST_RAD`` apart from it on, are judged as they stand; all of the segment is proven
+        clear but for parts within which no body moves farther than ``FINE_MM`` from a state where FCL finds nothing.
+        The start itself is not looked at beyond that.
+
+        Raises:
+            InputError: If a state is not finite.
+        """
+        start, end = np.array(start, dtype=np.float64), np.array(end, dtype=np.float64)
+        shares, begin = looks(math.ceil(_length(end - start) / LOOK_FIRST_RAD)), 0
+        while True:
+            segment_kernels.judge_segment(*self._packed, start, end, shares, begin, FINE_MM, self._order, self._answer)
+            status, check, begin, asked = self._answer.status.tolist()
+            if status == NOT_FINITE:
+                require_finite(np.stack([start, end]))
+            if status == CONTACT:
+                return self._met(check)
+            if asked > len(self._answer.shares):
+                self._answer, begin = _room_for(2 * asked), 0
+                continue
+            questions = self._answer.shares[:asked].tolist(), self._answer.checks[:asked].tolist()
+            for share, at in zip(*questions, strict=True):
+                if ask_fcl(self._checks[at], link_poses(self._model, start + share * (end - start))):
+                    return self._met(at)
+            if status != ASK:
+                return None
+
+    def _met(self, check: int) -> Contact:
+        """The contact of a check, which is asked first from now on."""
+        if self._order[0] != check:
+            self._order = np.concatenate([[check], self._order[self._order != check]])
+        return self._checks[check].contact
+
+
+def _room_for(questions: int) -> Answer:
+    return Answer(np.zeros(4, np.int64), np.empty(questions), np.empty(questions, np.int64))
+
+
+def _length(step: Array) -> float:
+    """Of a step (6,), rad; that of one that is no number counts as 0."""
+    length = math.sqrt(float(step @ step))
+    return length if math.isfinite(length) else 0.0
+
+
+def halving_order(count: int) -> Array:
+    """0, 1/n, 2/n ... (n - 1)/n in an order that spreads over the whole at once (van der Corput's), shape (n,)."""
+    order = np.argsort([int(f"{n:032b}"[::-1], 2) for n in range(count)], kind="stable")
+    return np.asarray(order / max(1, count))
+
+
+@lru_cache(maxsize=256)
+def looks(count: int) -> Array:
+    """Where on a segment so many states stand, the end first: shares of its way, shape (n,)."""
+    return np.asarray(1.0 - halving_order(count))

@@ -1,0 +1,92 @@
+"""What a judge of configurations answers, and the names behind which one judge takes another's place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.collision.bodies import BODY_NAMES
+
+Array = NDArray[np.float64]
+
+PATIENT = "patient"
+
+
+class Contact(NamedTuple):
+    """Two bodies that touch, such as ``("forearm", "patient")``; a body of the arm first."""
+
+    body: str
+    other: str
+
+
+NEEDLE_IN_PATIENT = Contact("needle", PATIENT)
+"""What may happen while the needle goes in."""
+
+
+class Met(NamedTuple):
+    """The first contact along a path: at which of its states, and of what."""
+
+    at: int
+    """Index of the state."""
+    contact: Contact
+
+
+class Nearest(NamedTuple):
+    """The smallest distance between the arm and something else; infinite, with empty names, where there is nothing."""
+
+    mm: float
+    body: str
+    other: str
+
+
+class Distances(NamedTuple):
+    """How close the arm is, 0 where it touches."""
+
+    patient: Nearest
+    """Moving links and holder to the skin."""
+    needle: Nearest
+    """Needle to the skin: 0 while it goes in."""
+    boxes: Nearest
+    """Moving links, holder and needle to the room's boxes."""
+
+
+DISTANCE_PAIRS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {"patient": BODY_NAMES[1:-1], "needle": BODY_NAMES[-1:], "boxes": BODY_NAMES[1:]}
+)
+"""The kinds of distance, by the fields of ``Distances``, and the bodies that each is measured from."""
+
+
+class StateChecker(Protocol):
+    """Judges configurations of one arm in one scene. A faster judge takes this one's place behind these names."""
+
+    @property
+    def model(self) -> UrModel:
+        """The arm."""
+
+    @property
+    def tool(self) -> Tool:
+        """What the flange carries."""
+
+    def contact(self, q: Array, *, needle_may_touch_patient: bool) -> Contact | None:
+        """The first contact found at ``q``, shape (6,), rad; None when the arm is clear."""
+
+    def first_contact(self, q_path: Array, *, needle_may_touch_patient: bool) -> Met | None:
+        """The first state of ``q_path`` (m, 6), rad, with a contact, and the contact; None when all are clear."""
+
+    def nearest(self, q: Array, pair: str, body: str | None = None) -> Nearest:
+        """One of ``DISTANCE_PAIRS`` at ``q``, shape (6,), rad; of one body alone when named."""
+
+    def distances(self, q: Array) -> Distances:
+        """All of them."""
+
+    def sweep_mm(self, q_path: Array) -> Array:
+        """Bound on every body's motion along each segment of ``q_path`` (m, 6): shape (m - 1,), mm."""
+
+    def body_sweeps_mm(self, q_path: Array) -> dict[str, Array]:
+        """The same for each moving body by name."""

@@ -1,0 +1,94 @@
+"""How far the bodies of an arm move between two configurations: the bound behind every sampled collision check."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.kinematics import link_poses
+from puncture_twin.planning.arm.links import collision_links
+from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.numba_kernels import nb
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SweptBodies:
+    """Boxes about the moving bodies, to bound their motion.
+
+    Attributes:
+        model: The arm.
+        tool: What its flange carries.
+        corners: Shape (6, 8, 3), mm: a box about each moving link in its frame, the last one with holder and needle.
+    """
+
+    model: UrModel
+    tool: Tool
+    corners: Array
+
+    @classmethod
+    def of(cls, model: UrModel, tool: Tool, padding_mm: float = 0.0) -> SweptBodies:
+        """The boxes about a model's links and a tool, each grown by ``padding_mm`` on every side."""
+        boxes = [link.mesh.bounds for link in collision_links(model)[1:]]
+        radius = max(tool.holder_diameter_mm, tool.needle_diameter_mm) / 2.0
+        reach = np.array([[-radius, -radius, tool.holder_span_mm[0]], [radius, radius, tool.needle_length_mm]])
+        boxes[-1] = np.stack([np.minimum(boxes[-1][0], reach[0]), np.maximum(boxes[-1][1], reach[1])])
+        grown = [box + [[-padding_mm], [padding_mm]] for box in boxes]
+        return cls(model, tool, np.stack([np.array(list(product(*box.T))) for box in grown]))
+
+    def bounds_mm(self, q_path: Array) -> Array:
+        """A bound on the motion of every point of each link along each straight joint segment of a path.
+
+        Along a segment each point stays within half this bound of where it is at one of the two ends: the farthest
+        chord of a box corner (a rigid displacement is affine, so a corner moves farthest), plus twice the sag of the
+        curve over its chord, at most (sum of joint steps)^2 times the longest lever / 8. It also bounds how far a
+        point ends up from where it started.
+
+        Args:
+            q_path: Shape (m, 6), rad.
+
+        Returns:
+            Shape (m - 1, 6), mm: shoulder, ..., wrist 3 with the tool.
+        """
+        path = np.array(q_path, dtype=np.float64, order="C")
+        bounds = np.empty((len(path) - 1, 6))
+        _motion_bounds(link_poses(self.model, path), path, self.corners, self.longest_lever_mm, bounds)
+        return bounds
+
+    @cached_property
+    def longest_lever_mm(self) -> float:
+        """No body point is ever farther from a joint's axis than this, mm."""
+        m = self.model
+        chain = abs(m.a2) + abs(m.a3) + m.d4 + m.d5 + m.d6
+        return float(chain + np.linalg.norm(self.corners, axis=-1).max())
+
+
+@nb.njit(cache=True)
+def _motion_bounds(frames, q, corners, lever, bounds):  # type: ignore[no-untyped-def]  # numba infers
+    """Fill ``bounds`` (m - 1, 6) from ``frames`` (m, 7, 4, 4), ``q`` (m, 6) and box ``corners`` (6, 8, 3).
+
+    A NaN anywhere gives a NaN.
+    """
+    for k in range(len(q) - 1):
+        turned = 0.0
+        for link in range(6):
+            turned += abs(q[k + 1, link] - q[k, link])
+            here, there = frames[k, link + 1], frames[k + 1, link + 1]
+            farthest = 0.0
+            for c in range(8):
+                squared = 0.0
+                for i in range(3):
+                    moved = there[i, 3] - here[i, 3]
+                    for j in range(3):
+                        moved += (there[i, j] - here[i, j]) * corners[link, c, j]
+                    squared += moved * moved
+                if not squared <= farthest:
+                    farthest = squared
+            bounds[k, link] = math.sqrt(farthest) + 2.0 * turned * turned * lever / 8.0

@@ -1,0 +1,113 @@
+"""What stands around the arm in a case: the patient's skin, the obstacles, the needle on the flange."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy, Role
+from puncture_twin.planning.anatomy.body.outside_body import joined
+from puncture_twin.planning.arm.gantry import gantry_boxes
+from puncture_twin.planning.arm.tool import Box, Tool
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import Case, Gantry, Obstacle
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+Floats = NDArray[np.float64]
+
+
+ARM_PADDING_MM = 5.0
+"""The arm keeps this distance from patient and room: more than the registration's error, and enough to prove the way
+between two checked states."""
+
+
+def case_tool(case: Case) -> Tool:
+    """The needle and its holder."""
+    needle = case.needle
+    return Tool(needle.length_mm, needle.shaft_mm, needle.diameter_mm, needle.holder_diameter_mm)
+
+
+def case_boxes(case: Case, T_base_ct: Floats) -> tuple[Box, ...]:
+    """The obstacles and the gantry, in the base frame; the gantry's boxes are called ``gantry_0`` ..."""
+    boxes = tuple(_box(obstacle, T_base_ct) for obstacle in case.obstacles)
+    return boxes if case.gantry is None else (*boxes, *_gantry_boxes(case.gantry, T_base_ct))
+
+
+def gantry_in_ct(gantry: Gantry) -> tuple[Box, ...]:
+    """The gantry's boxes in the CT frame, which stands in for their base frame."""
+    return _gantry_boxes(gantry, np.eye(4))
+
+
+def _gantry_boxes(gantry: Gantry, T_base_ct: Floats) -> tuple[Box, ...]:
+    return gantry_boxes(
+        T_base_ct @ gantry.T_ct_gantry,
+        bore_diameter_mm=gantry.bore_diameter_mm,
+        wall_mm=gantry.wall_mm,
+        depth_mm=gantry.thickness_mm,
+    )
+
+
+def gantry_in_patient_mm(gantry: Gantry, skin: TriangleMesh) -> float:
+    """How deep the skin's farthest corner lies in the gantry's wall, outward from the bore; 0 where none does.
+
+    Args:
+        gantry: The wall.
+        skin: CT frame.
+    """
+    T = np.linalg.inv(gantry.T_ct_gantry)
+    at = skin.vertices @ T[:3, :3].T + T[:3, 3]
+    beside = np.hypot(at[:, 0], at[:, 1])[np.abs(at[:, 2]) <= gantry.thickness_mm / 2]
+    return max(0.0, float(beside.max(initial=0.0)) - gantry.bore_diameter_mm / 2)
+
+
+def _box(obstacle: Obstacle, T_base_ct: Floats) -> Box:
+    T = np.eye(4)
+    T[:3, 3] = obstacle.center_mm
+    T_base_box = T if obstacle.frame == "base" else T_base_ct @ T
+    x, y, z = obstacle.size_mm
+    return Box(obstacle.name, T_base_box, (float(x), float(y), float(z)))
+
+
+def check_gantry(case: Case, skin: TriangleMesh) -> None:
+    """Refuse a gantry that does not go around the patient.
+
+    Args:
+        case: The case.
+        skin: CT frame.
+
+    Raises:
+        InputError: Its wall stands in him.
+    """
+    deep = 0.0 if case.gantry is None else gantry_in_patient_mm(case.gantry, skin)
+    if deep > 0.0:
+        what = f"the gantry's wall stands {deep:.0f} mm in the patient"
+        raise InputError(what, where=f"{case.path}: gantry", allowed="a bore about the body: see center_mm, tilt_deg")
+
+
+def patient_surface(anatomy: Anatomy) -> TriangleMesh:
+    """What the arm must not touch as the patient, CT frame: the skin, and what the CT shows outside of it."""
+    outside = [one.mesh for one in anatomy.surroundings if one.role is Role.UNKNOWN]
+    return joined([anatomy.skin.mesh, *outside]) if outside else anatomy.skin.mesh
+
+
+def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats) -> FastChecker:
+    """The collision checker of the case's room, with the patient where ``T_base_ct`` says.
+
+    Raises:
+        InputError: The robot's base stands in the patient, or the gantry's wall does.
+    """
+    check_gantry(case, anatomy.skin.mesh)
+    patient, skin = (mesh.transformed(T_base_ct) for mesh in (patient_surface(anatomy), anatomy.skin.mesh))
+    boxes = case_boxes(case, T_base_ct)
+    model, tool = ur_model(case.robot.model), case_tool(case)
+    return FastChecker(model, tool, boxes, patient, skin=skin, padding_mm=ARM_PADDING_MM, cache=user_cache())
+
+
+def home_configuration(case: Case) -> Floats:
+    """Where the arm waits, shape (6,), rad: the case's, or arm up and wrist down."""
+    if case.robot.home is not None:
+        return case.robot.home
+    return np.radians([0.0, -90.0, 0.0, -90.0, 0.0, 0.0])

@@ -1,0 +1,223 @@
+"""Which label is which organ, and which organs a case's name patterns mean."""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import io
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Protocol
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.text_names import check_name
+from puncture_twin.planning.formats.labels import totalsegmentator
+from puncture_twin.planning.formats.labels.labelmaps import MAX_LABEL
+
+BUILT_IN: Mapping[str, Mapping[int, str]] = {
+    "totalsegmentator-v1": totalsegmentator.V1,
+    "totalsegmentator-v2": totalsegmentator.V2,
+}
+OWN_NAMES = "seg.nrrd"
+"""The naming that takes the names inside a .seg.nrrd."""
+MAX_CSV_BYTES = 10_000_000
+"""A table of all 65,535 labels stays below 4 MB."""
+
+
+class RuleKind(StrEnum):
+    """What a case wants of the labels that a pattern names."""
+
+    AVOID = "avoid"
+    TRAVERSE = "traverse"
+    TARGET = "target"
+    IGNORE = "ignore"
+
+
+@dataclass(frozen=True)
+class LabelRule:
+    """What holds for one label that is present.
+
+    Attributes:
+        label: Its number in the map.
+        name: Its name.
+        kind: What the case wants of it.
+        margin_mm: The clearance that an avoided structure demands; 0 for the other kinds.
+        pattern: The pattern that said so.
+    """
+
+    label: int
+    name: str
+    kind: RuleKind
+    margin_mm: float
+    pattern: str
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What the patterns of a case say about the labels of a map.
+
+    Attributes:
+        rules: One per label present, by rising label, those to ignore included.
+        warnings: Patterns that match no label of this map.
+    """
+
+    rules: tuple[LabelRule, ...]
+    warnings: tuple[str, ...]
+
+
+class OwnNames(Protocol):
+    """Whatever may hold names of its own: a label map."""
+
+    @property
+    def path(self) -> Path:
+        """Its file."""
+
+    @property
+    def names(self) -> Mapping[int, str] | None:
+        """Label to name, or None."""
+
+
+def is_naming_file(naming: str | None) -> bool:
+    """Whether a naming is a file, and not a table of this package or of the label map itself."""
+    return naming is not None and naming not in BUILT_IN and naming.lower().endswith(".csv")
+
+
+def names_for(naming: str | None, folder: Path, content: Callable[[str], bytes], labelmap: OwnNames) -> dict[int, str]:
+    """The names of labels, by number.
+
+    Args:
+        naming: ``"totalsegmentator-v1"``, ``"totalsegmentator-v2"``, the path of a CSV with the columns
+            ``id,name``, or None or ``"seg.nrrd"`` for the names that a .seg.nrrd holds.
+        folder: What a CSV's path is relative to.
+        content: Gives the bytes of a CSV by its path.
+        labelmap: The map, for its own names.
+
+    Raises:
+        InputError: An unknown naming, a map without names of its own, or a CSV that cannot be used.
+    """
+    allowed = f"{', '.join(BUILT_IN)}, a CSV with id,name, or a .seg.nrrd with names"
+    if naming is None or naming == OWN_NAMES:
+        if labelmap.names is None:
+            raise InputError("the label map holds no names", where=labelmap.path, allowed=allowed)
+        return _unique(labelmap.names, labelmap.path)
+    if naming in BUILT_IN:
+        return dict(BUILT_IN[naming])
+    if naming.lower().endswith(".csv"):
+        return _unique(_read_csv(content(naming), folder / naming), folder / naming)
+    near = difflib.get_close_matches(naming, BUILT_IN, n=1)
+    hint = f" (nearest: {near[0]})" if near else ""
+    raise InputError(f"unknown naming {naming!r}{hint}", where=labelmap.path, allowed=allowed)
+
+
+def select(
+    names: Mapping[int, str],
+    present: Collection[int],
+    *,
+    avoid: Mapping[str, float],
+    traverse: Sequence[str] = (),
+    target: Sequence[str] = (),
+    ignore: Sequence[str] = (),
+    where: str | Path,
+) -> Selection:
+    """Gives every label present its rule.
+
+    Patterns are shell patterns (``*``, ``?``, ``[...]``), capitals count. Where several ``avoid`` patterns name
+    one label, the largest margin holds.
+
+    Args:
+        names: Label to name.
+        present: The labels of the map.
+        avoid: Pattern to margin in mm.
+        traverse: Patterns of what may be crossed.
+        target: Patterns of what holds the lesion.
+        ignore: Patterns of what does not count.
+        where: The case file and entry, for messages.
+
+    Raises:
+        InputError: A label present that has no name or that no pattern names, one that two kinds name, a
+            pattern that matches no name of the naming, or a margin that is negative or not finite.
+    """
+    patterns = [LabelRule(0, "", RuleKind.AVOID, float(margin), pattern) for pattern, margin in avoid.items()]
+    for kind, listed in ((RuleKind.TRAVERSE, traverse), (RuleKind.TARGET, target), (RuleKind.IGNORE, ignore)):
+        patterns += [LabelRule(0, "", kind, 0.0, pattern) for pattern in listed]
+    _check_patterns(patterns, names, where)
+    nameless = [label for label in sorted(present) if label not in names]
+    if nameless:
+        raise InputError(f"labels without a name: {_listed(nameless)}", where=where, allowed="labels of the naming")
+    rules = [_rule(label, names[label], patterns, where) for label in sorted(present)]
+    missing = [names[label] for label, rule in zip(sorted(present), rules, strict=True) if rule is None]
+    if missing:
+        what = f"no rule names these labels, which are present: {_listed(missing)}"
+        raise InputError(what, where=where, allowed="a pattern in avoid, traverse, target or ignore for each")
+    here = [names[label] for label in present]
+    unused = [p for p in patterns if not any(fnmatchcase(name, p.pattern) for name in here)]
+    warnings = tuple(f"{where}: {p.kind} pattern {p.pattern!r} matches no label present" for p in unused)
+    return Selection(tuple(rule for rule in rules if rule is not None), warnings)
+
+
+def _check_patterns(patterns: Sequence[LabelRule], names: Mapping[int, str], where: str | Path) -> None:
+    for rule in patterns:
+        if not (math.isfinite(rule.margin_mm) and rule.margin_mm >= 0):
+            what = f"margin {rule.margin_mm} of pattern {rule.pattern!r}"
+            raise InputError(what, where=where, allowed="mm, 0 or more")
+        if not any(fnmatchcase(name, rule.pattern) for name in names.values()):
+            near = difflib.get_close_matches(rule.pattern.strip("*?"), names.values(), n=3, cutoff=0.4)
+            allowed = f"names like {', '.join(near)}" if near else f"one of {_listed(sorted(names.values()))}"
+            what = f"{rule.kind} pattern {rule.pattern!r} matches no name of the naming"
+            raise InputError(what, where=where, allowed=allowed)
+
+
+def _rule(label: int, name: str, patterns: Sequence[LabelRule], where: str | Path) -> LabelRule | None:
+    matching = [p for p in patterns if fnmatchcase(name, p.pattern)]
+    if not matching:
+        return None
+    first = max(matching, key=lambda p: p.margin_mm)
+    other = next((p for p in matching if p.kind is not first.kind), None)
+    if other is not None:
+        what = f"label {name!r} is named by {first.kind} {first.pattern!r} and by {other.kind} {other.pattern!r}"
+        raise InputError(what, where=where, allowed="one kind of rule per label")
+    return LabelRule(label, name, first.kind, first.margin_mm, first.pattern)
+
+
+def _listed(items: Sequence[object]) -> str:
+    return ", ".join(str(item) for item in items)
+
+
+def _unique(names: Mapping[int, str], where: Path) -> dict[int, str]:
+    """The names, each of one label: two structures of one name could not be told apart in a result."""
+    seen: dict[str, int] = {}
+    for label, name in names.items():
+        check_name(name, f"label {label}", where=where)
+        if name in seen:
+            what = f"labels {seen[name]} and {label} are both named {name!r}"
+            raise InputError(what, where=where, allowed="a name of its own for each label")
+        seen[name] = label
+    return dict(names)
+
+
+def _read_csv(data: bytes, path: Path) -> dict[int, str]:
+    allowed = "a CSV with the header id,name and one label per line"
+    try:
+        rows = list(csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"is no CSV text ({error})", where=path, allowed=allowed) from error
+    if not rows or [cell.strip().lower() for cell in rows[0]] != ["id", "name"]:
+        raise InputError(f"header {rows[0] if rows else 'missing'}", where=path, allowed=allowed)
+    names: dict[int, str] = {}
+    for number, row in enumerate(rows[1:], start=2):
+        if not row:
+            continue
+        where = f"{path}, line {number}"
+        cell = row[0].strip()
+        if len(row) != 2 or not (cell.isascii() and cell.isdigit() and len(cell) < 7 and 0 < int(cell) <= MAX_LABEL):
+            raise InputError(f"{row}", where=where, allowed=f"id,name with an id from 1 to {MAX_LABEL}")
+        if int(cell) in names:
+            raise InputError(f"id {cell} stands twice", where=where, allowed="each id once")
+        names[int(cell)] = row[1].strip()
+    if not names:
+        raise InputError("the naming holds no label", where=path, allowed=allowed)
+    return names

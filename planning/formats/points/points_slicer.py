@@ -1,0 +1,139 @@
+"""Points of 3D Slicer: markups as JSON (.mrk.json), and the older fiducial lists (.fcsv).
+
+Source: Slicer documentation, "Markups" module, file formats; in older files the coordinate system is a number.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from typing import Any
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.points.raw_points import RawPoints, parse_coordinate
+from puncture_twin.planning.formats.raw_mesh import decode_text, refuse
+from puncture_twin.planning.geometry.spaces import Space, Unit, parse_unit
+
+_MARKUPS_ALLOWED = "one Slicer markup of type Fiducial with labelled, defined control points"
+_SPACES = {"LPS": Space.LPS, "RAS": Space.RAS, "0": Space.RAS, "1": Space.LPS}
+_FCSV_ALLOWED = "a Slicer fiducial list with '# CoordinateSystem = ' and '# columns = id,x,y,z,...,label,...'"
+_FCSV_SYSTEM = "# coordinatesystem"
+_FCSV_COLUMNS = "# columns"
+
+
+def read_markups_points(data: bytes, where: str) -> RawPoints:
+    """The control points of a Slicer markups file.
+
+    Args:
+        data: The whole file.
+        where: Its name, for the error.
+
+    Raises:
+        InputError: If it is no such file, states no known space, or a point has no label or defined position.
+    """
+    try:
+        tree: Any = json.loads(decode_text(data, where), object_pairs_hook=_unique_keys)
+    except (ValueError, RecursionError) as error:  # no JSON, a key twice, nesting without end
+        raise InputError(f"JSON cannot be read ({error})", where=where, allowed=_MARKUPS_ALLOWED) from error
+    markups = tree.get("markups") if isinstance(tree, dict) else None
+    if not isinstance(markups, list) or len(markups) != 1 or not isinstance(markups[0], dict):
+        refuse("not exactly one entry in 'markups'", where, _MARKUPS_ALLOWED)
+    markup = markups[0]
+    if markup.get("type", "Fiducial") != "Fiducial":
+        refuse(f"markup of type {str(markup['type'])[:40]!r}", where, _MARKUPS_ALLOWED)
+    points = markup.get("controlPoints")
+    if not isinstance(points, list) or not points:
+        refuse("no control point", where, _MARKUPS_ALLOWED)
+    places = [f"{where}, control point {number}" for number in range(1, len(points) + 1)]
+    return RawPoints(
+        names=[_label(point, place) for point, place in zip(points, places, strict=True)],
+        points=[_position(point, place) for point, place in zip(points, places, strict=True)],
+        unit=_unit(markup.get("coordinateUnits"), where),
+        space=_space(markup.get("coordinateSystem"), where),
+    )
+
+
+def read_fcsv_points(data: bytes, where: str) -> RawPoints:
+    """The points of an older Slicer fiducial list, which is in mm by its definition.
+
+    Args:
+        data: The whole file.
+        where: Its name, for the error.
+
+    Raises:
+        InputError: If it states no known space or columns, or a line is not understood.
+    """
+    lines = decode_text(data, where).splitlines()
+    system, header = _fcsv_value(lines, _FCSV_SYSTEM), _fcsv_value(lines, _FCSV_COLUMNS)
+    columns = [] if header is None else [name.strip() for name in header.split(",")]
+    if any(columns.count(name) != 1 for name in ("x", "y", "z", "label")):
+        refuse(f"columns {columns}", where, _FCSV_ALLOWED)
+    names, points = [], []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        place = f"{where}, line {number}"
+        fields = _fcsv_fields(line, place)
+        if len(fields) != len(columns):
+            refuse(f"{len(fields)} fields instead of {len(columns)}", place, _FCSV_ALLOWED)
+        names.append(fields[columns.index("label")].strip())
+        x, y, z = (parse_coordinate(fields[columns.index(axis)], place) for axis in "xyz")
+        points.append((x, y, z))
+    return RawPoints(names, points, Unit.MM, _space(system, where))
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    keys = [key for key, _ in pairs]
+    if len(set(keys)) != len(keys):
+        raise ValueError(f"a key stands twice among {keys[:20]}")
+    return dict(pairs)
+
+
+def _space(value: object, where: str) -> Space:
+    key = str(value).strip() if isinstance(value, (str, int)) and not isinstance(value, bool) else ""
+    if key not in _SPACES:
+        refuse(f"coordinate system {str(value)[:40]!r}", where, "LPS or RAS (in older files 1 or 0)")
+    return _SPACES[key]
+
+
+def _unit(value: object, where: str) -> Unit | None:
+    """From "mm", or a coded entry such as ["mm", "UCUM", "millimeter"]; None if there is none."""
+    if value is None:
+        return None
+    text = value[0] if isinstance(value, list) and value else value
+    if not isinstance(text, str):
+        refuse(f"coordinateUnits {str(value)[:40]!r}", where, 'such as "mm" or ["mm", "UCUM", "millimeter"]')
+    return parse_unit(text, where=where)
+
+
+def _label(point: object, where: str) -> str:
+    label = point.get("label") if isinstance(point, dict) else None
+    if not isinstance(label, str) or not label.strip():
+        refuse(f"label {str(label)[:40]!r}", where, "a label that is not empty")
+    return label.strip()
+
+
+def _position(point: dict[str, Any], where: str) -> tuple[float, float, float]:
+    status = point.get("positionStatus", "defined")
+    if status != "defined":
+        refuse(f"positionStatus is {str(status)[:40]!r}", where, '"defined"')
+    position = point.get("position")
+    if not isinstance(position, list) or len(position) != 3:
+        refuse(f"position {str(position)[:60]!r}", where, "three numbers")
+    for value in position:
+        if not isinstance(value, (int, float)) or isinstance(value, bool):
+            refuse(f"position {str(position)[:60]!r}", where, "three numbers")
+    x, y, z = (parse_coordinate(str(value), where) for value in position)
+    return x, y, z
+
+
+def _fcsv_value(lines: list[str], key: str) -> str | None:
+    found = [line.partition("=")[2].strip() for line in lines if line.lower().startswith(key)]
+    return found[0] if len(found) == 1 else None
+
+
+def _fcsv_fields(line: str, where: str) -> list[str]:
+    try:
+        return next(csv.reader([line], strict=True))
+    except csv.Error as error:
+        raise InputError(f"{error}", where=where, allowed=_FCSV_ALLOWED) from error

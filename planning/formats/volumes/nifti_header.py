@@ -1,0 +1,216 @@
+"""NIfTI-1 headers, checked before any voxel is looked at.
+
+Layout and meaning of the fields: NIfTI-1 standard, nifti1.h (DFWG, 2003), "methods" 2 (qform) and 3 (sform).
+A NIfTI affine maps to RAS; everything here leaves in LPS.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.volumes.inflate import first_bytes
+from puncture_twin.planning.formats.volumes.volume_header import (
+    Cells,
+    VolumeHeader,
+    check_affine,
+    check_shape,
+    corner_deviation_mm,
+)
+
+HEADER_BYTES = 348
+FIRST_VOXEL_BYTE = 352
+TYPES = {
+    2: "u1",
+    4: "i2",
+    8: "i4",
+    16: "f4",
+    64: "f8",
+    256: "i1",
+    512: "u2",
+    768: "u4",
+    1024: "i8",
+    1280: "u8",
+}
+"""Datatype code to type: signed and unsigned integers and floats; no colour, no complex numbers."""
+BITS_OF_DATATYPE = {code: 8 * np.dtype(name).itemsize for code, name in TYPES.items()}
+"""Datatype code to bits per voxel."""
+LEAST_SLOPE = float(np.finfo(np.float64).eps)
+"""A slope below means "none" to some programs, and is one to others."""
+MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
+"""``xyzt_units`` to mm: unknown (taken as mm, and the spacing must then be plausible), metre, mm, micrometre."""
+QFORM_TOLERANCE_MM = 0.2
+"""How far the two affines may part at a corner: a float32 quaternion near a half turn errs by 4e-4 rad at worst."""
+PIXDIM_TOLERANCE = 1e-3
+"""Relative difference between pixdim and the sform's column lengths; SimpleITK takes its spacing from pixdim."""
+LPS_FROM_RAS = np.array([[-1.0], [-1.0], [1.0], [1.0]])
+"""Factors of the rows of an affine."""
+PLAIN = "a single-file NIfTI-1 (.nii, .nii.gz) with 3 axes"
+
+
+@dataclass(frozen=True)
+class _Fields:
+    """The header's fields that matter, as stored; ``order`` is the byte order, "<" or ">"."""
+
+    order: str
+    dim: tuple[int, ...]
+    datatype: int
+    bitpix: int
+    pixdim: tuple[float, ...]
+    vox_offset: float
+    scaling: tuple[float, float]
+    units: int
+    qform_code: int
+    sform_code: int
+    quaternion: tuple[float, ...]
+    qoffset: tuple[float, ...]
+    srow: tuple[float, ...]
+
+
+def parse_nifti_header(content: bytes, path: Path) -> VolumeHeader:
+    """What the header of a file says; of a .nii.gz no more than the header is inflated.
+
+    Where sform and qform are both given they must agree, so that it does not matter which one a program takes
+    (SimpleITK takes the sform if its code is 1, else the qform).
+
+    Args:
+        content: The whole file.
+        path: Its name.
+
+    Raises:
+        InputError: Whatever is wrong with the header.
+    """
+    compressed = path.name.lower().endswith(".gz")
+    start = memoryview(content)
+    head = first_bytes(start, HEADER_BYTES, where=path, allowed=PLAIN) if compressed else content[:HEADER_BYTES]
+    fields = _parse(head, path)
+    shape = _shape(fields, path)
+    if BITS_OF_DATATYPE.get(fields.datatype) != fields.bitpix:
+        what = f"datatype {fields.datatype} with {fields.bitpix} bits"
+        raise InputError(what, where=path, allowed=f"(datatype: bits) {BITS_OF_DATATYPE}")
+    slope, intercept = _scaling(fields, path)
+    T_ct_index = check_affine(_affine(fields, shape, path), where=path)
+    offset = fields.vox_offset
+    if not (np.isfinite(offset) and offset >= FIRST_VOXEL_BYTE and offset == int(offset)):
+        raise InputError(f"vox_offset {offset}", where=path, allowed=f"a whole number >= {FIRST_VOXEL_BYTE}")
+    dtype = np.dtype(fields.order + TYPES[fields.datatype])
+    encoding = "gzip" if compressed else "raw"
+    cells = Cells(dtype, encoding, offset=int(offset), slope=slope, intercept=intercept)
+    return VolumeHeader(shape, T_ct_index, {}, cells, path)
+
+
+def _scaling(fields: _Fields, path: Path) -> tuple[float, float]:
+    """What stored values are multiplied with, and what is added: 1 and 0 where the header says nothing."""
+    slope, intercept = fields.scaling
+    if not np.isfinite(fields.scaling).all():
+        raise InputError("scl_slope or scl_inter is not finite", where=path, allowed="finite numbers")
+    if slope == 0.0 and intercept == 0.0:
+        return 1.0, 0.0
+    if abs(slope) <= LEAST_SLOPE:
+        what = f"scl_slope {slope:g} with scl_inter {intercept:g}: some programs scale by it and others do not"
+        raise InputError(what, where=path, allowed="both 0, or a slope that is not")
+    return slope, intercept
+
+
+def _parse(data: bytes, path: Path) -> _Fields:
+    if len(data) < HEADER_BYTES:
+        raise InputError(f"the file ends inside the header ({len(data)} bytes)", where=path, allowed=PLAIN)
+    order = {348: "<", 1543569408: ">"}.get(struct.unpack_from("<i", data, 0)[0])
+    if order is None or data[344:348] != b"n+1\0":
+        raise InputError("no NIfTI-1 header (header size and magic 'n+1')", where=path, allowed=PLAIN)
+
+    def get(layout: str, offset: int) -> tuple[float, ...]:
+        return struct.unpack_from(order + layout, data, offset)
+
+    return _Fields(
+        order=order,
+        dim=struct.unpack_from(order + "8h", data, 40),
+        datatype=struct.unpack_from(order + "h", data, 70)[0],
+        bitpix=struct.unpack_from(order + "h", data, 72)[0],
+        pixdim=get("8f", 76),
+        vox_offset=get("f", 108)[0],
+        scaling=(get("f", 112)[0], get("f", 116)[0]),
+        units=data[123] & 7,
+        qform_code=struct.unpack_from(order + "h", data, 252)[0],
+        sform_code=struct.unpack_from(order + "h", data, 254)[0],
+        quaternion=get("3f", 256),
+        qoffset=get("3f", 268),
+        srow=get("12f", 280),
+    )
+
+
+def _shape(fields: _Fields, path: Path) -> tuple[int, int, int]:
+    if fields.dim[0] != 3:
+        what = f"{fields.dim[0]} dimensions, sizes {fields.dim[1:]}"
+        raise InputError(what, where=path, allowed="one volume with 3 dimensions, no time series, no components")
+    return check_shape(fields.dim[1:4], where=path)
+
+
+def _affine(fields: _Fields, shape: tuple[int, int, int], path: Path) -> NDArray[np.float64]:
+    """Voxel index to LPS mm, from the sform where it is given, else from the qform. Not checked yet."""
+    if fields.units not in MM_PER_UNIT:
+        what = f"unit code {fields.units} in xyzt_units"
+        raise InputError(what, where=path, allowed="0 unknown (taken as mm), 1 metre, 2 mm, 3 micrometre")
+    scale = MM_PER_UNIT[fields.units]
+    if not (np.isfinite(fields.pixdim[1:4]).all() and min(fields.pixdim[1:4]) > 0):
+        raise InputError(f"pixdim {fields.pixdim[1:4]}", where=path, allowed="positive voxel sizes")
+    if fields.sform_code <= 0 and fields.qform_code <= 0:
+        what = "neither sform nor qform is set (both codes 0): the file does not say its space"
+        raise InputError(what, where=path, allowed="sform_code or qform_code > 0")
+    candidates = []
+    if fields.sform_code > 0:
+        candidates.append(_to_lps_mm(_sform(fields), scale))
+        _check_pixdim(candidates[0], np.array(fields.pixdim[1:4]) * scale, path)
+    if fields.qform_code > 0:
+        candidates.append(_to_lps_mm(_qform(fields, path), scale))
+    checked = [check_affine(T, where=path) for T in candidates]
+    apart = corner_deviation_mm(checked[0], checked[-1], shape)
+    if apart > QFORM_TOLERANCE_MM:
+        what = f"sform and qform place a corner of the volume {apart:.3g} mm apart"
+        raise InputError(what, where=path, allowed=f"both agree within {QFORM_TOLERANCE_MM} mm, or one is unset")
+    return checked[0]
+
+
+def _check_pixdim(T_ct_index: NDArray[np.float64], pixdim_mm: NDArray[np.float64], path: Path) -> None:
+    with np.errstate(over="ignore", invalid="ignore"):  # a hostile affine is refused by name just after
+        spacing = np.linalg.norm(T_ct_index[:3, :3], axis=0)
+    plausible = np.isfinite(spacing).all() and spacing.min() > 0
+    if plausible and np.abs(spacing / pixdim_mm - 1).max() > PIXDIM_TOLERANCE:
+        what = f"pixdim says voxels of {pixdim_mm.round(4)} mm, the sform {spacing.round(4)} mm"
+        raise InputError(what, where=path, allowed=f"both agree within {PIXDIM_TOLERANCE:.1%}")
+
+
+def _to_lps_mm(T_ras_index: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
+    T = LPS_FROM_RAS * T_ras_index
+    T[:3] *= scale
+    return T
+
+
+def _sform(fields: _Fields) -> NDArray[np.float64]:
+    return np.vstack([np.reshape(fields.srow, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+
+
+def _qform(fields: _Fields, path: Path) -> NDArray[np.float64]:
+    """Quaternion (a, b, c, d) with a >= 0, column 3 times qfac (NIfTI-1 standard, method 2)."""
+    b, c, d = fields.quaternion
+    square = b * b + c * c + d * d
+    if not square <= 1 + 1e-6:  # float32 rounding of a unit quaternion; NaN lands here too
+        raise InputError(f"quaternion {(b, c, d)} of the qform", where=path, allowed="b^2 + c^2 + d^2 <= 1")
+    a = max(0.0, 1.0 - square) ** 0.5
+    R = np.array(
+        [
+            [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
+            [2 * (b * c + a * d), a * a + c * c - b * b - d * d, 2 * (c * d - a * b)],
+            [2 * (b * d - a * c), 2 * (c * d + a * b), a * a + d * d - b * b - c * c],
+        ]
+    )
+    qfac = -1.0 if fields.pixdim[0] < 0 else 1.0
+    T = np.eye(4)
+    T[:3, :3] = R * np.array(fields.pixdim[1:4]) * [1.0, 1.0, qfac]
+    T[:3, 3] = fields.qoffset
+    return T

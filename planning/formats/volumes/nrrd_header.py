@@ -1,0 +1,261 @@
+"""NRRD headers, checked before any voxel is looked at.
+
+Layout and meaning of the fields: "Definition of NRRD File Format" (Teem project). A NRRD header may name any
+file of the machine as its data; here it may only name one beside it.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.files import is_plain_file
+from puncture_twin.planning.formats.volumes.volume_header import Cells, VolumeHeader, check_affine, check_shape
+
+MAX_HEADER_BYTES = 4_000_000
+"""A .seg.nrrd with a thousand segments stays below 1 MB."""
+KNOWN_FIELDS = frozenset(
+    (
+        "type",
+        "dimension",
+        "space",
+        "sizes",
+        "spacedirections",
+        "spaceorigin",
+        "spaceunits",
+        "kinds",
+        "endian",
+        "encoding",
+        "datafile",
+        "centers",
+        "centerings",
+        "content",
+        "measurementframe",
+        "byteskip",
+        "lineskip",
+        "thicknesses",
+        "units",
+        "labels",
+        "min",
+        "max",
+        "oldmin",
+        "oldmax",
+        "number",
+        "axismins",
+        "axismaxs",
+        "sampleunits",
+    )
+)
+LPS_SIGNS = {
+    "left-posterior-superior": (1.0, 1.0, 1.0),
+    "lps": (1.0, 1.0, 1.0),
+    "right-anterior-superior": (-1.0, -1.0, 1.0),
+    "ras": (-1.0, -1.0, 1.0),
+    "left-anterior-superior": (1.0, -1.0, 1.0),
+    "las": (1.0, -1.0, 1.0),
+}
+TYPES = {
+    **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
+    **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
+    **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"),
+    **dict.fromkeys(("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"), "u2"),
+    **dict.fromkeys(("int", "signed int", "int32", "int32_t"), "i4"),
+    **dict.fromkeys(("uint", "unsigned int", "uint32", "uint32_t"), "u4"),
+    **dict.fromkeys(("longlong", "long long", "long long int", "signed long long", "int64", "int64_t"), "i8"),
+    **dict.fromkeys(("ulonglong", "unsigned long long", "unsigned long long int", "uint64", "uint64_t"), "u8"),
+    "float": "f4",
+    "double": "f8",
+}
+GZIP = frozenset(("gzip", "gz"))
+ASCII = frozenset(("ascii", "text", "txt"))
+AXIS_KINDS = frozenset(("domain", "space", "time", "none", "???"))
+"""What an axis may be that runs through space; others (vector, list, color) hold several values per voxel."""
+VECTOR = re.compile(r"\(([^()]*)\)")
+
+
+@dataclass(frozen=True)
+class _Raw:
+    """The header as text, and where the data lie."""
+
+    fields: dict[str, str]
+    remarks: dict[str, str]
+    data_path: Path
+    data_offset: int
+
+
+def parse_nrrd_header(content: bytes, path: Path) -> VolumeHeader:
+    """What the header of a file says.
+
+    Args:
+        content: The file that holds the header.
+        path: Its name.
+
+    Raises:
+        InputError: A damaged header, an unknown field, a space that is not patient space, or data elsewhere than in
+            the file or beside it.
+    """
+    raw = _split(content[:MAX_HEADER_BYTES], path)
+    fields = raw.fields
+    if fields.get("dimension") != "3":
+        layers = " (segments that overlap are stored in layers: export them as separate label maps)"
+        what = f"dimension {fields.get('dimension')}{layers if fields.get('dimension') == '4' else ''}"
+        raise InputError(what, where=path, allowed="dimension: 3")
+    shape = check_shape(tuple(_whole(text, path) for text in _need(fields, "sizes", path).split()), where=path)
+    _check_units(fields, path)
+    _check_axes(fields, path)
+    T_ct_index = check_affine(_affine(fields, path), where=path)
+    return VolumeHeader(shape, T_ct_index, raw.remarks, _cells(raw, path), raw.data_path)
+
+
+def data_file(content: bytes, path: Path) -> str | None:
+    """The name of the file beside a detached header that holds its data; None where header and data are one file.
+
+    Args:
+        content: The file, or its beginning.
+        path: Its name.
+
+    Raises:
+        InputError: A damaged header, or data elsewhere than in the file or beside it.
+    """
+    raw = _split(content[:MAX_HEADER_BYTES], path)
+    return None if raw.data_path == path else raw.data_path.name
+
+
+def _split(head: bytes, path: Path) -> _Raw:
+    if re.match(rb"NRRD000[1-5]\r?\n", head) is None:
+        raise InputError("no NRRD header (magic NRRD0001 to NRRD0005)", where=path, allowed="a .nrrd or .nhdr file")
+    end = re.search(rb"\n\r?\n", head)
+    if end is None and len(head) == MAX_HEADER_BYTES:
+        raise InputError("the header has no end", where=path, allowed=f"at most {MAX_HEADER_BYTES} bytes")
+    try:
+        lines = head[: end.start() if end else None].decode("utf-8").split("\n")[1:]
+    except UnicodeDecodeError as error:
+        raise InputError(f"the header is not text ({error})", where=path, allowed="UTF-8") from error
+    fields, remarks = _lines(lines, path)
+    if "datafile" in fields:
+        return _Raw(fields, remarks, _beside(fields["datafile"], path), 0)
+    if end is None:
+        raise InputError("the file ends inside the header", where=path, allowed="a complete file")
+    return _Raw(fields, remarks, path, end.end())
+
+
+def _lines(lines: list[str], path: Path) -> tuple[dict[str, str], dict[str, str]]:
+    fields: dict[str, str] = {}
+    remarks: dict[str, str] = {}
+    for number, line in enumerate((text.rstrip("\r") for text in lines), start=2):
+        where = f"{path}, line {number}"
+        if line.startswith("#") or not line:
+            continue
+        field, mark, value = re.match(r"([^:]*)(:=|: |:|$)(.*)", line, re.DOTALL).groups()  # type: ignore[union-attr] # matches every line
+        if mark == ":=":
+            remarks[field.strip()] = value.strip()
+            continue
+        key = field.lower().replace(" ", "")
+        if not mark or key not in KNOWN_FIELDS:
+            raise InputError(f"unknown header line {line[:60]!r}", where=where, allowed=", ".join(sorted(KNOWN_FIELDS)))
+        if key in fields:
+            raise InputError(f"the field {field!r} stands twice", where=where, allowed="each field once")
+        fields[key] = value.strip()
+    return fields, remarks
+
+
+def _need(fields: dict[str, str], key: str, path: Path) -> str:
+    if not fields.get(key):
+        raise InputError(f"the header has no field {key!r}", where=path, allowed="a complete NRRD header")
+    return fields[key]
+
+
+def _whole(text: str, path: Path) -> int:
+    if not (text.isascii() and text.isdigit() and len(text) < 19):
+        raise InputError(f"size {text[:30]!r}", where=path, allowed="positive whole numbers")
+    return int(text)
+
+
+def _beside(name: str, path: Path) -> Path:
+    """The data file of a detached header: a plain name in the same folder, or nothing."""
+    allowed = "the name of one file in the same folder"
+    if not name or re.search(r"[/\\%\s\0]", name) or name in (".", "..") or name.upper().startswith("LIST"):
+        raise InputError(f"data file {name[:80]!r}", where=path, allowed=allowed)
+    data_path = path.parent / name
+    if not is_plain_file(data_path):
+        raise InputError(f"data file {name!r} does not exist", where=path, allowed=allowed)
+    if data_path.resolve().parent != path.parent.resolve():
+        raise InputError(f"data file {name!r} is a link to another folder", where=path, allowed=allowed)
+    if data_path.resolve() == path.resolve():
+        raise InputError("the data file is the header itself", where=path, allowed=allowed)
+    return data_path
+
+
+def _check_units(fields: dict[str, str], path: Path) -> None:
+    for key in ("spaceunits", "units"):
+        named = set(re.findall(r'"([^"]*)"', fields.get(key, ""))) - {""}
+        if (fields.get(key) and not named and key == "spaceunits") or named - {"mm"}:
+            raise InputError(f"{key} {fields[key]!r}", where=path, allowed='"mm" "mm" "mm"')
+
+
+def _affine(fields: dict[str, str], path: Path) -> NDArray[np.float64]:
+    space = _need(fields, "space", path).lower()
+    if space not in LPS_SIGNS:
+        allowed = "left-posterior-superior, right-anterior-superior, left-anterior-superior"
+        raise InputError(f"space {space!r} is not patient space", where=path, allowed=allowed)
+    directions = _vectors(_need(fields, "spacedirections", path), 3, path)
+    origin = _vectors(_need(fields, "spaceorigin", path), 1, path)
+    T = np.eye(4)
+    T[:3, :3] = directions.T
+    T[:3, 3] = origin[0]
+    T[:3] *= np.array(LPS_SIGNS[space])[:, None]
+    return T
+
+
+def _vectors(text: str, count: int, path: Path) -> NDArray[np.float64]:
+    allowed = f"{count} of (x,y,z) in mm"
+    rows = VECTOR.findall(text)
+    if len(rows) != count or VECTOR.sub("", text).strip():
+        raise InputError(f"{text[:80]!r}", where=path, allowed=allowed)
+    try:
+        vectors = np.array([[float(cell) for cell in row.split(",")] for row in rows])
+    except ValueError as error:
+        raise InputError(f"{text[:80]!r} ({error})", where=path, allowed=allowed) from error
+    if vectors.shape != (count, 3):
+        raise InputError(f"{text[:80]!r}", where=path, allowed=allowed)
+    return vectors
+
+
+def _check_axes(fields: dict[str, str], path: Path) -> None:
+    """Refuse axes that hold several values per voxel, or that are placed in two ways."""
+    kinds = fields.get("kinds", "domain domain domain").lower().split()
+    if len(kinds) != 3 or not AXIS_KINDS.issuperset(kinds):
+        raise InputError(f"kinds {fields['kinds'][:80]!r}", where=path, allowed="domain domain domain")
+    for key in ("axismins", "axismaxs"):
+        if set(fields.get(key, "nan").lower().split()) != {"nan"}:
+            raise InputError(f"{key} beside a space", where=path, allowed="space origin and space directions alone")
+
+
+def _cells(raw: _Raw, path: Path) -> Cells:
+    for key in ("byteskip", "lineskip"):
+        if raw.fields.get(key, "0") != "0":
+            raise InputError(f"{key} {raw.fields[key]!r}", where=path, allowed="0")
+    stated = _need(raw.fields, "encoding", path).lower()
+    encoding = "gzip" if stated in GZIP else "ascii" if stated in ASCII else stated
+    if encoding not in {"raw", "gzip", "ascii"}:
+        raise InputError(f"encoding {stated!r}", where=path, allowed="raw, gzip, ascii")
+    return Cells(_dtype(raw.fields, encoding, path), encoding, start=raw.data_offset)
+
+
+def _dtype(fields: dict[str, str], encoding: str, path: Path) -> np.dtype[Any]:
+    name = TYPES.get(_need(fields, "type", path).lower())
+    if name is None:
+        raise InputError(f"type {fields['type']!r}", where=path, allowed="an integer type, float or double")
+    dtype = np.dtype(name)
+    if encoding == "ascii" or dtype.itemsize == 1:
+        return dtype
+    order = {"little": "<", "big": ">"}.get(fields.get("endian", "").lower())
+    if order is None:
+        raise InputError("the byte order is not said", where=path, allowed="endian: little or big")
+    return np.dtype(order + name)

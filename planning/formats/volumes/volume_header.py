@@ -1,0 +1,137 @@
+"""What the header of a volume promises: its shape, its cells' type and size, and where its voxels lie."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+
+MAX_VOXELS = 1_000_000_000
+"""Four times a whole-body CT (512 x 512 x 1000); a header that claims more is wrong or hostile."""
+MIN_SPACING_MM, MAX_SPACING_MM = 0.05, 20.0
+"""Finer than a micro-CT and coarser than any clinical slice: outside, the unit was mistaken."""
+SHEAR_TOLERANCE = 1e-4
+"""Largest cosine between two axes; ITK accepts no more, and float32 headers stay below 1e-6."""
+MAX_ORIGIN_MM = 100_000.0
+"""No scanner places a patient 100 m from its own origin."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """How a file stores its voxels, axis i first.
+
+    Attributes:
+        dtype: Of one voxel, with the file's byte order.
+        encoding: ``raw``, ``gzip`` or ``ascii``: of all that the file holds from byte ``start`` on.
+        start: Bytes of the file before the encoded data.
+        offset: Bytes of the decoded data before the first voxel.
+        slope: What a stored value is multiplied with; 1 and an intercept of 0 leave it as it is.
+        intercept: What is added then.
+    """
+
+    dtype: np.dtype[Any]
+    encoding: str
+    start: int = 0
+    offset: int = 0
+    slope: float = 1.0
+    intercept: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class VolumeHeader:
+    """One volume as its header describes it; the data have not been looked at.
+
+    Attributes:
+        shape: Voxels along i, j, k.
+        T_ct_index: Shape (4, 4), maps voxel index (i, j, k) to LPS mm.
+        fields: The file's own key/value remarks (NRRD ``key:=value``), empty for NIfTI.
+        cells: How the voxels are stored.
+        data_path: The file that holds them: the header's own, or one beside it.
+    """
+
+    shape: tuple[int, int, int]
+    T_ct_index: NDArray[np.float64]
+    fields: dict[str, str]
+    cells: Cells
+    data_path: Path
+
+    @property
+    def count(self) -> int:
+        """Voxels in all."""
+        return self.shape[0] * self.shape[1] * self.shape[2]
+
+    @property
+    def spacing_mm(self) -> NDArray[np.float64]:
+        """Distance of neighbouring voxels along i, j and k, shape (3,)."""
+        return np.asarray(np.linalg.norm(self.T_ct_index[:3, :3], axis=0))
+
+
+def check_shape(shape: tuple[int, ...], *, where: Path) -> tuple[int, int, int]:
+    """The shape, if it is that of a volume in three dimensions that fits a machine.
+
+    Raises:
+        InputError: An axis with fewer than two voxels, or more than ``MAX_VOXELS`` in all.
+    """
+    if len(shape) != 3 or min(shape) < 2:
+        raise InputError(f"a volume of size {shape}", where=where, allowed="3 axes with at least 2 voxels each")
+    count = shape[0] * shape[1] * shape[2]
+    if count > MAX_VOXELS:
+        raise InputError(f"the header claims {count} voxels", where=where, allowed=f"at most {MAX_VOXELS}")
+    return shape[0], shape[1], shape[2]
+
+
+def check_affine(T_ct_index: NDArray[np.float64], *, where: Path) -> NDArray[np.float64]:
+    """The affine, read-only, if it is finite, regular, without shear and of plausible spacing and origin.
+
+    Args:
+        T_ct_index: Shape (4, 4), maps voxel index to mm.
+        where: The file, for the message.
+
+    Raises:
+        InputError: Named: not finite, zero or singular, implausible spacing, sheared, implausible origin.
+    """
+    T = np.array(T_ct_index, dtype=np.float64)
+    if not np.isfinite(T).all():
+        raise InputError("the affine holds NaN or infinity", where=where, allowed="finite numbers")
+    with np.errstate(over="ignore"):  # float32 headers reach 1e38; the spacing check below refuses them
+        spacing = np.linalg.norm(T[:3, :3], axis=0)
+    if not np.all((spacing >= MIN_SPACING_MM) & (spacing <= MAX_SPACING_MM)):
+        shown = " x ".join(f"{s:.3g}" for s in spacing)
+        kind = "a zero or singular affine, " if spacing.min() == 0 else ""
+        allowed = f"{MIN_SPACING_MM} to {MAX_SPACING_MM} mm (is the unit right?)"
+        raise InputError(f"{kind}voxel spacing {shown} mm", where=where, allowed=allowed)
+    axes = T[:3, :3] / spacing
+    shear = float(np.abs(axes.T @ axes - np.eye(3)).max())
+    if shear > SHEAR_TOLERANCE:
+        kind = "singular" if abs(np.linalg.det(axes)) < SHEAR_TOLERANCE else "sheared"
+        what = f"the affine is {kind}: two voxel axes are {shear:.2g} (cosine) from being perpendicular"
+        raise InputError(what, where=where, allowed=f"axes perpendicular within {SHEAR_TOLERANCE}")
+    if np.abs(T[:3, 3]).max() > MAX_ORIGIN_MM:
+        raise InputError(f"origin at {T[:3, 3]} mm", where=where, allowed=f"within {MAX_ORIGIN_MM:.0f} mm")
+    T.setflags(write=False)
+    return T
+
+
+def corner_deviation_mm(T_a: NDArray[np.float64], T_b: NDArray[np.float64], shape: tuple[int, int, int]) -> float:
+    """Largest distance between where two affines place a corner of the volume, mm."""
+    corners = np.array(list(itertools.product(*((0, n - 1) for n in shape))), dtype=np.float64)
+    difference = T_a - T_b
+    return float(np.linalg.norm(corners @ difference[:3, :3].T + difference[:3, 3], axis=1).max())
+
+
+def check_exact_size(actual: int, promised: int, *, where: Path) -> None:
+    """Refuses a file that is shorter or longer than its header says.
+
+    Raises:
+        InputError: The two sizes (bytes) differ.
+    """
+    if actual != promised:
+        kind = "cut short" if actual < promised else "longer than its header says"
+        what = f"the file is {kind}: {actual} bytes where the header promises {promised}"
+        raise InputError(what, where=where, allowed="a complete file")

@@ -1,0 +1,58 @@
+"""Smooth where a surface is smooth, sharp where it is sharp: which corners of triangles share a normal."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+CREASE = np.radians(60.0)
+"""Two triangles that meet at more are faces of a thing with an edge. Steps of a meshed voxel mask stay below (55)."""
+
+
+def split_at_creases(mesh: TriangleMesh) -> TriangleMesh:
+    """The same surface with one vertex for each smooth fan of triangles about a point.
+
+    A normal that is blended from the triangles of a vertex then never mixes two sides of a box, and mixes the
+    triangles of a smooth surface even where the file stores each with corners of its own (as STL does). The order of
+    the triangles is kept.
+    """
+    keys = (mesh.vertices + 0.0).view(np.dtype((np.void, 24))).reshape(-1)
+    _, welded = np.unique(keys, return_inverse=True)
+    corner_vertex = welded[mesh.faces]
+    pairs = _smooth_pairs(mesh, corner_vertex.astype(np.int64))
+    count = 3 * len(mesh.faces)
+    graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    fans, fan = connected_components(graph, directed=False)
+    vertices = np.empty((fans, 3))
+    vertices[fan] = mesh.vertices[mesh.faces.reshape(-1)]
+    return TriangleMesh(vertices, fan.reshape(-1, 3))
+
+
+def _smooth_pairs(mesh: TriangleMesh, corner_vertex: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Pairs of triangle corners (3 f + k) at one point, of two triangles that share an edge and meet smoothly."""
+    faces = np.repeat(np.arange(len(mesh.faces)), 3)
+    first, second = corner_vertex.reshape(-1), np.roll(corner_vertex, -1, axis=1).reshape(-1)
+    this, following = np.arange(3 * len(mesh.faces)), 3 * faces + (np.tile([1, 2, 0], len(mesh.faces)))
+    swap = first > second
+    low_corner, high_corner = np.where(swap, following, this), np.where(swap, this, following)
+    edge = np.minimum(first, second) * (corner_vertex.max() + 1) + np.maximum(first, second)
+    order = np.argsort(edge, kind="stable")
+    same = np.flatnonzero(edge[order][1:] == edge[order][:-1])
+    a, b = order[same], order[same + 1]
+    normals = _normals(mesh)
+    smooth = np.abs(np.einsum("ij,ij->i", normals[faces[a]], normals[faces[b]])) >= np.cos(CREASE)
+    a, b = a[smooth], b[smooth]
+    return np.concatenate(
+        [np.stack([low_corner[a], low_corner[b]], axis=1), np.stack([high_corner[a], high_corner[b]], axis=1)]
+    )
+
+
+def _normals(mesh: TriangleMesh) -> NDArray[np.float64]:
+    corners = mesh.triangles
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(areas, axis=1, keepdims=True)
+    return np.asarray(areas / np.where(lengths > 0, lengths, 1.0))

@@ -1,0 +1,169 @@
+"""Where rays from one point cross a surface: every crossing, in float64, without a missed edge.
+
+All rays start at the target, so a triangle is met exactly by the rays inside the solid angle that it subtends. Rays are
+binned by direction; each triangle visits the bins that its bounding cone touches. Two triangles that share an edge
+compute its edge function from the same numbers with the opposite sign, so a ray through the edge hits at least one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+POLAR_BINS = 120
+"""Bins over the polar angle (1.5 degrees each); twice as many over the azimuth."""
+
+SAME_CROSSING_MM = 1e-6
+"""Crossings of one ray closer than this are one: the ray runs through an edge or a corner."""
+
+CONE_SLACK = 1e-9
+"""Radians by which a bounding cone is widened against rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Crossings:
+    """Every crossing, sorted by ray and then by depth.
+
+    Attributes:
+        ray: Shape (c,), row of the ray.
+        depth: Shape (c,), mm from the origin.
+        face: Shape (c,), triangle that is crossed.
+        count: Shape (n,), crossings of each ray.
+        first: Shape (n,), row in ``depth`` of each ray's first crossing (meaningless where count is 0).
+    """
+
+    ray: Ints
+    depth: Floats
+    face: Ints
+    count: Ints
+    first: Ints
+
+
+def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: float = np.inf) -> Crossings:
+    """All crossings of rays with a surface.
+
+    Args:
+        mesh: The surface.
+        origin: Shape (3,), where every ray starts, mm.
+        directions: Shape (n, 3), unit vectors.
+        length: Crossings beyond are left out, mm.
+    """
+    corners = mesh.triangles - origin
+    order, starts = _binned(directions)
+    directions = np.ascontiguousarray(directions)
+    total = _visit(
+        corners, directions, order, starts, length, np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64)
+    )
+    ray, depth, face = np.empty(total, np.int64), np.empty(total), np.empty(total, np.int64)
+    _visit(corners, directions, order, starts, length, ray, depth, face)
+    rows = np.lexsort((depth, ray))
+    ray, depth, face = ray[rows], depth[rows], face[rows]
+    fresh = np.ones(total, bool)
+    fresh[1:] = (ray[1:] != ray[:-1]) | (depth[1:] - depth[:-1] > SAME_CROSSING_MM)
+    ray, depth, face = ray[fresh], depth[fresh], face[fresh]
+    count = np.bincount(ray, minlength=len(directions))
+    return Crossings(ray, depth, face, count, np.concatenate([[0], np.cumsum(count)[:-1]]))
+
+
+def first_crossing(mesh: TriangleMesh, origin: Floats, directions: Floats, length: float) -> Floats:
+    """Depth of each ray's first crossing, shape (n,), mm; 0 for a ray that crosses nothing (it lies in the surface)."""
+    found = crossings(mesh, origin, directions, length)
+    depth = np.zeros(len(directions))
+    hit = found.count > 0
+    depth[hit] = found.depth[found.first[hit]]
+    return depth
+
+
+def _binned(directions: Floats) -> tuple[Ints, Ints]:
+    """Ray numbers sorted by direction bin, and where each bin starts, shape (bins + 1,)."""
+    polar = np.arccos(np.clip(directions[:, 2], -1, 1))
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0]) + np.pi
+    row = np.minimum((polar * (POLAR_BINS / np.pi)).astype(np.int64), POLAR_BINS - 1)
+    column = np.minimum((azimuth * (POLAR_BINS / np.pi)).astype(np.int64), 2 * POLAR_BINS - 1)
+    bins = row * 2 * POLAR_BINS + column
+    order = np.argsort(bins, kind="stable")
+    starts = np.searchsorted(bins[order], np.arange(2 * POLAR_BINS**2 + 1))
+    return order, starts
+
+
+@nb.njit(cache=True)
+def _visit(corners, directions, order, starts, length, ray, depth, face):  # type: ignore[no-untyped-def]  # numba infers
+    """Count the crossings; write them too where the output arrays have room."""
+    found = 0
+    for f in range(len(corners)):
+        a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
+        center, radius = _cone(a, b, c)
+        first_row, last_row = 0, POLAR_BINS - 1
+        polar = np.arccos(min(1.0, max(-1.0, center[2])))
+        if radius < 1.5:
+            first_row = max(0, int((polar - radius) * (POLAR_BINS / np.pi)))
+            last_row = min(POLAR_BINS - 1, int((polar + radius) * (POLAR_BINS / np.pi)))
+        low, high = _azimuths(center, polar, radius)
+        for row in range(first_row, last_row + 1):
+            for column in range(low, high + 1):
+                cell = row * 2 * POLAR_BINS + column % (2 * POLAR_BINS)
+                for k in range(starts[cell], starts[cell + 1]):
+                    t = _cross(a, b, c, directions[order[k]])
+                    if 0.0 <= t <= length:
+                        if found < len(ray):
+                            ray[found], depth[found], face[found] = order[k], t, f
+                        found += 1
+    return found
+
+
+@nb.njit(cache=True)
+def _cone(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
+    """Axis and half-angle of a cone about the origin that holds a triangle; half-angle pi where none is narrow."""
+    na, nb_, nc = np.sqrt(a @ a), np.sqrt(b @ b), np.sqrt(c @ c)
+    axis = np.array([0.0, 0.0, 1.0])
+    if min(na, nb_, nc) == 0.0:
+        return axis, np.pi
+    total = a / na + b / nb_ + c / nc
+    norm = np.sqrt(total @ total)
+    if norm < 0.3:
+        return axis, np.pi
+    axis = total / norm
+    cosine = min(axis @ a / na, axis @ b / nb_, axis @ c / nc)
+    if cosine < 0.2:
+        return axis, np.pi
+    return axis, np.arccos(min(1.0, cosine)) + CONE_SLACK + 1e-7
+
+
+@nb.njit(cache=True)
+def _azimuths(center, polar, radius):  # type: ignore[no-untyped-def]  # numba infers
+    """First and last azimuth bin that a cone touches (the last may run past the full circle)."""
+    if radius >= 1.5 or polar - radius <= 0.0 or polar + radius >= np.pi:
+        return 0, 2 * POLAR_BINS - 1
+    half = np.arcsin(min(1.0, np.sin(radius) / np.sin(polar)))
+    azimuth = np.arctan2(center[1], center[0]) + np.pi
+    low = int(np.floor((azimuth - half) * (POLAR_BINS / np.pi) - 1e-9))
+    high = int(np.floor((azimuth + half) * (POLAR_BINS / np.pi) + 1e-9))
+    if high - low >= 2 * POLAR_BINS:
+        return 0, 2 * POLAR_BINS - 1
+    return low, high
+
+
+@nb.njit(cache=True)
+def _cross(a, b, c, u):  # type: ignore[no-untyped-def]  # numba infers
+    """Depth at which the ray from the origin along u crosses the triangle; -1 where it does not."""
+    wa, wb, wc = _edge(b, c, u), _edge(c, a, u), _edge(a, b, u)
+    if not ((wa >= 0.0 and wb >= 0.0 and wc >= 0.0) or (wa <= 0.0 and wb <= 0.0 and wc <= 0.0)):
+        return -1.0
+    total = wa + wb + wc
+    if total == 0.0:
+        return -1.0
+    return (wa * (a @ u) + wb * (b @ u) + wc * (c @ u)) / total
+
+
+@nb.njit(cache=True)
+def _edge(p, q, u):  # type: ignore[no-untyped-def]  # numba infers
+    """Triple product u . (p x q): on which side of the edge p-q the ray passes; swapping p and q negates it exactly."""
+    return u[0] * (p[1] * q[2] - p[2] * q[1]) + u[1] * (p[2] * q[0] - p[0] * q[2]) + u[2] * (p[0] * q[1] - p[1] * q[0])

@@ -1,0 +1,73 @@
+"""In which space and unit a file speaks, and the way from there to mm and LPS.
+
+Patient spaces differ in the sign of two axes: LPS counts toward the patient's left and posterior, RAS toward
+right and anterior; both count toward superior. Neither is guessed: a file says its space, or the case does.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+
+
+class Space(StrEnum):
+    """The meaning of the three axes of a set of coordinates."""
+
+    LPS = "LPS"
+    RAS = "RAS"
+    LOCAL = "local"
+
+
+class Unit(StrEnum):
+    """A unit of length that a file may use."""
+
+    MM = "mm"
+    CM = "cm"
+    M = "m"
+
+    @property
+    def mm(self) -> float:
+        """How many millimetres one of this unit is."""
+        return {Unit.MM: 1.0, Unit.CM: 10.0, Unit.M: 1000.0}[self]
+
+
+def to_lps(points: NDArray[np.float64], space: Space) -> NDArray[np.float64]:
+    """Coordinates in LPS; those of a local frame stay as they are, since such a frame is its own.
+
+    Args:
+        points: Shape (n, 3), any unit, in ``space``.
+        space: Where the coordinates come from.
+
+    Returns:
+        Shape (n, 3), same unit. RAS has x and y negated, which is its own inverse.
+    """
+    if space is Space.RAS:
+        return np.multiply(points, [-1.0, -1.0, 1.0], dtype=np.float64)
+    return np.array(points, dtype=np.float64)
+
+
+def parse_space(text: str, *, where: str) -> Space:
+    """The space that a text names; upper and lower case are the same.
+
+    Raises:
+        InputError: If it names none.
+    """
+    for space in Space:
+        if text.strip().lower() == space.lower():
+            return space
+    raise InputError(f"unknown space {text!r}", where=where, allowed=", ".join(Space))
+
+
+def parse_unit(text: str, *, where: str) -> Unit:
+    """The unit of length that a text names.
+
+    Raises:
+        InputError: If it names none.
+    """
+    if text.strip() in tuple(Unit):
+        return Unit(text.strip())
+    raise InputError(f"unknown unit of length {text!r}", where=where, allowed=", ".join(Unit))

@@ -1,0 +1,259 @@
+"""From home to a standoff pose: RRT-Connect to several goals, shortened, corners rounded, timed, and checked by FCL.
+
+A fast checker proves whole segments (:class:`SegmentJudge`). With FCL alone a segment is judged at
+samples, which can miss something thin; the check of the finished motion is closer, and plans anew what it refuses.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.collision.checker import Contact, StateChecker
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.segments import halving_order
+from puncture_twin.planning.motion.follow import follow, rounded
+from puncture_twin.planning.motion.path_check import (
+    MAX_SWEEP_MM,
+    dense_states,
+    first_contact,
+    least_clearance,
+    path_length,
+)
+from puncture_twin.planning.motion.rrt_connect import Connected, SegmentContact, connect
+from puncture_twin.planning.motion.trajectory import Trajectory
+
+__all__ = [
+    "FINER",
+    "MAX_SWEEP_MM",
+    "RESOLUTION_RAD",
+    "Approach",
+    "dense_states",
+    "first_contact",
+    "least_clearance",
+    "path_length",
+    "plan_approach",
+]
+
+Array = NDArray[np.float64]
+
+RESOLUTION_RAD = 0.05
+"""Joint distance of the states at which FCL alone judges a segment: up to 50 mm at a metre, never the last word."""
+
+FINER = 10
+"""The check of the finished trajectory is this many times finer, and no body moves more than ``MAX_SWEEP_MM`` between
+its states."""
+
+MAX_SAMPLES = 6000
+"""Of the planner, in each run: in a free room tens of them do, beside a gantry it may take thousands; all of them take
+it one to two seconds."""
+
+PATIENCE, LEAST_SAMPLES = 4, 500
+"""A run for a shorter way gets so many times the samples that the first one took, or at least so many."""
+
+RUNS = 3
+"""Of the planner, while it might find a way that is much shorter; see ``SHORT_ENOUGH``."""
+
+SHORT_ENOUGH = 1.3
+"""No run seeks a way shorter than one that is this many times as long as the straight line to the nearest goal."""
+
+ATTEMPTS = 6
+"""Ways that the finer check may refuse; for FCL alone each next one is planned at half the resolution."""
+
+APPROACH_SPEED = 0.5
+"""Share of the joints' speed limits on the way to the patient."""
+
+CUT_SHARE = 0.5
+"""A corner is rounded from the middle of its shorter segment on: the farther, the faster."""
+
+HALVINGS = 5
+"""Of a rounding that is not free; then the arm stops at the corner."""
+
+CURVE_PIECES = 8
+"""Straight pieces that stand for a rounding when it is chosen; the finished trajectory is checked sample by sample."""
+
+
+@dataclass(frozen=True, eq=False)
+class Approach:
+    """A collision-free motion from home to a standoff pose, with the needle outside the patient.
+
+    Attributes:
+        waypoints: Shape (k, 6), rad, k >= 2: straight joint segments from home to the goal.
+        cuts: Shape (k - 2,), rad: how far from each waypoint between the ends its rounding begins; 0 stops there.
+        trajectory: The motion: rounded at the waypoints, within the limits of speed, acceleration and jerk.
+        goal_index: Which of the goals it ends at.
+        checked_q: Shape (m, 6), rad: the states that FCL found free, in order; no body moves more than
+            ``MAX_SWEEP_MM`` between two of them. For :func:`least_clearance`.
+        seed: The seed that gave it.
+        attempts: How many ways were planned.
+    """
+
+    waypoints: Array
+    cuts: Array
+    trajectory: Trajectory
+    goal_index: int
+    checked_q: Array
+    seed: int
+    attempts: int
+
+    def __post_init__(self) -> None:
+        for array in (self.waypoints, self.cuts, self.checked_q):
+            array.setflags(write=False)
+
+
+class _Way(NamedTuple):
+    """Straight segments from home to a goal."""
+
+    waypoints: Array
+    goal_index: int
+
+    @property
+    def length(self) -> float:
+        return path_length(self.waypoints)
+
+
+def plan_approach(
+    checker: StateChecker,
+    q_home: Array,
+    q_goals: Array,
+    *,
+    seed: int,
+    max_samples: int = MAX_SAMPLES,
+    speed_scale: float = APPROACH_SPEED,
+) -> Approach:
+    """Plan from home to the goal that the shortest way found leads to.
+
+    Args:
+        checker: Judges contacts.
+        q_home: Shape (6,), rad, within the joint limits.
+        q_goals: Shape (6,) or (g, 6), rad, within the joint limits.
+        seed: Of OMPL's generator. Same seed, same motion.
+        max_samples: Of the planner, in each of its runs.
+        speed_scale: Share of the joints' speed limits to use.
+
+    Raises:
+        InputError: If home or a goal is not six finite angles within the limits, or the scale makes no sense.
+        NoAnswerError: If home or every goal is in collision, or no way was found; says what touches what, and what was
+            in the way.
+    """
+    home = _within_limits(checker, q_home, "home")[0]
+    goals = _within_limits(checker, q_goals, "goal")
+    open_goals = _free_goals(checker, home, goals)
+    refused = ""
+    for attempt in range(ATTEMPTS):
+        judge = _judge(checker, RESOLUTION_RAD / 2**attempt)
+        way = _shortest(checker, judge, home, goals[open_goals], seed + RUNS * attempt, max_samples)
+        if isinstance(way, Connected):
+            raise NoAnswerError(_why_none(way, len(goals), len(open_goals), seed) + refused)
+        cuts = _cuts(judge, way.waypoints)
+        for rounding in (cuts, np.zeros_like(cuts)) if cuts.any() else (cuts,):
+            trajectory = follow(checker.model, way.waypoints, rounding, speed_scale=speed_scale)
+            checked = dense_states(checker, trajectory.q, RESOLUTION_RAD / FINER)
+            contact = first_contact(checker, checked)
+            if contact is None:
+                goal = int(open_goals[way.goal_index])
+                return Approach(way.waypoints, rounding, trajectory, goal, checked, seed, attempt + 1)
+        assert contact is not None
+        refused = f"; before that, on a closer look {contact.body} touched {contact.other} on the way"
+    raise NoAnswerError(f"approach not found: {ATTEMPTS} ways were refused (seed {seed}){refused}")
+
+
+def _judge(checker: StateChecker, resolution_rad: float) -> SegmentContact:
+    """Who judges segments: the fast checker's proof, or FCL at samples."""
+    if isinstance(checker, FastChecker):
+        return checker.segment_judge()
+
+    def sampled(start: Array, end: Array) -> Contact | None:
+        shares = halving_order(max(1, math.ceil(float(np.linalg.norm(end - start)) / resolution_rad)))
+        states = end + shares[:, None] * (start - end)
+        return first_contact(checker, states)
+
+    return sampled
+
+
+def _shortest(
+    checker: StateChecker, judge: SegmentContact, home: Array, goals: Array, seed: int, max_samples: int
+) -> _Way | Connected:
+    """The shortest way found to any goal, or the run that found none.
+
+    No way is shorter than the straight line to its goal, so once there is a way, only goals nearer than it is long are
+    sought.
+    """
+    away = np.linalg.norm(goals - home, axis=1)
+    nearest_first = np.argsort(away, kind="stable")
+    straight = (goal for goal in nearest_first.tolist() if judge(home, goals[goal]) is None)
+    goal = next(straight, None)
+    best = None if goal is None else _Way(np.stack([home, goals[goal]]), goal)
+    for run in range(RUNS):
+        sought = nearest_first if best is None else nearest_first[away[nearest_first] * SHORT_ENOUGH < best.length]
+        if len(sought) == 0:
+            break
+        found = connect(
+            checker.model.joint_limits, judge, home, goals[sought], seed=seed + run, max_samples=max_samples
+        )
+        if found.waypoints is None:
+            return found if best is None else best
+        max_samples = min(max_samples, max(LEAST_SAMPLES, PATIENCE * found.samples))
+        way = _Way(found.waypoints, int(sought[found.goal_index]))
+        best = way if best is None or way.length < best.length else best
+    assert best is not None  # the first run has returned without one
+    return best
+
+
+def _cuts(judge: SegmentContact, waypoints: Array) -> Array:
+    """How far from each waypoint between the ends its rounding may begin, shape (k - 2,), rad; 0 where none is free."""
+    steps = np.diff(waypoints, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    if not lengths.all():
+        return np.zeros(len(waypoints) - 2)
+    directions, cuts = steps / lengths[:, None], np.zeros(len(waypoints) - 2)
+    share = np.linspace(0.0, 1.0, CURVE_PIECES + 1)
+    for at in range(len(cuts)):
+        cut = CUT_SHARE * float(lengths[at : at + 2].min())
+        for _ in range(HALVINGS):
+            curve = rounded(waypoints[at + 1], directions[at], directions[at + 1], cut, share)
+            if all(judge(start, end) is None for start, end in pairwise(curve)):
+                cuts[at] = cut
+                break
+            cut /= 2.0
+    return cuts
+
+
+def _within_limits(checker: StateChecker, q: Array, name: str) -> Array:
+    rows = np.atleast_2d(np.asarray(q, dtype=np.float64))
+    if rows.ndim != 2 or rows.shape[1] != 6 or not checker.model.within_limits(rows).all() or len(rows) == 0:
+        limits = np.round(np.degrees(checker.model.joint_limits[:, 1])).astype(int).tolist()
+        raise InputError(f"{name} = {rows.round(4).tolist()}", where="approach", allowed=f"six angles, +-{limits} deg")
+    return rows
+
+
+def _free_goals(checker: StateChecker, home: Array, goals: Array) -> NDArray[np.int64]:
+    """Which goals are free, home being free."""
+    contact = checker.contact(home, needle_may_touch_patient=False)
+    if contact is not None:
+        raise NoAnswerError(f"home is in collision: {contact.body} touches {contact.other}")
+    contacts = [checker.contact(goal, needle_may_touch_patient=False) for goal in goals]
+    if all(contacts):
+        named = sorted({f"{contact.body} touches {contact.other}" for contact in contacts if contact})
+        raise NoAnswerError(f"every goal is in collision: {', '.join(named)}")
+    return np.array([row for row, contact in enumerate(contacts) if contact is None], dtype=np.int64)
+
+
+def _why_none(found: Connected, n_goals: int, n_free: int, seed: int) -> str:
+    """Why a run found no way, in words: which tree stayed small, and what was in the way."""
+    where = "the goals lie" if found.goal_states <= found.home_states else "home lies"
+    trees = f"{found.home_states} states joined home, {found.goal_states} the goals"
+    total = sum(found.blocked.values())
+    most = [f"{c.body} touches {c.other} ({n} of {total})" for c, n in Counter(found.blocked).most_common(2)]
+    busy = "" if n_free == n_goals else f"; {n_goals - n_free} of {n_goals} goals are in collision themselves"
+    return (
+        f"approach not found: {where} in a part of the space that {found.samples} samples could not reach "
+        f"(seed {seed}): {trees}; most often in the way: {', '.join(most) or 'nothing'}{busy}"
+    )

@@ -1,0 +1,258 @@
+"""Joint paths in time: past rounded corners without a stop, and straight insertions; from rest to rest, low in jerk.
+
+Corner. Between two straight segments with unit directions u and w the joints' velocity turns from v u to v w at one
+speed v of the path: dq/dt = v ((1 - f) u + f w) with f = 3 x^2 - 2 x^3, x = t / T. The curve leaves the one segment
+and joins the other at the distance d = v T / 2 from the corner, which fixes its shape whatever the speed. Each joint's
+speed stays between those of the two segments; its acceleration is at most 3/4 v^2 |w - u| / d and zero at both ends;
+its jerk is at most 3/2 v^3 |w - u| / d^2; the curve passes the corner at 3/16 d |w - u|, inside the triangle that it
+cuts off. On the segments between, ruckig changes the speed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.motion.timing import Rates, TimeLaw, reachable_speed, time_law
+from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
+
+Array = NDArray[np.float64]
+
+MAX_JERK = 14.0
+"""rad/s^3, of every joint: a UR's acceleration of 1.4 rad/s^2 is reached in a tenth of a second. No manual states a
+limit; this is for the needle, which swings after every jolt."""
+
+STANDSTILL_RAD = 1e-12
+"""A segment on which no joint turns farther is no motion: rounding."""
+
+SAME_STEP = 1e-9
+"""Of a sample: a duration that is a whole number of samples but for this is one."""
+
+TINY = 1e-30
+"""Below every rate that means anything: keeps divisions finite."""
+
+SPLINE_SAMPLES = 8
+"""Samples between two rows of a smooth motion, to find its fastest joint; the spline's slope is quadratic there."""
+
+
+class _Straight(NamedTuple):
+    """A stretch of a segment."""
+
+    start: Array
+    direction: Array
+    law: TimeLaw
+
+    @property
+    def duration_s(self) -> float:
+        return self.law.duration_s
+
+    def at(self, times_s: Array) -> Array:
+        return np.asarray(self.start + self.law.driven(times_s)[:, None] * self.direction)
+
+
+class _Round(NamedTuple):
+    """A rounded corner."""
+
+    corner: Array
+    before: Array
+    after: Array
+    cut: float
+    speed: float
+
+    @property
+    def duration_s(self) -> float:
+        return 2.0 * self.cut / self.speed
+
+    def at(self, times_s: Array) -> Array:
+        return rounded(self.corner, self.before, self.after, self.cut, times_s / self.duration_s)
+
+
+_Stretch = _Straight | _Round
+
+
+def rounded(corner: Array, before: Array, after: Array, cut: float, share: Array) -> Array:
+    """The curve past a corner.
+
+    Args:
+        corner: Shape (6,), rad.
+        before: Shape (6,), unit direction of the segment that leads to it.
+        after: Shape (6,), unit direction of the one that leads on.
+        cut: How far from the corner the curve begins and ends, rad.
+        share: Shape (m,), 0..1: of the time on the curve.
+
+    Returns:
+        Shape (m, 6), rad.
+    """
+    turned = share**3 - share**4 / 2.0  # of f, from 0 to share
+    along, across = -1.0 + 2.0 * (share - turned), 2.0 * turned
+    return np.asarray(corner + cut * (along[:, None] * before + across[:, None] * after))
+
+
+def follow(model: UrModel, waypoints: Array, cuts: Array | None = None, *, speed_scale: float = 1.0) -> Trajectory:
+    """Run straight joint segments as fast as the limits allow, past rounded corners, from rest to rest.
+
+    Args:
+        model: The arm: its speed and acceleration limits; the jerk's is ``MAX_JERK``.
+        waypoints: Shape (k, 6), rad.
+        cuts: Shape (k - 2,), rad: how far from each waypoint between the ends its rounding begins; 0 stops there. None
+            stops at all of them.
+        speed_scale: Share of the speed limits to use, above 0, at most 1.
+
+    Returns:
+        Samples every ``SAMPLE_S``, every stop among them.
+
+    Raises:
+        InputError: If waypoints, cuts or scale make no sense.
+    """
+    waypoints = _checked_rows(waypoints)
+    if not 0.0 < speed_scale <= 1.0:
+        raise InputError(f"speed_scale = {speed_scale}", where="trajectory", allowed="above 0, at most 1")
+    cuts = np.zeros(max(0, len(waypoints) - 2)) if cuts is None else np.asarray(cuts, dtype=np.float64)
+    if not cuts.any():
+        waypoints = waypoints[np.append(True, np.abs(np.diff(waypoints, axis=0)).max(axis=1) > STANDSTILL_RAD)]
+        cuts = np.zeros(max(0, len(waypoints) - 2))
+    if len(waypoints) == 1:
+        return Trajectory(np.zeros(1), waypoints)
+    room = _room(waypoints, cuts)
+    return _sampled(waypoints, _runs(model, waypoints, cuts, room, speed_scale))
+
+
+def _room(waypoints: Array, cuts: Array) -> Array:
+    """What the rounded corners leave of each segment, shape (k - 1,), rad."""
+    lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
+    fits = cuts.shape == (len(lengths) - 1,) and bool((cuts >= 0.0).all() and (lengths > 0.0).all())
+    room = lengths - np.append(cuts, 0.0) - np.append(0.0, cuts) if fits else lengths
+    if not (fits and (room >= -STANDSTILL_RAD).all()):
+        allowed = "one a corner, two of them no longer than the segment between"
+        raise InputError(f"cuts {cuts.tolist()} of {len(lengths)} segments", where="trajectory", allowed=allowed)
+    return np.asarray(room.clip(0.0))
+
+
+def _runs(model: UrModel, waypoints: Array, cuts: Array, room: Array, speed_scale: float) -> Iterator[list[_Stretch]]:
+    """The ways from stop to stop: straight stretches (``room`` long, one a segment) and rounded corners in turn."""
+    steps = np.diff(waypoints, axis=0)
+    directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
+    rates = [_segment_rates(model, direction, speed_scale) for direction in directions]
+    speeds = _corner_speeds(model, directions, cuts, room, rates)
+    run: list[_Stretch] = []
+    for at, (direction, length) in enumerate(zip(directions, room, strict=True)):
+        start = waypoints[at] + (cuts[at - 1] if at else 0.0) * direction
+        if length > STANDSTILL_RAD:
+            run.append(_Straight(start, direction, time_law(float(length), rates[at], speeds[at], speeds[at + 1])))
+        if speeds[at + 1] == 0.0:
+            yield run
+            run = []
+        else:
+            run.append(_Round(waypoints[at + 1], direction, directions[at + 1], float(cuts[at]), speeds[at + 1]))
+
+
+def _segment_rates(model: UrModel, direction: Array, speed_scale: float) -> Rates:
+    """What the joints' limits allow along a unit direction."""
+    share = np.maximum(np.abs(direction), TINY)
+    limits = (speed_scale * model.max_speeds, model.max_acceleration, MAX_JERK)
+    return Rates(*(float((limit / share).min()) for limit in limits))
+
+
+def _corner_speeds(model: UrModel, directions: Array, cuts: Array, room: Array, rates: list[Rates]) -> list[float]:
+    """The speed at each waypoint, 0 at the ends: what the corner allows, and what the segments can change it to."""
+    speeds = [0.0]
+    for at, cut in enumerate(cuts.tolist()):
+        turn = max(TINY, float(np.abs(directions[at + 1] - directions[at]).max()))
+        by_acceleration = math.sqrt(model.max_acceleration * cut / (0.75 * turn))
+        by_jerk = (MAX_JERK * cut * cut / (1.5 * turn)) ** (1.0 / 3.0)
+        speeds.append(min(by_acceleration, by_jerk, rates[at].speed, rates[at + 1].speed))
+    speeds.append(0.0)
+    for at in range(len(room)):
+        speeds[at + 1] = min(speeds[at + 1], reachable_speed(speeds[at], speeds[at + 1], float(room[at]), rates[at]))
+    for at in range(len(room) - 1, -1, -1):
+        speeds[at] = min(speeds[at], reachable_speed(speeds[at + 1], speeds[at], float(room[at]), rates[at]))
+    return speeds
+
+
+def _sampled(waypoints: Array, runs: Iterable[list[_Stretch]]) -> Trajectory:
+    """All runs one after the other, each slowed down by less than one sample, so that it ends on one."""
+    rows, count = [waypoints[:1]], 0
+    for run in runs:
+        ends = np.cumsum([stretch.duration_s for stretch in run])
+        steps = _steps(float(ends[-1]))
+        times = ends[-1] * np.arange(1, steps + 1) / steps
+        which = np.minimum(np.searchsorted(ends, times), len(run) - 1)
+        for at, stretch in enumerate(run):
+            begin = ends[at] - stretch.duration_s
+            rows.append(stretch.at((times[which == at] - begin).clip(0.0, stretch.duration_s)))
+        count += steps
+    return _ending_at(waypoints[-1], np.concatenate(rows))
+
+
+def _steps(duration_s: float) -> int:
+    """How many samples a duration takes."""
+    return max(1, math.ceil(duration_s / SAMPLE_S - SAME_STEP))
+
+
+def _ending_at(end: Array, rows: Array) -> Trajectory:
+    """Samples with their last state put in exactly: sums of steps round."""
+    q = np.array(rows, dtype=np.float64)
+    q[-1] = end
+    return Trajectory(SAMPLE_S * np.arange(len(q), dtype=np.float64), q)
+
+
+def drive_smoothly(model: UrModel, q: Array, depths_mm: Array, *, max_tip_speed_mm_s: float) -> Trajectory:
+    """Run a dense, smooth motion in one go, such as the insertion: rest, steady tip speed, rest.
+
+    A cubic spline over depth passes through every row. With the tip's speed v, acceleration a and jerk j, and the
+    spline's derivatives q1, q2, q3 by depth, the joints have q1 v, q1 a + q2 v^2 and q1 j + 3 q2 v a + q3 v^3. v, a and
+    j are such that the terms of each sum share its limit equally, at the worst place of the motion, and v stays within
+    ``max_tip_speed_mm_s``.
+
+    Args:
+        model: The arm.
+        q: Shape (m, 6), rad, m >= 2.
+        depths_mm: Shape (m,), strictly rising, mm driven at each row.
+        max_tip_speed_mm_s: mm/s.
+
+    Returns:
+        Samples every ``SAMPLE_S``.
+
+    Raises:
+        InputError: If rows, depths or speed make no sense.
+    """
+    q, depths = _checked_rows(q), np.asarray(depths_mm, dtype=np.float64)
+    if len(q) < 2 or depths.shape != (len(q),) or not (np.diff(depths) > 0.0).all():
+        raise InputError("depths do not rise row by row", where="trajectory", allowed="one rising depth a row")
+    if not (math.isfinite(max_tip_speed_mm_s) and max_tip_speed_mm_s > 0.0):
+        raise InputError(f"max_tip_speed_mm_s = {max_tip_speed_mm_s}", where="trajectory", allowed="above 0")
+    spline = CubicSpline(depths, q)
+    law = time_law(float(depths[-1] - depths[0]), _tip_rates(model, spline, max_tip_speed_mm_s))
+    steps = _steps(law.duration_s)
+    return _ending_at(q[-1], spline(depths[0] + law.driven(law.duration_s * np.arange(steps + 1) / steps)))
+
+
+def _tip_rates(model: UrModel, spline: CubicSpline, max_tip_speed_mm_s: float) -> Rates:
+    """The tip's highest speed, acceleration and jerk for which every joint keeps its limits all along a spline."""
+    depths = spline.x
+    share = np.linspace(0.0, 1.0, SPLINE_SAMPLES, endpoint=False)
+    dense = np.append((depths[:-1, None] + np.diff(depths)[:, None] * share).ravel(), depths[-1])
+    slope = np.abs(spline(dense, 1)).max(axis=0)
+    bend, twist = (float(np.abs(spline(depths, order)).max()) for order in (2, 3))  # linear and constant between rows
+    if not slope.any():
+        raise InputError("no joint moves", where="trajectory", allowed="a motion")
+    speed = min(max_tip_speed_mm_s, float((model.max_speeds / np.maximum(slope, TINY)).min()))
+    speed = min(speed, math.sqrt(model.max_acceleration / 2.0 / max(bend, TINY)))
+    speed = min(speed, (MAX_JERK / 3.0 / max(twist, TINY)) ** (1.0 / 3.0))
+    acceleration = model.max_acceleration / 2.0 / float(slope.max())
+    acceleration = min(acceleration, MAX_JERK / 9.0 / max(bend * speed, TINY))
+    return Rates(speed, acceleration, MAX_JERK / 3.0 / float(slope.max()))
+
+
+def _checked_rows(q: Array) -> Array:
+    rows = np.asarray(q, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[0] == 0 or rows.shape[1] != 6 or not np.isfinite(rows).all():
+        raise InputError(f"joint rows of shape {rows.shape}", where="trajectory", allowed="(k, 6), finite")
+    return rows

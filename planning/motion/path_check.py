@@ -1,0 +1,135 @@
+"""A joint path, looked at closely: states between which no body moves far, the first contact, the least clearance."""
+
+from __future__ import annotations
+
+from heapq import heappop, heappush
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.collision.checker import DISTANCE_PAIRS, Contact, Distances, Nearest, StateChecker
+from puncture_twin.planning.collision.fast_checker import FastChecker
+
+Array = NDArray[np.float64]
+
+MAX_SWEEP_MM = 2.0
+"""So fine that no body point moves farther between two checked states."""
+
+CLEARANCE_STEP_MM = 1.0
+"""The least clearance is found to this: states that cannot improve on it by more are passed over."""
+
+
+ROUGHLY_MM = 10.0
+"""To this the least clearance is sought first; then a fast checker passes over what it proves to be no nearer."""
+
+_At = tuple[int, float]
+"""A state and a body's distance there, mm."""
+
+_Stretch = tuple[float, str, _At, _At]
+"""Of a path: how near a body might come between two states, mm; the body; its ends."""
+
+
+def path_length(waypoints: Array) -> float:
+    """Joint-space length of straight segments through (k, 6), rad."""
+    return float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum())
+
+
+def dense_states(checker: StateChecker, waypoints: Array, step_rad: float) -> Array:
+    """States along a path, so close that neither joint distance nor any body's motion exceeds its bound.
+
+    Args:
+        checker: Knows the bodies.
+        waypoints: Shape (k, 6), rad.
+        step_rad: Largest joint distance between two states; ``MAX_SWEEP_MM`` bounds the bodies.
+
+    Returns:
+        Shape (m, 6), rad, all waypoints among them.
+    """
+    waypoints = np.asarray(waypoints, dtype=np.float64)
+    lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
+    counts = np.maximum(1, np.ceil(lengths / step_rad)).astype(np.int64)
+    while True:
+        states = _between(waypoints, counts)
+        if len(counts) == 0:
+            return states
+        farthest = np.maximum.reduceat(checker.sweep_mm(states), np.cumsum(counts) - counts)
+        if farthest.max() <= MAX_SWEEP_MM:
+            return states
+        counts = np.ceil(counts * np.maximum(1.0, farthest / MAX_SWEEP_MM)).astype(np.int64)
+
+
+def _between(waypoints: Array, counts: NDArray[np.int64]) -> Array:
+    """The waypoints (k, 6) and states between them, each segment in its count of equal steps."""
+    segment = np.repeat(np.arange(len(counts)), counts)
+    share = (np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)) / np.repeat(counts, counts)
+    rows = waypoints[segment] + share[:, None] * (waypoints[segment + 1] - waypoints[segment])
+    return np.concatenate([rows, waypoints[-1:]])
+
+
+def first_contact(checker: StateChecker, q_path: Array) -> Contact | None:
+    """The first contact along states (m, 6), the needle being outside the patient; None if all are free."""
+    met = checker.first_contact(q_path, needle_may_touch_patient=False)
+    return None if met is None else met.contact
+
+
+def least_clearance(checker: StateChecker, q_path: Array) -> Distances:
+    """The least of each distance over states along a path, to ``CLEARANCE_STEP_MM``.
+
+    Args:
+        checker: Judges distances.
+        q_path: Shape (m, 6), rad.
+    """
+    path = _Path(checker, np.asarray(q_path, dtype=np.float64))
+    return Distances(*(path.least(pair) for pair in DISTANCE_PAIRS))
+
+
+class _Path:
+    """States whose distances are asked for. A body's distance changes by no more than the body moves."""
+
+    def __init__(self, checker: StateChecker, q: Array) -> None:
+        self._checker, self._q = checker, q
+        sweeps = checker.body_sweeps_mm(q)
+        self._moved = {body: np.concatenate([[0.0], np.cumsum(sweep)]) for body, sweep in sweeps.items()}
+
+    def least(self, pair: str) -> Nearest:
+        """The least of one kind of distance."""
+        if not isinstance(self._checker, FastChecker):
+            return self._split(pair, CLEARANCE_STEP_MM)
+        best, motion = self._split(pair, ROUGHLY_MM), self._checker.motion(self._q)
+        for body in DISTANCE_PAIRS[pair] if np.isfinite(best.mm) else ():
+            at = self._checker.next_nearer(motion, 0, pair, body, best.mm - CLEARANCE_STEP_MM)
+            while at >= 0:
+                here = self._checker.nearest(self._q[at], pair, body)
+                best = min(best, here)
+                moved = self._moved[body]
+                at = int(np.searchsorted(moved, moved[at] + here.mm - best.mm + CLEARANCE_STEP_MM))
+                if at >= len(moved):
+                    break
+                at = self._checker.next_nearer(motion, at, pair, body, best.mm - CLEARANCE_STEP_MM)
+        return best
+
+    def _split(self, pair: str, tolerance_mm: float) -> Nearest:
+        """The least to a tolerance: the stretch that might be nearest is split until none might (Piyavskii 1972)."""
+        stretches: list[_Stretch] = []
+        last, best = len(self._q) - 1, Nearest(np.inf, "", "")
+        for body in DISTANCE_PAIRS[pair]:
+            ends = [(at, self._checker.nearest(self._q[at], pair, body)) for at in (0, last)]
+            best = min(best, *(here for _, here in ends))
+            self._push(stretches, body, *((at, here.mm) for at, here in ends))
+        while stretches and stretches[0][0] < best.mm - tolerance_mm:
+            _, body, first, second = heappop(stretches)
+            moved = self._moved[body]
+            lowest = (moved[first[0]] + moved[second[0]] + first[1] - second[1]) / 2.0
+            at = int(np.clip(np.searchsorted(moved, lowest), first[0] + 1, second[0] - 1))
+            here = self._checker.nearest(self._q[at], pair, body)
+            best = min(best, here)
+            self._push(stretches, body, first, (at, here.mm))
+            self._push(stretches, body, (at, here.mm), second)
+        return best
+
+    def _push(self, stretches: list[_Stretch], body: str, first: _At, second: _At) -> None:
+        """Add a stretch with states between its ends, by how near the body might come there."""
+        if second[0] - first[0] > 1 and np.isfinite(first[1]):
+            moved = self._moved[body]
+            nearest = (first[1] + second[1] - (moved[second[0]] - moved[first[0]])) / 2.0
+            heappush(stretches, (float(nearest), body, first, second))

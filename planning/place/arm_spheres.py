@@ -1,0 +1,204 @@
+"""The arm as balls, and whether they keep clear of the patient and the room: quick, and about right.
+
+Only for choosing where to look: what a placement is worth says :func:`planning.reach.reach.assess_reach_all`.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+# numba infers the types
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.links import collision_links
+from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.collision.bounding_spheres import ball_tree, prism
+from puncture_twin.planning.place.obstacle_field import CELL_MM, Boxes, SkinField
+
+Floats = NDArray[np.float64]
+
+BALL_MM = 30.0
+"""Bodies are cut until their balls are no larger: half of a UR3 wrist's size."""
+
+FLANGE = 6
+"""The frame of wrist 3, with which the holder moves."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArmBalls:
+    """Balls that enclose the links and the needle's holder, in bodies; not the needle.
+
+    Attributes:
+        centres: Shape (n, 3), mm, each in its body's frame.
+        radii: Shape (n,), mm.
+        starts: Shape (k + 1,): the first ball of each body, which encloses all of the body; the others cover it.
+        frames: Shape (k,), the body's frame among ``link_poses``: 0 is the base's.
+    """
+
+    centres: Floats
+    radii: Floats
+    starts: NDArray[np.int64]
+    frames: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, model: UrModel, tool: Tool) -> ArmBalls:
+        """The balls of an arm with its tool.
+
+        Raises:
+            InputError: If the model's meshes do not ship.
+        """
+        bodies = [[piece.vertices for piece in link.pieces] for link in collision_links(model)]
+        start, end = tool.holder_span_mm
+        bodies.append([prism(tool.holder_diameter_mm / 2, end - start) + [0.0, 0.0, (start + end) / 2]])
+        trees = [ball_tree(pieces, BALL_MM) for pieces in bodies]
+        rows = [np.insert(tree.leaves, 0, 0) for tree in trees]  # row 0 is the root
+        return cls(
+            np.concatenate([tree.centres[kept] for tree, kept in zip(trees, rows, strict=True)]),
+            np.concatenate([tree.radii[kept] for tree, kept in zip(trees, rows, strict=True)]),
+            np.cumsum([0] + [len(kept) for kept in rows]),
+            np.minimum(np.arange(len(trees)), FLANGE),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What the arm must not meet.
+
+    Attributes:
+        skin: The patient, CT frame.
+        fixed: The boxes that stand with the patient, CT frame.
+        carried: The boxes that stand with the arm, base frame.
+        padding_mm: The distance to be kept from all of them.
+    """
+
+    skin: SkinField
+    fixed: Boxes
+    carried: Boxes
+    padding_mm: float
+
+
+def clear_ways(balls: ArmBalls, room: Surroundings, T_ct_base: Floats, frames: Floats) -> NDArray[np.bool_]:
+    """Which motions keep clear of the room at each of their states; the base is not asked about.
+
+    Args:
+        balls: The arm.
+        room: What it must not meet.
+        T_ct_base: Shape (4, 4), mm.
+        frames: Shape (k, m, 7, 4, 4), mm, base frame: ``link_poses`` of k motions of m states.
+
+    Returns:
+        Shape (k,).
+    """
+    arm = (balls.centres, balls.radii + room.padding_mm, balls.starts[1:], balls.frames[1:])
+    clear = np.empty(len(frames), np.bool_)
+    _clear(arm, _compiled(room), np.ascontiguousarray(T_ct_base), frames, clear)
+    return clear
+
+
+def base_is_clear(balls: ArmBalls, room: Surroundings, T_ct_base: Floats) -> bool:
+    """Whether the base itself stands free of the patient and of what stands with him. A True is proven for boxes."""
+    base = (balls.centres, balls.radii + room.padding_mm, balls.starts[:2], balls.frames[:1])
+    alone = Surroundings(room.skin, room.fixed, Boxes.of([]), room.padding_mm)  # it is bolted to what it carries
+    clear = np.empty(1, np.bool_)
+    _clear(base, _compiled(alone), np.ascontiguousarray(T_ct_base), np.tile(np.eye(4), (1, 1, 7, 1, 1)), clear)
+    return bool(clear[0])
+
+
+def _compiled(room: Surroundings) -> tuple[tuple[Floats, Floats], ...]:
+    skin, fixed, carried = room.skin, room.fixed, room.carried
+    return (
+        (skin.origin, skin.values),
+        (fixed.T_box_frame, fixed.halves),
+        (carried.T_box_frame, carried.halves),
+    )
+
+
+@nb.njit(cache=True)
+def _moved(T, x, y, z):
+    """A point where the frame ``T`` (4, 4) takes it."""
+    a = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+    b = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+    c = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+    return a, b, c
+
+
+@nb.njit(cache=True)
+def skin_distance(origin, values, x, y, z):
+    """Signed distance to the skin, mm, linear between the nodes; beyond the grid at least the way to the grid."""
+    u, v, w = (x - origin[0]) / CELL_MM, (y - origin[1]) / CELL_MM, (z - origin[2]) / CELL_MM
+    a = min(max(u, 0.0), values.shape[0] - 1.000001)
+    b = min(max(v, 0.0), values.shape[1] - 1.000001)
+    c = min(max(w, 0.0), values.shape[2] - 1.000001)
+    beyond = (u - a) ** 2 + (v - b) ** 2 + (w - c) ** 2
+    i, j, k = int(a), int(b), int(c)
+    a, b, c = a - i, b - j, c - k
+    low = (values[i, j, k] * (1 - a) + values[i + 1, j, k] * a) * (1 - b)
+    low += (values[i, j + 1, k] * (1 - a) + values[i + 1, j + 1, k] * a) * b
+    high = (values[i, j, k + 1] * (1 - a) + values[i + 1, j, k + 1] * a) * (1 - b)
+    high += (values[i, j + 1, k + 1] * (1 - a) + values[i + 1, j + 1, k + 1] * a) * b
+    inner = low * (1 - c) + high * c
+    return inner if beyond == 0.0 else max(inner, CELL_MM * np.sqrt(beyond))
+
+
+@nb.njit(cache=True)
+def _meets_box(boxes, x, y, z, radius):
+    """Whether a ball meets one of the boxes."""
+    poses, halves = boxes
+    for k in range(len(halves)):
+        squared = 0.0
+        for i in range(3):
+            along = poses[k, i, 0] * x + poses[k, i, 1] * y + poses[k, i, 2] * z + poses[k, i, 3]
+            squared += max(0.0, abs(along) - halves[k, i]) ** 2
+        if squared < radius * radius:
+            return True
+    return False
+
+
+@nb.njit(cache=True)
+def _meets(room, T_ct_base, T_base_body, centre, radius):
+    """Whether one ball meets anything."""
+    skin, fixed, carried = room
+    x, y, z = _moved(T_base_body, centre[0], centre[1], centre[2])
+    if _meets_box(carried, x, y, z, radius):
+        return True
+    x, y, z = _moved(T_ct_base, x, y, z)
+    return skin_distance(skin[0], skin[1], x, y, z) < radius or _meets_box(fixed, x, y, z, radius)
+
+
+@nb.njit(cache=True)
+def _is_clear(arm, room, T_ct_base, frames, met):
+    """One state. First the ball ``met`` (body, ball) that met something last; then the far bodies before the near."""
+    centres, radii, starts, body_frames = arm
+    body, ball = met
+    if ball >= 0:
+        T, first = frames[body_frames[body]], starts[body]
+        if _meets(room, T_ct_base, T, centres[ball], radii[ball]) and _meets(
+            room, T_ct_base, T, centres[first], radii[first]
+        ):
+            return False
+    for body in range(len(body_frames) - 1, -1, -1):
+        T = frames[body_frames[body]]
+        first = starts[body]
+        if _meets(room, T_ct_base, T, centres[first], radii[first]):
+            for ball in range(first + 1, starts[body + 1]):
+                if _meets(room, T_ct_base, T, centres[ball], radii[ball]):
+                    met[0], met[1] = body, ball
+                    return False
+    return True
+
+
+@nb.njit(cache=True)
+def _clear(arm, room, T_ct_base, frames, clear):
+    """Fill ``clear`` (k,) for motions ``frames`` (k, m, 7, 4, 4)."""
+    met = np.array([0, -1])
+    for way in range(len(frames)):
+        clear[way] = True
+        for state in range(frames.shape[1] - 1, -1, -1):  # the last is the nearest to the patient
+            if not _is_clear(arm, room, T_ct_base, frames[way, state], met):
+                clear[way] = False
+                break

@@ -1,0 +1,107 @@
+"""What a placement is worth: the search's own answer for the arm, asked for every organ-safe direction."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.tool import Box, Tool
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.state_checker import Contact
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.place.directions import WantedDirections
+from puncture_twin.planning.reach.reach import ReachRequest, assess_reach_all
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The exact answer for one placement.
+
+    Attributes:
+        share: Solid angle of the held directions over that of the asked ones, 0..1.
+        held: How many directions the arm can hold and drive through.
+        asked: How many there are.
+        margin: Mean reach margin of the held ones, 0..1; 0 for none.
+        reasons: How many of the others fell to which reason.
+        home_contact: What the arm touches in its home configuration, or "".
+    """
+
+    share: float
+    held: int
+    asked: int
+    margin: float
+    reasons: Mapping[str, int]
+    home_contact: str
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Judges placements. What it holds can be sent to another process.
+
+    Attributes:
+        model: Name of the arm.
+        tool: What its flange carries.
+        skin: CT frame.
+        patient: CT frame, the skin and what the CT shows outside of it.
+        fixed: Boxes that stand with the patient; their ``T_base_box`` is in the CT frame.
+        carried: Boxes that stand with the arm, base frame.
+        padding_mm: Of the arm.
+        target_ct: Shape (3,), mm.
+        wanted: The directions.
+        home: Shape (6,), rad.
+    """
+
+    model: str
+    tool: Tool
+    skin: TriangleMesh
+    patient: TriangleMesh
+    fixed: tuple[Box, ...]
+    carried: tuple[Box, ...]
+    padding_mm: float
+    target_ct: Floats
+    wanted: WantedDirections
+    home: Floats
+
+    def verdict(self, T_base_ct: Floats) -> Verdict:
+        """Ask for every direction.
+
+        Raises:
+            InputError: The base stands in the patient.
+        """
+        checker = self._checker(T_base_ct)
+        target = T_base_ct[:3, :3] @ self.target_ct + T_base_ct[:3, 3]
+        requests = [
+            ReachRequest(target, T_base_ct[:3, :3] @ outward, self.tool.needle_length_mm, float(standoff))
+            for outward, standoff in zip(self.wanted.outward_ct, self.wanted.standoff_mm, strict=True)
+        ]
+        answers = assess_reach_all(checker, requests)
+        held = np.array([answer.reachable for answer in answers], bool)
+        margins = [answer.margin for answer in answers if answer.reachable]
+        return Verdict(
+            share=float(self.wanted.weight[held].sum()),
+            held=int(held.sum()),
+            asked=len(held),
+            margin=float(np.mean(margins)) if margins else 0.0,
+            reasons=dict(Counter(answer.reason.value for answer in answers if not answer.reachable).most_common()),
+            home_contact=_words(checker.contact(self.home, needle_may_touch_patient=False)),
+        )
+
+    def _checker(self, T_base_ct: Floats) -> FastChecker:
+        boxes = [Box(box.name, T_base_ct @ box.T_base_box, box.size_mm) for box in self.fixed]
+        patient, skin = (mesh.transformed(T_base_ct) for mesh in (self.patient, self.skin))
+        model, everything = ur_model(self.model), (*boxes, *self.carried)
+        return FastChecker(
+            model, self.tool, everything, patient, skin=skin, padding_mm=self.padding_mm, cache=user_cache()
+        )
+
+
+def _words(contact: Contact | None) -> str:
+    return "" if contact is None else f"{contact.body} touches {contact.other}"

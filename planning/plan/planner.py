@@ -1,0 +1,115 @@
+"""From ranked candidates to a plan: the best one that the arm can come to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.collision.workcell import home_configuration
+from puncture_twin.planning.motion.approach import plan_approach
+from puncture_twin.planning.motion.follow import drive_smoothly
+from puncture_twin.planning.plan.motion import motion_contact, phase_clearances
+from puncture_twin.planning.plan.plan import INSERTION_MM_S, Plan
+from puncture_twin.planning.reach.goals import approach_goals
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.context import Prepared
+from puncture_twin.planning.search.search import ranked, reach_request
+
+MAX_TRIES = 20
+"""Candidates to which an approach is sought; what none of the best twenty allows is a matter of the room."""
+
+
+class Planned(NamedTuple):
+    """A plan, and the candidates with those that no approach was found for marked."""
+
+    plan: Plan
+    candidates: Candidates
+
+
+def make_plan(prepared: Prepared, candidates: Candidates, *, seed: int) -> Planned:
+    """Plan to the best candidate for which an approach is found.
+
+    Args:
+        prepared: The case.
+        candidates: Its search result, with reach.
+        seed: Of the approach's planner.
+
+    Raises:
+        InputError: The case does not say where the arm stands.
+        NoAnswerError: No candidate is safe, or none of the best can be come to.
+    """
+    if prepared.reach is None:
+        raise InputError(
+            "the case does not say where the robot stands",
+            where=prepared.case.path,
+            allowed="[registration] with markers, or [robot.mount]",
+        )
+    last = "no candidate is safe"
+    for row in candidates.ranked[:MAX_TRIES]:
+        try:
+            plan = _plan(prepared, candidates, int(row), seed)
+        except NoAnswerError as error:
+            last = str(error)
+            candidates = _without(prepared, candidates, int(row), last)
+            continue
+        return Planned(plan, candidates)
+    raise NoAnswerError(f"no plan: {last}", counts=candidates.counts())
+
+
+def _without(prepared: Prepared, candidates: Candidates, row: int, why: str) -> Candidates:
+    """The same candidates with one marked ``approach_not_found``, ranked anew."""
+    reason, detail = candidates.reason.copy(), candidates.reason_detail.copy()
+    reason[row], detail[row] = Reason.APPROACH_NOT_FOUND.value, why
+    blank = replace(
+        candidates,
+        reason=reason,
+        reason_detail=detail,
+        cost=np.full(len(candidates), np.nan),
+        rank=np.zeros(len(candidates), np.int32),
+        pareto=np.zeros(len(candidates), bool),
+    )
+    return ranked(prepared.case, blank)
+
+
+def _plan(prepared: Prepared, candidates: Candidates, row: int, seed: int) -> Plan:
+    """The plan for one candidate; what it returns has been checked as it would be when it is loaded.
+
+    Raises:
+        NoAnswerError: No approach, or the timed motion touches something after all.
+    """
+    assert prepared.reach is not None and prepared.placement is not None  # the caller has refused this
+    case, checker = prepared.case, prepared.reach.checker
+    request = reach_request(case, candidates, row, prepared.reach.T_base_ct)
+    home = home_configuration(case)
+    goals = approach_goals(checker, request, home)
+    approach = plan_approach(checker, home, np.array([goal.insertion_q[0] for goal in goals]), seed=seed)
+    answer = goals[approach.goal_index]
+    plan = Plan(
+        case_name=case.name,
+        inputs=case.inputs,
+        seed=seed,
+        model=case.robot.model,
+        T_base_ct=prepared.placement.T_base_ct,
+        expected_target_error_mm=prepared.placement.target_error_mm,
+        theta=float(candidates.theta[row]),
+        beta=float(candidates.beta[row]),
+        entry_ct=candidates.entry_ct[row],
+        target_ct=case.target_ct,
+        outward_ct=candidates.outward_ct[row],
+        roll=answer.roll,
+        standoff_mm=request.standoff_mm,
+        needle_length_mm=case.needle.length_mm,
+        approach=approach.trajectory,
+        insertion=drive_smoothly(
+            checker.model, answer.insertion_q, answer.insertion_depth_mm, max_tip_speed_mm_s=INSERTION_MM_S
+        ),
+        clearance_mm={"needle": float(candidates.min_clearance[row])},
+    )
+    touched = motion_contact(plan, checker)
+    if touched is not None:
+        raise NoAnswerError(touched)
+    return replace(plan, clearance_mm={**phase_clearances(plan, checker), **plan.clearance_mm})

@@ -1,0 +1,96 @@
+"""A plan, held against its case again: same inputs, same verdict, and a motion that FCL finds free."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.collision.workcell import home_configuration
+from puncture_twin.planning.plan.motion import motion_contact, phase_clearances
+from puncture_twin.planning.plan.plan import Plan, check_angles, check_inputs
+from puncture_twin.planning.reach.standoff import standoffs
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.context import Prepared
+from puncture_twin.planning.search.explain import reason_text
+
+Floats = NDArray[np.float64]
+
+SAME_DIRECTION = 1e-6
+"""Largest difference of two unit vectors that name one direction: degrees in the file are rounded to 1e-15."""
+
+
+SAME_NUMBER_MM = 1e-4
+"""A number that is computed again may differ by this: FCL's own threshold."""
+
+
+def check_plan(plan: Plan, prepared: Prepared, path: Path, *, seed: int | None = None) -> Candidates:
+    """Judge a loaded plan's direction and motion anew.
+
+    Args:
+        plan: What was read.
+        prepared: Its case.
+        path: The plan's file, for errors.
+        seed: That the plan must state: the command ``plan`` takes the case's. None where code chose another.
+
+    Returns:
+        The candidate of the plan, judged.
+
+    Raises:
+        InputError: The inputs changed, the direction is not safe any more, or the motion touches something.
+    """
+    check_inputs(plan, prepared.case, path)
+    if prepared.reach is None or not np.array_equal(plan.T_base_ct, prepared.reach.T_base_ct):
+        raise InputError("T_base_ct is not the case's", where=path, allowed="plan again")
+    candidates = prepared.check(plan.theta, plan.beta)
+    if not np.allclose(candidates.outward_ct[0], plan.outward_ct, atol=SAME_DIRECTION):
+        raise InputError("outward_ct is not the direction of theta_deg, beta_deg", where=path, allowed="plan again")
+    if not candidates.safe[0]:
+        raise InputError(f"its direction is rejected: {reason_text(candidates, 0)}", where=path, allowed="plan again")
+    if seed is not None:
+        _check_same("seed", plan.seed, seed, path)
+    _check_labels(plan, prepared, candidates, path)
+    check_angles(plan, path)
+    touched = motion_contact(plan, prepared.reach.checker)
+    if touched is not None:
+        raise InputError(f"its {touched}", where=path, allowed="a motion that touches nothing")
+    for phase, known in phase_clearances(plan, prepared.reach.checker).items():
+        _check_same(f"clearance_mm.{phase}", plan.clearance_mm.get(phase, np.nan), known, path)
+    return candidates
+
+
+def _check_labels(plan: Plan, prepared: Prepared, candidates: Candidates, path: Path) -> None:
+    """Refuse what a plan says of itself where the case says otherwise: people read these numbers."""
+    case, placement = prepared.case, prepared.placement
+    error = float("nan") if placement is None else placement.target_error_mm
+    stated: tuple[tuple[str, Any, Any], ...] = (
+        ("case", plan.case_name, case.name),
+        ("robot", plan.model, case.robot.model),
+        ("needle_length_mm", plan.needle_length_mm, case.needle.length_mm),
+        ("target_ct_mm", plan.target_ct, case.target_ct),
+        ("entry_ct_mm", plan.entry_ct, candidates.entry_ct[0]),
+        ("standoff_mm", plan.standoff_mm, standoffs(case.needle, candidates.path_length[0], candidates.skin_angle[0])),
+        ("expected_target_error_mm", plan.expected_target_error_mm, error),
+        ("clearance_mm.needle", plan.clearance_mm.get("needle", np.nan), candidates.min_clearance[0]),
+        ("the approach's first row", plan.approach.q[0], home_configuration(case)),
+    )
+    for name, said, known in stated:
+        _check_same(name, said, known, path)
+
+
+def _check_same(name: str, said: Any, known: Any, path: Path) -> None:
+    """Refuse a stated number that is another when it is computed again; no number in a file is null, whichever it is.
+
+    Raises:
+        InputError: Names it.
+    """
+    if isinstance(known, str | int):
+        same = said == known
+    else:
+        said, known = (np.where(np.isfinite(value), value, np.nan) for value in (said, known))
+        same = np.allclose(said, known, rtol=0, atol=SAME_NUMBER_MM, equal_nan=True)
+    if not same:
+        raise InputError(f"{name} is {said}, the case gives {known}", where=path, allowed="plan again")

@@ -1,0 +1,85 @@
+"""What is asked of the arm for one direction, and what it answers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.collision.checker import Contact
+
+Array = NDArray[np.float64]
+
+SAME_UNIT = 1e-9
+"""How far a direction's length may be from 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReachRequest:
+    """One direction to reach along.
+
+    Attributes:
+        target_base: Shape (3,), mm: the lesion, base frame.
+        outward_base: Shape (3,), unit: from the target out of the body, base frame.
+        needle_length_mm: Flange to tip.
+        standoff_mm: Tip to target before the insertion starts.
+
+    Raises:
+        InputError: If something is not finite, the direction not a unit vector, or a length not positive.
+    """
+
+    target_base: Array
+    outward_base: Array
+    needle_length_mm: float
+    standoff_mm: float
+
+    def __post_init__(self) -> None:
+        for name in ("target_base", "outward_base"):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            if array.shape != (3,) or not np.isfinite(array).all():
+                raise InputError(f"{name} = {array}", where="reach request", allowed="three finite numbers")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        if abs(float(np.linalg.norm(self.outward_base)) - 1.0) > SAME_UNIT:
+            raise InputError(f"outward_base = {self.outward_base}", where="reach request", allowed="a unit vector")
+        for name in ("needle_length_mm", "standoff_mm"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise InputError(f"{name} = {getattr(self, name)}", where="reach request", allowed="finite and above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class ReachAnswer:
+    """Whether and how the arm reaches along one direction.
+
+    Attributes:
+        reachable: The verdict.
+        reason: ``NONE``, ``UNREACHABLE``, ``ARM_COLLISION`` (at standoff) or ``INSERTION_BLOCKED``.
+        depth_mm: How far the needle was driven from standoff when it was blocked; None for other reasons.
+        detail: One sentence for people: what touched what, or what was missing; empty when reachable.
+        contact: What touched what, where that was the reason.
+        roll: Turn about the needle against :func:`flange_poses`' zero, rad; NaN when not reachable.
+        branch: Index among the eight branches of ``inverse``; -1 when not reachable.
+        insertion_q: Shape (m, 6), rad: standoff first, tip on the target last; empty when not reachable.
+        insertion_depth_mm: Shape (m,), mm driven from standoff at each row.
+        margin: 0..1, the least over the insertion of: each joint's distance to its limits over a quarter turn, and the
+            three singularity terms. 0 when not reachable.
+    """
+
+    reachable: bool
+    reason: Reason
+    depth_mm: float | None
+    detail: str
+    contact: Contact | None
+    roll: float
+    branch: int
+    insertion_q: Array
+    insertion_depth_mm: Array
+    margin: float
+
+    def __post_init__(self) -> None:
+        self.insertion_q.setflags(write=False)
+        self.insertion_depth_mm.setflags(write=False)

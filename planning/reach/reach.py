@@ -1,0 +1,301 @@
+"""Which directions the arm can hold and drive through: standoff pose, straight insertion, nothing touched on the way.
+
+Retraction is the same motion backwards, so what may be driven in may be driven out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.insertion import (
+    NeedleLine,
+    away_from_singularities,
+    branch_way,
+    every_way,
+    first_stop,
+    flange_at,
+    needle_lines,
+    reach_margin,
+    survey,
+    why_unreachable,
+)
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.collision.checker import Contact, StateChecker
+from puncture_twin.planning.reach.answer import ReachAnswer, ReachRequest
+
+__all__ = [
+    "MAX_SWEEP_MM",
+    "ReachAnswer",
+    "ReachRequest",
+    "assess_reach",
+    "assess_reach_all",
+    "every_reach",
+]
+
+Array = NDArray[np.float64]
+
+MAX_SWEEP_MM = 2.0
+"""Between two collision checks no body point moves farther, so that it is never more than half of this from where it
+was checked."""
+
+SAME_LENGTH_MM = 1e-6
+"""Two statements of one needle's length may differ by this much: rounding."""
+
+MARGIN_DIGITS = 9
+"""Margins that agree to this many digits are equal, so that rounding does not choose between mirrored branches."""
+
+CHUNK = 64
+"""Requests between two reports of progress."""
+
+ROLL_BODY = "wrist_3"
+"""The only body that turns with the roll and is not round about the needle: other contacts hold for every roll."""
+
+
+class _Drive(NamedTuple):
+    """A motion from standoff to target on one branch at one roll."""
+
+    line: NeedleLine
+    branch: int
+    roll: float
+    turn: Array
+    """Shape (6,), rad: what to add to the branch's way at roll 0, the roll and whole turns."""
+
+    def along(self, model: UrModel, request: ReachRequest, depths_mm: Array) -> Array:
+        """The motion at some depths, shape (m, 6), rad."""
+        return branch_way(model, self.line, _distances(request, depths_mm), self.branch, self.turn)
+
+
+class _Blocked(NamedTuple):
+    """Where a motion ends early, and whether another roll on the same branch would meet the same."""
+
+    depth_mm: float
+    detail: str
+    at_any_roll: bool = True
+    at_standoff: bool = False
+    contact: Contact | None = None
+
+
+class _Tried(NamedTuple):
+    """A motion that was checked for contacts; ``block`` is None when it is clear to the target."""
+
+    q: Array
+    depths: Array
+    block: _Blocked | None
+
+
+def assess_reach(
+    checker: StateChecker, request: ReachRequest, *, n_rolls: int = 8, step_mm: float = MAX_SWEEP_MM
+) -> ReachAnswer:
+    """Find a roll and a branch on which the arm holds the standoff pose and drives straight to the target, untouched.
+
+    All (roll, branch) pairs are ordered by margin; the first that is clear is the answer, so it is the best of them.
+
+    Args:
+        checker: Judges contacts, in the base frame.
+        request: The direction.
+        n_rolls: How many rolls, evenly over the turn.
+        step_mm: Spacing of the insertion's samples; finer where a body would move farther than ``MAX_SWEEP_MM``.
+
+    Raises:
+        InputError: If the request's needle is not the checker's, or a number makes no sense.
+    """
+    return _answers(checker, [request], n_rolls, step_mm)[0]
+
+
+def every_reach(
+    checker: StateChecker, request: ReachRequest, *, n_rolls: int = 8, step_mm: float = MAX_SWEEP_MM
+) -> list[ReachAnswer]:
+    """All rolls and branches on which :func:`assess_reach` would say yes, the best margin first; empty if none.
+
+    Args:
+        checker: Judges contacts, in the base frame.
+        request: The direction.
+        n_rolls: See :func:`assess_reach`.
+        step_mm: The same.
+
+    Raises:
+        InputError: The same.
+    """
+    surveyed = next(_surveyed(checker, [request], n_rolls, step_mm))
+    tries = ((drive, _try(checker, request, drive, surveyed.depths)) for drive in surveyed.drives())
+    return [_success(checker.model, drive, tried) for drive, tried in tries if tried.block is None]
+
+
+def assess_reach_all(
+    checker: StateChecker,
+    requests: Sequence[ReachRequest],
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    n_rolls: int = 8,
+    step_mm: float = MAX_SWEEP_MM,
+) -> list[ReachAnswer]:
+    """The answers of :func:`assess_reach` to many requests: kinematics for all of them, then contacts one by one.
+
+    Args:
+        checker: Judges contacts, in the base frame.
+        requests: The directions.
+        progress: Called with (answered, to answer).
+        n_rolls: See :func:`assess_reach`.
+        step_mm: The same.
+
+    Raises:
+        InputError: The same.
+    """
+    answers: list[ReachAnswer] = []
+    for start in range(0, len(requests), CHUNK):
+        answers += _answers(checker, requests[start : start + CHUNK], n_rolls, step_mm)
+        if progress is not None:
+            progress(len(answers), len(requests))
+    return answers
+
+
+class _Surveyed(NamedTuple):
+    """What kinematics alone says of one request."""
+
+    request: ReachRequest
+    line: NeedleLine
+    depths: Array
+    rolls: Array
+    stop_at: NDArray[np.int64]
+    margins: Array
+    turns: Array
+
+    def drives(self) -> Iterator[_Drive]:
+        """The motions that kinematics allows, see :func:`_drives`."""
+        return _drives(self.line, self.margins, self.turns, self.rolls)
+
+
+def _surveyed(
+    checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int, step_mm: float
+) -> Iterator[_Surveyed]:
+    for request in requests:
+        if abs(request.needle_length_mm - checker.tool.needle_length_mm) > SAME_LENGTH_MM:
+            allowed = f"the tool's {checker.tool.needle_length_mm}"
+            raise InputError(f"needle_length_mm = {request.needle_length_mm}", where="reach request", allowed=allowed)
+    if n_rolls < 1 or not step_mm > 0.0:
+        raise InputError(f"n_rolls = {n_rolls}, step_mm = {step_mm}", where="reach", allowed="both above 0")
+    depths = [_depths(request, step_mm) for request in requests]
+    rolls = 2.0 * math.pi * np.arange(n_rolls) / n_rolls
+    targets = np.array([request.target_base for request in requests])
+    outwards = np.array([request.outward_base for request in requests])
+    distances = [_distances(request, depth) for request, depth in zip(requests, depths, strict=True)]
+    lines = needle_lines(targets, outwards)
+    found = survey(checker.model, lines, distances, depths, rolls)
+    for request, line, depth, stop_at, margins, turns in zip(requests, lines, depths, *found, strict=True):
+        yield _Surveyed(request, line, depth, rolls, stop_at, margins, turns)
+
+
+def _answers(
+    checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int, step_mm: float
+) -> list[ReachAnswer]:
+    answers = []
+    for found in _surveyed(checker, requests, n_rolls, step_mm):
+        if not np.isnan(found.margins).all():
+            answers.append(_first_clear(checker, found.request, found.depths, found.drives()))
+        else:
+            answers.append(_why_none(checker.model, found.request, found.line, found.depths, found.stop_at))
+    return answers
+
+
+def _why_none(
+    model: UrModel, request: ReachRequest, line: NeedleLine, depths: Array, stop_at: NDArray[np.int64]
+) -> ReachAnswer:
+    """The refusal of a direction along which kinematics allows no motion."""
+    if (stop_at < 0).any():
+        return _refusal(Reason.UNREACHABLE, None, "every roll and branch leaves the joint limits")
+    distances = _distances(request, depths)
+    paths = every_way(model, line, distances)
+    holds = away_from_singularities(model, paths[:, 0])
+    if not holds.any():
+        why = why_unreachable(model, flange_at(line, distances[0]))
+        return _refusal(Reason.UNREACHABLE, None, why)
+    stops = [first_stop(model, path, depths) for path in paths[holds]]
+    deepest = max((stop for stop in stops if stop), key=lambda stop: stop.depth_mm)
+    return _refusal(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail)
+
+
+def _depths(request: ReachRequest, step_mm: float) -> Array:
+    return np.linspace(0.0, request.standoff_mm, math.ceil(request.standoff_mm / step_mm) + 1)
+
+
+def _distances(request: ReachRequest, depths_mm: Array) -> Array:
+    """Target to flange at each depth, mm."""
+    return request.needle_length_mm + request.standoff_mm - depths_mm
+
+
+def _drives(line: NeedleLine, margins: Array, turns: Array, rolls: Array) -> Iterator[_Drive]:
+    """The motions that kinematics allows, the best margin first; of equals the first branch, then the first roll."""
+    branches, rolled = np.nonzero(~np.isnan(margins))
+    order = np.argsort(-np.round(margins[branches, rolled], MARGIN_DIGITS), kind="stable")
+    for i in order:
+        branch, roll = int(branches[i]), int(rolled[i])
+        yield _Drive(line, branch, float(rolls[roll]), turns[branch, roll])
+
+
+def _first_clear(checker: StateChecker, request: ReachRequest, depths: Array, drives: Iterable[_Drive]) -> ReachAnswer:
+    """The first of several motions that touches nothing; else a refusal with the one that came farthest."""
+    blocks: list[_Blocked] = []
+    hopeless: set[int] = set()
+    for drive in drives:
+        if drive.branch in hopeless:
+            continue
+        tried = _try(checker, request, drive, depths)
+        if tried.block is None:
+            return _success(checker.model, drive, tried)
+        blocks.append(tried.block)
+        if tried.block.at_any_roll:
+            hopeless.add(drive.branch)
+    deepest = max(blocks, key=lambda block: block.depth_mm)  # the first of equals: the best margin
+    if deepest.at_standoff:
+        return _refusal(Reason.ARM_COLLISION, None, deepest.detail, deepest.contact)
+    return _refusal(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail, deepest.contact)
+
+
+def _try(checker: StateChecker, request: ReachRequest, drive: _Drive, depths: Array) -> _Tried:
+    """Check one motion for contacts, standoff first."""
+    model = checker.model
+    standoff = drive.along(model, request, depths[:1])
+    contact = checker.contact(standoff[0], needle_may_touch_patient=False)
+    if contact is not None:
+        detail = f"{contact.body} touches {contact.other} at standoff"
+        block = _Blocked(0.0, detail, ROLL_BODY not in contact, at_standoff=True, contact=contact)
+        return _Tried(standoff, depths[:1], block)
+    q, depths = _refined(checker, request, drive, depths)
+    stop = first_stop(model, q, depths)
+    if stop is not None:
+        return _Tried(q, depths, _Blocked(stop.depth_mm, stop.detail))
+    if reach_margin(model, q) < 0.0:
+        return _Tried(q, depths, _Blocked(0.0, "a joint leaves its limits on the way", at_any_roll=False))
+    met = checker.first_contact(q, needle_may_touch_patient=True)
+    if met is None:
+        return _Tried(q, depths, None)
+    depth, contact = float(depths[met.at]), met.contact
+    detail = f"{contact.body} touches {contact.other} {depth:.1f} mm after the standoff"
+    return _Tried(q, depths, _Blocked(depth, detail, ROLL_BODY not in contact, contact=contact))
+
+
+def _refined(checker: StateChecker, request: ReachRequest, drive: _Drive, depths: Array) -> tuple[Array, Array]:
+    """The motion sampled so that no body moves more than ``MAX_SWEEP_MM`` from sample to sample, and its depths."""
+    q = drive.along(checker.model, request, depths)
+    while (worst := checker.sweep_mm(q).max()) > MAX_SWEEP_MM:
+        depths = np.linspace(0.0, request.standoff_mm, math.ceil((len(depths) - 1) * worst / MAX_SWEEP_MM) + 1)
+        q = drive.along(checker.model, request, depths)
+        if np.isnan(q).any():
+            break  # the caller finds where
+    return q, depths
+
+
+def _success(model: UrModel, drive: _Drive, tried: _Tried) -> ReachAnswer:
+    margin = reach_margin(model, tried.q)
+    return ReachAnswer(True, Reason.NONE, None, "", None, drive.roll, drive.branch, tried.q, tried.depths, margin)
+
+
+def _refusal(reason: Reason, depth_mm: float | None, detail: str, contact: Contact | None = None) -> ReachAnswer:
+    return ReachAnswer(False, reason, depth_mm, detail, contact, math.nan, -1, np.empty((0, 6)), np.empty(0), 0.0)

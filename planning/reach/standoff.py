@@ -1,0 +1,77 @@
+"""How far from the target the tip waits before the insertion: just outside the skin, or where the case says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.anatomy.anatomy import Structure
+from puncture_twin.planning.case.case import Case, Needle
+from puncture_twin.planning.collision.workcell import ARM_PADDING_MM
+
+Floats = NDArray[np.float64]
+
+UNEVEN_SKIN_MM = 1.0
+"""Added along the needle because skin is not flat and its triangles are coarser than it. On the embedded abdomen and
+on two label maps of a real CT 0 and 0.1 mm leave the needle too near in up to 10 % of the organ-safe solid angle, 1 mm
+in none of it."""
+
+MAX_GAP_MM = 200.0
+"""Along a path that grazes the skin no gap suffices; none is larger than the largest that a case may ask for."""
+
+
+def skin_gaps(needle: Needle, skin_angle: Floats | float) -> Floats:
+    """Distance along the needle from the waiting tip to the skin, for a case that states no standoff.
+
+    The arm's checker keeps its padding p from the skin: about the needle (radius r) it sees a cylinder of radius r + p
+    that begins p before the tip. At an angle a to the normal of flat skin, the rim of that cylinder's end lies
+    (gap - p) cos(a) - (r + p) sin(a) above it, which is positive for gap > p + (r + p) tan(a).
+
+    Args:
+        needle: With ``skin_gap_mm``, the least gap.
+        skin_angle: Any shape, rad, 0 straight in; NaN without a skin entry.
+
+    Returns:
+        Shape of ``skin_angle``, mm; NaN where that is.
+    """
+    slope = np.tan(np.asarray(skin_angle, dtype=float))
+    clear = ARM_PADDING_MM + (needle.radius_mm + ARM_PADDING_MM) * slope + UNEVEN_SKIN_MM
+    return np.asarray(np.clip(clear, needle.skin_gap_mm, max(MAX_GAP_MM, needle.skin_gap_mm)))
+
+
+def standoffs(needle: Needle, path_length: Floats | float, skin_angle: Floats | float) -> Floats:
+    """Distance tip to target before the insertion: the case's, or just so that the needle clears the skin; mm.
+
+    Args:
+        needle: The needle.
+        path_length: Target to skin, mm; NaN without a skin entry.
+        skin_angle: The same shape, rad.
+    """
+    path_length = np.asarray(path_length, dtype=float)
+    if needle.standoff_mm is None:
+        return path_length + skin_gaps(needle, skin_angle)
+    return np.full(path_length.shape, needle.standoff_mm)
+
+
+def farthest_flange(needle: Needle, max_skin_angle: float) -> float:
+    """How far from the target, along the needle, the flange can be while the tip waits at any standoff, mm.
+
+    Args:
+        needle: The needle.
+        max_skin_angle: The steepest angle at the skin that a case allows, rad.
+    """
+    if needle.standoff_mm is not None:
+        return needle.length_mm + needle.standoff_mm
+    return needle.length_mm + needle.shaft_mm + float(skin_gaps(needle, max_skin_angle))
+
+
+def axis_lengths(case: Case, structures: Sequence[Structure]) -> Floats:
+    """How far from the target the needle's axis is checked against each structure, shape (k,), mm.
+
+    Against the body's structures up to where the flange ends; against what is outside of the body up to where the
+    flange can be while the tip waits at its standoff.
+    """
+    farthest = farthest_flange(case.needle, case.search.max_skin_angle)
+    return np.array([farthest if s.outside else case.needle.length_mm for s in structures], dtype=np.float64)

@@ -1,0 +1,81 @@
+"""Can the markers be trusted? What their residuals cannot show: permuted names, slipped axes, markers off the skin."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import load_skin
+from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.axis_slips import MarkerList, check_axes, marker_list
+from puncture_twin.planning.registration.name_slips import check_names
+from puncture_twin.planning.registration.placement import Placement, load_placement
+from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.registration.skin_fit import MARKER_ON_SKIN_MM
+
+LOCAL_AXES = 'space "local": nothing tells whether the axes of markers_ct have slipped by a half turn'
+BASE_AXES = (
+    "not checked: a half turn of markers_base (such as ROS base_link for the controller's base); residuals, skin and "
+    "couch are blind to it"
+)
+
+
+class MarkerFindings(NamedTuple):
+    """What is to be known about a case's markers."""
+
+    warnings: tuple[str, ...]
+    """What these markers leave open, one sentence each."""
+    notes: tuple[str, ...]
+    """What no markers can show."""
+
+
+class CheckedPlacement(NamedTuple):
+    """A placement whose markers have been held against names, skin and couch."""
+
+    placement: Placement
+    findings: MarkerFindings
+
+
+def checked_placement(case: Case, cache: Cache) -> CheckedPlacement | None:
+    """Where the patient lies for the robot, with its markers checked; None where the case does not say it.
+
+    Raises:
+        InputError: As `load_placement` and `check_markers`, or a skin that cannot be read.
+    """
+    placement = load_placement(case)
+    if placement is None or placement.registration is None:
+        return None if placement is None else CheckedPlacement(placement, MarkerFindings((), ()))
+    return CheckedPlacement(placement, check_markers(case, load_skin(case, cache), placement.registration))
+
+
+def check_markers(case: Case, skin: Skin, registration: Registration) -> MarkerFindings:
+    """Hold a registration's markers against permuted names, half turns, skin and couch.
+
+    Raises:
+        InputError: Names that fit much better permuted, or as well where nothing tells them apart; a list that lies on
+            the skin only after a half turn.
+    """
+    names = check_names(case, skin, registration)
+    given = marker_list(case, skin, registration)
+    local = case.space is Space.LOCAL
+    axes = () if local else check_axes(case, skin, registration, given)
+    warnings = (*names, *axes, *_off_the_skin(registration, given))
+    return MarkerFindings(warnings, (LOCAL_AXES, BASE_AXES) if local else (BASE_AXES,))
+
+
+def _off_the_skin(registration: Registration, given: MarkerList) -> tuple[str, ...]:
+    names = registration.markers.names
+    gaps = zip(names, np.abs(given.fit.gaps_mm), strict=True)
+    far = [f"{name} ({gap:.0f} mm)" for name, gap in gaps if gap > MARKER_ON_SKIN_MM]
+    behind = tuple(
+        f"marker {names[row]} lies behind obstacle '{obstacle}': no needle can touch it there"
+        for row, obstacle in given.behind
+    )
+    if not far:
+        return behind
+    said = f"markers far from the skin: {', '.join(far)}; is their file in the case's space (LPS/RAS) and unit?"
+    return (said, *behind)

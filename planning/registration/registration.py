@@ -1,0 +1,309 @@
+"""CT to robot from markers: triad and rigid fit, their residuals, and the error to expect at the target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.points.point_files import NamedPoints
+from puncture_twin.planning.registration.conditioning import Conditioning, conditioning, leverage
+from puncture_twin.planning.registration.residual_test import Interval, ResidualTest
+
+Floats = NDArray[np.float64]
+
+MIN_MARKERS = 3
+"""Two points leave a rotation free."""
+
+COLLINEAR = 0.01
+"""Second over first singular value of the centred markers below which they count as one line."""
+
+UNIT_SLIP = 5.0
+"""Ratio of the two marker sets' spreads from which on a unit (mm, cm, m) is wrong, not a measurement."""
+
+MAX_RESIDUAL_MM = 15.0
+"""A marker that misses by more was swapped, moved or typed wrongly: the paper's worst set misses by 7 mm."""
+
+ALLOWED_RESIDUALS = "names and readings checked, the true fle_mm, or registration.accept_residuals = true"
+
+MIRROR_GAIN = 2.0
+"""A mirrored fit that is better than the proper one by this factor (and 1 mm) says that one side is mirrored."""
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerPairs:
+    """The same markers in both frames, matched by name; shapes (n, 3), mm."""
+
+    names: tuple[str, ...]
+    points_ct: Floats
+    points_base: Floats
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """T_base_ct from markers, and what is known of its error.
+
+    Attributes:
+        method: How it was fitted.
+        T_base_ct: Shape (4, 4), rigid, mm.
+        markers: The matched markers.
+        residuals: Shape (n, 3), T_base_ct markers_ct - markers_base, mm.
+        residual_test: The residuals of the rigid fit against the noise.
+        conditioning: The three flags of a weak set, for the target given.
+    """
+
+    method: str
+    T_base_ct: Floats
+    markers: MarkerPairs
+    residuals: Floats
+    residual_test: ResidualTest
+    conditioning: Conditioning
+
+    @property
+    def fle_mm(self) -> float:
+        """The fiducial localisation error (rms) that the expectations use."""
+        return self.residual_test.fle_mm
+
+    @property
+    def fle_source(self) -> str:
+        """Where that number comes from."""
+        return self.residual_test.source
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """What weakens this registration, in words: the conditioning, and residuals that were accepted."""
+        accepted = () if self.residual_test.explained else (f"{self.residual_test.text()}; accepted by the case",)
+        return (*self.conditioning.flags, *accepted)
+
+    @property
+    def residual_mm(self) -> Floats:
+        """Length of each marker's residual, shape (n,)."""
+        return np.asarray(np.linalg.norm(self.residuals, axis=1))
+
+    @property
+    def mean_error_mm(self) -> float:
+        """Mean residual over the markers (Chen 2019, Eq. 16)."""
+        return float(self.residual_mm.mean())
+
+    @property
+    def fre_mm(self) -> float:
+        """Root mean square residual. It is not the accuracy at the target."""
+        return float(np.sqrt(np.mean(self.residual_mm**2)))
+
+    def expected_tre_mm(self, points_ct: Floats) -> Floats:
+        """Expected (rms) target registration error at points (n, 3) of the CT frame, shape (n,), mm."""
+        return self.fle_mm * leverage(self.markers.points_ct, points_ct)
+
+    def expected_tre_interval_mm(self, point_ct: Floats) -> Interval:
+        """The same at one point (3,), at both ends of the noise's 95 % interval, mm."""
+        lever = float(leverage(self.markers.points_ct, point_ct[None])[0])
+        return Interval(*(fle * lever for fle in self.residual_test.fle_interval_mm))
+
+
+def match(
+    markers_ct: NamedPoints,
+    markers_base: NamedPoints,
+    *,
+    use: tuple[str, ...] | None,
+    where: str | Path = "registration",
+) -> MarkerPairs:
+    """Pair markers by name.
+
+    Args:
+        markers_ct: Markers in the CT frame.
+        markers_base: Markers in the base frame.
+        use: The names to use, in this order; None demands the same names on both sides.
+        where: What errors name.
+
+    Raises:
+        InputError: A name that one side lacks, or fewer than three markers.
+    """
+    names = markers_ct.names if use is None else use
+    for side, points, other in (
+        ("CT", markers_ct, markers_base),
+        ("base", markers_base, markers_ct),
+    ):
+        wanted = set(names) if use is not None else set(other.names)
+        missing = sorted(wanted - set(points.names))
+        if missing:
+            raise InputError(
+                f"{', '.join(missing)} missing on the {side} side",
+                where=where,
+                allowed="the same names on both sides, or registration.use = [names]",
+            )
+    if len(set(names)) < len(names):
+        raise InputError(f"names repeat: {', '.join(names)}", where=where, allowed="unique names")
+    rows_ct = [markers_ct.names.index(name) for name in names]
+    rows_base = [markers_base.names.index(name) for name in names]
+    return MarkerPairs(tuple(names), markers_ct.points[rows_ct], markers_base.points[rows_base])
+
+
+def register(
+    markers: MarkerPairs,
+    *,
+    method: Literal["triad", "rigid", "affine"],
+    target_ct: Floats,
+    fle_mm: float | None = None,
+    accept_residuals: bool = False,
+    where: str | Path = "registration",
+) -> Registration:
+    """Fit T_base_ct, and hold its residuals against the noise.
+
+    Args:
+        markers: At least three, matched.
+        method: ``triad`` (Chen 2019, Eq. 1-9, three markers in the order given) or ``rigid`` (least squares).
+        target_ct: Shape (3,), where the error matters.
+        fle_mm: Known localisation error (rms, both sides together); None estimates it from FRE.
+        accept_residuals: Whether residuals beyond the noise are taken, and the noise is scaled to them.
+        where: What errors name.
+
+    Raises:
+        InputError: Fewer than three markers, collinear, mirrored, a unit slip, a marker far off, ``affine``, or
+            residuals that the noise does not explain.
+    """
+    if method == "affine":
+        raise InputError(
+            "method 'affine' bends the patient",
+            where=where,
+            allowed="triad or rigid; affine only reproduces the paper's Table 6",
+        )
+    _check_markers(markers, where)
+    if method == "triad" and len(markers) != MIN_MARKERS:
+        raise InputError(f"triad takes 3 markers, not {len(markers)}", where=where, allowed="3 names in use")
+    fit = fit_triad if method == "triad" else fit_rigid
+    T_base_ct = fit(markers.points_ct, markers.points_base)
+    residuals = apply(T_base_ct, markers.points_ct) - markers.points_base
+    _check_residuals(markers, residuals, where)
+    test = ResidualTest(len(markers), _rigid_fre(markers), fle_mm)
+    if not (test.explained or accept_residuals):
+        raise InputError(test.text(), where=where, allowed=ALLOWED_RESIDUALS)
+    return Registration(method, T_base_ct, markers, residuals, test, conditioning(markers.points_ct, target_ct))
+
+
+def fit_triad(points_ct: Floats, points_base: Floats) -> Floats:
+    """T_base_ct by the frames that three markers span (Chen 2019, Eq. 1-9).
+
+    R_base_ct = R_base R_ct^T; the translation is the mean over the three markers.
+
+    Args:
+        points_ct: Shape (3, 3), rows M1, M2, M3, mm.
+        points_base: Shape (3, 3), the same markers.
+    """
+    R = _triad(points_base) @ _triad(points_ct).T
+    return _rigid(R, np.mean(points_base - points_ct @ R.T, axis=0))
+
+
+def _triad(points: Floats) -> Floats:
+    e1 = points[1] - points[0]
+    e1 = e1 / np.linalg.norm(e1)
+    e3 = np.cross(e1, points[2] - points[0])
+    e3 = e3 / np.linalg.norm(e3)
+    return np.stack([e1, np.cross(e3, e1), e3], axis=1)
+
+
+def fit_rigid(points_ct: Floats, points_base: Floats) -> Floats:
+    """T_base_ct that minimises the squared residuals over rotations (Arun 1987, by SVD; det = +1 after Umeyama 1991).
+
+    Args:
+        points_ct: Shape (n, 3), n >= 3, not collinear, mm.
+        points_base: Shape (n, 3), the same markers.
+    """
+    return _least_squares(points_ct, points_base, mirrored=False)
+
+
+def _least_squares(points_ct: Floats, points_base: Floats, *, mirrored: bool) -> Floats:
+    center_ct, center_base = points_ct.mean(axis=0), points_base.mean(axis=0)
+    U, _, Vt = np.linalg.svd((points_base - center_base).T @ (points_ct - center_ct))
+    sign = np.sign(np.linalg.det(U @ Vt)) * (-1.0 if mirrored else 1.0)
+    R = U @ np.diag([1.0, 1.0, sign]) @ Vt
+    return _rigid(R, center_base - R @ center_ct)
+
+
+def fit_affine(points_ct: Floats, points_base: Floats) -> Floats:
+    """The unconstrained 12-parameter least squares of the paper's Table 6, shape (4, 4). Not a rigid motion.
+
+    With fewer than four markers that span space it is not unique, and the solution of least norm is taken.
+    """
+    homogeneous = np.column_stack([points_ct, np.ones(len(points_ct))])
+    solution, *_ = np.linalg.lstsq(homogeneous, points_base, rcond=None)
+    T = np.eye(4)
+    T[:3] = solution.T
+    return T
+
+
+def apply(T_b_a: Floats, points_a: Floats) -> Floats:
+    """Points (..., 3) of frame a in frame b."""
+    return points_a @ T_b_a[:3, :3].T + T_b_a[:3, 3]
+
+
+def _rigid_fre(markers: MarkerPairs) -> float:
+    """FRE of the least-squares fit, whatever the method: the chi-squared test is about that."""
+    fitted = apply(fit_rigid(markers.points_ct, markers.points_base), markers.points_ct)
+    return _rms(fitted - markers.points_base)
+
+
+def _rigid(R: Floats, t: Floats) -> Floats:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    T.setflags(write=False)
+    return T
+
+
+def _check_markers(markers: MarkerPairs, where: str | Path) -> None:
+    if len(markers) < MIN_MARKERS:
+        raise InputError(f"{len(markers)} markers", where=where, allowed="3 or more, by the same names")
+    both = np.concatenate([markers.points_ct, markers.points_base])
+    if not np.isfinite(both).all():
+        bad = [n for n, a, b in zip(markers.names, markers.points_ct, markers.points_base, strict=True)
+               if not np.isfinite([a, b]).all()]  # fmt: skip
+        raise InputError(f"marker {', '.join(bad)} is not finite", where=where, allowed="finite mm")
+    spreads = [_singular_values(points) for points in (markers.points_ct, markers.points_base)]
+    for side, values in zip(("CT", "base"), spreads, strict=True):
+        if values[0] == 0 or values[1] / values[0] < COLLINEAR:
+            raise InputError(
+                f"markers {', '.join(markers.names)} are collinear on the {side} side",
+                where=where,
+                allowed="three markers that span a triangle",
+            )
+    ratio = float(np.linalg.norm(spreads[1]) / np.linalg.norm(spreads[0]))
+    if not 1 / UNIT_SLIP < ratio < UNIT_SLIP:
+        raise InputError(
+            f"base markers spread {ratio:.3g} times as wide as the CT's: a likely mm/cm/m slip",
+            where=where,
+            allowed="both sides in mm",
+        )
+
+
+def _singular_values(points: Floats) -> Floats:
+    return np.asarray(np.linalg.svd(points - points.mean(axis=0), compute_uv=False))
+
+
+def _check_residuals(markers: MarkerPairs, residuals: Floats, where: str | Path) -> None:
+    mirrored = _least_squares(markers.points_ct, markers.points_base, mirrored=True)
+    best = _rms(apply(mirrored, markers.points_ct) - markers.points_base)
+    if _rms(residuals) > MIRROR_GAIN * best + 1.0:
+        raise InputError(
+            f"markers {', '.join(markers.names)} match only mirrored (rms {best:.2f} mm against "
+            f"{_rms(residuals):.2f} mm)",
+            where=where,
+            allowed="both sides right-handed: check LPS/RAS and the marker names",
+        )
+    lengths = np.linalg.norm(residuals, axis=1)
+    worst = int(np.argmax(lengths))
+    if lengths[worst] > MAX_RESIDUAL_MM:
+        raise InputError(
+            f"marker {markers.names[worst]} misses by {lengths[worst]:.1f} mm: swapped, moved or mistyped",
+            where=where,
+            allowed=f"residuals up to {MAX_RESIDUAL_MM:g} mm",
+        )
+
+
+def _rms(residuals: Floats) -> float:
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))

@@ -1,0 +1,97 @@
+"""How a list of markers lies on the skin: signed gaps, their common height, and what is left over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import fdtri
+
+from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.decimation import squared_distance
+
+Floats = NDArray[np.float64]
+
+MARKER_ON_SKIN_MM = 30.0
+"""A skin marker's centre lies within its own height of the skin; one farther off stands on a frame, or is misread."""
+
+SCATTER_MM = 0.25
+"""No skin is known better: a third of a millimetre's voxel, and the marker's own reading."""
+
+USUAL_SCATTER_MM = 3.0
+"""Markers of one kind on the skin of their own CT scatter less."""
+
+
+@dataclass(frozen=True, eq=False)
+class SkinFit:
+    """Markers against the skin.
+
+    Attributes:
+        gaps_mm: Shape (n,), distance from the skin, negative inside the body (of an open skin that is not known).
+        normals_ct: Shape (n, 3), unit vectors out of the skin at its nearest triangle.
+    """
+
+    gaps_mm: Floats
+    normals_ct: Floats
+
+    @property
+    def on_skin(self) -> bool:
+        """Whether every marker is within its own height of the skin."""
+        return bool(np.all(np.abs(self.gaps_mm) <= MARKER_ON_SKIN_MM))
+
+    @property
+    def scatter_mm(self) -> float:
+        """Root mean square of what is left of the gaps by the best common height of the markers, n - 1 degrees."""
+        height = np.clip(self.gaps_mm.mean(), 0.0, MARKER_ON_SKIN_MM)
+        return float(np.sqrt(np.sum((self.gaps_mm - height) ** 2) / (len(self.gaps_mm) - 1)))
+
+    def worse_than(self, other: SkinFit, *, doubt: float) -> bool:
+        """Whether the same markers scatter more here than chance explains, by an F-test.
+
+        Args:
+            other: The same markers, read in other axes.
+            doubt: How often two lists of one scatter would seem so different.
+        """
+        freedom = len(self.gaps_mm) - 1
+        limit = float(np.sqrt(fdtri(freedom, freedom, 1 - doubt)))
+        return self.scatter_mm > limit * max(other.scatter_mm, SCATTER_MM)
+
+    def unusual_beside(self, other: SkinFit) -> bool:
+        """Whether the markers scatter more here than markers do, and no more than that there."""
+        return self.scatter_mm > USUAL_SCATTER_MM >= other.scatter_mm
+
+
+def skin_fit(points_ct: Floats, skin: Skin) -> SkinFit:
+    """Hold markers against the skin; where the body was cut there is none.
+
+    Args:
+        points_ct: Shape (n, 3), mm.
+        skin: Of the case.
+    """
+    triangles = skin.mesh.triangles[~skin.cut_faces]
+    centres = triangles.mean(axis=1)
+    reach = np.linalg.norm(triangles - centres[:, None], axis=2).max()
+    outward = _orientation(skin)
+    gaps, normals = np.empty(len(points_ct)), np.empty((len(points_ct), 3))
+    for row, point in enumerate(points_ct):
+        from_centres = np.linalg.norm(centres - point, axis=1)
+        near = triangles[from_centres <= from_centres.min() + reach]  # holds the nearest one
+        squares = squared_distance(point, near)
+        inside = side_of(skin.mesh, point) is Side.INSIDE
+        gaps[row] = np.sqrt(squares.min()) * (-1.0 if inside else 1.0)
+        normals[row] = outward * _normal(near[int(np.argmin(squares))])
+    return SkinFit(gaps, normals)
+
+
+def _orientation(skin: Skin) -> float:
+    """1 where the triangles' normals point out of the body, -1 where they point into it."""
+    a, b, c = np.moveaxis(skin.mesh.triangles - skin.mesh.bounds.mean(axis=0), 1, 0)
+    return 1.0 if np.einsum("ij,ij->", a, np.cross(b, c)) >= 0 else -1.0
+
+
+def _normal(triangle: Floats) -> Floats:
+    normal = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
+    length = np.linalg.norm(normal)
+    return np.asarray(normal / length) if length > 0 else np.array([0.0, 0.0, 1.0])

@@ -1,0 +1,87 @@
+"""Could the robot be where a registration puts it, and could its needle's tip have touched a marker of the CT?"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.case.case import Case, Obstacle
+from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+Floats = NDArray[np.float64]
+
+CONE = np.radians(60.0)
+"""A marker is touched from within this angle of the skin's outward normal."""
+
+CONE_DIRECTIONS = 100
+"""Tried in that cone: one every 10 degrees."""
+
+
+def place_excluded(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
+    """Why the arm cannot stand where a registration puts it, in words; empty where it can.
+
+    Its base or shoulder lies in the patient or in a box of the CT frame, or the target is farther from the shoulder
+    than links and needle span.
+
+    Args:
+        case: For arm, needle, target and obstacles.
+        skin: CT frame.
+        T_base_ct: Shape (4, 4), mm.
+    """
+    model = ur_model(case.robot.model)
+    T_ct_base = np.linalg.inv(T_base_ct)
+    column = np.stack([np.zeros(3), model.shoulder_base]) @ T_ct_base[:3, :3].T + T_ct_base[:3, 3]
+    if any(side_of(skin, point) is Side.INSIDE for point in column):
+        return "the robot's base would stand in the patient"
+    for box in _boxes_ct(case):
+        if any(np.all(np.abs(point - box.center_mm) <= box.size_mm / 2) for point in column):
+            return f"the robot's base would stand in obstacle '{box.name}'"
+    span = abs(model.a2) + abs(model.a3) + model.d4 + model.d5 + model.d6 + case.needle.length_mm
+    if np.linalg.norm(case.target_ct - column[1]) > span:
+        return "the target would be out of the arm's reach"
+    return ""
+
+
+def untouchable(case: Case, points_ct: Floats, normals_ct: Floats) -> tuple[tuple[int, str], ...]:
+    """Which points no needle can have touched, because a box of the CT frame lies before them on all sides.
+
+    Args:
+        case: For needle and obstacles.
+        points_ct: Shape (n, 3), mm.
+        normals_ct: Shape (n, 3), unit vectors out of the skin there.
+
+    Returns:
+        Row and name of the obstacle that is before it.
+    """
+    found = []
+    for row, (point, normal) in enumerate(zip(points_ct, normals_ct, strict=True)):
+        directions = _cone(normal)
+        blocked = [_meets(box, point, directions, case.needle.length_mm) for box in _boxes_ct(case)]
+        if blocked and np.any(blocked, axis=0).all():
+            found.append((row, _boxes_ct(case)[int(np.argmax(np.sum(blocked, axis=1)))].name))
+    return tuple(found)
+
+
+def _boxes_ct(case: Case) -> tuple[Obstacle, ...]:
+    return tuple(box for box in case.obstacles if box.frame == "ct")
+
+
+def _cone(axis: Floats) -> Floats:
+    """Unit vectors within `CONE` of an axis, evenly spread (Fibonacci), the axis first, shape (k, 3)."""
+    number = np.arange(CONE_DIRECTIONS)
+    z = 1 - (1 - np.cos(CONE)) * number / (CONE_DIRECTIONS - 1)
+    angle = number * np.pi * (3 - np.sqrt(5))
+    local = np.column_stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z])
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    across = across / np.linalg.norm(across)
+    return np.asarray(local @ np.stack([across, np.cross(axis, across), axis]))
+
+
+def _meets(box: Obstacle, point: Floats, directions: Floats, length_mm: float) -> NDArray[np.bool_]:
+    """Which segments from a point meet a box with axes parallel to the frame's (slabs), shape (k,)."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # along a slab: from -inf to inf, or nowhere
+        one, other = ((box.center_mm + side * box.size_mm / 2 - point) / directions for side in (-1.0, 1.0))
+    into, out = np.fmin(one, other).max(axis=1), np.fmax(one, other).min(axis=1)
+    return np.asarray((into <= out) & (out >= 0) & (into <= length_mm))

@@ -1,0 +1,183 @@
+"""Do the inputs fit each other? What one file alone cannot tell: a slip of space or unit, a map that ends too early."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
+from puncture_twin.planning.anatomy.inside_skin import LEAST_TOLERANCE_MM, inside_skin
+from puncture_twin.planning.anatomy.regions import absent_organs
+from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.formats.volumes.volume_files import parse_header
+from puncture_twin.planning.formats.volumes.volume_header import VolumeHeader
+from puncture_twin.planning.geometry.decimation import squared_distance
+from puncture_twin.planning.geometry.winding import winding_number
+from puncture_twin.planning.registration.marker_check import check_markers
+from puncture_twin.planning.registration.placement import Placement
+from puncture_twin.planning.search.constraints import longest_path
+from puncture_twin.planning.search.resolution import resolution_warnings
+
+Floats = NDArray[np.float64]
+Headers = Mapping[str, VolumeHeader]
+
+USUAL_INSIDE = 0.99
+"""Of a structure's area, inside the skin; a smaller fraction is a warning. One percent is what smoothing moves."""
+
+LEAST_INSIDE = 0.9
+"""A smaller fraction is refused: whatever the cause is, the organ is not where the search takes it to be."""
+
+ALLOWED_INSIDE = (
+    f"at least {100 * LEAST_INSIDE:g} % of a structure's surface inside the skin; "
+    'role "unknown" for what is known to lie outside'
+)
+
+CAUSES = "a part of the body that the skin does not hold (such as an arm), or a slip of space (LPS/RAS) or unit?"
+
+VOXELS_OF_SLACK = 1.0
+"""A map may end so many voxels inside the skin's box: the skin itself is found to that."""
+
+
+def check_consistency(case: Case, anatomy: Anatomy, placement: Placement | None) -> tuple[str, ...]:
+    """Hold the inputs against each other.
+
+    Returns:
+        Warnings, one sentence each.
+
+    Raises:
+        InputError: A structure of which too much lies outside the body, an open one that seems to hold the target, a
+            label map that ends inside the body within the needle's reach, or markers whose names or axes have likely
+            slipped.
+    """
+    headers = volume_headers(case)
+    outside = _outside_warnings(case, anatomy, headers)
+    _refuse_open_around_target(case, anatomy)
+    _refuse_short_maps(case, anatomy, headers)
+    return (
+        *outside,
+        *_marker_warnings(case, anatomy, placement),
+        *_needle_warnings(case, anatomy.skin),
+        *resolution_warnings(case, anatomy, headers),
+        *_region_warnings(case, anatomy),
+    )
+
+
+def _outside_warnings(case: Case, anatomy: Anatomy, headers: Headers) -> tuple[str, ...]:
+    """An organ that is elsewhere protects nothing; what is `unknown` may lie anywhere."""
+    placed = [structure for structure in anatomy.structures if structure.role is not Role.UNKNOWN]
+    _refuse_wholly_outside(case, anatomy.skin, placed)
+    if not anatomy.skin.mesh.closed:
+        return ("the skin mesh is open: how much of each structure lies inside the body is not known",)
+    skin_volume = next(section.ct or section.labelmap for section in case.structure if section.role == "skin")
+    tolerances = np.array([_surface_tolerance_mm(structure, skin_volume, headers) for structure in placed])
+    parts = inside_skin([structure.mesh for structure in placed], anatomy.skin, case.target_ct, tolerances)
+    warnings = []
+    for structure, part in zip(placed, parts, strict=True):
+        outside = f"{100 * (1 - part.fraction):.1f} % of its surface lies outside the skin"
+        said = f"structure '{structure.name}': {outside}: {CAUSES}"
+        if part.fraction < LEAST_INSIDE:
+            raise InputError(said, where=case.path, allowed=ALLOWED_INSIDE)
+        if part.fraction < USUAL_INSIDE:
+            warnings.append(said)
+    return tuple(warnings)
+
+
+def _refuse_wholly_outside(case: Case, skin: Skin, structures: Sequence[Structure]) -> None:
+    """Also where the skin is open, or its cut sides say nothing: no box of an organ lies beside the body's."""
+    low, high = skin.mesh.bounds
+    for structure in structures:
+        below, above = structure.mesh.bounds
+        if np.any(below > high) or np.any(above < low):
+            raise InputError(
+                f"structure '{structure.name}' lies wholly outside the skin: a slip of space (LPS/RAS) or unit?",
+                where=case.path,
+                allowed="structures that reach into the body",
+            )
+
+
+def _surface_tolerance_mm(structure: Structure, skin_volume: str | None, headers: Headers) -> float:
+    """How far a structure's surface and the skin may be off: half a voxel each, and no less than a mesh may."""
+    names = (skin_volume, structure.source.rpartition(":")[0])
+    halves = [float(headers[name].spacing_mm.max()) / 2 for name in names if name and name in headers]
+    return max(LEAST_TOLERANCE_MM, sum(halves))
+
+
+def volume_headers(case: Case) -> dict[str, VolumeHeader]:
+    """The headers of the CT and the label maps that the case's structures come from, by file name.
+
+    Raises:
+        InputError: A header that cannot be trusted.
+    """
+    named = {section.ct or section.labelmap for section in case.structure}
+    named |= {section.labelmap for section in case.structures}
+    files = sorted(name for name in named if name)
+    return {name: parse_header(case.files.content(name), case.folder / name) for name in files}
+
+
+def _refuse_open_around_target(case: Case, anatomy: Anatomy) -> None:
+    """Of an open surface the inside is not known; but one that goes more than half around the target is no way out."""
+    for structure in anatomy.structures:
+        if structure.role is not Role.AVOID or structure.mesh.closed:
+            continue
+        around = abs(winding_number(structure.mesh, case.target_ct))
+        if around > 0.5:
+            raise InputError(
+                f"'{structure.name}' is an open mesh that goes around the target (by {100 * around:.0f} %)",
+                where=case.path,
+                allowed="a closed mesh, or a target clearly outside",
+            )
+
+
+def _refuse_short_maps(case: Case, anatomy: Anatomy, headers: Headers) -> None:
+    """Beyond a label map's box organs have no label: within the needle's reach the box must hold the body."""
+    reach = case.needle.length_mm
+    low, high = anatomy.skin.mesh.bounds
+    low, high = np.maximum(low, case.target_ct - reach), np.minimum(high, case.target_ct + reach)
+    corners = np.array([[low[0], high[0]], [low[1], high[1]], [low[2], high[2]]])
+    points = np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, 3)
+    for name in sorted({s.labelmap for s in case.structure if s.labelmap} | {s.labelmap for s in case.structures}):
+        header = headers[name]
+        T_index_ct = np.linalg.inv(header.T_ct_index)
+        index = points @ T_index_ct[:3, :3].T + T_index_ct[:3, 3]
+        outside = np.maximum(-0.5 - index, index - (np.array(header.shape) - 0.5)).max()
+        if outside > VOXELS_OF_SLACK:
+            raise InputError(
+                f"label map {name} ends {outside:.0f} voxels inside the body, within the needle's reach",
+                where=case.path,
+                allowed="a label map of the whole body about the target",
+            )
+
+
+def _needle_warnings(case: Case, skin: Skin) -> tuple[str, ...]:
+    """A needle that is shorter than the shortest way from the target to the skin."""
+    triangles = skin.mesh.triangles[~skin.cut_faces]
+    if len(triangles) == 0:
+        return ()
+    nearest = float(np.sqrt(squared_distance(case.target_ct, triangles).min()))
+    longest = longest_path(case.needle)
+    if longest >= nearest:
+        return ()
+    said = f"the needle's longest path is {longest:g} mm, and the skin is {nearest:.1f} mm away"
+    return (f"{said}: every path is too long",)
+
+
+def _region_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
+    """The usual organs of the case's region that nobody named: they count as free."""
+    if case.region is None:
+        return ()
+    absent = absent_organs(case.region, [*(structure.name for structure in anatomy.structures), *anatomy.ignored])
+    if not absent:
+        return ()
+    like = ", ".join(absent)
+    return (f"region {case.region}: no structure is named like {like}; what has no structure counts as free",)
+
+
+def _marker_warnings(case: Case, anatomy: Anatomy, placement: Placement | None) -> tuple[str, ...]:
+    if placement is None or placement.registration is None:
+        return ()
+    weak = tuple(f"registration: {flag}" for flag in placement.registration.flags)
+    return (*weak, *check_markers(case, anatomy.skin, placement.registration).warnings)

@@ -1,0 +1,114 @@
+"""What makes a candidate safe for the organs or not: the constraints, in the order in which a reason is given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.anatomy.anatomy import Role, Structure
+from puncture_twin.planning.anatomy.skin_entry import SkinPaths
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.case.case import Needle
+from puncture_twin.planning.clearance.engine import Floats
+from puncture_twin.planning.clearance.measure import Clearances
+from puncture_twin.planning.search.candidates import Texts
+
+Bools = NDArray[np.bool_]
+Column = NDArray[Any] | str | float
+
+
+@dataclass(frozen=True, eq=False)
+class Verdicts:
+    """The first constraint that each of n candidates breaks.
+
+    Attributes:
+        reason: Shape (n,), values of `Reason`, the empty string where none is broken.
+        structure: Shape (n,), the structure that the reason names, or "".
+        depth: Shape (n,), from the target along the needle, mm, or NaN.
+        amount: Shape (n,), what fell short (see `puncture_twin.planning.search.candidates.Candidates.reason_amount`).
+    """
+
+    reason: Texts
+    structure: Texts
+    depth: Floats
+    amount: Floats
+
+
+def longest_path(needle: Needle) -> float:
+    """The longest path, target to skin, that the needle can drive, mm.
+
+    The shaft must reach; and with a fixed standoff the tip must still lie ``skin_gap_mm`` outside, along the needle.
+    """
+    if needle.standoff_mm is None:
+        return needle.shaft_mm
+    return min(needle.shaft_mm, needle.standoff_mm - needle.skin_gap_mm)
+
+
+def judge(
+    paths: SkinPaths,
+    clearances: Clearances,
+    structures: tuple[Structure, ...],
+    *,
+    needle: Needle,
+    max_skin_angle: float,
+    skin: str = "skin",
+) -> Verdicts:
+    """Apply every constraint; the reason given is the first that is broken, in the order of the code.
+
+    Unknown regions come first among those on the path: nothing behind them can be judged.
+
+    Args:
+        paths: The skin along the n paths.
+        clearances: To the k structures.
+        structures: The k structures.
+        needle: For the longest path.
+        max_skin_angle: rad.
+        skin: Name of the skin in the reasons.
+    """
+    count = len(paths.path_length)
+    verdicts = Verdicts(
+        np.full(count, Reason.NONE.value, dtype=object),
+        np.full(count, "", dtype=object),
+        np.full(count, np.nan),
+        np.full(count, np.nan),
+    )
+    unset = np.ones(count, bool)
+
+    def give(reason: Reason, where: Bools, names: Column, depth: Column, amount: Column = np.nan) -> None:
+        rows = np.flatnonzero(where & unset)
+        unset[rows] = False
+        verdicts.reason[rows] = reason.value
+        columns: tuple[tuple[NDArray[Any], Column], ...]
+        columns = ((verdicts.structure, names), (verdicts.depth, depth), (verdicts.amount, amount))
+        for column, value in columns:
+            column[rows] = value[rows] if isinstance(value, np.ndarray) else value
+
+    length = paths.path_length
+    give(Reason.UNKNOWN_REGION, ~np.isnan(paths.unknown_depth), skin, paths.unknown_depth)
+    give(Reason.NO_SKIN_ENTRY, np.isnan(length), skin, np.nan)
+    give(Reason.REENTERS_SKIN, ~np.isnan(paths.reentry_depth), skin, paths.reentry_depth)
+    give(Reason.TOO_LONG, length > longest_path(needle), skin, length, length)
+    give(Reason.SKIN_ANGLE, paths.skin_angle > max_skin_angle, skin, length, np.degrees(paths.skin_angle))
+    worst = worst_violation(clearances, structures)
+    names = np.array([s.name for s in structures] or [""], dtype=object)[worst]
+    unknown = np.array([s.role is Role.UNKNOWN for s in structures] or [False])[worst]
+    rows = np.arange(count)
+    if structures:
+        broken = np.asarray(clearances.violated.any(axis=1))
+        depth, amount = clearances.depth[rows, worst], clearances.clearance[rows, worst]
+        give(Reason.UNKNOWN_REGION, broken & unknown, names, depth, amount)
+        give(Reason.TOO_CLOSE, broken, names, depth, amount)
+    return verdicts
+
+
+def worst_violation(clearances: Clearances, structures: tuple[Structure, ...]) -> NDArray[np.int64]:
+    """Column of the structure that lacks most of its margin, shape (n,); equal lacks go to the one met first."""
+    if not structures:
+        return np.zeros(len(clearances.clearance), np.int64)
+    margins = np.array([s.margin_mm for s in structures])
+    lack = np.where(clearances.violated, margins - clearances.clearance, -np.inf)
+    most = lack.max(axis=1, keepdims=True)
+    return np.argmin(np.where(lack == most, clearances.depth, np.inf), axis=1)

@@ -1,0 +1,175 @@
+"""A case, read and ready to be asked: its structures, its engine, and the arm in its room."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Protocol
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy, load_anatomy
+from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.base.stages import Stages
+from puncture_twin.planning.case.case import Case, load_case
+from puncture_twin.planning.clearance.cross_check import CrossChecked, cross_check
+from puncture_twin.planning.clearance.engine import ClearanceEngine
+from puncture_twin.planning.clearance.fast_engine import FastEngine
+from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.collision.surroundings import with_surroundings
+from puncture_twin.planning.collision.workcell import case_checker
+from puncture_twin.planning.reach.standoff import axis_lengths
+from puncture_twin.planning.registration.placement import Placement, load_placement
+from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
+from puncture_twin.planning.search.consistency import check_consistency
+from puncture_twin.planning.search.search import Reach, case_directions, one_direction, search
+
+ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
+"""Who measures clearance: the fast exact engine, or FCL alone as the plain reference."""
+
+NO_BASE = "the case does not say where the robot's base is"
+ALLOWED_BASE = "[registration] with markers_ct and markers_base, or [robot.mount]; or a check without the arm"
+
+
+class Watcher(Protocol):
+    """Whoever shows progress."""
+
+    def step(self, stage: str, what: str) -> None:
+        """A stage has come to a named thing."""
+        ...
+
+    def count(self, stage: str, done: int, total: int) -> None:
+        """A stage has done so many of so many."""
+        ...
+
+    def note(self, line: str) -> None:
+        """Something happened that whoever watches should know."""
+        ...
+
+
+class Silent:
+    """Shows nothing."""
+
+    def step(self, stage: str, what: str) -> None:
+        """Nothing."""
+
+    def count(self, stage: str, done: int, total: int) -> None:
+        """Nothing."""
+
+    def note(self, line: str) -> None:
+        """Nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What every question about a case needs, read once.
+
+    Attributes:
+        placement: Where the patient lies for the robot, or None when the case does not say.
+        reach: Who answers for the arm, or None without a placement.
+        stages: How long reading took; later stages are added as they happen.
+    """
+
+    case: Case
+    anatomy: Anatomy
+    placement: Placement | None
+    engine: ClearanceEngine
+    reach: Reach | None
+    watcher: Watcher
+    stages: Stages
+
+    @property
+    def arm(self) -> str:
+        """Whether the arm is checked, and if not, why: see `Candidates.arm`."""
+        if self.reach is not None:
+            return ARM_CHECKED
+        return f"not checked: {NO_BASE if self.placement is None else 'switched off (--no-arm)'}"
+
+    def search(self) -> Candidates:
+        """Judge the case's whole grid."""
+        with self.stages.time("search"):
+            found = search(
+                self.case,
+                self.anatomy,
+                self.engine,
+                case_directions(self.case),
+                reach=self.reach,
+                progress=partial(self.watcher.count, "arm"),
+            )
+        return replace(found, arm=self.arm)
+
+    def check(self, theta: float, beta: float) -> Candidates:
+        """Judge a single direction (rad)."""
+        directions = one_direction(self.case, theta, beta)
+        found = search(self.case, self.anatomy, self.engine, directions, reach=self.reach)
+        return replace(found, arm=self.arm)
+
+    def cross_check(self, count: int) -> CrossChecked:
+        """Measure random directions of the grid again with FCL.
+
+        Raises:
+            CrossCheckError: A distance differs by more than rounding.
+        """
+        with self.stages.time("cross-check"):
+            case, outward = self.case, case_directions(self.case).outward_ct
+            meshes = tuple(structure.mesh for structure in self.anatomy.checked)
+            length, rng = axis_lengths(case, self.anatomy.checked), np.random.default_rng(case.rehearsal.seed)
+            found = self.engine.measure(case.target_ct, outward, length)
+            return cross_check(found, meshes, case.target_ct, outward, length, count=count, rng=rng)
+
+    def provenance(self) -> dict[str, Any]:
+        """Where a result comes from: case, inputs, version, grid."""
+        return {
+            "case": self.case.name,
+            "inputs": inputs_document(self.case.inputs),
+            "version": version("puncture-twin"),
+            "seed": self.case.rehearsal.seed,
+            "step_deg": float(np.degrees(self.case.search.step)),
+            "arm": self.arm,
+            "warnings": list(self.anatomy.warnings),
+        }
+
+
+def prepare(
+    path: Path | str, *, arm: bool | None = None, engine: str = "fast", watcher: Watcher | None = None
+) -> Prepared:
+    """Read a case and everything that it names.
+
+    Args:
+        path: Case file, or the folder that holds ``case.toml``.
+        arm: Whether the arm is checked too; None checks it where the case says where its base is.
+        engine: A name of `ENGINES`.
+        watcher: Whoever shows progress.
+
+    Raises:
+        InputError: Anything in the case that cannot be used, an unknown engine, or an arm that is to be checked in a
+            case that does not say where its base is.
+    """
+    if engine not in ENGINES:
+        raise InputError(f"engine '{engine}' is not known", where="--engine", allowed=", ".join(ENGINES))
+    watcher = watcher or Silent()
+    stages = Stages(announce=partial(watcher.step, "stage"))
+    with stages.time("case"):
+        case = load_case(path)
+        placement = load_placement(case)
+    if arm and placement is None:
+        raise InputError(f"the arm is to be checked, but {NO_BASE}", where=case.path, allowed=ALLOWED_BASE)
+    with stages.time("anatomy"):
+        anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), user_cache())
+        anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
+        warnings = (*case.warnings, *anatomy.warnings, *check_consistency(case, anatomy, placement))
+        anatomy = replace(anatomy, warnings=warnings)
+        case.files.release()
+    with stages.time("trees"):
+        meshes = [structure.mesh for structure in anatomy.checked]
+        measurer = ENGINES[engine](meshes, partial(watcher.count, "directions"))
+        reach = None
+        if arm is not False and placement is not None:
+            reach = Reach(case_checker(case, anatomy, placement.T_base_ct), placement.T_base_ct)
+    return Prepared(case, anatomy, placement, measurer, reach, watcher, stages)

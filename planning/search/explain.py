@@ -1,0 +1,205 @@
+"""One candidate, explained in full: every constraint with its number and its limit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy, surface_distance
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.reach.standoff import standoffs
+from puncture_twin.planning.search.along_path import Stretch, stretches
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.constraints import longest_path
+
+MOST = 0.5
+"""Of all directions: a needle that is too short for more of them was likely not meant for this target."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A judged candidate with what it was judged against.
+
+    Attributes:
+        candidates: A search's result with this candidate alone.
+    """
+
+    case: Case
+    anatomy: Anatomy
+    candidates: Candidates
+
+    @property
+    def safe(self) -> bool:
+        """The verdict."""
+        return bool(self.candidates.safe[0])
+
+    @property
+    def verdict(self) -> str:
+        """``safe`` or ``rejected``; for the organs alone where ``candidates.arm`` says that the arm was not checked."""
+        return "safe" if self.safe else "rejected"
+
+    @property
+    def target_depth_mm(self) -> float:
+        """How far the target lies from the surface of its own structure, mm."""
+        return surface_distance(self.anatomy.structure(self.case.target_structure).mesh, self.case.target_ct)
+
+    def clearances(self) -> dict[str, float]:
+        """Structure to clearance, mm."""
+        return dict(zip(self.candidates.structures, map(float, self.candidates.clearance[0]), strict=True))
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON: mm and degrees; null where there is no number."""
+        row = self.candidates
+        return {
+            "case": self.case.name,
+            "inputs": inputs_document(self.case.inputs),
+            "theta_deg": float(np.degrees(row.theta[0])),
+            "beta_deg": float(np.degrees(row.beta[0])),
+            "verdict": self.verdict,
+            "arm": row.arm,
+            "reason": str(row.reason[0]),
+            "reason_structure": str(row.reason_structure[0]),
+            "reason_depth_mm": finite(row.reason_depth[0]),
+            "reason_amount": finite(row.reason_amount[0]),
+            "reason_detail": str(row.reason_detail[0]),
+            "entry_ct_mm": [finite(x) for x in row.entry_ct[0]],
+            "target_depth_mm": self.target_depth_mm,
+            "path_length_mm": finite(row.path_length[0]),
+            "skin_angle_deg": finite(np.degrees(row.skin_angle[0])),
+            "tissue_mm": finite(row.tissue[0]),
+            "clearance_mm": self.clearances(),
+            "reachable": None if row.reachable[0] < 0 else bool(row.reachable[0]),
+            "reach_margin": finite(row.reach_margin[0]),
+            "safe_cone_deg": finite(np.degrees(row.safe_cone[0])),
+            "cost": finite(row.cost[0]),
+            "along_path": [
+                {
+                    "start_mm": part.start_mm,
+                    "end_mm": part.end_mm,
+                    "structures": list(part.structures),
+                    "hu": [finite(part.hu_low), finite(part.hu_median), finite(part.hu_high)],
+                }
+                for part in self.along_path
+            ],
+            "warnings": list(self.anatomy.warnings),
+        }
+
+    @cached_property
+    def along_path(self) -> tuple[Stretch, ...]:
+        """The CT along the path, beside the structures; empty without a CT."""
+        row = self.candidates
+        return stretches(self.anatomy, self.case.target_ct, row.outward_ct[0], float(row.path_length[0]))
+
+    def text(self) -> str:
+        """The same for a person."""
+        row = self.candidates
+        verdict = row.safe_text if self.safe else self.verdict
+        head = f"theta {np.degrees(row.theta[0]):g} deg, beta {np.degrees(row.beta[0]):g} deg: {verdict}"
+        return "\n".join(
+            [
+                f"case {self.case.name}",
+                head,
+                *self._reason(),
+                *self._path(),
+                self._target(),
+                *self._scan(),
+                *self._table(),
+                *self._rest(),
+            ]
+        )
+
+    def _target(self) -> str:
+        return f"  target         {self.target_depth_mm:8.2f} mm below the surface of {self.case.target_structure}"
+
+    def _reason(self) -> list[str]:
+        return [] if self.safe else ["  because " + reason_text(self.candidates, 0)]
+
+    def _path(self) -> list[str]:
+        row, needle = self.candidates, self.case.needle
+        if np.isnan(row.path_length[0]):
+            return ["  no skin entry on this path"]
+        entry = ", ".join(f"{x:.1f}" for x in row.entry_ct[0])
+        limit = np.degrees(self.case.search.max_skin_angle)
+        standoff = float(standoffs(needle, row.path_length[0], row.skin_angle[0]))
+        return [
+            f"  skin entry     ({entry}) mm in the CT frame",
+            f"  path length    {row.path_length[0]:8.2f} mm, allowed {longest_path(needle):g}",
+            f"  skin angle     {np.degrees(row.skin_angle[0]):8.2f} deg, allowed {limit:g}",
+            f"  standoff       {standoff:8.2f} mm, its tip {standoff - row.path_length[0]:.1f} mm before the skin",
+            f"  tissue crossed {row.tissue[0]:8.2f} mm",
+        ]
+
+    def _scan(self) -> list[str]:
+        """Depths, Hounsfield units and structures, from the target outward."""
+        if not self.along_path:
+            return []
+        lines = ["  along the path, mm from the target:   HU least, median, most   inside of"]
+        for part in self.along_path:
+            hu = f"{part.hu_low:8.0f} {part.hu_median:8.0f} {part.hu_high:8.0f}"
+            lines.append(
+                f"    {part.start_mm:6.0f} to {part.end_mm:4.0f} {hu:>41s}   {', '.join(part.structures) or '-'}"
+            )
+        return lines
+
+    def _table(self) -> list[str]:
+        lines = ["  structure                        role       clearance mm   margin mm"]
+        clearances = self.candidates.clearance[0]
+        for column in np.argsort(clearances, kind="stable"):
+            structure = self.anatomy.checked[column]
+            margin = f"{structure.margin_mm:11.2f}" if structure.demands_margin else "          -"
+            short = structure.demands_margin and clearances[column] < structure.margin_mm
+            lines.append(
+                f"  {structure.name:32s} {structure.role:8s} {clearances[column]:14.3f} {margin}"
+                + ("  too close" if short else "")
+            )
+        return lines
+
+    def _rest(self) -> list[str]:
+        return [f"  {self._arm()}", *(f"  warning: {warning}" for warning in self.anatomy.warnings)]
+
+    def _arm(self) -> str:
+        row = self.candidates
+        if not row.arm_checked:
+            return f"arm {row.arm}"
+        no_need = "not computed, the organs reject the direction"
+        reached = {-1: no_need, 0: "no", 1: f"yes, margin {row.reach_margin[0]:.2f}"}
+        return f"arm reaches it: {reached[int(row.reachable[0])]}"
+
+
+def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
+    """What to say where the needle is too short for most of the directions."""
+    short = int((candidates.reason == Reason.TOO_LONG.value).sum())
+    if short <= MOST * len(candidates):
+        return []
+    return [
+        f"the needle is too short for {short} of {len(candidates)} directions: its longest path is "
+        f"{longest_path(case.needle):g} mm"
+    ]
+
+
+def reason_text(candidates: Candidates, row: int) -> str:
+    """Reason, structure, depth and number of a rejected candidate, in one line."""
+    parts = [str(candidates.reason[row])]
+    if candidates.reason_structure[row]:
+        parts.append(f"({candidates.reason_structure[row]})")
+    if np.isfinite(candidates.reason_depth[row]):
+        parts.append(f"at {candidates.reason_depth[row]:.1f} mm from the target")
+    if np.isfinite(candidates.reason_amount[row]):
+        parts.append(f"with {candidates.reason_amount[row]:.2f} {_unit(str(candidates.reason[row]))}")
+    if candidates.reason_detail[row]:
+        parts.append(f"- {candidates.reason_detail[row]}")
+    return " ".join(parts)
+
+
+def _unit(reason: str) -> str:
+    return {"skin_angle": "deg", "too_long": "mm of path"}.get(reason, "mm clearance")
+
+
+def finite(value: float) -> float | None:
+    """The number, or None where there is none (JSON knows no NaN)."""
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,95 @@
+"""Which of the safe candidates to prefer: a weighted cost of six terms, and the Pareto front of the same terms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.case.case_file import RankingSection
+
+Floats = NDArray[np.float64]
+
+COMFORT_MM = 20.0
+"""Clearance from which on more is no better: several times any registration error that a case should have."""
+
+TIE_DIGITS = 9
+"""Costs that agree to so many digits are equal: rounding must not decide a rank, nor differ between engines."""
+
+COMFORT_CONE = np.radians(5.0)
+"""Safe cone from which on more is no better: a hand-held or robotic needle is aimed within a degree or two."""
+
+TERMS = ("clearance", "path_length", "skin_angle", "tissue", "reach", "safe_cone")
+"""The cost's terms, in the order of the columns."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ranking:
+    """The order of n safe candidates.
+
+    Attributes:
+        terms: Shape (n, 6), each in 0..1, 0 is best, columns as `TERMS`.
+        cost: Shape (n,), weighted mean of the terms.
+        rank: Shape (n,), 1 is best; equal costs keep their order.
+        pareto: Shape (n,), no other candidate is at least as good in every term and better in one.
+    """
+
+    terms: Floats
+    cost: Floats
+    rank: NDArray[np.int32]
+    pareto: NDArray[np.bool_]
+
+
+def rank(
+    *,
+    min_clearance: Floats,
+    path_length: Floats,
+    skin_angle: Floats,
+    tissue: Floats,
+    reach_margin: Floats,
+    safe_cone: Floats,
+    shaft: float,
+    max_skin_angle: float,
+    weights: RankingSection,
+) -> Ranking:
+    """Rank candidates; all arrays have shape (n,), mm and rad.
+
+    The terms: 1 - min(clearance, 20 mm)/20 mm to the nearest structure with a margin; path length over usable shaft;
+    skin angle over the largest allowed; length through other structures over usable shaft; 1 - reach margin
+    (0 for all where reach was not asked); 1 - min(safe cone, 5 degrees)/5 degrees (0 for all without a certificate).
+    """
+    terms = np.stack(
+        [
+            1 - np.clip(min_clearance, 0, COMFORT_MM) / COMFORT_MM,
+            path_length / shaft,
+            skin_angle / max_skin_angle,
+            tissue / shaft,
+            np.where(np.isnan(reach_margin), 0.0, 1 - reach_margin),
+            np.where(np.isnan(safe_cone), 0.0, 1 - np.clip(safe_cone, 0, COMFORT_CONE) / COMFORT_CONE),
+        ],
+        axis=1,
+    )
+    terms = np.clip(np.nan_to_num(terms, nan=1.0), 0, 1)
+    factors = np.array([getattr(weights, term) for term in TERMS])
+    cost = terms @ factors / max(factors.sum(), np.finfo(float).tiny)
+    order = np.argsort(np.round(cost, TIE_DIGITS), kind="stable")
+    ranks = np.empty(len(cost), np.int32)
+    ranks[order] = np.arange(1, len(cost) + 1)
+    return Ranking(terms, cost, ranks, pareto_front(terms))
+
+
+def pareto_front(terms: Floats) -> NDArray[np.bool_]:
+    """Which rows of (n, m) no other row dominates (at most as large everywhere, smaller somewhere); shape (n,).
+
+    In ascending order of the sum a row can be dominated only by earlier ones, and then by one of the front.
+    """
+    front = np.zeros(len(terms), bool)
+    kept: list[int] = []
+    for row in np.lexsort((*terms.T, terms.sum(axis=1))):
+        others = terms[kept]
+        dominated = np.all(others <= terms[row], axis=1) & np.any(others < terms[row], axis=1)
+        if not dominated.any():
+            front[row] = True
+            kept.append(int(row))
+    return front

@@ -1,0 +1,185 @@
+"""The batch search: a case in, one judged row per direction out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.skin_entry import skin_paths
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.entry import Directions, direction, grid
+from puncture_twin.planning.clearance.engine import ClearanceEngine
+from puncture_twin.planning.clearance.measure import measure
+from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.reach.reach import ReachRequest, assess_reach_all
+from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange, standoffs
+from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
+from puncture_twin.planning.search.constraints import judge
+from puncture_twin.planning.search.ranking import rank
+from puncture_twin.planning.search.tissue import tissue_crossed
+
+Floats = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """Who answers whether the arm can hold a candidate: the checked room, and where the patient is in it."""
+
+    checker: CellChecker
+    T_base_ct: Floats
+
+
+def case_directions(case: Case) -> Directions:
+    """The grid that the case asks for."""
+    settings = case.search
+    return grid(settings.theta, settings.beta, settings.step, case.T_ct_entry[:3, :3])
+
+
+def one_direction(case: Case, theta: float, beta: float) -> Directions:
+    """A single direction (rad) of the case's entry frame."""
+    return direction(theta, beta, case.T_ct_entry[:3, :3])
+
+
+def search(
+    case: Case,
+    anatomy: Anatomy,
+    engine: ClearanceEngine,
+    directions: Directions,
+    *,
+    reach: Reach | None = None,
+    progress: Progress | None = None,
+) -> Candidates:
+    """Judge every direction against the organs, those that pass against the arm, and rank what is left.
+
+    Args:
+        case: The validated case.
+        anatomy: Its structures.
+        engine: Prepared for the meshes of ``anatomy.checked``, in that order.
+        directions: What to judge.
+        reach: Who answers for the arm; None leaves ``reachable`` unasked.
+        progress: Called with (candidates asked, candidates to ask) while the arm is checked.
+    """
+    found = organ_candidates(case, anatomy, engine, directions)
+    if reach is not None:
+        found = with_reach(case, found, reach, progress)
+    return ranked(case, found)
+
+
+def organ_candidates(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> Candidates:
+    """Judge every direction against skin and organs alone; nothing is ranked yet."""
+    needle, outward = case.needle, directions.outward_ct
+    checked, farthest = anatomy.checked, farthest_flange(needle, case.search.max_skin_angle)
+    paths = skin_paths(anatomy.skin, case.target_ct, outward, needle.length_mm, farthest)
+    lengths = axis_lengths(case, checked)
+    clearances = measure(engine, checked, case.target_ct, outward, length=lengths, radius=needle.radius_mm)
+    verdicts = judge(paths, clearances, checked, needle=needle, max_skin_angle=case.search.max_skin_angle)
+    demanding = np.array([s.demands_margin for s in checked], bool)
+    count = len(directions)
+    return Candidates(
+        theta=directions.theta,
+        beta=directions.beta,
+        outward_ct=outward,
+        reason=verdicts.reason,
+        reason_structure=verdicts.structure,
+        reason_depth=verdicts.depth,
+        reason_amount=verdicts.amount,
+        reason_detail=np.full(count, "", dtype=object),
+        entry_ct=paths.entry_ct,
+        path_length=paths.path_length,
+        skin_angle=paths.skin_angle,
+        structures=tuple(s.name for s in checked),
+        margins=np.array([s.margin_mm if s.demands_margin else np.nan for s in checked]),
+        clearance=clearances.clearance,
+        min_clearance=clearances.clearance[:, demanding].min(axis=1, initial=np.inf),
+        tissue=tissue_crossed(checked, case.target_structure, case.target_ct, outward, paths.path_length),
+        reachable=np.full(count, -1, np.int8),
+        reach_margin=np.full(count, np.nan),
+        safe_cone=np.full(count, np.nan),
+        cost=np.full(count, np.nan),
+        rank=np.zeros(count, np.int32),
+        pareto=np.zeros(count, bool),
+    )
+
+
+def reach_request(case: Case, candidates: Candidates, row: int, T_base_ct: Floats) -> ReachRequest:
+    """What the arm is asked to hold for one candidate."""
+    return ReachRequest(
+        target_base=T_base_ct[:3, :3] @ case.target_ct + T_base_ct[:3, 3],
+        outward_base=T_base_ct[:3, :3] @ candidates.outward_ct[row],
+        needle_length_mm=case.needle.length_mm,
+        standoff_mm=float(standoffs(case.needle, candidates.path_length[row], candidates.skin_angle[row])),
+    )
+
+
+def with_reach(case: Case, found: Candidates, reach: Reach, progress: Progress | None = None) -> Candidates:
+    """Ask the arm for every candidate that the organs allow."""
+    rows = np.flatnonzero(found.safe)
+    requests = [reach_request(case, found, int(row), reach.T_base_ct) for row in rows]
+    answers = assess_reach_all(reach.checker, requests, progress)
+    reason, structure, detail = found.reason.copy(), found.reason_structure.copy(), found.reason_detail.copy()
+    depth, reachable, margin = found.reason_depth.copy(), found.reachable.copy(), found.reach_margin.copy()
+    for row, answer in zip(rows, answers, strict=True):
+        reachable[row] = int(answer.reachable)
+        margin[row] = answer.margin
+        if not answer.reachable:
+            reason[row], detail[row] = answer.reason.value, answer.detail
+            structure[row] = "" if answer.contact is None else "/".join(answer.contact)
+            depth[row] = np.nan if answer.depth_mm is None else reach_depth(case, found, int(row), answer.depth_mm)
+    return replace(
+        found,
+        reason=reason,
+        reason_structure=structure,
+        reason_detail=detail,
+        reason_depth=depth,
+        reachable=reachable,
+        reach_margin=margin,
+        arm=ARM_CHECKED,
+    )
+
+
+def reach_depth(case: Case, found: Candidates, row: int, driven_mm: float) -> float:
+    """Where the tip stands, from the target along the needle, after so many mm of insertion; mm."""
+    return float(standoffs(case.needle, found.path_length[row], found.skin_angle[row])) - driven_mm
+
+
+def ranked(case: Case, found: Candidates) -> Candidates:
+    """Give cost, rank and Pareto mark to the safe candidates."""
+    rows = np.flatnonzero(found.safe)
+    cost, ranks, pareto = found.cost.copy(), found.rank.copy(), found.pareto.copy()
+    order = rank(
+        min_clearance=found.min_clearance[rows],
+        path_length=found.path_length[rows],
+        skin_angle=found.skin_angle[rows],
+        tissue=found.tissue[rows],
+        reach_margin=found.reach_margin[rows],
+        safe_cone=found.safe_cone[rows],
+        shaft=case.needle.shaft_mm,
+        max_skin_angle=case.search.max_skin_angle,
+        weights=case.ranking,
+    )
+    cost[rows], ranks[rows], pareto[rows] = order.cost, order.rank, order.pareto
+    return replace(found, cost=cost, rank=ranks, pareto=pareto)
+
+
+def closest_miss(found: Candidates) -> int | None:
+    """Row of the rejected candidate that came closest: the least lack of clearance among those that lack only that.
+
+    Without such a row, the one that passed most constraints; None for no rows at all.
+    """
+    lacking = np.flatnonzero(found.reason == Reason.TOO_CLOSE.value)
+    if len(lacking):
+        demanded = ~np.isnan(found.margins)
+        lack = (found.margins - found.clearance)[:, demanded].max(axis=1)
+        return int(lacking[np.argmin(lack[lacking])])
+    order = (Reason.APPROACH_NOT_FOUND, Reason.INSERTION_BLOCKED, Reason.ARM_COLLISION, Reason.UNREACHABLE)
+    for reason in (*order, Reason.SKIN_ANGLE, Reason.TOO_LONG, Reason.REENTERS_SKIN, Reason.UNKNOWN_REGION):
+        rows = np.flatnonzero(found.reason == reason.value)
+        if len(rows):
+            return int(rows[0])
+    return None

@@ -1,0 +1,65 @@
+"""The candidates table on disk: Parquet, mm and degrees, with the run's provenance in the file's metadata."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.search.candidates import Candidates
+
+
+def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
+    """One row per direction, columns as DESIGN names them: `theta_deg`, `beta_deg`, `verdict`, `reason`, ...
+
+    Args:
+        candidates: The search's result.
+        provenance: Case name, input hashes, version, seed, step; stored under the key ``run`` as JSON.
+    """
+    reachable = [None if asked < 0 else bool(asked) for asked in candidates.reachable]
+    columns: dict[str, Any] = {
+        "theta_deg": np.degrees(candidates.theta),
+        "beta_deg": np.degrees(candidates.beta),
+        "verdict": np.where(candidates.safe, "safe", "rejected"),
+        "reason": candidates.reason,
+        "reason_structure": candidates.reason_structure,
+        "reason_depth_mm": candidates.reason_depth,
+        "reason_amount": candidates.reason_amount,
+        "reason_detail": candidates.reason_detail,
+        "entry_x_mm": candidates.entry_ct[:, 0],
+        "entry_y_mm": candidates.entry_ct[:, 1],
+        "entry_z_mm": candidates.entry_ct[:, 2],
+        "path_length_mm": candidates.path_length,
+        "skin_angle_deg": np.degrees(candidates.skin_angle),
+        "min_clearance_mm": candidates.min_clearance,
+    }
+    for column, name in enumerate(candidates.structures):
+        columns[f"clearance_{name}_mm"] = candidates.clearance[:, column]
+    columns |= {
+        "tissue_mm": candidates.tissue,
+        "reachable": pa.array(reachable, pa.bool_()),
+        "reach_margin": candidates.reach_margin,
+        "safe_cone_deg": np.degrees(candidates.safe_cone),
+        "cost": candidates.cost,
+        "rank": candidates.rank,
+        "pareto": candidates.pareto,
+    }
+    table = pa.table({name: _array(value) for name, value in columns.items()})
+    return table.replace_schema_metadata({"run": json.dumps(dict(provenance), sort_keys=True)})
+
+
+def _array(value: Any) -> pa.Array:
+    """NaN becomes null: "no number" is not a number."""
+    return value if isinstance(value, pa.Array) else pa.array(value, from_pandas=True)
+
+
+def write_table(candidates: Candidates, provenance: Mapping[str, Any], path: Path) -> None:
+    """Write the table as Parquet, whole or not at all."""
+    with atomic(path) as temporary, temporary.open("wb") as stream:
+        pq.write_table(to_table(candidates, provenance), stream)

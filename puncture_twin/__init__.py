@@ -1,0 +1,1 @@
+"""Planner and digital twin for robotic needle puncture."""

@@ -1,0 +1,134 @@
+"""Where the ball's outline crosses spokes around its centre, to a small part of a pixel.
+
+A spoke runs over the sphere of viewing directions, from inside the outline to outside, and is laid on the picture by
+the camera: so the lens and the ellipse are in the spoke and the outline is at the same angle on each. The grey along it
+is read with cubic splines. The edge is where the grey changes fastest after a Gaussian's derivative (Canny 1986), the
+peak refined by a parabola.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d, map_coordinates, spline_filter
+
+from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
+
+Floats = NDArray[np.float64]
+
+STEP_PX = 0.25
+"""Between two readings on a spoke: a quarter of the narrowest edge."""
+SMOOTHING_PX = 0.8
+"""Of the derivative: as wide as the edge itself is the best against noise; wider sees the ball's shading."""
+EDGE_WIDTH_PX = 0.8
+"""Blur and pixel together; turns the steepest slope into the step's height."""
+
+SAME_GREY = 0.4
+"""In parts of the contrast: a lamp's share of 0.4 shades the ball by less, what hides it differs by more."""
+DISC_RINGS = 0.85 * np.sqrt((np.arange(6) + 0.5) / 6)
+"""Radii at which the disc is read, in parts of the outline's: each ring stands for the same area."""
+
+
+class Grey(NamedTuple):
+    """A part of a picture, ready to be read between its pixels."""
+
+    pixels: NDArray[np.uint8]
+    spline: Floats
+    """Coefficients of the cubic spline."""
+    offset: Floats
+    """Shape (2,): column and row of the first pixel."""
+    noise: float
+    """Standard deviation of its noise, grey levels."""
+
+
+class Edges(NamedTuple):
+    """One edge per spoke; arrays of shape (n,)."""
+
+    points: Floats
+    """Shape (n, 2), in the stereographic plane that touches at the spokes' centre."""
+    scales: Floats
+    """px per radian across the outline."""
+    contrast: Floats
+    """Grey levels, inside minus outside."""
+    inside: NDArray[np.bool_]
+    """False where the steepest place lies at the end of the spoke or outside the picture: no edge."""
+
+
+class Spokes(NamedTuple):
+    """Where to look: all round a direction, about a half angle."""
+
+    direction: Floats
+    """Shape (3,), unit."""
+    half_angle: float
+    """Of the outline, rad."""
+    number: int
+    reach_px: float
+    """How far to both sides of the outline."""
+
+
+def grey_part(pixels: NDArray[np.uint8], offset: Floats) -> Grey:
+    """Prepare a part of a picture; its noise is the median of second differences, which edges hardly touch."""
+    grey = pixels.astype(np.float64)
+    second = grey[:, :-2] - 2 * grey[:, 1:-1] + grey[:, 2:]
+    noise = 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6.0) if second.size else 0.0
+    return Grey(pixels, np.asarray(spline_filter(grey, 3)), offset, noise)
+
+
+def find_edges(grey: Grey, camera: Camera, spokes: Spokes) -> Edges:
+    """The steepest place on each spoke."""
+    around = 2 * np.pi * np.arange(spokes.number) / spokes.number
+    across = np.stack([np.cos(around), np.sin(around)])
+    scales = _scales(camera, spokes.direction, across)
+    half = min(spokes.reach_px, 0.8 * spokes.half_angle * float(scales.min()))
+    steps = np.arange(-half, half + STEP_PX / 2, STEP_PX)
+    angles = spokes.half_angle + steps[None] / scales[:, None]
+    turned = (tangent_axes(spokes.direction) @ across).T
+    rays = np.cos(angles)[..., None] * spokes.direction + np.sin(angles)[..., None] * turned[:, None]
+    places = camera.project(camera.center_c + rays) - grey.offset
+    seen = np.all((places >= 0) & (places <= np.array(grey.pixels.shape[::-1]) - 1), axis=-1)
+    read = map_coordinates(grey.spline, [places[..., 1], places[..., 0]], order=3, prefilter=False, mode="nearest")
+    slope = gaussian_filter1d(read, SMOOTHING_PX / STEP_PX, axis=1, order=1, mode="nearest") / STEP_PX
+    peak, height, inside = _peaks(slope)
+    edge = spokes.half_angle + (peak * STEP_PX - half) / scales
+    width = np.hypot(SMOOTHING_PX, EDGE_WIDTH_PX)
+    points = 2 * np.tan(edge / 2)[:, None] * across.T
+    return Edges(points, scales, -height * width * np.sqrt(2 * np.pi), inside & seen.all(axis=1))
+
+
+def visible_share(grey: Grey, camera: Camera, spokes: Spokes, on_circle: NDArray[np.bool_], contrast: float) -> float:
+    """Share of the disc that looks like the ball: as bright as it is next to its edges, within a part of its contrast.
+
+    Args:
+        grey: The picture.
+        camera: The camera.
+        spokes: Around the measured ball.
+        on_circle: Shape (n,): the spokes whose edge lies on the circle.
+        contrast: Between ball and surroundings, grey levels.
+    """
+    around = 2 * np.pi * np.arange(spokes.number) / spokes.number
+    turned = (tangent_axes(spokes.direction) @ np.stack([np.cos(around), np.sin(around)])).T
+    angles = spokes.half_angle * DISC_RINGS
+    rays = np.cos(angles)[:, None, None] * spokes.direction + np.sin(angles)[:, None, None] * turned
+    places = camera.project(camera.center_c + rays) - grey.offset
+    read = map_coordinates(grey.spline, [places[..., 1], places[..., 0]], order=3, prefilter=False, mode="nearest")
+    ball = float(np.median(read[-1][on_circle]))
+    return float(np.mean(np.abs(read - ball) < SAME_GREY * abs(contrast)))
+
+
+def _scales(camera: Camera, direction: Floats, across: Floats) -> Floats:
+    """How far an outline moves across itself, px per radian, when a tangent circle grows: 1 / |J^-T e|."""
+    normals = np.linalg.solve(camera.angle_slope(direction).T, across)
+    return np.asarray(1 / np.linalg.norm(normals, axis=0))
+
+
+def _peaks(slope: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Place (in steps) and height of each row's steepest slope, and whether it lies inside the row."""
+    rows = np.arange(len(slope))
+    best = np.argmax(np.abs(slope), axis=1)
+    middle = np.clip(best, 1, slope.shape[1] - 2)
+    before, here, after = (np.abs(slope[rows, middle + side]) for side in (-1, 0, 1))
+    bend = before - 2 * here + after
+    shift = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
+    return middle + np.clip(shift, -1, 1), slope[rows, middle], best == middle

@@ -1,0 +1,248 @@
+"""Find the ball in a picture near where the robot's kinematics predict it, and measure its centre.
+
+Hough's transform finds circles; edges on spokes measure them; three edges propose a circle, the others vote, and a
+robust fit refines it. What is measured is the projection of the ball's **centre**, as the circle is fitted on the
+sphere of viewing directions (see circle). A ball that is not there, mostly hidden or too faint is a ``LostBall``, not a
+number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.twin.guidance.stereo.ball.ball_edges import Edges, Grey, Spokes, find_edges, grey_part, visible_share
+from puncture_twin.twin.guidance.stereo.ball.ball_image import Picture
+from puncture_twin.twin.guidance.stereo.ball.hough import Found, find_circles
+from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
+from puncture_twin.twin.guidance.stereo.cameras.circle import Circle, cone, consensus, refit
+
+Floats = NDArray[np.float64]
+
+Reason = Literal["not_in_view", "no_circle", "few_inliers", "wrong_radius", "low_contrast"]
+
+MARGIN_PX = 8.0
+"""Beyond search region and ball: what edges and their smoothing need."""
+HOUGH_SIGMA_PX = 0.4
+"""Of a centre by Hough alone, per axis (measured: benchmarks/ball.py)."""
+CLOSER = 2
+"""Times that the edges are read again around the measured circle: the second moves it by less than 0.001 px."""
+KEPT_AWAY = 2
+"""Spokes between a used edge and one off the circle: 10 degrees, 1.7 px at a radius of 10 px."""
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """How the ball is measured and when it is believed.
+
+    Attributes:
+        spokes: Edges asked for, evenly around the outline.
+        first_reach_px: How far from Hough's circle an edge may lie.
+        last_reach_px: How far from the measured circle.
+        inlier_px: An edge this near votes for a circle.
+        min_inliers: Share of all spokes that must agree.
+        min_visible: Share of the disc that must look like the ball.
+        radius_share: How far the radius may be from the predicted one.
+        min_contrast: Grey levels between ball and surroundings that make an edge.
+        noise_factor: The same in parts of the picture's own noise; the larger counts.
+        model_px: Standard deviation, per axis, of what lamp, blur and rod do to the centre and the edges do not tell.
+    """
+
+    spokes: int = 72
+    first_reach_px: float = 4.0
+    last_reach_px: float = 2.5
+    inlier_px: float = 0.35
+    min_inliers: float = 0.5
+    min_visible: float = 0.5
+    radius_share: float = 0.05
+    min_contrast: float = 12.0
+    noise_factor: float = 5.0
+    model_px: float = 0.014
+
+
+DEFAULT = TrackerSettings()
+
+
+class Ball(NamedTuple):
+    """A ball that was found."""
+
+    pixel: Floats
+    """Shape (2,): the projection of the ball's centre, px."""
+    covariance: Floats
+    """Shape (2, 2), px^2."""
+    radius_px: float
+    """As ``Camera.ball_radius_px`` defines it."""
+    inliers: int
+    """Edges on the circle; 0 for Hough alone."""
+    n_edges: int
+    """Edges asked for."""
+
+
+class LostBall(NamedTuple):
+    """No ball that can be believed."""
+
+    reason: Reason
+    inliers: int = 0
+    """Of the best circle."""
+
+
+def find_ball(
+    image: Picture | NDArray[np.uint8],
+    camera: Camera,
+    predicted_c: Floats,
+    radius_mm: float,
+    *,
+    search_px: float,
+    settings: TrackerSettings = DEFAULT,
+    hough_only: bool = False,
+) -> Ball | LostBall:
+    """Find and measure the ball.
+
+    Args:
+        image: A whole picture, shape (height, width), or a part of one with its offset.
+        camera: As calibrated.
+        predicted_c: Shape (3,), mm: the ball's centre by the robot's kinematics. Its depth predicts the radius.
+        radius_mm: The ball's.
+        search_px: How far from the prediction the centre may be.
+        settings: What to believe.
+        hough_only: The paper's way: the centre of the best circle that Hough finds, neither measured nor gated.
+    """
+    picture = image if isinstance(image, Picture) else Picture(image)
+    predicted = camera.project(predicted_c)
+    if not camera.sees(predicted):
+        return LostBall("not_in_view")
+    radius = camera.ball_radius_px(predicted_c, radius_mm)
+    part = _cut(picture, predicted, search_px + 2 * radius + MARGIN_PX)
+    if min(part.grey.shape) < 2 * radius:
+        return LostBall("not_in_view")
+    grey = grey_part(part.grey, np.array(part.offset, dtype=np.float64))
+    if _contrast(part.grey) < _threshold(grey, settings):
+        return LostBall("low_contrast")
+    found = find_circles(part.grey, radius)
+    centers = found.centers + part.offset
+    near = np.linalg.norm(centers - predicted, axis=1) <= search_px
+    if not near.any():
+        return LostBall("no_circle")
+    if hough_only:
+        best = int(np.flatnonzero(near)[0])
+        return Ball(centers[best], HOUGH_SIGMA_PX**2 * np.eye(2), float(found.radii[best]), 0, 0)
+    return _best(grey, camera, Found(centers[near], found.radii[near]), radius, settings)
+
+
+def _cut(picture: Picture, center: Floats, half: float) -> Picture:
+    """The part of a picture around a pixel, as far as there is one."""
+    size = np.array(picture.grey.shape[::-1])
+    low = np.clip(np.floor(center - half).astype(int) - picture.offset, 0, size)
+    high = np.clip(np.ceil(center + half).astype(int) + 1 - picture.offset, 0, size)
+    part = np.ascontiguousarray(picture.grey[low[1] : high[1], low[0] : high[0]])
+    return Picture(part, (int(low[0]) + picture.offset[0], int(low[1]) + picture.offset[1]))
+
+
+def _contrast(grey: NDArray[np.uint8]) -> float:
+    return float(np.percentile(grey, 99.5) - np.percentile(grey, 0.5))
+
+
+def _threshold(grey: Grey, settings: TrackerSettings) -> float:
+    return max(settings.min_contrast, settings.noise_factor * grey.noise)
+
+
+def _best(grey: Grey, camera: Camera, found: Found, radius: float, settings: TrackerSettings) -> Ball | LostBall:
+    """The first circle that stands the test, or why the one with most inliers did not."""
+    lost = []
+    for center in found.centers:
+        ball = _measure(grey, camera, center, radius, settings)
+        if isinstance(ball, Ball):
+            return ball
+        lost.append(ball)
+    return max(lost, key=lambda one: one.inliers)
+
+
+def _measure(grey: Grey, camera: Camera, center: Floats, radius: float, settings: TrackerSettings) -> Ball | LostBall:
+    """One circle: edges about Hough's place, the vote, then edges about the measured place until they agree."""
+    direction = camera.rays(center)
+    spokes = Spokes(direction, radius / camera.local_scale(direction), settings.spokes, settings.first_reach_px)
+    fitted = _fit(grey, camera, spokes, radius, settings)
+    for _ in range(CLOSER):
+        if isinstance(fitted, LostBall):
+            return fitted
+        fitted = _fit(grey, camera, fitted.spokes._replace(reach_px=settings.last_reach_px), radius, settings)
+    if isinstance(fitted, LostBall):
+        return fitted
+    if visible_share(grey, camera, fitted.spokes, fitted.on_circle, fitted.contrast) < settings.min_visible:
+        return LostBall("few_inliers", fitted.inliers)
+    direction = fitted.spokes.direction
+    size = fitted.spokes.half_angle * camera.local_scale(direction)
+    slope = camera.angle_slope(direction)
+    noise = fitted.covariance[:2, :2] / _independent(settings.spokes, size)
+    covariance = slope @ noise @ slope.T + settings.model_px**2 * np.eye(2)
+    return Ball(camera.project(camera.center_c + direction), covariance, size, fitted.inliers, settings.spokes)
+
+
+class _Fitted(NamedTuple):
+    """A circle through the edges on spokes."""
+
+    spokes: Spokes
+    """Around what was measured."""
+    covariance: Floats
+    """Shape (3, 3), rad^2."""
+    on_circle: NDArray[np.bool_]
+    """Shape (n,): whose edge lies on the circle."""
+    contrast: float
+
+    @property
+    def inliers(self) -> int:
+        return int(self.on_circle.sum())
+
+
+def _fit(grey: Grey, camera: Camera, spokes: Spokes, radius: float, settings: TrackerSettings) -> _Fitted | LostBall:
+    edges = find_edges(grey, camera, spokes)
+    valid, faint = _believable(edges, _threshold(grey, settings))
+    if faint:
+        return LostBall("low_contrast", int(valid.sum()))
+    circle = consensus(edges.points, valid, edges.scales, settings.inlier_px)
+    if circle is None:
+        return LostBall("few_inliers")
+    on_circle = _agree(edges, valid, circle, settings.inlier_px)
+    if on_circle.sum() < settings.min_inliers * settings.spokes:
+        return LostBall("few_inliers", int(on_circle.sum()))
+    used = _away_from_others(on_circle)
+    fit = refit(edges.points[used], edges.scales[used], circle, settings.inlier_px)
+    on_circle = _agree(edges, valid, fit.circle, settings.inlier_px)
+    if on_circle.sum() < settings.min_inliers * settings.spokes:
+        return LostBall("few_inliers", int(on_circle.sum()))
+    axis, half_angle = cone(fit.circle, spokes.direction, tangent_axes(spokes.direction))
+    if abs(half_angle * camera.local_scale(axis) - radius) > settings.radius_share * radius:
+        return LostBall("wrong_radius", int(on_circle.sum()))
+    measured = spokes._replace(direction=axis, half_angle=half_angle)
+    return _Fitted(measured, fit.covariance, on_circle, float(np.median(edges.contrast[on_circle])))
+
+
+def _away_from_others(on_circle: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Spokes whose neighbours agree too: next to the rod or an occluder the edge is bent by it.
+
+    Where that would leave fewer than half of them, all stay.
+    """
+    used = on_circle.copy()
+    for shift in range(-KEPT_AWAY, KEPT_AWAY + 1):
+        used &= np.roll(on_circle, shift)
+    return used if used.sum() >= on_circle.sum() / 2 else on_circle
+
+
+def _believable(edges: Edges, threshold: float) -> tuple[NDArray[np.bool_], bool]:
+    """Edges that are steep enough and go the way most do, and whether most are too faint."""
+    steep = edges.inside & (np.abs(edges.contrast) >= threshold)
+    way = np.sign(np.sum(np.sign(edges.contrast[steep]))) or 1.0
+    return steep & (edges.contrast * way > 0), bool(np.mean(np.abs(edges.contrast) < threshold) > 0.5)
+
+
+def _agree(edges: Edges, valid: NDArray[np.bool_], circle: Circle, tolerance_px: float) -> NDArray[np.bool_]:
+    distance = np.linalg.norm(edges.points - circle.center, axis=1)
+    return np.asarray(valid & (np.abs(distance - circle.radius) * edges.scales <= tolerance_px))
+
+
+def _independent(spokes: int, radius_px: float) -> float:
+    """Share of the edges that count: those closer than 1.5 px read the same pixels."""
+    return min(1.0, 2 * np.pi * radius_px / (1.5 * spokes))

@@ -1,0 +1,212 @@
+"""A calibrated camera: where a point of the calibration frame C appears, and which ray belongs to a pixel.
+
+Pixel (u, v) is column and row; **pixel centres are at integers**, so the picture spans -0.5 .. width - 0.5. The
+camera's frame is the field's: x right, y down, z forward. Distortion is Brown's k1, k2, p1, p2 as OpenCV has it
+(see lens).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.registration.registration import apply
+from puncture_twin.twin.guidance.stereo.cameras.lens import distort, distortion_slope, fold, undistort
+
+Floats = NDArray[np.float64]
+
+ROTATION_TOLERANCE = 1e-6
+"""How far R^T R may be from the identity: a rotation typed with seven digits passes, a scaled one does not."""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One camera.
+
+    Attributes:
+        width: Pixels.
+        height: Pixels.
+        fx: Focal length along the rows, px.
+        fy: Focal length along the columns, px.
+        cx: Principal point, px, column.
+        cy: Principal point, px, row.
+        distortion: Shape (4,), k1, k2, p1, p2.
+        T_camera_c: Shape (4, 4), mm, rigid: frame C to the camera's frame.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: Floats
+    T_camera_c: Floats
+
+    def __post_init__(self) -> None:
+        for name, shape in (("distortion", (4,)), ("T_camera_c", (4, 4))):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            if array.shape != shape or not np.isfinite(array).all():
+                raise InputError(f"{name} has shape {array.shape} or is not finite", where="camera", allowed=str(shape))
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        sizes = (self.width, self.height, self.fx, self.fy)
+        if not (np.isfinite([*sizes, self.cx, self.cy]).all() and min(sizes) > 0):
+            raise InputError(f"size and focal length {sizes}", where="camera", allowed="finite and above 0")
+        R = self.T_camera_c[:3, :3]
+        if np.abs(R.T @ R - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+            raise InputError("T_camera_c is not rigid", where="camera", allowed="a rotation and a translation")
+
+    @property
+    def center_c(self) -> Floats:
+        """The centre of projection in C, shape (3,), mm."""
+        return np.asarray(-self.T_camera_c[:3, :3].T @ self.T_camera_c[:3, 3])
+
+    @property
+    def K(self) -> Floats:  # noqa: N802
+        """The intrinsic matrix, shape (3, 3), px."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def matrix(self) -> Floats:
+        """The paper's M, shape (3, 4), z [u v 1]^T = M [x y z 1]^T (Liu 2007, Eq. 1), without the lens's distortion."""
+        return np.asarray(self.K @ self.T_camera_c[:3])
+
+    def project(self, points_c: Floats) -> Floats:
+        """Pixels (..., 2) of points (..., 3), mm; NaN behind the camera and beyond the lens's range."""
+        points = apply(self.T_camera_c, np.asarray(points_c, dtype=np.float64))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            flat = np.where(points[..., 2:] > 0, points[..., :2] / points[..., 2:], np.nan)
+            flat = np.where(np.sum(flat**2, axis=-1, keepdims=True) < fold(self.distortion) ** 2, flat, np.nan)
+        return np.asarray(distort(flat, self.distortion) * [self.fx, self.fy] + [self.cx, self.cy])
+
+    def jacobian(self, points_c: Floats) -> Floats:
+        """Derivative of ``project`` by the point, shape (..., 2, 3), px/mm."""
+        points = apply(self.T_camera_c, np.asarray(points_c, dtype=np.float64))
+        slope = distortion_slope(points[..., :2] / points[..., 2:], self.distortion)
+        flat = np.zeros((*points.shape[:-1], 2, 3))
+        flat[..., 0, 0] = flat[..., 1, 1] = 1 / points[..., 2]
+        flat[..., :2, 2] = -points[..., :2] / points[..., 2:] ** 2
+        return np.asarray(np.array([self.fx, self.fy])[:, None] * (slope @ flat @ self.T_camera_c[:3, :3]))
+
+    def rays(self, pixels: Floats) -> Floats:
+        """Unit directions (..., 3), in C, from the centre through pixels (..., 2); NaN where the lens has no ray."""
+        flat = (np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
+        flat = undistort(flat, self.distortion)
+        directions = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1) @ self.T_camera_c[:3, :3]
+        return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
+
+    def sees(self, pixels: Floats, margin_px: float = 0.0) -> NDArray[np.bool_]:
+        """Whether pixels (..., 2) lie in the picture, at least a margin from its border; NaN does not."""
+        low = margin_px - 0.5
+        high = np.array([self.width, self.height]) - 0.5 - margin_px
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.all((pixels >= low) & (pixels <= high), axis=-1))
+
+    def ball_radius_px(self, point_c: Floats, radius_mm: float) -> float:
+        """Radius of the circle as large as a ball's outline: sqrt of the two half axes' product, px.
+
+        A ball of radius R at distance D fills a cone of half angle asin(R / D); the local scale takes it to pixels.
+
+        Args:
+            point_c: The ball's centre, shape (3,), mm.
+            radius_mm: The ball's radius.
+        """
+        toward = np.asarray(point_c, dtype=np.float64) - self.center_c
+        distance = float(np.linalg.norm(toward))
+        return float(np.arcsin(radius_mm / distance)) * self.local_scale(toward / distance)
+
+    def local_scale(self, direction_c: Floats) -> float:
+        """Pixels per radian around a direction (3,): the root of the area's magnification."""
+        return float(np.sqrt(abs(np.linalg.det(self.angle_slope(direction_c)))))
+
+    def angle_slope(self, direction_c: Floats) -> Floats:
+        """Derivative of the pixel by a turn of the ray about a unit direction, shape (2, 2), px/rad.
+
+        Its columns belong to the two axes of ``tangent_axes``.
+        """
+        return np.asarray(self.jacobian(self.center_c + direction_c) @ tangent_axes(direction_c))
+
+    def moved(self, T_c_other: Floats) -> Camera:
+        """The same camera known in another frame: ``T_camera_other = T_camera_c T_c_other``."""
+        return replace(self, T_camera_c=self.T_camera_c @ T_c_other)
+
+    def pinhole(self) -> Camera:
+        """The same camera with a perfect lens."""
+        return replace(self, distortion=np.zeros(4))
+
+
+def tangent_axes(direction: Floats) -> Floats:
+    """Two unit vectors across a unit direction (3,), as columns, shape (3, 2); the three are right-handed."""
+    least = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    first = np.cross(least, direction)
+    first = first / np.linalg.norm(first)
+    return np.stack([first, np.cross(direction, first)], axis=1)
+
+
+def looking_at(
+    eye_c: Floats,
+    target_c: Floats,
+    size: tuple[int, int],
+    focal_px: float,
+    *,
+    down_c: Floats | Sequence[float] = (0.0, 1.0, 0.0),
+    distortion: Floats | Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+) -> Camera:
+    """A camera at a place in C that has a point in the middle of its picture.
+
+    Args:
+        eye_c: Shape (3,), mm.
+        target_c: Shape (3,), mm.
+        size: Width and height, px.
+        focal_px: Focal length, px.
+        down_c: Shape (3,): what is down in the picture.
+        distortion: k1, k2, p1, p2.
+    """
+    z = np.asarray(target_c, dtype=np.float64) - eye_c
+    z = z / np.linalg.norm(z)
+    x = np.cross(down_c, z)
+    x = x / np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z])
+    T[:3, 3] = -T[:3, :3] @ np.asarray(eye_c, dtype=np.float64)
+    width, height = size
+    middle = (width - 1) / 2, (height - 1) / 2
+    return Camera(width, height, focal_px, focal_px, *middle, np.asarray(distortion, dtype=np.float64), T)
+
+
+def stereo_pair(
+    width: int,
+    height: int,
+    focal_px: float,
+    baseline_mm: float,
+    distance_mm: float,
+    distortion: Floats | Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+) -> tuple[Camera, Camera]:
+    """Left and right camera, side by side, both looking at the room's centre.
+
+    The centre is C's origin; x runs from the left camera to the right one, y down, z away from them. The cameras stand
+    at (-+ baseline / 2, 0, -distance). Use ``Camera.moved`` to know them in a frame that lies otherwise.
+
+    Args:
+        width: Pixels.
+        height: Pixels.
+        focal_px: Pixels; 2560 shows 500 mm at 1 m on 1280 px.
+        baseline_mm: Between the two centres.
+        distance_mm: From the middle of the baseline to the room's centre.
+        distortion: k1, k2, p1, p2 of both.
+
+    Raises:
+        InputError: A size, length or distance that is not above 0.
+    """
+    if not (np.isfinite([baseline_mm, distance_mm]).all() and min(baseline_mm, distance_mm) > 0):
+        raise InputError(
+            f"baseline {baseline_mm:g} mm, distance {distance_mm:g} mm", where="stereo pair", allowed="above 0"
+        )
+    eyes = [np.array([side * baseline_mm / 2, 0.0, -distance_mm]) for side in (-1, 1)]
+    left, right = (looking_at(eye, np.zeros(3), (width, height), focal_px, distortion=distortion) for eye in eyes)
+    return left, right

@@ -1,0 +1,149 @@
+"""What the guidance gets to see: a ball's centre in each camera, from pictures of the true room.
+
+``picture_sight`` draws a picture with the true camera and measures it with the believed one. ``pixel_sight`` leaves the
+picture out and adds normal errors to the true pixel: for studies of everything behind the picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.twin.guidance.stereo.ball.ball_image import BallScene, render
+from puncture_twin.twin.guidance.stereo.ball.tracker import LostBall, find_ball
+from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
+from puncture_twin.twin.guidance.stereo.cameras.triangulation import Points, triangulate
+from puncture_twin.twin.guidance.stereo.servo_case import CamerasSection
+from puncture_twin.twin.guidance.stereo.servo_loop import Lost
+from puncture_twin.twin.guidance.stereo.stereo_room import Room
+
+Floats = NDArray[np.float64]
+
+DIFFUSE = {"diffuse": 0.8, "lamp": 0.4}
+"""Share of the light that comes from everywhere; the rest is a lamp's."""
+
+WINDOW_MARGIN_PX = 24
+"""A picture, and the rod in it, are drawn this far beyond the region that is searched: the rest is never looked at."""
+
+
+class Placed(NamedTuple):
+    """A ball as it truly stands, C, mm."""
+
+    center_c: Floats
+    """Shape (3,)."""
+    radius_mm: float
+    rod_c: Floats | None
+    """Shape (3,): along the rod; None for a marker, which has none."""
+    head_there: bool = True
+    """Whether the head stands in the room and may hide it; it does not during the calibration."""
+
+
+class Spot(NamedTuple):
+    """A ball's centre in one picture."""
+
+    pixel: Floats
+    """Shape (2,)."""
+    covariance: Floats
+    """Shape (2, 2), px^2."""
+
+
+class Search(NamedTuple):
+    """Where to look for a ball."""
+
+    camera: Camera
+    """As it is believed."""
+    predicted_c: Floats
+    """Shape (3,), mm."""
+    search_px: float
+
+
+Sight = Callable[[int, Placed, Search], Spot | Lost]
+"""Takes the camera's number, the ball as it truly is, and where to look."""
+
+
+class Spots(NamedTuple):
+    """One ball in every camera."""
+
+    pixels: Floats
+    """Shape (c, 2)."""
+    covariances: Floats
+    """Shape (c, 2, 2), px^2."""
+
+
+def picture_sight(room: Room, rng: np.random.Generator) -> Sight:
+    """Pictures of the true room, each drawn anew with noise; what the head hides is hidden."""
+    plan = room.case.file.cameras
+
+    def see(number: int, ball: Placed, search: Search) -> Spot | Lost:
+        true = room.cameras[number]
+        hidden = room.hidden_share(true, ball.center_c, ball.radius_mm) if ball.head_there else 0.0
+        away = np.abs(true.project(ball.center_c) - search.camera.project(search.predicted_c)).max()
+        radius = true.ball_radius_px(ball.center_c, ball.radius_mm)
+        half = int(np.ceil(np.nan_to_num(away, nan=0.0) + search.search_px + 2 * radius)) + WINDOW_MARGIN_PX
+        scene = replace(ball_scene(plan, ball, hidden, rng), rod_length_mm=half * ball.radius_mm / radius)
+        image = render(true, scene, rng=rng, noise=plan.noise_grey, blur_px=plan.blur_px, half_px=half)
+        found = find_ball(
+            image,
+            search.camera,
+            search.predicted_c,
+            ball.radius_mm,
+            search_px=search.search_px,
+            hough_only=plan.centre == "hough",
+        )
+        return Lost(found.reason) if isinstance(found, LostBall) else Spot(found.pixel, found.covariance)
+
+    return see
+
+
+def pixel_sight(room: Room, sigma_px: float, rng: np.random.Generator) -> Sight:
+    """True pixels with normal errors of a standard deviation per axis."""
+
+    def see(number: int, ball: Placed, search: Search) -> Spot | Lost:
+        del search
+        pixel = room.cameras[number].project(ball.center_c) + rng.normal(0.0, sigma_px, 2)
+        return Spot(pixel, max(sigma_px, 1e-6) ** 2 * np.eye(2))
+
+    return see
+
+
+def ball_scene(plan: CamerasSection, ball: Placed, hidden: float, rng: np.random.Generator) -> BallScene:
+    """The ball for the picture; an occluder that the case asks for comes from any side."""
+    share = min(max(plan.occlusion if ball.rod_c is not None else 0.0, hidden), 0.99)
+    return BallScene(
+        ball.center_c,
+        radius_mm=ball.radius_mm,
+        rod_c=(0.0, -1.0, 0.0) if ball.rod_c is None else ball.rod_c,
+        rod=ball.rod_c is not None,
+        diffuse=DIFFUSE[plan.light],
+        hidden_share=share,
+        hidden_from=float(rng.uniform(-np.pi, np.pi)),
+    )
+
+
+def look_at(sight: Sight, ball: Placed, searches: tuple[Search, ...], frames: int = 1) -> Spots | Lost:
+    """One ball in every camera, several pictures each; all must show it.
+
+    Pictures of one camera are averaged by their inverse covariances.
+    """
+    pixels, covariances = [], []
+    for number, search in enumerate(searches):
+        spots = []
+        for _ in range(frames):
+            spot = sight(number, ball, search)
+            if isinstance(spot, Lost):
+                return Lost(f"camera {number + 1}: {spot.reason}")
+            spots.append(spot)
+        weights = np.linalg.inv([spot.covariance for spot in spots])
+        covariance = np.linalg.inv(weights.sum(axis=0))
+        pixels.append(covariance @ np.einsum("fij,fj->i", weights, [spot.pixel for spot in spots]))
+        covariances.append(covariance)
+    return Spots(np.array(pixels), np.array(covariances))
+
+
+def in_space(cameras: tuple[Camera, ...], spots: Spots) -> Points:
+    """One ball's place in C from its pixels."""
+    return triangulate(cameras, spots.pixels[:, None], spots.covariances[:, None])

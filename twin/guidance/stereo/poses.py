@@ -1,0 +1,80 @@
+"""How the arm holds the rod: one orientation, one inverse-kinematics branch for every point of a session."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.kinematics import inverse, nearest_within_limits, singularity
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.twin.guidance.stereo.servo_law import Held
+
+Floats = NDArray[np.float64]
+
+LEAST_SINGULARITY = 0.05
+"""A branch that comes nearer to a singularity (of 0..1) at some point is not used."""
+
+REFERENCE_RAD = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
+"""Whole turns are chosen nearest to this: arm up, elbow bent, flange down."""
+
+
+def rod_orientation(tilt_rad: float) -> Floats:
+    """R_base_flange, shape (3, 3): the flange looks down, its rod leaning away from the arm by an angle, rad."""
+    z = np.array([np.sin(tilt_rad), 0.0, -np.cos(tilt_rad)])
+    y = np.array([0.0, -1.0, 0.0])
+    return np.stack([np.cross(y, z), y, z], axis=1)
+
+
+def flange_poses(held: Held, points_base: Floats) -> Floats:
+    """T_base_flange, shape (n, 4, 4), mm, that put the ball on points (n, 3)."""
+    T = np.tile(np.eye(4), (len(points_base), 1, 1))
+    T[:, :3, :3] = held.R_base_flange
+    T[:, :3, 3] = points_base - held.rod_mm * held.R_base_flange[:, 2]
+    return T
+
+
+class Posture(NamedTuple):
+    """How the arm holds a set of points."""
+
+    q: Floats
+    """Shape (n, 6), rad."""
+    branch: int
+    """The inverse-kinematics branch of all of them. An arm's errors differ from branch to branch by millimetres, so
+    what was calibrated on one is to be used on it."""
+
+
+def configurations(held: Held, points_base: Floats, checker: StateChecker, *, first: int | None = None) -> Posture:
+    """Joint angles that hold the ball on every point, all on one branch, free of contacts.
+
+    Of the branches the one that stays farthest from every singularity is taken.
+
+    Args:
+        held: The arm, its rod and its orientation.
+        points_base: Shape (n, 3), mm.
+        checker: Judges contacts.
+        first: Try this branch before the others.
+
+    Raises:
+        NoAnswerError: No branch holds all points freely; says what the best one lacks.
+    """
+    every = inverse(held.model, flange_poses(held, points_base))
+    room = np.nan_to_num(singularity(held.model, every).least(), nan=0.0).min(axis=0)
+    why = f"a {held.model.name} cannot hold the ball on all {len(points_base)} points on one branch"
+    order = sorted(range(len(room)), key=lambda branch: (branch != first, -room[branch]))
+    for branch in (branch for branch in order if room[branch] >= LEAST_SINGULARITY):
+        q = nearest_within_limits(held.model, every[:, branch], REFERENCE_RAD)
+        if np.isnan(q).any():
+            continue
+        met = checker.first_contact(q, needle_may_touch_patient=False)
+        if met is None:
+            return Posture(q, branch)
+        why = f"{met.contact.body} would touch {met.contact.other} at point {met.at + 1} of {len(points_base)}"
+    raise NoAnswerError(why)
+
+
+def way_up(held: Held, points_base: Floats, up_mm: float) -> Floats:
+    """Points (n, 3) farther back along the rod by a distance, mm: where the arm hovers."""
+    return np.asarray(points_base - up_mm * held.R_base_flange[:, 2])

@@ -1,0 +1,151 @@
+"""The robot holds the ball at twelve points: they calibrate the cameras, define C, and tie the robot to it.
+
+A coordinate measuring arm measures each point once, in its own frame: that is C. Each camera is calibrated from the
+ball's images against those points; r_T_c is the rigid fit of where the robot believes it held the ball (Liu 2007).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.planning.registration.registration import fit_rigid
+from puncture_twin.twin.guidance.stereo.cameras.calibration import Calibration, calibrate
+from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
+from puncture_twin.twin.guidance.stereo.detection import Placed, Search, Sight, look_at
+from puncture_twin.twin.guidance.stereo.poses import configurations, rod_orientation
+from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
+from puncture_twin.twin.guidance.stereo.servo_law import Held, ball_base
+from puncture_twin.twin.guidance.stereo.servo_loop import Lost, way_contact
+from puncture_twin.twin.guidance.stereo.stereo_room import Room, planned_cameras
+
+Floats = NDArray[np.float64]
+
+GRID = (3, 2, 2)
+"""Points along the base's x, y and z."""
+
+FIRST_SEARCH_PX = 80.0
+"""Before the calibration the cameras stand only about where they were planned."""
+
+
+@dataclass(frozen=True, eq=False)
+class RobotHeld:
+    """The calibration, k points.
+
+    Attributes:
+        cameras: The calibrated cameras.
+        T_base_c: Shape (4, 4), mm: r_T_c.
+        q_command: Shape (k, 6), rad.
+        measured_c: Shape (k, 3), mm: the measuring arm's readings.
+        pixels: Shape (c, k, 2).
+        covariances: Shape (c, k, 2, 2), px^2.
+        rms_px: Residual of each camera.
+        robot_residual_mm: Shape (k,): what the rigid fit leaves; mostly the robot's own error.
+        q_true: Shape (k, 6), rad: where the arm truly stood; for the twin alone.
+        branch: Of the inverse kinematics; the arm's errors are known on this one.
+    """
+
+    cameras: tuple[Camera, ...]
+    T_base_c: Floats
+    q_command: Floats
+    measured_c: Floats
+    pixels: Floats
+    covariances: Floats
+    rms_px: tuple[float, ...]
+    robot_residual_mm: Floats
+    q_true: Floats
+    branch: int
+
+
+def held_rod(case: ServoCase, room: Room) -> Held:
+    """The nominal arm with the case's rod, as it is held at the targets."""
+    tool = case.file.tool
+    return Held(room.model, tool.rod_mm, rod_orientation(float(np.radians(tool.tilt_deg))))
+
+
+def calibrating_rod(case: ServoCase, room: Room) -> Held:
+    """The same, as it is held during the calibration."""
+    tilt = case.file.calibration.tilt_deg
+    held = held_rod(case, room)
+    return held if tilt is None else held._replace(R_base_flange=rod_orientation(float(np.radians(tilt))))
+
+
+def grid_points(case: ServoCase) -> Floats:
+    """The calibration's points, base frame, shape (12, 3), mm: neighbours in the order of the arm's way."""
+    cal = case.file.calibration
+    steps = np.array(list(product(*(np.linspace(-0.5, 0.5, count) for count in GRID))))
+    return np.asarray(cal.center_mm + steps * cal.size_mm)
+
+
+def calibrate_by_robot(room: Room, sight: Sight, checker: StateChecker, rng: np.random.Generator) -> RobotHeld:
+    """Drive to the points, look, measure, and fit.
+
+    Args:
+        room: The true room.
+        sight: Takes the pictures.
+        checker: Judges contacts; the head is not there yet.
+        rng: For the arm's repeatability and the measuring arm.
+
+    Raises:
+        NoAnswerError: The arm cannot go there, or a ball is not found.
+        InputError: The points do not determine a camera.
+    """
+    case, held = room.case, calibrating_rod(room.case, room)
+    points = grid_points(case)
+    q_command, branch = configurations(held, points, checker)
+    for number, (start, end) in enumerate(pairwise(q_command), start=2):
+        contact = way_contact(checker, np.stack([start, end]))
+        if contact is not None:
+            raise NoAnswerError(f"calibration: {contact.body} would touch {contact.other} on the way to point {number}")
+    sigma, q_true = case.file.calibration.measuring_arm_mm, q_command[0]
+    measured, spots, stood = [], [], []
+    for number, q in enumerate(q_command, start=1):
+        q_true = room.arm.settle(q, q_true, rng)
+        stood.append(q_true)
+        ball = Placed(room.ball_c(q_true), case.file.tool.ball_diameter_mm / 2, room.rod_c(q_true), head_there=False)
+        measured.append(ball.center_c + rng.normal(0.0, sigma, 3))
+        searches = tuple(Search(camera, measured[-1], FIRST_SEARCH_PX) for camera in planned_cameras(case))
+        seen = look_at(sight, ball, searches, case.file.servo.frames)
+        if isinstance(seen, Lost):
+            raise NoAnswerError(f"calibration, point {number}: {seen.reason}")
+        spots.append(seen)
+    measured_c = np.array(measured)
+    pixels = np.stack([s.pixels for s in spots], axis=1)
+    covariances = np.stack([s.covariances for s in spots], axis=1)
+    cameras = _cameras(case, measured_c, pixels)
+    T_base_c = fit_rigid(measured_c, ball_base(held, q_command))
+    residual = np.linalg.norm(measured_c @ T_base_c[:3, :3].T + T_base_c[:3, 3] - ball_base(held, q_command), axis=1)
+    return RobotHeld(
+        tuple(found.camera for found in cameras),
+        T_base_c,
+        q_command,
+        measured_c,
+        pixels,
+        covariances,
+        tuple(found.rms_px for found in cameras),
+        np.asarray(residual),
+        np.array(stood),
+        branch,
+    )
+
+
+def _cameras(case: ServoCase, measured_c: Floats, pixels: Floats) -> list[Calibration]:
+    """Each camera from the ball's images."""
+    plan = case.file.cameras
+    names = tuple(f"P{number}" for number in range(1, len(measured_c) + 1))
+    return [
+        calibrate(
+            measured_c,
+            seen,
+            plan.size_px,
+            names=names,
+            distortion=plan.model_distortion,
+            where=f"camera {number}",
+        )
+        for number, seen in enumerate(pixels, start=1)
+    ]

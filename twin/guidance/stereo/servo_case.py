@@ -1,0 +1,200 @@
+"""What a servo case may hold: the TOML schema, version 1, key by key, and the case read from it. See docs/stereo.md."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, Strict, model_validator
+
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
+from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
+from puncture_twin.planning.case.case_file import Coordinate, Length, Name, Number, Section, Vector
+from puncture_twin.planning.formats.meshes import mesh_files as meshes
+from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
+from puncture_twin.planning.formats.points import point_files as points
+from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.spaces import Space, Unit
+from puncture_twin.planning.registration.registration import MIN_MARKERS
+
+Floats = NDArray[np.float64]
+
+CASE_NAME = "servo.toml"
+ALLOWED_CASE = "a TOML servo case with schema = 1, or a folder with servo.toml"
+
+Pixels = Annotated[int, Strict(), Field(ge=64, le=8192)]
+Count = Annotated[int, Strict(), Field(ge=1, le=1000)]
+Degrees = Annotated[Number, Field(ge=-90, le=90)]
+SmallDegrees = Annotated[Number, Field(ge=0, le=10)]
+Coefficient = Annotated[Number, Field(ge=-2, le=2)]
+Millimetres = Annotated[Number, Field(ge=0, le=50)]
+"""A standard deviation or a tolerance."""
+
+
+class CamerasSection(Section):
+    """Two cameras side by side that look at the middle of the calibrated volume."""
+
+    size_px: tuple[Pixels, Pixels] = (1280, 960)
+    focal_px: Annotated[Number, Field(ge=50, le=50_000)] = 2560.0
+    baseline_mm: Annotated[Number, Field(ge=10, le=5000)] = 500.0
+    distance_mm: Annotated[Number, Field(ge=100, le=10_000)] = 1000.0
+    elevation_deg: Degrees = 45.0
+    distortion: tuple[Coefficient, Coefficient, Coefficient, Coefficient] = (-0.1, 0.02, 0.0005, -0.0005)
+    model_distortion: Annotated[bool, Strict()] = True
+    noise_grey: Annotated[Number, Field(ge=0, le=100)] = 2.0
+    blur_px: Annotated[Number, Field(ge=0, le=20)] = 0.7
+    light: Literal["diffuse", "lamp"] = "diffuse"
+    occlusion: Annotated[Number, Field(ge=0, le=0.9)] = 0.0
+    centre: Literal["edges", "hough"] = "edges"
+
+
+class RobotSection(Section):
+    """The arm, and how far it is from its nominal model: standard deviations, and the full width of the play."""
+
+    model: Name = "ur3"
+    link_mm: Millimetres = 0.0
+    twist_deg: SmallDegrees = 0.0
+    joint_deg: SmallDegrees = 0.0
+    backlash_deg: SmallDegrees = 0.0
+    repeatability_deg: SmallDegrees = 0.0
+
+
+class ToolSection(Section):
+    """A rod along the flange's z axis with a ball at its end; ``rod_mm`` runs from the flange to the ball's centre."""
+
+    ball_diameter_mm: Annotated[Number, Field(ge=1, le=100)] = 8.0
+    rod_mm: Annotated[Number, Field(ge=30, le=500)] = 160.0
+    rod_diameter_mm: Annotated[Number, Field(ge=0.5, le=50)] = 3.0
+    holder_mm: Annotated[Number, Field(ge=1, le=400)] = 40.0
+    holder_diameter_mm: Annotated[Number, Field(ge=1, le=200)] = 30.0
+    tilt_deg: Annotated[Number, Field(ge=-60, le=60)] = 10.0
+
+    @model_validator(mode="after")
+    def _parts_fit(self) -> Self:
+        if self.holder_mm >= self.rod_mm:
+            raise ValueError(f"holder_mm {self.holder_mm:g} is not shorter than rod_mm {self.rod_mm:g}")
+        if self.rod_diameter_mm >= self.ball_diameter_mm:
+            raise ValueError(f"rod_diameter_mm {self.rod_diameter_mm:g} hides a ball of {self.ball_diameter_mm:g} mm")
+        return self
+
+
+class CalibrationSection(Section):
+    """The robot-held points: a 3 x 2 x 2 grid along the base's axes, about a centre; the rod tilted as at the targets.
+
+    With another ``tilt_deg`` the arm's errors at the targets are not those that the calibration met.
+    """
+
+    center_mm: Vector
+    size_mm: tuple[Length, Length, Length] = (160.0, 120.0, 120.0)
+    measuring_arm_mm: Annotated[Number, Field(ge=0, le=1)] = 0.01
+    tilt_deg: Annotated[Number, Field(ge=-60, le=60)] | None = None
+
+
+class HeadSection(Section):
+    """The head: its surface and its points in the image frame, and where it stands; z up, face to the cameras."""
+
+    mesh: str
+    unit: Literal["mm", "cm", "m"]
+    markers: str
+    targets: str
+    position_mm: Vector
+    yaw_deg: Annotated[Number, Field(ge=-360, le=360)] = 0.0
+    marker_diameter_mm: Annotated[Number, Field(ge=1, le=100)] = 8.0
+    marker_mm: Millimetres = 0.3
+    target_mm: Millimetres = 0.0
+
+
+class ServoSection(Section):
+    """The loop's limits."""
+
+    tolerance_mm: Annotated[Number, Field(ge=0.001, le=20)] = 0.1
+    estimate: Literal["chain", "joint"] = "chain"
+    max_steps: Count = 10
+    frames: Annotated[int, Strict(), Field(ge=1, le=100)] = 1
+    looks: Annotated[int, Strict(), Field(ge=1, le=20)] = 3
+    search_px: Annotated[Number, Field(ge=4, le=1000)] = 48.0
+    max_step_mm: Annotated[Number, Field(ge=0.1, le=200)] = 10.0
+    max_joint_step_deg: Annotated[Number, Field(ge=0.01, le=90)] = 10.0
+    max_drift_deg: Annotated[Number, Field(ge=0, le=45)] = 1.0
+    hover_mm: Annotated[Number, Field(ge=5, le=300)] = 70.0
+    padding_mm: Annotated[Number, Field(ge=1, le=50)] = 2.0
+
+
+class BoxSection(Section):
+    """A box in the room, axes parallel to the base's."""
+
+    name: Name
+    center_mm: tuple[Coordinate, Coordinate, Coordinate]
+    size_mm: tuple[Length, Length, Length]
+
+
+class ServoFile(Section):
+    """The whole file."""
+
+    schema_: SchemaOne = Field(alias="schema")
+    name: Name
+    seed: Annotated[int, Strict(), Field(ge=0, lt=2**31)] = 0
+    cameras: CamerasSection = CamerasSection()
+    robot: RobotSection = RobotSection()
+    tool: ToolSection = ToolSection()
+    calibration: CalibrationSection
+    head: HeadSection
+    servo: ServoSection = ServoSection()
+    box: tuple[BoxSection, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class ServoCase:
+    """A servo case, read and checked.
+
+    Attributes:
+        path: The case file.
+        file: Its content.
+        skin: The head's surface, image frame, mm.
+        markers: The markers' centres, image frame, as they truly are.
+        targets: The targets, likewise.
+        inputs: Every file, with role and hash.
+    """
+
+    path: Path
+    file: ServoFile
+    skin: TriangleMesh
+    markers: NamedPoints
+    targets: NamedPoints
+    inputs: tuple[Input, ...]
+
+    @property
+    def name(self) -> str:
+        """The case's name."""
+        return self.file.name
+
+
+def load_servo_case(path: Path | str) -> ServoCase:
+    """Read a servo case, or a folder that holds ``servo.toml``.
+
+    Raises:
+        InputError: Anything unreadable, unknown, missing or contradictory; names the key.
+    """
+    path = find_toml(path, CASE_NAME)
+    files = InputFiles(path.parent)
+    stated = files.add(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE))
+    file = parse_toml(stated, path, ServoFile, allowed=ALLOWED_CASE, keys="docs/stereo.md")
+    ur_model(file.robot.model)
+    surface = _read(files, file.head, "mesh", meshes.MAX_FILE_BYTES, path)
+    named = {key: _read(files, file.head, key, points.MAX_FILE_BYTES, path) for key in ("markers", "targets")}
+    skin = parse_mesh(surface, path.parent / file.head.mesh, unit=Unit(file.head.unit), space=Space.LOCAL)
+    markers = parse_points(named["markers"], path.parent / file.head.markers, default_space=Space.LOCAL)
+    targets = parse_points(named["targets"], path.parent / file.head.targets, default_space=Space.LOCAL)
+    if len(markers.names) < MIN_MARKERS:
+        raise InputError(f"head.markers: {len(markers.names)} markers", where=path, allowed="3 or more")
+    return ServoCase(path, file, skin, markers, targets, files.inputs)
+
+
+def _read(files: InputFiles, head: HeadSection, role: str, max_bytes: int, path: Path) -> bytes:
+    return files.read(role, getattr(head, role), max_bytes=max_bytes, key=f"head.{role}", where=path)

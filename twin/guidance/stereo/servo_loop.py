@@ -1,0 +1,183 @@
+"""Look, move, look again: the servo on what the cameras see of the ball and of the head.
+
+The robot's own accuracy does not enter the error that is driven to zero; its kinematics only say which way to turn.
+Where the ball is not seen the arm does not move, and every way is checked for contacts before it is driven.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.collision.state_checker import Contact, StateChecker
+from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, dense_states, first_contact
+from puncture_twin.twin.guidance.stereo.servo_law import Held, StepLimits, Stop, servo_step
+
+Floats = NDArray[np.float64]
+
+DIVERGING_RATIO = 1.5
+"""A step that leaves this times the error it found makes things worse."""
+
+DIVERGING_STEPS = 2
+"""So many such steps in a row end the servo: one may be the play of the gears."""
+
+NOISE_TOLERANCES = 3.0
+"""Errors below this many tolerances are noise, and do not diverge."""
+
+
+class Seen(NamedTuple):
+    """One look, in C."""
+
+    ball_c: Floats
+    """Shape (3,), mm."""
+    target_c: Floats
+    """Shape (3,), mm: where the target is believed now."""
+    covariance: Floats
+    """Shape (3, 3), mm^2: of the ball's position."""
+
+
+class Lost(NamedTuple):
+    """A ball that was not found."""
+
+    reason: str
+
+
+Look = Callable[[Floats, Floats], Seen | Lost]
+"""Takes where the arm was sent and where it truly is, each (6,), rad; the truth is for the pictures alone."""
+
+Drive = Callable[[Floats], Floats]
+"""Takes the commanded configuration (6,) and returns the true one, rad."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What the servo is to do.
+
+    Attributes:
+        held: The arm, its rod and the orientation to keep.
+        T_base_c: Shape (4, 4), mm: r_T_c, as calibrated.
+        tolerance_mm: The servo has converged when a look sees no larger error.
+        max_steps: Moves at most.
+        looks: Looks at most before a ball counts as lost.
+        limits: What one step may do.
+        checker: Judges contacts, with the head where it is believed to stand.
+    """
+
+    held: Held
+    T_base_c: Floats
+    tolerance_mm: float
+    max_steps: int
+    looks: int
+    limits: StepLimits
+    checker: StateChecker
+
+
+class Visit(NamedTuple):
+    """One stay of the arm: what was commanded, what came of it, what was seen."""
+
+    q_command: Floats
+    q_true: Floats
+    seen: Seen
+    error_mm: float
+    """From the ball seen to the target believed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Servoed:
+    """How a servo went.
+
+    Attributes:
+        stop: Why it ended.
+        visits: Every stay at which the ball was seen, in order.
+        q_command: Shape (6,), rad: the last command.
+        q_true: Shape (6,), rad: where the arm truly stands.
+        detail: What was met or missing, for people.
+        position_only: Whether some step gave the orientation up.
+    """
+
+    stop: Stop
+    visits: tuple[Visit, ...]
+    q_command: Floats
+    q_true: Floats
+    detail: str = ""
+    position_only: bool = False
+
+    @property
+    def steps(self) -> int:
+        """Corrections that were driven."""
+        return max(0, len(self.visits) - 1)
+
+    @property
+    def errors_mm(self) -> Floats:
+        """Seen error at each stay, shape (n,)."""
+        return np.array([visit.error_mm for visit in self.visits])
+
+
+def servo(task: Task, q_command: Floats, q_true: Floats, look: Look, drive: Drive) -> Servoed:
+    """Drive the ball onto the target.
+
+    Args:
+        task: What to do.
+        q_command: Shape (6,), rad: where the arm was sent.
+        q_true: Shape (6,), rad: where it truly is; only handed on to ``look``.
+        look: Takes pictures and measures.
+        drive: Moves the arm.
+    """
+    visits: list[Visit] = []
+    blind = False
+
+    def ended(stop: Stop, detail: str = "") -> Servoed:
+        return Servoed(stop, tuple(visits), q_command, q_true, detail, blind)
+
+    while True:
+        seen = _look(task, q_command, q_true, look)
+        if isinstance(seen, Lost):
+            return ended(Stop.LOST_BALL, seen.reason)
+        miss = seen.target_c - seen.ball_c
+        visits.append(Visit(q_command, q_true, seen, float(np.linalg.norm(miss))))
+        stop = _judge(task, visits)
+        if stop is not None:
+            return ended(stop)
+        step = servo_step(task.held, q_command, task.T_base_c[:3, :3] @ miss, task.limits)
+        blind = blind or step.position_only
+        if step.stop is not None:
+            return ended(step.stop)
+        contact = way_contact(task.checker, step.q_path)
+        if contact is not None:
+            return ended(Stop.CONTACT, f"{contact.body} and {contact.other}")
+        q_command = step.q_path[-1]
+        q_true = drive(q_command)
+
+
+def way_contact(checker: StateChecker, q_path: Floats) -> Contact | None:
+    """The first contact on the way through waypoints (m, 6), rad, checked as finely as any motion; None if free."""
+    return first_contact(checker, dense_states(checker, q_path, RESOLUTION_RAD / FINER))
+
+
+def _look(task: Task, q_command: Floats, q_true: Floats, look: Look) -> Seen | Lost:
+    """Look, and look again where the ball was not found: the arm stands still meanwhile."""
+    found = look(q_command, q_true)
+    for _ in range(task.looks - 1):
+        if isinstance(found, Seen):
+            break
+        found = look(q_command, q_true)
+    return found
+
+
+def _judge(task: Task, visits: list[Visit]) -> Stop | None:
+    """Whether to stop after the last look."""
+    errors = [visit.error_mm for visit in visits]
+    if errors[-1] <= task.tolerance_mm:
+        return Stop.CONVERGED
+    last = errors[-DIVERGING_STEPS - 1 :]
+    worse = [b > DIVERGING_RATIO * a for a, b in pairwise(last)]
+    if len(worse) == DIVERGING_STEPS and all(worse) and errors[-1] > NOISE_TOLERANCES * task.tolerance_mm:
+        return Stop.DIVERGING
+    if len(visits) > task.max_steps:
+        return Stop.TOLERANCE_NOT_REACHED
+    return None

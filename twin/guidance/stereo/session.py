@@ -1,0 +1,246 @@
+"""A whole session: calibrate, map the head, then servo onto every target; belief and truth kept apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.planning.registration.registration import apply
+from puncture_twin.twin.guidance.stereo.detection import Placed, Search, Sight, Spots, in_space, look_at, picture_sight
+from puncture_twin.twin.guidance.stereo.guide import Guide, JointGuide, Known
+from puncture_twin.twin.guidance.stereo.mapping import Mapping, SeenMarkers, map_head
+from puncture_twin.twin.guidance.stereo.poses import configurations, way_up
+from puncture_twin.twin.guidance.stereo.robot_calibration import RobotHeld, calibrate_by_robot, grid_points, held_rod
+from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
+from puncture_twin.twin.guidance.stereo.servo_law import StepLimits, Stop
+from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed, Task, servo, way_contact
+from puncture_twin.twin.guidance.stereo.stereo_room import Room, draw_room, room_checker
+
+Floats = NDArray[np.float64]
+
+POINTED_MM = 3.0
+"""How well an operator points at a marker in the pictures, per axis: where the search for it begins."""
+
+TEST_POINTS = 10
+"""Points at which the stereo is tried, as in the paper's Table 1."""
+
+Eyes = Callable[[Room, np.random.Generator], Sight]
+"""Makes a sight of a room."""
+
+
+class Reached(NamedTuple):
+    """One target, measured in truth; mm."""
+
+    target: str
+    servoed: Servoed
+    mapping_mm: float
+    """Estimated target to true target."""
+    expected_tre_mm: float
+    """What the mapping expects of itself (rms)."""
+    before_mm: float
+    """True ball to true target where the robot alone brought it; the whole distance if it could not start."""
+    after_mm: float
+    """The same at the end."""
+    servo_only_mm: float
+    """True ball to estimated target at the end: what the servo answers for."""
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the last look saw the ball within the tolerance."""
+        return self.servoed.stop is Stop.CONVERGED
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """What came of a session.
+
+    Attributes:
+        seed: What it was drawn from.
+        room: The truth.
+        calibration: What the robot-held points gave.
+        mapping: What the markers gave.
+        stereo_mm: Shape (10,): error of the stereo at points of the calibrated volume.
+        reached: One for each target.
+        guide: Who told the servo where ball and target are; knows everything that was measured.
+    """
+
+    seed: int
+    room: Room
+    calibration: RobotHeld
+    mapping: Mapping
+    stereo_mm: Floats
+    reached: tuple[Reached, ...]
+    guide: Guide
+
+
+class _Parts(NamedTuple):
+    """Random generators, one for each part, so that one part's draws do not shift another's."""
+
+    room: np.random.Generator
+    pictures: np.random.Generator
+    arm: np.random.Generator
+    image: np.random.Generator
+    tests: np.random.Generator
+
+
+def run_session(
+    case: ServoCase,
+    seed: int,
+    *,
+    targets: tuple[str, ...] | None = None,
+    eyes: Eyes = picture_sight,
+    empty: StateChecker | None = None,
+) -> Session:
+    """Everything, in a room drawn from a seed.
+
+    Args:
+        case: The case.
+        seed: Of all that is drawn.
+        targets: Only these; all when None.
+        eyes: Who looks; ``pixel_sight`` leaves the pictures out.
+        empty: Judge of the room without the head, where one is at hand.
+
+    Raises:
+        NoAnswerError: The calibration, the mapping or a start pose could not be done; says what stood in the way.
+        InputError: The case contradicts itself.
+    """
+    parts = _Parts(*(np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(len(_Parts._fields))))
+    room = draw_room(case, parts.room)
+    sight = eyes(room, parts.pictures)
+    calibration = calibrate_by_robot(room, sight, empty or room_checker(case, None), parts.arm)
+    stereo_mm = _try_stereo(room, calibration, sight, parts.tests)
+    markers_m = case.markers.points + parts.image.normal(0.0, case.file.head.marker_mm, case.markers.points.shape)
+    targets_m = case.targets.points + parts.image.normal(0.0, case.file.head.target_mm, case.targets.points.shape)
+    seen = see_markers(room, calibration, sight, parts.tests)
+    mapping = _map(case, calibration, seen, markers_m, targets_m)
+    joint = case.file.servo.estimate == "joint"
+    guide = (JointGuide if joint else Guide)(Known(room, calibration, mapping, seen, markers_m, sight))
+    reached = _reach_all(room, guide, mapping, targets_m, calibration, parts.arm, targets)
+    return Session(seed, room, calibration, mapping, stereo_mm, reached, guide)
+
+
+def see_markers(room: Room, calibration: RobotHeld, sight: Sight, rng: np.random.Generator) -> list[Spots]:
+    """Every marker in every camera.
+
+    Raises:
+        NoAnswerError: A marker is not found.
+    """
+    head, servo_plan, found = room.case.file.head, room.case.file.servo, []
+    for name, point in zip(room.case.markers.names, room.markers_c, strict=True):
+        predicted = point + rng.normal(0.0, POINTED_MM, 3)
+        searches = tuple(Search(camera, predicted, servo_plan.search_px) for camera in calibration.cameras)
+        spots = look_at(sight, Placed(point, head.marker_diameter_mm / 2, None), searches, servo_plan.frames)
+        if isinstance(spots, Lost):
+            raise NoAnswerError(f"marker {name}: {spots.reason}")
+        found.append(spots)
+    return found
+
+
+def _map(case: ServoCase, calibration: RobotHeld, seen: list[Spots], markers_m: Floats, targets_m: Floats) -> Mapping:
+    points = [in_space(calibration.cameras, spots) for spots in seen]
+    markers = SeenMarkers(np.concatenate([p.points_c for p in points]), np.concatenate([p.covariance for p in points]))
+    names = case.markers.names
+    return map_head(names, markers, markers_m, case.file.head.marker_mm, targets_m, where=f"{case.path}: mapping")
+
+
+def _try_stereo(room: Room, calibration: RobotHeld, sight: Sight, rng: np.random.Generator) -> Floats:
+    """Error of the stereo at points anywhere in the calibrated volume, shape (10,), mm."""
+    T_c_base = np.asarray(np.linalg.inv(calibration.T_base_c), dtype=np.float64)
+    tool = room.case.file.tool
+    grid = grid_points(room.case)
+    rod_c = -T_c_base[:3, :3] @ held_rod(room.case, room).R_base_flange[:, 2]
+    errors = []
+    for point in rng.uniform(grid.min(axis=0), grid.max(axis=0), (TEST_POINTS, 3)):
+        ball = Placed(apply(room.T_c_base, point), tool.ball_diameter_mm / 2, rod_c, head_there=False)
+        searches = _searches(room.case, calibration, apply(T_c_base, point))
+        spots = look_at(sight, ball, searches, room.case.file.servo.frames)
+        if isinstance(spots, Lost):
+            raise NoAnswerError(f"stereo test: {spots.reason}")
+        errors.append(np.linalg.norm(in_space(calibration.cameras, spots).points_c[0] - ball.center_c))
+    return np.array(errors)
+
+
+def _searches(case: ServoCase, calibration: RobotHeld, predicted_c: Floats) -> tuple[Search, ...]:
+    return tuple(Search(camera, predicted_c, case.file.servo.search_px) for camera in calibration.cameras)
+
+
+def _reach_all(
+    room: Room,
+    guide: Guide,
+    mapping: Mapping,
+    targets_m: Floats,
+    calibration: RobotHeld,
+    rng: np.random.Generator,
+    wanted: tuple[str, ...] | None,
+) -> tuple[Reached, ...]:
+    case, held = room.case, held_rod(room.case, room)
+    names = case.targets.names
+    chosen = [i for i, name in enumerate(names) if wanted is None or name in wanted]
+    checker = room_checker(case, calibration.T_base_c @ mapping.T_c_m)
+    aims_base = apply(calibration.T_base_c, mapping.to_c(targets_m[chosen]))
+    hovers = way_up(held, aims_base, case.file.servo.hover_mm)
+    q = configurations(held, np.concatenate([aims_base, hovers]), checker, first=calibration.branch).q
+    limits = case.file.servo
+    steps = StepLimits(
+        limits.max_step_mm, float(np.radians(limits.max_joint_step_deg)), float(np.radians(limits.max_drift_deg))
+    )
+    task = Task(held, calibration.T_base_c, limits.tolerance_mm, limits.max_steps, limits.looks, steps, checker)
+    expected = mapping.expected_tre_mm(targets_m, case.file.head.target_mm)
+    q_true, reached = calibration.q_true[-1], []
+    for row, index in enumerate(chosen):
+        q_true = room.arm.settle(q[len(chosen) + row], q_true, rng)
+        guide.aim_at(targets_m[index])
+        one = _Aim(names[index], room.targets_c[index], float(expected[index]))
+        done = _reach(room, guide, task, q[len(chosen) + row], q[row], q_true, one, rng)
+        q_true = room.arm.settle(q[len(chosen) + row], done.servoed.q_true, rng)
+        reached.append(done)
+    return tuple(reached)
+
+
+class _Aim(NamedTuple):
+    name: str
+    target_c: Floats
+    expected_mm: float
+
+
+def _reach(
+    room: Room,
+    guide: Guide,
+    task: Task,
+    q_hover: Floats,
+    q_aim: Floats,
+    q_true: Floats,
+    aim: _Aim,
+    rng: np.random.Generator,
+) -> Reached:
+    """From where the arm hovers onto the target by the robot alone, then by the servo."""
+    contact = way_contact(task.checker, np.stack([q_hover, q_aim]))
+    if contact is None:
+        q_true = room.arm.settle(q_aim, q_true, rng)
+    before = float(np.linalg.norm(room.ball_c(q_true) - aim.target_c))
+    if contact is None:
+        state = [q_true]
+
+        def drive(q_command: Floats) -> Floats:
+            state[0] = room.arm.settle(q_command, state[0], rng)
+            return state[0]
+
+        done = servo(task, q_aim, q_true, guide.look, drive)
+    else:
+        done = Servoed(Stop.CONTACT, (), q_hover, q_true, f"{contact.body} and {contact.other}")
+    ball, estimated = room.ball_c(done.q_true), guide.target_c
+    return Reached(
+        aim.name,
+        done,
+        float(np.linalg.norm(estimated - aim.target_c)),
+        aim.expected_mm,
+        before,
+        float(np.linalg.norm(ball - aim.target_c)),
+        float(np.linalg.norm(ball - estimated)),
+    )

@@ -1,0 +1,198 @@
+"""The room as it truly is: an arm off its nominal model, two cameras, a head; drawn once for each seed.
+
+Two frames matter to the guidance. The base's, in which the arm is commanded; and C, which the measuring arm defines at
+the calibration and in which the cameras know themselves. Nobody is told how C lies in the base.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from puncture_twin.planning.arm.tool import Box, Tool
+from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.geometry.crossings import crossings
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.registration.registration import apply
+from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, stereo_pair, tangent_axes
+from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, ToolSection
+from puncture_twin.twin.plant.true_arm import ArmErrors, TrueArm, draw_true_arm
+
+Floats = NDArray[np.float64]
+
+SIGHT_RINGS = ((0.0, 1), (0.55, 6), (0.95, 12))
+"""Where on the ball's disc a line of sight ends: share of the radius, and how many around."""
+
+CAMERA_TURN_RAD = 0.004
+CAMERA_SHIFT_MM = 3.0
+CAMERA_AXIS_PX = 8.0
+CAMERA_FOCAL = 0.01
+"""How far a camera is from where it was planned: turn about each axis, shift along each, principal point, focal length
+(share). The calibration takes them out; until then the ball is searched for in a wide region."""
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """One drawn room. Whoever guides must not look in here.
+
+    Attributes:
+        case: What it was drawn from.
+        arm: The true arm.
+        T_c_base: Shape (4, 4), mm: the true arm's base in C.
+        cameras: The true cameras.
+        T_c_m: Shape (4, 4), mm: where the head truly stands, image frame to C.
+    """
+
+    case: ServoCase
+    arm: TrueArm
+    T_c_base: Floats
+    cameras: tuple[Camera, ...]
+    T_c_m: Floats
+
+    @property
+    def model(self) -> UrModel:
+        """The nominal arm."""
+        return self.arm.nominal
+
+    @property
+    def markers_c(self) -> Floats:
+        """Where the markers truly are, shape (n, 3), mm."""
+        return apply(self.T_c_m, self.case.markers.points)
+
+    @property
+    def targets_c(self) -> Floats:
+        """Where the targets truly are, shape (n, 3), mm."""
+        return apply(self.T_c_m, self.case.targets.points)
+
+    @cached_property
+    def head_c(self) -> TriangleMesh:
+        """The head's surface where it truly stands, C, mm."""
+        return self.case.skin.transformed(self.T_c_m)
+
+    def ball_c(self, q_true: Floats) -> Floats:
+        """Where the ball's centre truly is, shape (..., 3), mm, at true configurations (..., 6), rad."""
+        rod = self.case.file.tool.rod_mm
+        flange = self.arm.flange_pose(q_true)
+        return apply(self.T_c_base, flange[..., :3, 3] + rod * flange[..., :3, 2])
+
+    def rod_c(self, q_true: Floats) -> Floats:
+        """Unit direction from the ball along the rod to the flange, shape (3,), C."""
+        return np.asarray(-self.T_c_base[:3, :3] @ self.arm.flange_pose(q_true)[:3, 2])
+
+    def hidden_share(self, camera: Camera, point_c: Floats, radius_mm: float) -> float:
+        """Share of a ball's disc that the head hides from a camera, 0 to 1, by lines of sight."""
+        toward = point_c - camera.center_c
+        across = tangent_axes(toward / np.linalg.norm(toward))
+        angles = [(r * radius_mm, 2 * np.pi * k / n) for r, n in SIGHT_RINGS for k in range(n)]
+        spots = np.array([r * (np.cos(a) * across[:, 0] + np.sin(a) * across[:, 1]) for r, a in angles])
+        rays = toward + spots
+        lengths = np.linalg.norm(rays, axis=1)
+        nearby = self._head_about(camera.center_c, toward / np.linalg.norm(toward), radius_mm)
+        if nearby is None:
+            return 0.0
+        found = crossings(nearby, camera.center_c, rays / lengths[:, None])
+        nearest = np.full(len(rays), np.inf)
+        nearest[found.count > 0] = found.depth[found.first[found.count > 0]]
+        return float(np.mean(nearest < lengths - radius_mm))
+
+    @cached_property
+    def _head_triangles(self) -> tuple[Floats, Floats]:
+        """Middle (n, 3) of each of the head's triangles, and how far its corners are from there (n,), mm."""
+        corners = self.head_c.triangles
+        middles = corners.mean(axis=1)
+        return middles, np.asarray(np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1))
+
+    def _head_about(self, origin: Floats, direction: Floats, radius_mm: float) -> TriangleMesh | None:
+        """The triangles of the head that a cylinder about a line may meet; None where there are none."""
+        middles, reach = self._head_triangles
+        offsets = middles - origin
+        aside = np.linalg.norm(offsets - (offsets @ direction)[:, None] * direction, axis=1)
+        near = aside <= radius_mm + reach
+        return TriangleMesh(self.head_c.vertices, self.head_c.faces[near]) if near.any() else None
+
+
+def draw_room(case: ServoCase, rng: np.random.Generator) -> Room:
+    """A room with its errors drawn from the case's standard deviations.
+
+    Raises:
+        InputError: Cameras or arm that cannot be.
+    """
+    file = case.file
+    arm = draw_true_arm(ur_model(file.robot.model), arm_errors(case), rng)
+    T_base_c = calibration_frame(case)
+    T_c_base = np.asarray(np.linalg.inv(T_base_c), dtype=np.float64)
+    cameras = tuple(_misplaced(camera, rng) for camera in planned_cameras(case))
+    return Room(case, arm, T_c_base, cameras, T_c_base @ head_pose(case))
+
+
+def planned_cameras(case: ServoCase) -> tuple[Camera, ...]:
+    """The cameras as the case plans them; where they really stand nobody knows better than by calibration."""
+    plan = case.file.cameras
+    return stereo_pair(*plan.size_px, plan.focal_px, plan.baseline_mm, plan.distance_mm, plan.distortion)
+
+
+def _misplaced(camera: Camera, rng: np.random.Generator) -> Camera:
+    """A camera as it was really put up: turned, shifted, its lens off its focal length and axis."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(rng.normal(0.0, CAMERA_TURN_RAD, 3)).as_matrix()
+    T[:3, 3] = rng.normal(0.0, CAMERA_SHIFT_MM, 3)
+    cx, cy = np.array([camera.cx, camera.cy]) + rng.normal(0.0, CAMERA_AXIS_PX, 2)
+    focal = camera.fx * (1.0 + rng.normal(0.0, CAMERA_FOCAL))
+    return replace(camera, fx=focal, fy=focal, cx=float(cx), cy=float(cy), T_camera_c=T @ camera.T_camera_c)
+
+
+def arm_errors(case: ServoCase) -> ArmErrors:
+    """How far the case's arm is from its nominal model, mm and rad."""
+    robot = case.file.robot
+    angles = (robot.twist_deg, robot.joint_deg, robot.backlash_deg, robot.repeatability_deg)
+    return ArmErrors(robot.link_mm, *(float(np.radians(angle)) for angle in angles))
+
+
+def calibration_frame(case: ServoCase) -> Floats:
+    """T_base_c, shape (4, 4), mm: C at the calibrated volume's middle, z the way the cameras look, y down.
+
+    The cameras stand on the far side of the head, seen from the arm, and look back and down at it.
+    """
+    down = np.radians(case.file.cameras.elevation_deg)
+    T = np.eye(4)
+    z, y = [-np.cos(down), 0.0, -np.sin(down)], [np.sin(down), 0.0, -np.cos(down)]
+    T[:3, :3] = np.stack([np.cross(y, z), y, z], axis=1)
+    T[:3, 3] = case.file.calibration.center_mm
+    return T
+
+
+def head_pose(case: ServoCase) -> Floats:
+    """T_base_m, shape (4, 4), mm: the head's z up, its face (-y) along the base's x at yaw 0."""
+    head = case.file.head
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", 90.0 + head.yaw_deg, degrees=True).as_matrix()
+    T[:3, 3] = head.position_mm
+    return T
+
+
+def rod_tool(tool: ToolSection) -> Tool:
+    """Rod and holder for the collision checker; the rod as thick as its ball, and up to the ball's far side."""
+    length = tool.rod_mm + tool.ball_diameter_mm / 2
+    return Tool(length, length - tool.holder_mm, tool.ball_diameter_mm, tool.holder_diameter_mm)
+
+
+def room_checker(case: ServoCase, T_base_m: Floats | None) -> FastChecker:
+    """The planner's judge of contacts.
+
+    Args:
+        case: The case.
+        T_base_m: Where the head is believed to stand, shape (4, 4), mm; None for a room without it.
+    """
+    boxes = []
+    for box in case.file.box:
+        T = np.eye(4)
+        T[:3, 3] = box.center_mm
+        boxes.append(Box(box.name, T, box.size_mm))
+    skin = None if T_base_m is None else case.skin.transformed(T_base_m)
+    model, padding = ur_model(case.file.robot.model), case.file.servo.padding_mm
+    return FastChecker(model, rod_tool(case.file.tool), boxes, skin, padding_mm=padding)

@@ -1,0 +1,212 @@
+"""Recording in the twin: go to a pose, jog the needle into the slice, take a picture, detect, write down."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.pose_choice import choose_poses
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
+from puncture_twin.twin.guidance.ultrasound.candidate_poses import Candidates, drawing
+from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, Missed, detect
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedlePose, Picture, render
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import RoomTruth, jog_into_slice
+from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE
+from puncture_twin.twin.guidance.ultrasound.two_arms import BetweenArms, TwoArms
+
+Floats = NDArray[np.float64]
+
+JOG_FAILED = "jog out of reach"
+JOG_TOUCHES = "jog would touch"
+
+
+class Shot(NamedTuple):
+    """One picture with all that belongs to it."""
+
+    candidate: int
+    q_probe: Floats
+    """What the probe's arm was told, shape (6,), rad."""
+    q_needle: Floats
+    """The same of the needle's arm, after the jog."""
+    picture: Picture
+    found: Detection | Missed
+    true_needle: NeedlePose
+    """Where the needle truly was in the true image."""
+    touched: bool
+    """Whether the true arms truly touched each other."""
+
+
+@dataclass(frozen=True, eq=False)
+class Acquisition:
+    """What was recorded.
+
+    Attributes:
+        recording: Poses as the controllers print them, tips and directions as detected.
+        shots: The pictures behind it, in the same order.
+        missed: Pictures in which no needle was found, by reason, and poses that were given up.
+        missed_shots: Those pictures.
+        left: Indices of candidates that were never gone to.
+    """
+
+    recording: Recording
+    shots: tuple[Shot, ...]
+    missed: dict[str, int]
+    missed_shots: tuple[Shot, ...]
+    left: NDArray[np.int_]
+
+    def detection_errors(self) -> Floats:
+        """Detected minus true tip, along and across the true shaft, mm, and the angle's error, rad; shape (n, 3)."""
+        return np.array([_detection_error(shot) for shot in self.shots])
+
+
+class _Motion:
+    """Both true arms, which remember where their play left them; and whether they touch."""
+
+    def __init__(self, case: SelfcalCase, truth: RoomTruth, rng: np.random.Generator) -> None:
+        self._truth, self._rng = truth, rng
+        self.between = BetweenArms(case, truth.X, truth.Y, 0.0)
+        self._before: list[Floats | None] = [None, None]
+
+    def settle(self, which: int, q: Floats) -> Floats:
+        """Where the joints of arm 0 (probe) or 1 (needle) come to rest, shape (6,), rad."""
+        arm = (self._truth.probe_arm, self._truth.needle_arm)[which]
+        before = self._before[which]
+        rest = arm.settle(q, q if before is None else before, self._rng)
+        self._before[which] = rest
+        return rest
+
+
+def acquire(
+    case: SelfcalCase,
+    room: TwoArms,
+    candidates: Candidates,
+    truth: RoomTruth,
+    rng: np.random.Generator,
+    count: Callable[[int, int], None] = lambda done, total: None,
+) -> Acquisition:
+    """Record as many poses as the case asks for, choosing others for those in which the needle is not found.
+
+    Args:
+        case: The room.
+        room: Its collision checker: the jog is checked too.
+        candidates: Poses that can be taken.
+        truth: The true room.
+        rng: For the choice, if random, the arms' repeatability, what the jog leaves, and the pictures.
+        count: Told after every picture.
+
+    Raises:
+        NoAnswerError: The candidates are used up before enough pictures show the needle.
+    """
+    motion, wanted = _Motion(case, truth, rng), case.content.poses.count
+    shots: list[Shot] = []
+    missed: list[Shot] = []
+    given_up: Counter[str] = Counter()
+    left = np.arange(len(candidates.q_probe))
+    while len(shots) < wanted:
+        if wanted - len(shots) > len(left):
+            raise NoAnswerError(_too_few(case, candidates, shots, missed, given_up), counts=candidates.counts)
+        chosen = choose(case, candidates, left, wanted - len(shots), rng, shots)
+        left = np.setdiff1d(left, chosen)
+        for row in chosen:
+            taken = _shot(case, room, candidates, truth, motion, int(row), rng)
+            if isinstance(taken, str):
+                given_up[taken] += 1
+            elif isinstance(taken.found, Missed):
+                missed.append(taken)
+            else:
+                shots.append(taken)
+            tried = len(missed) + given_up.total()
+            count(len(shots) + tried, wanted + tried)
+    reasons = Counter(shot.found.value for shot in missed if isinstance(shot.found, Missed)) + given_up
+    return Acquisition(_recording(room, shots), tuple(shots), dict(reasons), tuple(missed), left)
+
+
+def choose(
+    case: SelfcalCase,
+    candidates: Candidates,
+    left: NDArray[np.int_],
+    n: int,
+    rng: np.random.Generator,
+    shots: list[Shot],
+) -> NDArray[np.int_]:
+    """The next n candidates of those left: the most informative beside what is recorded, or at random."""
+    if case.content.poses.choose == "random":
+        return np.sort(rng.choice(left, n, replace=False))
+    recorded = candidates.poses.subset(np.array([shot.candidate for shot in shots])) if shots else None
+    noise = choice_noise(case)
+    return left[choose_poses(candidates.poses.subset(left), n, noise, drawing(case), recorded=recorded)]
+
+
+def choice_noise(case: SelfcalCase) -> Noise:
+    """The noise that poses are chosen for: the case's, or the usual one."""
+    return SPEC_NOISE if case.content.noise is None else case.content.noise.noise()
+
+
+def _shot(
+    case: SelfcalCase,
+    room: TwoArms,
+    candidates: Candidates,
+    truth: RoomTruth,
+    motion: _Motion,
+    row: int,
+    rng: np.random.Generator,
+) -> Shot | str:
+    """Go to one candidate and take its picture, or say why it was given up."""
+    q_probe = candidates.q_probe[row]
+    rest_probe = motion.settle(0, q_probe)
+    wanted = _after_jog(case, candidates.poses, row, rng)
+    q_needle = jog_into_slice(truth, rest_probe, candidates.q_needle[row], wanted, float(candidates.roll[row]))
+    if np.isnan(q_needle).any():
+        return JOG_FAILED
+    if room.verdict(q_probe, q_needle) is not None:
+        return JOG_TOUCHES
+    rest_needle = motion.settle(1, q_needle)
+    needle = truth.needle_in_image(rest_probe, rest_needle)
+    imager = case.content.image.imager()
+    picture = render(imager, needle, rng, echo=case.content.image.echo())
+    touched = not motion.between.apart(rest_probe, rest_needle)
+    return Shot(row, q_probe, q_needle, picture, detect(picture, imager), needle, touched)
+
+
+def _after_jog(case: SelfcalCase, poses: Recording, row: int, rng: np.random.Generator) -> NeedlePose:
+    """Where the needle is to stand in the image, with what the operator leaves: off the plane, and leaning."""
+    off = case.content.truth
+    assert poses.v is not None  # candidates are made with directions
+    lean = rng.normal(0.0, np.radians(off.lean_deg))
+    tip = np.array([*poses.P[row], rng.normal(0.0, off.off_plane_mm)])
+    return NeedlePose(tip, np.array([*(np.cos(lean) * poses.v[row]), np.sin(lean)]))
+
+
+def _recording(room: TwoArms, shots: list[Shot]) -> Recording:
+    found = [shot.found for shot in shots if isinstance(shot.found, Detection)]
+    return Recording(
+        flange_pose(room.probe_model, np.array([shot.q_probe for shot in shots])),
+        flange_pose(room.needle_model, np.array([shot.q_needle for shot in shots])),
+        np.array([one.tip_image for one in found]),
+        np.array([one.direction_image for one in found]),
+    )
+
+
+def _detection_error(shot: Shot) -> tuple[float, float, float]:
+    assert isinstance(shot.found, Detection)  # only those are kept as shots
+    d = shot.true_needle.direction_image[:2] / np.linalg.norm(shot.true_needle.direction_image[:2])
+    e = shot.found.tip_image - shot.true_needle.tip_image[:2]
+    v = shot.found.direction_image
+    return float(e @ d), float(d[0] * e[1] - d[1] * e[0]), float(np.arctan2(d[0] * v[1] - d[1] * v[0], d @ v))
+
+
+def _too_few(
+    case: SelfcalCase, candidates: Candidates, shots: list[Shot], missed: list[Shot], given_up: Counter[str]
+) -> str:
+    return (
+        f"{len(shots)} of {case.content.poses.count} poses show the needle; of {len(candidates.q_probe)} candidates "
+        f"{len(missed)} showed none and {given_up.total()} were given up. More [poses] samples would help"
+    )

@@ -1,0 +1,242 @@
+"""What a self-calibration found, and how well it is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2, f
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, PARAMETERS, T_Q, Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip, tip_residuals
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import log, tangent_basis
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.solve import Solution, solve
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import Spread
+
+Floats = NDArray[np.float64]
+
+SHAFT_BIAS = (
+    "a constant error of the detected tip along the shaft moves the tip in the needle's flange frame and leaves every "
+    "residual as it is; the known needle length would hold it"
+)
+SCALE_TAKEN = "the image's mm per pixel was taken as given: 1 % off makes the error at the tip half as large again"
+DIRECTION_SIGN = (
+    "no directions were measured: the needle's axis comes from the image plane alone, pointing from flange to tip"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """X, Y and the needle in its flange frame, from A X P = Y B Q.
+
+    Attributes:
+        X: T_end1_image, shape (4, 4), mm.
+        Y: T_base1_base2, shape (4, 4), mm.
+        tip_end2: t_Q, the needle's tip, shape (3,), mm, frame end2.
+        needle_direction_end2: V, unit, toward the tip, shape (3,), frame end2.
+        scale: mm per unit of P along u and v, shape (2,); ones where it was not asked for.
+        residuals: Y B Q - A X P, shape (n, 3), mm, base1, of every pose.
+        rms_mm: Root mean square length of the residuals of the poses that were used.
+        weights: One per pose, shape (n,): 1 used, 0 set aside.
+        outliers: Names of the poses set aside.
+        iterations: Steps of the refinement, all rounds together.
+        condition: Least over largest singular value of the Jacobian, lengths in 100 mm.
+        covariance: Shape (p, p), of the parameters named below.
+        parameters: Names with their units; rotations are small turns on the right, R exp([w]x).
+        freedom: Residuals minus unknowns.
+        noise: What the weights were made from: given, or found from the residuals (``Spread``).
+        noise_ratio: Size of the residuals over what ``noise`` expects; far above 1 says that the noise is larger.
+        tip_bias_mm: How far the detected tip lies beyond the true one along the shaft; None without a needle length.
+        orientations: M, rotation from end2 to image, shape (n, 3, 3): how the needle stood in the image.
+        cannot_show: What the data cannot tell, in words.
+    """
+
+    X: Floats
+    Y: Floats
+    tip_end2: Floats
+    needle_direction_end2: Floats
+    scale: Floats
+    residuals: Floats
+    rms_mm: float
+    weights: Floats
+    outliers: tuple[str, ...]
+    iterations: int
+    condition: float
+    covariance: Floats
+    parameters: tuple[str, ...]
+    freedom: int
+    noise: Noise | Spread
+    noise_ratio: float
+    tip_bias_mm: float | None
+    orientations: Floats
+    cannot_show: tuple[str, ...]
+
+    def tre(self, A: Floats, B: Floats, P: Floats) -> Floats:
+        """Length of Y B Q - A X P where the true poses and the true tip are given, shape (n,), mm.
+
+        Args:
+            A: True T_base1_end1, shape (n, 4, 4), mm.
+            B: True T_base2_end2, shape (n, 4, 4), mm.
+            P: True tip in the image, shape (n, 2), in the recording's unit.
+        """
+        return np.asarray(np.linalg.norm(tip_residuals(self.estimate, Recording(A, B, P)), axis=1))
+
+    def predicted_tre_mm(self, points_image: Floats, A: Floats) -> Floats:
+        """Expected (rms) distance of the tip from a target seen in the image, from the covariance alone.
+
+        The needle is taken to stand in the image as it did in the recording, one orientation as likely as the other.
+
+        Args:
+            points_image: Shape (m, 2), in the recording's unit.
+            A: T_base1_end1, shape (4, 4) or (m, 4, 4), mm.
+
+        Returns:
+            Shape (m,), mm.
+        """
+        points = np.atleast_2d(np.asarray(points_image, dtype=np.float64))[:, :2]
+        A = np.broadcast_to(A, (len(points), 4, 4))
+        mean = self.orientations.mean(axis=0)
+        J = linearised_tip(self.estimate, self._aimed(points, A)).jacobian
+        J[:, :, T_Q] = A[:, :3, :3] @ self.X[:3, :3] @ mean
+        names = np.array(self.parameters)
+        J = J[:, :, [PARAMETERS.index(name) for name in names]]
+        squared = np.einsum("nip,pq,niq->n", J, self.covariance, J)
+        tip = np.flatnonzero(np.char.startswith(names, "t_Q"))
+        if len(tip):  # what the mean orientation leaves out of E[R_B C R_B^T]
+            squared = squared + np.trace(self.covariance[np.ix_(tip, tip)] @ (np.eye(3) - mean.T @ mean))
+        return np.asarray(np.sqrt(squared))
+
+    def _aimed(self, points: Floats, A: Floats) -> Recording:
+        """Poses of the needle's arm that bring the tip to image points."""
+        estimate = self.estimate
+        in_end1 = (points * self.scale) @ estimate.R_X[:, :2].T + estimate.t_X
+        target = np.einsum("nij,nj->ni", A[:, :3, :3], in_end1) + A[:, :3, 3]
+        B = np.tile(np.eye(4), (len(points), 1, 1))
+        B[:, :3, 3] = (target - estimate.t_Y) @ estimate.R_Y - estimate.t_Q
+        return Recording(A, B, points)
+
+    @property
+    def estimate(self) -> Estimate:
+        """The same values, as the solvers take them."""
+        X, Y = self.X, self.Y
+        tip, V = self.tip_end2, self.needle_direction_end2
+        return Estimate(X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3], tip, self.scale, V)
+
+    def parameter_error(self, truth: Estimate) -> Floats:
+        """Truth minus estimate in the order of ``parameters``, shape (p,): the step that leads to the truth."""
+        own = self.estimate
+        parts = [
+            log(own.R_X.T @ truth.R_X),
+            truth.t_X - own.t_X,
+            log(own.R_Y.T @ truth.R_Y),
+            truth.t_Y - own.t_Y,
+            truth.t_Q - own.t_Q,
+            truth.scale - own.scale,
+            tangent_basis(own.V).T @ truth.V,
+        ]
+        return np.concatenate(parts)[[PARAMETERS.index(name) for name in self.parameters]]
+
+    def region_limit(self, level: float = 0.95) -> float:
+        """Largest e^T C^-1 e inside the confidence region, e as in ``parameter_error``.
+
+        Chi-squared for a given noise. For a spread found from the residuals Fisher's F; the least-known part of that
+        spread has one residual per pose, so that only this share of the freedom counts.
+        """
+        p = len(self.parameters)
+        if isinstance(self.noise, Noise):
+            return float(chi2.ppf(level, p))
+        per_pose = 5 if "V_1_rad" in self.parameters else 3
+        return float(p * f.ppf(level, p, max(self.freedom / per_pose, 1.0)))
+
+
+def calibrate(
+    recording: Recording,
+    *,
+    noise: Noise | None = None,
+    known_tip: Floats | None = None,
+    needle_length_mm: float | None = None,
+    scale: bool = False,
+    robust: bool = True,
+    direction: bool = True,
+    start: Estimate | None = None,
+) -> Calibration:
+    """Solve A X P = Y B Q: closed form, then weighted least squares over the poses that agree.
+
+    Args:
+        recording: At least 16 poses (20 are better); 7 with ``known_tip``; unknowns / 3 + 1 with ``start``.
+        noise: Of both arms and the image; None finds the residuals' spread inside and across the image by itself.
+        known_tip: t_Q, shape (3,), mm, frame end2, where it is known.
+        needle_length_mm: Distance along the shaft from the flange's origin to the tip: holds a constant error of the
+            detected tip along the shaft, which nothing else can.
+        scale: Find mm per unit of P along both axes of the image.
+        robust: Set aside poses that disagree with the others.
+        direction: Let measured directions take part, where the recording has them.
+        start: Begin here instead of at the closed form.
+
+    Raises:
+        InputError: Too few poses, or more than half of them disagree.
+        Degenerate: The poses cannot show every unknown. It names the motion and proposes further poses.
+    """
+    if needle_length_mm is not None and not 0 < needle_length_mm < np.inf:
+        raise InputError(f"needle length {needle_length_mm}", where="needle_length_mm", allowed="a positive number, mm")
+    solution = solve(
+        recording, noise=noise, known_tip=known_tip, scale=scale, robust=robust, direction=direction, start=start
+    )
+    estimate, covariance, bias = solution.estimate, solution.covariance, None
+    if needle_length_mm is not None and known_tip is None:
+        bias = float(estimate.V @ estimate.t_Q) - needle_length_mm
+        covariance = _with_length(solution, bias)
+        estimate = estimate._replace(t_Q=estimate.t_Q - bias * estimate.V)
+    cannot = [SHAFT_BIAS] * (needle_length_mm is None and known_tip is None) + [SCALE_TAKEN] * (not scale)
+    cannot += [DIRECTION_SIGN] * (recording.v is None)
+    return _assembled(recording, solution._replace(estimate=estimate, covariance=covariance), bias, tuple(cannot))
+
+
+def _assembled(recording: Recording, solution: Solution, bias: float | None, cannot: tuple[str, ...]) -> Calibration:
+    estimate, kept = solution.estimate, solution.tip_kept
+    return Calibration(
+        _pose(estimate.R_X, estimate.t_X),
+        _pose(estimate.R_Y, estimate.t_Y),
+        _frozen(estimate.t_Q),
+        _frozen(estimate.V),
+        _frozen(estimate.scale),
+        _frozen(solution.residuals),
+        float(np.sqrt(np.mean(np.sum(solution.residuals[kept] ** 2, axis=1)))),
+        _frozen(1.0 * kept),
+        tuple(name for name, used in zip(recording.names, kept, strict=True) if not used),
+        solution.iterations,
+        solution.observability.ratio,
+        _frozen(solution.covariance),
+        tuple(PARAMETERS[column] for column in solution.active),
+        solution.freedom,
+        solution.noise,
+        solution.noise_ratio,
+        bias,
+        _frozen(solution.orientations),
+        cannot,
+    )
+
+
+def _with_length(solution: Solution, bias: float) -> Floats:
+    """The covariance after t_Q <- t_Q - (V.t_Q - length) V."""
+    V, t_Q = solution.estimate.V, solution.estimate.t_Q
+    full = np.eye(len(PARAMETERS))
+    full[T_Q, T_Q] -= np.outer(V, V)
+    full[T_Q, DIRECTION] = -(bias * np.eye(3) + np.outer(V, t_Q)) @ tangent_basis(V)
+    change = full[np.ix_(solution.active, solution.active)]
+    return np.asarray(change @ solution.covariance @ change.T)
+
+
+def _pose(R: Floats, t: Floats) -> Floats:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return _frozen(T)
+
+
+def _frozen(array: ArrayLike) -> Floats:
+    copy = np.array(array, dtype=np.float64)
+    copy.setflags(write=False)
+    return copy

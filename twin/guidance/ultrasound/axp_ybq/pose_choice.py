@@ -1,0 +1,164 @@
+"""Which of many possible poses to record: those that tell most about the error at the tip."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import parameter_units
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import covariances, whitener
+
+Floats = NDArray[np.float64]
+Criterion = Literal["tre", "D"]
+
+PRIOR_WEIGHT = 1e-6
+"""Information that every parameter is taken to have beforehand, as a share of a candidate's; for the first picks."""
+
+NO_INFORMATION = 1e-13
+"""Least over largest eigenvalue of an information matrix below which nothing but rounding is left."""
+
+MAX_SWEEPS = 20
+"""How often all chosen poses are looked at for a better exchange."""
+
+WORTH = 1e-4
+"""An exchange must lower the criterion by this share."""
+
+
+class _Design(NamedTuple):
+    """What every candidate tells, and what is to be known."""
+
+    rows: Floats
+    """Jacobian of each candidate over its residuals' spread, shape (n, 3, p): its information is rows^T rows."""
+    wanted: Floats
+    """Mean of J^T J over the workspace, shape (p, p): trace(C wanted) is the mean squared error at the tip."""
+    base: Floats
+    """Information held beforehand, shape (p, p)."""
+    criterion: Criterion
+
+    def information(self, index: int) -> Floats:
+        """Of one candidate, shape (p, p)."""
+        return np.asarray(self.rows[index].T @ self.rows[index])
+
+
+def choose_poses(
+    candidates: Recording,
+    n: int,
+    noise: Noise,
+    prior: Calibration | Estimate,
+    *,
+    criterion: Criterion = "tre",
+    recorded: Recording | None = None,
+) -> NDArray[np.int_]:
+    """Choose poses by Fisher information: greedily, then by exchange until no single exchange helps.
+
+    Args:
+        candidates: Poses that could be recorded, with the tip where it would show.
+        n: How many to choose.
+        noise: Of both arms and the image.
+        prior: A rough calibration, such as the drawing's: 10 deg and 20 mm off will do.
+        criterion: ``tre``, least mean squared error at the tip over all candidates (A-optimal for that error), or
+            ``D``, least volume of the confidence region.
+        recorded: Poses that are recorded already and count.
+
+    Returns:
+        Indices into the candidates, ascending.
+
+    Raises:
+        InputError: More poses asked for than there are candidates, or none.
+    """
+    if not 0 < n <= len(candidates):
+        raise InputError(f"{n} poses of {len(candidates)} candidates", where="pose choice", allowed="1 to all of them")
+    prior = prior.estimate if isinstance(prior, Calibration) else prior
+    design = _design(candidates, noise, prior, recorded, criterion)
+    chosen: list[int] = []
+    H = design.base
+    for _ in range(n):
+        chosen.append(_best(design, H, chosen))
+        H = H + design.information(chosen[-1])
+    return np.sort(_exchanged(design, H, chosen))
+
+
+def expected_tre_mm(poses: Recording, noise: Noise, prior: Estimate, workspace: Recording) -> float:
+    """Cramer-Rao bound of the rms error at the tip over a workspace, mm, if these poses are recorded.
+
+    Infinite where they leave a combination of the unknowns free.
+    """
+    rows = _whitened(poses, noise, prior)
+    H = np.einsum("nip,niq->pq", rows, rows)
+    values = np.linalg.eigvalsh(H)
+    if values[0] <= NO_INFORMATION * values[-1]:
+        return float("inf")
+    return float(np.sqrt(np.trace(np.linalg.solve(H, _wanted(workspace, prior)))))
+
+
+def _scaled(recording: Recording, prior: Estimate) -> Floats:
+    active = active_columns(tip=True, scale=False, direction=False)
+    return np.asarray(linearised_tip(prior, recording).jacobian[:, :, active] * parameter_units(active, prior.scale))
+
+
+def _whitened(recording: Recording, noise: Noise, prior: Estimate) -> Floats:
+    W = whitener(covariances(prior, recording, noise), np.ones((len(recording), 3)))
+    return np.asarray(W @ _scaled(recording, prior))
+
+
+def _wanted(workspace: Recording, prior: Estimate) -> Floats:
+    J = _scaled(workspace, prior)
+    return np.asarray((J.transpose(0, 2, 1) @ J).mean(axis=0))
+
+
+def _design(
+    candidates: Recording, noise: Noise, prior: Estimate, recorded: Recording | None, criterion: Criterion
+) -> _Design:
+    rows = _whitened(candidates, noise, prior)
+    base = PRIOR_WEIGHT * np.diag((rows**2).sum(axis=1).mean(axis=0))
+    if recorded is not None:
+        held = _whitened(recorded, noise, prior).reshape(-1, rows.shape[2])
+        base = base + held.T @ held
+    return _Design(rows, _wanted(candidates, prior), base, criterion)
+
+
+def _value(design: _Design, H: Floats) -> float:
+    """Mean squared error at the tip, or the size of the confidence region per parameter; the less, the better."""
+    if design.criterion == "tre":
+        return float(np.trace(np.linalg.solve(H, design.wanted)))
+    return float(np.exp(-np.linalg.slogdet(H)[1] / len(H)))
+
+
+def _values_with(design: _Design, H: Floats) -> Floats:
+    """The value with each candidate added, shape (n,), by Woodbury's identity: only 3 x 3 systems are solved."""
+    C = np.linalg.inv(H)
+    GC = design.rows @ C
+    S = np.eye(3) + GC @ design.rows.transpose(0, 2, 1)
+    if design.criterion == "tre":
+        gained = np.linalg.solve(S, GC @ design.wanted @ GC.transpose(0, 2, 1))
+        return np.asarray(_value(design, H) - np.trace(gained, axis1=1, axis2=2))
+    return np.asarray(_value(design, H) * np.exp(-np.linalg.slogdet(S)[1] / len(H)))
+
+
+def _best(design: _Design, H: Floats, without: list[int]) -> int:
+    """The candidate whose addition leaves the least value."""
+    values = _values_with(design, H)
+    values[without] = np.inf
+    return int(np.argmin(values))
+
+
+def _exchanged(design: _Design, H: Floats, chosen: list[int]) -> NDArray[np.int_]:
+    """Give each chosen pose up for the best other one, until none is worth it (Fedorov 1972)."""
+    for _ in range(MAX_SWEEPS):
+        changed = False
+        for place, index in enumerate(list(chosen)):
+            without = H - design.information(index)
+            best = _best(design, without, chosen[:place] + chosen[place + 1 :])
+            after = without + design.information(best)
+            if best != index and _value(design, after) < (1 - WORTH) * _value(design, H):
+                chosen[place], H, changed = best, after, True
+        if not changed:
+            break
+    return np.array(chosen)

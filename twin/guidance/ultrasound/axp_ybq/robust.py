@@ -1,0 +1,238 @@
+"""Least squares that single wrong poses cannot bend: find them, set them aside, fit the others.
+
+1. Fit all. If no studentised residual stands out, that is the answer, at full efficiency.
+2. Otherwise weigh residuals down as they grow, first by Huber's weights, then by Tukey's; the scale from the median.
+3. Set aside what stands out there, fit the rest by plain (weighted) least squares, and look once more at all poses.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import HALF_NORMAL
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import (
+    Problem,
+    linearise,
+    problem_covariances,
+    refine,
+    residual_weights,
+)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import directions_image, needle_in_image
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import Spread, whitener
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+FALSE_ALARMS = 0.01
+"""Chance that a recording without outliers loses a pose."""
+
+HUBER_STEPS, TUKEY_STEPS = 6, 12
+HUBER, TUKEY = (float(np.sqrt(2 * gammaincinv(3 / 2, level))) for level in (0.8, 0.9999))
+"""Where the weights begin to fall, and where they reach zero, in standard deviations."""
+
+LEAST_MM = 1e-9
+"""Below this there is no noise, only rounding."""
+
+ROUNDING = 1e-6
+"""Mm, and rad: residuals of this size are rounding, and none of them stands out."""
+
+STILL_USED = 0.05
+"""Tukey's weight from which on a pose counts as one that agrees."""
+
+ALARM_SHARE = 0.6
+"""Share of the spread that is believed while outliers may be in it: a false alarm costs time, not accuracy."""
+
+LOOKS = 5
+"""How often poses may change sides before the last split is kept."""
+
+LEAST_KEPT = 0.5
+"""If more than half of the poses disagree, nobody can say which half is right."""
+
+
+class RobustFit(NamedTuple):
+    """A fit, and which poses made it."""
+
+    estimate: Estimate
+    tip_kept: Flags
+    """Shape (n,): the tip of this pose was used."""
+    direction_kept: Flags
+    """Shape (n,): its direction was used."""
+    iterations: int
+
+
+class Fitted(NamedTuple):
+    """A problem linearised at its fit."""
+
+    residuals: Floats
+    """Shape (n, k)."""
+    jacobian: Floats
+    """Shape (n, k, p)."""
+    sigma: Floats
+    """Expected covariance of each pose's residuals, shape (n, k, k)."""
+    white: Floats
+    """The residuals of the poses that were used, over their spread, shape (n, k)."""
+    covariance: Floats
+    """Of the free parameters, shape (p, p)."""
+
+
+def fitted(problem: Problem, fit: RobustFit) -> Fitted:
+    """Linearise a problem at its fit; the covariance is the inverse of J^T W J over the poses that were used."""
+    r, J = linearise(problem, fit.estimate)
+    sigma = problem_covariances(problem, fit.estimate)
+    W = whitener(sigma, residual_weights(problem, fit.tip_kept, fit.direction_kept))
+    slopes = (W @ J).reshape(-1, J.shape[2])
+    C = np.linalg.pinv(slopes.T @ slopes, hermitian=True)
+    return Fitted(r, J, sigma, (W @ r[:, :, None])[:, :, 0], np.asarray(C, dtype=np.float64))
+
+
+class _Block(NamedTuple):
+    """One kind of residual."""
+
+    rows: slice
+    median: float
+    limit: float
+    """Of the squared studentised residual, for a recording of this size."""
+    least: float
+    """Variance over the expected one below which it is not believed: told noise is there; less than rounding is not."""
+
+
+def plain_fit(problem: Problem, start: Estimate) -> RobustFit:
+    """Least squares over all poses."""
+    ones = np.ones(len(problem.recording))
+    fit = refine(problem, start, residual_weights(problem, ones, ones))
+    return RobustFit(fit.estimate, ones > 0, ones > 0, fit.iterations)
+
+
+def robust_fit(problem: Problem, start: Estimate) -> RobustFit:
+    """Least squares over the poses that agree.
+
+    Raises:
+        InputError: More than half of the poses disagree.
+    """
+    fit = plain_fit(problem, start)
+    if isinstance(problem.noise, Spread):
+        problem = problem._replace(noise=_median_spread(problem, fit.estimate))
+    if all(part.all() for part in _judge(problem, fit, alarm=True)):
+        return fit
+    return settled(problem, _reweighted(problem, fit))
+
+
+def settled(problem: Problem, fit: RobustFit, *, judge: bool = True) -> RobustFit:
+    """Fit the poses that were kept, judge all poses by it, and so on until none changes sides.
+
+    Args:
+        problem: It may have grown since the fit (directions, another spread).
+        fit: Where to begin.
+        judge: Whether poses may change sides at all.
+
+    Raises:
+        InputError: More than half of the poses disagree.
+    """
+    kept = (fit.tip_kept, fit.direction_kept)
+    for _ in range(LOOKS):
+        _check_enough(problem, kept[0])
+        again = refine(problem, fit.estimate, residual_weights(problem, kept[0], kept[1]))
+        fit = RobustFit(again.estimate, *kept, fit.iterations + again.iterations)
+        kept = _judge(problem, fit) if judge else kept
+        if all(np.array_equal(new, old) for new, old in zip(kept, fit[1:3], strict=True)):
+            break
+    return fit
+
+
+def _median_spread(problem: Problem, estimate: Estimate) -> Spread:
+    """The tip's spread inside and across the image, from medians: outliers hardly move it."""
+    to_image = (problem.recording.A[:, :3, :3] @ estimate.R_X).transpose(0, 2, 1)
+    r = np.abs(to_image @ linearise(problem, estimate).residuals[:, :3, None])[:, :, 0]
+    inside, across = (max(float(np.median(part)) / HALF_NORMAL, LEAST_MM) for part in (r[:, :2], r[:, 2]))
+    return Spread(max(inside, across / 3), max(across, inside / 3), 1.0)
+
+
+def _blocks(problem: Problem) -> list[_Block]:
+    """The tip's three residuals, and the direction's one inside the image: across it little is claimed."""
+    quantile, noise = 1 - FALSE_ALARMS / len(problem.recording), problem.noise
+    least = least_turn = 1.0
+    if isinstance(noise, Spread):
+        least, least_turn = (ROUNDING / noise.inside_mm) ** 2, (ROUNDING / noise.direction_rad) ** 2
+    found = [_Block(slice(0, 3), _chi_squared(0.5, 3), _chi_squared(quantile, 3), least)]
+    if problem.with_direction:
+        found.append(_Block(slice(3, 4), _chi_squared(0.5, 1), _chi_squared(quantile, 1), least_turn))
+    return found
+
+
+def _chi_squared(level: float, freedom: int) -> float:
+    """Quantile of the chi-squared distribution (scipy.stats takes a hundred times as long)."""
+    return float(2 * gammaincinv(freedom / 2, level))
+
+
+def _judge(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[Flags, Flags]:
+    """Which tips and which directions agree with the fit, given how far each one pulled it.
+
+    Args:
+        problem: What was fitted.
+        fit: The fit.
+        alarm: Only ask whether a closer look is due, after a fit of all poses, whose outliers widen the spread.
+    """
+    r, J, sigma, _, C = fitted(problem, fit)
+    pulled = J @ C @ J.transpose(0, 2, 1)
+    kept = []
+    for block, used in zip(_blocks(problem), (fit.tip_kept, fit.direction_kept), strict=False):
+        own = sigma[:, block.rows, block.rows]
+        sign = np.where(used, -1.0, 1.0)[:, None, None]
+        S = own + sign * pulled[:, block.rows, block.rows]
+        size = _squared(r[:, block.rows], _lifted(S, own))
+        believed = _scale(size[used], block, ALARM_SHARE if alarm else 1.0)
+        kept.append(size <= block.limit * believed)
+    return kept[0], kept[1] & _facing(problem, fit.estimate) if problem.with_direction else fit.direction_kept
+
+
+def _facing(problem: Problem, estimate: Estimate) -> Flags:
+    """Whether a direction points the way of V at all: one that is turned round has no residual."""
+    m = needle_in_image(estimate, problem.recording) @ estimate.V
+    return np.asarray(np.einsum("ni,ni->n", m, directions_image(problem.recording, estimate)) > 0)
+
+
+def _scale(squared: Floats, block: _Block, share: float = 1.0) -> float:
+    """Variance over the expected one, from the median."""
+    return max(share * float(np.median(squared)) / block.median, block.least)
+
+
+def _squared(r: Floats, S: Floats) -> Floats:
+    return np.asarray(np.einsum("ni,ni->n", r, np.linalg.solve(S, r[:, :, None])[:, :, 0]))
+
+
+def _lifted(S: Floats, own: Floats) -> Floats:
+    """S with what rounding and a pose of nearly full leverage leave of it lifted to a thousandth of its own noise."""
+    least = 1e-3 * np.trace(own, axis1=1, axis2=2)[:, None, None] / own.shape[1] * np.eye(own.shape[1])
+    return np.asarray(S + least)
+
+
+def _reweighted(problem: Problem, fit: RobustFit) -> RobustFit:
+    """Huber, then Tukey; every pose still counts as used, with a weight below 1."""
+    estimate, weights = fit.estimate, [np.ones(len(problem.recording))] * 2
+    for step in range(HUBER_STEPS + TUKEY_STEPS):
+        r = linearise(problem, estimate).residuals
+        sigma = problem_covariances(problem, estimate)
+        for k, block in enumerate(_blocks(problem)):
+            squared = _squared(r[:, block.rows], sigma[:, block.rows, block.rows])
+            size = np.sqrt(squared / _scale(squared, block))
+            falls = np.minimum(1.0, HUBER / np.maximum(size, 1e-12))
+            weights[k] = falls if step < HUBER_STEPS else np.maximum(1 - (size / TUKEY) ** 2, 0.0) ** 2
+        estimate = refine(problem, estimate, residual_weights(problem, *weights), max_steps=1).estimate
+    steps = fit.iterations + HUBER_STEPS + TUKEY_STEPS
+    return RobustFit(estimate, weights[0] > STILL_USED, weights[1] > STILL_USED, steps)
+
+
+def _check_enough(problem: Problem, kept: Flags) -> None:
+    n, unknowns = len(problem.recording), len(problem.active)
+    if kept.sum() < max(LEAST_KEPT * n, unknowns / 3 + 1):
+        raise InputError(
+            f"only {int(kept.sum())} of {n} poses agree with each other",
+            where="recording",
+            allowed="a recording in which most tips are right",
+        )

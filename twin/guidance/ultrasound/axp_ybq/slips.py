@@ -1,0 +1,127 @@
+"""Recordings that were written in another reading: inverse poses, arms in each other's place, metres.
+
+Such a recording still has a best fit, with residuals of centimetres, and no pose stands out because all are wrong. So
+where the reading as given does not fit, the slips that people make are undone one by one; the one that then fits is
+named. A recording that fits in no reading is refused too: its calibration would send the needle anywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+
+Floats = NDArray[np.float64]
+Reading = Callable[[Recording], Recording]
+
+SUSPECT_MM = 1.5
+"""Residuals (rms) from which on other readings are tried: three times those of a usual recording."""
+
+SOUND_MM = 5.0
+"""Residuals (rms) beyond which nothing was calibrated, whatever the reason."""
+
+BETTER = 1 / 3
+"""A reading whose residuals are below this part of the given one's, and are not suspect, is the right one."""
+
+LEAST_REACH_MM = 20.0
+"""An arm whose flange never leaves this distance of its base was written in metres."""
+
+ALLOWED = "A = T_base1_end1 and B = T_base2_end2 in mm, rotations by rows, P in mm"
+
+
+def checked_calibration(recording: Recording, fit: Callable[[], Calibration], where: Path) -> Calibration:
+    """A calibration of a recording from outside, if the recording was read as it was meant.
+
+    Args:
+        recording: As its file gives it.
+        fit: Calibrates it.
+        where: Its file.
+
+    Raises:
+        InputError: Another reading fits and this one does not, or none does; or what ``fit`` refuses.
+    """
+    _check_reach(recording, where)
+    try:
+        found = fit()
+    except InputError:
+        _refuse_slip(recording, np.inf, where)
+        raise
+    if found.rms_mm > SUSPECT_MM:
+        _refuse_slip(recording, found.rms_mm, where)
+    if found.rms_mm > SOUND_MM:
+        what = f"residuals of {found.rms_mm:.3g} mm (rms): the poses and the image do not belong together"
+        raise InputError(what, where=where, allowed=f"residuals up to {SOUND_MM:g} mm; {ALLOWED}")
+    return found
+
+
+def _check_reach(recording: Recording, where: Path) -> None:
+    for name, T in (("A", recording.A), ("B", recording.B)):
+        farthest = float(np.linalg.norm(T[:, :3, 3], axis=1).max())
+        if farthest < LEAST_REACH_MM:
+            what = f"the flange of {name} is never farther than {farthest:.3g} mm from its base: metres?"
+            raise InputError(what, where=where, allowed=ALLOWED)
+
+
+def _refuse_slip(recording: Recording, rms_mm: float, where: Path) -> None:
+    for slip, undo in SLIPS.items():
+        other = _residual_mm(undo, recording)
+        if other < SUSPECT_MM and other < BETTER * rms_mm:
+            as_given = f"residuals {rms_mm:.3g} mm" if np.isfinite(rms_mm) else "no fit"
+            what = f"it fits ({other:.2g} mm rms) if {slip}, and not as it is given ({as_given})"
+            raise InputError(what, where=where, allowed=ALLOWED)
+
+
+def _residual_mm(undo: Reading, recording: Recording) -> float:
+    """Of the other reading, over all poses; infinite where it cannot be calibrated."""
+    try:
+        return calibrate(undo(recording), scale=recording.pixels, direction=False).rms_mm
+    except InputError:
+        return float("inf")
+
+
+def _read(recording: Recording, A: Floats, B: Floats, P: Floats) -> Recording:
+    return Recording(A, B, P, None, recording.names, recording.pixels)
+
+
+def _inverse(T: Floats) -> Floats:
+    found = np.tile(np.eye(4), (len(T), 1, 1))
+    found[:, :3, :3] = T[:, :3, :3].transpose(0, 2, 1)
+    found[:, :3, 3] = -(found[:, :3, :3] @ T[:, :3, 3:])[:, :, 0]
+    return found
+
+
+def _transposed(T: Floats) -> Floats:
+    found = np.array(T)
+    found[:, :3, :3] = T[:, :3, :3].transpose(0, 2, 1)
+    return found
+
+
+def _longer(T: Floats, factor: float) -> Floats:
+    found = np.array(T)
+    found[:, :3, 3] *= factor
+    return found
+
+
+SLIPS: Mapping[str, Reading] = MappingProxyType(
+    {
+        "A and B are inverse (base in flange)": lambda r: _read(r, _inverse(r.A), _inverse(r.B), r.P),
+        "A is inverse (base in flange)": lambda r: _read(r, _inverse(r.A), r.B, r.P),
+        "B is inverse (base in flange)": lambda r: _read(r, r.A, _inverse(r.B), r.P),
+        "the arms A and B are swapped": lambda r: _read(r, r.B, r.A, r.P),
+        "the arms are swapped and inverse": lambda r: _read(r, _inverse(r.B), _inverse(r.A), r.P),
+        "the rotations of A and B are written by columns": lambda r: _read(r, _transposed(r.A), _transposed(r.B), r.P),
+        "the rotations of A are written by columns": lambda r: _read(r, _transposed(r.A), r.B, r.P),
+        "the rotations of B are written by columns": lambda r: _read(r, r.A, _transposed(r.B), r.P),
+        "A and B are in cm": lambda r: _read(r, _longer(r.A, 10), _longer(r.B, 10), r.P),
+        "P is in metres": lambda r: _read(r, r.A, r.B, r.P * 1000),
+        "P is in cm": lambda r: _read(r, r.A, r.B, r.P * 10),
+    }
+)
+"""What people write instead of `ALLOWED`, in words, and how it is undone."""

@@ -1,0 +1,286 @@
+"""The needle in a B-mode picture: its tip, its direction, and whether to believe either.
+
+1. Amplitude over background: the display's log compression is undone, the median around divides it.
+2. The brightest straight segment (:mod:`twin.guidance.ultrasound.image.line_search`); too small a sum is no needle.
+3. The line, by weighted least squares on the ridge, through a window that narrows to it.
+4. The tip: where the amplitude along the line falls half way from the shaft's level to the background's, for good.
+
+The needle goes down into the body, so the deeper end is the tip. What shows is where the needle leaves the *slice*: of
+a needle that is tilted against the image plane the end that shows need not be the tip, and no picture alone can tell.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.image.line_search import Segment, brightest_segment
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, Picture
+
+Floats = NDArray[np.float64]
+
+MEAN_OVER_MEDIAN = float(np.sqrt(np.pi / 2.0) / np.sqrt(2.0 * np.log(2.0)))
+"""Of a Rayleigh amplitude."""
+
+COARSE = 2
+"""The background is taken, and the segment searched, in a picture this many times smaller."""
+
+ANGLE_STEP = float(np.radians(1.5))
+"""Between the directions that are tried: 0.3 mm at the end of 20 mm, well inside the ridge."""
+
+BACKGROUND_MM = 12.0
+"""Edge of the window whose median is the background: wide enough that a needle fills a small part of it, and narrow
+enough to follow its shadow."""
+
+BRIGHTEST = 3.0
+"""Amplitude over background above which a pixel counts no more: one bright cell makes no needle."""
+
+EXPECTED = 0.4
+"""What a sample must exceed the background by to lengthen a segment."""
+
+STEP_MM = 0.1
+"""Of the samples along and across the line."""
+
+ACROSS_MM = 2.0
+"""How far across the line the ridge is looked for."""
+
+WINDOWS_MM = (0.8, 0.5, 0.4, 0.4)
+"""Standard deviations of the window about the line, one per iteration; the first holds the search's own error."""
+
+SHAFT_MM = 8.0
+"""Of shaft before the tip whose median is its level."""
+
+NEAR_TIP_MM = 1.0
+"""Of shaft that is left out of its level: the tip is brighter."""
+
+TIP_ROUNDS = 3
+"""Of shaft's level and shaft's end in turn."""
+
+SEEK_MM = 3.0
+"""How far from the shaft's coarse end the tip is looked for."""
+
+ENDS_AGREE_MM = 3.0
+"""A faint shaft has gaps: where the search ends farther from the tip than this, nobody knows which is the end."""
+
+RIDGE_MM = 0.8
+"""Width of the ridge that a profile along the line averages."""
+
+SHAFT_PERCENTILE = 70.0
+"""Of the profile along a segment: the shaft's level, though a part of the segment may be no shaft."""
+
+
+class Missed(StrEnum):
+    """Why there is no detection."""
+
+    NO_NEEDLE = "no line stands out from the speckle"
+    TOO_SHORT = "too little of the needle shows"
+    TIP_AT_EDGE = "the needle leaves the image before its tip"
+    NO_END = "no clear end: the tip is not where the line fades"
+
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """What is believed, and the correction of the tip.
+
+    Attributes:
+        least_score_mm: Sum along the segment, amplitude over background times mm, that makes a needle.
+        least_length_mm: Of the segment.
+        edge_mm: The tip is no nearer to the picture's sides.
+        least_step: Fall of the amplitude at the tip, over background, that makes an end.
+        sure_step: Below it, the end is believed only where the search's own end agrees.
+        tip_bias: How far the detected tip lies beyond the true one along the shaft, on average, over the standard
+            deviation of the point spread in that direction; taken off. It comes from the tip's brightness: a property
+            of a needle in a machine, measured in the twin (benchmarks/bmode.py), to be measured anew elsewhere.
+        inclination_deg: Directions that are tried: angle to the probe's face, on either side.
+    """
+
+    least_score_mm: float = 9.0
+    least_length_mm: float = 6.0
+    edge_mm: float = 1.5
+    least_step: float = 0.8
+    sure_step: float = 2.0
+    tip_bias: float = 0.4
+    inclination_deg: tuple[float, float] = (8.0, 82.0)
+
+
+class Detection(NamedTuple):
+    """A needle."""
+
+    tip_image: Floats
+    """Shape (2,), mm: (u, v), corrected for the bias."""
+    direction_image: Floats
+    """Unit, shape (2,): toward the tip."""
+    score_mm: float
+    """Sum along the visible segment of the amplitude over background, times mm."""
+    visible_mm: float
+    """Length of the segment."""
+    contrast_db: float
+    """Amplitude of the last piece of shaft over the background."""
+
+
+def detect(picture: Picture, imager: Imager, settings: DetectorSettings | None = None) -> Detection | Missed:
+    """Find the needle, or say why not.
+
+    Args:
+        picture: Grey levels, shape (rows, columns).
+        imager: Pixel, display range and point spread of the machine.
+        settings: What is believed.
+
+    Raises:
+        InputError: A picture of another size than the imager's.
+    """
+    settings = settings or DetectorSettings()
+    if picture.shape != (imager.rows, imager.columns):
+        size = f"({imager.rows}, {imager.columns})"
+        raise InputError(f"picture of shape {picture.shape}", where="needle detector", allowed=f"{size}, the imager's")
+    relative = over_background(picture, imager)
+    segment = _segment(relative, imager, settings)
+    length = float(np.linalg.norm(segment.end - segment.start))
+    if segment.score < settings.least_score_mm:
+        return Missed.NO_NEEDLE
+    if length < settings.least_length_mm:
+        return Missed.TOO_SHORT
+    line = _shaft_only(relative, imager, _ridge(relative, imager, segment))
+    tip = _tip(relative, imager, line)
+    disagree = abs(float((segment.end - line.point) @ line.direction) - tip.s)
+    if tip.step < settings.least_step or (tip.step < settings.sure_step and disagree > ENDS_AGREE_MM):
+        return Missed.NO_END
+    found = line.point + (tip.s - settings.tip_bias * _blur_along(imager, line)) * line.direction
+    width, depth = imager.size_mm
+    high = np.array([width, depth]) - settings.edge_mm
+    if np.any(found < settings.edge_mm) or np.any(found > high):
+        return Missed.TIP_AT_EDGE
+    contrast = 20.0 * float(np.log10(max(1.0 + tip.step, 1e-6)))
+    return Detection(found, line.direction, segment.score, length, contrast)
+
+
+def search_score(picture: Picture, imager: Imager) -> float:
+    """What the gate is held against: the largest sum along any segment, amplitude over background times mm."""
+    return _segment(over_background(picture, imager), imager, DetectorSettings()).score
+
+
+def over_background(picture: Picture, imager: Imager) -> Floats:
+    """Amplitude over the mean amplitude of the background around, shape (rows, columns)."""
+    size = int(BACKGROUND_MM / imager.pixel_mm) // COARSE | 1
+    coarse = np.ascontiguousarray(picture[::COARSE, ::COARSE])
+    median = cv2.medianBlur(coarse, size).astype(np.float64)
+    grey = cv2.resize(cv2.GaussianBlur(median, (0, 0), size / 8.0), picture.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(imager.amplitude(picture) / (MEAN_OVER_MEDIAN * imager.amplitude(grey)))
+
+
+def _segment(relative: Floats, imager: Imager, settings: DetectorSettings) -> Segment:
+    """The brightest segment, mm."""
+    clipped = np.minimum(relative, BRIGHTEST) - 1.0 - EXPECTED
+    small = np.asarray(cv2.GaussianBlur(clipped, (0, 0), COARSE / 1.5)[::COARSE, ::COARSE], dtype=np.float64)
+    low, high = np.radians(settings.inclination_deg)
+    right = np.arange(float(low), float(high), ANGLE_STEP, dtype=np.float64)
+    found = brightest_segment(small, np.concatenate([right, np.pi - right]))
+    pixel = imager.pixel_mm * COARSE
+    return Segment(found.start * pixel, found.end * pixel, found.score * pixel)
+
+
+class _Line(NamedTuple):
+    """A line in the picture, mm: s = 0 at its point, growing toward the tip."""
+
+    point: Floats
+    direction: Floats
+    start: float
+    """s of the segment's shallow end; the deep end is 0."""
+
+
+class _Tip(NamedTuple):
+    """Where the shaft ends on its line, and by how much the amplitude falls there."""
+
+    s: float
+    step: float
+
+
+def _samples(relative: Floats, imager: Imager, line: _Line, s: Floats, t: Floats) -> Floats:
+    """Amplitude at s along and t across the line, shape (len(s), len(t)); 1 outside the picture."""
+    across = np.array([-line.direction[1], line.direction[0]])
+    at = line.point + s[:, None, None] * line.direction + t[None, :, None] * across
+    maps = (at / imager.pixel_mm).astype(np.float32)
+    image = relative.astype(np.float32)
+    sampled = cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderValue=1.0)
+    return np.asarray(sampled, dtype=np.float64)
+
+
+def _ridge(relative: Floats, imager: Imager, segment: Segment) -> _Line:
+    """The line along the middle of the bright ridge."""
+    direction = (segment.end - segment.start) / np.linalg.norm(segment.end - segment.start)
+    line = _Line(segment.end, direction, -float(np.linalg.norm(segment.end - segment.start)))
+    t = np.arange(-ACROSS_MM, ACROSS_MM + STEP_MM / 2.0, STEP_MM)
+    s = np.arange(line.start, 0.0, STEP_MM)
+    for window in WINDOWS_MM:
+        bright = np.maximum(_samples(relative, imager, line, s, t) - 1.0 - EXPECTED, 0.0)
+        bright = np.minimum(bright, 2.0 * np.median(bright.max(axis=1)) + 1e-9)
+        weight = bright**2 * np.exp(-0.5 * (t / window) ** 2)  # squared: half the error of the angle (measured)
+        line = _moved(line, s, t, weight)
+    return line
+
+
+def _moved(line: _Line, s: Floats, t: Floats, weight: Floats) -> _Line:
+    """The line through the weighted samples: t = a + b s by least squares."""
+    total, across = weight.sum(axis=1), weight @ t
+    moments = np.array([[total.sum(), total @ s], [total @ s, total @ s**2]])
+    a, b = np.linalg.solve(moments + 1e-9 * np.eye(2), np.array([across.sum(), across @ s]))
+    normal = np.array([-line.direction[1], line.direction[0]])
+    direction = line.direction + b * normal
+    return _Line(line.point + a * normal, direction / np.linalg.norm(direction), line.start)
+
+
+def _profile(relative: Floats, imager: Imager, line: _Line, s: Floats) -> Floats:
+    """Mean amplitude across the ridge at each s along the line."""
+    t = np.arange(-RIDGE_MM / 2.0, RIDGE_MM / 2.0 + STEP_MM / 2.0, STEP_MM)
+    return np.asarray(_samples(relative, imager, line, s, t).mean(axis=1))
+
+
+def _shaft_only(relative: Floats, imager: Imager, line: _Line) -> _Line:
+    """The same line, cut to where it is brighter than half way between background and shaft.
+
+    The search lengthens a segment through any speckle that is a little bright; the shaft's own level tells better.
+    """
+    for _ in range(2):
+        s = np.arange(line.start, SEEK_MM, STEP_MM)
+        profile = _profile(relative, imager, line, s)
+        shaft = float(np.percentile(profile[s < 0.0], SHAFT_PERCENTILE))
+        gain = np.cumsum(np.minimum(profile, 1.5 * shaft) - 0.5 * (1.0 + shaft))
+        lowest = np.minimum.accumulate(np.concatenate([[0.0], gain[:-1]]))
+        end = int(np.argmax(gain - lowest))
+        begin = int(np.argmin(np.concatenate([[0.0], gain])[: end + 1]))
+        line = _Line(line.point + s[end] * line.direction, line.direction, min(s[begin] - s[end], -STEP_MM))
+    return line
+
+
+def _tip(relative: Floats, imager: Imager, line: _Line) -> _Tip:
+    """The end of the shaft: where its amplitude has fallen half way to the background's, for good.
+
+    For good: where the sum of what exceeds the half-way level is largest. A blurred step passes its half at the step.
+    """
+    s = np.arange(-SHAFT_MM - 2.0 * SEEK_MM, 2.0 * SEEK_MM, STEP_MM)
+    profile = _profile(relative, imager, line, s)
+    end, shaft = 0.0, 0.0
+    for _ in range(TIP_ROUNDS):
+        last = (s > max(end - SHAFT_MM, line.start)) & (s < end - NEAR_TIP_MM)
+        if not last.any():
+            return _Tip(end, 0.0)
+        shaft = float(np.median(profile[last]))
+        half = 0.5 * (1.0 + shaft)
+        here = np.flatnonzero(s > end - SHAFT_MM)[:-1]
+        at = int(here[np.argmax(np.cumsum(profile[here] - half))])
+        fall = max(profile[at] - profile[at + 1], 1e-9)
+        end = float(s[at] + STEP_MM * np.clip((profile[at] - half) / fall, 0.0, 1.0))
+    return _Tip(end, shaft - 1.0)
+
+
+def _blur_along(imager: Imager, line: _Line) -> float:
+    """Standard deviation of the point spread along the line at its end, mm."""
+    depth = np.array(max(float(line.point[1]), 0.0))
+    lateral, axial = imager.spread.lateral_sigma(depth), imager.spread.axial_sigma(depth)
+    return float(np.hypot(lateral * line.direction[0], axial * line.direction[1]))

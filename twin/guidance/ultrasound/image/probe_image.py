@@ -1,0 +1,253 @@
+"""A B-mode picture of a needle in a speckle phantom, from where needle and image plane really are.
+
+The frame ``image``: its origin is the middle of the upper left pixel, x (u) runs along the probe's face to the right,
+y (v) into the depth, z out of the plane; mm. A needle off the plane fades as the slice's Gaussian profile (spec 3,
+section 5). One picture's speckle is independent of the next one's: two poses of a calibration show different cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.image.speckle import FWHM_PER_SIGMA, Complexes, PointSpread, blurred_speckle
+
+Floats = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+WHITE = 255
+"""The brightest grey level."""
+
+SAMPLE_MM = 0.2
+"""Step along the shaft; not wider than the narrowest point spread's sigma (0.21 mm), so the line has no ripple."""
+
+UNIT = 1e-6
+"""How far a direction's length may be from 1."""
+
+
+@dataclass(frozen=True)
+class Imager:
+    """Probe and machine. Lengths in mm.
+
+    Attributes:
+        columns: Pixels along the face.
+        rows: Pixels in depth.
+        pixel_mm: Edge of a pixel.
+        slice_fwhm_mm: Full width of the slice's amplitude profile across the plane.
+        range_db: Dynamic range of the display: this many dB from black to white.
+        speckle_db: Grey of mean speckle power, dB below white.
+        noise_db: Electronic noise, dB below mean speckle.
+        spread: The point spread in the plane.
+    """
+
+    columns: int = 250
+    rows: int = 300
+    pixel_mm: float = 0.2
+    slice_fwhm_mm: float = 1.2
+    range_db: float = 60.0
+    speckle_db: float = 34.0
+    noise_db: float = 25.0
+    spread: PointSpread = field(default_factory=PointSpread)
+
+    @property
+    def size_mm(self) -> tuple[float, float]:
+        """Width and depth: (u, v) of the last pixel's middle."""
+        return ((self.columns - 1) * self.pixel_mm, (self.rows - 1) * self.pixel_mm)
+
+    @property
+    def slice_sigma(self) -> float:
+        """Standard deviation of the slice's profile, mm."""
+        return self.slice_fwhm_mm / FWHM_PER_SIGMA
+
+    def slice_gain(self, off_plane_mm: Floats) -> Floats:
+        """Amplitude of what lies off the plane, over the same in it; any shape."""
+        return np.asarray(np.exp(-0.5 * (off_plane_mm / self.slice_sigma) ** 2))
+
+    def grey(self, amplitude: Floats) -> Picture:
+        """Log compression: amplitude 1 is mean speckle."""
+        level = 20.0 * np.log10(np.maximum(amplitude, 1e-12)) - self.speckle_db
+        return np.clip(np.round(WHITE * (1.0 + level / self.range_db)), 0, WHITE).astype(np.uint8)
+
+    def amplitude(self, picture: NDArray[np.generic]) -> Floats:
+        """What :meth:`grey` was made from, where it was neither black nor white."""
+        level = self.range_db * (np.asarray(picture, dtype=np.float64) / WHITE - 1.0)
+        return np.asarray(10.0 ** ((level + self.speckle_db) / 20.0))
+
+
+@dataclass(frozen=True)
+class NeedleEcho:
+    """What the needle's steel sends back. Amplitudes against mean speckle.
+
+    Attributes:
+        contrast_db: Of the shaft in the plane and parallel to the face, at the middle depth.
+        steep_loss_db: How much fainter it is when it points straight down: less comes back to the face.
+        roughness: Random part of the shaft's amplitude.
+        tip_gain: Amplitude of the tip over the shaft's.
+        tip_length_mm: Over which the tip is brighter.
+        reverberations: Echoes between the walls, below the shaft.
+        reverberation_mm: Spacing of them.
+        reverberation_gain: Of each against the one before, for a needle parallel to the face. It falls with the squared
+            cosine of the inclination: what bounces between tilted walls is mirrored away from the face.
+        shadow: How much of the sound the needle keeps from what lies below it, 0..1.
+    """
+
+    contrast_db: float = 28.0
+    steep_loss_db: float = 8.0
+    roughness: float = 0.35
+    tip_gain: float = 1.8
+    tip_length_mm: float = 0.6
+    reverberations: int = 2
+    reverberation_mm: float = 1.6
+    reverberation_gain: float = 0.3
+    shadow: float = 0.5
+
+
+class NeedlePose(NamedTuple):
+    """Where the needle is, in the frame ``image``."""
+
+    tip_image: Floats
+    """Shape (3,), mm; z is how far the tip is off the plane."""
+    direction_image: Floats
+    """Unit, shape (3,): from the hub to the tip."""
+
+
+class Lesion(NamedTuple):
+    """A ball that scatters less than what is around it."""
+
+    centre_image: Floats
+    """Shape (3,), mm."""
+    radius_mm: float
+    gain: float = 0.25
+    """Its scatterers' amplitude against the rest."""
+
+
+def render(
+    imager: Imager,
+    needle: NeedlePose | None,
+    rng: np.random.Generator,
+    *,
+    echo: NeedleEcho | None = None,
+    lesion: Lesion | None = None,
+) -> Picture:
+    """One B-mode picture.
+
+    Args:
+        imager: Probe and machine.
+        needle: The needle, or None for none.
+        rng: Draws speckle, the shaft's roughness and electronic noise.
+        echo: What the needle sends back; None for the usual one.
+        lesion: A darker ball.
+
+    Returns:
+        Grey levels, shape (rows, columns).
+
+    Raises:
+        InputError: A needle that is not finite or whose direction is no unit vector.
+    """
+    echo = echo or NeedleEcho()
+    reflectivity = _lesion_gain(imager, lesion)
+    if needle is not None:
+        _require_usable(needle)
+        reflectivity = reflectivity * _shadow(imager, needle, echo)
+    size = (imager.rows, imager.columns)
+    signal = blurred_speckle(imager.rows, imager.columns, imager.pixel_mm, imager.spread, reflectivity, rng)
+    if needle is not None:
+        signal = signal + needle_signal(imager, needle, echo, rng)
+    hiss = 10.0 ** (-imager.noise_db / 20.0) / np.sqrt(2.0)
+    signal = signal + hiss * (rng.standard_normal(size) + 1j * rng.standard_normal(size))
+    return imager.grey(np.abs(signal))
+
+
+def needle_signal(imager: Imager, needle: NeedlePose, echo: NeedleEcho, rng: np.random.Generator) -> Complexes:
+    """The needle's echoes, complex, shape (rows, columns), before the envelope is taken."""
+    points, s = _shaft(imager, needle)
+    size = (imager.rows, imager.columns)
+    if len(points) == 0:
+        return np.zeros(size, dtype=np.complex128)
+    rough = rng.standard_normal(len(s)) + 1j * rng.standard_normal(len(s))
+    source = imager.slice_gain(points[:, 2]) * (1.0 + echo.roughness * rough / np.sqrt(2.0))
+    source = source * np.where(s < echo.tip_length_mm, echo.tip_gain, 1.0)
+    source = source * _brightness(imager, needle, echo) * np.exp(2j * np.pi * rng.uniform())
+    signal = np.zeros(size, dtype=np.complex128)
+    bounced = echo.reverberation_gain * float(1.0 - needle.direction_image[1] ** 2)
+    for bounce in range(echo.reverberations + 1):
+        below = points + [0.0, bounce * echo.reverberation_mm, 0.0]
+        phase = np.exp(2j * np.pi * rng.uniform()) if bounce else 1.0
+        signal += phase * bounced**bounce * _spread_out(imager, below, source)
+    return signal
+
+
+def _brightness(imager: Imager, needle: NeedlePose, echo: NeedleEcho) -> float:
+    """Amplitude of one sample, such that a level shaft at the middle depth has the stated contrast."""
+    middle = imager.spread.axial_sigma(np.array(imager.size_mm[1] / 2.0))
+    steep = float(needle.direction_image[1] ** 2)
+    level_db = echo.contrast_db - echo.steep_loss_db * steep
+    return float(10.0 ** (level_db / 20.0) * np.sqrt(2.0 * np.pi) * middle * SAMPLE_MM)
+
+
+def _spread_out(imager: Imager, points: Floats, source: Complexes) -> Complexes:
+    """Points' echoes as the point spread has them, each of unit integral, exact below the pixel."""
+    depth = np.maximum(points[:, 1], 0.0)
+    across, along = imager.spread.lateral_sigma(depth), imager.spread.axial_sigma(depth)
+    lateral = _gaussians(imager.pixel_mm * np.arange(imager.columns, dtype=np.float64), points[:, 0], across)
+    axial = _gaussians(imager.pixel_mm * np.arange(imager.rows, dtype=np.float64), points[:, 1], along)
+    weight = (source / (2.0 * np.pi * across * along))[:, None]
+    parts = [axial.T @ (lateral * part.astype(np.float32)) for part in (weight.real, weight.imag)]
+    return np.asarray(parts[0] + 1j * parts[1], dtype=np.complex128)
+
+
+def _gaussians(at: Floats, middles: Floats, sigmas: Floats) -> NDArray[np.float32]:
+    """exp(-(at - middle)^2 / 2 sigma^2), shape (len(middles), len(at)), in single precision: 256 greys show no more."""
+    away = ((at[None, :] - middles[:, None]) / sigmas[:, None]).astype(np.float32)
+    return np.asarray(np.exp(np.float32(-0.5) * away * away))
+
+
+def _shaft(imager: Imager, needle: NeedlePose) -> tuple[Floats, Floats]:
+    """Points along the shaft that may show, shape (n, 3), and their distances from the tip, shape (n,), mm."""
+    longest = float(np.hypot(*imager.size_mm)) + 20.0
+    s = SAMPLE_MM * (np.arange(int(longest / SAMPLE_MM)) + 0.5)
+    points = needle.tip_image - s[:, None] * needle.direction_image
+    near = 5.0
+    high = np.array(imager.size_mm) + near
+    seen = np.all((points[:, :2] > -near) & (points[:, :2] < high), axis=1) & (points[:, 1] > 0.0)
+    seen &= imager.slice_gain(points[:, 2]) > 1e-4
+    return points[seen], s[seen]
+
+
+def _shadow(imager: Imager, needle: NeedlePose, echo: NeedleEcho) -> Floats:
+    """What the needle leaves of the sound, shape (rows, columns)."""
+    points, _ = _shaft(imager, needle)
+    left = np.ones((imager.rows, imager.columns))
+    if len(points) < 2:
+        return left
+    u = imager.pixel_mm * np.arange(imager.columns)
+    order = np.argsort(points[:, 0])
+    sorted_u = points[order, 0]
+    under = (u >= sorted_u[0]) & (u <= sorted_u[-1])
+    depth = np.interp(u, sorted_u, points[order, 1])
+    kept = 1.0 - echo.shadow * imager.slice_gain(np.interp(u, sorted_u, points[order, 2]))
+    v = imager.pixel_mm * np.arange(imager.rows)
+    below = (v[:, None] > depth[None, :]) & under[None, :]
+    return np.where(below, kept[None, :], left)
+
+
+def _lesion_gain(imager: Imager, lesion: Lesion | None) -> Floats:
+    gain = np.ones((imager.rows, imager.columns))
+    if lesion is None:
+        return gain
+    u, v = imager.pixel_mm * np.arange(imager.columns), imager.pixel_mm * np.arange(imager.rows)
+    x, y, z = lesion.centre_image
+    inside = (u[None, :] - x) ** 2 + (v[:, None] - y) ** 2 + z**2 < lesion.radius_mm**2
+    return np.where(inside, lesion.gain, gain)
+
+
+def _require_usable(needle: NeedlePose) -> None:
+    tip, direction = np.asarray(needle.tip_image), np.asarray(needle.direction_image)
+    usable = tip.shape == (3,) and direction.shape == (3,) and bool(np.isfinite([*tip, *direction]).all())
+    if not usable or abs(float(np.linalg.norm(direction)) - 1.0) > UNIT:
+        what = f"needle at {tip.tolist()} along {direction.tolist()}"
+        raise InputError(what, where="B-mode picture", allowed="a finite tip (3,) in mm and a unit direction (3,)")

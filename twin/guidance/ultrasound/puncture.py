@@ -1,0 +1,163 @@
+"""After the calibration: the needle is sent to a target that is seen in the image, and where its tip truly ends."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
+from puncture_twin.twin.guidance.ultrasound.candidate_poses import Candidates, needle_flange
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import Lesion, NeedlePose, Picture, render
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import RoomTruth, nearest_configuration
+from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
+
+Floats = NDArray[np.float64]
+
+LESION_MM = 4.0
+"""Radius of the lesion that is drawn about the target in a picture."""
+
+
+class Puncture(NamedTuple):
+    """One target."""
+
+    candidate: int
+    target_image: Floats
+    """True target in the true image, shape (3,), mm; it lies in the plane, for it is seen."""
+    clicked_image: Floats
+    """Where the operator read it, shape (2,), mm."""
+    needle: NeedlePose
+    """Where the needle truly ended, in the true image."""
+    predicted_mm: float
+    """Expected (rms) error from the calibration's covariance alone."""
+    click_mm: float
+    """Standard deviation of the reading, per axis of the image."""
+
+    @property
+    def error_image(self) -> Floats:
+        """True tip minus true target, shape (3,), mm."""
+        return self.needle.tip_image - self.target_image
+
+    @property
+    def error_mm(self) -> float:
+        """Distance of the true tip from the true target."""
+        return float(np.linalg.norm(self.error_image))
+
+    @property
+    def expected_mm(self) -> float:
+        """Expected (rms) error from the calibration and the reading of the target; the arms' own errors come on top."""
+        return float(np.sqrt(self.predicted_mm**2 + 2.0 * self.click_mm**2))
+
+    @property
+    def depth_mm(self) -> float:
+        """Its part along the true needle: + is too deep."""
+        return float(self.error_image @ self.needle.direction_image)
+
+    @property
+    def lateral_mm(self) -> float:
+        """Its part across the needle."""
+        return float(np.sqrt(max(self.error_mm**2 - self.depth_mm**2, 0.0)))
+
+
+def punctures(
+    case: SelfcalCase,
+    room: TwoArms,
+    candidates: Candidates,
+    rows: NDArray[np.int_],
+    truth: RoomTruth,
+    calibration: Calibration,
+    rng: np.random.Generator,
+) -> tuple[Puncture, ...]:
+    """Send the needle to the middle of the picture's tip, one held-out candidate after the other.
+
+    Args:
+        case: The room.
+        room: Its collision checker; a target at which something would touch is passed over.
+        candidates: Where probe and needle can stand.
+        rows: The candidates to use: none of them was recorded.
+        truth: The true room.
+        calibration: What was found.
+        rng: The reading of the target and the arms' repeatability.
+    """
+    done = [_puncture(case, room, candidates, int(row), truth, calibration, rng) for row in rows]
+    return tuple(one for one in done if one is not None)
+
+
+def _puncture(
+    case: SelfcalCase,
+    room: TwoArms,
+    candidates: Candidates,
+    row: int,
+    truth: RoomTruth,
+    calibration: Calibration,
+    rng: np.random.Generator,
+) -> Puncture | None:
+    q_probe = candidates.q_probe[row]
+    rest_probe = truth.probe_arm.settle(q_probe, q_probe, rng)
+    target = np.array([*candidates.poses.P[row], 0.0])
+    clicked = target[:2] + rng.normal(0.0, case.content.truth.click_mm, 2)
+    q_needle = aim(candidates, row, clicked, calibration, truth)
+    if np.isnan(q_needle).any() or room.verdict(q_probe, q_needle) is not None:
+        return None
+    rest_needle = truth.needle_arm.settle(q_needle, q_needle, rng)
+    predicted = float(calibration.predicted_tre_mm(clicked[None], candidates.poses.A[row])[0])
+    ended = truth.needle_in_image(rest_probe, rest_needle)
+    return Puncture(row, target, clicked, ended, predicted, case.content.truth.click_mm)
+
+
+def aim(candidates: Candidates, row: int, target_mm: Floats, calibration: Calibration, truth: RoomTruth) -> Floats:
+    """What the needle's arm is told: by its nominal kinematics and the calibration; (6,), rad, NaN if out of reach.
+
+    Args:
+        candidates: Where probe and needle can stand.
+        row: The candidate whose probe pose, insertion and roll are used.
+        target_mm: In the image, shape (2,).
+        calibration: What was found.
+        truth: Only for the nominal model of its needle arm.
+    """
+    poses = candidates.poses
+    assert poses.v is not None  # candidates are made with directions
+    T_base2_image = np.linalg.inv(calibration.Y) @ poses.A[row] @ calibration.X
+    tip, along = np.array([[*target_mm, 0.0]]), np.array([[*poses.v[row], 0.0]])
+    roll = candidates.roll[row : row + 1]
+    V, Q = calibration.needle_direction_end2, calibration.tip_end2
+    goal = needle_flange(T_base2_image[None], tip, along, roll, Q, V)[0]
+    return nearest_configuration(truth.needle_arm, goal, candidates.q_needle[row])
+
+
+def held_out_errors_mm(
+    candidates: Candidates,
+    rows: NDArray[np.int_],
+    truth: RoomTruth,
+    calibration: Calibration,
+    rng: np.random.Generator,
+) -> Floats:
+    """Predicted minus true tip at candidates that were not recorded, in the image; shape (n,), mm.
+
+    Both arms stand where they were told to by nominal kinematics, so their errors are in it; the image's are not.
+    """
+    errors = []
+    for row in rows:
+        rests = [
+            arm.settle(q, q, rng)
+            for arm, q in (
+                (truth.probe_arm, candidates.q_probe[row]),
+                (truth.needle_arm, candidates.q_needle[row]),
+            )
+        ]
+        seen = truth.needle_in_image(*rests).tip_image
+        T_base1_image = flange_pose(truth.probe_arm.nominal, candidates.q_probe[row]) @ calibration.X
+        T_base1_end2 = calibration.Y @ flange_pose(truth.needle_arm.nominal, candidates.q_needle[row])
+        tip = T_base1_end2[:3, :3] @ calibration.tip_end2 + T_base1_end2[:3, 3]
+        predicted = np.linalg.inv(T_base1_image) @ np.append(tip, 1.0)
+        errors.append(float(np.linalg.norm(predicted[:3] - seen)))
+    return np.array(errors)
+
+
+def puncture_picture(case: SelfcalCase, puncture: Puncture, rng: np.random.Generator) -> Picture:
+    """The picture after the puncture: a lesion about the target, and the needle."""
+    lesion = Lesion(puncture.target_image, LESION_MM)
+    return render(case.content.image.imager(), puncture.needle, rng, echo=case.content.image.echo(), lesion=lesion)

@@ -1,0 +1,271 @@
+"""What a self-calibration case may hold: the TOML schema, version 1, key by key. See docs/ultrasound.md."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, Strict, field_validator, model_validator
+from scipy.spatial.transform import Rotation
+
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.provenance import CASE_ROLE, Input, content_input
+from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
+from puncture_twin.planning.case.case_file import Length, Name, Number, Section, Sextuple, Vector
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleEcho
+from puncture_twin.twin.plant.true_arm import ArmErrors
+
+Floats = NDArray[np.float64]
+
+CASE_NAME = "selfcal.toml"
+"""What a folder is searched for."""
+
+
+ALLOWED_CASE = "a TOML self-calibration case with schema = 1, or a folder with selfcal.toml"
+
+ARMS_WITH_MESHES = ("ur3", "ur5", "ur10")
+"""Collision needs link meshes, and these ship."""
+
+Deviation = Annotated[Number, Field(ge=0, le=100)]
+"""A standard deviation."""
+
+Degrees = Annotated[Number, Field(ge=-180, le=180)]
+Steep = Annotated[Number, Field(ge=5, le=85)]
+Count = Annotated[int, Strict(), Field(ge=1, le=5000)]
+Tool = Annotated[Number, Field(ge=20, le=1000)]
+Thickness = Annotated[Number, Field(ge=0.1, le=200)]
+
+
+class ErrorsSection(Section):
+    """How far an arm of this kind is from its nominal model: standard deviations, and the play's full width."""
+
+    link_mm: Deviation = 0.05
+    twist_deg: Deviation = 0.005
+    joint_deg: Deviation = 0.005
+    backlash_deg: Deviation = 0.0
+    repeatability_deg: Deviation = 0.003
+
+    def arm_errors(self) -> ArmErrors:
+        """In mm and rad."""
+        angles = np.radians([self.twist_deg, self.joint_deg, self.backlash_deg, self.repeatability_deg])
+        return ArmErrors(self.link_mm, *(float(angle) for angle in angles))
+
+
+class ArmSection(Section):
+    """One of the two arms."""
+
+    model: str = "ur3"
+    home_deg: Sextuple = (0.0, -90.0, 90.0, -90.0, -90.0, 0.0)
+    errors: ErrorsSection = ErrorsSection()
+
+    @field_validator("model")
+    @classmethod
+    def _has_meshes(cls, value: str) -> str:
+        if value not in ARMS_WITH_MESHES:
+            raise ValueError(f"model '{value}'; collision needs link meshes, which ship for {ARMS_WITH_MESHES}")
+        return value
+
+
+class NeedleArmSection(ArmSection):
+    """The needle's arm, and where its base stands: in the frame of the probe's arm, both upright."""
+
+    position_mm: Vector = (800.0, 0.0, 0.0)
+    yaw_deg: Degrees = 180.0
+
+
+class ProbeSection(Section):
+    """The probe: a round handle along the flange's z axis, and a flat head whose end is the face."""
+
+    length_mm: Tool = 150.0
+    handle_diameter_mm: Thickness = 40.0
+    head_mm: tuple[Thickness, Thickness, Thickness] = (58.0, 30.0, 20.0)
+    yaw_deg: Degrees = 35.0
+
+    @model_validator(mode="after")
+    def _head_fits(self) -> Self:
+        if self.head_mm[1] >= self.length_mm:
+            raise ValueError(f"head_mm {self.head_mm[1]:g} along the probe is not shorter than length_mm")
+        return self
+
+
+class NeedleSection(Section):
+    """The needle along its flange's z axis; what lies between shaft and flange is the holder."""
+
+    length_mm: Tool = 210.0
+    shaft_mm: Tool = 150.0
+    diameter_mm: Thickness = 1.2
+    holder_diameter_mm: Thickness = 30.0
+
+    @model_validator(mode="after")
+    def _shaft_fits(self) -> Self:
+        if self.shaft_mm > self.length_mm:
+            raise ValueError(f"shaft_mm {self.shaft_mm:g} is longer than length_mm {self.length_mm:g}")
+        return self
+
+
+class PhantomSection(Section):
+    """A block of tissue on the table, between the arms; frame of the probe's arm."""
+
+    top_mm: Vector = (330.0, 0.0, 150.0)
+    size_mm: tuple[Length, Length, Length] = (160.0, 160.0, 100.0)
+    round_mm: Annotated[Number, Field(ge=1, le=50)] = 15.0
+    gel_mm: Annotated[Number, Field(ge=0.5, le=50)] = 2.0
+
+    @model_validator(mode="after")
+    def _corners_fit(self) -> Self:
+        if 2 * self.round_mm >= min(self.size_mm):
+            raise ValueError(f"round_mm {self.round_mm:g} leaves nothing of size_mm {self.size_mm}")
+        return self
+
+
+class ImageSection(Section):
+    """The machine, and what the needle sends back."""
+
+    pixel_mm: Annotated[Number, Field(ge=0.05, le=1)] = 0.2
+    slice_fwhm_mm: Annotated[Number, Field(ge=0.2, le=10)] = 1.2
+    contrast_db: Annotated[Number, Field(ge=0, le=60)] = 28.0
+
+    def imager(self) -> Imager:
+        """Probe and machine: 50 x 60 mm."""
+        columns, rows = round(50.0 / self.pixel_mm), round(60.0 / self.pixel_mm)
+        return Imager(columns=columns, rows=rows, pixel_mm=self.pixel_mm, slice_fwhm_mm=self.slice_fwhm_mm)
+
+    def echo(self) -> NeedleEcho:
+        """The needle's echo."""
+        return NeedleEcho(contrast_db=self.contrast_db)
+
+
+class PosesSection(Section):
+    """From which poses are chosen, and how."""
+
+    samples: Annotated[int, Strict(), Field(ge=20, le=100_000)] = 600
+    count: Annotated[int, Strict(), Field(ge=16, le=2000)] = 30
+    choose: Literal["information", "random"] = "information"
+    tilt_deg: Annotated[Number, Field(ge=1, le=60)] = 25.0
+    yaw_deg: Annotated[Number, Field(ge=1, le=180)] = 50.0
+    insertion_deg: tuple[Steep, Steep] = (20.0, 75.0)
+    clearance_mm: Annotated[Number, Field(ge=0, le=50)] = 4.0
+
+    @model_validator(mode="after")
+    def _insertion_ascends(self) -> Self:
+        if self.insertion_deg[0] >= self.insertion_deg[1]:
+            raise ValueError(f"insertion_deg {list(self.insertion_deg)} does not ascend; it is [lowest, highest]")
+        return self
+
+
+class TruthSection(Section):
+    """How far the truth is from the drawing, and what the operator leaves: standard deviations per axis."""
+
+    mount_mm: Deviation = 3.0
+    mount_deg: Deviation = 0.5
+    tip_mm: Deviation = 1.5
+    length_mm: Deviation = 0.2
+    needle_deg: Deviation = 0.5
+    off_plane_mm: Deviation = 0.15
+    lean_deg: Deviation = 0.5
+    click_mm: Deviation = 0.3
+
+
+class NoiseSection(Section):
+    """What the calibration is told; without it, it finds the residuals' spread by itself."""
+
+    robot_mm: Annotated[Number, Field(gt=0, le=100)]
+    robot_deg: Annotated[Number, Field(gt=0, le=10)]
+    image_mm: Annotated[Number, Field(gt=0, le=100)]
+    direction_deg: Annotated[Number, Field(gt=0, le=45)]
+
+    def noise(self) -> Noise:
+        """In mm and rad."""
+        return Noise(
+            self.robot_mm, float(np.radians(self.robot_deg)), self.image_mm, float(np.radians(self.direction_deg))
+        )
+
+
+class SelfcalFile(Section):
+    """The whole file."""
+
+    schema_: SchemaOne = Field(alias="schema")
+    name: Name
+    seed: Annotated[int, Strict(), Field(ge=0, lt=2**31)] = 0
+    hold_needle_length: Annotated[bool, Strict()] = False
+    probe_arm: ArmSection = ArmSection()
+    needle_arm: NeedleArmSection = NeedleArmSection()
+    probe: ProbeSection = ProbeSection()
+    needle: NeedleSection = NeedleSection()
+    phantom: PhantomSection = PhantomSection()
+    image: ImageSection = ImageSection()
+    poses: PosesSection = PosesSection()
+    truth: TruthSection = TruthSection()
+    noise: NoiseSection | None = None
+
+    @model_validator(mode="after")
+    def _phantom_on_table(self) -> Self:
+        if self.phantom.top_mm[2] - self.phantom.size_mm[2] < 0.0:
+            raise ValueError("phantom: its lower side (top_mm minus size_mm) is below the table at z = 0")
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class SelfcalCase:
+    """A validated case.
+
+    Attributes:
+        path: The case file.
+        content: What it says.
+        inputs: The case file, with role and hash.
+        T_end1_image: The drawing's X, shape (4, 4), mm: the face's middle on the flange's z axis, the depth along it.
+        T_base1_base2: The drawing's Y, shape (4, 4), mm.
+        tip_end2: The drawing's tip, shape (3,), mm.
+    """
+
+    path: Path
+    content: SelfcalFile
+    inputs: tuple[Input, ...]
+    T_end1_image: Floats = field(init=False)
+    T_base1_base2: Floats = field(init=False)
+    tip_end2: Floats = field(init=False)
+
+    def __post_init__(self) -> None:
+        content = self.content
+        width, _ = content.image.imager().size_mm
+        drawn = {
+            "T_end1_image": _probe_mount(content.probe, width),
+            "T_base1_base2": _base_mount(content.needle_arm),
+            "tip_end2": np.array([0.0, 0.0, content.needle.length_mm]),
+        }
+        for name, value in drawn.items():
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+
+def _probe_mount(probe: ProbeSection, width_mm: float) -> Floats:
+    c, s = np.cos(np.radians(probe.yaw_deg)), np.sin(np.radians(probe.yaw_deg))
+    T = np.eye(4)
+    T[:3, :3] = np.array([[c, 0.0, s], [s, 0.0, -c], [0.0, 1.0, 0.0]])
+    T[:3, 3] = [0.0, 0.0, probe.length_mm] - 0.5 * width_mm * T[:3, 0]
+    return T
+
+
+def _base_mount(arm: NeedleArmSection) -> Floats:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", arm.yaw_deg, degrees=True).as_matrix()
+    T[:3, 3] = arm.position_mm
+    return T
+
+
+def load_selfcal_case(path: Path | str) -> SelfcalCase:
+    """Read and validate a case file, or a folder that holds ``selfcal.toml``.
+
+    Raises:
+        InputError: Anything unreadable, unknown, missing or contradictory; names the key.
+    """
+    path = find_toml(path, CASE_NAME)
+    stated = read_toml_bytes(path, ALLOWED_CASE)
+    content = parse_toml(stated, path, SelfcalFile, allowed=ALLOWED_CASE, keys="docs/ultrasound.md")
+    for arm in (content.probe_arm, content.needle_arm):
+        ur_model(arm.model)
+    return SelfcalCase(path, content, (content_input(CASE_ROLE, path.name, stated),))

@@ -1,0 +1,103 @@
+"""The true room: arms that are not their nominal models, mounts that are not the drawing, a bent needle."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import exp, tangent_basis
+from puncture_twin.twin.guidance.ultrasound.candidate_poses import needle_flange
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedlePose
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
+from puncture_twin.twin.plant.true_arm import TrueArm, draw_true_arm
+
+Floats = NDArray[np.float64]
+
+JOG_STEPS = 4
+"""Of the operator's correction: each leaves about the arms' relative error, 1e-3, of what was left before."""
+
+
+class RoomTruth(NamedTuple):
+    """What nobody knows."""
+
+    probe_arm: TrueArm
+    needle_arm: TrueArm
+    X: Floats
+    """T_end1_image, shape (4, 4), mm."""
+    Y: Floats
+    """T_base1_base2, shape (4, 4), mm."""
+    tip_end2: Floats
+    """Shape (3,), mm."""
+    V: Floats
+    """The needle's direction in end2, shape (3,), unit."""
+
+    def image_pose(self, q_probe: Floats) -> Floats:
+        """The true T_base1_image, shape (4, 4), mm, of the probe's arm at rest at ``q_probe`` (6,), rad."""
+        return np.asarray(self.probe_arm.flange_pose(q_probe) @ self.X)
+
+    def needle_in_image(self, q_probe: Floats, q_needle: Floats) -> NeedlePose:
+        """The true needle in the true image, both arms at rest."""
+        T = np.linalg.inv(self.image_pose(q_probe)) @ self.Y @ self.needle_arm.flange_pose(q_needle)
+        direction = T[:3, :3] @ self.V
+        return NeedlePose(T[:3, :3] @ self.tip_end2 + T[:3, 3], direction / np.linalg.norm(direction))
+
+
+def draw_room(case: SelfcalCase, rng: np.random.Generator) -> RoomTruth:
+    """A room whose differences from the drawing are drawn from the case's standard deviations."""
+    content, off = case.content, case.content.truth
+    arms = [
+        draw_true_arm(ur_model(arm.model), arm.errors.arm_errors(), rng)
+        for arm in (content.probe_arm, content.needle_arm)
+    ]
+    X, Y = (_shifted(T, off.mount_mm, np.radians(off.mount_deg), rng) for T in (case.T_end1_image, case.T_base1_base2))
+    V = np.array([0.0, 0.0, 1.0])
+    tip = case.tip_end2 + [*rng.normal(0.0, off.tip_mm, 2), rng.normal(0.0, off.length_mm)]
+    bent = V + tangent_basis(V) @ rng.normal(0.0, np.radians(off.needle_deg), 2)
+    return RoomTruth(arms[0], arms[1], X, Y, tip, bent / np.linalg.norm(bent))
+
+
+def _shifted(T: Floats, mm: float, rad: float, rng: np.random.Generator) -> Floats:
+    moved = np.array(T)
+    moved[:3, 3] += rng.normal(0.0, mm, 3)
+    moved[:3, :3] = T[:3, :3] @ exp(rng.normal(0.0, rad, 3))
+    return moved
+
+
+def jog_into_slice(truth: RoomTruth, q_probe: Floats, q_needle: Floats, wanted: NeedlePose, roll: float) -> Floats:
+    """Move the needle's arm until the *true* needle stands in the *true* image as wanted.
+
+    It stands for the operator, or a servo on the picture, that jogs until the needle shows: what is left is in
+    ``wanted``. The commands follow from the nominal kinematics, corrected by what the true arm did before.
+
+    Args:
+        truth: The room.
+        q_probe: Where the probe's joints rest, shape (6,), rad.
+        q_needle: Where the needle's arm begins, shape (6,), rad.
+        wanted: The needle in the image, after the jog.
+        roll: About the needle, rad.
+
+    Returns:
+        What the arm is told, shape (6,), rad; NaN where no configuration holds it.
+    """
+    nominal = truth.needle_arm.nominal
+    T_base2_image = (np.linalg.inv(truth.Y) @ truth.image_pose(q_probe))[None]
+    tip, along = wanted.tip_image[None], wanted.direction_image[None]
+    goal = needle_flange(T_base2_image, tip, along, np.array([roll]), truth.tip_end2, truth.V)[0]
+    command, q = goal, np.array(q_needle)
+    for _ in range(JOG_STEPS):
+        q = nearest_configuration(truth.needle_arm, command, q)
+        if np.isnan(q).any():
+            return q
+        command = flange_pose(nominal, q) @ np.linalg.inv(truth.needle_arm.flange_pose(q)) @ goal
+    return q
+
+
+def nearest_configuration(arm: TrueArm, T_base_flange: Floats, q_near: Floats) -> Floats:
+    """The nominal arm's configuration for a flange pose that is nearest to another, shape (6,), rad; NaN for none."""
+    q = nearest_within_limits(arm.nominal, inverse(arm.nominal, T_base_flange)[0], q_near)
+    away = np.linalg.norm(q - q_near, axis=1)
+    return np.array(q[int(np.argmin(np.where(np.isnan(away), np.inf, away)))])

@@ -1,0 +1,116 @@
+"""Calibrations, trials and punctures as plain values, mm and degrees: for files, JSON, page and terminal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
+from puncture_twin.twin.guidance.ultrasound.puncture import Puncture
+from puncture_twin.twin.guidance.ultrasound.trial import Choice, Trial
+
+Floats = NDArray[np.float64]
+
+
+def calibration_summary(found: Calibration, recording: Recording) -> dict[str, Any]:
+    """A calibration's main values, mm and degrees."""
+    return {
+        "T_end1_image": found.X.tolist(),
+        "T_base1_base2": found.Y.tolist(),
+        "tip_end2_mm": found.tip_end2.tolist(),
+        "needle_direction_end2": found.needle_direction_end2.tolist(),
+        "scale_mm": found.scale.tolist() if recording.pixels else None,
+        "poses": len(recording),
+        "residual_rms_mm": found.rms_mm,
+        "set_aside": list(found.outliers),
+        "iterations": found.iterations,
+        "condition": found.condition,
+        "noise": noise_summary(found),
+        "predicted_tre_mm": predicted_tre(found, recording),
+        "tip_bias_mm": found.tip_bias_mm,
+        "cannot_show": list(found.cannot_show),
+    }
+
+
+def noise_summary(found: Calibration) -> dict[str, float]:
+    """The noise that was stated, or the spread that was found."""
+    if isinstance(found.noise, Noise):
+        stated = found.noise
+        return {
+            "robot_mm": stated.robot_mm,
+            "robot_deg": float(np.degrees(stated.robot_rad)),
+            "image_mm": stated.image_mm,
+            "direction_deg": float(np.degrees(stated.direction_rad)),
+        }
+    spread = found.noise
+    return {
+        "inside_image_mm": spread.inside_mm,
+        "across_image_mm": spread.across_mm,
+        "direction_deg": float(np.degrees(spread.direction_rad)),
+    }
+
+
+def predicted_tre(found: Calibration, recording: Recording) -> float:
+    """Expected (rms) error at the recorded tips, from the calibration's covariance alone, mm."""
+    return float(np.sqrt(np.mean(found.predicted_tre_mm(recording.P, recording.A) ** 2)))
+
+
+def choice_summary(choice: Choice) -> dict[str, Any]:
+    """Bounds in mm."""
+    return {
+        "chosen_bound_mm": choice.chosen_mm,
+        "random_bound_median_mm": choice.median_random_mm,
+        "random_bound_best_mm": min(choice.random_mm),
+        "random_sets": len(choice.random_mm),
+    }
+
+
+def trial_summary(trial: Trial) -> dict[str, Any]:
+    """One seed: mm and degrees."""
+    found, truth, errors = trial.calibration, trial.truth, trial.acquisition.detection_errors()
+    return {
+        "seed": trial.seed,
+        "residual_rms_mm": found.rms_mm,
+        "predicted_tre_mm": predicted_tre(found, trial.acquisition.recording),
+        "held_out_error_rms_mm": _rms(trial.held_out_mm),
+        "X_error_mm": float(np.linalg.norm(found.X[:3, 3] - truth.X[:3, 3])),
+        "Y_error_mm": float(np.linalg.norm(found.Y[:3, 3] - truth.Y[:3, 3])),
+        "tip_error_mm": float(np.linalg.norm(found.tip_end2 - truth.tip_end2)),
+        "needle_direction_error_deg": _angle_deg(found.needle_direction_end2, truth.V),
+        "detected_tip_along_mm": [float(np.mean(errors[:, 0])), float(np.std(errors[:, 0]))],
+        "detected_tip_across_mm": [float(np.mean(errors[:, 1])), float(np.std(errors[:, 1]))],
+        "detected_angle_deg": np.degrees([np.mean(errors[:, 2]), np.std(errors[:, 2])]).tolist(),
+        "missed": trial.acquisition.missed,
+        "set_aside": list(found.outliers),
+        "true_contacts": sum(shot.touched for shot in (*trial.acquisition.shots, *trial.acquisition.missed_shots)),
+        "punctures": puncture_summary(trial.punctures),
+    }
+
+
+def puncture_summary(reached: tuple[Puncture, ...]) -> dict[str, Any] | None:
+    """Errors at the targets, mm; None without any."""
+    if not reached:
+        return None
+    errors = np.array([one.error_mm for one in reached])
+    return {
+        "targets": len(reached),
+        "error_rms_mm": _rms(errors),
+        "error_median_mm": float(np.median(errors)),
+        "error_worst_mm": float(errors.max()),
+        "lateral_rms_mm": _rms(np.array([one.lateral_mm for one in reached])),
+        "depth_mean_mm": float(np.mean([one.depth_mm for one in reached])),
+        "depth_rms_mm": _rms(np.array([one.depth_mm for one in reached])),
+        "predicted_rms_mm": _rms(np.array([one.predicted_mm for one in reached])),
+        "predicted_with_reading_rms_mm": _rms(np.array([one.expected_mm for one in reached])),
+    }
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
+
+
+def _angle_deg(a: Floats, b: Floats) -> float:
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))

@@ -1,0 +1,425 @@
+"""The main job, stage by stage: search, plan, rehearse, and the files that show each."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.output.manifest import read_output
+from puncture_twin.planning.base.output.output_set import Draft, writing
+from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.certify import certify
+from puncture_twin.planning.certify.certificate import (
+    MAX_CERTIFICATE_BYTES,
+    Certificate,
+    parse_certificate,
+    write_certificate,
+)
+from puncture_twin.planning.certify.checker import verify
+from puncture_twin.planning.certify.cone_column import with_safe_cone
+from puncture_twin.planning.clearance.cross_check import CrossChecked
+from puncture_twin.planning.export.exporter import Exported, export_name, export_plan
+from puncture_twin.planning.plan.plan import MAX_PLAN_BYTES, Plan, parse_plan, write_plan
+from puncture_twin.planning.plan.planner import make_plan
+from puncture_twin.planning.plan.recheck import check_plan
+from puncture_twin.planning.registration.marker_check import checked_placement
+from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.context import Prepared
+from puncture_twin.planning.search.explain import Explanation, finite, needle_warnings
+from puncture_twin.planning.search.table import write_table
+from puncture_twin.twin.plant.truth import draw_truth
+from puncture_twin.twin.rehearsal.rehearsal import Rehearsal, rehearse
+from puncture_twin.twin.report.map.map_picture import draw_map
+from puncture_twin.twin.report.page.page import write_page
+from puncture_twin.twin.report.scene.film import draw_film
+from puncture_twin.twin.report.scene.scene_picture import draw_scene
+
+PICTURES = ("map.png", "scene.png", "report.html")
+CERTIFICATE, FILM = "certificate.json", "rehearsal.mp4"
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What a command has done so far, and the files that it wrote."""
+
+    prepared: Prepared
+    candidates: Candidates
+    files: tuple[Path, ...]
+    plan: Plan | None = None
+    refusal: str = ""
+    rehearsal: Rehearsal | None = None
+    checked: CrossChecked | None = None
+    certificate: Certificate | None = None
+    read: tuple[Input, ...] = ()
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """The files that the command read beside the case's, then the case's."""
+        return (*self.read, *self.prepared.case.inputs)
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON: mm and degrees."""
+        found, provenance = self.candidates, self.prepared.provenance()
+        return {
+            **provenance,
+            "warnings": [*provenance["warnings"], *needle_warnings(self.prepared.case, found)],
+            "inputs": inputs_document(self.inputs),
+            "directions": len(found),
+            "counts": found.counts(),
+            "best": [candidate_summary(found, int(row)) for row in found.ranked[:10]],
+            "plan": None if self.plan is None else plan_summary(self.plan),
+            "rehearsal": None if self.rehearsal is None else rehearsal_summary(self.rehearsal),
+            "cross_check": None if self.checked is None else asdict(self.checked),
+            "certificate": None if self.certificate is None else self.certificate.summary(),
+            "seconds": {stage: round(seconds, 3) for stage, seconds in self.prepared.stages.seconds.items()},
+            "files": [str(path) for path in self.files],
+        }
+
+
+def search_case(
+    prepared: Prepared,
+    out: Path,
+    *,
+    pictures: bool = True,
+    checked: CrossChecked | None = None,
+    certify_deg: float | None = None,
+) -> Run:
+    """Search; write ``candidates.parquet`` and, if wanted, the certificate, the pictures and the page."""
+    names = ("candidates.parquet", *(PICTURES if pictures else ()), *(() if certify_deg is None else (CERTIFICATE,)))
+    with _writing(out, "search", prepared, names) as draft:
+        run = Run(prepared, prepared.search(), (), checked=checked)
+        if certify_deg is not None:
+            run = _certified(run, certify_deg, draft.folder)
+        run = _with_table(run, draft.folder)
+        run = _with_pictures(run, draft.folder) if pictures else run
+    return _final(run, draft)
+
+
+def plan_case(prepared: Prepared, out: Path) -> Run:
+    """Search and plan; write ``plan.json`` too.
+
+    Raises:
+        InputError: The case does not say where the arm stands.
+        NoAnswerError: No plan; the search's files are written all the same.
+    """
+    _refuse_without_arm(prepared)
+    with _writing(out, "plan", prepared, ("candidates.parquet", "plan.json", *PICTURES)) as draft:
+        run = _with_pictures(_searched_and_planned(prepared, draft.folder), draft.folder)
+    return _answered(_final(run, draft), out)
+
+
+def rehearse_case(prepared: Prepared, out: Path) -> Run:
+    """Plan, rehearse the plan, and write everything.
+
+    Raises:
+        InputError: The case does not say where the arm stands.
+        NoAnswerError: No plan; the search's files are written all the same.
+    """
+    _refuse_without_arm(prepared)
+    names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, *PICTURES)
+    with _writing(out, "plan", prepared, names) as draft:
+        run = _searched_and_planned(prepared, draft.folder)
+        planned = run.files
+        run = run if run.plan is None else _rehearsed(run, draft.folder)
+        run = _with_pictures(run, draft.folder)
+        if run.rehearsal is not None:  # the page shows it: it goes with it
+            shown = {draft.folder / "map.png", draft.folder / "scene.png"}
+            draft.split("rehearse", *(path for path in run.files if path not in {*planned, *shown}))
+    return _answered(_final(run, draft), out)
+
+
+def _refuse_without_arm(prepared: Prepared) -> None:
+    if prepared.reach is None:
+        raise InputError(
+            "the case does not say where the robot stands, so nothing can be planned",
+            where=prepared.case.path,
+            allowed="[registration] with markers_ct and markers_base, or [robot.mount]",
+        )
+
+
+def _writing(
+    out: Path,
+    command: str,
+    prepared: Prepared,
+    names: Iterable[str],
+    source: Input | None = None,
+) -> AbstractContextManager[Draft]:
+    """A draft of a command's files, with the case's inputs and the run's times."""
+    read = () if source is None else (source,)
+    return writing(
+        out,
+        command,
+        inputs=(*read, *prepared.case.inputs),
+        seconds=prepared.stages.seconds,
+        names=names,
+        made_from={one.path: one.sha256 for one in read},
+        note=prepared.watcher.note,
+    )
+
+
+def _final(run: Run, draft: Draft) -> Run:
+    """The run with its files where they lie now."""
+    return replace(run, files=draft.final(run.files))
+
+
+def _answered(run: Run, out: Path) -> Run:
+    """The run, if it has a plan.
+
+    Raises:
+        NoAnswerError: It has none.
+    """
+    if run.plan is None:
+        raise NoAnswerError(f"{run.refusal}; see {out / 'report.html'}", counts=run.candidates.counts())
+    return run
+
+
+def _searched_and_planned(prepared: Prepared, out: Path) -> Run:
+    return _with_table(_planned(Run(prepared, prepared.search(), ()), out), out)
+
+
+def rehearse_plan(prepared: Prepared, plan_path: Path, out: Path) -> Run:
+    """Load a plan, check it again, rehearse it; write the rehearsal's files and the scene, but no map of one direction.
+
+    The scene is left out where the plan's own stands beside it: it shows the same.
+
+    Raises:
+        InputError: A plan that does not belong to the case or does not hold any more.
+    """
+    source, plan = _read_plan(plan_path, prepared.watcher.note)
+    with prepared.stages.time("plan"):
+        candidates = check_plan(plan, prepared, plan_path, seed=prepared.case.rehearsal.seed)
+    with _writing(out, "rehearse", prepared, ("rehearsal.json", FILM), source) as draft:
+        run = _rehearsed(Run(prepared, candidates, (), plan, read=(source,)), draft.folder)
+        if not draft.source_has("scene.png"):
+            with prepared.stages.time("scene"):
+                draw_scene(prepared.case, prepared.anatomy, candidates, plan, draft.folder / "scene.png")
+            run = _with(run, draft.folder / "scene.png")
+    return _final(run, draft)
+
+
+def _read_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Plan]:
+    """A plan of a whole set, or with a warning from outside of any, and the hash of the bytes that it was read from."""
+    found = read_output(path, max_bytes=MAX_PLAN_BYTES)
+    plan = parse_plan(found.data, path)
+    if found.note:
+        note(f"warning: {found.note}")
+    return found.input("plan"), plan
+
+
+def _rehearsed(run: Run, out: Path) -> Run:
+    """Execute the run's plan where the truth differs, write the numbers and the film."""
+    assert run.plan is not None
+    prepared = run.prepared
+    with prepared.stages.time("rehearsal"):
+        truth = draw_truth(prepared.case, run.plan.T_base_ct)
+        rehearsal = rehearse(run.plan, prepared.case, prepared.anatomy, truth)
+    document = {**rehearsal_summary(rehearsal), "inputs": inputs_document(run.inputs)}
+    run = _with(replace(run, rehearsal=rehearsal), _write_json(document, out / "rehearsal.json"))
+    with prepared.stages.time("film"):
+        film = draw_film(
+            rehearsal,
+            run.plan,
+            prepared.case,
+            prepared.anatomy,
+            out / FILM,
+            progress=partial(prepared.watcher.count, "film"),
+        )
+    return _with(run, film)
+
+
+def export(
+    plan_path: Path, format_name: str, out: Path, prepared: Prepared | None, note: Callable[[str], None]
+) -> Exported:
+    """Write a plan for a robot; with its case, after it has been checked again, and with rounded corners where free.
+
+    Raises:
+        InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
+    """
+    source, plan = _read_plan(plan_path, note)
+    if prepared is not None:
+        check_plan(plan, prepared, plan_path, seed=prepared.case.rehearsal.seed)
+    checker = None if prepared is None or prepared.reach is None else prepared.reach.checker
+    name = export_name(plan_path, format_name)
+    inputs, made_from = (source, *plan.inputs), {source.path: source.sha256}
+    with writing(out, f"export {name}", inputs=inputs, names=(name,), made_from=made_from, note=note) as draft:
+        done = export_plan(plan, format_name, draft.folder, source=plan_path, checker=checker)
+    return replace(done, path=draft.final((done.path,))[0])
+
+
+def check_candidate(prepared: Prepared, theta_deg: float, beta_deg: float) -> Explanation:
+    """Judge one direction and explain it."""
+    found = prepared.check(np.radians(theta_deg), np.radians(beta_deg))
+    return Explanation(prepared.case, prepared.anatomy, found)
+
+
+def registration_report(path: Path) -> dict[str, Any]:
+    """Everything known about a case's registration, as plain values.
+
+    Raises:
+        InputError: The case has no markers, or they cannot be used.
+    """
+    case = load_case(path)
+    checked = checked_placement(case, user_cache())
+    if checked is None or checked.placement.registration is None:
+        raise InputError("the case has no [registration]", where=case.path, allowed="markers_ct and markers_base")
+    placement, registration = checked.placement, checked.placement.registration
+    report = registration_summary(registration)
+    pose = case.target_ct + case.needle.shaft_mm * case.T_ct_entry[:3, 2]
+    along = np.linspace(case.target_ct, pose, 4)
+    report["case"] = case.name
+    report["inputs"] = inputs_document(case.inputs)
+    report["expected_tre_target_mm"] = placement.target_error_mm
+    report["expected_tre_target_interval_mm"] = list(registration.expected_tre_interval_mm(case.target_ct))
+    report["expected_tre_along_shaft_mm"] = registration.expected_tre_mm(along).tolist()
+    report["warnings"] = [*case.warnings, *checked.findings.warnings]
+    report["notes"] = list(checked.findings.notes)
+    return report
+
+
+def registration_summary(registration: Registration) -> dict[str, Any]:
+    """A registration as plain values: mm."""
+    return {
+        "method": registration.method,
+        "T_base_ct": registration.T_base_ct.tolist(),
+        "residual_mm": dict(zip(registration.markers.names, registration.residual_mm.tolist(), strict=True)),
+        "fre_mm": registration.fre_mm,
+        "mean_error_mm": registration.mean_error_mm,
+        "fle_mm": registration.fle_mm,
+        "fle_source": registration.fle_source,
+        "fle_interval_mm": list(registration.residual_test.fle_interval_mm),
+        "chi_squared": finite(registration.residual_test.chi_squared),
+        "degrees_of_freedom": registration.residual_test.freedom,
+        "noise_scale": registration.residual_test.scale,
+        "spread_ratio": registration.conditioning.spread_ratio,
+        "altitude_mm": registration.conditioning.altitude_mm,
+        "leverage": registration.conditioning.leverage,
+        "flags": list(registration.flags),
+    }
+
+
+def candidate_summary(found: Candidates, row: int) -> dict[str, Any]:
+    """One ranked candidate as plain values: mm and degrees."""
+    return {
+        "rank": int(found.rank[row]),
+        "theta_deg": float(np.degrees(found.theta[row])),
+        "beta_deg": float(np.degrees(found.beta[row])),
+        "cost": finite(found.cost[row]),
+        "min_clearance_mm": finite(found.min_clearance[row]),
+        "path_length_mm": finite(found.path_length[row]),
+        "skin_angle_deg": finite(np.degrees(found.skin_angle[row])),
+        "tissue_mm": finite(found.tissue[row]),
+        "reach_margin": finite(found.reach_margin[row]),
+        "safe_cone_deg": finite(np.degrees(found.safe_cone[row])),
+        "pareto": bool(found.pareto[row]),
+    }
+
+
+def plan_summary(plan: Plan) -> dict[str, Any]:
+    """A plan's main numbers as plain values."""
+    return {
+        "theta_deg": float(np.degrees(plan.theta)),
+        "beta_deg": float(np.degrees(plan.beta)),
+        "entry_ct_mm": plan.entry_ct.tolist(),
+        "standoff_mm": plan.standoff_mm,
+        "expected_target_error_mm": finite(plan.expected_target_error_mm),
+        "approach_s": float(plan.approach.times_s[-1]),
+        "insertion_s": float(plan.insertion.times_s[-1]),
+        "clearance_mm": {phase: finite(value) for phase, value in plan.clearance_mm.items()},
+    }
+
+
+def rehearsal_summary(rehearsal: Rehearsal) -> dict[str, Any]:
+    """A rehearsal's main numbers as plain values."""
+    return {
+        "seed": rehearsal.seed,
+        "tip_error_mm": rehearsal.tip_error_mm,
+        "lateral_mm": rehearsal.lateral_mm,
+        "depth_mm": rehearsal.depth_mm,
+        "predicted_error_mm": finite(rehearsal.predicted_error_mm),
+        "contacts": [f"{c.link} touches {c.body} at {c.time_s:.2f} s" for c in rehearsal.contacts],
+        "least_clearance_mm": {name: float(np.min(values)) for name, values in rehearsal.clearance_mm.items()},
+        "max_joint_speed_deg_s": np.degrees(rehearsal.max_joint_speed).tolist(),
+        "joint_speed_limit_deg_s": np.degrees(rehearsal.speed_limits).tolist(),
+    }
+
+
+def verify_certificate(path: Path, prepared: Prepared) -> dict[str, Any]:
+    """Prove every cell of a certificate again, by the plain checker.
+
+    Raises:
+        InputError: Not a certificate, not of this case, or a cell whose verdict does not follow.
+    """
+    found = read_output(path, max_bytes=MAX_CERTIFICATE_BYTES)
+    stated, certificate = found.input("certificate"), parse_certificate(found.data, path)
+    if found.note:
+        prepared.watcher.note(f"warning: {found.note}")
+    done = verify(certificate, prepared.case, prepared.anatomy, partial(prepared.watcher.count, "cells"))
+    inputs = inputs_document((stated, *prepared.case.inputs))
+    return {"certificate": str(path), "inputs": inputs, **certificate.summary(), "verified": asdict(done)}
+
+
+def _certified(run: Run, size_deg: float, out: Path) -> Run:
+    """Certify the cap to a cell size, and rank again with the safe cones."""
+    prepared = run.prepared
+    with prepared.stages.time("certify"):
+        certificate = certify(prepared.case, prepared.anatomy, size=float(np.radians(size_deg)))
+    with prepared.stages.time("safe cones"):
+        found = with_safe_cone(prepared.case, run.candidates, certificate)
+    write_certificate(certificate, out / CERTIFICATE)
+    return _with(replace(run, candidates=found, certificate=certificate), out / CERTIFICATE)
+
+
+def _planned(run: Run, out: Path) -> Run:
+    prepared = run.prepared
+    try:
+        with prepared.stages.time("plan"):
+            plan, candidates = make_plan(prepared, run.candidates, seed=prepared.case.rehearsal.seed)
+    except NoAnswerError as error:
+        return replace(run, refusal=str(error))
+    write_plan(plan, out / "plan.json")
+    return _with(replace(run, plan=plan, candidates=candidates), out / "plan.json")
+
+
+def _with_table(run: Run, out: Path) -> Run:
+    path = out / "candidates.parquet"
+    with run.prepared.stages.time("table"):
+        write_table(run.candidates, run.prepared.provenance(), path)
+    return _with(run, path)
+
+
+def _with_pictures(run: Run, out: Path) -> Run:
+    """Draw the map, the scene and the page of what is known."""
+    prepared, found = run.prepared, run.candidates
+    case, anatomy, stages = prepared.case, prepared.anatomy, prepared.stages
+    with stages.time("map"):
+        draw_map(found, case, out / "map.png")
+    with stages.time("scene"):
+        draw_scene(case, anatomy, found, run.plan, out / "scene.png")
+    registration = prepared.placement.registration if prepared.placement is not None else None
+    shown = None if registration is None else registration_summary(registration)
+    film = next((path.name for path in run.files if path.stem == Path(FILM).stem and path.suffix != ".json"), None)
+    with stages.time("page"):
+        write_page(case, anatomy, found, run.plan, run.rehearsal, shown, out / "report.html", film=film)
+    return _with(run, out / "map.png", out / "scene.png", out / "report.html")
+
+
+def _write_json(summary: dict[str, Any], path: Path) -> Path:
+    with atomic(path) as temporary:
+        temporary.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return path
+
+
+def _with(run: Run, *files: Path) -> Run:
+    return replace(run, files=(*run.files, *files))

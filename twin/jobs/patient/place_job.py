@@ -1,0 +1,97 @@
+"""The job ``place``: search for a place to stand the arm, and the files that show it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.base.output.output_set import withdraw, writing
+from puncture_twin.planning.case.case import mount_pose
+from puncture_twin.planning.collision.workcell import case_checker
+from puncture_twin.planning.place.document import place_document, write_place_document, write_placements
+from puncture_twin.planning.place.search import PlaceSearch, search_placements
+from puncture_twin.planning.search.candidates import ARM_CHECKED
+from puncture_twin.planning.search.context import Prepared
+from puncture_twin.planning.search.search import Reach, case_directions, organ_candidates, ranked, with_reach
+from puncture_twin.twin.report.map.map_picture import draw_map
+from puncture_twin.twin.report.map.placement_picture import draw_placements
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceRun:
+    """What ``place`` has found, and the files that it wrote."""
+
+    prepared: Prepared
+    found: PlaceSearch
+    document: dict[str, Any]
+    files: tuple[Path, ...]
+    directions: int
+    """That the organs allow."""
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON: mm; shares 0..1."""
+        seconds = {stage: round(spent, 3) for stage, spent in self.prepared.stages.seconds.items()}
+        return {**self.document, "seconds": seconds, "files": [str(path) for path in self.files]}
+
+
+def place_case(prepared: Prepared, out: Path, *, jobs: int, pictures: bool = True) -> PlaceRun:
+    """Search; write ``placements.csv``, ``place.json`` and, if wanted, the two pictures.
+
+    Raises:
+        InputError: Bounds that contradict the case.
+        NoAnswerError: No direction is safe for the organs, or no placement holds one; the files are written in the
+            second case.
+    """
+    names = ("placements.csv", "place.json", *(("placements.png", "map_best_place.png") if pictures else ()))
+    try:
+        with writing(
+            out,
+            "place",
+            inputs=prepared.case.inputs,
+            seconds=prepared.stages.seconds,
+            names=names,
+            note=prepared.watcher.note,
+        ) as draft:
+            run = _placed(prepared, draft.folder, jobs, pictures)
+    except NoAnswerError:
+        withdraw(out, "place")
+        raise
+    if not any(one.verdict.held for one in run.found.judged):
+        raise NoAnswerError(f"no placement holds any of the {run.directions} organ-safe directions")
+    return replace(run, files=draft.final(run.files))
+
+
+def _placed(prepared: Prepared, out: Path, jobs: int, pictures: bool) -> PlaceRun:
+    """Search, and write everything into a folder."""
+    case, stages = prepared.case, prepared.stages
+    with stages.time("organs"):
+        candidates = organ_candidates(case, prepared.anatomy, prepared.engine, case_directions(case))
+    with stages.time("placements"):
+        found = search_placements(
+            case,
+            prepared.anatomy,
+            candidates,
+            prepared.placement,
+            jobs=jobs,
+            progress=prepared.watcher.count,
+        )
+    document = place_document(found, prepared.provenance() | {"arm": ARM_CHECKED})
+    write_placements(found, out / "placements.csv")
+    write_place_document(document, out / "place.json")
+    files = [out / "placements.csv", out / "place.json"]
+    if pictures:
+        with stages.time("pictures"):
+            draw_placements(found, case, prepared.anatomy.skin.mesh, out / "placements.png")
+            files.append(out / "placements.png")
+    if pictures and any(one.verdict.held for one in found.judged):
+        T_base_ct = mount_pose(found.judged[0].mount, case.space, case.path)
+        with stages.time("map"):
+            reach = Reach(case_checker(case, prepared.anatomy, T_base_ct), np.asarray(T_base_ct))
+            held = ranked(case, with_reach(case, candidates, reach))
+            draw_map(held, replace(case, name=f"{case.name}, arm at the best place"), out / "map_best_place.png")
+            files.append(out / "map_best_place.png")
+    return PlaceRun(prepared, found, document, tuple(files), int(candidates.safe.sum()))

@@ -1,0 +1,63 @@
+"""What ``place`` and ``mirror`` print for a person."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from puncture_twin.planning.place.search import Judged
+from puncture_twin.twin.jobs.patient.place_job import PlaceRun
+from puncture_twin.twin.jobs.robot.mirror import Mirrored
+from puncture_twin.twin.report.mount_text import direction_words, mount_words
+
+HALF_A_DIGIT = 5e-4
+"""Of a share that is printed in % with one digit."""
+
+
+def place_text(run: PlaceRun) -> str:
+    """The ranked placements, the case's own, the lines to paste, and the files."""
+    case, found = run.prepared.case, run.found
+    asked = found.judged[0].verdict.asked if found.judged else 0
+    x, y, z = (direction_words(found.T_ct_bed[:3, axis], str(case.space)) for axis in range(3))
+    lines = [
+        f"case {case.name}: {asked} organ-safe directions; {len(found.coarse)} + {found.refined} placements estimated,"
+        f" {len(found.judged)} judged",
+        f"  from the target, mm: along = toward {x}, across = toward {y}, height = toward {z}",
+        *needle_line(found.possible),
+        "rank  share %   held  margin  along  across  height  mount",
+    ]
+    lines += [_line(f"{rank:4d}", one, run) for rank, one in enumerate(found.judged, start=1)]
+    if found.own is not None:
+        lines.append(_line("   -", found.own, run))
+    best = run.document["mount_lines"]
+    if best:
+        lines += ["the best, for the case (in place of its [registration] or [robot.mount]):", ""]
+        lines += [f"  {line}" for line in str(best).splitlines()]
+        lines += ["", "a proposal: where the arm then really stands, markers must say ([registration])"]
+    seconds = ", ".join(f"{stage} {spent:.1f}" for stage, spent in run.prepared.stages.seconds.items())
+    return "\n".join([*lines, f"seconds: {seconds}", "look at:", *(f"  {path}" for path in run.files)])
+
+
+def needle_line(possible: float) -> list[str]:
+    """What no placement can mend, where there is such a thing."""
+    if possible > 1.0 - HALF_A_DIGIT:
+        return []
+    share = f"at most {100 * possible:.1f} % can be held from anywhere"
+    return [f"  {share}: elsewhere the needle itself would start too near the skin"]
+
+
+def _line(rank: str, one: Judged, run: PlaceRun) -> str:
+    verdict, space = one.verdict, str(run.prepared.case.space)
+    where = "     -       -       -" if one.site is None else "{:6.0f}  {:6.0f}  {:6.0f}".format(*one.site.position)
+    name = one.name if one.site is None else mount_words(one.site.region, run.found.T_ct_bed, space)
+    home = f"; home: {verdict.home_contact}" if verdict.home_contact else ""
+    return f"{rank}  {100 * verdict.share:7.1f}  {verdict.held:5d}  {verdict.margin:6.2f}  {where}  {name}{home}"
+
+
+def mirror_line(shown: Mirrored) -> str:
+    """One state of a mirrored arm."""
+    x, y, z = shown.tip_ct
+    joints = " ".join(f"{angle:7.2f}" for angle in np.degrees(shown.q))
+    return (
+        f"{shown.time_s:9.3f} s  joints {joints} deg  tip (CT) {x:8.2f} {y:8.2f} {z:8.2f} mm"
+        f"  to target {shown.to_target_mm:7.2f} mm, off its line {shown.off_axis_mm:6.2f} mm"
+    )

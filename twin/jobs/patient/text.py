@@ -1,0 +1,203 @@
+"""What the commands print for a person. Plain values in, text out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from puncture_twin.planning.export.exporter import Exported
+from puncture_twin.planning.search.explain import needle_warnings, reason_text
+from puncture_twin.planning.search.search import closest_miss
+from puncture_twin.twin.jobs.papers.chen2019 import Reproduction
+from puncture_twin.twin.jobs.patient.main_job import Run, plan_summary, rehearsal_summary
+
+
+def search_text(run: Run) -> str:
+    """Counts, the best ten, or what came closest; then the files."""
+    return "\n".join([*_search(run), *_footer(run)])
+
+
+def plan_text(run: Run) -> str:
+    """The search, then the plan; then the files."""
+    return "\n".join([*_search(run), *_plan(run), *_footer(run)])
+
+
+def rehearsal_text(run: Run) -> str:
+    """The search and the plan, then where the tip ended; then the files."""
+    return "\n".join([*_search(run), *_plan(run), *_rehearsal(run), *_footer(run)])
+
+
+def _search(run: Run) -> list[str]:
+    found = run.candidates
+    lines = [f"case {run.prepared.case.name}: {len(found)} direction{'s' if len(found) != 1 else ''}"]
+    counts = ((found.safe_text if reason == "safe" else reason, count) for reason, count in found.counts().items())
+    lines += [f"  {count:7d}  {reason}" for reason, count in counts]
+    lines += needle_warnings(run.prepared.case, found)
+    lines += [] if found.arm_checked else [f"arm {found.arm}"]
+    return lines + (_best(run) if found.safe.any() else _nothing_safe(run))
+
+
+def _plan(run: Run) -> list[str]:
+    assert run.plan is not None
+    plan = plan_summary(run.plan)
+    error = plan["expected_target_error_mm"]
+    return [
+        f"plan: theta {plan['theta_deg']:g} deg, beta {plan['beta_deg']:g} deg, standoff {plan['standoff_mm']:.1f} mm",
+        f"  approach {plan['approach_s']:.1f} s, insertion {plan['insertion_s']:.1f} s",
+        "  expected error at the target: " + ("unknown (no markers)" if error is None else f"{error:.2f} mm (rms)"),
+    ]
+
+
+def _rehearsal(run: Run) -> list[str]:
+    assert run.rehearsal is not None
+    done = rehearsal_summary(run.rehearsal)
+    kept = {s.name: done["least_clearance_mm"][s.name] for s in run.prepared.anatomy.structures if s.demands_margin}
+    nearest = min(kept.items(), key=lambda item: item[1], default=("nothing", float("nan")))
+    return [
+        f"rehearsal (seed {done['seed']}): the tip ended {done['tip_error_mm']:.2f} mm from the true target",
+        f"  lateral {done['lateral_mm']:.2f} mm, depth {done['depth_mm']:+.2f} mm (+ is too deep)",
+        f"  least clearance of the true needle to what it must avoid: {nearest[1]:.2f} mm, {nearest[0]}",
+        f"  arm contacts: {'; '.join(done['contacts']) or 'none'}",
+    ]
+
+
+def certificate_lines(summary: dict[str, Any]) -> list[str]:
+    """What a certificate says of the cap; where nothing is safe, that this is proven, and to what."""
+    share = summary["undecided_share"]
+    undecided = "" if share is None else f" ({100 * share:.2f} % of the cap)"
+    area = f"{summary['undecided_square_deg']:.1f} square degrees{undecided}"
+    if summary["safe_cells"] == 0:
+        left = f", except perhaps in {area} of undecided cells" if summary["undecided_cells"] else ""
+        said = f"proven: no direction of the cap is safe, to {summary['size_deg']:g} deg{left}"
+    else:
+        share = summary["safe_share"]
+        safe = "" if share is None else f" ({100 * share:.1f} % of the cap)"
+        said = f"certified to {summary['size_deg']:g} deg: safe {summary['safe_square_deg']:.1f} square degrees{safe}"
+        said += f", undecided {area}"
+    return [f"{said}; {summary['queries']} exact queries", f"  not certified: {', '.join(summary['not_certified'])}"]
+
+
+def certificate_text(report: dict[str, Any]) -> str:
+    """What the plain checker proved."""
+    done = report["verified"]
+    return "\n".join(
+        [
+            f"{report['certificate']}: every cell holds",
+            f"  {done['safe']} safe and {done['rejected']} rejected cells proven again, {done['undecided']} undecided",
+            *certificate_lines(report),
+        ]
+    )
+
+
+def export_text(done: Exported, case_checked: bool) -> str:
+    """What was written, and what whoever runs it should know."""
+    checked = "" if case_checked else "the plan was not held against its case again: name it with --case"
+    notes = [note for note in (*done.notes, checked) if note]
+    return "\n".join([f"{done.format_name}: {done.path}", *(f"  {note}" for note in notes)])
+
+
+def registration_text(report: dict[str, Any]) -> str:
+    """Residuals, expected error and weak points of a registration."""
+    lines = [f"case {report['case']}: registration by {report['method']}"]
+    lines += [f"  marker {name}: residual {mm:.3f} mm" for name, mm in report["residual_mm"].items()]
+    lines += [
+        f"  FRE {report['fre_mm']:.3f} mm, mean residual {report['mean_error_mm']:.3f} mm",
+        "  (the residuals are not the accuracy at the target)",
+        f"  FLE {report['fle_mm']:.3f} mm, {report['fle_source']}{_interval(report['fle_interval_mm'])}",
+        f"  expected error at the target {report['expected_tre_target_mm']:.3f} mm"
+        + _interval(report["expected_tre_target_interval_mm"]),
+        "  along the shaft, target to hub: " + ", ".join(f"{mm:.3f}" for mm in report["expected_tre_along_shaft_mm"]),
+        f"  spread s2/s1 {report['spread_ratio']:.2f}, altitude {report['altitude_mm']:.0f} mm, "
+        f"TRE/FLE {report['leverage']:.2f}",
+    ]
+    for kind, key in (("weak", "flags"), ("warning", "warnings"), ("note", "notes")):
+        lines += [f"  {kind}: {sentence}" for sentence in report[key]]
+    return "\n".join(lines)
+
+
+def _interval(bounds: Sequence[float]) -> str:
+    """A 95 % interval; nothing where both bounds are one."""
+    low, high = bounds
+    return "" if low == high else f" (95 %: {low:.3f} to {high:.3f})"
+
+
+def batch_text(rows: Sequence[dict[str, Any]]) -> str:
+    """One line per case."""
+    width = max((len(row["case"]) for row in rows), default=4)
+    lines = [f"{'case':{width}s}  safe  of     best theta/beta  said"]
+    for row in rows:
+        best = "-" if row["best_theta_deg"] is None else f"{row['best_theta_deg']:g}/{row['best_beta_deg']:g}"
+        lines.append(f"{row['case']:{width}s}  {row['safe']:5d} {row['directions']:6d}  {best:15s}  {row['said']}")
+    return "\n".join(lines)
+
+
+def reproduction_text(result: Reproduction) -> str:
+    """The paper's numbers beside ours."""
+    lines = [
+        "table  what                                    paper                       ours                   differs"
+    ]
+    for row in result.rows:
+        paper, ours = (" ".join(f"{x:8.2f}" for x in values) for values in (row.paper, row.ours))
+        mark = "" if row.holds else "  DOES NOT HOLD"
+        lines.append(f"{row.table:5s}  {row.what:36.36s} {paper:>27s} {ours:>27s} {row.difference_mm:8.4f}{mark}")
+    reach = result.reach
+    lines += [
+        "",
+        f"The worked pose puts the flange {reach.flange_from_shoulder_mm:.1f} mm from the shoulder of a UR3, "
+        f"whose links span {reach.longest_span_mm:.1f} mm at most: "
+        + ("it is out of reach." if reach.out_of_reach else "it is within reach."),
+        "every number holds" if result.holds else "NOT every number holds",
+    ]
+    return "\n".join(lines)
+
+
+def reproduction_summary(result: Reproduction) -> dict[str, Any]:
+    """The same as plain values."""
+    rows = [
+        {"table": r.table, "what": r.what, "paper_mm": r.paper, "ours_mm": r.ours, "holds": r.holds}
+        for r in result.rows
+    ]
+    return {
+        "rows": rows,
+        "flange_from_shoulder_mm": result.reach.flange_from_shoulder_mm,
+        "longest_span_mm": result.reach.longest_span_mm,
+        "out_of_reach": result.reach.out_of_reach,
+        "holds": result.holds,
+    }
+
+
+def _best(run: Run) -> list[str]:
+    lines = ["rank  theta   beta   cost  clearance  path  angle  reach  (deg, mm)"]
+    for best in run.summary()["best"]:
+        cone = "" if best["safe_cone_deg"] is None else f"  safe cone {best['safe_cone_deg']:.1f}"
+        reach = "    -" if best["reach_margin"] is None else f"{best['reach_margin']:5.2f}"
+        lines.append(
+            f"{best['rank']:4d} {best['theta_deg']:6.1f} {best['beta_deg']:6.1f} {best['cost']:6.3f} "
+            f"{best['min_clearance_mm']:10.2f} {best['path_length_mm']:5.0f} {best['skin_angle_deg']:6.1f}  {reach}"
+            + cone
+            + ("  Pareto" if best["pareto"] else "")
+        )
+    return lines
+
+
+def _nothing_safe(run: Run) -> list[str]:
+    row = closest_miss(run.candidates)
+    if row is None:
+        return ["no candidate is safe"]
+    found = run.candidates.at(row)
+    angles = f"theta {found['theta_deg']:g} deg, beta {found['beta_deg']:g} deg"
+    return [f"no candidate is safe; closest came {angles}: {reason_text(run.candidates, row)}"]
+
+
+def _footer(run: Run) -> list[str]:
+    lines = [f"warning: {warning}" for warning in run.prepared.anatomy.warnings]
+    if run.certificate is not None:
+        lines += certificate_lines(run.certificate.summary())
+    if run.checked is not None:
+        checked = run.checked
+        lines.append(
+            f"cross-check: FCL measured {checked.directions} directions again; {checked.pairs} distances agree,"
+            f" largest difference {checked.largest_mm:.1e} mm"
+        )
+    stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in run.prepared.stages.seconds.items())
+    return [*lines, f"seconds: {stages}", "look at:", *(f"  {path}" for path in run.files)]

@@ -1,0 +1,228 @@
+"""The self-calibration from end to end: in the twin (truth, poses, pictures, detection) or from a recording."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.provenance import Input, content_input, inputs_document
+from puncture_twin.planning.base.stages import Stages
+from puncture_twin.planning.base.whole_lines import unfinished_warnings
+from puncture_twin.planning.search.context import Watcher
+from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, acquire, choice_noise
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.pose_choice import expected_tre_mm
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import (
+    FILE_NAME,
+    MAX_BYTES,
+    Recording,
+    parse_recording,
+    recording_file,
+    write_recording,
+)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.slips import checked_calibration
+from puncture_twin.twin.guidance.ultrasound.candidate_poses import Candidates, drawing, find_candidates
+from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, held_out_errors_mm, punctures
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_room
+from puncture_twin.twin.guidance.ultrasound.summaries import (
+    calibration_summary,
+    choice_summary,
+    puncture_summary,
+    trial_summary,
+)
+from puncture_twin.twin.guidance.ultrasound.trial import Choice, Trial
+from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
+
+VERSION = 2
+"""Of ``calibration.json``. 2: ``inputs`` lists each file with its role."""
+
+TARGETS = 6
+"""Punctures per seed."""
+
+HELD_OUT = 60
+"""Candidates per seed at which prediction and truth are compared."""
+
+RANDOM_SETS = 50
+"""Random choices that the informative one is compared with."""
+
+
+@dataclass(frozen=True, eq=False)
+class SelfcalRun:
+    """What the command did.
+
+    Attributes:
+        name: The case's, or the recording file's.
+        calibration: The first trial's, or the recording's.
+        recording: What it was made from.
+        inputs: Recording and case file, with role and hash.
+        trials: In the twin, one per seed; empty for a recording.
+        case: The case, in the twin.
+        candidates: The same.
+        choice: The same.
+        stages: Seconds.
+        files: What was written.
+        warnings: What the recording leaves open, one sentence each.
+    """
+
+    name: str
+    calibration: Calibration
+    recording: Recording
+    inputs: tuple[Input, ...]
+    trials: tuple[Trial, ...] = ()
+    case: SelfcalCase | None = None
+    candidates: Candidates | None = None
+    choice: Choice | None = None
+    stages: Stages = field(default_factory=Stages)
+    files: tuple[Path, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def punctures(self) -> tuple[Puncture, ...]:
+        """Of all seeds."""
+        return tuple(one for trial in self.trials for one in trial.punctures)
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON: mm and degrees."""
+        return {
+            **calibration_summary(self.calibration, self.recording),
+            "name": self.name,
+            "inputs": inputs_document(self.inputs),
+            "candidates": None if self.candidates is None else self.candidates.counts,
+            "choice": None if self.choice is None else choice_summary(self.choice),
+            "trials": [trial_summary(trial) for trial in self.trials],
+            "punctures": puncture_summary(self.punctures),
+            "seconds": {stage: round(seconds, 3) for stage, seconds in self.stages.seconds.items()},
+            "files": [str(path) for path in self.files],
+            "warnings": list(self.warnings),
+        }
+
+    def with_files(self, *files: Path) -> SelfcalRun:
+        """The same, with files written."""
+        return replace(self, files=(*self.files, *files))
+
+
+def selfcal_twin(case: SelfcalCase, seeds: int, watcher: Watcher) -> SelfcalRun:
+    """Draw ``seeds`` rooms from the case's seed on; record, calibrate and puncture in each.
+
+    Raises:
+        Degenerate: The poses cannot show every unknown.
+        NoAnswerError: Not enough poses can be taken or show the needle.
+    """
+    stages = Stages()
+    with stages.time("room"):
+        room = TwoArms(case)
+    with stages.time("candidates"):
+        candidates = find_candidates(case, room, np.random.default_rng(case.content.seed))
+    trials = []
+    for seed in range(case.content.seed, case.content.seed + seeds):
+        trials.append(_trial(case, room, candidates, seed, stages, watcher))
+    with stages.time("comparison with random choice"):
+        choice = compare_choice(case, candidates, trials[0].acquisition)
+    first = trials[0]
+    return SelfcalRun(
+        case.content.name,
+        first.calibration,
+        first.acquisition.recording,
+        case.inputs,
+        tuple(trials),
+        case,
+        candidates,
+        choice,
+        stages,
+    )
+
+
+def selfcal_recording(path: Path, case: SelfcalCase | None) -> SelfcalRun:
+    """Calibrate from a recording's CSV, or a folder with ``recording.csv``; a case says noise and needle length.
+
+    Raises:
+        InputError: A recording that cannot be used, or that fits only in another reading (inverse, swapped, metres).
+        Degenerate: The poses cannot show every unknown.
+    """
+    file = recording_file(path)
+    stages = Stages()
+    with stages.time("read"):
+        content = read_input(file, max_bytes=MAX_BYTES, where=str(file))
+        recording = parse_recording(content, file)
+    with stages.time("calibrate"):
+        calibration = checked_calibration(recording, partial(calibrate_case, recording, case), file)
+    inputs = (content_input("recording", file.name, content), *(() if case is None else case.inputs))
+    warnings = unfinished_warnings(content, file.name)
+    return SelfcalRun(file.stem, calibration, recording, inputs, case=case, stages=stages, warnings=warnings)
+
+
+def calibrate_case(recording: Recording, case: SelfcalCase | None) -> Calibration:
+    """Calibrate with what the case says of noise and needle; pixels are solved for where the recording has them."""
+    noise = None if case is None or case.content.noise is None else case.content.noise.noise()
+    length = case.content.needle.length_mm if case is not None and case.content.hold_needle_length else None
+    return calibrate(recording, noise=noise, needle_length_mm=length, scale=recording.pixels)
+
+
+def _trial(
+    case: SelfcalCase, room: TwoArms, candidates: Candidates, seed: int, stages: Stages, watcher: Watcher
+) -> Trial:
+    rng = np.random.default_rng(seed)
+    truth = draw_room(case, rng)
+    with stages.time("recording"):
+        taken = acquire(
+            case, room, candidates, truth, rng, lambda done, total: watcher.count(f"seed {seed}: pictures", done, total)
+        )
+    with stages.time("calibrate"):
+        calibration = calibrate_case(taken.recording, case)
+    others = rng.permutation(taken.left)
+    with stages.time("puncture"):
+        held_out = held_out_errors_mm(candidates, others[:HELD_OUT], truth, calibration, rng)
+        reached = punctures(case, room, candidates, others[:TARGETS], truth, calibration, rng)
+    return Trial(seed, truth, taken, calibration, held_out, reached)
+
+
+def compare_choice(case: SelfcalCase, candidates: Candidates, taken: Acquisition) -> Choice:
+    """The expected error of the poses that were recorded, and of random choices of as many."""
+    noise, belief, poses = choice_noise(case), drawing(case), candidates.poses
+    rng = np.random.default_rng(case.content.seed)
+    rows = np.array([shot.candidate for shot in taken.shots])
+
+    def expected(some: NDArray[np.int_]) -> float:
+        return expected_tre_mm(poses.subset(some), noise, belief, poses)
+
+    sets = [rng.choice(len(poses), len(rows), replace=False) for _ in range(RANDOM_SETS)]
+    return Choice(expected(rows), tuple(expected(some) for some in sets))
+
+
+def write_run(run: SelfcalRun, out: Path) -> SelfcalRun:
+    """Write ``calibration.json`` and, in the twin, the first seed's ``recording.csv``."""
+    written = [_write_json(calibration_file(run), out / "calibration.json")]
+    if run.trials:
+        write_recording(run.recording, out / FILE_NAME)
+        written.append(out / FILE_NAME)
+    return run.with_files(*written)
+
+
+def calibration_file(run: SelfcalRun) -> dict[str, Any]:
+    """What ``calibration.json`` holds."""
+    found = run.calibration
+    return {
+        "version": VERSION,
+        "name": run.name,
+        "seed": run.trials[0].seed if run.trials else None,
+        "inputs": inputs_document(run.inputs),
+        **calibration_summary(found, run.recording),
+        "residuals_mm": dict(zip(run.recording.names, found.residuals.tolist(), strict=True)),
+        "parameters": list(found.parameters),
+        "covariance": found.covariance.tolist(),
+    }
+
+
+def _write_json(content: dict[str, Any], path: Path) -> Path:
+    with atomic(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return path

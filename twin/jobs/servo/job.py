@@ -1,0 +1,87 @@
+"""The jobs behind the command line: a servo case, or the paper, from file to pictures and page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.twin.guidance.stereo.experiment import Statistics, Trial
+from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
+from puncture_twin.twin.guidance.stereo.session import Session
+from puncture_twin.twin.jobs.servo import liu2007
+from puncture_twin.twin.jobs.servo import text as servo_words
+from puncture_twin.twin.jobs.servo.liu2007 import Reproduction, held_sessions
+from puncture_twin.twin.jobs.servo.page import write_servo_page
+from puncture_twin.twin.jobs.servo.pictures import draw_cameras, draw_convergence
+
+NAMES = ("servo.html", "convergence.png", "camera_1.png", "camera_2.png")
+
+
+class ServoJob(NamedTuple):
+    """What came of a job."""
+
+    holds: bool
+    """Whether every servo converged; for the paper, whether its finding holds."""
+    summary: dict[str, Any]
+    """Plain values."""
+    text: str
+    """For a person."""
+
+
+def run_servo(
+    path: Path,
+    out_dir: Path,
+    seeds: int,
+    done: Callable[[int, int], None] | None = None,
+    note: Callable[[str], None] | None = None,
+) -> ServoJob:
+    """Hold the sessions of a case and write pictures, plot and page.
+
+    Args:
+        path: The case.
+        out_dir: Folder for the files.
+        seeds: How many, from the case's own on.
+        done: Told how many of how many are done.
+        note: Told what was removed that nobody might expect.
+
+    Raises:
+        InputError: The case cannot be used.
+        NoAnswerError: The first session could not be held.
+    """
+    case = load_servo_case(path)
+    with writing(out_dir, "servo", inputs=case.inputs, names=NAMES, note=note) as draft:
+        result = held_sessions(case, seeds, done)
+        written = _files(case, result.first, result.trials, result.ours, draft.folder)
+    files = [str(path) for path in draft.final(written)]
+    summary = {**servo_words.servo_summary(case, result.trials, result.ours), "files": files}
+    text = servo_words.servo_text(case, result.trials, result.ours, files)
+    return ServoJob(result.ours.not_confirmed == 0.0 and result.ours.refused == 0, summary, text)
+
+
+def reproduce_paper(out_dir: Path, seeds: int | None) -> ServoJob:
+    """Print the paper's tables beside ours, and write pictures, plot and page."""
+    with writing(out_dir, "reproduce", names=NAMES) as draft:
+        result = liu2007.reproduce(seeds)
+        draft.inputs = result.case.inputs
+        written = _files(result.case, result.first, result.trials, result.ours, draft.folder, result)
+    files = [str(path) for path in draft.final(written)]
+    summary = {**servo_words.reproduction_summary(result), "files": files}
+    return ServoJob(result.holds, summary, servo_words.reproduction_text(result, files))
+
+
+def _files(
+    case: ServoCase,
+    first: Session,
+    trials: tuple[Trial, ...],
+    ours: Statistics,
+    out_dir: Path,
+    paper: Reproduction | None = None,
+) -> list[Path]:
+    """Write everything; returns the paths."""
+    pictures = draw_cameras(first, out_dir)
+    convergence, page = out_dir / "convergence.png", out_dir / "servo.html"
+    draw_convergence(first, convergence)
+    write_servo_page(case, trials, ours, pictures, convergence, page, () if paper is None else paper.columns)
+    return [page, convergence, *pictures]

@@ -1,0 +1,142 @@
+"""The tables of Liu et al. 2007, recomputed from their rows, beside a session of ours in a room like theirs.
+
+Liu J., Zhang Y., Li Z., "Visual servoing control in robot-assisted stereotactic neurosurgery", J. Beijing Univ. of
+Aeronautics and Astronautics 33(3), 2007. The constants are what the paper prints, mm.
+
+The paper did not measure what the servo alone leaves, |true ball - estimated target|. It can be bounded: by the
+triangle's inequality no target of the table can have less than |after - mapping|.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.meshes import folder
+from puncture_twin.twin.guidance.stereo.experiment import Statistics, Trial, run_trials, statistics, trial
+from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
+from puncture_twin.twin.guidance.stereo.session import Session, run_session
+
+TABLE_1 = (0.33, 0.31, 0.19, 0.27, 0.21, 0.26, 0.34, 0.33, 0.38, 0.35)
+"""Error of the stereo at ten points."""
+
+TABLE_2 = (
+    (0.73, 1.19, 0.76),
+    (1.76, 2.29, 1.67),
+    (0.88, 1.45, 0.68),
+    (1.37, 1.25, 1.39),
+    (1.49, 1.49, 1.25),
+    (1.67, 1.77, 1.61),
+    (0.94, 0.93, 0.97),
+    (1.12, 1.67, 0.97),
+    (0.96, 0.99, 0.53),
+    (0.98, 1.72, 0.91),
+    (0.79, 1.27, 0.78),
+    (0.61, 2.41, 0.59),
+    (1.25, 1.89, 1.41),
+    (1.39, 1.47, 1.35),
+    (0.74, 0.96, 0.60),
+    (0.23, 0.91, 0.58),
+)
+"""Error of the mapping, before and after the servo, at sixteen targets."""
+
+TABLE_1_PRINTED = (0.30, 0.38)
+"""Mean and maximum."""
+
+TABLE_2_PRINTED = ((1.06, 1.76), (1.47, 2.41), (1.00, 1.67))
+"""Mean and maximum of mapping, before, after. The mean before is 1.477 by the rows: 1.48, not 1.47."""
+
+ROUNDING_MM = 0.005
+"""The paper prints two decimals."""
+
+CASE = "liu2007.toml"
+DEFAULT_SEEDS = 8
+
+
+class PaperMean(NamedTuple):
+    """A column of the paper: what it prints, and what its own rows give; mm."""
+
+    name: str
+    printed_mean: float
+    mean: float
+    printed_max: float
+    max: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether mean and maximum are what the rows give, to the paper's rounding."""
+        wrong = max(abs(self.mean - self.printed_mean), abs(self.max - self.printed_max))
+        return wrong <= ROUNDING_MM + 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Reproduction:
+    """The paper's numbers, and ours.
+
+    Attributes:
+        case: The room like the paper's.
+        columns: The paper's columns, recomputed.
+        first: The session of the first seed, in full.
+        trials: Every seed.
+        ours: Over all seeds.
+    """
+
+    case: ServoCase
+    columns: tuple[PaperMean, ...]
+    first: Session
+    trials: tuple[Trial, ...]
+    ours: Statistics
+
+    @property
+    def holds(self) -> bool:
+        """Whether the paper's finding holds in our room: the servo takes the robot's error out."""
+        return self.ours.after_mean < self.ours.before_mean and self.ours.not_confirmed < 0.5
+
+
+def paper_columns() -> tuple[PaperMean, ...]:
+    """Stereo, mapping, before, after: as printed, and by the rows."""
+    rows = np.array(TABLE_2)
+    columns = [("stereo", TABLE_1_PRINTED, np.array(TABLE_1))]
+    columns += [
+        (name, printed, rows[:, i])
+        for i, (name, printed) in enumerate(zip(("mapping", "before", "after"), TABLE_2_PRINTED, strict=True))
+    ]
+    return tuple(
+        PaperMean(name, printed[0], float(values.mean()), printed[1], float(values.max()))
+        for name, printed, values in columns
+    )
+
+
+def paper_servo_only_at_least() -> tuple[float, ...]:
+    """Least error that the servo alone can have had at each of the paper's targets, mm."""
+    return tuple(abs(after - mapping) for mapping, _, after in TABLE_2)
+
+
+def paper_case() -> ServoCase:
+    """The embedded room like the paper's."""
+    return load_servo_case(folder() / "head" / CASE)
+
+
+def reproduce(seeds: int | None = None, done: Callable[[int, int], None] | None = None) -> Reproduction:
+    """Hold the paper's sessions in the twin.
+
+    Args:
+        seeds: How many; the first is the case's own, the others follow it.
+        done: Told how many of how many are done.
+    """
+    return held_sessions(paper_case(), seeds or DEFAULT_SEEDS, done)
+
+
+def held_sessions(case: ServoCase, seeds: int, done: Callable[[int, int], None] | None = None) -> Reproduction:
+    """The sessions of a case beside the paper's numbers."""
+    first = run_session(case, case.file.seed)
+    tell = done or (lambda at, of: None)
+    tell(1, seeds)
+    others: Sequence[Trial] = run_trials(
+        case, range(case.file.seed + 1, case.file.seed + seeds), done=lambda at, of: tell(at + 1, seeds)
+    )
+    trials = (trial(first), *others)
+    return Reproduction(case, paper_columns(), first, trials, statistics(trials))

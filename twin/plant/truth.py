@@ -1,0 +1,175 @@
+"""What is really so, beside what the planner believes: where the patient lies and what the joints truly do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.case_file import RegistrationSection
+from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.registration import (
+    MIN_MARKERS,
+    MarkerPairs,
+    apply,
+    fit_rigid,
+    fit_triad,
+    match,
+)
+
+Floats = NDArray[np.float64]
+
+COLLINEAR = 0.01
+"""s2/s1 of the true points below which they leave a rotation free."""
+
+
+Fit = Callable[[Floats, Floats], Floats]
+
+
+class MarkerNoise(NamedTuple):
+    """Standard deviations per axis, normal errors."""
+
+    ct_mm: float
+    """Where a marker is found in the CT."""
+    touch_mm: float
+    """Where the robot says it touched it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The twin's truth.
+
+    Attributes:
+        T_base_ct_true: Shape (4, 4), mm: the patient in the true base frame.
+        joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says. They stand for all that changed
+            or was not seen since the markers were touched.
+        seed: What the random part was drawn from.
+        source: How it was found, in words for the report.
+    """
+
+    T_base_ct_true: Floats
+    joint_offsets: Floats
+    seed: int
+    source: str
+
+    def __post_init__(self) -> None:
+        for name in ("T_base_ct_true", "joint_offsets"):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+
+def draw_truth(case: Case, T_base_ct: Floats, *, seed: int | None = None) -> Truth:
+    """The truth of a case.
+
+    Where the case names a file of true positions, the patient lies where that file says. Otherwise marker errors are
+    drawn such that the belief is a plausible registration of this truth. Without markers belief and truth agree.
+
+    Args:
+        case: The case; its ``[rehearsal]`` table says how large the errors are.
+        T_base_ct: The belief, shape (4, 4), mm.
+        seed: Instead of the case's own.
+
+    Raises:
+        InputError: The file of true positions cannot be used.
+    """
+    settings = case.rehearsal
+    seed = settings.seed if seed is None else seed
+    rng = np.random.default_rng(seed)
+    offsets = rng.normal(0.0, np.radians(settings.joint_offset_deg), 6)
+    if settings.truth_base is not None:
+        T_true = _from_file(case, settings.truth_base)
+        source = f"true positions from {settings.truth_base}"
+    elif case.registration is not None:
+        T_true = _drawn(case, case.registration, T_base_ct, rng)
+        source = (
+            f"drawn with seed {seed}: marker errors of {settings.fle_ct_mm:g} mm in the CT and "
+            f"{settings.fle_touch_mm:g} mm at the touch (standard deviations per axis)"
+        )
+    else:
+        T_true, source = T_base_ct, "the belief itself: the case has no markers that could be off"
+    return Truth(T_true, offsets, seed, source)
+
+
+def registration_error(
+    points_ct: Floats, T_base_ct: Floats, fit: Fit, noise: MarkerNoise, rng: np.random.Generator
+) -> Floats:
+    """E with T_believed = T_true E: one registration of noisy markers, shape (4, 4), mm, CT frame.
+
+    Args:
+        points_ct: The markers, shape (n, 3), mm.
+        T_base_ct: Shape (4, 4): where they are touched, without error.
+        fit: The registration method.
+        noise: How far off the markers are found.
+        rng: Source of the errors.
+    """
+    read_ct = points_ct + rng.normal(0.0, noise.ct_mm, points_ct.shape)
+    touched_base = apply(T_base_ct, points_ct) + rng.normal(0.0, noise.touch_mm, points_ct.shape)
+    return np.asarray(np.linalg.inv(T_base_ct) @ fit(read_ct, touched_base))
+
+
+def _drawn(case: Case, registration: RegistrationSection, T_base_ct: Floats, rng: np.random.Generator) -> Floats:
+    markers = match(
+        _read(case, registration.markers_ct, case.space),
+        _read(case, registration.markers_base, None),
+        use=registration.use,
+    )
+    fit = fit_triad if registration.method == "triad" else fit_rigid
+    noise = MarkerNoise(case.rehearsal.fle_ct_mm, case.rehearsal.fle_touch_mm)
+    error = registration_error(markers.points_ct, T_base_ct, fit, noise, rng)
+    return np.asarray(T_base_ct @ np.linalg.inv(error))
+
+
+def pose_of_true_points(points: MarkerPairs, target_name: str, *, where: str = "rehearsal.truth_base") -> Floats:
+    """Where the patient lies when these points of the CT truly are there.
+
+    The rotation is the rigid least-squares fit of all points. Where the target is among them, the translation puts
+    it exactly on its true place: what the twin measures is the distance from there.
+
+    Args:
+        points: Markers and target by name, in the CT and at their true positions in the base frame.
+        target_name: The name of the target.
+        where: What errors name.
+
+    Returns:
+        T_base_ct, shape (4, 4), mm.
+
+    Raises:
+        InputError: Fewer than three points, or all on a line.
+    """
+    allowed = "3 or more points by the names of the markers and the target, not on a line"
+    named = ", ".join(points.names) or "none"
+    if len(points) < MIN_MARKERS:
+        raise InputError(f"names in common with the CT: {named}", where=where, allowed=allowed)
+    for side in (points.points_ct, points.points_base):
+        spread = np.linalg.svd(side - side.mean(axis=0), compute_uv=False)
+        if spread[1] <= COLLINEAR * spread[0]:
+            raise InputError(f"{named} lie on a line", where=where, allowed=allowed)
+    T = np.array(fit_rigid(points.points_ct, points.points_base))
+    if target_name in points.names:
+        row = points.names.index(target_name)
+        T[:3, 3] = points.points_base[row] - T[:3, :3] @ points.points_ct[row]
+    return T
+
+
+def _from_file(case: Case, name: str) -> Floats:
+    true_base = _read(case, name, None)
+    in_ct = {case.target_name: case.target_ct}
+    if case.registration is not None:
+        markers = _read(case, case.registration.markers_ct, case.space)
+        in_ct = dict(zip(markers.names, markers.points, strict=True)) | in_ct
+    rows = [row for row, point in enumerate(true_base.names) if point in in_ct]
+    names = tuple(true_base.names[row] for row in rows)
+    points_ct = np.array([in_ct[point] for point in names]).reshape(-1, 3)
+    pairs = MarkerPairs(names, points_ct, true_base.points[rows])
+    return pose_of_true_points(pairs, case.target_name, where=f"{case.path}: rehearsal.truth_base")
+
+
+def _read(case: Case, name: str, space: Space | None) -> NamedPoints:
+    return parse_points(case.files.content(name), case.folder / name, default_space=space)

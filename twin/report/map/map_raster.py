@@ -1,0 +1,101 @@
+"""The map as pixels: every pixel asks which grid cell it lies in, so no gap and no moire can arise.
+
+A pixel with other colours around it is the mean of a few samples; all others have the colour of their cell.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.twin.report.map_view import Cells, MapView
+from puncture_twin.twin.report.palette import REASON_COLOURS, reason_of, safe_shades
+
+OVERSAMPLING = 2
+"""Samples per pixel side at the cells' borders, which they smooth."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapRaster:
+    """The square picture of the cap; row 0 is the top.
+
+    Attributes:
+        rgba: Shape (n, n, 4), transparent outside the grid.
+        rows: Shape (n, n), the candidate under each pixel's centre, -1 outside the grid.
+    """
+
+    rgba: NDArray[np.uint8]
+    rows: NDArray[np.int64]
+
+
+def clearance_range(candidates: Candidates) -> tuple[float, float]:
+    """Least and greatest clearance among the safe directions, mm; (0, 1) when there is none to speak of."""
+    values = candidates.min_clearance[candidates.safe]
+    values = values[np.isfinite(values)]
+    if len(values) == 0:
+        return 0.0, 1.0
+    low, high = float(values.min()), float(values.max())
+    return low, max(high, low + 1e-3)
+
+
+def row_colours(candidates: Candidates) -> NDArray[np.uint8]:
+    """The colour of every direction, shape (n, 3)."""
+    colours = np.zeros((len(candidates), 3), dtype=np.uint8)
+    for value in np.unique(candidates.reason):
+        reason = reason_of(str(value))
+        if reason in REASON_COLOURS:
+            colours[candidates.reason == value] = REASON_COLOURS[reason]
+    low, high = clearance_range(candidates)
+    safe = candidates.safe
+    colours[safe] = safe_shades((candidates.min_clearance[safe] - low) / (high - low))
+    return colours
+
+
+def map_raster(candidates: Candidates, view: MapView, size: int) -> MapRaster:
+    """Draw the cap.
+
+    Args:
+        candidates: The grid's rows.
+        view: The map's geometry.
+        size: Pixels per side.
+    """
+    cells = Cells.of(candidates)
+    rows = cells.picture(view, size)
+    table = np.zeros((len(candidates) + 1, 4), dtype=np.uint8)
+    table[:-1, :3] = row_colours(candidates)
+    table[:-1, 3] = 255
+    whole = table.view(np.uint32)[rows, 0]
+    rgba = whole.view(np.uint8).reshape(size, size, 4)
+    line, column = np.nonzero(_beside_another(whole))
+    parts = (np.arange(OVERSAMPLING) + 0.5) / OVERSAMPLING
+    within = np.stack(np.meshgrid(parts, parts), axis=-1).reshape(-1, 1, 2)
+    fine = table[cells.rows(*view.angles_at(_to_disc(np.stack([column, line], axis=-1) + within, size)))].astype(float)
+    opaque = fine[..., 3:] / 255.0
+    mean = (fine[..., :3] * opaque).mean(axis=0) / np.maximum(opaque.mean(axis=0), 1.0 / 255.0)
+    rgba[line, column] = np.round(np.concatenate([mean, 255.0 * opaque.mean(axis=0)], axis=-1))
+    return MapRaster(rgba, rows)
+
+
+def _to_disc(pixels: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Points of the unit disc (x right, y up) at columns and rows of the picture, shape (..., 2)."""
+    return (pixels / size * 2 - 1) * [1.0, -1.0]
+
+
+def _beside_another(colours: NDArray[np.uint32]) -> NDArray[np.bool_]:
+    """Whether one of the eight around each entry, or nothing at the border, differs from it; shape (n, n)."""
+    beside = np.zeros(colours.shape, dtype=bool)
+    beside[[0, -1]] = beside[:, [0, -1]] = True
+    here, there = slice(None, -1), slice(1, None)
+    for a, b in (
+        ((here, slice(None)), (there, slice(None))),
+        ((slice(None), here), (slice(None), there)),
+        ((here, here), (there, there)),
+        ((here, there), (there, here)),
+    ):
+        differs = colours[a] != colours[b]
+        beside[a] |= differs
+        beside[b] |= differs
+    return beside

@@ -1,0 +1,207 @@
+"""``placements.png``: from where the arm can hold how much, each way of mounting it seen from above."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon, Rectangle
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MultipleLocator
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.case.case import mount_pose
+from puncture_twin.planning.collision.workcell import case_boxes
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.place.mounts import Region
+from puncture_twin.planning.place.search import Judged, PlaceSearch
+from puncture_twin.twin.report.mount_text import direction_words, mount_words
+from puncture_twin.twin.report.numbers import needle_words, target_words
+
+Floats = NDArray[np.float64]
+
+DPI = 110
+PANEL_INCHES = 4.3
+MOST_COLUMNS = 4
+SHADES = colormaps["viridis"]
+NOTHING: tuple[float, float, float] = (0.9, 0.9, 0.9)
+"""Where no direction is held, or the base would stand in something."""
+
+SEEN_FROM_ABOVE = (1, 0)
+"""The bed's axes to the right and up: across, along. The first runs to the left, as seen from above."""
+
+EDGE_CELLS = 1.6
+"""White about the cells of the widest panel, for the body directions."""
+
+TICKS_MM = 500.0
+
+ALL_OF_IT = 1.0 - 5e-4
+"""A share that is not told from the whole."""
+
+HALO = [withStroke(linewidth=2.5, foreground="white")]
+SAME_AXIS = 0.94
+"""Cosine from which the case's own base axis is a panel's (20 degrees)."""
+
+
+def draw_placements(found: PlaceSearch, case: Any, skin: TriangleMesh, path: Path) -> None:
+    """Write the map of shares over position.
+
+    Args:
+        found: The search's result.
+        case: The case.
+        skin: The patient, CT frame.
+        path: The PNG to write; it appears whole or not at all.
+    """
+    panels = _panels(found)
+    columns = min(MOST_COLUMNS, len(panels) + 1)
+    rows = -(-(len(panels) + 1) // columns)
+    figure = Figure(figsize=(columns * PANEL_INCHES, rows * PANEL_INCHES + 1.0), dpi=DPI, facecolor="white")
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    top = max((e.share for _, e in found.coarse), default=0.0)
+    scale = Normalize(0.0, max(top, max((one.verdict.share for one in found.judged), default=0.0), 0.01))
+    extent = _extent(found, float(case.place.step_mm))
+    for axes, regions in zip(grid, panels, strict=False):
+        _panel(axes, regions, found, case, scale)
+        _bed(axes, found, case, skin)
+        axes.set_xlim(extent[:2])
+        axes.set_ylim(extent[2:])
+    _legend(grid[len(panels)], figure, found, case, scale)
+    for axes in grid[len(panels) + 1 :]:
+        axes.set_axis_off()
+    title = f"{case.name}: where to stand the {case.robot.model.upper()} for {target_words(case)}"
+    figure.suptitle(f"{title}\n{needle_words(case)}", fontsize=14, fontweight="bold")
+    figure.tight_layout(rect=(0, 0.02, 1, 0.98))
+    figure.text(0.99, 0.006, "research software, not a medical device", fontsize=9, color="0.4", ha="right")
+    with atomic(Path(path)) as temporary:
+        FigureCanvasAgg(figure)
+        figure.savefig(temporary, format="png")
+
+
+def _panels(found: PlaceSearch) -> list[list[Region]]:
+    """The regions of each panel: the two rails share one."""
+    panels: dict[str, list[Region]] = defaultdict(list)
+    for region in dict.fromkeys(site.region for site, _ in found.coarse):
+        panels["rail" if region.mount == "rail" else region.name].append(region)
+    return list(panels.values())
+
+
+def _extent(found: PlaceSearch, step: float) -> tuple[float, float, float, float]:
+    points = np.array([site.position for site, _ in found.coarse])[:, SEEN_FROM_ABOVE]
+    low, high = points.min(axis=0) - EDGE_CELLS * step, points.max(axis=0) + EDGE_CELLS * step
+    return float(high[0]), float(low[0]), float(low[1]), float(high[1])
+
+
+def _panel(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any, scale: Normalize) -> None:
+    best: dict[tuple[float, float], float] = {}
+    for site, estimate in found.coarse:
+        if site.region in regions:
+            key = site.position[:2]
+            best[key] = max(best.get(key, 0.0), estimate.share)
+    step = float(case.place.step_mm)
+    for key, share in best.items():
+        y, x = key
+        colour = SHADES(scale(share)) if share > 0 else NOTHING
+        axes.add_patch(Rectangle((x - step / 2, y - step / 2), step, step, facecolor=colour, edgecolor="none"))
+    space = str(case.space)
+    words = mount_words(regions[0], found.T_ct_bed, space) if len(regions) == 1 else regions[0].mount
+    axes.set_title(words, fontsize=11.5, fontweight="bold")
+    axes.set_aspect("equal")
+    axes.tick_params(labelsize=8)
+    axes.xaxis.set_major_locator(MultipleLocator(TICKS_MM))
+    axes.yaxis.set_major_locator(MultipleLocator(TICKS_MM))
+    axes.set_xlabel("across, mm", fontsize=8)
+    axes.set_ylabel("along, mm", fontsize=8)
+    _directions(axes, found, space)
+    _marks(axes, regions, found, case)
+
+
+def _directions(axes: Axes, found: PlaceSearch, space: str) -> None:
+    """Body directions at the panel's edges; the ticks are mm from the target."""
+    R = found.T_ct_bed[:3, :3]
+    places = ((R[:, 0], 0.5, 0.985, "top"), (-R[:, 0], 0.5, 0.015, "bottom"))
+    for direction, x, y, side in places:
+        words = direction_words(direction, space)
+        axes.text(x, y, words, transform=axes.transAxes, ha="center", va=side, fontsize=9, path_effects=HALO, zorder=8)
+    for direction, x, turn in ((R[:, 1], 0.015, 90), (-R[:, 1], 0.985, -90)):
+        words, side = direction_words(direction, space), "left" if x < 0.5 else "right"
+        look: dict[str, Any] = {"fontsize": 9, "path_effects": HALO, "zorder": 8}
+        axes.text(x, 0.5, words, transform=axes.transAxes, ha=side, va="center", rotation=turn, **look)
+
+
+def _marks(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any) -> None:
+    for rank, one in enumerate(found.judged, start=1):
+        if one.site is not None and one.site.region in regions:
+            along, across, height = one.site.position
+            _mark(axes, across, along, "*" if rank == 1 else "o", f"{rank}: {_worth(one)}, h {height:+.0f}")
+    if found.own is None:
+        return
+    T = np.linalg.inv(mount_pose(found.own.mount, case.space, case.path) @ found.T_ct_bed)
+    if any(float(T[:3, 2] @ np.array(region.axis)) > SAME_AXIS for region in regions if region.mount != "rail"):
+        _mark(axes, float(T[1, 3]), float(T[0, 3]), "D", f"now: {_worth(found.own)}, h {T[2, 3]:+.0f}")
+
+
+def _worth(one: Judged) -> str:
+    return f"{100 * one.verdict.share:.0f} %"
+
+
+def _mark(axes: Axes, x: float, y: float, shape: str, words: str) -> None:
+    size = 230 if shape == "*" else 60
+    axes.scatter([x], [y], s=size, marker=shape, c="white", edgecolors="black", linewidths=1.3, zorder=9)
+    offset, align = ((0, -15), "center") if shape != "D" else ((8, -3), "left")
+    axes.annotate(
+        words, (x, y), offset, textcoords="offset points", ha=align, fontsize=8.5, path_effects=HALO, zorder=10
+    )
+
+
+def _bed(axes: Axes, found: PlaceSearch, case: Any, skin: TriangleMesh) -> None:
+    """Outlines of the patient, of the boxes that stand with him, and of the gantry; the target."""
+    T_bed_ct = np.linalg.inv(found.T_ct_bed)
+    carried = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"}
+    parts: dict[str, list[Floats]] = defaultdict(list)
+    for box in case_boxes(case, np.eye(4)):
+        if box.name not in carried:
+            parts["gantry" if box.name.startswith("gantry_") else box.name].append(box.corners)
+    things = [(np.concatenate(corners), {"ls": "--", "lw": 0.9}) for corners in parts.values()]
+    for corners, look in [*things, (skin.vertices, {"ls": "-", "lw": 1.6})]:
+        flat = (corners @ T_bed_ct[:3, :3].T + T_bed_ct[:3, 3])[:, SEEN_FROM_ABOVE]
+        outline = flat[ConvexHull(flat).vertices]
+        axes.add_patch(Polygon(outline, closed=True, fill=False, edgecolor="black", zorder=7, **look))
+    axes.plot([0], [0], marker="+", color="red", ms=11, mew=2.0, zorder=8)
+
+
+def _legend(axes: Axes, figure: Figure, found: PlaceSearch, case: Any, scale: Normalize) -> None:
+    axes.set_axis_off()
+    up = direction_words(found.T_ct_bed[:3, 2], str(case.space))
+    words = (
+        "HOW TO READ\n"
+        f"Every panel looks down on the bed (toward you: {up or 'place.up'}).\n"
+        "Ticks are mm from the target (red +). A cell is the middle\n"
+        "of the base; its colour the best height's ESTIMATED share\n"
+        "of the organ-safe directions that the arm can hold there.\n"
+        "Grey: none, or the base would stand in something.\n\n"
+        "* best, o the others that were judged exactly: rank, share,\n"
+        "height h of the base over the target, mm."
+        + ("\nDiamond: where the case has the arm now." if found.own is not None else "")
+        + "\n\nSolid line: the patient from above. Dashed: table, gantry,\nother boxes.\n\n"
+    )
+    if found.possible < ALL_OF_IT:
+        words += (
+            f"From anywhere at most {100 * found.possible:.0f} % can be held: elsewhere\n"
+            "the needle itself would start too near the skin."
+        )
+    axes.text(0.0, 1.0, words, transform=axes.transAxes, fontsize=9.5, va="top", linespacing=1.35)
+    bar = axes.inset_axes((0.0, 0.06, 0.95, 0.05))
+    figure.colorbar(ScalarMappable(scale, SHADES), cax=bar, orientation="horizontal")
+    bar.set_xlabel("share of the organ-safe solid angle, 0..1", fontsize=9)
+    bar.tick_params(labelsize=8)

@@ -1,0 +1,107 @@
+"""The page's map: a picture of the cap, and the rows behind it for the pointer to read."""
+
+from __future__ import annotations
+
+import base64
+import io
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.twin.report.map.map_raster import map_raster
+from puncture_twin.twin.report.map_view import map_view
+from puncture_twin.twin.report.palette import PNG_LEVEL, REASON_WORDS, reason_of
+
+PIXELS = 560
+"""Side of the map on the page, CSS pixels; the picture is twice as fine for sharp screens."""
+
+DETAIL_UNITS = {
+    Reason.TOO_CLOSE: ("clearance", "mm"),
+    Reason.UNKNOWN_REGION: ("clearance", "mm"),
+    Reason.TOO_LONG: ("path", "mm"),
+    Reason.SKIN_ANGLE: ("skin angle", "°"),
+}
+"""What ``Candidates.reason_amount`` is, by reason."""
+
+
+def map_data(case: Any, candidates: Candidates) -> dict[str, Any]:
+    """What the page's script needs to draw the map and answer the pointer; plain values, degrees and mm.
+
+    The pixel-to-row table is stored run by run, row after row of the picture: ``runs`` is [candidate, length, ...],
+    candidate -1 outside the grid.
+    """
+    view = map_view(case, candidates)
+    raster = map_raster(candidates, view, 2 * PIXELS)
+    rows = map_raster_rows(raster.rows[::2, ::2])
+    structures = sorted({*map(str, candidates.reason_structure), *candidates.structures})
+    index = {name: i for i, name in enumerate(structures)}
+    nearest, amounts = _nearest(candidates)
+    reasons = [str(r) for r in np.unique(candidates.reason)]
+    sentences, sentence = np.unique(candidates.reason_detail, return_inverse=True)
+    return {
+        "size": PIXELS,
+        "image": _png(raster.rgba),
+        "runs": rows,
+        "theta_max_deg": round(float(np.degrees(view.theta_max)), 4),
+        "turn_deg": round(float(np.degrees(view.turn)), 4),
+        "rim": [{"text": label.text, "angle_deg": float(np.degrees(label.angle))} for label in view.rim],
+        "centre": view.centre,
+        "structures": structures,
+        "reasons": [REASON_WORDS[reason_of(r)] for r in reasons],
+        "safe": candidates.safe_text,
+        "arm": candidates.arm,
+        "codes": [r or "safe" for r in reasons],
+        "details": [DETAIL_UNITS.get(reason_of(r), ("", "")) for r in reasons],
+        "theta": _rounded(np.degrees(candidates.theta), 3),
+        "beta": _rounded(np.degrees(candidates.beta), 3),
+        "reason": [reasons.index(str(r)) for r in candidates.reason],
+        "structure": [index[str(s)] for s in candidates.reason_structure],
+        "sentences": [str(s) for s in sentences],
+        "sentence": sentence.tolist(),
+        "depth": _rounded(candidates.reason_depth, 1),
+        "amount": _rounded(candidates.reason_amount, 2),
+        "nearest": [index[name] if name else -1 for name in nearest],
+        "clearance": _rounded(amounts, 2),
+        "path": _rounded(candidates.path_length, 1),
+        "skin_angle": _rounded(np.degrees(candidates.skin_angle), 1),
+        "rank": candidates.rank.tolist(),
+        "reachable": candidates.reachable.tolist(),
+        "outward": _rounded(candidates.outward_ct.ravel(), 5),
+        "best": candidates.ranked[:10].tolist(),
+        "pareto": np.flatnonzero(candidates.pareto & candidates.safe).tolist(),
+    }
+
+
+def map_raster_rows(rows: Any) -> list[int]:
+    """Run lengths of a table of integers, flattened: [value, length, value, length, ...]."""
+    flat = np.asarray(rows).ravel()
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(flat)) + 1])
+    lengths = np.diff(np.append(starts, len(flat)))
+    return [int(v) for v in np.stack([flat[starts], lengths], axis=1).ravel()]
+
+
+def _nearest(candidates: Candidates) -> tuple[list[str], Any]:
+    """For every row the nearest structure that demands a margin, and its clearance."""
+    demanding = np.flatnonzero(np.isfinite(candidates.margins))
+    if len(demanding) == 0:
+        return [""] * len(candidates), np.full(len(candidates), np.nan)
+    columns = demanding[np.argmin(np.nan_to_num(candidates.clearance[:, demanding], nan=np.inf), axis=1)]
+    return [candidates.structures[c] for c in columns], candidates.clearance[np.arange(len(candidates)), columns]
+
+
+def _png(rgba: Any) -> str:
+    stream = io.BytesIO()
+    Image.fromarray(rgba).save(stream, format="PNG", compress_level=PNG_LEVEL)
+    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
+
+
+def _rounded(values: Any, digits: int) -> list[float | None]:
+    """JSON-ready numbers; what is not finite becomes null."""
+    values = np.asarray(values, dtype=float)
+    rounded: list[float | None] = np.round(values, digits).tolist()
+    for i in np.flatnonzero(~np.isfinite(values)):
+        rounded[i] = None
+    return rounded

@@ -1,0 +1,179 @@
+"""The page's scene: the same bodies as the picture, lightened for a browser, as plotly traces."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.twin.report.map_view import body_directions
+from puncture_twin.twin.report.palette import css
+from puncture_twin.twin.report.raster.render import Layer
+from puncture_twin.twin.report.scene.lighter_mesh import lighter_mesh
+from puncture_twin.twin.report.scene.scene_parts import (
+    ArmPicture,
+    Body,
+    chosen_direction,
+    needle_bodies,
+    patient,
+    room,
+    safe_region,
+)
+from puncture_twin.twin.report.scene.views import overview, up_ct
+
+TRIANGLES = 100_000
+"""For the whole scene; a laptop turns that smoothly."""
+
+VIEW = (1200, 640)
+"""Width and height of the scene on the page, CSS pixels."""
+
+LEAST_TRIANGLES = 300
+"""A body is never cut below this."""
+
+LABEL_OUT_MM = 45.0
+LEGEND_SHARE = 0.14
+"""Of the width; the legend stands left of the scene."""
+
+EYE_DISTANCE = 1.55
+"""In plotly's unit, the scene's size."""
+
+GROUP_NAMES = {"safe": "safe region", "arm": "arm", "room": "room", "needle": "needle"}
+"""Bodies that share one line of the legend."""
+
+
+def scene_figure(
+    case: Any, anatomy: Any, candidates: Candidates, plan: Any | None, cache: Cache = NO_CACHE
+) -> dict[str, Any]:
+    """A plotly figure as plain values, meshes in base64.
+
+    Args:
+        case: The case.
+        anatomy: Structures and skin.
+        candidates: The search's rows.
+        plan: The plan, or None: then there is no arm.
+        cache: Where lightened meshes are kept.
+    """
+    bodies, standoff = _bodies(case, anatomy, candidates, plan)
+    light = lightened([*bodies, *standoff], TRIANGLES, cache)
+    hidden = set(range(len(bodies), len(light)))
+    first = {_legend_name(body): i for i, body in reversed(list(enumerate(light))) if i not in hidden}
+    traces = [
+        _trace(body, hidden=i in hidden, in_legend=first.get(_legend_name(body)) == i) for i, body in enumerate(light)
+    ]
+    traces.append(_labels(case, anatomy))
+    return {"data": [*traces, _probe()], "layout": _layout(case, bodies)}
+
+
+def lightened(bodies: Sequence[Body], triangles: int, cache: Cache = NO_CACHE) -> list[Body]:
+    """The bodies with about so many triangles altogether, each cut by the same share."""
+    share = min(1.0, triangles / max(1, sum(len(b.mesh.faces) for b in bodies)))
+    wanted = [max(LEAST_TRIANGLES, int(share * len(body.mesh.faces))) for body in bodies]
+    return [replace(body, mesh=lighter_mesh(body.mesh, most, cache)) for body, most in zip(bodies, wanted, strict=True)]
+
+
+def _bodies(case: Any, anatomy: Any, candidates: Candidates, plan: Any | None) -> tuple[list[Body], list[Body]]:
+    """What is shown at first (the needle on the target), and what the standoff pose adds."""
+    T_base_ct = None if plan is None else plan.T_base_ct
+    bodies = [*patient(anatomy, case), *room(case, T_base_ct), *safe_region(candidates, case)]
+    direction = chosen_direction(candidates, case, plan)
+    if direction is not None:
+        bodies += needle_bodies(case.needle, case.target_ct, direction).all
+    if plan is None or direction is None:
+        return bodies, []
+    arm = ArmPicture(plan.model, plan.T_base_ct)
+    bodies += arm.bodies(plan.insertion.q[-1])
+    tip = case.target_ct + plan.standoff_mm * direction
+    waiting = [*arm.bodies(plan.insertion.q[0]), *needle_bodies(case.needle, tip, direction).all]
+    return bodies, [Body(f"{b.name}, standoff", f"{b.group}-standoff", b.mesh, b.colour) for b in waiting]
+
+
+def _legend_name(body: Body) -> str:
+    base = body.group.removesuffix("-standoff")
+    return GROUP_NAMES.get(base, body.name).replace("_", " ")
+
+
+def _trace(body: Body, *, hidden: bool, in_legend: bool) -> dict[str, Any]:
+    base, group = body.group.removesuffix("-standoff"), _legend_name(body)
+    moving = base in {"arm", "needle"}
+    return {
+        "type": "mesh3d",
+        **{axis: _packed(values, np.float32) for axis, values in zip("xyz", body.mesh.vertices.T, strict=True)},
+        **{corner: _packed(values, np.int32) for corner, values in zip("ijk", body.mesh.faces.T, strict=True)},
+        "color": css(body.colour),
+        "opacity": body.alpha,
+        "name": group,
+        "legendgroup": group,
+        "showlegend": in_legend,
+        "visible": not hidden,
+        "hoverinfo": "name" if base == "organ" else "skip",
+        "flatshading": False,
+        "lighting": {"ambient": 0.5, "diffuse": 0.7, "specular": 0.15, "roughness": 0.6, "fresnel": 0.1},
+        "meta": {"pose": "standoff" if hidden else "target" if moving else ""},
+    }
+
+
+def _packed(values: NDArray[Any], dtype: type) -> dict[str, str]:
+    """An array as plotly's script reads it: its type and its bytes in base64."""
+    array: NDArray[Any] = np.ascontiguousarray(values, dtype=dtype)
+    return {"dtype": array.dtype.str[1:], "bdata": base64.b64encode(array.tobytes()).decode("ascii")}
+
+
+def _labels(case: Any, anatomy: Any) -> dict[str, Any]:
+    """The body's directions, written around it."""
+    low, high = anatomy.skin.mesh.bounds
+    centre, half = (low + high) / 2, (high - low) / 2
+    names = body_directions(case.space)
+    places = np.array([centre + v * (np.abs(v) @ half + LABEL_OUT_MM) for v in names.values()])
+    return {
+        "type": "scatter3d",
+        **{axis: values.tolist() for axis, values in zip("xyz", places.T, strict=True)},
+        "mode": "text",
+        "text": [f"<b>{name}</b>" for name in names],
+        "textfont": {"size": 14, "color": "#222222"},
+        "hoverinfo": "skip",
+        "showlegend": False,
+        "name": "directions",
+    }
+
+
+def _probe() -> dict[str, Any]:
+    """The line of the direction that the pointer chose on the map; the page's script fills it."""
+    return {
+        "type": "scatter3d",
+        **{axis: [None] for axis in "xyz"},
+        "mode": "lines",
+        "line": {"color": "#d6001e", "width": 7},
+        "name": "direction clicked on the map",
+        "hoverinfo": "skip",
+        "showlegend": False,
+    }
+
+
+def _layout(case: Any, bodies: Sequence[Body]) -> dict[str, Any]:
+    axis = {"visible": False, "showspikes": False}
+    content = np.concatenate([b.mesh.vertices for b in bodies if b.group != "room"])
+    blockers = Layer([b.surface for b in bodies if b.group in {"arm", "room", "target"}])
+    seen = overview(case, content, case.target_ct[None], blockers, VIEW)
+    vectors = {"up": up_ct(case), "eye": -EYE_DISTANCE * seen.axes[2]}
+    camera = {k: dict(zip("xyz", (float(x) for x in v), strict=True)) for k, v in vectors.items()}
+    return {
+        "scene": {
+            "domain": {"x": [LEGEND_SHARE, 1.0]},
+            "aspectmode": "data",
+            "xaxis": axis,
+            "yaxis": axis,
+            "zaxis": axis,
+            "camera": camera,
+        },
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "legend": {"itemsizing": "constant", "font": {"size": 12}, "x": 0.0, "y": 1.0},
+        "paper_bgcolor": "#f6f7f9",
+        "height": VIEW[1],
+        "uirevision": "keep",
+    }

@@ -1,0 +1,233 @@
+"""Which triangle every sample of a picture shows: all rays leave one eye, so triangles are drawn, not searched for.
+
+A sample (x, y) looks along d = (x, y, 1) in the camera's frame (right, up, forward). The ray meets the plane of the
+triangle a, b, c at 1/z = d.((b - a) x (c - a)) / a.(b x c), and lies inside where d.(b x c), d.(c x a) and d.(a x b)
+agree in sign. That is linear in x and y, also for triangles that reach behind the eye, and two triangles compute the
+same number, but for its sign, at an edge that they share: no sample falls between them. (Olano and Greer, "Triangle
+scan conversion using 2D homogeneous coordinates", Graphics Hardware 1997.)
+"""
+
+# numba infers the types
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import numpy as np
+
+from puncture_twin.planning.base.numba_kernels import nb
+
+NEAR = 1.0
+"""mm before the eye, along the view, from which on an outline is drawn."""
+
+TIE = 1e-2
+"""mm along the view; two bodies nearer to each other than this are one surface, that of the body named first.
+Organs that an image cuts off end in one plane with the skin."""
+
+EDGE = 1e-6
+"""Samples by which rounding may shrink an outline."""
+
+WIDE = 8
+"""Columns from which on it pays to compute where a row enters and leaves a triangle."""
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def outlines(points, faces, grid):
+    """The rows and columns of samples that each triangle may cover.
+
+    Args:
+        points: Shape (n, 3), camera's frame, mm.
+        faces: Shape (m, 3).
+        grid: Samples per unit of x and y, rows, columns.
+
+    Returns:
+        Shape (k, 5): triangle, first and last row, first and last column, of each that may cover any; ascending.
+    """
+    scale, height, width = grid
+    seen = np.empty((len(points), 2))
+    for i in range(len(points)):
+        if points[i, 2] >= NEAR:
+            per_mm = scale / points[i, 2]
+            seen[i, 0] = width / 2 - 0.5 + points[i, 0] * per_mm
+            seen[i, 1] = height / 2 - 0.5 - points[i, 1] * per_mm
+    spans = np.empty((len(faces), 5), dtype=np.int32)
+    count = 0
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        if min(points[a, 2], points[b, 2], points[c, 2]) >= NEAR:
+            left, right = min(seen[a, 0], seen[b, 0], seen[c, 0]), max(seen[a, 0], seen[b, 0], seen[c, 0])
+            top, bottom = min(seen[a, 1], seen[b, 1], seen[c, 1]), max(seen[a, 1], seen[b, 1], seen[c, 1])
+        elif max(points[a, 2], points[b, 2], points[c, 2]) < NEAR:
+            continue
+        else:
+            left, right, top, bottom = _cut_outline(points, faces[f], seen, grid)
+        first, last = int(np.ceil(max(top - EDGE, 0.0))), int(np.floor(min(bottom + EDGE, height - 1.0)))
+        begin, end = int(np.ceil(max(left - EDGE, 0.0))), int(np.floor(min(right + EDGE, width - 1.0)))
+        if first <= last and begin <= end:
+            spans[count, 0], spans[count, 1], spans[count, 2] = f, first, last
+            spans[count, 3], spans[count, 4] = begin, end
+            count += 1
+    return spans[:count]
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def sorted_by_band(spans, rows, count):
+    """Which triangles each band of a picture needs.
+
+    Args:
+        spans: What `outlines` returned.
+        rows: Rows of a band.
+        count: How many bands there are.
+
+    Returns:
+        Where each band begins in the second array, shape (count + 1,); rows of ``spans``, band after band.
+    """
+    starts = np.zeros(count + 1, dtype=np.int64)
+    for s in range(len(spans)):
+        for band in range(spans[s, 1] // rows, spans[s, 2] // rows + 1):
+            starts[band + 1] += 1
+    for band in range(count):
+        starts[band + 1] += starts[band]
+    free = starts[:-1].copy()
+    needed = np.empty((starts[count], 5), dtype=np.int32)
+    for s in range(len(spans)):
+        for band in range(spans[s, 1] // rows, spans[s, 2] // rows + 1):
+            needed[free[band]] = spans[s]
+            free[band] += 1
+    return starts, needed
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _cut_outline(points, face, seen, grid):
+    """The outline of what a triangle that reaches behind the eye has before it."""
+    scale, height, width = grid
+    left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
+    for i in range(3):
+        p, q = points[face[i]], points[face[(i + 1) % 3]]
+        if p[2] >= NEAR:
+            column, row = seen[face[i], 0], seen[face[i], 1]
+            left, right, top, bottom = min(left, column), max(right, column), min(top, row), max(bottom, row)
+        if (p[2] >= NEAR) != (q[2] >= NEAR):  # the edge passes the plane z = NEAR
+            t = (NEAR - p[2]) / (q[2] - p[2])
+            column = width / 2 - 0.5 + scale * (p[0] + t * (q[0] - p[0])) / NEAR
+            row = height / 2 - 0.5 - scale * (p[1] + t * (q[1] - p[1])) / NEAR
+            left, right, top, bottom = min(left, column), max(right, column), min(top, row), max(bottom, row)
+    return left, right, top, bottom
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def draw(points, faces, bodies, spans, grid, corner, before, inverse, triangle):
+    """Keep in every sample the nearest surface, or the nearest few in order, of those that nothing opaque hides.
+
+    Args:
+        points: Shape (n, 3), camera's frame, mm.
+        faces: Shape (m, 3).
+        bodies: Shape (m,), the body of each triangle; bodies ascend.
+        spans: Rows of what `outlines` returned.
+        grid: Samples per unit of x and y, rows, columns of the whole picture.
+        corner: Row and column of the picture at which the arrays below begin.
+        before: Shape (h, w), 1/z of what is opaque there already, 0 for nothing.
+        inverse: Shape (k, h, w), 1/z of the surfaces, nearest first; written to.
+        triangle: Shape (k, h, w), their triangles, -1 for none; written to.
+    """
+    scale, height, width = grid
+    step, left = 1.0 / scale, (0.5 - width / 2) / scale
+    row0, column0 = corner
+    most, rows, columns = inverse.shape
+    for s in range(len(spans)):
+        first, last = max(spans[s, 1], row0), min(spans[s, 2], row0 + rows - 1)
+        begin, end = max(spans[s, 3], column0), min(spans[s, 4], column0 + columns - 1)
+        if first > last or begin > end:
+            continue
+        f = spans[s, 0]
+        facing, p, q, r = _edges(_row(points, faces[f, 0]), _row(points, faces[f, 1]), _row(points, faces[f, 2]))
+        if facing == 0.0:
+            continue
+        per_facing = 1.0 / facing
+        pu, qu, ru = p[0] * step, q[0] * step, r[0] * step  # what one column more adds
+        for row in range(first, last + 1):
+            y = (height / 2 - row - 0.5) * step
+            pe, qe, re = (
+                p[0] * left + (p[1] * y + p[2]),
+                q[0] * left + (q[1] * y + q[2]),
+                r[0] * left + (r[1] * y + r[2]),
+            )
+            lo, hi = begin, end
+            if end - begin > WIDE:
+                lo, hi = _inside(pu, pe, qu, qe, ru, re, begin, end)
+            for column in range(lo, hi + 1):
+                wa, wb, wc = pu * column + pe, qu * column + qe, ru * column + re
+                if wa < 0.0 or wb < 0.0 or wc < 0.0:
+                    continue
+                value = (wa + wb + wc) * per_facing
+                i, j = row - row0, column - column0
+                slack = TIE * value * value
+                if value <= before[i, j] + slack:
+                    continue
+                mine = f
+                # Written out: a function that takes arrays costs more here than all that it does.
+                for k in range(most):
+                    other, known = triangle[k, i, j], inverse[k, i, j]
+                    if other < 0:
+                        inverse[k, i, j], triangle[k, i, j] = value, mine
+                        break
+                    if abs(value - known) <= slack:
+                        first_named = bodies[mine] < bodies[other]
+                        if first_named or (bodies[mine] == bodies[other] and value > known):
+                            inverse[k, i, j], triangle[k, i, j] = value, mine
+                        break
+                    if value > known:
+                        inverse[k, i, j], triangle[k, i, j] = value, mine
+                        value, mine = known, other
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def depth_before(depth, grid, corner):
+    """1/z of depths along the rays, shape (h, w): 0 where the depth is infinite.
+
+    Args:
+        depth: Shape (h, w), mm.
+        grid: Samples per unit of x and y, rows, columns of the whole picture.
+        corner: Row and column of the picture at which ``depth`` begins.
+    """
+    scale, height, width = grid
+    inverse = np.empty(depth.shape)
+    for i in range(depth.shape[0]):
+        y = (height / 2 - (corner[0] + i) - 0.5) / scale
+        for j in range(depth.shape[1]):
+            x = (corner[1] + j + 0.5 - width / 2) / scale
+            inverse[i, j] = np.sqrt(1 + x * x + y * y) / depth[i, j]
+    return inverse
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _row(points, i):
+    return points[i, 0], points[i, 1], points[i, 2]
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _edges(a, b, c):
+    """a.(b x c), made positive, and the planes through the eye and the edges opposite a, b, c, with their signs."""
+    p, q, r = _cross(b, c), _cross(c, a), _cross(a, b)
+    facing = a[0] * p[0] + a[1] * p[1] + a[2] * p[2]
+    if facing < 0.0:
+        p, q, r = (-p[0], -p[1], -p[2]), (-q[0], -q[1], -q[2]), (-r[0], -r[1], -r[2])
+    return abs(facing), p, q, r
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _inside(pu, pe, qu, qe, ru, re, begin, end):
+    """The columns of a row in which u * column + e >= 0 may hold for all three edges; one more to each side."""
+    low, high = float(begin), float(end)
+    for u, e in ((pu, pe), (qu, qe), (ru, re)):
+        if u > 0.0:
+            low = max(low, -e / u - 1.0)
+        elif u < 0.0:
+            high = min(high, 1.0 - e / u)
+        elif e < 0.0:
+            return 0, -1
+    return (0, -1) if low > high else (int(low), int(high))

@@ -1,0 +1,229 @@
+"""``rehearsal.mp4``: the rehearsal as it happened in the twin, with time, phase and distances written into it.
+
+The patient and the room do not move, so each view's picture of them is made once; every frame then casts rays only
+where the arm is, and blends only what changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import imageio_ffmpeg
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.twin.report import palette
+from puncture_twin.twin.report.numbers import demanding
+from puncture_twin.twin.report.raster.camera import Camera
+from puncture_twin.twin.report.raster.compositing import NOWHERE, SAMPLES, PixelBox, Shot, Veil, compose
+from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, put_moving, veils_of
+from puncture_twin.twin.report.scene.film_text import FrameWords, draw_words
+from puncture_twin.twin.report.scene.scene_parts import ArmPicture, Body, needle_bodies, patient, room
+from puncture_twin.twin.report.scene.shapes import bar
+from puncture_twin.twin.report.scene.views import close_up, overview
+
+Floats = NDArray[np.float64]
+
+WIDTH, HEIGHT = 832, 608
+"""Pixels; multiples of 16, as H.264 likes them."""
+
+VIEW_WIDTH, VIEW_HEIGHT = 592, 528
+"""The overview, upper left. Below it stand the numbers."""
+
+INSET = 240
+"""Side of the close-up, upper right; below it stand the names and the body's directions."""
+
+FRAMES_PER_SECOND = 10
+LONGEST_S = 11.0
+"""Playback is sped up until the motion fits into this time; then the last frame stands still."""
+
+STILL_S = 2.0
+SPEEDS = (0.5, 1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 30, 40, 60, 100, 200, 500)
+INSET_RADIUS_MM = 30.0
+PLANNED: palette.Rgb = (0, 158, 115)
+PLANNED_RADIUS_MM = 0.7
+
+
+@dataclass(frozen=True)
+class FilmTimes:
+    """When each frame is taken: moments of the rehearsal in s, the playback speed, and how many frames stand still."""
+
+    moments: tuple[float, ...]
+    speed: float
+    still_frames: int
+
+    @property
+    def frames(self) -> int:
+        """All frames of the film."""
+        return len(self.moments) + self.still_frames
+
+    @property
+    def duration_s(self) -> float:
+        """Of the film."""
+        return self.frames / FRAMES_PER_SECOND
+
+
+def film_times(total_s: float) -> FilmTimes:
+    """The frames of a rehearsal that took ``total_s``; the last moving frame shows its end."""
+    speed = next((s for s in SPEEDS if total_s / s <= LONGEST_S), SPEEDS[-1])
+    count = max(2, int(np.ceil(total_s / speed * FRAMES_PER_SECOND)) + 1)
+    moments = np.minimum(np.arange(count) * speed / FRAMES_PER_SECOND, total_s)
+    return FilmTimes(tuple(float(m) for m in moments), float(speed), round(STILL_S * FRAMES_PER_SECOND))
+
+
+def draw_film(
+    rehearsal: Any,
+    plan: Any,
+    case: Any,
+    anatomy: Any,
+    path: Path,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Write the film; a GIF beside it when no H.264 encoder can be started.
+
+    Args:
+        rehearsal: What was measured.
+        plan: What was planned.
+        case: The case.
+        anatomy: Structures and skin, CT frame.
+        path: The ``.mp4`` to write; it appears whole or not at all.
+        progress: Called with frames done and all frames.
+
+    Returns:
+        The file that was written.
+    """
+    times = film_times(float(rehearsal.times_s[-1]))
+    frames = list(_frames(rehearsal, plan, case, anatomy, times, progress))
+    frames += [frames[-1]] * times.still_frames
+    path = Path(path)
+    try:
+        _write_mp4(frames, path)
+    except (OSError, RuntimeError):  # no encoder on this machine, or one without H.264
+        path = path.with_suffix(".gif")
+        _write_gif(frames, path)
+    return path
+
+
+def _frames(
+    rehearsal: Any,
+    plan: Any,
+    case: Any,
+    anatomy: Any,
+    times: FilmTimes,
+    progress: Callable[[int, int], None] | None,
+) -> Iterator[NDArray[np.uint8]]:
+    T_base_ct = rehearsal.T_base_ct_true
+    arm = ArmPicture(plan.model, T_base_ct)
+    still = [*patient(anatomy, case), *room(case, T_base_ct), _planned_path(plan)]
+    wide = _Stage(still, _wide_camera(case, still, arm, rehearsal, plan))
+    near = _Stage([b for b in still if b.group != "room"], _near_camera(case, still, plan))
+    tool = _tool_layer(case)
+    words = FrameWords(rehearsal, plan, times.speed, demanding(anatomy))
+    for number, moment in enumerate(times.moments):
+        row = int(np.searchsorted(rehearsal.times_s, moment, side="right")) - 1
+        T_ct_flange = np.linalg.inv(T_base_ct) @ rehearsal.T_base_flange_true[row]
+        links = list(zip(arm.layers, arm.poses_ct(rehearsal.q[row]), strict=True))
+        frame = Image.new("RGB", (WIDTH, HEIGHT), (255, 255, 255))
+        frame.paste(Image.fromarray(wide.picture([*links, (tool, T_ct_flange)])), (0, 0))
+        frame.paste(Image.fromarray(near.picture([(tool, T_ct_flange)])), (VIEW_WIDTH, 0))
+        draw_words(frame, words, row, moment, (wide.camera, near.camera), case)
+        if progress is not None:
+            progress(number + 1, len(times.moments))
+        yield np.asarray(frame)
+
+
+class _Stage:
+    """One view: what stands still is drawn once, what moves is drawn over a copy.
+
+    Args:
+        bodies: What stands still, CT frame.
+        camera: The view, in pixels.
+    """
+
+    def __init__(self, bodies: list[Body], camera: Camera) -> None:
+        self.camera = camera
+        self._fine = camera.finer(SAMPLES)
+        self._still: Shot = opaque_shot(Layer([b.surface for b in bodies if b.alpha >= 1]), self._fine)
+        veils = [b.surface for b in bodies if b.alpha < 1]
+        self._veils: tuple[Veil, ...] = veils_of(Layer(veils), self._fine) if veils else ()
+        self._picture = compose(self._still, self._veils)
+
+    def picture(self, moving: list[tuple[Layer, Floats]]) -> NDArray[np.uint8]:
+        """The view with bodies at their poses T_ct_body, shape (h, w, 3)."""
+        shot = Shot(self._still.colour.copy(), self._still.depth.copy())
+        changed = NOWHERE
+        for layer, T_ct_layer in moving:
+            changed = changed.around(put_moving(shot, layer, T_ct_layer, self._fine))
+        picture = self._picture.copy()
+        if not changed.empty:
+            x0, y0 = changed.x0 // SAMPLES, changed.y0 // SAMPLES
+            x1, y1 = -(-changed.x1 // SAMPLES), -(-changed.y1 // SAMPLES)
+            box = PixelBox(x0 * SAMPLES, y0 * SAMPLES, x1 * SAMPLES, y1 * SAMPLES)
+            picture[y0:y1, x0:x1] = compose(shot, self._veils, box)
+        return picture
+
+
+def _planned_path(plan: Any) -> Body:
+    """The line that the tip should follow, from standoff to target."""
+    way = (plan.entry_ct - plan.target_ct) / np.linalg.norm(plan.entry_ct - plan.target_ct)
+    line = bar(plan.target_ct, plan.target_ct + plan.standoff_mm * way, PLANNED_RADIUS_MM)
+    return Body("planned path", "safe", line, PLANNED)
+
+
+def _tool_layer(case: Any) -> Layer:
+    """Needle and holder in the flange frame: the needle points along +z."""
+    tip = np.array([0.0, 0.0, case.needle.length_mm])
+    bodies = needle_bodies(case.needle, tip, np.array([0.0, 0.0, -1.0])).all
+    return Layer([Surface(b.mesh, b.colour) for b in bodies])
+
+
+def _wide_camera(case: Any, still: list[Body], arm: ArmPicture, rehearsal: Any, plan: Any) -> Camera:
+    poses = [rehearsal.q[0], plan.insertion.q[0], rehearsal.q[-1]]
+    moving = [body for q in poses for body in arm.bodies(q)]
+    content = [b.mesh.vertices for b in [*still, *moving] if b.group in {"skin", "arm"}]
+    way = (plan.entry_ct - plan.target_ct) / np.linalg.norm(plan.entry_ct - plan.target_ct)
+    focus = plan.target_ct + np.linspace(0, plan.standoff_mm + case.needle.length_mm, 24)[:, None] * way
+    at_work = [body for q in poses[1:] for body in arm.bodies(q)]
+    blockers = Layer([b.surface for b in at_work] + [b.surface for b in still if b.group == "room"])
+    return overview(case, np.concatenate(content), focus, blockers, (VIEW_WIDTH, VIEW_HEIGHT))
+
+
+def _near_camera(case: Any, still: list[Body], plan: Any) -> Camera:
+    blockers = Layer([b.surface for b in still if b.alpha >= 1 and b.group in {"organ", "target"}])
+    path_ct = np.stack([plan.target_ct, plan.entry_ct])
+    return close_up(case, path_ct, INSET_RADIUS_MM, blockers, (INSET, INSET))
+
+
+def _write_mp4(frames: list[NDArray[np.uint8]], path: Path) -> None:
+    with atomic(path) as temporary:
+        writer = imageio_ffmpeg.write_frames(
+            str(temporary),
+            (WIDTH, HEIGHT),
+            fps=FRAMES_PER_SECOND,
+            codec="libx264",
+            quality=None,
+            output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"],
+            ffmpeg_log_level="quiet",
+        )
+        writer.send(None)
+        try:
+            for frame in frames:
+                writer.send(np.ascontiguousarray(frame))
+        finally:
+            writer.close()
+        written, _ = imageio_ffmpeg.count_frames_and_secs(str(temporary))  # an encoder on a full disk says nothing
+        if written != len(frames):
+            raise RuntimeError(f"the encoder wrote {written} of {len(frames)} frames")
+
+
+def _write_gif(frames: list[NDArray[np.uint8]], path: Path) -> None:
+    images = [Image.fromarray(frame).quantize(128) for frame in frames]
+    with atomic(path) as temporary:
+        images[0].save(
+            temporary, format="GIF", save_all=True, append_images=images[1:], loop=0, duration=1000 // FRAMES_PER_SECOND
+        )

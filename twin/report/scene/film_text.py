@@ -1,0 +1,120 @@
+"""What is written into a frame of the film: time, phase, distances, contacts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from puncture_twin.twin.report import annotate
+from puncture_twin.twin.report.numbers import number
+from puncture_twin.twin.report.raster.camera import Camera
+
+PHASES = {
+    "approach": "approach to standoff",
+    "settle": "settling at standoff",
+    "insertion": "insertion",
+    "hold": "at the target",
+}
+CONTACT_SHOWN_S = 3.0
+"""How long (time of the rehearsal) a contact stays in large letters."""
+
+LABEL, VALUE = 13, 17
+
+
+@dataclass(frozen=True)
+class FrameWords:
+    """Where the words of a frame come from: measurements, plan, playback speed, structures to keep away from."""
+
+    rehearsal: Any
+    plan: Any
+    speed: float
+    demanding: frozenset[str]
+
+    def clearance(self, moment: float) -> tuple[str, float] | None:
+        """Nearest structure to keep away from, and its clearance, at the latest sample; None before the first."""
+        times = self.rehearsal.clearance_times_s
+        names = [name for name in self.rehearsal.clearance_mm if name in self.demanding]
+        if len(times) == 0 or moment < times[0] or not names:
+            return None
+        sample = int(np.searchsorted(times, moment, side="right")) - 1
+        name = min(names, key=lambda n: float(self.rehearsal.clearance_mm[n][sample]))
+        return name, float(self.rehearsal.clearance_mm[name][sample])
+
+    def distance(self, row: int) -> float:
+        """True tip to true target, mm."""
+        return float(np.linalg.norm(self.rehearsal.tip_true_ct[row] - self.plan.target_ct))
+
+    def contacts(self, moment: float) -> list[Any]:
+        """The contacts seen so far."""
+        return [c for c in self.rehearsal.contacts if c.time_s <= moment]
+
+
+def draw_words(
+    frame: Image.Image, words: FrameWords, row: int, moment: float, cameras: tuple[Camera, Camera], case: Any
+) -> None:
+    """Write a frame's words.
+
+    Args:
+        frame: The picture, already with its views: the overview upper left, the close-up beside it.
+        words: Where the numbers come from.
+        row: The rehearsal's record shown.
+        moment: Its time, s.
+        cameras: Of the overview and of the close-up.
+        case: For names and the space.
+    """
+    draw = ImageDraw.Draw(frame)
+    wide, near = cameras
+    left, below = wide.width, near.height
+    draw.rectangle([left, 0, frame.width, below], outline=(150, 156, 164), width=1)
+    draw.line([(left, below), (left, wide.height), (0, wide.height)], fill=(190, 194, 200), width=1)
+    annotate.write(draw, (left + 8, 7), "close-up", size=13, bold=True, halo=2)
+    annotate.scale_bar(draw, near, case.target_ct, left + 12, below - 12, 90, note="")
+    speed = "real time" if words.speed == 1 else f"playback × {words.speed:g}"
+    annotate.write(draw, (left + 10, below + 12), str(case.name)[:26], size=17, bold=True)
+    for line, text in enumerate(("rehearsal in the twin", f"{speed}; green: planned path")):
+        annotate.write(draw, (left + 10, below + 37 + 19 * line), text, size=13)
+    annotate.body_axes(draw, wide, case.space, (left + near.width / 2, wide.height - 96), 42, size=14)
+    annotate.write(draw, (left + 24, wide.height - 204), "directions in the large view", size=11, colour=annotate.FAINT)
+    _strip(draw, words, row, moment, wide.height)
+    _alarm(draw, words, moment)
+
+
+def _strip(draw: ImageDraw.ImageDraw, words: FrameWords, row: int, moment: float, top: int) -> None:
+    phase = str(words.rehearsal.phase[row])
+    nearest = words.clearance(moment)
+    contacts = len(words.contacts(moment))
+    near = "– (not yet)" if nearest is None else f"{number(nearest[1], 1, 'mm')}  {_short(nearest[0])}"
+    colour = annotate.RED if contacts else annotate.INK
+    cells = [
+        (12, "time", f"{moment:.1f} s", annotate.INK),
+        (95, "phase", PHASES.get(phase, phase), annotate.INK),
+        (320, "true tip to target", number(words.distance(row), 1, "mm"), annotate.INK),
+        (470, "contacts", str(contacts), colour),
+        (560, "needle to nearest structure", near, annotate.INK),
+    ]
+    for x, label, value, ink in cells:
+        annotate.write(draw, (x, top + 6), label, size=LABEL, colour=annotate.FAINT)
+        annotate.write(draw, (x, top + 22), value, size=VALUE, bold=True, colour=ink)
+    r = words.rehearsal
+    if row == len(r.times_s) - 1:
+        way = "deep" if r.depth_mm >= 0 else "shallow"
+        parts = f"lateral {number(r.lateral_mm, 2)}, {number(abs(r.depth_mm), 2)} too {way}"
+        result = f"tip error at the end {number(r.tip_error_mm, 2, 'mm')}: {parts}"
+        annotate.write(draw, (12, top + 51), result, size=VALUE, bold=True)
+    else:
+        note = "rigid tissue and needle; research software, not a medical device"
+        annotate.write(draw, (12, top + 54), note, size=11, colour=annotate.FAINT)
+
+
+def _alarm(draw: ImageDraw.ImageDraw, words: FrameWords, moment: float) -> None:
+    fresh = [c for c in words.contacts(moment) if moment - c.time_s <= CONTACT_SHOWN_S]
+    for line, contact in enumerate(fresh[-3:]):
+        text = f"CONTACT: {_short(contact.link)} touches {_short(contact.body)}"
+        annotate.write(draw, (12, 12 + 24 * line), text, size=17, bold=True, colour=annotate.RED, halo=3)
+
+
+def _short(name: str) -> str:
+    return name.replace("_", " ")

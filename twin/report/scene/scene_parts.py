@@ -1,0 +1,204 @@
+"""What stands in the scene, as coloured meshes in the CT frame: the same for picture, film and page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.kinematics import link_poses
+from puncture_twin.planning.arm.links import visual_links
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.winding import winding_number
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.twin.report import palette
+from puncture_twin.twin.report.numbers import chosen_row
+from puncture_twin.twin.report.palette import Rgb
+from puncture_twin.twin.report.raster.render import Layer, Surface
+from puncture_twin.twin.report.scene.shapes import ball, bar, box, corridor_mouth, corridor_walls, ring
+
+Floats = NDArray[np.float64]
+
+ORGAN_VEIL = 0.38
+"""Opacity of the organ that holds the target, so that the lesion and its vessels show."""
+
+UNKNOWN_VEIL = 0.30
+OUTSIDE_SHOWN_MM = np.array([150.0, 150.0, 0.0])
+"""How far beyond the skin's box what is outside of the body is drawn: to the sides, front and back, along the bed."""
+SKIN_VEIL = 0.20
+GANTRY_VEIL = 0.15
+"""Opacity of the gantry, so that it does not hide the patient in its bore."""
+
+MOUTH_VEIL = 0.88
+"""Of where a needle may enter: what lies behind it hardly shows, since seen through green it would look safe to hit."""
+
+WALL_VEIL = 0.10
+
+TARGET_BALL_MM = 3.0
+"""Radius of the ball that marks the target point."""
+
+LEAST_NEEDLE_MM = 1.0
+"""Least radius at which the needle is drawn: thinner ones would be below a pixel. The legend says so."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """One thing of the scene.
+
+    Attributes:
+        name: What the legend calls it.
+        group: "organ", "skin", "safe", "needle", "arm", "room" or "target".
+        mesh: CT frame, mm.
+        colour: RGB.
+        alpha: 1 for opaque; less for see-through.
+    """
+
+    name: str
+    group: str
+    mesh: TriangleMesh
+    colour: Rgb
+    alpha: float = 1.0
+
+    @property
+    def surface(self) -> Surface:
+        """For the ray caster; the corridor is flat colour, without the rim that makes a skin look like glass."""
+        return Surface(self.mesh, self.colour, self.alpha, *((0.0,) if self.group == "safe" else ()))
+
+
+@dataclass(frozen=True, eq=False)
+class NeedleBodies:
+    """Needle and holder at one place."""
+
+    needle: Body
+    holder: Body | None
+
+    @property
+    def all(self) -> tuple[Body, ...]:
+        """Both, or the needle alone where the shaft reaches the flange."""
+        return (self.needle,) if self.holder is None else (self.needle, self.holder)
+
+
+def patient(anatomy: Any, case: Any) -> tuple[Body, ...]:
+    """Organs, skin and the target's mark; what holds the target, and unknown structures, are see-through."""
+    structures = anatomy.structures
+    colours = palette.organ_colours(tuple(s.name for s in structures))
+    bodies = [Body(s.name, "organ", s.mesh, colours[s.name], _opacity(s, case)) for s in structures]
+    bodies += [
+        Body(s.name, "organ", _near(s.mesh, anatomy.skin.mesh), palette.OUTSIDE, UNKNOWN_VEIL)
+        for s in anatomy.surroundings
+        if str(s.role) == "unknown"
+    ]
+    bodies.append(Body("skin", "skin", anatomy.skin.mesh, palette.SKIN, SKIN_VEIL))
+    bodies.append(Body("target", "target", ball(case.target_ct, TARGET_BALL_MM), palette.TARGET_POINT))
+    return tuple(bodies)
+
+
+def _near(mesh: TriangleMesh, skin: TriangleMesh) -> TriangleMesh:
+    """What is drawn of a surface that goes on beyond the image: its part about the skin, flattened at the rest."""
+    low, high = skin.bounds
+    return TriangleMesh(np.clip(mesh.vertices, low - OUTSIDE_SHOWN_MM, high + OUTSIDE_SHOWN_MM), mesh.faces)
+
+
+def _opacity(structure: Any, case: Any) -> float:
+    if str(structure.role) == "unknown":
+        return UNKNOWN_VEIL
+    if structure.name == case.target_structure:
+        return ORGAN_VEIL
+    low, high = structure.mesh.bounds
+    near = bool(np.all((low <= case.target_ct) & (case.target_ct <= high)))
+    return ORGAN_VEIL if near and abs(winding_number(structure.mesh, case.target_ct)) > 0.5 else 1.0
+
+
+def safe_region(candidates: Candidates, case: Any) -> tuple[Body, ...]:
+    """The safe directions: where they pierce the skin, and the walls of the corridor; empty when nothing is safe."""
+    mouth, walls = corridor_mouth(candidates, case), corridor_walls(candidates, case)
+    bodies = []
+    if mouth is not None:
+        bodies.append(Body("safe entry", "safe", mouth, palette.SAFE, MOUTH_VEIL))
+    if walls is not None:
+        bodies.append(Body("safe corridor", "safe", walls, palette.SAFE, WALL_VEIL))
+    return tuple(bodies)
+
+
+def needle_bodies(needle: Any, tip_ct: Floats, outward_ct: Floats) -> NeedleBodies:
+    """Needle and holder with the tip at a point.
+
+    Args:
+        needle: With ``length_mm``, ``shaft_mm``, ``radius_mm``, ``holder_diameter_mm``.
+        tip_ct: Shape (3,).
+        outward_ct: Shape (3,), unit, from the tip to the flange.
+    """
+    radius = max(needle.radius_mm, LEAST_NEEDLE_MM)
+    shaft, top = tip_ct + needle.shaft_mm * outward_ct, tip_ct + needle.length_mm * outward_ct
+    body = Body("needle", "needle", bar(tip_ct, shaft, radius), palette.NEEDLE)
+    if needle.length_mm - needle.shaft_mm < 1e-6:
+        return NeedleBodies(body, None)
+    holder = bar(shaft, top, needle.holder_diameter_mm / 2)
+    return NeedleBodies(body, Body("needle holder", "needle", holder, palette.HOLDER))
+
+
+def chosen_direction(candidates: Candidates, case: Any, plan: Any | None) -> Floats | None:
+    """The outward direction of the plan, else of the best candidate, else None; shape (3,), CT frame."""
+    if plan is not None:
+        way = np.asarray(plan.entry_ct, dtype=float) - np.asarray(plan.target_ct, dtype=float)
+        return np.asarray(way / np.linalg.norm(way))
+    row = chosen_row(candidates)
+    return None if row is None else candidates.outward_ct[row]
+
+
+def needle_words(needle: Any) -> str:
+    """The needle in the legend, honest about a drawn thickness."""
+    if needle.radius_mm >= LEAST_NEEDLE_MM:
+        return "needle"
+    return f"needle (drawn ⌀ {2 * LEAST_NEEDLE_MM:g} mm, is ⌀ {needle.diameter_mm:g} mm)"
+
+
+class ArmPicture:
+    """The arm's links ready to be drawn at any configuration.
+
+    Args:
+        model: The arm's name, such as "ur3".
+        T_base_ct: Shape (4, 4), where the patient is believed (or known) to be.
+    """
+
+    def __init__(self, model: str, T_base_ct: Floats) -> None:
+        self._model = ur_model(model)
+        self._links = visual_links(self._model)
+        self._T_ct_base = np.linalg.inv(T_base_ct)
+        self.layers = tuple(Layer([Surface(link.mesh, palette.ARM)]) for link in self._links)
+
+    def poses_ct(self, q: Floats) -> Floats:
+        """T_ct_link of every layer, shape (k, 4, 4), mm, at a configuration (6,), rad."""
+        frames = [link.frame for link in self._links]
+        return np.asarray(self._T_ct_base @ link_poses(self._model, np.asarray(q))[frames])
+
+    def bodies(self, q: Floats) -> tuple[Body, ...]:
+        """The links in the CT frame at one configuration."""
+        poses = self.poses_ct(q)
+        return tuple(
+            Body(link.name, "arm", link.mesh.transformed(T), palette.ARM)
+            for link, T in zip(self._links, poses, strict=True)
+        )
+
+
+def room(case: Any, T_base_ct: Floats | None) -> tuple[Body, ...]:
+    """The case's gantry and obstacles (table and the like); those given in the base frame need to know where it is."""
+    bodies = [] if case.gantry is None else [_gantry(case.gantry)]
+    for obstacle in case.obstacles:
+        T = np.eye(4)
+        T[:3, 3] = obstacle.center_mm
+        if obstacle.frame == "base":
+            if T_base_ct is None:
+                continue
+            T = np.linalg.inv(T_base_ct) @ T
+        bodies.append(Body(obstacle.name, "room", box(T, obstacle.size_mm), palette.TABLE))
+    return tuple(bodies)
+
+
+def _gantry(gantry: Any) -> Body:
+    radius = gantry.bore_diameter_mm / 2
+    wall = ring(gantry.T_ct_gantry, radius, radius + gantry.wall_mm, gantry.thickness_mm)
+    return Body("gantry", "room", wall, palette.TABLE, GANTRY_VEIL)

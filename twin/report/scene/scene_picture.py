@@ -1,0 +1,232 @@
+"""``scene.png``: the patient with the safe corridor, the needle and the arm, from afar and close by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.twin.report import annotate, palette
+from puncture_twin.twin.report.numbers import chosen_row, nearest_structure, number, target_words
+from puncture_twin.twin.report.raster.camera import Camera
+from puncture_twin.twin.report.raster.render import BACKGROUND, Layer, picture
+from puncture_twin.twin.report.scene.scene_parts import (
+    ArmPicture,
+    Body,
+    chosen_direction,
+    needle_bodies,
+    needle_words,
+    patient,
+    room,
+    safe_region,
+)
+from puncture_twin.twin.report.scene.views import close_up, overview
+
+WIDTH, HEIGHT = 1720, 1020
+LEFT_BOX = (16, 84, 926, 840)
+RIGHT_BOX = (942, 84, 1704, 840)
+LEGEND_TOP = 858
+
+AXES_LENGTH, AXES_CORNER = 44, 110
+"""Pixels: length of the body's axes, and how far from the corner they cross."""
+
+CORNER_GAIN = 0.1
+"""How much emptier the upper corner must be for the axes to stand there instead of below."""
+
+BODY_SHARE_MM = 700.0
+"""The overview shows the patient within this distance of the target, and the whole arm."""
+
+CLOSE_RADIUS_MM = 38.0
+HIDDEN_NEARBY = ("room", "safe")
+"""Groups that the close-up leaves out: a rib seen through the green of the skin would look safe to hit."""
+
+NOTHING_RADIUS_MM = 90.0
+"""Around the target, when there is no path to show."""
+
+
+def draw_scene(case: Any, anatomy: Any, candidates: Candidates, plan: Any | None, path: Path) -> None:
+    """Write the picture of the scene.
+
+    Args:
+        case: The case.
+        anatomy: Structures and skin, CT frame.
+        candidates: The search's rows; the safe ones make the corridor.
+        plan: The plan, or None: then there is no arm, and the needle is that of the best candidate.
+        path: The PNG to write; it appears whole or not at all.
+    """
+    T_base_ct = None if plan is None else plan.T_base_ct
+    bodies = [*patient(anatomy, case), *safe_region(candidates, case), *room(case, T_base_ct)]
+    direction = chosen_direction(candidates, case, plan)
+    if direction is not None:
+        bodies.extend(needle_bodies(case.needle, case.target_ct, direction).all)
+    arm = [] if plan is None else list(ArmPicture(plan.model, plan.T_base_ct).bodies(plan.insertion.q[-1]))
+    image = Image.new("RGB", (WIDTH, HEIGHT), annotate.WHITE)
+    draw = ImageDraw.Draw(image)
+    path_ct = _path(case, candidates, plan, direction)
+    with_arm = [*bodies, *arm]
+    far = _overview_camera(case, with_arm, path_ct)
+    needle = None if path_ct is None else _needle_line(case, path_ct)
+    title = "Overview" + (": needle on the target" if arm else "")
+    _view(image, draw, with_arm, far, LEFT_BOX, case, title, needle)
+    near = _close_camera(case, bodies, path_ct)
+    few = [body for body in bodies if body.name != "needle holder" and body.group not in HIDDEN_NEARBY]
+    _view(image, draw, few, near, RIGHT_BOX, case, "Close-up of the path", needle)
+    bottom = _words(draw, case, candidates, plan, bool(arm), bodies)
+    image = image.crop((0, 0, WIDTH, min(HEIGHT, round(bottom) + 8)))
+    with atomic(Path(path)) as temporary:
+        image.save(temporary, format="PNG", compress_level=palette.PNG_LEVEL)
+
+
+def render_bodies(bodies: Sequence[Body], camera: Camera) -> NDArray[np.uint8]:
+    """One view of a scene, anti-aliased: the opaque bodies, and the see-through ones over them."""
+    opaque = Layer([b.surface for b in bodies if b.alpha >= 1])
+    return picture(opaque, Layer([b.surface for b in bodies if b.alpha < 1]), camera)
+
+
+def _path(case: Any, candidates: Candidates, plan: Any | None, direction: Any) -> NDArray[np.float64] | None:
+    """Target and entry, shape (2, 3), or None."""
+    if plan is not None:
+        return np.stack([plan.target_ct, plan.entry_ct])
+    row = chosen_row(candidates)
+    if row is None or direction is None:
+        return None
+    return np.stack([case.target_ct, case.target_ct + candidates.path_length[row] * direction])
+
+
+def _overview_camera(case: Any, bodies: Sequence[Body], path_ct: Any) -> Camera:
+    size = _size(LEFT_BOX)
+    points = []
+    for body in bodies:
+        vertices = body.mesh.vertices
+        if body.group in {"skin", "organ"}:
+            vertices = vertices[np.linalg.norm(vertices - case.target_ct, axis=1) < BODY_SHARE_MM]
+        if body.group != "room" and len(vertices):
+            points.append(vertices)
+    focus = np.stack([case.target_ct]) if path_ct is None else _needle_line(case, path_ct)
+    blockers = Layer([b.surface for b in bodies if b.alpha >= 1 and b.group in {"arm", "room", "target"}])
+    return overview(case, np.concatenate(points), focus, blockers, size)
+
+
+def _needle_line(case: Any, path_ct: NDArray[np.float64]) -> NDArray[np.float64]:
+    way = path_ct[1] - path_ct[0]
+    way = way / np.linalg.norm(way)
+    return np.asarray(path_ct[0] + np.linspace(0, case.needle.length_mm, 24)[:, None] * way)
+
+
+def _close_camera(case: Any, bodies: Sequence[Body], path_ct: Any) -> Camera:
+    radius = CLOSE_RADIUS_MM
+    if path_ct is None:
+        z = np.asarray(case.T_ct_entry)[:3, 2]
+        path_ct, radius = np.stack([case.target_ct, case.target_ct + z]), NOTHING_RADIUS_MM
+    blockers = Layer([b.surface for b in bodies if b.alpha >= 1 and b.group in {"organ", "target"}])
+    return close_up(case, path_ct, radius, blockers, _size(RIGHT_BOX))
+
+
+def _size(box: tuple[int, int, int, int]) -> tuple[int, int]:
+    return box[2] - box[0], box[3] - box[1]
+
+
+def _view(
+    image: Image.Image,
+    draw: ImageDraw.ImageDraw,
+    bodies: Sequence[Body],
+    camera: Camera,
+    box: tuple[int, int, int, int],
+    case: Any,
+    title: str,
+    needle: NDArray[np.float64] | None,
+) -> None:
+    seen = render_bodies(bodies, camera)
+    image.paste(Image.fromarray(seen), box[:2])
+    annotate.panel(draw, box, title)
+    on_needle = np.empty((0, 2)) if needle is None else camera.project(needle)[:, :2] + box[:2]
+    annotate.body_axes(draw, camera, case.space, _empty_corner(seen, box, on_needle), AXES_LENGTH)
+    annotate.scale_bar(draw, camera, case.target_ct, box[0] + 20, box[3] - 22, 200)
+
+
+def _empty_corner(
+    seen: NDArray[np.uint8], box: tuple[int, int, int, int], on_needle: NDArray[np.float64]
+) -> tuple[float, float]:
+    """The middle of the right corner, upper or lower, where no needle is, or else less is to be seen."""
+    far = AXES_CORNER
+    upper, lower = (box[2] - far, box[1] + far), (box[2] - far, box[3] - far)
+    covers = [bool((np.linalg.norm(on_needle - corner, axis=1) < far).any()) for corner in (upper, lower)]
+    if covers[0] != covers[1]:
+        return lower if covers[0] else upper
+    plain = (seen == np.round(BACKGROUND).astype(np.uint8)).all(axis=2)
+    emptier = plain[: 2 * far, -2 * far :].mean() > plain[-2 * far :, -2 * far :].mean() + CORNER_GAIN
+    return upper if emptier else lower
+
+
+def _words(
+    draw: ImageDraw.ImageDraw,
+    case: Any,
+    candidates: Candidates,
+    plan: Any | None,
+    arm: bool,
+    bodies: Sequence[Body],
+) -> float:
+    """Everything around the views; returns the row below the legend."""
+    annotate.write(draw, (18, 12), f"{case.name}: needle path to {target_words(case)}", size=28, bold=True)
+    row = chosen_row(candidates)
+    if row is None and plan is None:
+        words, colour = "NOTHING IS SAFE: every direction is refused; no needle is shown", annotate.RED
+    else:
+        words, colour = _path_words(candidates, plan, row), annotate.FAINT
+    annotate.write(draw, (18, 50), words, size=18, bold=row is None and plan is None, colour=colour)
+    items = [("target", palette.TARGET_POINT), (needle_words(case.needle), palette.NEEDLE)]
+    if candidates.safe.any():
+        items.append((f"{candidates.safe_text}: where a needle may enter, and its corridor (overview)", palette.SAFE))
+    items.append(("skin (see-through)", palette.SKIN))
+    if arm:
+        items += [
+            (f"arm ({plan.model})" if plan is not None else "arm", palette.ARM),
+            ("needle holder", palette.HOLDER),
+        ]
+    items += [(_see_through(b), b.colour) for b in bodies if b.group == "room"]
+    below = annotate.legend(draw, items, 20, LEGEND_TOP, WIDTH - 20)
+    names = [(_see_through(b), b.colour) for b in bodies if b.group == "organ"]
+    note = "research software, not a medical device"
+    annotate.write(draw, (WIDTH - 18, 24), note, size=14, colour=annotate.FAINT, anchor="ra")
+    return annotate.legend(draw, families(names), 20, below, WIDTH - 20)
+
+
+def _see_through(body: Body) -> str:
+    return body.name + (" (see-through)" if body.alpha < 1 else "")
+
+
+def _path_words(candidates: Candidates, plan: Any | None, row: int | None) -> str:
+    if plan is not None:
+        theta, beta = np.degrees(plan.theta), np.degrees(plan.beta)
+        length = float(np.linalg.norm(plan.entry_ct - plan.target_ct))
+    else:
+        theta, beta = np.degrees(candidates.theta[row]), np.degrees(candidates.beta[row])
+        length = float(candidates.path_length[row])
+    words = f"θ {theta:g}°, β {beta:g}°, {number(length, 1, 'mm')} in the body"
+    if row is not None:
+        name, clearance = nearest_structure(candidates, row)
+        words += f", nearest {name.replace('_', ' ')} {number(clearance, 1, 'mm')}" if name else ""
+    return words + ("" if plan is not None else "  (no plan: the arm is not shown)")
+
+
+def families(names: list[tuple[str, palette.Rgb]], most: int = 26) -> list[tuple[str, palette.Rgb]]:
+    """Legend entries, with numbered families (ribs, vertebrae) folded into one when there are many.
+
+    Args:
+        names: Name and colour of each structure.
+        most: Up to so many entries nothing is folded.
+    """
+    if len(names) <= most:
+        return names
+    folded: dict[tuple[str, palette.Rgb], int] = {}
+    for name, colour in names:
+        key = name.split("_")[0], colour
+        folded[key] = folded.get(key, 0) + 1
+    first = {(name.split("_")[0], colour): name for name, colour in reversed(names)}
+    return [(f"{k[0]} ({n})" if n > 1 else first[k], k[1]) for k, n in folded.items()]

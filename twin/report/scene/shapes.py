@@ -1,0 +1,96 @@
+"""Simple bodies that the pictures need: needle, holder, ball, box, and the corridor of safe directions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from puncture_twin.planning.case.entry import outward
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.twin.report.map_view import step_of
+
+Floats = NDArray[np.float64]
+
+SECTIONS = 24
+"""Sides of a round bar."""
+
+LIFT_MM = 1.0
+"""How far the corridor's mouth is drawn outside the skin, so that the two surfaces do not flicker."""
+
+KEY = 1e-6
+"""rad; corners of cells nearer than this are one corner."""
+
+
+def bar(start_ct: Floats, end_ct: Floats, radius: float) -> TriangleMesh:
+    """A closed round bar between two points, mm."""
+    mesh = trimesh.creation.cylinder(radius, segment=np.stack([start_ct, end_ct]), sections=SECTIONS)
+    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def ball(centre_ct: Floats, radius: float) -> TriangleMesh:
+    """A sphere, mm."""
+    mesh = trimesh.creation.icosphere(2, radius)
+    return TriangleMesh(np.asarray(mesh.vertices) + centre_ct, np.asarray(mesh.faces))
+
+
+def box(T_ct_box: Floats, size: Any) -> TriangleMesh:
+    """A cuboid about the origin of its frame, with full edge lengths ``size``, mm."""
+    mesh = trimesh.creation.box(np.asarray(size, dtype=float))
+    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)).transformed(T_ct_box)
+
+
+def ring(T_ct_ring: Floats, inner: float, outer: float, thickness: float) -> TriangleMesh:
+    """A flat ring about the z axis of its frame, two radii and the extent along z, mm."""
+    mesh = trimesh.creation.annulus(inner, outer, thickness, sections=2 * SECTIONS)
+    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)).transformed(np.asarray(T_ct_ring))
+
+
+def corridor_mouth(candidates: Candidates, case: Any) -> TriangleMesh | None:
+    """Where a needle may enter: one patch on the skin for every safe cell of the grid, None when nothing is safe."""
+    cells = _cells(candidates, case)
+    if cells is None:
+        return None
+    points, corners = cells
+    return TriangleMesh(points, np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]))
+
+
+def corridor_walls(candidates: Candidates, case: Any) -> TriangleMesh | None:
+    """The border of the safe directions: triangles from the target to the rim of the mouth."""
+    cells = _cells(candidates, case)
+    if cells is None:
+        return None
+    points, corners = cells
+    edges = np.sort(np.concatenate([corners[:, [i, (i + 1) % 4]] for i in range(4)]), axis=1)
+    edges, uses = np.unique(edges, axis=0, return_counts=True)
+    rim = edges[uses == 1]
+    long = np.linalg.norm(points[rim[:, 0]] - points[rim[:, 1]], axis=1) > KEY
+    rim = rim[long]
+    if len(rim) == 0:
+        return None
+    apex = np.full((len(rim), 1), len(points))
+    return TriangleMesh(np.vstack([points, case.target_ct]), np.hstack([apex, rim]))
+
+
+def _cells(candidates: Candidates, case: Any) -> tuple[Floats, NDArray[np.int64]] | None:
+    """Corner points (n, 3), shared between cells, and the four corners (m, 4) of every safe cell."""
+    rows = np.flatnonzero(candidates.safe & np.isfinite(candidates.path_length))
+    if len(rows) == 0:
+        return None
+    half = step_of(candidates) / 2
+    signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    theta = np.clip(candidates.theta[rows, None] + half * signs[:, 0], 0.0, np.pi)
+    beta = candidates.beta[rows, None] + half * signs[:, 1]
+    turn = round(2 * np.pi / KEY)
+    around = np.where(np.sin(theta) < KEY, 0, np.mod(np.round(beta / KEY), turn))  # a pole is one corner
+    keys = np.stack([np.round(theta / KEY), around], axis=-1).reshape(-1, 2)
+    _, first, shared = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    shared = shared.reshape(-1)
+    lengths = np.repeat(candidates.path_length[rows], 4)
+    length = np.bincount(shared, weights=lengths) / np.bincount(shared) + LIFT_MM
+    T = np.asarray(case.T_ct_entry)
+    points = case.target_ct + length[:, None] * (outward(theta.ravel()[first], beta.ravel()[first]) @ T[:3, :3].T)
+    return points, shared.reshape(-1, 4)

@@ -1,0 +1,114 @@
+"""Where to look from: the room with the arm, and close to the needle's path."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from puncture_twin.planning.case.entry import ANATOMICAL_LPS
+from puncture_twin.twin.report.raster.camera import Camera, camera_around
+from puncture_twin.twin.report.raster.render import Layer
+
+Floats = NDArray[np.float64]
+
+FOV = np.radians(28.0)
+"""A long lens: little perspective, sizes compare."""
+
+UPRIGHT = 0.5
+"""An entry frame whose z is within 60 degrees of the body's long axis does not say what is up on the table."""
+
+ALONG_BODY = 0.62
+"""A patient is not looked at more steeply along the body than this cosine: from head or feet little is recognised."""
+
+ELEVATIONS = (np.radians(22.0), np.radians(40.0))
+AZIMUTHS = 16
+TILTS = (0.0, np.radians(25.0), np.radians(-25.0))
+PATH_SAMPLES = 24
+TARGET_WEIGHT = 8
+"""The target counts as so many points of the path when one asks what a view hides."""
+
+
+def up_ct(case: Any) -> Floats:
+    """Up in the room, unit, CT frame: the entry frame's z; the front of a patient whose frame looks along the body."""
+    z = np.asarray(case.T_ct_entry)[:3, 2]
+    if str(case.space) != "local" and abs(z @ np.array(ANATOMICAL_LPS["head"])) > UPRIGHT:
+        return np.array(ANATOMICAL_LPS["anterior"])
+    return z
+
+
+def overview(case: Any, content_ct: Floats, focus_ct: Floats, blockers: Layer, size: tuple[int, int]) -> Camera:
+    """A view of everything from above the table, from the side where the needle is best seen.
+
+    Args:
+        case: For the direction up.
+        content_ct: Shape (n, 3), what must be in the picture.
+        focus_ct: Shape (k, 3), what should not be hidden.
+        blockers: What can hide it.
+        size: Width and height in pixels.
+    """
+    up = up_ct(case)
+    side = _across(up)
+    options = []
+    for elevation in ELEVATIONS:
+        for turn in (np.arange(AZIMUTHS) + 0.5) * 2 * np.pi / AZIMUTHS:
+            level = np.cos(turn) * side + np.sin(turn) * np.cross(up, side)
+            options.append(-np.cos(elevation) * level - np.sin(elevation) * up)
+    if str(case.space) != "local":
+        options = [o for o in options if abs(o @ np.array(ANATOMICAL_LPS["head"])) < ALONG_BODY]
+    return _best(options, up, content_ct, focus_ct, blockers, size)
+
+
+def close_up(case: Any, path_ct: Floats, radius: float, blockers: Layer, size: tuple[int, int]) -> Camera:
+    """A view across the needle's path, from where the fewest structures hide it.
+
+    Args:
+        case: For the direction up.
+        path_ct: Shape (2, 3), target and entry.
+        radius: mm about the path's ends that must be in the picture.
+        blockers: What can hide the path.
+        size: Width and height in pixels.
+    """
+    along = (path_ct[1] - path_ct[0]) / np.linalg.norm(path_ct[1] - path_ct[0])
+    side = _across(along)
+    options = []
+    for tilt in TILTS:
+        for turn in (np.arange(AZIMUTHS) + 0.5) * 2 * np.pi / AZIMUTHS:
+            level = np.cos(turn) * side + np.sin(turn) * np.cross(along, side)
+            options.append(np.cos(tilt) * level + np.sin(tilt) * along)
+    up = up_ct(case)
+    options = [o for o in options if o @ up < 0.35]  # not from below the table
+    steps = np.linspace(0, 1, PATH_SAMPLES)[:, None]
+    focus = path_ct[0] * (1 - steps) + path_ct[1] * steps
+    focus = np.concatenate([focus, np.repeat(path_ct[:1], TARGET_WEIGHT, axis=0)])
+    cube = radius * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / np.sqrt(3)
+    content = np.concatenate([path_ct[0] + cube, path_ct[1] + cube])
+    return _best(options, up, content, focus, blockers, size)
+
+
+def _across(direction: Floats) -> Floats:
+    least = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    side = np.cross(direction, least)
+    return np.asarray(side / np.linalg.norm(side))
+
+
+def _best(
+    options: list[Floats], up: Floats, content: Floats, focus: Floats, blockers: Layer, size: tuple[int, int]
+) -> Camera:
+    """The option that sees most of the focus; among equals, the one that sees it longest in the picture."""
+    content = content[ConvexHull(content).vertices]
+    best, best_score = None, -np.inf
+    for toward in options:
+        if abs(toward @ up) > 0.95:
+            continue
+        camera = camera_around(content, toward, up, fov=FOV, width=size[0], height=size[1])
+        seen = camera.project(focus)
+        extent = np.linalg.norm(np.ptp(seen[:, :2], axis=0)) / np.hypot(*size)
+        score = float(blockers.sees(camera.eye, focus).mean()) + 0.8 * float(extent)
+        if score > best_score:
+            best, best_score = camera, score
+    if best is None:
+        return camera_around(content, -_across(up), up, fov=FOV, width=size[0], height=size[1])
+    return best
