@@ -38,8 +38,15 @@ from puncture_twin.planning.export.exporter import FORMATS
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.twin.jobs.patient import main_job
 from puncture_twin.twin.jobs.patient import text as words
-from puncture_twin.twin.jobs.patient.place_text import mirror_line, place_text
-from puncture_twin.twin.jobs.robot.mirror import Mirror, connect, live_states, recorded_states, recording_warnings
+from puncture_twin.twin.jobs.patient.place_text import place_text
+from puncture_twin.twin.jobs.robot.mirror import (
+    Mirror,
+    connect,
+    live_states,
+    mirror_text,
+    recorded_states,
+    recording_warnings,
+)
 from puncture_twin.twin.report.progress import progress_display
 
 MOST_SEEDS = 10_000
@@ -204,7 +211,7 @@ def mirror(
     shown = []
     with suppress(KeyboardInterrupt):
         for one in mirrored.follow(states):
-            shown.append(one.summary()) if as_json else out.print(mirror_line(one), highlight=False, markup=False)
+            shown.append(one.summary()) if as_json else out.print(mirror_text(one), highlight=False, markup=False)
     if as_json:
         _print({"case": str(case), "inputs": inputs_document(followed.inputs), "states": shown}, "", as_json)
 

@@ -22,9 +22,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script,
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.case.entry import Directions, grid, outward
-from puncture_twin.planning.certify import certify
 from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.certify.checker import verify
+from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.search.context import Prepared, prepare
 from puncture_twin.planning.search.search import organ_candidates

@@ -10,8 +10,8 @@ from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import load_case
-from puncture_twin.planning.certify import certify
 from puncture_twin.planning.certify.checker import verify
+from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.twin.phantoms import supine

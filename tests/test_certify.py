@@ -21,7 +21,6 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case_file import EntryAxes
 from puncture_twin.planning.case.entry import Directions, angles, entry_frame, outward
-from puncture_twin.planning.certify import certify
 from puncture_twin.planning.certify.bounds import view_bounds
 from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, angle_between, nearest_cell, split
 from puncture_twin.planning.certify.certificate import read_certificate, write_certificate
@@ -30,6 +29,7 @@ from puncture_twin.planning.certify.cones import Lists, zones
 from puncture_twin.planning.certify.near_organs import Organs, organ_facts
 from puncture_twin.planning.certify.skin_cones import skin_bounds
 from puncture_twin.planning.certify.skin_surface import skin_surface
+from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space

@@ -1,1 +1,5 @@
-"""The simulated room that knows the truth, beside the belief that planning works on."""
+"""The digital twin: the experiment with a ground truth that the planner does not know, and pictures of what happened.
+
+`plant` answers as devices do, `guidance` sees measurements only, `rehearsal` executes plans, `report` draws, `jobs`
+composes them into the commands.
+"""

@@ -1,24 +1,8 @@
-"""The map between the grid points: cells of directions that are proven safe or rejected, and the proof as a file."""
+"""The map between the grid points: cells of directions proven safe or rejected, the proof as a file, its checker.
 
-from puncture_twin.planning.certify.certificate import (
-    Certificate,
-    parse_certificate,
-    read_certificate,
-    write_certificate,
-)
-from puncture_twin.planning.certify.certify import certify
-from puncture_twin.planning.certify.checker import Verification, verify
-from puncture_twin.planning.certify.cone_column import with_safe_cone
-from puncture_twin.planning.certify.question import Question
+The checker (`checker`, `plain_skin`) shares no code with the search or with what makes the certificate.
+"""
 
-__all__ = [
-    "Certificate",
-    "Question",
-    "Verification",
-    "certify",
-    "parse_certificate",
-    "read_certificate",
-    "verify",
-    "with_safe_cone",
-    "write_certificate",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,5 +1,8 @@
-"""A checked plan as a file for a robot: URScript, ROS 2, or a table of times. Metres: names with ``_m``."""
+"""A checked plan as a file for a robot: URScript, ROS 2, or a table of times. Metres: names with ``_m``.
 
-from puncture_twin.planning.export.exporter import FORMATS, Exported, export_name, export_plan
+What is written is read back and compared with the plan before it is published.
+"""
 
-__all__ = ["FORMATS", "Exported", "export_name", "export_plan"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,28 +1,9 @@
-"""What other programs write: meshes, label maps, CT volumes and named points, each through the guard."""
+"""What other programs write, read strictly: every byte that a file promises must be there, or it is refused.
 
-from puncture_twin.planning.formats.guard import guard_mesh, guard_points, guard_transform
-from puncture_twin.planning.formats.labels.labelmaps import LabelMap, read_labelmap
-from puncture_twin.planning.formats.meshes.mesh_files import mesh_warnings, read_mesh
-from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points, write_points
-from puncture_twin.planning.formats.volumes.volume_files import Volume, read_volume
-from puncture_twin.planning.geometry.spaces import Space, Unit, parse_space, parse_unit, to_lps
+The guard stands before all compiled code. Each kind of file has its room below. What a file means to a case (roles,
+margins, markers) is not decided here.
+"""
 
-__all__ = [
-    "LabelMap",
-    "NamedPoints",
-    "Space",
-    "Unit",
-    "Volume",
-    "guard_mesh",
-    "guard_points",
-    "guard_transform",
-    "mesh_warnings",
-    "parse_space",
-    "parse_unit",
-    "read_labelmap",
-    "read_mesh",
-    "read_points",
-    "read_volume",
-    "to_lps",
-    "write_points",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,8 @@
-"""TODO."""
+"""Markers to pose: CT to robot base with residuals and expected error, and all that could make markers lie.
+
+The equations are Arun's and Horn's rigid fit and Fitzpatrick's error formulas; each module names its source.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,8 @@
-"""TODO."""
+"""The main job: every direction (θ, β) of a case to a verdict with a reason, ranked, explained and written as a table.
+
+`prepare` puts together what a search needs from the rooms below; `constraints` holds the order of the reasons.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,1 @@
-"""TODO."""
+"""The commands: each composes planning, plant, guidance and report. No algorithm lives here."""

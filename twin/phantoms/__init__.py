@@ -1,23 +1,8 @@
-"""Bodies with known truth: the carton of Chen 2019, an abdomen and an open head of our own."""
+"""Bodies with known truth: the carton of Chen 2019, an abdomen, an open head, and a supine patient as a CT.
 
-from puncture_twin.twin.phantoms.abdomen import STRUCTURES, abdomen_field, abdomen_mesh, lesion_centre_ct
-from puncture_twin.twin.phantoms.carton import carton_field, carton_meshes
-from puncture_twin.twin.phantoms.guidance import abdomen_guidance, patient_placement, skin_markers_ct
-from puncture_twin.twin.phantoms.head import head_field, head_mesh, head_targets
-from puncture_twin.twin.phantoms.manifest import write_phantoms
+``python -m puncture_twin.twin.phantoms --out DIR`` makes the embedded cases' files again.
+"""
 
-__all__ = [
-    "STRUCTURES",
-    "abdomen_field",
-    "abdomen_guidance",
-    "abdomen_mesh",
-    "carton_field",
-    "carton_meshes",
-    "head_field",
-    "head_mesh",
-    "head_targets",
-    "lesion_centre_ct",
-    "patient_placement",
-    "skin_markers_ct",
-    "write_phantoms",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,8 +1,8 @@
-"""What a person looks at: the map, the scene, the film and the page."""
+"""What a person looks at. Here: colours, numbers, the map's projection, text on pictures, progress.
 
-from puncture_twin.twin.report.map.map_picture import draw_map
-from puncture_twin.twin.report.page.page import write_page
-from puncture_twin.twin.report.scene.film import draw_film
-from puncture_twin.twin.report.scene.scene_picture import draw_scene
+Pictures, map, scene and page have a room each. Nothing here decides; every number comes from a result.
+"""
 
-__all__ = ["draw_film", "draw_map", "draw_scene", "write_page"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,8 @@
-"""TODO."""
+"""The camera guidance: two calibrated cameras, a ball on the tool, and a servo on what they see (Liu 2007).
+
+The session draws its own room with ground truth, an exception from `guidance` never importing `plant`.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

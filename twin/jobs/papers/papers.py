@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from puncture_twin.twin.jobs.papers import axp_ybq, chen2019
-from puncture_twin.twin.jobs.patient import text as words
+from puncture_twin.twin.jobs.papers.chen2019_text import reproduction_summary, reproduction_text
 from puncture_twin.twin.jobs.servo.job import reproduce_paper
 
 
@@ -30,7 +30,7 @@ Reproduce = Callable[[Path, int | None], PaperResult]
 def _chen2019(out_dir: Path, seeds: int | None) -> PaperResult:
     del out_dir, seeds  # arithmetic on printed tables: nothing is drawn, in either sense
     result = chen2019.reproduce()
-    return PaperResult(result.holds, words.reproduction_summary(result), words.reproduction_text(result))
+    return PaperResult(result.holds, reproduction_summary(result), reproduction_text(result))
 
 
 def _axp_ybq(out_dir: Path, seeds: int | None) -> PaperResult:

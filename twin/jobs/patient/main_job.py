@@ -19,7 +19,6 @@ from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import Draft, writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.case.case import load_case
-from puncture_twin.planning.certify import certify
 from puncture_twin.planning.certify.certificate import (
     MAX_CERTIFICATE_BYTES,
     Certificate,
@@ -28,6 +27,7 @@ from puncture_twin.planning.certify.certificate import (
 )
 from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.certify.cone_column import with_safe_cone
+from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.cross_check import CrossChecked
 from puncture_twin.planning.export.exporter import Exported, export_name, export_plan
 from puncture_twin.planning.plan.plan import MAX_PLAN_BYTES, Plan, parse_plan, write_plan

@@ -1,12 +1,9 @@
-"""What ``place`` and ``mirror`` print for a person."""
+"""What ``place`` prints for a person."""
 
 from __future__ import annotations
 
-import numpy as np
-
 from puncture_twin.planning.place.search import Judged
 from puncture_twin.twin.jobs.patient.place_job import PlaceRun
-from puncture_twin.twin.jobs.robot.mirror import Mirrored
 from puncture_twin.twin.report.mount_text import direction_words, mount_words
 
 HALF_A_DIGIT = 5e-4
@@ -51,13 +48,3 @@ def _line(rank: str, one: Judged, run: PlaceRun) -> str:
     name = one.name if one.site is None else mount_words(one.site.region, run.found.T_ct_bed, space)
     home = f"; home: {verdict.home_contact}" if verdict.home_contact else ""
     return f"{rank}  {100 * verdict.share:7.1f}  {verdict.held:5d}  {verdict.margin:6.2f}  {where}  {name}{home}"
-
-
-def mirror_line(shown: Mirrored) -> str:
-    """One state of a mirrored arm."""
-    x, y, z = shown.tip_ct
-    joints = " ".join(f"{angle:7.2f}" for angle in np.degrees(shown.q))
-    return (
-        f"{shown.time_s:9.3f} s  joints {joints} deg  tip (CT) {x:8.2f} {y:8.2f} {z:8.2f} mm"
-        f"  to target {shown.to_target_mm:7.2f} mm, off its line {shown.off_axis_mm:6.2f} mm"
-    )

@@ -8,7 +8,6 @@ from typing import Any
 from puncture_twin.planning.export.exporter import Exported
 from puncture_twin.planning.search.explain import needle_warnings, reason_text
 from puncture_twin.planning.search.search import closest_miss
-from puncture_twin.twin.jobs.papers.chen2019 import Reproduction
 from puncture_twin.twin.jobs.patient.main_job import Run, plan_summary, rehearsal_summary
 
 
@@ -129,41 +128,6 @@ def batch_text(rows: Sequence[dict[str, Any]]) -> str:
         best = "-" if row["best_theta_deg"] is None else f"{row['best_theta_deg']:g}/{row['best_beta_deg']:g}"
         lines.append(f"{row['case']:{width}s}  {row['safe']:5d} {row['directions']:6d}  {best:15s}  {row['said']}")
     return "\n".join(lines)
-
-
-def reproduction_text(result: Reproduction) -> str:
-    """The paper's numbers beside ours."""
-    lines = [
-        "table  what                                    paper                       ours                   differs"
-    ]
-    for row in result.rows:
-        paper, ours = (" ".join(f"{x:8.2f}" for x in values) for values in (row.paper, row.ours))
-        mark = "" if row.holds else "  DOES NOT HOLD"
-        lines.append(f"{row.table:5s}  {row.what:36.36s} {paper:>27s} {ours:>27s} {row.difference_mm:8.4f}{mark}")
-    reach = result.reach
-    lines += [
-        "",
-        f"The worked pose puts the flange {reach.flange_from_shoulder_mm:.1f} mm from the shoulder of a UR3, "
-        f"whose links span {reach.longest_span_mm:.1f} mm at most: "
-        + ("it is out of reach." if reach.out_of_reach else "it is within reach."),
-        "every number holds" if result.holds else "NOT every number holds",
-    ]
-    return "\n".join(lines)
-
-
-def reproduction_summary(result: Reproduction) -> dict[str, Any]:
-    """The same as plain values."""
-    rows = [
-        {"table": r.table, "what": r.what, "paper_mm": r.paper, "ours_mm": r.ours, "holds": r.holds}
-        for r in result.rows
-    ]
-    return {
-        "rows": rows,
-        "flange_from_shoulder_mm": result.reach.flange_from_shoulder_mm,
-        "longest_span_mm": result.reach.longest_span_mm,
-        "out_of_reach": result.reach.out_of_reach,
-        "holds": result.holds,
-    }
 
 
 def _best(run: Run) -> list[str]:

@@ -232,3 +232,13 @@ def checked(time_s: float, q: list[float], where: str) -> JointState:
     if angles.shape != (6,) or not np.isfinite(angles).all() or not np.isfinite(time_s):
         raise InputError(f"joint angles {q} at {time_s} s", where=where, allowed="a time and six finite angles, rad")
     return JointState(float(time_s), angles)
+
+
+def mirror_text(shown: Mirrored) -> str:
+    """One state of a mirrored arm."""
+    x, y, z = shown.tip_ct
+    joints = " ".join(f"{angle:7.2f}" for angle in np.degrees(shown.q))
+    return (
+        f"{shown.time_s:9.3f} s  joints {joints} deg  tip (CT) {x:8.2f} {y:8.2f} {z:8.2f} mm"
+        f"  to target {shown.to_target_mm:7.2f} mm, off its line {shown.off_axis_mm:6.2f} mm"
+    )

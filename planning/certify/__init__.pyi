@@ -1,0 +1,15 @@
+from .certificate import (
+    MAX_CERTIFICATE_BYTES as MAX_CERTIFICATE_BYTES,
+)
+from .certificate import (
+    Certificate as Certificate,
+)
+from .certificate import (
+    parse_certificate as parse_certificate,
+)
+from .certificate import (
+    write_certificate as write_certificate,
+)
+from .checker import verify as verify
+from .cone_column import with_safe_cone as with_safe_cone
+from .subdivision import certify as certify

@@ -1,0 +1,3 @@
+from .point_files import NamedPoints as NamedPoints
+from .point_files import parse_points as parse_points
+from .raw_points import parse_coordinate as parse_coordinate

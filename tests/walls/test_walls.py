@@ -1,0 +1,183 @@
+"""The walls of the house: who may import whom, how full a room may be, and that nothing in it is unused."""
+
+import ast
+import importlib
+import subprocess
+import sys
+import types
+from collections import Counter, defaultdict
+
+import pytest
+from walls.house import NAME, ROOT, arrows, cycle, imported, is_package, modules, room_arrows, room_of, tree
+
+MOST_MODULES = 16
+"""A folder that a person can take in at a glance."""
+
+PLANT_IN_GUIDANCE = {
+    "puncture_twin.twin.guidance.stereo.joint_model",
+    "puncture_twin.twin.guidance.stereo.stereo_room",
+    "puncture_twin.twin.guidance.ultrasound.selfcal_case",
+    "puncture_twin.twin.guidance.ultrasound.selfcal_truth",
+}
+"""Modules of guidance that know the ground truth: stereo and ultrasound still draw their own room. It only shrinks."""
+
+WITHOUT_WORK = {
+    "puncture_twin.twin.plant.scanner",
+    "puncture_twin.twin.plant.tip_touch",
+}
+"""Devices that no command uses yet."""
+
+
+def within(module, package):
+    """Whether a module is a package or lies in it."""
+    return module == package or module.startswith(package + ".")
+
+
+def broken(inside, forbidden, but=frozenset()):
+    """Imports of something forbidden from modules inside a package."""
+    return [
+        f"{name} imports {target}"
+        for name, path in modules().items()
+        if within(name, inside) and name not in but
+        for target in imported(path)
+        if any(within(target, wall) for wall in forbidden)
+    ]
+
+
+def test_planning_never_imports_the_twin_or_the_physics():
+    """It decides by what it is given."""
+    assert broken(f"{NAME}.planning", [f"{NAME}.twin", f"{NAME}.run_twin", "pybullet", "matplotlib"]) == []
+
+
+def test_the_physics_is_met_in_one_room():
+    """PyBullet, and with it metres, stay in twin/world."""
+    assert [line for line in broken(NAME, ["pybullet", "pybullet_data"]) if ".twin.world." not in line] == []
+
+
+def test_nobody_imports_the_command_line():
+    """It is the outermost."""
+    assert broken(NAME, [f"{NAME}.run_twin"]) == []
+
+
+def test_guidance_never_sees_the_plant():
+    """Stereo and ultrasound are exceptions whose list only shrinks."""
+    guidance, plant = f"{NAME}.twin.guidance", [f"{NAME}.twin.plant"]
+    assert broken(guidance, plant, but=PLANT_IN_GUIDANCE) == []
+    assert {line.split()[0] for line in broken(guidance, plant)} == PLANT_IN_GUIDANCE
+
+
+def test_the_ways_of_guidance_do_not_meet():
+    """Each can be read, and thrown away, without the others."""
+    kinds = [name for name in modules() if name.count(".") == 3 and within(name, f"{NAME}.twin.guidance")]
+    assert len(kinds) >= 2
+    for kind in kinds:
+        assert broken(kind, [other for other in kinds if other != kind]) == []
+
+
+def test_kernels_are_compiled_in_one_way():
+    """What imports numba by itself is kept by numba's rule, which misses edits of other files."""
+    own = (f"{NAME}.planning.base.cache", f"{NAME}.planning.base.numba_kernels")
+    allowed = ("numba.core", "numba.extending")  # types and intrinsics compile nothing
+    lines = [line for line in broken(NAME, ["numba"]) if not line.startswith(own)]
+    assert [line for line in lines if not line.split()[-1].startswith((*allowed, "numba"))] == []
+    assert [line for line in lines if line.endswith(("imports numba.njit", "imports numba.jit"))] == []
+
+
+def test_everything_is_imported_under_one_name():
+    """A second way to the same file would be a second copy of every class."""
+    folders = ("tests", "benchmarks", "docs", "examples")
+    files = [*modules().values(), *(path for folder in folders for path in (ROOT / folder).rglob("*.py"))]
+    tops = ("planning", "twin", "meshes", "run_twin")
+    assert [f"{path}: {name}" for path in files for name in imported(path) if name.split(".")[0] in tops] == []
+
+
+def test_modules_form_no_cycle():
+    """No module imports itself through others."""
+    assert (
+        cycle({name: {other for other in targets if not is_package(other)} for name, targets in arrows().items()}) == []
+    )
+
+
+def test_rooms_form_no_cycle():
+    """No folder imports itself through others, parent and child apart."""
+    graph = defaultdict(set)
+    for one, other in room_arrows():
+        graph[one].add(other)
+    assert cycle(graph) == []
+
+
+def test_a_room_holds_few_modules():
+    """What has more is two rooms."""
+    counts = Counter(room_of(name) for name in modules() if not is_package(name))
+    assert {room: count for room, count in counts.items() if count > MOST_MODULES} == {}
+
+
+def test_every_room_says_what_lives_in_it():
+    """Its ``__init__`` has a paragraph, and no code but what hands names on."""
+    for name, path in modules().items():
+        if is_package(name) and name not in (NAME, f"{NAME}.meshes"):
+            assert len(ast.get_docstring(tree(path)) or "") > 50, name
+            kinds = {type(node) for node in tree(path).body[1:]}
+            assert kinds <= {ast.Import, ast.Assign}, name
+
+
+def test_every_name_that_a_room_hands_on_is_there():
+    """And is the thing itself, not the module that has its name."""
+    for name in modules():
+        if is_package(name):
+            room = importlib.import_module(name)
+            for public in getattr(room, "__all__", ()):
+                assert not isinstance(getattr(room, public), types.ModuleType), f"{name}.{public}"
+
+
+def test_every_module_is_reached_from_a_command_or_the_api():
+    """Code that only tests use is not the product's."""
+    reached, waiting = set(), [f"{NAME}.run_twin", NAME, f"{NAME}.planning.collision_cases.pytest_plugin"]
+    waiting += [f"{NAME}.twin.phantoms.__main__"]
+    while waiting:
+        name = waiting.pop()
+        if name not in reached:
+            reached.add(name)
+            waiting += arrows()[name]
+    assert {name for name in modules() if not is_package(name)} - reached == WITHOUT_WORK
+
+
+def public_names():
+    """Every public function and class at the top of a module: (module, name)."""
+    kinds = (ast.FunctionDef, ast.ClassDef)
+    for name, path in modules().items():
+        yield from (
+            (name, node.name) for node in tree(path).body if isinstance(node, kinds) and not node.name.startswith("_")
+        )
+
+
+def used_names():
+    """Every word by which the product and the examples name something, counted."""
+    files = [*modules().values(), *(ROOT / "examples").glob("*.py")]
+    for path in files:
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.Name):
+                yield node.id
+            elif isinstance(node, ast.Attribute):
+                yield node.attr
+            elif isinstance(node, ast.alias):
+                yield node.name.rpartition(".")[2]
+
+
+REGISTERED = {"run_twin", "collision_cases.pytest_plugin"}
+"""Their functions are called by typer and by pytest."""
+
+
+def test_every_public_function_is_used():
+    """By a command, the public API or an example; never by tests alone."""
+    used = set(used_names())
+    unused = {f"{module}.{name}" for module, name in public_names() if name not in used}
+    kept = WITHOUT_WORK | {f"{NAME}.planning.{name}" for name in REGISTERED} | {f"{NAME}.run_twin"}
+    assert {name for name in unused if name.rpartition(".")[0] not in kept} == set()
+
+
+@pytest.mark.parametrize("heavy", ["pybullet", "matplotlib", "numba", "trimesh", "SimpleITK", "ompl"])
+def test_importing_the_planner_loads_nothing_heavy(heavy):
+    """A command pays only for what it uses."""
+    code = f"import sys, {NAME}, {NAME}.planning\nassert {heavy!r} not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

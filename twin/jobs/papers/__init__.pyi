@@ -1,0 +1,1 @@
+from .papers import PAPERS as PAPERS

@@ -1,0 +1,1 @@
+from .place_job import place_case as place_case

@@ -1,0 +1,2 @@
+from .job import run_selfcal as run_selfcal
+from .text import selfcal_text as selfcal_text

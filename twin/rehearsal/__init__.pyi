@@ -1,0 +1,2 @@
+from .rehearsal import Rehearsal as Rehearsal
+from .rehearsal import rehearse as rehearse
