@@ -36,8 +36,7 @@ from puncture_twin.planning.batch.batch import run_batch
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.export.exporter import FORMATS
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.twin.jobs.patient import main_job
-from puncture_twin.twin.jobs.patient import text as words
+from puncture_twin.twin.jobs.patient import main_job, text as words
 from puncture_twin.twin.jobs.patient.place_text import place_text
 from puncture_twin.twin.jobs.robot.mirror import (
     Mirror,

@@ -6,8 +6,7 @@ import fcl
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from oracles import segment_mesh_distance
 
 from puncture_twin import meshes

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import ur_analytic_ik
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 from puncture_twin.planning.arm.kinematics import (
     flange_pose,

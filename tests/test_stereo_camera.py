@@ -5,8 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, looking_at, stereo_pair, tangent_axes

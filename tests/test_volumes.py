@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.volumes.nifti_header import TYPES

@@ -1,13 +1,7 @@
 from .certificate import (
     MAX_CERTIFICATE_BYTES as MAX_CERTIFICATE_BYTES,
-)
-from .certificate import (
     Certificate as Certificate,
-)
-from .certificate import (
     parse_certificate as parse_certificate,
-)
-from .certificate import (
     write_certificate as write_certificate,
 )
 from .checker import verify as verify

@@ -1,15 +1,8 @@
-from .containment import Side as Side
-from .containment import side_of as side_of
+from .containment import Side as Side, side_of as side_of
 from .creases import split_at_creases as split_at_creases
-from .crossings import Crossings as Crossings
-from .crossings import first_crossing as first_crossing
-from .decimation import decimated as decimated
-from .decimation import squared_distance as squared_distance
+from .crossings import Crossings as Crossings, first_crossing as first_crossing
+from .decimation import decimated as decimated, squared_distance as squared_distance
 from .mesh import TriangleMesh as TriangleMesh
-from .spaces import Space as Space
-from .spaces import Unit as Unit
-from .spaces import parse_space as parse_space
-from .spaces import parse_unit as parse_unit
-from .spaces import to_lps as to_lps
+from .spaces import Space as Space, Unit as Unit, parse_space as parse_space, parse_unit as parse_unit, to_lps as to_lps
 from .voxelize import voxels_inside as voxels_inside
 from .winding import winding_number as winding_number

@@ -16,9 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from ompl import base as ob
-from ompl import geometric as og
-from ompl import util as ou
+from ompl import base as ob, geometric as og, util as ou
 
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.checker import Contact

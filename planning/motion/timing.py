@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from ruckig import InputParameter, Result, Ruckig
-from ruckig import Trajectory as Profile
+from ruckig import InputParameter, Result, Ruckig, Trajectory as Profile
 
 from puncture_twin.planning.base.errors import InputError
 

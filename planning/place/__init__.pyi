@@ -2,14 +2,8 @@ from .bed import bed_frame as bed_frame
 from .directions import ring_weights as ring_weights
 from .document import (
     place_document as place_document,
-)
-from .document import (
     write_place_document as write_place_document,
-)
-from .document import (
     write_placements as write_placements,
 )
 from .mounts import Region as Region
-from .search import Judged as Judged
-from .search import PlaceSearch as PlaceSearch
-from .search import search_placements as search_placements
+from .search import Judged as Judged, PlaceSearch as PlaceSearch, search_placements as search_placements

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import Directions, direction, grid
@@ -165,6 +166,25 @@ def ranked(case: Case, found: Candidates) -> Candidates:
     )
     cost[rows], ranks[rows], pareto[rows] = order.cost, order.rank, order.pareto
     return replace(found, cost=cost, rank=ranks, pareto=pareto)
+
+
+def ranked_by(found: Candidates, cost: Floats) -> Candidates:
+    """The safe candidates ranked by a cost of the caller's, smaller is better; equal costs keep their order.
+
+    Args:
+        found: Candidates.
+        cost: Shape (n,); rejected candidates' entries are not looked at.
+
+    Raises:
+        InputError: Another shape, or a safe candidate whose cost is not finite.
+    """
+    rows = np.flatnonzero(found.safe)
+    if cost.shape != (len(found),) or not np.isfinite(cost[rows]).all():
+        allowed = f"shape ({len(found)},), finite for the {len(rows)} safe candidates"
+        raise InputError(f"a cost of shape {cost.shape}", where="rerank", allowed=allowed)
+    ranks = np.zeros(len(found), np.int32)
+    ranks[rows[np.argsort(cost[rows], kind="stable")]] = np.arange(1, len(rows) + 1)
+    return replace(found, cost=np.where(found.safe, cost, np.nan), rank=ranks)
 
 
 def closest_miss(found: Candidates) -> int | None:

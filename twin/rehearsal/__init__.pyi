@@ -1,2 +1,1 @@
-from .rehearsal import Rehearsal as Rehearsal
-from .rehearsal import rehearse as rehearse
+from .rehearsal import Rehearsal as Rehearsal, rehearse as rehearse

@@ -1,4 +1,2 @@
-from .array_cache import NO_CACHE as NO_CACHE
-from .array_cache import Cache as Cache
-from .array_cache import user_cache as user_cache
+from .array_cache import NO_CACHE as NO_CACHE, Cache as Cache, user_cache as user_cache
 from .kernel_cache import use_kernel_cache as use_kernel_cache

@@ -1,4 +1,2 @@
 from .manifest import read_output as read_output
-from .output_set import Draft as Draft
-from .output_set import withdraw as withdraw
-from .output_set import writing as writing
+from .output_set import Draft as Draft, withdraw as withdraw, writing as writing

@@ -1,11 +1,4 @@
 from .hulls import Hulls as Hulls
-from .proofs import Movers as Movers
-from .proofs import Scene as Scene
-from .proofs import Skin as Skin
-from .proofs import scratch as scratch
-from .segments import ASK as ASK
-from .segments import CONTACT as CONTACT
-from .segments import NOT_FINITE as NOT_FINITE
-from .segments import Answer as Answer
-from .surfaces import CELL_MM as CELL_MM
-from .surfaces import farthest_from as farthest_from
+from .proofs import Movers as Movers, Scene as Scene, Skin as Skin, scratch as scratch
+from .segments import ASK as ASK, CONTACT as CONTACT, NOT_FINITE as NOT_FINITE, Answer as Answer
+from .surfaces import CELL_MM as CELL_MM, farthest_from as farthest_from

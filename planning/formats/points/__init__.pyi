@@ -1,3 +1,2 @@
-from .point_files import NamedPoints as NamedPoints
-from .point_files import parse_points as parse_points
+from .point_files import NamedPoints as NamedPoints, parse_points as parse_points
 from .raw_points import parse_coordinate as parse_coordinate

@@ -1,2 +1,1 @@
-from .job import reproduce_paper as reproduce_paper
-from .job import run_servo as run_servo
+from .job import reproduce_paper as reproduce_paper, run_servo as run_servo

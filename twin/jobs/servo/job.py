@@ -10,8 +10,7 @@ from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.twin.guidance.stereo.experiment import Statistics, Trial
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.session import Session
-from puncture_twin.twin.jobs.servo import liu2007
-from puncture_twin.twin.jobs.servo import text as servo_words
+from puncture_twin.twin.jobs.servo import liu2007, text as servo_words
 from puncture_twin.twin.jobs.servo.liu2007 import Reproduction, held_sessions
 from puncture_twin.twin.jobs.servo.page import write_servo_page
 from puncture_twin.twin.jobs.servo.pictures import draw_cameras, draw_convergence

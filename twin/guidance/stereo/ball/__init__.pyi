@@ -1,4 +1,2 @@
-from .ball_image import BallScene as BallScene
-from .ball_image import render as render
-from .tracker import LostBall as LostBall
-from .tracker import find_ball as find_ball
+from .ball_image import BallScene as BallScene, render as render
+from .tracker import LostBall as LostBall, find_ball as find_ball

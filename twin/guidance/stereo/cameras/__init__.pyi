@@ -1,14 +1,5 @@
-from .calibration import Calibration as Calibration
-from .calibration import calibrate as calibrate
-from .camera import Camera as Camera
-from .camera import stereo_pair as stereo_pair
-from .camera import tangent_axes as tangent_axes
-from .circle import Circle as Circle
-from .circle import cone as cone
-from .circle import consensus as consensus
-from .circle import refit as refit
-from .lens import coefficient_slope as coefficient_slope
-from .lens import distortion_slope as distortion_slope
-from .lens import undistort as undistort
-from .triangulation import Points as Points
-from .triangulation import triangulate as triangulate
+from .calibration import Calibration as Calibration, calibrate as calibrate
+from .camera import Camera as Camera, stereo_pair as stereo_pair, tangent_axes as tangent_axes
+from .circle import Circle as Circle, cone as cone, consensus as consensus, refit as refit
+from .lens import coefficient_slope as coefficient_slope, distortion_slope as distortion_slope, undistort as undistort
+from .triangulation import Points as Points, triangulate as triangulate

@@ -1,0 +1,33 @@
+"""Where is the patient for the robot? Two lists of the same markers, no case needed.
+
+    python examples/02_register_two_marker_lists.py [MARKERS_CT MARKERS_BASE X Y Z]
+
+Both files are CSV (name,x_mm,y_mm,z_mm) or 3D Slicer's; X Y Z is the target in the CT frame, LPS, mm.
+"""
+
+import sys
+
+import numpy as np
+
+import puncture_twin as pt
+from puncture_twin.meshes import folder
+
+
+def main() -> None:
+    """Register, and print the pose, what each marker misses by, and the error to expect at the target."""
+    files = sys.argv[1:3] or [folder() / "abdomen" / name for name in ("markers_ct.csv", "touch.csv")]
+    target_ct = [float(word) for word in (sys.argv[3:6] or ("-90", "-10", "60"))]
+    markers_ct, markers_base = (pt.read_points(file) for file in files)
+    found = pt.register(markers_ct, markers_base, target_ct=target_ct)
+    print("T_base_ct, mm:")
+    print(np.array2string(found.T_base_ct, precision=3, suppress_small=True))
+    for name, residual in zip(found.markers.names, found.residual_mm, strict=True):
+        print(f"marker {name} misses by {residual:.2f} mm")
+    expected = found.expected_tre_mm(np.array([target_ct]))[0]
+    print(f"FRE {found.fre_mm:.2f} mm, which is not the error at the target: {expected:.2f} mm (rms) is expected there")
+    for flag in found.flags:
+        print(f"weak: {flag}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,239 @@
+"""The public API: what `puncture_twin` hands on. Lengths are mm; angles are degrees where a name ends in ``_deg``.
+
+Each function composes rooms of `planning` and `twin`; the rooms may be used by themselves for more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.points.point_files import NamedPoints
+
+if TYPE_CHECKING:
+    from puncture_twin.planning.case.case import Case
+    from puncture_twin.planning.certify.certificate import Certificate
+    from puncture_twin.planning.certify.checker import Verification
+    from puncture_twin.planning.plan.plan import Plan
+    from puncture_twin.planning.registration.registration import Registration
+    from puncture_twin.planning.search.candidates import Candidates
+    from puncture_twin.planning.search.context import Prepared
+    from puncture_twin.planning.search.explain import Explanation
+    from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
+
+Points = NamedPoints | Mapping[str, ArrayLike]
+"""Named points: read from a file, or name to (x, y, z) in mm."""
+
+
+def load_case(path: Path | str) -> Case:
+    """A validated case, without what its files hold. `prepare` reads those too.
+
+    Args:
+        path: Case file, or the folder that holds ``case.toml``.
+
+    Raises:
+        InputError: One line: what is wrong, where, and what is allowed.
+    """
+    from puncture_twin.planning.case.case import load_case
+
+    return load_case(path)
+
+
+def prepare(case: Path | str, *, arm: bool | None = None, engine: str = "fast") -> Prepared:
+    """Read a case and all that it names: structures, registration, arm.
+
+    Args:
+        case: Case file, or the folder that holds ``case.toml``.
+        arm: Whether a candidate must be reachable too; None asks it where the case says where the robot's base is.
+        engine: ``fast``, or ``fcl``, the plain reference.
+
+    Raises:
+        InputError: Anything in the case that cannot be used.
+    """
+    from puncture_twin.planning.search.context import prepare
+
+    return prepare(case, arm=arm, engine=engine)
+
+
+def search(context: Prepared) -> Candidates:
+    """Every direction of the case's grid with its verdict, ranked."""
+    return context.search()
+
+
+def check(context: Prepared, theta_deg: float, beta_deg: float) -> Explanation:
+    """One direction, explained: every constraint with its number and its limit.
+
+    Args:
+        context: From `prepare`.
+        theta_deg: Puncture angle θ, 0..180.
+        beta_deg: Azimuth β, 0..360.
+    """
+    from puncture_twin.planning.search.explain import Explanation
+
+    found = context.check(float(np.radians(theta_deg)), float(np.radians(beta_deg)))
+    return Explanation(context.case, context.anatomy, found)
+
+
+def rerank(candidates: Candidates, cost: ArrayLike) -> Candidates:
+    """The candidates ranked by a cost of one's own. Which are safe stays as it is.
+
+    Args:
+        candidates: From `search`.
+        cost: Shape (n,), smaller is better; what it says of rejected candidates does not matter.
+
+    Raises:
+        InputError: Another shape, or a safe candidate without a finite cost.
+    """
+    from puncture_twin.planning.search.search import ranked_by
+
+    return ranked_by(candidates, np.asarray(cost, dtype=np.float64))
+
+
+def register(
+    markers_ct: Points,
+    markers_base: Points,
+    *,
+    target_ct: ArrayLike,
+    method: Literal["triad", "rigid"] = "rigid",
+    fle_mm: float | None = None,
+) -> Registration:
+    """CT to robot base from markers alone, with residuals and the error to expect at the target.
+
+    Args:
+        markers_ct: In the CT frame (LPS, mm).
+        markers_base: The same names as the robot touched them (mm).
+        target_ct: Shape (3,), where the error matters.
+        method: ``rigid`` (least squares) or ``triad`` (Chen 2019, Eq. 1-9, three markers).
+        fle_mm: Known localisation error (rms, both sides together); None estimates it from the residuals.
+
+    Raises:
+        InputError: Names that do not match, collinear or mirrored markers, residuals that the noise does not explain.
+    """
+    from puncture_twin.planning.registration import registration
+
+    pairs = registration.match(_named(markers_ct), _named(markers_base), use=None)
+    target = np.asarray(target_ct, dtype=np.float64)
+    return registration.register(pairs, method=method, target_ct=target, fle_mm=fle_mm)
+
+
+def certify(context: Prepared, *, size_deg: float = 0.25) -> Certificate:
+    """The map between the grid points: cells of directions that are proven safe for the organs, or rejected.
+
+    Args:
+        context: From `prepare`.
+        size_deg: Cells are halved down to this size.
+    """
+    from puncture_twin.planning.certify.subdivision import certify
+
+    return certify(context.case, context.anatomy, size=float(np.radians(size_deg)))
+
+
+def verify(certificate: Certificate, context: Prepared) -> Verification:
+    """Prove every cell of a certificate again, by a plain checker that shares none of the fast code.
+
+    Raises:
+        InputError: A certificate of another case, or a cell whose verdict does not follow.
+    """
+    from puncture_twin.planning.certify.checker import verify
+
+    return verify(certificate, context.case, context.anatomy)
+
+
+def make_plan(context: Prepared, candidates: Candidates, *, seed: int | None = None) -> Plan:
+    """The best candidate that the arm can come to, with its approach and insertion.
+
+    Args:
+        context: From `prepare`, with the arm.
+        candidates: From `search`, or ranked anew by `rerank`.
+        seed: Of the approach's planner; the case's by default.
+
+    Raises:
+        InputError: The case does not say where the robot's base is.
+        NoAnswerError: No candidate is safe, or none of the best has a free approach.
+    """
+    from puncture_twin.planning.plan.planner import make_plan
+
+    return make_plan(context, candidates, seed=context.case.rehearsal.seed if seed is None else seed).plan
+
+
+def read_plan(path: Path | str, context: Prepared) -> Plan:
+    """A plan from its file, checked against its case again: same inputs, still safe, a motion that touches nothing.
+
+    Raises:
+        InputError: It cannot be read, or it does not hold any more.
+    """
+    from puncture_twin.planning.plan.plan import read_plan
+    from puncture_twin.planning.plan.recheck import check_plan
+
+    plan = read_plan(Path(path))
+    check_plan(plan, context, Path(path))
+    return plan
+
+
+def read_certificate(path: Path | str) -> Certificate:
+    """A certificate from its file; `verify` proves it.
+
+    Raises:
+        InputError: Not a certificate, another version, missing or contradicting parts.
+    """
+    from puncture_twin.planning.certify.certificate import read_certificate
+
+    return read_certificate(Path(path))
+
+
+def read_points(path: Path | str) -> NamedPoints:
+    """Named points from CSV, Slicer markups (.mrk.json) or .fcsv: mm, and LPS where the file states a space.
+
+    Raises:
+        InputError: It cannot be read, or is not whole.
+    """
+    from puncture_twin.planning.formats.points.point_files import read_points
+
+    return read_points(Path(path))
+
+
+def write_plan(plan: Plan, path: Path | str) -> None:
+    """Write a plan as JSON, whole or not at all."""
+    from puncture_twin.planning.plan.plan import write_plan
+
+    write_plan(plan, Path(path))
+
+
+def rehearse(context: Prepared, plan: Plan, *, seed: int | None = None) -> Rehearsal:
+    """Execute a plan in the twin, where the ground truth differs from the belief.
+
+    Args:
+        context: The plan's case.
+        plan: From `make_plan` or `read_plan`.
+        seed: What the ground truth is drawn from; the case's by default.
+    """
+    from puncture_twin.twin.plant.truth import draw_truth
+    from puncture_twin.twin.rehearsal.rehearsal import rehearse
+
+    truth = draw_truth(context.case, plan.T_base_ct, seed=seed)
+    return rehearse(plan, context.case, context.anatomy, truth)
+
+
+def _named(points: Points) -> NamedPoints:
+    """Named points, from whichever form.
+
+    Raises:
+        InputError: A point that is not three finite numbers.
+    """
+    from puncture_twin.planning.formats.guard import guard_points
+
+    if isinstance(points, NamedPoints):
+        return points
+    allowed = "name to three finite numbers, mm"
+    try:
+        values = np.array([np.asarray(point, dtype=np.float64) for point in points.values()])
+    except (TypeError, ValueError) as error:
+        raise InputError(f"a point is no three numbers ({error})", where="register", allowed=allowed) from error
+    if values.ndim != 2 or values.shape[1] != 3:
+        raise InputError(f"points of shape {values.shape}", where="register", allowed=allowed)
+    return NamedPoints(tuple(points), guard_points(values, tuple(points), where="register"), None)

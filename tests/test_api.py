@@ -1,0 +1,87 @@
+"""`import puncture_twin as pt`: a dozen names, light to import, and the same answers as the command line."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import puncture_twin as pt
+from puncture_twin.meshes import folder
+from puncture_twin.planning.search.context import prepare
+
+HEAVY = ("numba", "pybullet", "matplotlib", "trimesh", "scipy", "ompl", "fcl", "pyarrow", "SimpleITK", "plotly")
+
+
+@pytest.fixture(scope="module")
+def context():
+    """The carton, organs alone."""
+    return pt.prepare(folder() / "carton" / "case_m.toml", arm=False)
+
+
+def test_every_name_is_there_with_a_docstring():
+    """And the list is short enough to be read."""
+    assert 12 <= len(pt.__all__) <= 24
+    for name in pt.__all__:
+        assert getattr(pt, name).__doc__, name
+
+
+def test_importing_it_loads_nothing_heavy_and_prints_nothing():
+    """A notebook that only registers markers does not wait for a simulator."""
+    code = f"import sys, puncture_twin as pt; pt.register; print([name for name in {HEAVY} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (done.stdout.strip(), done.stderr) == ("[]", "")
+
+
+def test_search_gives_what_the_context_gives(context):
+    """No second way to an answer."""
+    ours, theirs = pt.search(context), prepare(folder() / "carton" / "case_m.toml", arm=False).search()
+    assert np.array_equal(ours.reason, theirs.reason)
+    assert np.array_equal(ours.cost, theirs.cost, equal_nan=True)
+
+
+def test_check_takes_degrees(context):
+    """And gives the verdict of the same row of the search."""
+    candidates = pt.search(context)
+    for row in (0, len(candidates) // 2):
+        explained = pt.check(context, np.degrees(candidates.theta[row]), np.degrees(candidates.beta[row]))
+        assert explained.safe == candidates.safe[row]
+
+
+def test_rerank_orders_the_safe_ones_alone(context):
+    """Rejected candidates keep rank 0 whatever their cost, and no verdict changes."""
+    candidates = pt.search(context)
+    mine = pt.rerank(candidates, -candidates.path_length)
+    assert np.array_equal(mine.safe, candidates.safe)
+    assert (mine.rank[~mine.safe] == 0).all()
+    assert (np.diff(mine.path_length[mine.ranked]) <= 0).all()
+    assert sorted(mine.rank[mine.safe]) == list(range(1, int(mine.safe.sum()) + 1))
+
+
+@pytest.mark.parametrize("cost", [np.zeros(3), "nan"], ids=["another shape", "not a number"])
+def test_rerank_refuses_a_cost_that_orders_nothing(context, cost):
+    """One line that says what is allowed."""
+    candidates = pt.search(context)
+    cost = np.full(len(candidates), np.nan) if isinstance(cost, str) else cost
+    with pytest.raises(pt.InputError, match=r"rerank: a cost of shape .*; allowed: shape"):
+        pt.rerank(candidates, cost)
+
+
+def test_register_takes_two_lists_and_no_case():
+    """A rigid motion of four markers is found again; names decide, not their order."""
+    ct = {"a": (0, 0, 0), "b": (100, 0, 0), "c": (0, 80, 0), "d": (10, 20, 60)}
+    R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    base = {name: R @ np.array(ct[name]) + (5, 6, 7) for name in reversed(ct)}
+    found = pt.register(ct, base, target_ct=(10, 10, 10), fle_mm=0.5)
+    assert np.allclose(found.T_base_ct[:3, :3], R)
+    assert np.allclose(found.T_base_ct[:3, 3], (5, 6, 7))
+    with pytest.raises(pt.InputError, match="missing on the base side"):
+        pt.register(ct, {"a": (0, 0, 0), "b": (100, 0, 0), "x": (0, 80, 0)}, target_ct=(0, 0, 0))
+
+
+def test_register_refuses_points_that_are_none():
+    """Two coordinates, or something that is no number, is one line, not a traceback."""
+    good = {"a": (0, 0, 0), "b": (100, 0, 0), "c": (0, 80, 0)}
+    for bad in ((0, 0), (0, 0, "x"), (0, 0, float("nan"))):
+        with pytest.raises(pt.InputError):
+            pt.register({**good, "c": bad}, good, target_ct=(0, 0, 0))
