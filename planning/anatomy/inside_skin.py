@@ -6,16 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from puncture_twin.planning.anatomy.skin import FieldOfView, Skin
 from puncture_twin.planning.anatomy.skin_entry import settled_crossings
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.geometry.decimation import squared_distance
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 SAMPLES = 1000
 """Points on a structure's surface, each for the same area: a fraction is found to 0.1 %."""

@@ -24,6 +24,7 @@ from puncture_twin.planning.anatomy.body.outside_body import (
 from puncture_twin.planning.anatomy.second_witness import BodyImage, Named, Unnamed, unnamed_surfaces
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces, kept_mesh
+from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.cache.array_cache import Arrays
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.volumes.orientation import Oriented, canonical
@@ -34,8 +35,6 @@ from puncture_twin.planning.geometry.voxelize import voxels_inside
 SKIN_TOLERANCE_MM = 3.0
 """A skin from elsewhere (a label, a mesh) is off the CT's by so much, or by one voxel and a half: nearer to it what is
 dense counts as body. Beyond, it is outside, as an arm is that the skin lacks."""
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +123,7 @@ class Scan:
         return self._ct.values.astype(np.float32)
 
     @cached_property
-    def _body(self) -> Mask:
+    def _body(self) -> Bools:
         """The body's voxels: as found in the CT, or inside the skin that the case gives."""
         ct = self._ct
         if self.skin is None:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.voxelize import voxels_inside
@@ -34,7 +35,6 @@ GAS_HOLDERS = (
 GAS_WORDS = ("sinus", "sinuses", "nasal", "nose", "oral", "mouth", "gas", "air", "cavity")
 """Whole words that do: "oral" is not to be found in "femoral"."""
 
-Mask = NDArray[np.bool_]
 FULL = np.ones((3, 3, 3), bool)
 
 
@@ -65,7 +65,7 @@ class BodyImage:
     """
 
     hu: NDArray[np.float32]
-    body: Mask
+    body: Bools
     T_ct_index: NDArray[np.float64]
     spacing_mm: NDArray[np.float64]
     slack_mm: float = 0.0
@@ -95,7 +95,7 @@ def unnamed_surfaces(image: BodyImage, structures: Sequence[Named], *, dense_hu:
     return Unnamed(_surface(dense, image, where), _surface(gas, image, where))
 
 
-def _deep(image: BodyImage) -> Mask:
+def _deep(image: BodyImage) -> Bools:
     """Voxels so deep in the body that air in them is not the room's."""
     deep = ndimage.binary_erosion(image.body, FULL, iterations=SKIN_VOXELS, border_value=1)
     if image.slack_mm > 0.0 and not image.body.all():
@@ -103,7 +103,7 @@ def _deep(image: BodyImage) -> Mask:
     return np.asarray(deep)
 
 
-def _grown_union(structures: Sequence[Named], image: BodyImage) -> Mask:
+def _grown_union(structures: Sequence[Named], image: BodyImage) -> Bools:
     """Voxels of all structures, dilated by one voxel."""
     union = np.zeros(image.hu.shape, bool)
     for structure in structures:
@@ -111,7 +111,7 @@ def _grown_union(structures: Sequence[Named], image: BodyImage) -> Mask:
     return np.asarray(ndimage.binary_dilation(union))
 
 
-def _surface(mask: Mask, image: BodyImage, where: str | Path) -> TriangleMesh | None:
+def _surface(mask: Bools, image: BodyImage, where: str | Path) -> TriangleMesh | None:
     """The surface of the components that are large enough."""
     kept = np.zeros_like(mask)
     least = MIN_COMPONENT_MM3 / float(np.prod(image.spacing_mm))
@@ -121,7 +121,7 @@ def _surface(mask: Mask, image: BodyImage, where: str | Path) -> TriangleMesh | 
     return field_surface(kept.astype(np.float32) - 0.5, image.T_ct_index, where=where) if kept.any() else None
 
 
-def _components(mask: Mask) -> Iterator[tuple[tuple[slice, ...], Mask]]:
+def _components(mask: Bools) -> Iterator[tuple[tuple[slice, ...], Bools]]:
     labels, _ = ndimage.label(mask, FULL)
     for number, box in enumerate(ndimage.find_objects(labels), start=1):
         yield box, labels[box] == number

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, body_mask, filled_slices
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
@@ -39,8 +40,6 @@ SIDES: Mapping[str, tuple[int, int]] = MappingProxyType(
     {"right": (0, 0), "left": (0, 1), "front": (1, 0), "back": (1, 1), "feet": (2, 0), "head": (2, 1)}
 )
 """The patient's sides: LPS axis, and whether its low (0) or high (1) end."""
-
-Directions = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +80,7 @@ class FieldOfView:
         """Points (n, 3) from LPS mm to mm from the box's low corner along its axes."""
         return np.asarray((points_ct - self.T_ct_box[:3, 3]) @ self.T_ct_box[:3, :3])
 
-    def exit(self, origin_ct: NDArray[np.float64], directions_ct: Directions) -> FieldExit:
+    def exit(self, origin_ct: NDArray[np.float64], directions_ct: Floats) -> FieldExit:
         """Where rays from a point inside the box leave it. An exit on an edge counts for both of its faces.
 
         Args:

@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.geometry.crossings import Crossings, crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 NUDGE = 1e-7
 """Radians by which a ray through an edge or corner is turned when its crossings do not add up."""

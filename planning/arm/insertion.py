@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm import kernels
 from puncture_twin.planning.arm.kinematics import N_BRANCHES, inverse, missing_reach_mm, singularity
 from puncture_twin.planning.arm.ur import UrModel
-
-Array = NDArray[np.float64]
+from puncture_twin.planning.base.arrays import Floats
 
 MIN_SINGULARITY = 0.05
 """Each term of :class:`planning.arm.kinematics.Singularity` must exceed this over the whole insertion. For the wrist
@@ -34,8 +33,8 @@ class Stop(NamedTuple):
 
 
 def flange_poses(
-    target_base: Array, outward_base: Array, distance_mm: Array | float, roll: Array | float = 0.0
-) -> Array:
+    target_base: Floats, outward_base: Floats, distance_mm: Floats | float, roll: Floats | float = 0.0
+) -> Floats:
     """Flange poses that point the needle at the target from a distance.
 
     At roll 0 the flange's x axis is, of the three base axes, the one farthest from the needle, made square to it.
@@ -67,7 +66,7 @@ def flange_poses(
     return T
 
 
-def insertion_paths(model: UrModel, target_base: Array, outward_base: Array, distance_mm: Array) -> Array:
+def insertion_paths(model: UrModel, target_base: Floats, outward_base: Floats, distance_mm: Floats) -> Floats:
     """Every branch's way along the needle at roll 0. A roll adds to q6 and to nothing else.
 
     Args:
@@ -83,12 +82,12 @@ def insertion_paths(model: UrModel, target_base: Array, outward_base: Array, dis
     return every_way(model, line, np.ascontiguousarray(distance_mm, dtype=np.float64))
 
 
-def away_from_singularities(model: UrModel, q: Array, at_least: float = MIN_SINGULARITY) -> NDArray[np.bool_]:
+def away_from_singularities(model: UrModel, q: Floats, at_least: float = MIN_SINGULARITY) -> NDArray[np.bool_]:
     """Whether configurations (..., 6) keep their distance from every singularity; NaN does not. Shape (...)."""
     return np.asarray(singularity(model, q).least() > at_least)
 
 
-def first_stop(model: UrModel, path: Array, depths_mm: Array) -> Stop | None:
+def first_stop(model: UrModel, path: Floats, depths_mm: Floats) -> Stop | None:
     """Where a way stops being drivable: out of reach, at a singularity, or with a joint that jumps; None if nowhere.
 
     Args:
@@ -109,7 +108,7 @@ def first_stop(model: UrModel, path: Array, depths_mm: Array) -> Stop | None:
     return Stop(float(depths_mm[at]), f"{what} {depths_mm[at]:.1f} mm after the standoff")
 
 
-def reach_margin(model: UrModel, q: Array) -> float:
+def reach_margin(model: UrModel, q: Floats) -> float:
     """The least over a motion of each joint's distance to its limits over a quarter turn, and of the singularity terms.
 
     Args:
@@ -122,7 +121,7 @@ def reach_margin(model: UrModel, q: Array) -> float:
     return float(kernels.path_margin(model.lengths, model.joint_limits, FULL_MARGIN_RAD, q))
 
 
-def why_unreachable(model: UrModel, T_base_flange: Array) -> str:
+def why_unreachable(model: UrModel, T_base_flange: Floats) -> str:
     """What keeps every branch from one flange pose (4, 4), in mm: one sentence for people."""
     stands = (
         f"the flange would stand {np.linalg.norm(T_base_flange[:3, 3] - model.shoulder_base):.1f} mm from the shoulder"
@@ -140,21 +139,21 @@ def why_unreachable(model: UrModel, T_base_flange: Array) -> str:
 class NeedleLine(NamedTuple):
     """A line to drive along, base frame."""
 
-    R_base_flange: Array
+    R_base_flange: Floats
     """Shape (3, 3): the flange's axes at roll 0."""
-    target: Array
+    target: Floats
     """Shape (3,), mm."""
-    outward: Array
+    outward: Floats
     """Shape (3,), unit."""
 
 
-def needle_lines(targets_base: Array, outwards_base: Array) -> list[NeedleLine]:
+def needle_lines(targets_base: Floats, outwards_base: Floats) -> list[NeedleLine]:
     """Lines through targets (n, 3), mm, outward along unit vectors (n, 3)."""
     rotations = np.ascontiguousarray(flange_poses(targets_base, outwards_base, 0.0)[:, :3, :3])
     return [NeedleLine(*row) for row in zip(rotations, targets_base, outwards_base, strict=True)]
 
 
-def flange_at(line: NeedleLine, distance_mm: float) -> Array:
+def flange_at(line: NeedleLine, distance_mm: float) -> Floats:
     """T_base_flange (4, 4), mm, at roll 0 and a distance from the target."""
     T = np.eye(4)
     T[:3, :3] = line.R_base_flange
@@ -162,14 +161,14 @@ def flange_at(line: NeedleLine, distance_mm: float) -> Array:
     return T
 
 
-def every_way(model: UrModel, line: NeedleLine, distance_mm: Array) -> Array:
+def every_way(model: UrModel, line: NeedleLine, distance_mm: Floats) -> Floats:
     """Every branch's way along a line, see :func:`insertion_paths`; ``distance_mm`` of shape (m,)."""
     q = np.empty((N_BRANCHES, len(distance_mm), 6))
     kernels.ways(model.lengths, *line, distance_mm, q)
     return q
 
 
-def branch_way(model: UrModel, line: NeedleLine, distance_mm: Array, branch: int, turn: Array) -> Array:
+def branch_way(model: UrModel, line: NeedleLine, distance_mm: Floats, branch: int, turn: Floats) -> Floats:
     """The way of one branch along the needle.
 
     Args:
@@ -192,18 +191,18 @@ class Survey(NamedTuple):
 
     stop_at: NDArray[np.int64]
     """Shape (n, 8): index of the sample at which the way ends, -1 where it reaches the target."""
-    margins: Array
+    margins: Floats
     """Shape (n, 8, r): see :func:`reach_margin`; NaN where the way ends early or leaves the joint limits."""
-    turns: Array
+    turns: Floats
     """Shape (n, 8, r, 6), rad: what to add to the way at roll 0, the roll and whole turns."""
 
 
 def survey(
     model: UrModel,
     lines: Sequence[NeedleLine],
-    distances_mm: Sequence[Array],
-    depths_mm: Sequence[Array],
-    rolls: Array,
+    distances_mm: Sequence[Floats],
+    depths_mm: Sequence[Floats],
+    rolls: Floats,
 ) -> Survey:
     """Every branch and roll of many straight insertions, each turned as far from the joint limits as whole turns allow.
 

@@ -13,12 +13,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm import kernels
 from puncture_twin.planning.arm.ur import UrModel
-
-Array = NDArray[np.float64]
+from puncture_twin.planning.base.arrays import Floats
 
 N_BRANCHES = 8
 """Shoulder left or right, times wrist flipped or not, times elbow up or down, in this order of weight 4, 2, 1."""
@@ -27,14 +25,14 @@ N_BRANCHES = 8
 class Singularity(NamedTuple):
     """How far a configuration is from the three singularities of a UR arm; each 0 (singular) to 1. Shapes (...)."""
 
-    shoulder: Array
+    shoulder: Floats
     """In-plane distance of the wrist centre from axis 1, over the longest possible."""
-    elbow: Array
+    elbow: Floats
     """|sin q3|."""
-    wrist: Array
+    wrist: Floats
     """|sin q5|."""
 
-    def least(self) -> Array:
+    def least(self) -> Floats:
         """The smallest of the three, shape (...)."""
         return np.minimum(np.minimum(self.shoulder, self.elbow), self.wrist)
 
@@ -44,12 +42,12 @@ class Singularity(NamedTuple):
         return min(self._fields, key=lambda name: float(getattr(self, name)))
 
 
-def _rows(q: Array) -> Array:
+def _rows(q: Floats) -> Floats:
     """Configurations (..., 6) as one new (n, 6): a copy, since read-only arrays would be compiled for once more."""
     return np.array(q, dtype=np.float64, order="C").reshape(-1, 6)
 
 
-def link_poses(model: UrModel, q: Array) -> Array:
+def link_poses(model: UrModel, q: Floats) -> Floats:
     """Frames of the base and the six links.
 
     Args:
@@ -65,12 +63,12 @@ def link_poses(model: UrModel, q: Array) -> Array:
     return poses.reshape(*np.shape(q)[:-1], 7, 4, 4)
 
 
-def flange_pose(model: UrModel, q: Array) -> Array:
+def flange_pose(model: UrModel, q: Floats) -> Floats:
     """T_base_flange, shape (..., 4, 4), mm, of configurations ``q``, shape (..., 6), rad."""
     return np.ascontiguousarray(link_poses(model, q)[..., 6, :, :])
 
 
-def jacobian(model: UrModel, q: Array) -> Array:
+def jacobian(model: UrModel, q: Floats) -> Floats:
     """The geometric Jacobian of the flange, base frame.
 
     Args:
@@ -87,7 +85,7 @@ def jacobian(model: UrModel, q: Array) -> Array:
     return columns.reshape(*np.shape(q)[:-1], 6, 6)
 
 
-def singularity(model: UrModel, q: Array) -> Singularity:
+def singularity(model: UrModel, q: Floats) -> Singularity:
     """Distance from the three singularities.
 
     The Jacobian's determinant is, up to sign and constant lengths, the product of sin q3, sin q5 and the shoulder
@@ -103,7 +101,7 @@ def singularity(model: UrModel, q: Array) -> Singularity:
     return Singularity(*terms.reshape(3, *np.shape(q)[:-1]))
 
 
-def inverse(model: UrModel, T_base_flange: Array) -> Array:
+def inverse(model: UrModel, T_base_flange: Floats) -> Floats:
     """All configurations that hold each flange pose.
 
     Args:
@@ -122,7 +120,7 @@ def inverse(model: UrModel, T_base_flange: Array) -> Array:
     return q
 
 
-def missing_reach_mm(model: UrModel, T_base_flange: Array) -> Array:
+def missing_reach_mm(model: UrModel, T_base_flange: Floats) -> Floats:
     """By how much upper arm and forearm are too short (or too long, folded) to hold each flange pose.
 
     Args:
@@ -139,13 +137,13 @@ def missing_reach_mm(model: UrModel, T_base_flange: Array) -> Array:
     return missing
 
 
-def wrap_to_pi(angle: Array) -> Array:
+def wrap_to_pi(angle: Floats) -> Floats:
     """The same angles in (-pi, pi], any shape, rad."""
     wrapped = np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
     return np.asarray(np.where(wrapped <= -np.pi, np.pi, wrapped))
 
 
-def nearest_within_limits(model: UrModel, q: Array, q_reference: Array) -> Array:
+def nearest_within_limits(model: UrModel, q: Floats, q_reference: Floats) -> Floats:
     """The whole turns added to each joint that bring it nearest to a reference without leaving its limits.
 
     Args:
@@ -165,7 +163,7 @@ def nearest_within_limits(model: UrModel, q: Array, q_reference: Array) -> Array
     return wrapped
 
 
-def wrapped_solutions(model: UrModel, q: Array) -> Array:
+def wrapped_solutions(model: UrModel, q: Floats) -> Floats:
     """Every configuration within the limits that differs from one by whole turns.
 
     Args:

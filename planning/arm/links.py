@@ -17,15 +17,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-Array = NDArray[np.float64]
 
 LINK_NAMES = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 """The URDF's names without their ``_link``; index = frame of ``link_poses``."""
@@ -137,7 +135,7 @@ def resolve_package(address: str) -> Path:
     return _share() / "share" / address.removeprefix("package://")
 
 
-def urdf_link_poses(model: UrModel, q: Array) -> Array:
+def urdf_link_poses(model: UrModel, q: Floats) -> Floats:
     """The links' frames as the URDF's own joint chain gives them, in the controller's base frame.
 
     Args:
@@ -233,7 +231,7 @@ def _pin(low: float, high: float) -> TriangleMesh:
     return TriangleMesh(np.asarray(hull.vertices), np.asarray(hull.faces))
 
 
-def _crossings(starts: Array, ends: Array, axis: int, cut: float) -> Array:
+def _crossings(starts: Floats, ends: Floats, axis: int, cut: float) -> Floats:
     """Where edges (n, 3) to (n, 3) pass the plane ``axis = cut``, shape (k, 3), mm."""
     a, b = starts[:, axis], ends[:, axis]
     crosses = (a - cut) * (b - cut) < 0.0
@@ -243,7 +241,7 @@ def _crossings(starts: Array, ends: Array, axis: int, cut: float) -> Array:
     return np.asarray(points)
 
 
-def _origin(element: ElementTree.Element) -> Array:
+def _origin(element: ElementTree.Element) -> Floats:
     """The ``origin`` of a URDF joint or collision as a 4x4 in mm; identity where there is none."""
     T = np.eye(4)
     origin = element.find("origin")
@@ -253,7 +251,7 @@ def _origin(element: ElementTree.Element) -> Array:
     return T
 
 
-def _floats(element: ElementTree.Element | None, key: str) -> Array:
+def _floats(element: ElementTree.Element | None, key: str) -> Floats:
     text = "0 0 0" if element is None else element.get(key, "0 0 0")
     values = np.array([float(word) for word in text.split()])
     if values.shape != (3,) or not all(map(math.isfinite, values)):

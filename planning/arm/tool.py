@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-
-Array = NDArray[np.float64]
 
 HOLDER_ROOT_MM = 5.0
 """How far the holder's body reaches back into wrist 3, whose mesh ends up to 1.4 mm before the flange plane: without
@@ -80,7 +78,7 @@ class Box:
     """
 
     name: str
-    T_base_box: Array
+    T_base_box: Floats
     size_mm: tuple[float, float, float]
 
     def __post_init__(self) -> None:
@@ -95,13 +93,13 @@ class Box:
         object.__setattr__(self, "T_base_box", T)
 
     @property
-    def corners(self) -> Array:
+    def corners(self) -> Floats:
         """Its eight corners, base frame, shape (8, 3), mm."""
         local = np.array(list(product((-0.5, 0.5), repeat=3))) * self.size_mm
         return np.asarray(local @ self.T_base_box[:3, :3].T + self.T_base_box[:3, 3])
 
     @property
-    def bounds(self) -> Array:
+    def bounds(self) -> Floats:
         """Lowest and highest corner of the axis-aligned box about it, base frame, shape (2, 3), mm."""
         half = np.abs(self.T_base_box[:3, :3]) @ (np.asarray(self.size_mm) / 2.0)
         return np.stack([self.T_base_box[:3, 3] - half, self.T_base_box[:3, 3] + half])

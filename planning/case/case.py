@@ -8,9 +8,10 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
 from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
@@ -40,7 +41,6 @@ from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 ALLOWED_CASE = "a TOML case file with schema = 1 or 2, or a folder with case.toml"
 
-Matrix = NDArray[np.float64]
 
 AXES_PARALLEL = 0.999
 """|cos| above which a mount's x and z axes do not span a frame (2.6 degrees)."""
@@ -102,8 +102,8 @@ class Obstacle:
 
     name: str
     frame: str
-    center_mm: Matrix
-    size_mm: Matrix
+    center_mm: Floats
+    size_mm: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ class Gantry:
         thickness_mm: Along the bore.
     """
 
-    T_ct_gantry: Matrix
+    T_ct_gantry: Floats
     bore_diameter_mm: float
     wall_mm: float
     thickness_mm: float
@@ -128,8 +128,8 @@ class RobotSettings:
     """The arm: model name, home configuration (rad) or None for the model's own, mount or None."""
 
     model: str
-    home: Matrix | None
-    T_base_ct_mount: Matrix | None
+    home: Floats | None
+    T_base_ct_mount: Floats | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,13 +148,13 @@ class Case:
     path: Path
     name: str
     space: Space
-    target_ct: Matrix
+    target_ct: Floats
     target_name: str
     target_structure: str
     needle: Needle
     search: SearchSettings
     ranking: RankingSection
-    T_ct_entry: Matrix
+    T_ct_entry: Floats
     structure: tuple[StructureSection, ...]
     structures: tuple[StructuresSection, ...]
     registration: RegistrationSection | None
@@ -240,7 +240,7 @@ def load_case(path: Path | str) -> Case:
     )
 
 
-def _target(content: CaseFile, path: Path, space: Space, files: InputFiles) -> Matrix:
+def _target(content: CaseFile, path: Path, space: Space, files: InputFiles) -> Floats:
     target = content.target
     if target.position_mm is not None:
         return _read_only(to_lps(np.asarray([target.position_mm]), space)[0])
@@ -259,7 +259,7 @@ def _robot(content: CaseFile, space: Space, path: Path) -> RobotSettings:
     return RobotSettings(ur_model(robot.model).name, home, mount)
 
 
-def mount_pose(mount: MountSection, space: Space, path: Path) -> Matrix:
+def mount_pose(mount: MountSection, space: Space, path: Path) -> Floats:
     """T_base_ct, shape (4, 4), from the base's origin and axes, as a case states them in its own space.
 
     Raises:
@@ -299,7 +299,7 @@ def _gantry(gantry: GantrySection, space: Space, path: Path) -> Gantry:
 Axis = Anatomical | tuple[float, float, float]
 
 
-def axes_frame(z: Axis, x: Axis, space: Space, path: Path, key: str) -> Matrix:
+def axes_frame(z: Axis, x: Axis, space: Space, path: Path, key: str) -> Floats:
     """R_ct_frame, shape (3, 3), of a frame whose z axis is given and whose x axis is what of ``x`` is square to it.
 
     Raises:
@@ -360,7 +360,7 @@ def _data_beside(files: InputFiles, path: Path, name: str) -> str | None:
     return None if beside is None else str(PurePosixPath(name).with_name(beside))
 
 
-def _read_only(array: ArrayLike) -> Matrix:
+def _read_only(array: ArrayLike) -> Floats:
     frozen = np.array(array, dtype=np.float64)
     frozen.setflags(write=False)
     return frozen

@@ -7,13 +7,11 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case_file import EntryAxes
 from puncture_twin.planning.geometry.spaces import Space, to_lps
-
-Floats = NDArray[np.float64]
 
 ANATOMICAL_LPS = MappingProxyType(
     {

@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.skin import FieldOfView
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from puncture_twin.planning.base.arrays import Bools, Floats
 
 CLEARANCE_PAD_MM = 2e-4
 """Kept from every margin: within 1e-4 mm of one the search leaves the verdict to FCL's capsule."""

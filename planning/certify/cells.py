@@ -12,11 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.case.entry import outward
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 ROUNDING_RAD = 1e-12
 """Added to a cell's radius: thousands of times the rounding of its corners."""

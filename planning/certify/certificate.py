@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
@@ -19,9 +20,6 @@ from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, nearest_cell, split
 from puncture_twin.planning.certify.question import Question
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 CERTIFICATE_VERSION = 3
 """Version of the file's layout. 3: lists its inputs with their roles, files that a file names included; a length each

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import differing_input
 from puncture_twin.planning.case.case import Case
@@ -22,9 +23,6 @@ from puncture_twin.planning.certify.plain_skin import PlainSkin, SkinFacts, leav
 from puncture_twin.planning.certify.question import question_of
 from puncture_twin.planning.geometry.containment import Side, side_of
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 Progress = Callable[[int, int], None]
 
 CLEARANCE_PAD_MM = 1e-4

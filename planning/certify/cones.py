@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.numba_kernels import nb
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 ZONE_PAD_RAD = 1e-6
 """Widens every triangle's zone against rounding, which near an angle of 0 is 1e-8."""

@@ -9,16 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.certify.cells import Cones
 from puncture_twin.planning.certify.cones import Lists, Zones
 from puncture_twin.planning.clearance.kernels.segment_triangle import axis_triangle
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 BULGES = 3.0
 """Times L and the bulge: what a witness must lack so that directions outside the hull of the corners are covered."""

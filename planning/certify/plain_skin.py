@@ -6,14 +6,10 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.skin import FieldOfView, Skin
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 CONE_PAD_RAD = 2e-7
 """Twice what the search turns a ray by; less than the certifier's own padding, so that rounding refuses nothing."""

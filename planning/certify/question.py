@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.certify.cells import Cells
 from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange
 from puncture_twin.planning.search.constraints import longest_path
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

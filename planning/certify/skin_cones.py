@@ -10,11 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.certify.cones import Lists
 from puncture_twin.planning.certify.skin_surface import SkinSurface
-
-Floats = NDArray[np.float64]
 
 CONE_PAD_RAD = 3e-7
 """Widens every cone: the search turns a ray that meets an edge by 1e-7, and angles round to 1e-8."""

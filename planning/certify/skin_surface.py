@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.certify.cones import Zones, zones
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 EDGE_ON = 1e-10
 """A triangle whose solid angle's determinant is below this, relative to its corners' lengths, is seen edge-on."""

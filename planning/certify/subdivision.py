@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.base.reasons import Reason
@@ -23,10 +24,6 @@ from puncture_twin.planning.certify.skin_cones import LENGTH_PAD_MM, skin_bounds
 from puncture_twin.planning.certify.skin_surface import SkinSurface, skin_surface
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 TOO_WIDE = np.radians(80)
 """Cells with a larger radius are halved unasked."""

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import PlanningError
-from puncture_twin.planning.clearance.engine import AxisDistances, Floats
+from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 

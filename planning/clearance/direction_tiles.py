@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.clearance.kernels.kd_order import kd_order
-
-Floats = NDArray[np.float64]
 
 TILE = 12
 """Directions of a bundle at most."""

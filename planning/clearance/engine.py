@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
-Floats = NDArray[np.float64]
+from puncture_twin.planning.base.arrays import Floats
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.clearance.direction_tiles import Tiles, bundle
-from puncture_twin.planning.clearance.engine import AxisDistances, Floats
+from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
 from puncture_twin.planning.clearance.kernels.lanes import LANES

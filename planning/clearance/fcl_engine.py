@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 import fcl
 import numpy as np
 
-from puncture_twin.planning.clearance.engine import AxisDistances, Floats
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.geometry.crossings import first_crossing
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 

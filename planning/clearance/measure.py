@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Structure
-from puncture_twin.planning.clearance.engine import ClearanceEngine, Floats
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.geometry.containment import Side, side_of
 
 NEAR_THRESHOLD_MM = 1e-4

@@ -9,15 +9,13 @@ from typing import NamedTuple
 
 import fcl
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.links import LINK_NAMES, Link, collision_links, joined
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.bounding_spheres import prism
 from puncture_twin.planning.collision.shapes import convex, padded, surface
-
-Array = NDArray[np.float64]
 
 BODY_NAMES = (*LINK_NAMES, "holder", "needle")
 """The bodies of the arm, from the base on."""
@@ -45,7 +43,7 @@ class Shape(NamedTuple):
 
     solids: tuple[fcl.CollisionObject, ...]
     surface: fcl.CollisionObject
-    hulls: tuple[Array, ...]
+    hulls: tuple[Floats, ...]
     """For each solid, corners (n, 3), mm, of a convex hull that contains it, in the frame of the shapes."""
 
 
@@ -64,17 +62,17 @@ class Body:
 
     name: str
     frame: int
-    T_frame_body: Array
+    T_frame_body: Floats
     bare: Shape
     full: Shape
     radius_mm: float
 
-    def pose(self, poses: Array) -> fcl.Transform:
+    def pose(self, poses: Floats) -> fcl.Transform:
         """Where ``link_poses`` (7, 4, 4) has the body's shapes."""
         T = poses[self.frame] @ self.T_frame_body
         return fcl.Transform(T[:3, :3], T[:3, 3])
 
-    def place(self, poses: Array) -> None:
+    def place(self, poses: Floats) -> None:
         """Move the shapes to where ``link_poses`` (7, 4, 4) has them."""
         transform = self.pose(poses)
         for shape in (self.bare,) if self.full is self.bare else (self.bare, self.full):

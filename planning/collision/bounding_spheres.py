@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.collision.kernels.surfaces import farthest_from
-
-Array = NDArray[np.float64]
 
 LEAF_RADIUS_MM = 30.0
 """Parts are cut until their ball is no larger: half of a UR3 wrist's size."""
@@ -40,7 +39,7 @@ PRISM_SIDES = 24
 class Ball(NamedTuple):
     """A ball, mm."""
 
-    centre: Array
+    centre: Floats
     radius: float
 
 
@@ -51,7 +50,7 @@ COARSE_DIRECTIONS = 60
 class Coarse(NamedTuple):
     """A few corners of a convex hull."""
 
-    corners: Array
+    corners: Floats
     """Shape (n, 3), mm."""
     slack_mm: float
     """No point of the whole hull lies farther outside the hull of these."""
@@ -67,8 +66,8 @@ class BallTree:
         children: Shape (n, 2): rows of the two children; -1 at a leaf.
     """
 
-    centres: Array
-    radii: Array
+    centres: Floats
+    radii: Floats
     children: NDArray[np.int64]
 
     @property
@@ -88,7 +87,7 @@ def settings() -> dict[str, float]:
     }
 
 
-def enclosing_ball(points: Array) -> Ball:
+def enclosing_ball(points: Floats) -> Ball:
     """A small ball about points (n, 3): steps toward the farthest point, ever shorter (Badoiu and Clarkson 2003)."""
     centre = np.empty(3)
     radius = _walk_to_centre(np.ascontiguousarray(points), CENTRE_STEPS, centre)
@@ -115,7 +114,7 @@ def _walk_to_centre(points, steps, best):  # type: ignore[no-untyped-def]  # num
     return math.sqrt(least)
 
 
-def prism(radius_mm: float, length_mm: float) -> Array:
+def prism(radius_mm: float, length_mm: float) -> Floats:
     """Corners of a prism about a cylinder along z, centred: shape (2 ``PRISM_SIDES``, 3), mm."""
     turn = 2.0 * np.pi * np.arange(PRISM_SIDES) / PRISM_SIDES
     outer = (radius_mm + SLACK_MM) / np.cos(np.pi / PRISM_SIDES)
@@ -124,7 +123,7 @@ def prism(radius_mm: float, length_mm: float) -> Array:
     return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
 
 
-def inscribed_prism(corners: Array) -> Array:
+def inscribed_prism(corners: Floats) -> Floats:
     """Corners of a prism inside the cylinder that :func:`prism` gave the corners about, along z of any frame."""
     middle, inside = corners.mean(axis=0), 1.0 - INSIDE
     return np.asarray(middle + (corners - middle) * (2 * [inside * np.cos(np.pi / PRISM_SIDES)] + [inside]))
@@ -139,7 +138,7 @@ class Neighbours(NamedTuple):
     """The neighbours of the first corner, of the second, and so on."""
 
 
-def neighbours(corners: Array) -> Neighbours:
+def neighbours(corners: Floats) -> Neighbours:
     """Which corners (n, 3) of a convex hull share an edge of its triangles; a corner within the hull has none."""
     faces = ConvexHull(corners).simplices
     edges = np.concatenate([np.roll(faces, turn, axis=1)[:, :2] for turn in range(3)])
@@ -147,7 +146,7 @@ def neighbours(corners: Array) -> Neighbours:
     return Neighbours(np.bincount(pairs[:, 0], minlength=len(corners)), pairs[:, 1])
 
 
-def halves(corners: Array) -> tuple[Array, Array]:
+def halves(corners: Floats) -> tuple[Floats, Floats]:
     """A convex hull's corners (n, 3), cut in the middle of its longest side: the corners of the two parts, mm."""
     low, high = corners.min(axis=0), corners.max(axis=0)
     axis = int(np.argmax(high - low))
@@ -161,12 +160,12 @@ def halves(corners: Array) -> tuple[Array, Array]:
     return np.concatenate([corners[below], crossings]), np.concatenate([corners[~below], crossings])
 
 
-def ball_tree(pieces: Sequence[Array], leaf_radius_mm: float = LEAF_RADIUS_MM) -> BallTree:
+def ball_tree(pieces: Sequence[Floats], leaf_radius_mm: float = LEAF_RADIUS_MM) -> BallTree:
     """Balls that enclose the union of convex pieces, each given by its corners (n, 3), mm."""
     balls: list[Ball] = []
     children: list[tuple[int, int]] = []
 
-    def add(parts: Sequence[Array]) -> int:
+    def add(parts: Sequence[Floats]) -> int:
         row = len(balls)
         balls.append(enclosing_ball(np.concatenate(parts)))
         children.append((-1, -1))
@@ -186,7 +185,7 @@ def ball_tree(pieces: Sequence[Array], leaf_radius_mm: float = LEAF_RADIUS_MM) -
     )
 
 
-def coarse_hull(corners: Array) -> Coarse:
+def coarse_hull(corners: Floats) -> Coarse:
     """The corners (n, 3) that are outermost in some of many directions, mm, and how far the others stand out.
 
     Distance to a convex set is a convex function, so over the whole hull it is largest at a corner.
@@ -200,7 +199,7 @@ def coarse_hull(corners: Array) -> Coarse:
     return Coarse(few, float(farthest_from(triangles, corners[outside])) + SLACK_MM)
 
 
-def _directions(count: int) -> Array:
+def _directions(count: int) -> Floats:
     """Unit vectors (count, 3) spread evenly: a spiral of equal steps in z and golden turns."""
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)

@@ -15,12 +15,12 @@ from typing import NamedTuple
 
 import fcl
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies import BODY_NAMES, NEVER_TESTED, Body, arm_bodies
 from puncture_twin.planning.collision.shapes import skin_surface, touch
@@ -54,8 +54,6 @@ __all__ = [
     "Tool",
 ]
 
-Array = NDArray[np.float64]
-
 
 class Check(NamedTuple):
     """One question to FCL: do two shapes touch."""
@@ -68,7 +66,7 @@ class Check(NamedTuple):
     first_body: Body | None
     """The body that ``first`` moves with; None for skin and boxes."""
     second_body: Body
-    hulls: tuple[Array | None, Array] | None
+    hulls: tuple[Floats | None, Floats] | None
     """Corners that enclose either, in the frames of their shapes; None for a box, and for the pair with the skin."""
 
 
@@ -117,7 +115,7 @@ class CellChecker:
             self._refuse_base_in(patient, patient if skin is None else skin)
         self._checks = tuple(self._room_checks()) + tuple(self._self_checks())
 
-    def contact(self, q: Array, *, needle_may_touch_patient: bool) -> Contact | None:
+    def contact(self, q: Floats, *, needle_may_touch_patient: bool) -> Contact | None:
         """The first contact found, or None when the arm is clear.
 
         Args:
@@ -134,7 +132,7 @@ class CellChecker:
                 return check.contact
         return None
 
-    def first_contact(self, q_path: Array, *, needle_may_touch_patient: bool) -> Met | None:
+    def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> Met | None:
         """The first state of a path with a contact, and the contact; None when all are clear.
 
         Args:
@@ -150,7 +148,7 @@ class CellChecker:
                 return Met(index, contact)
         return None
 
-    def nearest(self, q: Array, pair: str, body: str | None = None) -> Nearest:
+    def nearest(self, q: Floats, pair: str, body: str | None = None) -> Nearest:
         """The smallest of one kind of distance.
 
         Args:
@@ -170,7 +168,7 @@ class CellChecker:
         skin = {} if self._patient is None else {PATIENT: self._patient}
         return _nearest(bodies, self._boxes if pair == "boxes" else skin, self._bounds)
 
-    def distances(self, q: Array) -> Distances:
+    def distances(self, q: Floats) -> Distances:
         """How close the moving links and the tool are to patient and boxes.
 
         Args:
@@ -181,7 +179,7 @@ class CellChecker:
         """
         return Distances(*(self.nearest(q, pair) for pair in DISTANCE_PAIRS))
 
-    def sweep_mm(self, q_path: Array) -> Array:
+    def sweep_mm(self, q_path: Floats) -> Floats:
         """Bound on every body's motion along each segment of a path.
 
         Args:
@@ -192,7 +190,7 @@ class CellChecker:
         """
         return np.asarray(self._swept.bounds_mm(q_path).max(axis=1))
 
-    def body_sweeps_mm(self, q_path: Array) -> dict[str, Array]:
+    def body_sweeps_mm(self, q_path: Floats) -> dict[str, Floats]:
         """The same for each moving body by name; the tool counts with wrist 3 as one."""
         bounds = self._swept.bounds_mm(q_path)
         return {body.name: bounds[:, body.frame - 1] for body in self._bodies[1:]}
@@ -215,7 +213,7 @@ class CellChecker:
             for (a, hull_a), (b, hull_b) in shapes:
                 yield Check(Contact(second.name, first.name), a, b, first, second, (hull_a, hull_b))
 
-    def _place(self, q: Array) -> None:
+    def _place(self, q: Floats) -> None:
         require_finite(q)
         poses = link_poses(self.model, q)
         for body in self._bodies[1:]:
@@ -232,13 +230,13 @@ class CellChecker:
             raise InputError(what, where="cell", allowed="a base outside of it")
 
 
-def _holds(mesh: TriangleMesh, point: Array) -> bool:
+def _holds(mesh: TriangleMesh, point: Floats) -> bool:
     """Whether a point lies inside a surface; more than half around an open one counts too."""
     side = side_of(mesh, point)
     return side is Side.INSIDE or (side is Side.UNKNOWN and abs(winding_number(mesh, point)) > 0.5)
 
 
-def require_finite(q: Array) -> None:
+def require_finite(q: Floats) -> None:
     """Refuse joint angles that are not finite: FCL would call them free.
 
     Raises:
@@ -248,7 +246,9 @@ def require_finite(q: Array) -> None:
         raise InputError(f"joint angles {q} are not finite", where="collision check", allowed="six angles in rad")
 
 
-def _nearest(bodies: Sequence[Body], others: Mapping[str, fcl.CollisionObject], bounds: Mapping[str, Array]) -> Nearest:
+def _nearest(
+    bodies: Sequence[Body], others: Mapping[str, fcl.CollisionObject], bounds: Mapping[str, Floats]
+) -> Nearest:
     """The closest pair; pairs whose spheres cannot beat the best so far are passed over."""
     pairs = []
     for body in bodies:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.collision.checker import NEEDLE_IN_PATIENT, CellChecker, Contact, Met, require_finite
 from puncture_twin.planning.collision.never_touching import without_neighbours
@@ -18,9 +18,6 @@ from puncture_twin.planning.collision.segments import SegmentJudge
 from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.collision.sweep import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 class FastChecker(CellChecker):
@@ -62,18 +59,18 @@ class FastChecker(CellChecker):
         self._masks = {False: np.ones_like(needle), True: ~needle}
         self._padding_mm = padding_mm
 
-    def contact(self, q: Array, *, needle_may_touch_patient: bool) -> Contact | None:
+    def contact(self, q: Floats, *, needle_may_touch_patient: bool) -> Contact | None:
         """See :meth:`CellChecker.contact`."""
         met = self.first_contact(np.asarray(q)[None], needle_may_touch_patient=needle_may_touch_patient)
         return None if met is None else met.contact
 
-    def first_contact(self, q_path: Array, *, needle_may_touch_patient: bool) -> Met | None:
+    def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> Met | None:
         """See :meth:`CellChecker.first_contact`."""
         path = np.asarray(q_path, dtype=np.float64)
         require_finite(path)
         return self._first_met(self.motion(path), self._masks[needle_may_touch_patient])
 
-    def _first_met(self, motion: Motion, mask: Flags) -> Met | None:
+    def _first_met(self, motion: Motion, mask: Bools) -> Met | None:
         open_at = self._proofs.first_unproven(motion, 0, mask)
         while open_at >= 0:
             index, check = divmod(open_at, len(self._asked))
@@ -82,7 +79,7 @@ class FastChecker(CellChecker):
             open_at = self._proofs.first_unproven(motion, open_at + 1, mask)
         return None
 
-    def segment_contact(self, start: Array, end: Array) -> Contact | None:
+    def segment_contact(self, start: Floats, end: Floats) -> Contact | None:
         """A contact on the straight joint segment between states (6,), rad; None if free. See :class:`SegmentJudge`.
 
         Raises:
@@ -94,7 +91,7 @@ class FastChecker(CellChecker):
         """A judge of many segments, which remembers what touched last."""
         return SegmentJudge(self.model, self._asked, self._proofs)
 
-    def open_checks(self, q: Array, *, needle_may_touch_patient: bool) -> list[Contact]:
+    def open_checks(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact]:
         """The questions at ``q`` (6,) that are left to FCL."""
         motion = self.motion(np.asarray(q, dtype=np.float64)[None])
         mask = self._masks[needle_may_touch_patient]
@@ -123,7 +120,7 @@ class FastChecker(CellChecker):
         at = self._proofs.first_unproven(rest, 0, asked, mm - self._padding_mm)
         return -1 if at < 0 else begin + at // len(self._asked)
 
-    def motion(self, path: Array) -> Motion:
+    def motion(self, path: Floats) -> Motion:
         """States (m, 6) with what the bounds need of them."""
         if len(path) <= 1:
             return Motion(link_poses(self.model, path), *self._still)

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.collision.checker import Check
 from puncture_twin.planning.collision.proofs import Proofs, ask_fcl, made_from
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-Judge = Callable[[int, Array], bool]
+Judge = Callable[[int, Floats], bool]
 
 JOINTS_BETWEEN = 2
 """Such pairs see two angles alone, whose square can be searched in full; a cube of three would take too long."""
@@ -50,7 +48,7 @@ def without_neighbours(model: UrModel, checks: Sequence[Check], proofs: Proofs, 
     return tuple(check for check, gone in zip(checks, never.tolist(), strict=True) if not gone)
 
 
-def never_touching(model: UrModel, proofs: Proofs, touches: Judge) -> Flags:
+def never_touching(model: UrModel, proofs: Proofs, touches: Judge) -> Bools:
     """Which checks of a cell (k,) are proven clear at every angle: squares of angles, quartered until each is proven.
 
     Args:
@@ -68,7 +66,7 @@ def never_touching(model: UrModel, proofs: Proofs, touches: Judge) -> Flags:
     return never
 
 
-def _clear_all_over(model: UrModel, proofs: Proofs, touches: Judge, joint: int, asked: Flags) -> Flags:
+def _clear_all_over(model: UrModel, proofs: Proofs, touches: Judge, joint: int, asked: Bools) -> Bools:
     """Which of the checks asked (k,) are clear wherever two neighbouring joints stand."""
     middles, half = np.zeros((1, 2)), np.pi
     unproven, touching = asked[None], np.zeros_like(asked)

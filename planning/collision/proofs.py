@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.tool import Box
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.collision import bounding_spheres as enclosures
 from puncture_twin.planning.collision.bodies import Body
@@ -32,10 +33,7 @@ from puncture_twin.planning.collision.shapes import touch
 from puncture_twin.planning.collision.triangle_tree import TriangleTree
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Flags = NDArray[np.bool_]
-_Axes = tuple[Array, Array, Array]
+_Axes = tuple[Floats, Floats, Floats]
 
 ROOM_FRAME = 0
 """The frame of what does not move: the base's."""
@@ -56,17 +54,17 @@ ROUND = ("holder", "needle")
 class Motion(NamedTuple):
     """A path as the compiled code takes it, see :func:`proof_kernels.first_unproven`."""
 
-    frames: Array
-    moved: Array
-    turned: Array
+    frames: Floats
+    moved: Floats
+    turned: Floats
 
 
 class Around(NamedTuple):
     """What :meth:`Proofs.clear_about` leaves open."""
 
-    touching: Flags
+    touching: Bools
     """Shape (m, k): at the state itself a judge must be asked, and is likely to find that something touches."""
-    unproven: Flags
+    unproven: Bools
     """Shape (m, k): the checks open about each state."""
 
 
@@ -110,7 +108,7 @@ class Proofs:
     def __len__(self) -> int:
         return len(self._proven)
 
-    def drop(self, never: Flags) -> None:
+    def drop(self, never: Bools) -> None:
         """Ask no more of some checks (k,): the others keep their order."""
         kept = ~never
         self.scene = self.scene._replace(checks=self.scene.checks[kept])
@@ -119,7 +117,7 @@ class Proofs:
         self._work, self._proven = scratch(int(kept.sum()), len(self.scene.hulls.radii)), self._proven[kept].copy()
 
     def first_unproven(
-        self, motion: Motion, begin: int, asked: Flags, clear_mm: float = proof_kernels.MIN_GAP_MM
+        self, motion: Motion, begin: int, asked: Bools, clear_mm: float = proof_kernels.MIN_GAP_MM
     ) -> int:
         """The first check at or after ``begin``, counted as state * checks + check, that is not proven; -1 for none.
 
@@ -135,7 +133,7 @@ class Proofs:
         arguments = (self.scene, self._levers, tuple(motion), self._work, self._proven, *at, asked, clear_mm)
         return int(proof_kernels.first_unproven(*arguments))
 
-    def clear_about(self, frames: Array, turns: Array, asked: Flags) -> Around:
+    def clear_about(self, frames: Floats, turns: Floats, asked: Bools) -> Around:
         """Prove checks clear all about some states.
 
         Args:
@@ -148,7 +146,7 @@ class Proofs:
         return Around(gaps <= 0.0, unproven)
 
 
-def ask_fcl(check: Check, frames: Array) -> bool:
+def ask_fcl(check: Check, frames: Floats) -> bool:
     """Whether the shapes of a check touch where ``link_poses`` (7, 4, 4) has them."""
     check.second.setTransform(check.second_body.pose(frames))
     if check.first_body is not None:
@@ -156,7 +154,7 @@ def ask_fcl(check: Check, frames: Array) -> bool:
     return touch(check.first, check.second)
 
 
-def _levers(model: UrModel, check: Check) -> Array:
+def _levers(model: UrModel, check: Check) -> Floats:
     """How far a turn of each joint (6,) may move the second body against the first, mm/rad.
 
     A body's point is no farther from a joint's axis than the links between reach, end to end, and the body itself.
@@ -190,7 +188,7 @@ def _moving(checks: Sequence[Check]) -> Movers:
     return Movers(np.array(mover, dtype=np.int64), np.array(frames, dtype=np.int64), centres, radii)
 
 
-def _in_frame(corners: Array, body: Body) -> Array:
+def _in_frame(corners: Floats, body: Body) -> Floats:
     """Corners (n, 3) of a body's shapes in the frame that it moves with."""
     return np.asarray(corners @ body.T_frame_body[:3, :3].T + body.T_frame_body[:3, 3])
 
@@ -210,7 +208,7 @@ class _Hulls:
         """Row of the box of that name."""
         return self._names[name]
 
-    def add(self, corners: Array, body: Body) -> int:
+    def add(self, corners: Floats, body: Body) -> int:
         """Row of a hull of a body, which is added if it is new."""
         row = self._rows.setdefault(id(corners), len(self._corners))
         if row == len(self._corners):
@@ -219,7 +217,7 @@ class _Hulls:
             self._frames.append(body.frame)
         return row
 
-    def packed(self, cache: Cache) -> tuple[Hulls, Array, Array]:
+    def packed(self, cache: Cache) -> tuple[Hulls, Floats, Floats]:
         """``hulls``, ``T_box_base`` and ``halves`` of :class:`Scene`."""
         count = len(self._boxes)
         boxes, bodies = _enclosed(self._corners[:count]), self._corners[count:]
@@ -240,7 +238,7 @@ class _Hulls:
         return hulls, poses, halves
 
 
-def _enclosed(hulls: Sequence[Array]) -> Arrays:
+def _enclosed(hulls: Sequence[Floats]) -> Arrays:
     """Of each convex hull a ball about it and a coarse hull: their numbers, one array each."""
     balls, coarse = [enclosing_ball(corners) for corners in hulls], [coarse_hull(corners) for corners in hulls]
     edges, first = [neighbours(corners) for corners in hulls], _starts([len(corners) for corners in hulls])
@@ -265,11 +263,11 @@ def made_from(what: str, pieces: Sequence[NDArray[Any]]) -> dict[str, object]:
     return {"what": what, "pieces": digest.hexdigest(), **enclosures.settings()}
 
 
-def _starts(sizes: Sequence[int] | Indices) -> Indices:
+def _starts(sizes: Sequence[int] | Ints) -> Ints:
     return np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)]).astype(np.int64)
 
 
-def _axes(points: Array) -> _Axes:
+def _axes(points: Floats) -> _Axes:
     x, y, z = (np.ascontiguousarray(axis) for axis in points.T)
     return x, y, z
 
@@ -289,11 +287,11 @@ def _skin(patient: TriangleMesh | None) -> Skin:
     return Skin((tree.lows, tree.highs, tree.corners), np.full(cells, np.nan, np.float32), low - margin)
 
 
-def _tree_arrays(pieces: Sequence[Array]) -> Arrays:
+def _tree_arrays(pieces: Sequence[Floats]) -> Arrays:
     return dict(vars(ball_tree(pieces)))
 
 
-def _trees(bodies: Sequence[Body], cache: Cache) -> tuple[dict[str, int], tuple[Array, Array, Indices]]:
+def _trees(bodies: Sequence[Body], cache: Cache) -> tuple[dict[str, int], tuple[Floats, Floats, Ints]]:
     """The balls of the bodies' full shapes, each in the body's frame, and the row of each body's root."""
     roots: dict[str, int] = {}
     centres, radii, children = [np.empty((0, 3))], [np.empty(0)], [np.empty((0, 2), np.int64)]

@@ -7,16 +7,14 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.checker import Check, Contact, require_finite
 from puncture_twin.planning.collision.kernels import segments as segment_kernels
 from puncture_twin.planning.collision.kernels.segments import ASK, CONTACT, NOT_FINITE, Answer
 from puncture_twin.planning.collision.proofs import Proofs, ask_fcl
-
-Array = NDArray[np.float64]
 
 LOOK_FIRST_RAD = 0.125
 """States of a segment so far apart are looked at before it is proven: what it touches is found soonest so."""
@@ -47,7 +45,7 @@ class SegmentJudge:
         self._order = np.arange(len(checks), dtype=np.int64)
         self._answer = _room_for(QUESTIONS)
 
-    def __call__(self, start: Array, end: Array) -> Contact | None:
+    def __call__(self, start: Floats, end: Floats) -> Contact | None:
         """A contact on the segment between two states (6,), rad, the needle being outside the patient; None if free.
 
         The end, and states ``LOOK_FIRST_RAD`` apart from it on, are judged as they stand; all of the segment is proven
@@ -87,19 +85,19 @@ def _room_for(questions: int) -> Answer:
     return Answer(np.zeros(4, np.int64), np.empty(questions), np.empty(questions, np.int64))
 
 
-def _length(step: Array) -> float:
+def _length(step: Floats) -> float:
     """Of a step (6,), rad; that of one that is no number counts as 0."""
     length = math.sqrt(float(step @ step))
     return length if math.isfinite(length) else 0.0
 
 
-def halving_order(count: int) -> Array:
+def halving_order(count: int) -> Floats:
     """0, 1/n, 2/n ... (n - 1)/n in an order that spreads over the whole at once (van der Corput's), shape (n,)."""
     order = np.argsort([int(f"{n:032b}"[::-1], 2) for n in range(count)], kind="stable")
     return np.asarray(order / max(1, count))
 
 
 @lru_cache(maxsize=256)
-def looks(count: int) -> Array:
+def looks(count: int) -> Floats:
     """Where on a segment so many states stand, the end first: shares of its way, shape (n,)."""
     return np.asarray(1.0 - halving_order(count))

@@ -7,12 +7,9 @@ from itertools import product
 import fcl
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-Array = NDArray[np.float64]
 
 
 def touch(a: fcl.CollisionObject, b: fcl.CollisionObject) -> bool:

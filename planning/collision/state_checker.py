@@ -6,14 +6,10 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.bodies import BODY_NAMES
-
-Array = NDArray[np.float64]
 
 PATIENT = "patient"
 
@@ -73,20 +69,20 @@ class StateChecker(Protocol):
     def tool(self) -> Tool:
         """What the flange carries."""
 
-    def contact(self, q: Array, *, needle_may_touch_patient: bool) -> Contact | None:
+    def contact(self, q: Floats, *, needle_may_touch_patient: bool) -> Contact | None:
         """The first contact found at ``q``, shape (6,), rad; None when the arm is clear."""
 
-    def first_contact(self, q_path: Array, *, needle_may_touch_patient: bool) -> Met | None:
+    def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> Met | None:
         """The first state of ``q_path`` (m, 6), rad, with a contact, and the contact; None when all are clear."""
 
-    def nearest(self, q: Array, pair: str, body: str | None = None) -> Nearest:
+    def nearest(self, q: Floats, pair: str, body: str | None = None) -> Nearest:
         """One of ``DISTANCE_PAIRS`` at ``q``, shape (6,), rad; of one body alone when named."""
 
-    def distances(self, q: Array) -> Distances:
+    def distances(self, q: Floats) -> Distances:
         """All of them."""
 
-    def sweep_mm(self, q_path: Array) -> Array:
+    def sweep_mm(self, q_path: Floats) -> Floats:
         """Bound on every body's motion along each segment of ``q_path`` (m, 6): shape (m - 1,), mm."""
 
-    def body_sweeps_mm(self, q_path: Array) -> dict[str, Array]:
+    def body_sweeps_mm(self, q_path: Floats) -> dict[str, Floats]:
         """The same for each moving body by name."""

@@ -8,15 +8,13 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +29,7 @@ class SweptBodies:
 
     model: UrModel
     tool: Tool
-    corners: Array
+    corners: Floats
 
     @classmethod
     def of(cls, model: UrModel, tool: Tool, padding_mm: float = 0.0) -> SweptBodies:
@@ -43,7 +41,7 @@ class SweptBodies:
         grown = [box + [[-padding_mm], [padding_mm]] for box in boxes]
         return cls(model, tool, np.stack([np.array(list(product(*box.T))) for box in grown]))
 
-    def bounds_mm(self, q_path: Array) -> Array:
+    def bounds_mm(self, q_path: Floats) -> Floats:
         """A bound on the motion of every point of each link along each straight joint segment of a path.
 
         Along a segment each point stays within half this bound of where it is at one of the two ends: the farthest

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-Array = NDArray[np.float64]
 
 LEAF_TRIANGLES = 4
 """At most so many triangles in a leaf."""
@@ -25,9 +23,9 @@ class TriangleTree:
         corners: Shape (leaves, k, 3, 3), mm: the triangles of each leaf; some stand in two, so that all have k.
     """
 
-    lows: Array
-    highs: Array
-    corners: Array
+    lows: Floats
+    highs: Floats
+    corners: Floats
 
     @classmethod
     def of(cls, mesh: TriangleMesh) -> TriangleTree:

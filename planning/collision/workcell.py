@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Role
 from puncture_twin.planning.anatomy.body.outside_body import joined
 from puncture_twin.planning.arm.gantry import gantry_boxes
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case, Gantry, Obstacle
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-Floats = NDArray[np.float64]
-
 
 ARM_PADDING_MM = 5.0
 """The arm keeps this distance from patient and room: more than the registration's error, and enough to prove the way

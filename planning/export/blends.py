@@ -11,13 +11,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.checker import StateChecker
 from puncture_twin.planning.motion.approach import MAX_SWEEP_MM
-
-Array = NDArray[np.float64]
 
 GRID_MM = MAX_SWEEP_MM / 2.0
 """In two directions: no state of the triangle is farther from a checked one than half of ``MAX_SWEEP_MM``."""
@@ -35,7 +33,7 @@ SAMPLES = 400
 """Along a segment, to find where the tip comes within the radius."""
 
 
-def blend_radii_mm(checker: StateChecker, waypoints: Array, largest_mm: float = LARGEST_BLEND_MM) -> Array:
+def blend_radii_mm(checker: StateChecker, waypoints: Floats, largest_mm: float = LARGEST_BLEND_MM) -> Floats:
     """A radius for each waypoint between the ends; 0 where no corner may be cut.
 
     Args:
@@ -50,7 +48,7 @@ def blend_radii_mm(checker: StateChecker, waypoints: Array, largest_mm: float = 
     return np.array([_radius_mm(checker, waypoints[at - 1 : at + 2], largest_mm) for at in corners])
 
 
-def _radius_mm(checker: StateChecker, waypoints: Array, largest_mm: float) -> float:
+def _radius_mm(checker: StateChecker, waypoints: Floats, largest_mm: float) -> float:
     """The largest radius tried that is free, of the corner between three waypoints (3, 6)."""
     before, corner, after = waypoints
     radius = largest_mm
@@ -64,7 +62,7 @@ def _radius_mm(checker: StateChecker, waypoints: Array, largest_mm: float) -> fl
     return 0.0
 
 
-def _share_within(checker: StateChecker, corner: Array, other: Array, radius_mm: float) -> float:
+def _share_within(checker: StateChecker, corner: Floats, other: Floats, radius_mm: float) -> float:
     """The last share of the way from a corner at which the tip is still within a radius of it, or the next sample.
 
     1 where the tip is so near the other end, so that half of the distance between two tips bounds both radii.
@@ -78,13 +76,13 @@ def _share_within(checker: StateChecker, corner: Array, other: Array, radius_mm:
     return float(shares[min(SAMPLES, int(np.flatnonzero(far <= radius_mm)[-1]) + 1)])
 
 
-def _free(checker: StateChecker, corner: Array, back: Array, ahead: Array) -> bool:
+def _free(checker: StateChecker, corner: Floats, back: Floats, ahead: Floats) -> bool:
     """Whether every state of the triangle corner, corner + back, corner + ahead is free of contact."""
     states = _triangle(checker, corner, back, ahead)
     return all(checker.contact(q, needle_may_touch_patient=False) is None for q in states)
 
 
-def _triangle(checker: StateChecker, corner: Array, back: Array, ahead: Array) -> Array:
+def _triangle(checker: StateChecker, corner: Floats, back: Floats, ahead: Floats) -> Floats:
     """States of a triangle, (m, 6), in rays from its corner: neighbours on a ray or across are within ``GRID_MM``."""
     rays, steps = 1, 1
     while True:

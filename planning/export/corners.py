@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.motion.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 STRAIGHT_RAD = 1e-9
 """Joint distance within which samples lie on a straight segment: far above rounding, a millionth of a degree."""
@@ -17,7 +16,7 @@ REST_SLACK = 1e-6
 """Relative rounding of a speed by differences."""
 
 
-def corner_rows(q: Array) -> NDArray[np.intp]:
+def corner_rows(q: Floats) -> NDArray[np.intp]:
     """Rows at which a path turns or turns back, with both ends: every other row lies between two of them.
 
     Splits at the row farthest from the chord until none is off (Douglas and Peucker 1973, in six dimensions). For a
@@ -39,7 +38,7 @@ def corner_rows(q: Array) -> NDArray[np.intp]:
     return np.array(sorted(kept), dtype=np.intp)
 
 
-def _turning_row(rows: Array) -> int | None:
+def _turning_row(rows: Floats) -> int | None:
     """The row farthest from the segment between the ends, or the first before a way back; None on a straight way."""
     if len(rows) < 3:
         return None

@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.links import JOINT_NAMES
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.motion.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 POSITION_SLACK_RAD = 1e-9
 """A printed angle may round beyond its limit by this."""
@@ -24,7 +22,7 @@ ROUNDINGS = 8.0
 """Differences of differences of angles carry at most this many roundings of one angle."""
 
 
-def check_positions(model: UrModel, q: Array, *, what: str, where: Path) -> None:
+def check_positions(model: UrModel, q: Floats, *, what: str, where: Path) -> None:
     """Refuse angles outside the joints' limits.
 
     Args:
@@ -47,7 +45,7 @@ def check_positions(model: UrModel, q: Array, *, what: str, where: Path) -> None
         )
 
 
-def check_rates(model: UrModel, speeds: Array, accelerations: Array, *, what: str, where: Path) -> None:
+def check_rates(model: UrModel, speeds: Floats, accelerations: Floats, *, what: str, where: Path) -> None:
     """Refuse speeds and accelerations above the limits.
 
     Args:

@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, wrap_to_pi
 from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.export.corners import STRAIGHT_RAD, corner_rows, rests_at
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
 from puncture_twin.planning.plan.plan import POSE_TOLERANCE_MM, Plan
-
-Array = NDArray[np.float64]
 
 STREAM_S = SAMPLE_S
 """Period of a streamed approach: that of a CB3 controller, and four of an e-Series one."""
@@ -35,7 +34,7 @@ MOST_SAMPLES = 200_000
 class JointMove(NamedTuple):
     """One ``movej``: straight in joint angles."""
 
-    q: Array
+    q: Floats
     """Where it ends, shape (6,), rad."""
     speed: float
     """Peak speed of the joint that turns farthest, rad/s."""
@@ -63,13 +62,13 @@ class Program:
     """
 
     tcp_mm: float
-    start_q: Array
+    start_q: Floats
     moves: tuple[JointMove, ...]
-    stream_q: Array
-    T_base_standoff: Array
-    T_base_target: Array
-    standoff_q: Array
-    target_q: Array
+    stream_q: Floats
+    T_base_standoff: Floats
+    T_base_target: Floats
+    standoff_q: Floats
+    target_q: Floats
     insertion_mm_s: float
     insertion_mm_s2: float
 
@@ -90,7 +89,7 @@ def waypoint_rows(plan: Plan) -> NDArray[np.intp]:
     return rows if straight else rows[:0]
 
 
-def program_of(plan: Plan, blends_mm: Array | None = None) -> Program:
+def program_of(plan: Plan, blends_mm: Floats | None = None) -> Program:
     """The program of a plan.
 
     Args:
@@ -160,7 +159,7 @@ def _joint_move(trajectory: Trajectory, first: int, last: int, blend_mm: float) 
     return JointMove(q[-1], ramp.speed, ramp.acceleration, blend_mm)
 
 
-def _ramp(driven: Array, times: Array) -> _Ramp:
+def _ramp(driven: Floats, times: Floats) -> _Ramp:
     """The trapezoid from rest to rest with a motion's length L, duration T and highest acceleration a.
 
     From T = L / v + v / a follows v = a (T - sqrt(T^2 - 4 L / a)) / 2: below the motion's own peak speed, since a plan
@@ -180,19 +179,19 @@ def _ramp(driven: Array, times: Array) -> _Ramp:
     return _Ramp(acceleration * (duration - math.sqrt(spare)) / 2.0, acceleration)
 
 
-def stream_times(steps: int) -> Array:
+def stream_times(steps: int) -> Floats:
     """Shape (steps + 1,), from 0, s."""
     return np.asarray(STREAM_S * np.arange(steps + 1), dtype=np.float64)
 
 
-def tip_poses(plan: Plan) -> Array:
+def tip_poses(plan: Plan) -> Floats:
     """T_base_tip of every sample of the insertion, shape (m, 4, 4), mm."""
     poses = flange_pose(ur_model(plan.model), plan.insertion.q)
     poses[:, :3, 3] += plan.needle_length_mm * poses[:, :3, 2]
     return poses
 
 
-def _insertion_ramp(plan: Plan, tips: Array) -> _Ramp:
+def _insertion_ramp(plan: Plan, tips: Floats) -> _Ramp:
     points, times = tips[:, :3, 3], plan.insertion.times_s
     length = float(np.linalg.norm(points[-1] - points[0]))
     if length <= POSE_TOLERANCE_MM or len(points) < 2:
@@ -200,7 +199,7 @@ def _insertion_ramp(plan: Plan, tips: Array) -> _Ramp:
     return _ramp((points - points[0]) @ (points[-1] - points[0]) / length, times)
 
 
-def _trapezoid(length: float, speed: float, acceleration: float) -> tuple[Array, Array]:
+def _trapezoid(length: float, speed: float, acceleration: float) -> tuple[Floats, Floats]:
     """Times and distances run, both (m,), from rest to rest, in equal steps of ``STREAM_S`` or, of a long one, more."""
     speed = min(speed, math.sqrt(length * acceleration))
     ramp, hold = speed / acceleration, length / speed - speed / acceleration

@@ -7,10 +7,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.export.limits import check_positions, check_rates, check_trajectory
 from puncture_twin.planning.export.motion import ANGLE_TOLERANCE_RAD
@@ -25,8 +25,6 @@ from puncture_twin.planning.export.program import (
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import POSE_TOLERANCE_MM, STRAIGHT_TOLERANCE_MM, Plan
 
-Array = NDArray[np.float64]
-
 SAME_BRANCH_RAD = 0.01
 """How far the joints of the straight move may end from the plan's: a hundredth of the way to another branch."""
 
@@ -37,7 +35,7 @@ TURN_TOLERANCE_RAD = 1e-3
 """How far the straight move's orientation may be from the plan's: 0.2 mm over 200 mm of needle."""
 
 
-def check_program(program: Program, plan: Plan, blends_mm: Array | None = None, *, where: Path) -> None:
+def check_program(program: Program, plan: Plan, blends_mm: Floats | None = None, *, where: Path) -> None:
     """Refuse a program that is not the plan's motion, or that breaks a limit.
 
     Args:
@@ -68,7 +66,7 @@ def check_program(program: Program, plan: Plan, blends_mm: Array | None = None, 
     _check_insertion(program, plan, model, where)
 
 
-def _rates(program: Program) -> Array:
+def _rates(program: Program) -> Floats:
     """Everything that a program prints beside angles and poses; 1 + mm for radii, which may be 0."""
     moves = [(move.speed, move.acceleration, 1.0 + move.blend_mm) for move in program.moves]
     return np.array([program.tcp_mm, program.insertion_mm_s, program.insertion_mm_s2, *np.ravel(moves)])
@@ -114,7 +112,7 @@ def _check_insertion(program: Program, plan: Plan, model: UrModel, where: Path) 
     check_trajectory(model, driven, time_resolution_s=0.0, what="insertion", where=where)
 
 
-def _farthest_mm(points: Array, line: Array) -> float:
+def _farthest_mm(points: Floats, line: Floats) -> float:
     """The farthest that points (m, 3) stand from the straight line through the ends of another way (k, 3)."""
     unit = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
     worst = 0.0
@@ -124,11 +122,11 @@ def _farthest_mm(points: Array, line: Array) -> float:
     return worst
 
 
-def _pose_difference(T_a: Array, T_b: Array) -> tuple[float, float]:
+def _pose_difference(T_a: Floats, T_b: Floats) -> tuple[float, float]:
     turned = math.acos(float(np.clip((np.trace(T_a[:3, :3].T @ T_b[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
     return float(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3])), turned
 
 
-def _check_same(read: Array, planned: Array, what: str, where: Path) -> None:
+def _check_same(read: Floats, planned: Floats, what: str, where: Path) -> None:
     if read.shape != planned.shape or not np.abs(read - planned).max() <= ANGLE_TOLERANCE_RAD:
         raise InputError(f"{what} does not read back as the plan's", where=where, allowed="the plan's angles")

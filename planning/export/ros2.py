@@ -6,10 +6,10 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.links import JOINT_NAMES
 from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.export.corners import corner_rows, rests_at
 from puncture_twin.planning.export.limits import check_rates
@@ -17,8 +17,6 @@ from puncture_twin.planning.export.motion import SampledMotion
 from puncture_twin.planning.export.text import heading
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
-
-Array = NDArray[np.float64]
 
 NANOSECONDS = 1_000_000_000
 
@@ -66,13 +64,13 @@ def _message(model: UrModel, trajectory: Trajectory) -> list[str]:
     return lines
 
 
-def _floats(row: Array) -> str:
+def _floats(row: Floats) -> str:
     """Exact floats, each with a point: YAML 1.1 takes ``1e-05`` for a word and ``3`` for an integer."""
     texts = [repr(value) for value in row.tolist()]
     return f"[{', '.join(t if '.' in t else t.replace('e', '.0e') for t in texts)}]"
 
 
-def velocities(model: UrModel, trajectory: Trajectory) -> Array:
+def velocities(model: UrModel, trajectory: Trajectory) -> Floats:
     """Speeds at the samples, by differences: 0 at the ends, where the arm rests, and where a joint turns back.
 
     Of three parabolas through a sample and two neighbours (both before, one on each side, both after) at least two have
@@ -100,7 +98,7 @@ def velocities(model: UrModel, trajectory: Trajectory) -> Array:
     return speeds
 
 
-def _middle_slope(slopes: Array, steps: Array) -> Array:
+def _middle_slope(slopes: Floats, steps: Floats) -> Floats:
     """The middle one of three parabolas' slopes at each inner sample.
 
     Args:

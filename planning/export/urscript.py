@@ -12,15 +12,13 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.export.program import STREAM_S, JointMove, Program
 from puncture_twin.planning.export.text import heading
 from puncture_twin.planning.plan.plan import Plan
-
-Array = NDArray[np.float64]
 
 M_PER_MM = 1e-3
 
@@ -187,20 +185,20 @@ def _number(value: float) -> str:
     return text.lstrip("-") if float(text) == 0.0 else text
 
 
-def _list(values: Array | list[float]) -> str:
+def _list(values: Floats | list[float]) -> str:
     return f"[{', '.join(_number(float(value)) for value in values)}]"
 
 
-def _floats(text: str) -> Array:
+def _floats(text: str) -> Floats:
     return np.array([float(value) for value in text.strip("p[]").split(",")])
 
 
-def _pose_m(T: Array) -> Array:
+def _pose_m(T: Floats) -> Floats:
     """A pose as the controller writes it: position in metres, then the rotation vector in rad."""
     return np.concatenate([T[:3, 3] * M_PER_MM, Rotation.from_matrix(T[:3, :3]).as_rotvec()])
 
 
-def _pose_mm(pose_m: Array) -> Array:
+def _pose_mm(pose_m: Floats) -> Floats:
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec(pose_m[3:]).as_matrix()
     T[:3, 3] = pose_m[:3] / M_PER_MM

@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-Vertices = NDArray[np.float64]
+from puncture_twin.planning.base.arrays import Floats
+
 Faces = NDArray[np.int32]
 
 
@@ -21,7 +22,7 @@ class TriangleMesh:
         faces: Shape (m, 3), int32, indices into ``vertices``.
     """
 
-    vertices: Vertices
+    vertices: Floats
     faces: Faces
 
     def __post_init__(self) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -12,11 +12,8 @@ OFF_LINE = (0.000137, 0.000211)
 """Voxels by which the lines pass beside the voxels' centres in j and k, so that none runs through an edge or a corner
 of a surface that was made on the same grid. A line that does all the same flips its voxels by one edge too many."""
 
-Mask = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 
-
-def voxels_inside(mesh: TriangleMesh, T_ct_index: Floats, shape: tuple[int, int, int]) -> Mask:
+def voxels_inside(mesh: TriangleMesh, T_ct_index: Floats, shape: tuple[int, int, int]) -> Bools:
     """Voxels whose centres lie inside a surface, or through which it passes where it is open.
 
     Args:
@@ -55,7 +52,7 @@ def _count_crossings(corners, off, flips):  # type: ignore[no-untyped-def]  # nu
                     flips[min(max(0, int(np.ceil(x))), ni), j, k] += 1
 
 
-def _voxels_on(corners: Floats, shape: tuple[int, int, int]) -> Mask:
+def _voxels_on(corners: Floats, shape: tuple[int, int, int]) -> Bools:
     """Voxels that hold a point of the triangles (m, 3, 3), in voxels, sampled at half a voxel."""
     mask = np.zeros(shape, bool)
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0.0)

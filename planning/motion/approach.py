@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.collision.checker import Contact, StateChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
@@ -42,7 +43,6 @@ __all__ = [
     "plan_approach",
 ]
 
-Array = NDArray[np.float64]
 
 RESOLUTION_RAD = 0.05
 """Joint distance of the states at which FCL alone judges a segment: up to 50 mm at a metre, never the last word."""
@@ -95,11 +95,11 @@ class Approach:
         attempts: How many ways were planned.
     """
 
-    waypoints: Array
-    cuts: Array
+    waypoints: Floats
+    cuts: Floats
     trajectory: Trajectory
     goal_index: int
-    checked_q: Array
+    checked_q: Floats
     seed: int
     attempts: int
 
@@ -111,7 +111,7 @@ class Approach:
 class _Way(NamedTuple):
     """Straight segments from home to a goal."""
 
-    waypoints: Array
+    waypoints: Floats
     goal_index: int
 
     @property
@@ -121,8 +121,8 @@ class _Way(NamedTuple):
 
 def plan_approach(
     checker: StateChecker,
-    q_home: Array,
-    q_goals: Array,
+    q_home: Floats,
+    q_goals: Floats,
     *,
     seed: int,
     max_samples: int = MAX_SAMPLES,
@@ -170,7 +170,7 @@ def _judge(checker: StateChecker, resolution_rad: float) -> SegmentContact:
     if isinstance(checker, FastChecker):
         return checker.segment_judge()
 
-    def sampled(start: Array, end: Array) -> Contact | None:
+    def sampled(start: Floats, end: Floats) -> Contact | None:
         shares = halving_order(max(1, math.ceil(float(np.linalg.norm(end - start)) / resolution_rad)))
         states = end + shares[:, None] * (start - end)
         return first_contact(checker, states)
@@ -179,7 +179,7 @@ def _judge(checker: StateChecker, resolution_rad: float) -> SegmentContact:
 
 
 def _shortest(
-    checker: StateChecker, judge: SegmentContact, home: Array, goals: Array, seed: int, max_samples: int
+    checker: StateChecker, judge: SegmentContact, home: Floats, goals: Floats, seed: int, max_samples: int
 ) -> _Way | Connected:
     """The shortest way found to any goal, or the run that found none.
 
@@ -207,7 +207,7 @@ def _shortest(
     return best
 
 
-def _cuts(judge: SegmentContact, waypoints: Array) -> Array:
+def _cuts(judge: SegmentContact, waypoints: Floats) -> Floats:
     """How far from each waypoint between the ends its rounding may begin, shape (k - 2,), rad; 0 where none is free."""
     steps = np.diff(waypoints, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
@@ -226,7 +226,7 @@ def _cuts(judge: SegmentContact, waypoints: Array) -> Array:
     return cuts
 
 
-def _within_limits(checker: StateChecker, q: Array, name: str) -> Array:
+def _within_limits(checker: StateChecker, q: Floats, name: str) -> Floats:
     rows = np.atleast_2d(np.asarray(q, dtype=np.float64))
     if rows.ndim != 2 or rows.shape[1] != 6 or not checker.model.within_limits(rows).all() or len(rows) == 0:
         limits = np.round(np.degrees(checker.model.joint_limits[:, 1])).astype(int).tolist()
@@ -234,7 +234,7 @@ def _within_limits(checker: StateChecker, q: Array, name: str) -> Array:
     return rows
 
 
-def _free_goals(checker: StateChecker, home: Array, goals: Array) -> NDArray[np.int64]:
+def _free_goals(checker: StateChecker, home: Floats, goals: Floats) -> NDArray[np.int64]:
     """Which goals are free, home being free."""
     contact = checker.contact(home, needle_may_touch_patient=False)
     if contact is not None:

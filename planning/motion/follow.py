@@ -15,15 +15,13 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.motion.timing import Rates, TimeLaw, reachable_speed, time_law
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
-
-Array = NDArray[np.float64]
 
 MAX_JERK = 14.0
 """rad/s^3, of every joint: a UR's acceleration of 1.4 rad/s^2 is reached in a tenth of a second. No manual states a
@@ -45,24 +43,24 @@ SPLINE_SAMPLES = 8
 class _Straight(NamedTuple):
     """A stretch of a segment."""
 
-    start: Array
-    direction: Array
+    start: Floats
+    direction: Floats
     law: TimeLaw
 
     @property
     def duration_s(self) -> float:
         return self.law.duration_s
 
-    def at(self, times_s: Array) -> Array:
+    def at(self, times_s: Floats) -> Floats:
         return np.asarray(self.start + self.law.driven(times_s)[:, None] * self.direction)
 
 
 class _Round(NamedTuple):
     """A rounded corner."""
 
-    corner: Array
-    before: Array
-    after: Array
+    corner: Floats
+    before: Floats
+    after: Floats
     cut: float
     speed: float
 
@@ -70,14 +68,14 @@ class _Round(NamedTuple):
     def duration_s(self) -> float:
         return 2.0 * self.cut / self.speed
 
-    def at(self, times_s: Array) -> Array:
+    def at(self, times_s: Floats) -> Floats:
         return rounded(self.corner, self.before, self.after, self.cut, times_s / self.duration_s)
 
 
 _Stretch = _Straight | _Round
 
 
-def rounded(corner: Array, before: Array, after: Array, cut: float, share: Array) -> Array:
+def rounded(corner: Floats, before: Floats, after: Floats, cut: float, share: Floats) -> Floats:
     """The curve past a corner.
 
     Args:
@@ -95,7 +93,7 @@ def rounded(corner: Array, before: Array, after: Array, cut: float, share: Array
     return np.asarray(corner + cut * (along[:, None] * before + across[:, None] * after))
 
 
-def follow(model: UrModel, waypoints: Array, cuts: Array | None = None, *, speed_scale: float = 1.0) -> Trajectory:
+def follow(model: UrModel, waypoints: Floats, cuts: Floats | None = None, *, speed_scale: float = 1.0) -> Trajectory:
     """Run straight joint segments as fast as the limits allow, past rounded corners, from rest to rest.
 
     Args:
@@ -124,7 +122,7 @@ def follow(model: UrModel, waypoints: Array, cuts: Array | None = None, *, speed
     return _sampled(waypoints, _runs(model, waypoints, cuts, room, speed_scale))
 
 
-def _room(waypoints: Array, cuts: Array) -> Array:
+def _room(waypoints: Floats, cuts: Floats) -> Floats:
     """What the rounded corners leave of each segment, shape (k - 1,), rad."""
     lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
     fits = cuts.shape == (len(lengths) - 1,) and bool((cuts >= 0.0).all() and (lengths > 0.0).all())
@@ -135,7 +133,9 @@ def _room(waypoints: Array, cuts: Array) -> Array:
     return np.asarray(room.clip(0.0))
 
 
-def _runs(model: UrModel, waypoints: Array, cuts: Array, room: Array, speed_scale: float) -> Iterator[list[_Stretch]]:
+def _runs(
+    model: UrModel, waypoints: Floats, cuts: Floats, room: Floats, speed_scale: float
+) -> Iterator[list[_Stretch]]:
     """The ways from stop to stop: straight stretches (``room`` long, one a segment) and rounded corners in turn."""
     steps = np.diff(waypoints, axis=0)
     directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
@@ -153,14 +153,14 @@ def _runs(model: UrModel, waypoints: Array, cuts: Array, room: Array, speed_scal
             run.append(_Round(waypoints[at + 1], direction, directions[at + 1], float(cuts[at]), speeds[at + 1]))
 
 
-def _segment_rates(model: UrModel, direction: Array, speed_scale: float) -> Rates:
+def _segment_rates(model: UrModel, direction: Floats, speed_scale: float) -> Rates:
     """What the joints' limits allow along a unit direction."""
     share = np.maximum(np.abs(direction), TINY)
     limits = (speed_scale * model.max_speeds, model.max_acceleration, MAX_JERK)
     return Rates(*(float((limit / share).min()) for limit in limits))
 
 
-def _corner_speeds(model: UrModel, directions: Array, cuts: Array, room: Array, rates: list[Rates]) -> list[float]:
+def _corner_speeds(model: UrModel, directions: Floats, cuts: Floats, room: Floats, rates: list[Rates]) -> list[float]:
     """The speed at each waypoint, 0 at the ends: what the corner allows, and what the segments can change it to."""
     speeds = [0.0]
     for at, cut in enumerate(cuts.tolist()):
@@ -176,7 +176,7 @@ def _corner_speeds(model: UrModel, directions: Array, cuts: Array, room: Array, 
     return speeds
 
 
-def _sampled(waypoints: Array, runs: Iterable[list[_Stretch]]) -> Trajectory:
+def _sampled(waypoints: Floats, runs: Iterable[list[_Stretch]]) -> Trajectory:
     """All runs one after the other, each slowed down by less than one sample, so that it ends on one."""
     rows, count = [waypoints[:1]], 0
     for run in runs:
@@ -196,14 +196,14 @@ def _steps(duration_s: float) -> int:
     return max(1, math.ceil(duration_s / SAMPLE_S - SAME_STEP))
 
 
-def _ending_at(end: Array, rows: Array) -> Trajectory:
+def _ending_at(end: Floats, rows: Floats) -> Trajectory:
     """Samples with their last state put in exactly: sums of steps round."""
     q = np.array(rows, dtype=np.float64)
     q[-1] = end
     return Trajectory(SAMPLE_S * np.arange(len(q), dtype=np.float64), q)
 
 
-def drive_smoothly(model: UrModel, q: Array, depths_mm: Array, *, max_tip_speed_mm_s: float) -> Trajectory:
+def drive_smoothly(model: UrModel, q: Floats, depths_mm: Floats, *, max_tip_speed_mm_s: float) -> Trajectory:
     """Run a dense, smooth motion in one go, such as the insertion: rest, steady tip speed, rest.
 
     A cubic spline over depth passes through every row. With the tip's speed v, acceleration a and jerk j, and the
@@ -251,7 +251,7 @@ def _tip_rates(model: UrModel, spline: CubicSpline, max_tip_speed_mm_s: float) -
     return Rates(speed, acceleration, MAX_JERK / 3.0 / float(slope.max()))
 
 
-def _checked_rows(q: Array) -> Array:
+def _checked_rows(q: Floats) -> Floats:
     rows = np.asarray(q, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[0] == 0 or rows.shape[1] != 6 or not np.isfinite(rows).all():
         raise InputError(f"joint rows of shape {rows.shape}", where="trajectory", allowed="(k, 6), finite")

@@ -7,10 +7,9 @@ from heapq import heappop, heappush
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.checker import DISTANCE_PAIRS, Contact, Distances, Nearest, StateChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
-
-Array = NDArray[np.float64]
 
 MAX_SWEEP_MM = 2.0
 """So fine that no body point moves farther between two checked states."""
@@ -29,12 +28,12 @@ _Stretch = tuple[float, str, _At, _At]
 """Of a path: how near a body might come between two states, mm; the body; its ends."""
 
 
-def path_length(waypoints: Array) -> float:
+def path_length(waypoints: Floats) -> float:
     """Joint-space length of straight segments through (k, 6), rad."""
     return float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum())
 
 
-def dense_states(checker: StateChecker, waypoints: Array, step_rad: float) -> Array:
+def dense_states(checker: StateChecker, waypoints: Floats, step_rad: float) -> Floats:
     """States along a path, so close that neither joint distance nor any body's motion exceeds its bound.
 
     Args:
@@ -58,7 +57,7 @@ def dense_states(checker: StateChecker, waypoints: Array, step_rad: float) -> Ar
         counts = np.ceil(counts * np.maximum(1.0, farthest / MAX_SWEEP_MM)).astype(np.int64)
 
 
-def _between(waypoints: Array, counts: NDArray[np.int64]) -> Array:
+def _between(waypoints: Floats, counts: NDArray[np.int64]) -> Floats:
     """The waypoints (k, 6) and states between them, each segment in its count of equal steps."""
     segment = np.repeat(np.arange(len(counts)), counts)
     share = (np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)) / np.repeat(counts, counts)
@@ -66,13 +65,13 @@ def _between(waypoints: Array, counts: NDArray[np.int64]) -> Array:
     return np.concatenate([rows, waypoints[-1:]])
 
 
-def first_contact(checker: StateChecker, q_path: Array) -> Contact | None:
+def first_contact(checker: StateChecker, q_path: Floats) -> Contact | None:
     """The first contact along states (m, 6), the needle being outside the patient; None if all are free."""
     met = checker.first_contact(q_path, needle_may_touch_patient=False)
     return None if met is None else met.contact
 
 
-def least_clearance(checker: StateChecker, q_path: Array) -> Distances:
+def least_clearance(checker: StateChecker, q_path: Floats) -> Distances:
     """The least of each distance over states along a path, to ``CLEARANCE_STEP_MM``.
 
     Args:
@@ -86,7 +85,7 @@ def least_clearance(checker: StateChecker, q_path: Array) -> Distances:
 class _Path:
     """States whose distances are asked for. A body's distance changes by no more than the body moves."""
 
-    def __init__(self, checker: StateChecker, q: Array) -> None:
+    def __init__(self, checker: StateChecker, q: Floats) -> None:
         self._checker, self._q = checker, q
         sweeps = checker.body_sweeps_mm(q)
         self._moved = {body: np.concatenate([[0.0], np.cumsum(sweep)]) for body, sweep in sweeps.items()}

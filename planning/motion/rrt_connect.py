@@ -15,14 +15,13 @@ from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from ompl import base as ob, geometric as og, util as ou
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.checker import Contact
 
-Array = NDArray[np.float64]
-SegmentContact = Callable[[Array, Array], Contact | None]
+SegmentContact = Callable[[Floats, Floats], Contact | None]
 """What the straight joint segment between two states (6,) meets; None when it is free, its end included. Of a segment
 that begins at a state known to be free the judge is told that state first."""
 
@@ -46,7 +45,7 @@ branches touch something, a tree that later found its way out grew every 25 samp
 class Connected(NamedTuple):
     """What one run of the planner came to."""
 
-    waypoints: Array | None
+    waypoints: Floats | None
     """Shape (k, 6), rad: from home exactly to a goal exactly; None if it found no way."""
     goal_index: int
     """Which goal; -1 without a way."""
@@ -61,7 +60,7 @@ class Connected(NamedTuple):
 
 
 def connect(
-    joint_limits: Array, judge: SegmentContact, home: Array, goals: Array, *, seed: int, max_samples: int
+    joint_limits: Floats, judge: SegmentContact, home: Floats, goals: Floats, *, seed: int, max_samples: int
 ) -> Connected:
     """Plan from home to any of several goals, and shorten what was found.
 
@@ -112,7 +111,7 @@ class _Validator(ob.MotionValidator):  # type: ignore[misc]  # compiled, without
     from the goals the other way round, toward that tree.
     """
 
-    def __init__(self, information: ob.SpaceInformation, judge: SegmentContact, home: Array, goals: Array) -> None:
+    def __init__(self, information: ob.SpaceInformation, judge: SegmentContact, home: Floats, goals: Floats) -> None:
         super().__init__(information)
         self._judge = judge
         self._tree_of = {tuple(goal): GOAL_TREE for goal in goals.tolist()} | {tuple(home.tolist()): HOME_TREE}
@@ -152,7 +151,7 @@ def _angles(state: ob.State) -> tuple[float, ...]:
     return state[0], state[1], state[2], state[3], state[4], state[5]  # beyond them OMPL reads garbage
 
 
-def _space(joint_limits: Array) -> ob.RealVectorStateSpace:
+def _space(joint_limits: Floats) -> ob.RealVectorStateSpace:
     bounds = ob.RealVectorBounds(6)
     for joint, (low, high) in enumerate(joint_limits):
         bounds.setLow(joint, float(low))
@@ -162,7 +161,7 @@ def _space(joint_limits: Array) -> ob.RealVectorStateSpace:
     return space
 
 
-def _state(information: ob.SpaceInformation, q: Array) -> ob.State:
+def _state(information: ob.SpaceInformation, q: Floats) -> ob.State:
     state = information.allocState()
     for joint in range(6):
         state[joint] = float(q[joint])
@@ -177,7 +176,7 @@ def _shorten(information: ob.SpaceInformation, path: og.PathGeometric) -> None:
     simplifier.reduceVertices(path)
 
 
-def _with_exact_ends(waypoints: Array, home: Array, goals: Array) -> tuple[Array, int]:
+def _with_exact_ends(waypoints: Floats, home: Floats, goals: Floats) -> tuple[Floats, int]:
     """The planner's path with home and its goal put in exactly, after a look that it is one."""
     off = np.abs(goals - waypoints[-1]).max(axis=1)
     goal_index = int(np.argmin(off))

@@ -9,12 +9,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from ruckig import InputParameter, Result, Ruckig, Trajectory as Profile
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-
-Array = NDArray[np.float64]
 
 LENGTH_SLACK = 1e-6
 """Share of a length to spare for a change of speed: without, ruckig's rounding may miss the fit and take a detour."""
@@ -39,7 +37,7 @@ class TimeLaw(NamedTuple):
     profile: Profile | None
     """Ruckig's; None where the speed is constant."""
 
-    def driven(self, times_s: Array) -> Array:
+    def driven(self, times_s: Floats) -> Floats:
         """The length run at some times (m,) from 0 to ``duration_s``."""
         if self.profile is None:
             return np.asarray(self.length * times_s / self.duration_s)

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-
-Array = NDArray[np.float64]
 
 SAMPLE_S = 0.008
 """Spacing of the samples: the 125 Hz at which a UR3 takes joint targets."""
@@ -19,11 +17,11 @@ SAMPLE_S = 0.008
 class Peaks(NamedTuple):
     """The highest rates of each joint, by differences of the samples, from rest to rest; each of shape (6,)."""
 
-    speed: Array
+    speed: Floats
     """rad/s."""
-    acceleration: Array
+    acceleration: Floats
     """rad/s^2."""
-    jerk: Array
+    jerk: Floats
     """rad/s^3."""
 
 
@@ -39,8 +37,8 @@ class Trajectory:
         InputError: If shapes, times or numbers make no sense.
     """
 
-    times_s: Array
-    q: Array
+    times_s: Floats
+    q: Floats
 
     def __post_init__(self) -> None:
         times, q = np.array(self.times_s, dtype=np.float64), np.array(self.q, dtype=np.float64)
@@ -59,7 +57,7 @@ class Trajectory:
         """The time of the last sample, s."""
         return float(self.times_s[-1])
 
-    def at(self, time_s: Array | float) -> Array:
+    def at(self, time_s: Floats | float) -> Floats:
         """Joint angles at a time, or at many, clamped to the ends.
 
         Args:
@@ -70,7 +68,7 @@ class Trajectory:
         """
         return np.stack([np.interp(time_s, self.times_s, self.q[:, joint]) for joint in range(6)], axis=-1)
 
-    def max_speeds(self) -> Array:
+    def max_speeds(self) -> Floats:
         """The highest speed of each joint, shape (6,), rad/s."""
         return self.peaks().speed
 

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.collision.bounding_spheres import ball_tree, prism
 from puncture_twin.planning.place.obstacle_field import CELL_MM, Boxes, SkinField
-
-Floats = NDArray[np.float64]
 
 BALL_MM = 30.0
 """Bodies are cut until their balls are no larger: half of a UR3 wrist's size."""

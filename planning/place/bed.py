@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Axis, Case, axes_frame
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, view_frame
 from puncture_twin.planning.geometry.spaces import Space, to_lps
-
-Floats = NDArray[np.float64]
 
 UPRIGHT = 0.5
 """An entry frame whose z lies within 60 degrees of the body's long axis is not the direction up."""

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.candidates import Candidates
-
-Floats = NDArray[np.float64]
 
 SAME_RING_DIGITS = 7
 """θ equal to so many digits (rad) belong to one ring of the grid."""

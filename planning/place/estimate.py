@@ -7,19 +7,17 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.insertion import MIN_SINGULARITY, flange_poses
 from puncture_twin.planning.arm.kinematics import N_BRANCHES, inverse, link_poses, singularity
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.place.arm_spheres import ArmBalls, Surroundings, base_is_clear, clear_ways
 from puncture_twin.planning.place.directions import WantedDirections
 from puncture_twin.planning.place.mounts import Site
-
-Floats = NDArray[np.float64]
 
 STATES = 3
 """Of an insertion, from standoff to target: enough to see most of what ends it."""

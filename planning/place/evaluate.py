@@ -7,18 +7,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.state_checker import Contact
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.directions import WantedDirections
 from puncture_twin.planning.reach.reach import ReachRequest, assess_reach_all
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

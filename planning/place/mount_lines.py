@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case_file import MountSection
 from puncture_twin.planning.geometry.spaces import Space, to_lps
-
-Floats = NDArray[np.float64]
 
 POSITION_DIGITS = 1
 """Positions are written to 0.1 mm: nobody stands a base more exactly."""

@@ -9,14 +9,13 @@ from itertools import product
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case, Obstacle
 from puncture_twin.planning.case.case_file import MountBounds, MountName
 
-Floats = NDArray[np.float64]
 Range = tuple[float, float]
 
 FREE_MM = 100.0

@@ -8,12 +8,11 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.shapes import skin_surface, touch
 from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.directions import WantedDirections
-
-Floats = NDArray[np.float64]
 
 
 def needle_can_start(

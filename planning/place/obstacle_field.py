@@ -7,14 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from puncture_twin.planning.arm.tool import Box
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-Floats = NDArray[np.float64]
 
 CELL_MM = 8.0
 """Between the field's nodes; where the skin is smooth the values between them are right to about 1 mm."""

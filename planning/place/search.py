@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.case.case import Case, mount_pose
 from puncture_twin.planning.case.case_file import MountSection
@@ -34,7 +34,6 @@ from puncture_twin.planning.place.workers import ask_all
 from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.candidates import Candidates
 
-Floats = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
 COARSE_DIRECTIONS = 64

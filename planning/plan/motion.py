@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.checker import CellChecker, StateChecker
 from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, dense_states, least_clearance
 from puncture_twin.planning.plan.plan import Plan
-
-Floats = NDArray[np.float64]
 
 
 def phase_clearances(plan: Plan, checker: StateChecker) -> dict[str, float]:

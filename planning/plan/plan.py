@@ -10,11 +10,11 @@ from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.insertion import flange_at, needle_lines
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
@@ -25,7 +25,6 @@ from puncture_twin.planning.formats.guard import guard_transform
 from puncture_twin.planning.motion.follow import MAX_JERK
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Peaks, Trajectory
 
-Floats = NDArray[np.float64]
 Value = TypeVar("Value")
 
 PLAN_VERSION = 3

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.workcell import home_configuration
@@ -16,8 +15,6 @@ from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import Prepared
 from puncture_twin.planning.search.explain import reason_text
-
-Floats = NDArray[np.float64]
 
 SAME_DIRECTION = 1e-6
 """Largest difference of two unit vectors that name one direction: degrees in the file are rounded to 1e-15."""

@@ -6,13 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.checker import Contact
-
-Array = NDArray[np.float64]
 
 SAME_UNIT = 1e-9
 """How far a direction's length may be from 1."""
@@ -32,8 +30,8 @@ class ReachRequest:
         InputError: If something is not finite, the direction not a unit vector, or a length not positive.
     """
 
-    target_base: Array
-    outward_base: Array
+    target_base: Floats
+    outward_base: Floats
     needle_length_mm: float
     standoff_mm: float
 
@@ -76,8 +74,8 @@ class ReachAnswer:
     contact: Contact | None
     roll: float
     branch: int
-    insertion_q: Array
-    insertion_depth_mm: Array
+    insertion_q: Floats
+    insertion_depth_mm: Floats
     margin: float
 
     def __post_init__(self) -> None:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.insertion import reach_margin
 from puncture_twin.planning.arm.kinematics import wrapped_solutions
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.checker import StateChecker
 from puncture_twin.planning.reach.reach import ReachAnswer, ReachRequest, every_reach
-
-Array = NDArray[np.float64]
 
 MARGIN_SHARE = 0.5
 """A pose whose margin is below this share of the best one's is no goal: a shorter way is not worth a cramped arm."""
@@ -21,7 +19,7 @@ NEAREST = 4
 """Goals kept of each branch: those nearest to home."""
 
 
-def approach_goals(checker: StateChecker, request: ReachRequest, q_home: Array) -> list[ReachAnswer]:
+def approach_goals(checker: StateChecker, request: ReachRequest, q_home: Floats) -> list[ReachAnswer]:
     """The motions that may follow an approach, nearest to home first; empty if the arm does not hold the direction.
 
     Each answer of :func:`every_reach`, and the same with any joint turned by whole turns, as long as all of the

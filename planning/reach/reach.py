@@ -25,6 +25,7 @@ from puncture_twin.planning.arm.insertion import (
     why_unreachable,
 )
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.checker import Contact, StateChecker
@@ -39,7 +40,6 @@ __all__ = [
     "every_reach",
 ]
 
-Array = NDArray[np.float64]
 
 MAX_SWEEP_MM = 2.0
 """Between two collision checks no body point moves farther, so that it is never more than half of this from where it
@@ -64,10 +64,10 @@ class _Drive(NamedTuple):
     line: NeedleLine
     branch: int
     roll: float
-    turn: Array
+    turn: Floats
     """Shape (6,), rad: what to add to the branch's way at roll 0, the roll and whole turns."""
 
-    def along(self, model: UrModel, request: ReachRequest, depths_mm: Array) -> Array:
+    def along(self, model: UrModel, request: ReachRequest, depths_mm: Floats) -> Floats:
         """The motion at some depths, shape (m, 6), rad."""
         return branch_way(model, self.line, _distances(request, depths_mm), self.branch, self.turn)
 
@@ -85,8 +85,8 @@ class _Blocked(NamedTuple):
 class _Tried(NamedTuple):
     """A motion that was checked for contacts; ``block`` is None when it is clear to the target."""
 
-    q: Array
-    depths: Array
+    q: Floats
+    depths: Floats
     block: _Blocked | None
 
 
@@ -161,11 +161,11 @@ class _Surveyed(NamedTuple):
 
     request: ReachRequest
     line: NeedleLine
-    depths: Array
-    rolls: Array
+    depths: Floats
+    rolls: Floats
     stop_at: NDArray[np.int64]
-    margins: Array
-    turns: Array
+    margins: Floats
+    turns: Floats
 
     def drives(self) -> Iterator[_Drive]:
         """The motions that kinematics allows, see :func:`_drives`."""
@@ -205,7 +205,7 @@ def _answers(
 
 
 def _why_none(
-    model: UrModel, request: ReachRequest, line: NeedleLine, depths: Array, stop_at: NDArray[np.int64]
+    model: UrModel, request: ReachRequest, line: NeedleLine, depths: Floats, stop_at: NDArray[np.int64]
 ) -> ReachAnswer:
     """The refusal of a direction along which kinematics allows no motion."""
     if (stop_at < 0).any():
@@ -221,16 +221,16 @@ def _why_none(
     return _refusal(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail)
 
 
-def _depths(request: ReachRequest, step_mm: float) -> Array:
+def _depths(request: ReachRequest, step_mm: float) -> Floats:
     return np.linspace(0.0, request.standoff_mm, math.ceil(request.standoff_mm / step_mm) + 1)
 
 
-def _distances(request: ReachRequest, depths_mm: Array) -> Array:
+def _distances(request: ReachRequest, depths_mm: Floats) -> Floats:
     """Target to flange at each depth, mm."""
     return request.needle_length_mm + request.standoff_mm - depths_mm
 
 
-def _drives(line: NeedleLine, margins: Array, turns: Array, rolls: Array) -> Iterator[_Drive]:
+def _drives(line: NeedleLine, margins: Floats, turns: Floats, rolls: Floats) -> Iterator[_Drive]:
     """The motions that kinematics allows, the best margin first; of equals the first branch, then the first roll."""
     branches, rolled = np.nonzero(~np.isnan(margins))
     order = np.argsort(-np.round(margins[branches, rolled], MARGIN_DIGITS), kind="stable")
@@ -239,7 +239,7 @@ def _drives(line: NeedleLine, margins: Array, turns: Array, rolls: Array) -> Ite
         yield _Drive(line, branch, float(rolls[roll]), turns[branch, roll])
 
 
-def _first_clear(checker: StateChecker, request: ReachRequest, depths: Array, drives: Iterable[_Drive]) -> ReachAnswer:
+def _first_clear(checker: StateChecker, request: ReachRequest, depths: Floats, drives: Iterable[_Drive]) -> ReachAnswer:
     """The first of several motions that touches nothing; else a refusal with the one that came farthest."""
     blocks: list[_Blocked] = []
     hopeless: set[int] = set()
@@ -258,7 +258,7 @@ def _first_clear(checker: StateChecker, request: ReachRequest, depths: Array, dr
     return _refusal(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail, deepest.contact)
 
 
-def _try(checker: StateChecker, request: ReachRequest, drive: _Drive, depths: Array) -> _Tried:
+def _try(checker: StateChecker, request: ReachRequest, drive: _Drive, depths: Floats) -> _Tried:
     """Check one motion for contacts, standoff first."""
     model = checker.model
     standoff = drive.along(model, request, depths[:1])
@@ -281,7 +281,7 @@ def _try(checker: StateChecker, request: ReachRequest, drive: _Drive, depths: Ar
     return _Tried(q, depths, _Blocked(depth, detail, ROLL_BODY not in contact, contact=contact))
 
 
-def _refined(checker: StateChecker, request: ReachRequest, drive: _Drive, depths: Array) -> tuple[Array, Array]:
+def _refined(checker: StateChecker, request: ReachRequest, drive: _Drive, depths: Floats) -> tuple[Floats, Floats]:
     """The motion sampled so that no body moves more than ``MAX_SWEEP_MM`` from sample to sample, and its depths."""
     q = drive.along(checker.model, request, depths)
     while (worst := checker.sweep_mm(q).max()) > MAX_SWEEP_MM:

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Structure
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case, Needle
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM
-
-Floats = NDArray[np.float64]
 
 UNEVEN_SKIN_MM = 1.0
 """Added along the needle because skin is not flat and its triangles are coarser than it. On the embedded abdomen and

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.errors import InputError
@@ -21,7 +20,6 @@ from puncture_twin.planning.registration.registration import Registration, apply
 from puncture_twin.planning.registration.skin_fit import SkinFit, skin_fit
 from puncture_twin.planning.registration.touching import place_excluded, untouchable
 
-Floats = NDArray[np.float64]
 Signs = tuple[float, float, float]
 
 HALF_TURNS: Mapping[str, Signs] = MappingProxyType(

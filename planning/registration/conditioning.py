@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from puncture_twin.planning.base.arrays import Floats
 
 WEAK_SPREAD = 0.2
 """Conditioning flag: s2/s1 below it (spec: trips on the paper's A-C-D only)."""

@@ -13,12 +13,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.registration.registration import MarkerPairs, apply, fit_rigid
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.intp]
 
 MAX_NUMBERS = 20_000_000
 """Of one table of beginnings (160 MB): sets that are more alike than that are tested for swaps of two names only."""
@@ -98,7 +95,7 @@ def _rss(H: Floats, spreads: Floats | float) -> Floats:
     return np.asarray(np.maximum(spreads - 2 * values.sum(axis=-1), 0.0))
 
 
-def _matching(x: Floats, y: Floats, bound: float) -> Integers | None:
+def _matching(x: Floats, y: Floats, bound: float) -> Ints | None:
     """Every permutation that can have an RSS within the bound, shape (m, n); None where too many begin well."""
     count = len(x)
     in_ct, in_base = (np.linalg.norm(p[:, None] - p[None], axis=2) for p in (x, y))
@@ -116,7 +113,7 @@ def _matching(x: Floats, y: Floats, bound: float) -> Integers | None:
     return partial
 
 
-def _fitting_swaps(x: Floats, y: Floats, bound: float) -> Integers:
+def _fitting_swaps(x: Floats, y: Floats, bound: float) -> Ints:
     """The identity with two names exchanged, of every pair that keeps within the bound, shape (m, n)."""
     first, second = np.triu_indices(len(x), 1)
     exchanged = (y[first] - y[second])[:, :, None] * (x[first] - x[second])[:, None, :]
@@ -128,7 +125,7 @@ def _fitting_swaps(x: Floats, y: Floats, bound: float) -> Integers:
     return orders
 
 
-def _renaming(markers: MarkerPairs, order: Integers, T_given: Floats, target_ct: Floats) -> tuple[Renaming, float]:
+def _renaming(markers: MarkerPairs, order: Ints, T_given: Floats, target_ct: Floats) -> tuple[Renaming, float]:
     """The permutation, and how far it moves what it moves most (target or marker), mm."""
     permuted = markers.points_base[order]
     T = fit_rigid(markers.points_ct, permuted)

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.registration import Registration, match, register
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

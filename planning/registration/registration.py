@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.points.point_files import NamedPoints
 from puncture_twin.planning.registration.conditioning import Conditioning, conditioning, leverage
 from puncture_twin.planning.registration.residual_test import Interval, ResidualTest
-
-Floats = NDArray[np.float64]
 
 MIN_MARKERS = 3
 """Two points leave a rotation free."""

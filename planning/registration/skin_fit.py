@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtri
 
 from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.decimation import squared_distance
-
-Floats = NDArray[np.float64]
 
 MARKER_ON_SKIN_MM = 30.0
 """A skin marker's centre lies within its own height of the skin; one farther off stands on a frame, or is misread."""

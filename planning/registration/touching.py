@@ -6,11 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case, Obstacle
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-Floats = NDArray[np.float64]
 
 CONE = np.radians(60.0)
 """A marker is touched from within this angle of the skin's outward normal."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.crossings import crossings
 
@@ -16,8 +17,6 @@ STEP_MM = 1.0
 """Between two samples: finer than the voxels of nearly every CT."""
 BEYOND_SKIN_MM = 30.0
 """How far outside of the skin the path is followed."""
-
-Floats = NDArray[np.float64]
 
 
 class Stretch(NamedTuple):

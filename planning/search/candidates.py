@@ -8,11 +8,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats, Texts
 from puncture_twin.planning.base.reasons import Reason
-
-Floats = NDArray[np.float64]
-Texts = NDArray[np.object_]
-"""Strings of any length: an array of a fixed width would cut a name."""
 
 ARM_CHECKED = "checked"
 """What ``Candidates.arm`` says where a safe candidate is one that the arm can reach and insert along."""

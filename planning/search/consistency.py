@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
 from puncture_twin.planning.anatomy.inside_skin import LEAST_TOLERANCE_MM, inside_skin
@@ -22,7 +21,6 @@ from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.constraints import longest_path
 from puncture_twin.planning.search.resolution import resolution_warnings
 
-Floats = NDArray[np.float64]
 Headers = Mapping[str, VolumeHeader]
 
 USUAL_INSIDE = 0.99

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Role, Structure
 from puncture_twin.planning.anatomy.skin_entry import SkinPaths
+from puncture_twin.planning.base.arrays import Bools, Floats, Texts
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Needle
-from puncture_twin.planning.clearance.engine import Floats
 from puncture_twin.planning.clearance.measure import Clearances
-from puncture_twin.planning.search.candidates import Texts
 
-Bools = NDArray[np.bool_]
 Column = NDArray[Any] | str | float
 
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case_file import RankingSection
-
-Floats = NDArray[np.float64]
 
 COMFORT_MM = 20.0
 """Clearance from which on more is no better: several times any registration error that a case should have."""

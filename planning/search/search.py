@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
@@ -24,7 +24,6 @@ from puncture_twin.planning.search.constraints import judge
 from puncture_twin.planning.search.ranking import rank
 from puncture_twin.planning.search.tissue import tissue_crossed
 
-Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Role, Structure
-from puncture_twin.planning.clearance.engine import Floats
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.crossings import crossings
 

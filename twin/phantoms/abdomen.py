@@ -10,9 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.phantoms import bones, torso, vessels, viscera
-from puncture_twin.twin.phantoms.implicit import Array, Field
+from puncture_twin.twin.phantoms.implicit import Field
 from puncture_twin.twin.phantoms.mesher import Box, mesh_field
 from puncture_twin.twin.phantoms.viscera import LESION_CENTRE_LPS_MM
 
@@ -96,7 +97,7 @@ def abdomen_mesh(name: str) -> TriangleMesh:
     return mesh_field(field, _box(field, STRUCTURES[name].spacing_mm))
 
 
-def lesion_centre_ct() -> Array:
+def lesion_centre_ct() -> Floats:
     """Middle of the lesion, shape (3,), LPS mm."""
     return np.array(LESION_CENTRE_LPS_MM)
 

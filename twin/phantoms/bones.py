@@ -6,9 +6,9 @@ from functools import cache
 
 import numpy as np
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.phantoms import torso
 from puncture_twin.twin.phantoms.implicit import (
-    Array,
     Field,
     above,
     below,
@@ -41,7 +41,7 @@ def spine() -> Field:
     """The column from T5 to the sacrum, discs and processes included."""
     arches = [(z, _arch(z)) for z in torso.VERTEBRA_Z]
 
-    def field(points: Array) -> Array:
+    def field(points: Floats) -> Floats:
         value = _bodies(points)
         for z, arch in arches:
             near = np.abs(points[:, 2] - z) < 50.0
@@ -51,7 +51,7 @@ def spine() -> Field:
     return within(field, [above(2, torso.CONTENT_BOTTOM_MM), below(2, torso.CONTENT_TOP_MM)], 4.0)
 
 
-def _bodies(points: Array) -> Array:
+def _bodies(points: Floats) -> Floats:
     x, y, z = points.T
     height = np.clip(z, -180.0, 280.0)
     number = np.interp(z, torso.VERTEBRA_Z, np.arange(len(torso.VERTEBRA_Z)))
@@ -83,7 +83,7 @@ def _arch(z: float) -> Field:
     return union([right, mirrored(right), spinous], 5.0)
 
 
-def rib_path(number: int) -> Array:
+def rib_path(number: int) -> Floats:
     """Middle line of a right rib, head to front end, shape (n, 3), mm."""
     head_z = torso.VERTEBRA_Z[18 - number] + 6.0
     angle = np.radians(np.linspace(_RIB_START_DEG, _RIB_END_DEG[number], 14))
@@ -139,7 +139,7 @@ def costal_cartilages() -> Field:
     return carve(both, [sternum(), ribs_right(), ribs_left()], 0.8, 1.5)
 
 
-def _cartilage_path(number: int) -> Array:
+def _cartilage_path(number: int) -> Floats:
     """From just beyond the rib's end to the breastbone, or to the middle of the cartilage above, shape (9, 3), mm."""
     start = np.array([np.radians(_RIB_END_DEG[number]) + 0.085, rib_path(number)[-1, 2] - 4.0])
     if number in _CARTILAGE_GOAL:
@@ -152,7 +152,7 @@ def _cartilage_path(number: int) -> Array:
     return torso.on_cage(angle, start[1] + (goal[1] - start[1]) * share**1.3 + sag)
 
 
-def _angle_and_height(point: Array) -> Array:
+def _angle_and_height(point: Floats) -> Floats:
     centre = torso.on_cage(np.array([0.0, np.pi]), np.full(2, point[2])).mean(axis=0)
     return np.array([np.arctan2(-point[0], point[1] - centre[1]), point[2]])
 
@@ -161,14 +161,14 @@ def _angle_and_height(point: Array) -> Array:
 def hip_right() -> Field:
     """Upper part of the right iliac wing, a curved plate in the wall of the pelvis."""
 
-    def plate(points: Array) -> Array:
+    def plate(points: Floats) -> Floats:
         thickness = 4.2 + 2.0 * np.exp(-(((points[:, 2] - _crest(points)) / 12.0) ** 2))
         return np.asarray(np.abs(torso.cage(points) + 3.0) - thickness)
 
-    def crest(points: Array) -> Array:
+    def crest(points: Floats) -> Floats:
         return np.asarray((points[:, 2] - _crest(points)) * 0.85)
 
-    def front(points: Array) -> Array:
+    def front(points: Floats) -> Floats:
         return np.asarray(-54.0 + 0.35 * np.maximum(-104.0 - points[:, 2], 0.0) - points[:, 1])
 
     limits = [crest, front, above(2, torso.CONTENT_BOTTOM_MM), below(0, -50.0)]
@@ -181,7 +181,7 @@ def hip_left() -> Field:
     return mirrored(hip_right())
 
 
-def _crest(points: Array) -> Array:
+def _crest(points: Floats) -> Floats:
     """Height of the iliac crest over y, mm."""
     y = points[:, 1]
     return np.asarray(-78.0 - 40.0 * ((y - 12.0) / 62.0) ** 2)

@@ -13,9 +13,10 @@ from types import MappingProxyType
 
 import numpy as np
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_2
-from puncture_twin.twin.phantoms.implicit import Array, Field
+from puncture_twin.twin.phantoms.implicit import Field
 
 __all__ = ["LESIONS_CT_MM", "MARKERS_CT_MM", "TOUCHED_BASE_MM", "carton_field", "carton_meshes"]
 
@@ -52,19 +53,19 @@ def carton_field(name: str) -> Field:
         raise KeyError(f"no structure {name!r} in the carton; there are: skin, {', '.join(bolts)}")
     x, y, top = bolts[name]
 
-    def field(points: Array) -> Array:
+    def field(points: Floats) -> Floats:
         beside = np.hypot(points[:, 0] - x, points[:, 1] - y) - _BOLT_RADIUS_MM
         return _corner_distance(np.stack([beside, np.maximum(-points[:, 2], points[:, 2] - top)], axis=1))
 
     return field
 
 
-def _box_field(points: Array) -> Array:
+def _box_field(points: Floats) -> Floats:
     low, high = np.array(BOX_LOW_MM), np.array(BOX_HIGH_MM)
     return _corner_distance(np.maximum(low - points, points - high))
 
 
-def _corner_distance(beyond: Array) -> Array:
+def _corner_distance(beyond: Floats) -> Floats:
     """Signed distance from how far a point is beyond each pair of faces, shape (n, k)."""
     return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0))
 
@@ -87,7 +88,7 @@ def _box() -> TriangleMesh:
     return TriangleMesh(low + share * (high - low), np.array(faces, dtype=np.int32))
 
 
-def _bolt(end: Array) -> TriangleMesh:
+def _bolt(end: Floats) -> TriangleMesh:
     """A cylinder from the floor (z = 0) to its end; its corners lie on the true circle."""
     rings = round(float(end[2]) / _BOLT_RINGS_MM) + 1
     angle = 2 * np.pi * np.arange(_BOLT_SIDES) / _BOLT_SIDES

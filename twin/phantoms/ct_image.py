@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.twin.phantoms.implicit import Array, Field
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.twin.phantoms.implicit import Field
 
 AIR_HU = -1000.0
 
@@ -42,19 +43,19 @@ class Grid:
     shape: tuple[int, int, int]
 
     @property
-    def affine(self) -> Array:
+    def affine(self) -> Floats:
         """T_ct_index, shape (4, 4): voxel index to LPS mm."""
         T = np.diag([*self.spacing_mm, 1.0])
         T[:3, 3] = self.low_mm
         return T
 
-    def centres(self) -> Array:
+    def centres(self) -> Floats:
         """Of all voxels, shape (n, 3), LPS mm, the last index first."""
         index = np.indices(self.shape).reshape(3, -1).T
         return np.asarray(index * self.spacing_mm + self.low_mm)
 
 
-def rendered(parts: Sequence[Part], grid: Grid, *, noise_hu: float, rng: np.random.Generator) -> Array:
+def rendered(parts: Sequence[Part], grid: Grid, *, noise_hu: float, rng: np.random.Generator) -> Floats:
     """Hounsfield units of a scene, shape ``grid.shape``.
 
     A body's field grows by about 1 per mm, so a voxel as wide as w whose centre has the value d is filled by about

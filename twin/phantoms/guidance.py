@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.phantoms import torso
-from puncture_twin.twin.phantoms.implicit import Array
 from puncture_twin.twin.phantoms.viscera import LESION_CENTRE_LPS_MM
 
 __all__ = ["GUIDANCE_SEED", "Guidance", "abdomen_guidance", "patient_placement", "skin_markers_ct"]
@@ -40,12 +40,12 @@ class Guidance:
         truth_base: Markers and ``target`` where they really are, in the base frame.
     """
 
-    markers_ct: dict[str, Array]
-    touched_base: dict[str, Array]
-    truth_base: dict[str, Array]
+    markers_ct: dict[str, Floats]
+    touched_base: dict[str, Floats]
+    truth_base: dict[str, Floats]
 
 
-def patient_placement() -> Array:
+def patient_placement() -> Floats:
     """Where the patient truly lies: T_base_ct, CT frame to base frame, shape (4, 4), mm."""
     T_base_ct = np.eye(4)
     T_base_ct[:3, :3] = np.array(BASE_AXES_CT)
@@ -53,7 +53,7 @@ def patient_placement() -> Array:
     return T_base_ct
 
 
-def skin_markers_ct() -> dict[str, Array]:
+def skin_markers_ct() -> dict[str, Floats]:
     """True marker positions M1 to M6 on the skin, LPS, mm."""
     around, up = np.radians(np.array(MARKER_DIRECTIONS_DEG)).T
     directions = np.stack([-np.cos(around) * np.cos(up), -np.sin(around) * np.cos(up), np.sin(up)], axis=1)
@@ -61,7 +61,7 @@ def skin_markers_ct() -> dict[str, Array]:
     return {f"M{number}": point for number, point in enumerate(points, start=1)}
 
 
-def _leave_skin(start: Array, directions: Array) -> Array:
+def _leave_skin(start: Floats, directions: Floats) -> Floats:
     """Where rays from inside cross the skin, by bisection of its field, shape (n, 3)."""
     low, high = np.zeros(len(directions)), np.full(len(directions), _FARTHEST_MM)
     for _ in range(_HALVINGS):

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.twin.phantoms.implicit import Array, Field, above, below, capsule, carve, ellipsoid, union, within
+from puncture_twin.twin.phantoms.implicit import Field, above, below, capsule, carve, ellipsoid, union, within
 from puncture_twin.twin.phantoms.mesher import Box, mesh_field
 
 __all__ = ["MARKERS_MM", "RIM_MM", "head_field", "head_mesh", "head_targets"]
@@ -61,7 +62,7 @@ def head_mesh() -> TriangleMesh:
     return mesh_field(head_field(), Box((-88.0, -122.0, -118.0), (88.0, 106.0, 38.0), SPACING_MM))
 
 
-def head_targets() -> dict[str, Array]:
+def head_targets() -> dict[str, Floats]:
     """Sixteen targets T1 to T16 in the hollow: two rings of eight, the lower one narrower and turned by half a step."""
     targets = []
     for radius, height, turn in ((36.0, 12.0, 0.0), (24.0, -8.0, np.pi / 8)):

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
-Field = Callable[[Array], Array]
+from puncture_twin.planning.base.arrays import Floats
+
+Field = Callable[[Floats], Floats]
 """Takes points (n, 3), mm, and returns (n,) values, mm: < 0 inside, 0 on the surface, > 0 outside."""
 
 _EVALUATE_WITHIN_MM = 12.0
@@ -18,13 +19,13 @@ _NEAR_CENTRE = 1e-9
 """Keeps the distance estimate of an ellipsoid finite at its very centre."""
 
 
-def smooth_max(a: Array, b: Array, blend_mm: float) -> Array:
+def smooth_max(a: Floats, b: Floats, blend_mm: float) -> Floats:
     """Maximum of two fields with the crease rounded over ``blend_mm``; never below the true maximum."""
     overlap = np.maximum(blend_mm - np.abs(a - b), 0.0) / blend_mm
     return np.asarray(np.maximum(a, b) + overlap**2 * blend_mm / 4.0)
 
 
-def smooth_min(a: Array, b: Array, blend_mm: float) -> Array:
+def smooth_min(a: Floats, b: Floats, blend_mm: float) -> Floats:
     """Minimum of two fields with the crease filled over ``blend_mm``; never above the true minimum."""
     return -smooth_max(-a, -b, blend_mm)
 
@@ -32,7 +33,7 @@ def smooth_min(a: Array, b: Array, blend_mm: float) -> Array:
 def union(fields: Sequence[Field], blend_mm: float) -> Field:
     """The bodies together, their joins filled over ``blend_mm``."""
 
-    def field(points: Array) -> Array:
+    def field(points: Floats) -> Floats:
         value = fields[0](points)
         for other in fields[1:]:
             value = smooth_min(value, other(points), blend_mm)
@@ -49,7 +50,7 @@ def offset(body: Field, distance_mm: float) -> Field:
 def within(body: Field, limits: Sequence[Field], blend_mm: float) -> Field:
     """The part of a body that lies inside every limit, edges rounded over ``blend_mm``."""
 
-    def field(points: Array) -> Array:
+    def field(points: Floats) -> Floats:
         value = body(points)
         near = value < _EVALUATE_WITHIN_MM
         inner, kept = points[near], value[near]
@@ -84,7 +85,7 @@ def ellipsoid(centre: ArrayLike, radii: ArrayLike, turn: Rotation | None = None)
     middle, half = np.asarray(centre, dtype=float), np.asarray(radii, dtype=float)
     to_axes = np.eye(3) if turn is None else turn.as_matrix()
 
-    def field(points: Array) -> Array:
+    def field(points: Floats) -> Floats:
         local = (points - middle) @ to_axes / half
         k = np.linalg.norm(local, axis=1)
         slope = np.linalg.norm(local / half, axis=1)
@@ -99,7 +100,7 @@ def capsule(start: ArrayLike, end: ArrayLike, radius_start_mm: float, radius_end
     axis = b - a
     thin = radius_start_mm if radius_end_mm is None else radius_end_mm
 
-    def field(points: Array) -> Array:
+    def field(points: Floats) -> Floats:
         along = np.clip((points - a) @ axis / (axis @ axis), 0.0, 1.0)
         distance = np.linalg.norm(points - a - along[:, None] * axis, axis=1)
         return np.asarray(distance - radius_start_mm - along * (thin - radius_start_mm))

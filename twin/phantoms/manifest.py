@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.phantoms import abdomen, carton, guidance, head
-from puncture_twin.twin.phantoms.implicit import Array
 
 __all__ = ["ply_bytes", "points_csv", "write_phantoms"]
 
@@ -60,7 +60,7 @@ def ply_bytes(mesh: TriangleMesh) -> bytes:
     return header.encode("ascii") + mesh.vertices.astype("<f4").tobytes() + faces.tobytes()
 
 
-def points_csv(points: dict[str, Array], decimals: int) -> bytes:
+def points_csv(points: dict[str, Floats], decimals: int) -> bytes:
     """Named points as CSV: name, x_mm, y_mm, z_mm."""
     rows = [",".join([name, *(f"{value:.{decimals}f}" for value in point)]) for name, point in points.items()]
     return ("\n".join(["name,x_mm,y_mm,z_mm", *rows]) + "\n").encode("ascii")

@@ -9,8 +9,9 @@ from scipy.ndimage import zoom
 from scipy.sparse import csr_matrix
 from skimage.measure import marching_cubes
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import Faces, TriangleMesh
-from puncture_twin.twin.phantoms.implicit import Array, Field
+from puncture_twin.twin.phantoms.implicit import Field
 
 _COARSE = 4
 """Grid nodes per coarse node. Far from the surface the coarse values, interpolated, are good enough."""
@@ -59,7 +60,7 @@ def mesh_field(field: Field, box: Box) -> TriangleMesh:
     return TriangleMesh(vertices, faces)
 
 
-def _sample(field: Field, box: Box) -> Array:
+def _sample(field: Field, box: Box) -> Floats:
     """Field values on the grid, exact in a band about the surface, interpolated elsewhere."""
     low, high = np.asarray(box.low), np.asarray(box.high)
     cells = _COARSE * np.ceil((high - low) / (box.spacing_mm * _COARSE)).astype(int)
@@ -73,13 +74,13 @@ def _sample(field: Field, box: Box) -> Array:
     return np.asarray(values)
 
 
-def _outward(vertices: Array, faces: Faces) -> Faces:
+def _outward(vertices: Floats, faces: Faces) -> Faces:
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     volume = np.sum(a * np.cross(b, c))
     return faces if volume > 0 else np.ascontiguousarray(faces[:, ::-1])
 
 
-def _relax(field: Field, vertices: Array, faces: Faces, spacing_mm: float) -> Array:
+def _relax(field: Field, vertices: Floats, faces: Faces, spacing_mm: float) -> Floats:
     """Slide the vertices along the surface to even spacing, then put them onto the zero set."""
     mean = _neighbour_mean(faces, len(vertices))
     for _ in range(_RELAXATIONS):
@@ -91,7 +92,7 @@ def _relax(field: Field, vertices: Array, faces: Faces, spacing_mm: float) -> Ar
     return _project(field, vertices, spacing_mm)
 
 
-def _along(field: Field, vertices: Array, directions: Array, spacing_mm: float) -> Array:
+def _along(field: Field, vertices: Floats, directions: Floats, spacing_mm: float) -> Floats:
     """One Newton step along given directions; at most a quarter of the grid spacing."""
     value = field(vertices)
     slope = (field(vertices + _PROBE_MM * directions) - value) / _PROBE_MM
@@ -99,7 +100,7 @@ def _along(field: Field, vertices: Array, directions: Array, spacing_mm: float) 
     return np.asarray(vertices + step[:, None] * directions)
 
 
-def _project(field: Field, vertices: Array, spacing_mm: float) -> Array:
+def _project(field: Field, vertices: Floats, spacing_mm: float) -> Floats:
     """Newton steps along the gradient, each at most a quarter of the spacing, halved where it does not help."""
     vertices, values = vertices.copy(), field(vertices)
     damping = np.ones(len(vertices))
@@ -118,7 +119,7 @@ def _project(field: Field, vertices: Array, spacing_mm: float) -> Array:
     return vertices
 
 
-def field_gradient(field: Field, points: Array) -> Array:
+def field_gradient(field: Field, points: Floats) -> Floats:
     """Gradient of a field by central differences, shape (n, 3)."""
     probes = _PROBE_MM * np.eye(3)
     return np.stack([(field(points + probe) - field(points - probe)) / (2 * _PROBE_MM) for probe in probes], axis=1)
@@ -133,7 +134,7 @@ def _neighbour_mean(faces: Faces, count: int) -> csr_matrix:
     return csr_matrix(links.multiply(1.0 / degree[:, None]))
 
 
-def _vertex_normals(vertices: Array, faces: Faces) -> Array:
+def _vertex_normals(vertices: Floats, faces: Faces) -> Floats:
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     area = np.cross(b - a, c - a)
     normals = np.stack(

@@ -10,9 +10,10 @@ from typing import Literal
 
 import numpy as np
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.phantoms import torso
 from puncture_twin.twin.phantoms.ct_image import Grid, Part
-from puncture_twin.twin.phantoms.implicit import Array, Field, capsule, ellipsoid, offset, within
+from puncture_twin.twin.phantoms.implicit import Field, capsule, ellipsoid, offset, within
 
 LESION_LPS_MM = (-55.0, 20.0, 0.0)
 """In the right half of the trunk, nearer to the back."""
@@ -30,7 +31,7 @@ def slab(low: tuple[float, float, float], high: tuple[float, float, float]) -> F
     """A box with edges along the axes."""
     a, b = np.array(low), np.array(high)
 
-    def field(points: Array) -> Array:
+    def field(points: Floats) -> Floats:
         return np.asarray(np.maximum(a - points, points - b).max(axis=1))
 
     return field

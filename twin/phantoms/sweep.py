@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.spatial import cKDTree
 
-from puncture_twin.twin.phantoms.implicit import Array, Field
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.twin.phantoms.implicit import Field
 
 _SAMPLE_MM = 1.5
 """Step of the polyline along the curve; with the spans beside the nearest node the distance errs below 0.01 mm."""
@@ -24,16 +25,16 @@ class Curve:
         share: Shape (n,), the control points' running number at each node (0 at the first, m - 1 at the last).
     """
 
-    points: Array
-    share: Array
+    points: Floats
+    share: Floats
 
 
 @dataclass(frozen=True, eq=False)
 class Foot:
     """Nearest places on a curve: ``place`` (n, 3), mm; ``node`` (n,), fractional index into the curve's nodes."""
 
-    place: Array
-    node: Array
+    place: Floats
+    node: Floats
 
 
 def smooth_curve(controls: ArrayLike) -> Curve:
@@ -49,7 +50,7 @@ def smooth_curve(controls: ArrayLike) -> Curve:
     return Curve(points=points, share=np.interp(at, chord, np.arange(len(knots))))
 
 
-def nearest(curve: Curve, tree: cKDTree, points: Array) -> Foot:
+def nearest(curve: Curve, tree: cKDTree, points: Floats) -> Foot:
     """The foot of each point on the curve: the nearest node, then the better of the two spans beside it."""
     last = len(curve.points) - 1
     hit = tree.query(points)[1]
@@ -81,7 +82,7 @@ def tube(controls: ArrayLike, radii_mm: ArrayLike, folds_mm: float = 0.0, fold_l
     radius = radius - folds_mm * (0.5 + 0.5 * np.cos(2 * np.pi * length / fold_length_mm))
     tree, index = cKDTree(curve.points), np.arange(len(radius))
 
-    def field(points: Array) -> Array:
+    def field(points: Floats) -> Floats:
         foot = nearest(curve, tree, points)
         return np.asarray(np.linalg.norm(points - foot.place, axis=1) - np.interp(foot.node, index, radius))
 
@@ -106,7 +107,7 @@ def ribbon(controls: ArrayLike, outward: ArrayLike, half_height_mm: float, half_
     tree, index = cKDTree(curve.points), np.arange(len(height))
     flat = half_height_mm - half_thickness_mm
 
-    def field(points: Array) -> Array:
+    def field(points: Floats) -> Floats:
         foot = nearest(curve, tree, points)
         up = np.stack([np.interp(foot.node, index, column) for column in height.T], axis=1)
         offset = points - foot.place

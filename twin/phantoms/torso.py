@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from puncture_twin.twin.phantoms.implicit import Array, Field, smooth_max, smooth_min
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.twin.phantoms.implicit import Field, smooth_max, smooth_min
 
 TOP_MM, BOTTOM_MM = 258.0, -192.0
 """The trunk ends here, with rounded rims; like the edge of a scan, these two ends are not real skin."""
@@ -51,28 +52,28 @@ _BODY_WIDTH = PchipInterpolator(
 _BODY_DEPTH = PchipInterpolator((-180, -125, -73, 0, 97, 203, 280), (17, 18, 17.5, 17, 16, 14.5, 13.5))
 
 
-def spine_y(z: Array) -> Array:
+def spine_y(z: Floats) -> Floats:
     """Where the vertebral bodies' middle lies in y at height z, mm."""
     return np.asarray(_SPINE_Y(z))
 
 
-def body_half_width(z: Array) -> Array:
+def body_half_width(z: Floats) -> Floats:
     """Half width of the vertebral bodies at height z, mm."""
     return np.asarray(_BODY_WIDTH(z))
 
 
-def body_half_depth(z: Array) -> Array:
+def body_half_depth(z: Floats) -> Floats:
     """Half depth of the vertebral bodies at height z, mm."""
     return np.asarray(_BODY_DEPTH(z))
 
 
-def cage(points: Array) -> Array:
+def cage(points: Floats) -> Floats:
     """Field of the surface in which the ribs' middle lines lie, and its continuation in the wall of the belly."""
     z = np.clip(points[:, 2], _Z[0], _Z[-1])
     return _section(points[:, 0], points[:, 1] - _CENTRE_Y(z), _HALF_WIDTH(z), _HALF_DEPTH(z))
 
 
-def on_cage(angle_rad: Array, z: Array) -> Array:
+def on_cage(angle_rad: Floats, z: Floats) -> Floats:
     """Points of the cage surface, right side.
 
     Args:
@@ -92,7 +93,7 @@ def inside_cage(inset_mm: float) -> Field:
     return lambda points: cage(points) + inset_mm
 
 
-def skin(points: Array) -> Array:
+def skin(points: Floats) -> Floats:
     """Field of the trunk's surface, with navel and furrow of the back."""
     x, y, z = points.T
     height = np.clip(z, _Z[0], _Z[-1])
@@ -105,7 +106,7 @@ def skin(points: Array) -> Array:
     return smooth_max(wall + navel + furrow + linea, ends, 34.0)
 
 
-def diaphragm(points: Array) -> Array:
+def diaphragm(points: Floats) -> Floats:
     """Field of the room below the diaphragm: a high right dome, a lower left one, and the saddle of the heart."""
     right = _dome(points, (-58.0, 0.0), (71.0, 80.0, 112.0))
     left = _dome(points, (64.0, 2.0), (66.0, 78.0, 94.0))
@@ -113,7 +114,7 @@ def diaphragm(points: Array) -> Array:
     return smooth_min(smooth_min(right, left, 20.0), middle, 20.0)
 
 
-def spinal_mass(points: Array) -> Array:
+def spinal_mass(points: Floats) -> Floats:
     """Field of the spine with the muscles and crura around it: no organ of the belly or chest enters it."""
     x, y, z = points.T
     height = np.clip(z, -180.0, 280.0)
@@ -124,7 +125,7 @@ def spinal_mass(points: Array) -> Array:
     return smooth_min(bodies, back, 12.0)
 
 
-def _dome(points: Array, centre: tuple[float, float], radii: tuple[float, float, float]) -> Array:
+def _dome(points: Floats, centre: tuple[float, float], radii: tuple[float, float, float]) -> Floats:
     """An upright half ellipsoid from z = 42 upward, a cylinder below."""
     lift = np.maximum(points[:, 2] - 42.0, 0.0)
     local = np.stack([points[:, 0] - centre[0], points[:, 1] - centre[1], lift], axis=1)
@@ -133,11 +134,11 @@ def _dome(points: Array, centre: tuple[float, float], radii: tuple[float, float,
     return np.asarray(k * (k - 1.0) / np.maximum(slope, 1e-9))
 
 
-def _superellipse(u: Array, v: Array) -> Array:
+def _superellipse(u: Floats, v: Floats) -> Floats:
     return np.asarray((np.abs(u) ** _ROUNDNESS + np.abs(v) ** _ROUNDNESS) ** (1.0 / _ROUNDNESS))
 
 
-def _section(x: Array, y: Array, half_width: Array, half_depth: Array) -> Array:
+def _section(x: Floats, y: Floats, half_width: Floats, half_depth: Floats) -> Floats:
     """Distance along the ray from the middle of a section to its rim, mm."""
     radius = np.hypot(x, y)
     k = np.maximum(_superellipse(x / half_width, y / half_depth), 1e-9)

@@ -8,19 +8,9 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.phantoms import bones, torso, vessels
-from puncture_twin.twin.phantoms.implicit import (
-    Array,
-    Field,
-    above,
-    below,
-    carve,
-    ellipsoid,
-    mirrored,
-    offset,
-    union,
-    within,
-)
+from puncture_twin.twin.phantoms.implicit import Field, above, below, carve, ellipsoid, mirrored, offset, union, within
 from puncture_twin.twin.phantoms.sweep import tube
 
 LESION_CENTRE_LPS_MM = (-90.0, -10.0, 60.0)
@@ -71,7 +61,7 @@ def liver() -> Field:
     return carve(pressed, [torso.spinal_mass, vessels.aorta()], 4.0, 8.0)
 
 
-def _visceral_face(points: Array) -> Array:
+def _visceral_face(points: Floats) -> Floats:
     x, y, z = points.T
     face = 43.0 + 0.56 * (x + 20.0) + 0.42 * (y + 20.0)
     gate = 20.0 * np.exp(-(((x + 24.0) / 26.0) ** 2) - ((y + 8.0) / 22.0) ** 2)
@@ -79,7 +69,7 @@ def _visceral_face(points: Array) -> Array:
     return np.asarray((face + gate + notch - z) * 0.8)
 
 
-def _left_edge(points: Array) -> Array:
+def _left_edge(points: Floats) -> Floats:
     x, y, _ = points.T
     return np.asarray((x - 62.0) * 0.9 + 0.35 * (y + 40.0))
 
@@ -212,7 +202,7 @@ def small_bowel() -> Field:
     return carve(room, [colon(), duodenum(), *near], _GAP_MM, 3.0)
 
 
-def _loop_row(row: int, z: float) -> Array:
+def _loop_row(row: int, z: float) -> Floats:
     """Middle line of one row of loops, to the left in even rows and back in odd ones, shape (9, 3), mm."""
     i = np.arange(9)
     x = np.linspace(-50.0, 60.0, 9)[:: 1 if row % 2 == 0 else -1]
@@ -229,7 +219,7 @@ def heart() -> Field:
     return carve(room, near, 1.5, 6.0)
 
 
-def _recess(points: Array) -> Array:
+def _recess(points: Floats) -> Floats:
     """Lower end of the lungs: higher in front than behind, and highest beside the breastbone."""
     x, y, z = points.T
     front = 36.0 * np.exp(-((x / 55.0) ** 2)) / (1.0 + np.exp((y + 25.0) / 10.0))

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, singularity
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
-
-Floats = NDArray[np.float64]
 
 TILTS_DEG = (0.0, 15.0, 30.0, 45.0, 60.0)
 """How far the needle may lean from the wished direction, tried in this order."""

@@ -10,11 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.ur import UrModel
-
-Floats = NDArray[np.float64]
+from puncture_twin.planning.base.arrays import Floats
 
 
 class ArmErrors(NamedTuple):

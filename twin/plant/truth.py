@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import RegistrationSection
@@ -22,8 +22,6 @@ from puncture_twin.planning.registration.registration import (
     fit_triad,
     match,
 )
-
-Floats = NDArray[np.float64]
 
 COLLINEAR = 0.01
 """s2/s1 of the true points below which they leave a rotation free."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.collision.workcell import case_boxes, case_checker, case_tool
@@ -26,8 +27,6 @@ from puncture_twin.twin.plant.truth import Truth
 from puncture_twin.twin.world.client import TIME_STEP_S
 from puncture_twin.twin.world.execution import Execution, execute
 from puncture_twin.twin.world.workcell import open_room
-
-Floats = NDArray[np.float64]
 
 SETTLE_S = 0.5
 """Pause between approach and insertion: ten times the time in which a motor's lag dies out."""

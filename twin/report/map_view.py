@@ -14,11 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, angles
 from puncture_twin.planning.search.candidates import Candidates
-
-Floats = NDArray[np.float64]
 
 WORDS_LPS = {
     "left": "patient's left",

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.place.mounts import Region
 from puncture_twin.twin.report.map_view import body_directions
-
-Floats = NDArray[np.float64]
 
 NEARLY = 0.985
 """Cosine from which a direction carries a body direction's name (10 degrees)."""

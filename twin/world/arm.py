@@ -9,17 +9,15 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.links import T_BASE_URDFBASE
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.world.arm_file import write_arm_urdf
 from puncture_twin.twin.world.engine import pybullet
 from puncture_twin.twin.world.units import pose_to_m, pose_to_mm
-
-Floats = NDArray[np.float64]
 
 FLANGE = "tool0"
 """The URDF's link whose frame is the controller's flange."""

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import fast_simplification
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.world.engine import pybullet
 from puncture_twin.twin.world.surface_file import write_obj
 from puncture_twin.twin.world.units import pose_to_m, to_m
 
-Floats = NDArray[np.float64]
 Rgba = tuple[float, float, float, float]
 
 MAX_PHYSICS_FACES = 20_000

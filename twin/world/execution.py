@@ -8,11 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.world.client import TIME_STEP_S, step
 from puncture_twin.twin.world.contacts import touches
 from puncture_twin.twin.world.workcell import Room
-
-Floats = NDArray[np.float64]
 
 RECORD_EVERY = 4
 """Physics steps between two records: 60 records a second."""

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-Floats = NDArray[np.float64]
+from puncture_twin.planning.base.arrays import Floats
 
 MM_PER_M = 1000.0
 

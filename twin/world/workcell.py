@@ -11,17 +11,15 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.world.arm import Arm, load_arm
 from puncture_twin.twin.world.bodies import let_pass, load_box, load_surface
 from puncture_twin.twin.world.client import physics_client
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

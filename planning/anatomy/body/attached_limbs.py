@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from puncture_twin.planning.anatomy.body.detached_parts import BONE_HU, MIN_BONE_ML
+from puncture_twin.planning.base.arrays import Bools, Floats
 
 NECK_MM = 30.0
 """Radius of a ball that fits into an adult's upper arm (35 to 50 mm) and thigh, and not through the place where an arm
@@ -18,11 +19,8 @@ is pressed against the trunk, some 50 mm wide. A thinner arm, and one that is pr
 SAMPLING_MM = 4.0
 """Spacing at which necks are looked for."""
 
-Mask = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 
-
-def attached_limbs(hu: NDArray[np.float32], body: Mask, spacing_mm: Floats, target_index: Floats) -> Mask:
+def attached_limbs(hu: NDArray[np.float32], body: Bools, spacing_mm: Floats, target_index: Floats) -> Bools:
     """Voxels of the body that belong to another part than the target, with bone, joined to it by a narrow neck.
 
     Args:
@@ -49,13 +47,13 @@ def attached_limbs(hu: NDArray[np.float32], body: Mask, spacing_mm: Floats, targ
     return limbs
 
 
-def _holding(body: Mask, at: tuple[int, ...]) -> Mask:
+def _holding(body: Bools, at: tuple[int, ...]) -> Bools:
     """The connected part of the body that holds a voxel; the others are limbs with a skin of their own."""
     labels, _ = ndimage.label(body)
     return np.asarray(labels == labels[at]) & body
 
 
-def _nearest_core(body: Mask, spacing_mm: Floats) -> NDArray[np.int32]:
+def _nearest_core(body: Bools, spacing_mm: Floats) -> NDArray[np.int32]:
     """For every voxel of a body, the number of the nearest place into which the ball fits; 0 outside."""
     reach = np.ceil(NECK_MM / spacing_mm).astype(int)
     padded = np.pad(body, [(r, r) for r in reach], mode="edge")

@@ -16,6 +16,7 @@ from puncture_twin.planning.anatomy.body.detached_parts import (
     thick_parts,
 )
 from puncture_twin.planning.anatomy.body.flat_side import FlatSide, flat_sides
+from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.errors import InputError
 
 BODY_HU = -500.0
@@ -38,8 +39,6 @@ MIN_OUTSIDE_ML = 50.0
 MIN_BODY_ML = 100.0
 """Less than a tenth of a newborn's head: something else was found."""
 
-Mask = NDArray[np.bool_]
-
 
 @dataclass(frozen=True, eq=False)
 class BodyMask:
@@ -52,8 +51,8 @@ class BodyMask:
         flat_sides: Where the body ends in a plane, as a table does that touches it.
     """
 
-    body: Mask
-    unscanned: Mask
+    body: Bools
+    unscanned: Bools
     warnings: tuple[str, ...]
     flat_sides: tuple[FlatSide, ...] = ()
 
@@ -98,7 +97,7 @@ def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where
     return BodyMask(body, unscanned, tuple(warnings), sides)
 
 
-def unscanned_voxels(hu: NDArray[np.float32]) -> Mask:
+def unscanned_voxels(hu: NDArray[np.float32]) -> Bools:
     """Voxels that the scanner did not measure: far below air, or one least value that fills what is outside a circle.
 
     Many scanners write the value of air, -1024, outside of their circle of reconstruction: what is there is no air. In
@@ -120,7 +119,7 @@ def unscanned_voxels(hu: NDArray[np.float32]) -> Mask:
     return np.asarray(unscanned)
 
 
-def _outside_a_circle(padding: Mask) -> bool:
+def _outside_a_circle(padding: Bools) -> bool:
     """Whether pixels (nx, ny) are just those outside of a circle that fills the image."""
     inside = np.argwhere(~padding)
     if not padding.any() or len(inside) == 0:
@@ -134,12 +133,12 @@ def _outside_a_circle(padding: Mask) -> bool:
     return bool(farthest - nearest < CIRCLE_PIXELS)
 
 
-def filled_slices(mask: Mask) -> Mask:
+def filled_slices(mask: Bools) -> Bools:
     """The mask with every hole filled that it encloses in a slice across axis 2."""
     return np.stack([ndimage.binary_fill_holes(mask[:, :, k]) for k in range(mask.shape[2])], axis=2)
 
 
-def _with_cut_lungs(body: Mask, hu: NDArray[np.float32], voxel_ml: float, warnings: list[str]) -> Mask:
+def _with_cut_lungs(body: Bools, hu: NDArray[np.float32], voxel_ml: float, warnings: list[str]) -> Bools:
     """Fills air regions that are not the room: small ones, and those with the density of lung."""
     labels, count = ndimage.label(~body)
     if count == 0:

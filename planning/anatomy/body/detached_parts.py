@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
+
 OPENING_MM = 6.0
 """Parts thinner than twice this are no trunk, head or limb: table tops, sheets, tubes."""
 SAMPLING_MM = 3.0
@@ -29,12 +31,8 @@ ALIKE = 0.9
 """Overlap (intersection over union) of sections with the median one, from which on a part is one section drawn along
 the bed."""
 
-Mask = NDArray[np.bool_]
-Labels = NDArray[np.int32]
-Floats = NDArray[np.float64]
 
-
-def thick_parts(mask: Mask, spacing_mm: Floats) -> Labels:
+def thick_parts(mask: Bools, spacing_mm: Floats) -> Ints32:
     """Number the parts of a mask into which a ball of ``OPENING_MM`` fits, with what lies near each.
 
     The border counts as mask. Fine images are sampled: where a table ends and an arm begins is a coarse question.
@@ -62,7 +60,7 @@ def thick_parts(mask: Mask, spacing_mm: Floats) -> Labels:
     return np.where(mask, parts[tuple(slice(0, n) for n in mask.shape)], 0).astype(np.int32)
 
 
-def largest_component(mask: Mask) -> Mask:
+def largest_component(mask: Bools) -> Bools:
     """The largest part of a mask whose voxels share faces; the mask itself where it is empty."""
     labels, count = ndimage.label(mask)
     if count == 0:
@@ -70,7 +68,7 @@ def largest_component(mask: Mask) -> Mask:
     return np.asarray(labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:])))
 
 
-def detached_limbs(hu: NDArray[np.float32], parts: Labels, spacing_mm: Floats) -> tuple[Mask, ...]:
+def detached_limbs(hu: NDArray[np.float32], parts: Ints32, spacing_mm: Floats) -> tuple[Bools, ...]:
     """The parts, beside the first, that are of the patient.
 
     Args:
@@ -96,7 +94,7 @@ def detached_limbs(hu: NDArray[np.float32], parts: Labels, spacing_mm: Floats) -
     return tuple(limbs)
 
 
-def limb_warnings(limbs: Sequence[Mask], trunk: Mask, voxel_ml: float) -> Iterator[str]:
+def limb_warnings(limbs: Sequence[Bools], trunk: Bools, voxel_ml: float) -> Iterator[str]:
     """One sentence that names every detached part, where there is one."""
     if limbs:
         middle = ndimage.center_of_mass(trunk)
@@ -104,7 +102,7 @@ def limb_warnings(limbs: Sequence[Mask], trunk: Mask, voxel_ml: float) -> Iterat
         yield f"parts that do not touch the trunk (arms, legs?) count as body: {', '.join(named)}"
 
 
-def _side(limb: Mask, middle: Sequence[float]) -> str:
+def _side(limb: Bools, middle: Sequence[float]) -> str:
     """Where a part lies, seen from the trunk; axes run to the left and to the back."""
     away = np.array(ndimage.center_of_mass(limb)) - np.array(middle)
     if abs(away[0]) >= abs(away[1]):
@@ -112,7 +110,7 @@ def _side(limb: Mask, middle: Sequence[float]) -> str:
     return "behind it" if away[1] > 0 else "in front of it"
 
 
-def _by_size(mask: Mask) -> Labels:
+def _by_size(mask: Bools) -> Ints32:
     """Components of a mask, 1 the largest; 0 elsewhere."""
     labels, count = ndimage.label(mask)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
@@ -122,7 +120,7 @@ def _by_size(mask: Mask) -> Labels:
     return rank[labels]
 
 
-def _one_section(part: Mask) -> bool:
+def _one_section(part: Bools) -> bool:
     """Whether the part is the same in nearly every slice of the image, as a table is."""
     present = part.any(axis=(0, 1))
     if present.mean() < ALIKE:

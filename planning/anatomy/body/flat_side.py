@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Bools, Floats
+
 FLAT_MM = 1.0
 """A side is flat where it keeps within this of one plane; noise moves the surface of a 5 mm voxel by some 0.2 mm."""
 FLAT_WIDTH_MM = 100.0
@@ -21,9 +23,6 @@ BEYOND_FRACTION = 0.01
 """Of a side's surface: more of it beyond the plane, and the plane is a step, such as a table's top beside the body."""
 SIDES = {(0, 0): "right", (0, -1): "left", (1, 0): "front", (1, -1): "back"}
 """Names of the sides by array axis and end, axes running to the left, back and head."""
-
-Mask = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 
 
 class FlatSide(NamedTuple):
@@ -50,7 +49,7 @@ class FlatSide(NamedTuple):
         )
 
 
-def flat_sides(above: NDArray[np.floating], body: Mask, spacing_mm: Floats) -> tuple[FlatSide, ...]:
+def flat_sides(above: NDArray[np.floating], body: Bools, spacing_mm: Floats) -> tuple[FlatSide, ...]:
     """The sides at which a body ends in a plane across its image's axes.
 
     Args:
@@ -61,7 +60,7 @@ def flat_sides(above: NDArray[np.floating], body: Mask, spacing_mm: Floats) -> t
     return tuple(_flat_sides(above, body, spacing_mm))
 
 
-def _flat_sides(above: NDArray[np.floating], body: Mask, spacing_mm: Floats) -> Iterator[FlatSide]:
+def _flat_sides(above: NDArray[np.floating], body: Bools, spacing_mm: Floats) -> Iterator[FlatSide]:
     for axis, end in itertools.product((0, 1), (0, -1)):
         step_mm, across_mm = float(spacing_mm[axis]), float(spacing_mm[1 - axis])
         ends = _ends(above, body, axis, end)
@@ -72,7 +71,7 @@ def _flat_sides(above: NDArray[np.floating], body: Mask, spacing_mm: Floats) -> 
             yield FlatSide(axis, end, plane, width_mm)
 
 
-def _ends(above: NDArray[np.floating], body: Mask, axis: int, end: int) -> Floats:
+def _ends(above: NDArray[np.floating], body: Bools, axis: int, end: int) -> Floats:
     """Where the body's surface is along each line of an axis, in voxels, shape (n, nz); NaN where the image cuts it."""
     turn = slice(None, None, -1) if end else slice(None)
     inside = np.moveaxis(body, axis, 0)[turn]

@@ -18,6 +18,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, unscanned_voxels
 from puncture_twin.planning.anatomy.body.flat_side import FlatSide
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -36,8 +37,6 @@ most 550 mm wide and an image at least 350; along the bed table and mattress go 
 RIM_MM = 50.0
 """Where what is dense ends at voxels that were not scanned, they count as dense so far from it."""
 
-Mask = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 
 BOX_FACES = np.array(
     [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
@@ -61,12 +60,12 @@ class OutsideImage:
     """
 
     hu: NDArray[np.float32]
-    body: Mask
+    body: Bools
     T_ct_index: Floats
     spacing_mm: Floats
 
 
-def outside_mask(image: OutsideImage, air_hu: float) -> Mask:
+def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     """Voxels outside of the body that are not air.
 
     Beside the body's surface a voxel, or the mean about it, is partly skin, partly air; there only what is denser than
@@ -139,14 +138,14 @@ def joined(meshes: list[TriangleMesh]) -> TriangleMesh:
     return TriangleMesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
 
 
-def _without_specks(mask: Mask, least_voxels: float) -> Mask:
+def _without_specks(mask: Bools, least_voxels: float) -> Bools:
     labels, _ = ndimage.label(mask, FULL)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
     return np.asarray((sizes >= least_voxels)[labels])
 
 
-def _unscanned_beside(dense: Mask, unscanned: Mask, spacing_mm: Floats) -> Mask:
+def _unscanned_beside(dense: Bools, unscanned: Bools, spacing_mm: Floats) -> Bools:
     """Voxels that were not scanned, near to where something dense ends at them."""
     ends = ndimage.binary_dilation(dense, FULL) & unscanned
     if not ends.any():
@@ -164,7 +163,7 @@ def _drawn_out(surface: TriangleMesh, image: OutsideImage) -> TriangleMesh:
     return TriangleMesh(index @ T[:3, :3].T + T[:3, 3], surface.faces)
 
 
-def _hulls_beyond(mask: Mask, image: OutsideImage) -> list[TriangleMesh]:
+def _hulls_beyond(mask: Bools, image: OutsideImage) -> list[TriangleMesh]:
     """Prisms beyond the sides of the image, over the convex hull of the bulky pieces that a side cuts.
 
     Not beyond head and feet: there a table goes on as it is cut.

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.clearance.kernels.kd_order import kd_order
 from puncture_twin.planning.clearance.kernels.lanes import LANES
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-Floats = NDArray[np.float64]
 
 PARALLEL = 1e-6
 """Share of its triangles' area below which a block's mean normal says nothing."""

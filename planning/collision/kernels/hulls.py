@@ -17,10 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.numba_kernels import nb
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 TOUCHING = -1e9
 """In place of a gap: a point that both hulls contain was found."""
@@ -45,29 +43,29 @@ ONWARD = 1.0 - 1e-9
 class Hulls(NamedTuple):
     """Convex hulls, packed: h of them, with n corners in all, each in the frame that it moves with; mm."""
 
-    axes: tuple[Array, Array, Array]
+    axes: tuple[Floats, Floats, Floats]
     """The corners' x, y and z, each (n,) in one piece: so the outermost of many is found four abreast."""
-    starts: Indices
+    starts: Ints
     """Shape (h + 1,): where each hull's corners begin."""
-    few: tuple[Array, Array, Array]
+    few: tuple[Floats, Floats, Floats]
     """The same as ``axes`` for some outer corners of each."""
-    few_starts: Indices
-    slack: Array
+    few_starts: Ints
+    slack: Floats
     """Shape (h,): no corner lies farther outside the hull of the few."""
-    corners: Array
+    corners: Floats
     """Shape (n, 3): the corners once more."""
-    inner: Array
+    inner: Floats
     """Shape (n, 3): corners within the body itself, where the hull only encloses it."""
     rounded: NDArray[np.bool_]
     """Shape (h,): where it does."""
-    neighbour_starts: Indices
+    neighbour_starts: Ints
     """Shape (n + 1,): where each corner's neighbours begin."""
-    neighbours: Indices
+    neighbours: Ints
     """Their rows."""
-    centres: Array
+    centres: Floats
     """Shape (h, 3): of a ball about each hull."""
-    radii: Array
-    frames: Indices
+    radii: Floats
+    frames: Ints
     """Shape (h,): the frame that each moves with."""
 
 

@@ -15,12 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.collision.kernels.hulls import Hulls, hull_gap
 from puncture_twin.planning.collision.kernels.surfaces import STACK, moved, skin_gap
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 SKIN, BOX, PAIR = 0, 1, 2
 """Kinds of checks: body against skin, hull against a box of the room, hull against hull."""
@@ -38,52 +36,52 @@ FAR_MM = 200.0
 class Skin(NamedTuple):
     """The patient's surface."""
 
-    tree: tuple[Array, Array, Array]
+    tree: tuple[Floats, Floats, Floats]
     """Lowest and highest corners of its boxes and the triangles' corners: see :class:`TriangleTree`."""
     field: NDArray[np.float32]
     """Shape (i, j, k), mm: distances of the middles of cells; NaN where nobody has asked yet."""
-    origin: Array
+    origin: Floats
     """Shape (3,), mm: the lowest corner of the field."""
 
 
 class Scene(NamedTuple):
     """The checks of a cell and what they are about."""
 
-    checks: Indices
+    checks: Ints
     """Shape (k, 5): kind, first, second, and the frames of both. For ``SKIN`` the second is the row of the body's root
     among the balls, else both are rows of hulls."""
     skin: Skin
-    balls: tuple[Array, Array, Indices]
+    balls: tuple[Floats, Floats, Ints]
     """Centres, radii and children of all bodies' trees of balls, each in the frame of its body."""
     hulls: Hulls
-    T_box_base: Array
+    T_box_base: Floats
     """Shape (h, 4, 4): by hull, where it is a box."""
-    halves: Array
+    halves: Floats
     """Shape (h, 3), mm: the box's half sizes; -1 where it is none."""
 
 
 class Movers(NamedTuple):
     """What moves in each check, and a ball about it in the frame that it moves with."""
 
-    of_check: Indices
-    frames: Indices
-    centres: Array
-    radii: Array
+    of_check: Ints
+    frames: Ints
+    centres: Floats
+    radii: Floats
 
 
 class Scratch(NamedTuple):
     """What the search for a proof remembers and where it works: see :func:`scratch`."""
 
-    axes: Array
+    axes: Floats
     """Shape (k, 3): the last direction of each check; zero to begin anew."""
-    corners: Indices
+    corners: Ints
     """Shape (k, 2): the last corners."""
-    balls: Array
+    balls: Floats
     """Shape (h, 3), mm: where the centres of the hulls' balls stand."""
-    stack: Indices
-    inner_stack: Indices
-    M: Array
-    S: Array
+    stack: Ints
+    inner_stack: Ints
+    M: Floats
+    S: Floats
 
 
 @nb.njit(cache=True)

@@ -12,9 +12,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kernels import link_frames
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING
 from puncture_twin.planning.collision.kernels.proofs import (
@@ -27,9 +27,6 @@ from puncture_twin.planning.collision.kernels.proofs import (
     stand_balls,
     ways_about,
 )
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 CLEAR, CONTACT, ASK, NOT_FINITE = 0, 1, 2, 3
 """What a segment came to: proven but for the questions, a contact, a question to be asked at once, no numbers."""
@@ -45,25 +42,25 @@ PARTS = 256
 class Answer(NamedTuple):
     """What a segment came to, filled by :func:`judge_segment`."""
 
-    status: Indices
+    status: Ints
     """Shape (4,)."""
-    shares: Array
+    shares: Floats
     """Shape (q,): of each question, the share of the way at which its state stands."""
-    checks: Indices
+    checks: Ints
     """Shape (q,): the checks asked about."""
 
 
 class Way(NamedTuple):
     """A segment, and where the arm stands on it."""
 
-    lengths: Array
-    start: Array
-    step: Array
-    turns: Array
+    lengths: Floats
+    start: Floats
+    step: Floats
+    turns: Floats
     """Shape (6,), rad: how far each joint turns."""
-    q: Array
+    q: Floats
     """Shape (1, 6): scratch."""
-    frames: Array
+    frames: Floats
     """Shape (1, 7, 4, 4), mm: filled by :func:`_stand`."""
 
 

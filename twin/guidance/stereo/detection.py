@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.stereo.ball.ball_image import BallScene, render
 from puncture_twin.twin.guidance.stereo.ball.tracker import LostBall, find_ball
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
@@ -20,8 +20,6 @@ from puncture_twin.twin.guidance.stereo.cameras.triangulation import Points, tri
 from puncture_twin.twin.guidance.stereo.servo_case import CamerasSection
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost
 from puncture_twin.twin.guidance.stereo.stereo_room import Room
-
-Floats = NDArray[np.float64]
 
 DIFFUSE = {"diffuse": 0.8, "lamp": 0.4}
 """Share of the light that comes from everywhere; the rest is a lamp's."""

@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import worker_count
@@ -19,8 +18,6 @@ from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import Stop
 from puncture_twin.twin.guidance.stereo.session import Session, run_session
 from puncture_twin.twin.guidance.stereo.stereo_room import room_checker
-
-Floats = NDArray[np.float64]
 
 SHARE = 5
 """Seeds that a process takes at a time; they share the judge of the empty room."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.registration.registration import apply
 from puncture_twin.twin.guidance.stereo.detection import Placed, Search, Sight, Spots, in_space, look_at
 from puncture_twin.twin.guidance.stereo.joint_model import Guess, Observed, Unknowns
@@ -16,8 +16,6 @@ from puncture_twin.twin.guidance.stereo.robot_calibration import RobotHeld, held
 from puncture_twin.twin.guidance.stereo.servo_law import ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen
 from puncture_twin.twin.guidance.stereo.stereo_room import Room, arm_errors, planned_cameras
-
-Floats = NDArray[np.float64]
 
 
 class Known(NamedTuple):

@@ -14,10 +14,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.registration.registration import apply
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.lens import coefficient_slope
@@ -30,8 +30,6 @@ from puncture_twin.twin.guidance.stereo.stereo_room import (
     CAMERA_TURN_RAD,
 )
 from puncture_twin.twin.plant.true_arm import ArmErrors, TrueArm
-
-Floats = NDArray[np.float64]
 
 LENS = (0.2, 0.2, 0.002, 0.002)
 """Spread of k1, k2, p1, p2 about 0: what a lens of this kind may have."""

@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.registration.conditioning import Conditioning
 from puncture_twin.planning.registration.registration import MarkerPairs, apply, register
-
-Floats = NDArray[np.float64]
 
 MAX_ITERATIONS = 20
 CONVERGED = 1e-12

@@ -12,14 +12,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.registration.registration import apply
 from puncture_twin.twin.guidance.stereo.joint_model import Guess, JointModel, Observed, Unknowns, first_unknowns
-
-Floats = NDArray[np.float64]
 
 MAX_ITERATIONS = 30
 ARRIVED = 1e-4

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import inverse, nearest_within_limits, singularity
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.twin.guidance.stereo.servo_law import Held
-
-Floats = NDArray[np.float64]
 
 LEAST_SINGULARITY = 0.05
 """A branch that comes nearer to a singularity (of 0..1) at some point is not used."""

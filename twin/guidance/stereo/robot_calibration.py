@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from itertools import pairwise, product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.registration.registration import fit_rigid
@@ -23,8 +23,6 @@ from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import Held, ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, way_contact
 from puncture_twin.twin.guidance.stereo.stereo_room import Room, planned_cameras
-
-Floats = NDArray[np.float64]
 
 GRID = (3, 2, 2)
 """Points along the base's x, y and z."""

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, Strict, model_validator
 
 from puncture_twin.planning.arm.ur import ur_model
@@ -22,8 +20,6 @@ from puncture_twin.planning.formats.points.point_files import NamedPoints, parse
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.registration.registration import MIN_MARKERS
-
-Floats = NDArray[np.float64]
 
 CASE_NAME = "servo.toml"
 ALLOWED_CASE = "a TOML servo case with schema = 1, or a folder with servo.toml"

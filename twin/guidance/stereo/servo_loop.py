@@ -12,13 +12,11 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.state_checker import Contact, StateChecker
 from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, dense_states, first_contact
 from puncture_twin.twin.guidance.stereo.servo_law import Held, StepLimits, Stop, servo_step
-
-Floats = NDArray[np.float64]
 
 DIVERGING_RATIO = 1.5
 """A step that leaves this times the error it found makes things worse."""

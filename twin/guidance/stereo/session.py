@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.registration.registration import apply
@@ -21,8 +21,6 @@ from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import StepLimits, Stop
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed, Task, servo, way_contact
 from puncture_twin.twin.guidance.stereo.stereo_room import Room, draw_room, room_checker
-
-Floats = NDArray[np.float64]
 
 POINTED_MM = 3.0
 """How well an operator points at a marker in the pictures, per axis: where the search for it begins."""

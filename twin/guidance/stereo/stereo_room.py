@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.crossings import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -22,8 +22,6 @@ from puncture_twin.planning.registration.registration import apply
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, stereo_pair, tangent_axes
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, ToolSection
 from puncture_twin.twin.plant.true_arm import ArmErrors, TrueArm, draw_true_arm
-
-Floats = NDArray[np.float64]
 
 SIGHT_RINGS = ((0.0, 1), (0.55, 6), (0.95, 12))
 """Where on the ball's disc a line of sight ends: share of the radius, and how many around."""

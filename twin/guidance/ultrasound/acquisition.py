@@ -11,18 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.pose_choice import choose_poses
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import Candidates, drawing
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, Missed, detect
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedlePose, Picture, render
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedlePose, render
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import RoomTruth, jog_into_slice
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE
 from puncture_twin.twin.guidance.ultrasound.two_arms import BetweenArms, TwoArms
-
-Floats = NDArray[np.float64]
 
 JOG_FAILED = "jog out of reach"
 JOG_TOUCHES = "jog would touch"
@@ -36,7 +35,7 @@ class Shot(NamedTuple):
     """What the probe's arm was told, shape (6,), rad."""
     q_needle: Floats
     """The same of the needle's arm, after the jog."""
-    picture: Picture
+    picture: Pixels
     found: Detection | Missed
     true_needle: NeedlePose
     """Where the needle truly was in the true image."""

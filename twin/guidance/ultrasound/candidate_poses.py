@@ -10,19 +10,17 @@ from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.simulate import needle_orientations
 from puncture_twin.twin.guidance.ultrasound.two_arms import Touching, TwoArms, inside_phantom
-
-Floats = NDArray[np.float64]
 
 EDGE_MM = 6.0
 """The tip is drawn no nearer to the image's sides, nor above 12 mm: the drawing may be wrong by a few mm."""

@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import Candidates, needle_flange
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import Lesion, NeedlePose, Picture, render
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import Lesion, NeedlePose, render
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import RoomTruth, nearest_configuration
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
-
-Floats = NDArray[np.float64]
 
 LESION_MM = 4.0
 """Radius of the lesion that is drawn about the target in a picture."""
@@ -157,7 +156,7 @@ def held_out_errors_mm(
     return np.array(errors)
 
 
-def puncture_picture(case: SelfcalCase, puncture: Puncture, rng: np.random.Generator) -> Picture:
+def puncture_picture(case: SelfcalCase, puncture: Puncture, rng: np.random.Generator) -> Pixels:
     """The picture after the puncture: a lesion about the target, and the needle."""
     lesion = Lesion(puncture.target_image, LESION_MM)
     return render(case.content.image.imager(), puncture.needle, rng, echo=case.content.image.echo(), lesion=lesion)

@@ -7,19 +7,17 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, Strict, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, content_input
 from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.case.case_file import Length, Name, Number, Section, Sextuple, Vector
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleEcho
 from puncture_twin.twin.plant.true_arm import ArmErrors
-
-Floats = NDArray[np.float64]
 
 CASE_NAME = "selfcal.toml"
 """What a folder is searched for."""

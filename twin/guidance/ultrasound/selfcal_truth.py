@@ -5,17 +5,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import exp, tangent_basis
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import needle_flange
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedlePose
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.plant.true_arm import TrueArm, draw_true_arm
-
-Floats = NDArray[np.float64]
 
 JOG_STEPS = 4
 """Of the operator's correction: each leaves about the arms' relative error, 1e-3, of what was left before."""

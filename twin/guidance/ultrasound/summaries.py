@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture
 from puncture_twin.twin.guidance.ultrasound.trial import Choice, Trial
-
-Floats = NDArray[np.float64]
 
 
 def calibration_summary(found: Calibration, recording: Recording) -> dict[str, Any]:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import RoomTruth
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.bodies import Body, Shape, arm_bodies
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.shapes import skin_surface, touch
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import PhantomSection, SelfcalCase
-
-Floats = NDArray[np.float64]
 
 TABLE_MM = (1800.0, 1200.0, 40.0)
 TABLE_GAP_MM = 0.5

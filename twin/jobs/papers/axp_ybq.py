@@ -14,8 +14,8 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import closed_form
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import mean_direction
@@ -28,8 +28,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import plain_fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import log
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import UNWEIGHTED
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, Truth, simulate_recording
-
-Floats = NDArray[np.float64]
 
 SEED = 20230816
 RUNS = 200

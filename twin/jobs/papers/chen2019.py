@@ -11,14 +11,12 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.entry import needle_pose, outward
 from puncture_twin.planning.registration.registration import apply, fit_affine, fit_triad
 from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_2, TABLE_4, Point
-
-Floats = NDArray[np.float64]
 
 TOLERANCE_MM = 0.01
 """The paper prints two decimals; so much may rounding its inputs and outputs differ."""

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
@@ -22,8 +22,6 @@ from puncture_twin.planning.base.whole_lines import unfinished_warnings
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.raw_mesh import decode_text
 from puncture_twin.planning.registration.marker_check import checked_placement
-
-Floats = NDArray[np.float64]
 
 JOINT_COLUMNS = tuple(f"q{joint}_rad" for joint in range(1, 7))
 """Of a recording, beside ``time_s``: the columns that ``export --format csv`` writes."""

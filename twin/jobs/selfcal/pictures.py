@@ -7,18 +7,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import visual_links
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, Shot
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedlePose, Picture
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedlePose
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, puncture_picture
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.trial import Trial
@@ -30,8 +30,6 @@ from puncture_twin.twin.report.raster.camera import camera_around
 from puncture_twin.twin.report.raster.compositing import compose
 from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, veils_of
 from puncture_twin.twin.report.scene.shapes import bar, box
-
-Floats = NDArray[np.float64]
 
 PX_PER_MM = 8
 """Of the sheet."""
@@ -56,7 +54,7 @@ VEIL = 0.45
 class Panel(NamedTuple):
     """One picture of the sheet with its marks."""
 
-    picture: Picture
+    picture: Pixels
     title: str
     words: str
     found: Detection | None

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from puncture_twin.planning.arm.tool import Box, Tool
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.twin.guidance.stereo.ball.ball_image import render
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
@@ -23,8 +24,6 @@ from puncture_twin.twin.report.palette import Rgb
 from puncture_twin.twin.world.bodies import load_ball
 from puncture_twin.twin.world.cameras import pinhole_picture
 from puncture_twin.twin.world.workcell import open_room
-
-Floats = NDArray[np.float64]
 
 BALL, TARGET, MARKER = (214, 96, 0), (0, 120, 60), (30, 80, 200)
 """Colours of what is drawn over the picture."""

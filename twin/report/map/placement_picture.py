@@ -17,9 +17,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MultipleLocator
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.case.case import mount_pose
 from puncture_twin.planning.collision.workcell import case_boxes
@@ -28,8 +28,6 @@ from puncture_twin.planning.place.mounts import Region
 from puncture_twin.planning.place.search import Judged, PlaceSearch
 from puncture_twin.twin.report.mount_text import direction_words, mount_words
 from puncture_twin.twin.report.numbers import needle_words, target_words
-
-Floats = NDArray[np.float64]
 
 DPI = 110
 PANEL_INCHES = 4.3

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats, Ints32
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.report.palette import Rgb
 from puncture_twin.twin.report.raster.camera import Camera
@@ -24,9 +25,7 @@ from puncture_twin.twin.report.raster.line_of_sight import blocked
 from puncture_twin.twin.report.raster.raster import depth_before, draw, outlines, sorted_by_band
 from puncture_twin.twin.report.raster.shading import corner_normals, flat_normals, shade_nearest, shade_shells, turned
 
-Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
-Integers = NDArray[np.int32]
 T = TypeVar("T")
 
 MAX_SHELLS = 4
@@ -72,8 +71,8 @@ class Layer:
         meshes = [s.mesh for s in surfaces]
         shifts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
         self.vertices = _joined([m.vertices for m in meshes], np.float64)
-        self.faces: Integers = _joined([m.faces + k for m, k in zip(meshes, shifts, strict=False)], np.int32)
-        self.bodies: Integers = np.repeat(np.arange(len(meshes), dtype=np.int32), [len(m.faces) for m in meshes])
+        self.faces: Ints32 = _joined([m.faces + k for m, k in zip(meshes, shifts, strict=False)], np.int32)
+        self.bodies: Ints32 = np.repeat(np.arange(len(meshes), dtype=np.int32), [len(m.faces) for m in meshes])
         self.colours = np.array([s.colour for s in surfaces], dtype=np.float32).reshape(-1, 3)
         self.alphas = np.array([s.alpha for s in surfaces], dtype=np.float32)
         self.rims = np.array([s.rim for s in surfaces], dtype=np.float32)
@@ -110,11 +109,11 @@ class _View:
         self.spans = outlines(self.points, layer.faces, self._grid)
         self._starts, self._in_bands = sorted_by_band(self.spans, _band_rows(camera), len(_bands(camera)))
 
-    def of_band(self, band: int) -> Integers:
+    def of_band(self, band: int) -> Ints32:
         """The rows of ``spans`` that a band of the picture needs."""
         return np.asarray(self._in_bands[self._starts[band] : self._starts[band + 1]])
 
-    def put_opaque(self, shot: Shot, corner: tuple[int, int], spans: Integers) -> None:
+    def put_opaque(self, shot: Shot, corner: tuple[int, int], spans: Ints32) -> None:
         """Draw what is opaque into a picture, where it is nearer than what is there; in place.
 
         Args:
@@ -126,7 +125,7 @@ class _View:
         place = tuple(LAMP), self._grid, corner, inverse[0], triangle[0]
         shade_nearest(*self._mesh, *self._look, *place, shot.colour, shot.depth)
 
-    def shells(self, before: Floats32, corner: tuple[int, int], spans: Integers) -> tuple[Veil, ...]:
+    def shells(self, before: Floats32, corner: tuple[int, int], spans: Ints32) -> tuple[Veil, ...]:
         """What is see-through, as far as nothing opaque hides it, nearest first.
 
         Args:
@@ -142,9 +141,7 @@ class _View:
             shade_shells(*self._mesh, *look, *samples)
         return veils
 
-    def _drawn(
-        self, most: int, before: Floats32, corner: tuple[int, int], spans: Integers
-    ) -> tuple[Floats32, Integers]:
+    def _drawn(self, most: int, before: Floats32, corner: tuple[int, int], spans: Ints32) -> tuple[Floats32, Ints32]:
         """1/z and triangle of the nearest surfaces, shape (most, h, w), before what is opaque already."""
         size = (most, *before.shape)
         inverse, triangle = np.zeros(size, dtype=np.float32), np.full(size, -1, dtype=np.int32)

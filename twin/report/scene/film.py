@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.numbers import demanding
@@ -26,8 +27,6 @@ from puncture_twin.twin.report.scene.film_text import FrameWords, draw_words
 from puncture_twin.twin.report.scene.scene_parts import ArmPicture, Body, needle_bodies, patient, room
 from puncture_twin.twin.report.scene.shapes import bar
 from puncture_twin.twin.report.scene.views import close_up, overview
-
-Floats = NDArray[np.float64]
 
 WIDTH, HEIGHT = 832, 608
 """Pixels; multiples of 16, as H.264 likes them."""

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import visual_links
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.winding import winding_number
 from puncture_twin.planning.search.candidates import Candidates
@@ -19,8 +19,6 @@ from puncture_twin.twin.report.numbers import chosen_row
 from puncture_twin.twin.report.palette import Rgb
 from puncture_twin.twin.report.raster.render import Layer, Surface
 from puncture_twin.twin.report.scene.shapes import ball, bar, box, corridor_mouth, corridor_walls, ring
-
-Floats = NDArray[np.float64]
 
 ORGAN_VEIL = 0.38
 """Opacity of the organ that holds the target, so that the lesion and its vessels show."""

@@ -8,12 +8,11 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import step_of
-
-Floats = NDArray[np.float64]
 
 SECTIONS = 24
 """Sides of a round bar."""

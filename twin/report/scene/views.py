@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.twin.report.raster.camera import Camera, camera_around
 from puncture_twin.twin.report.raster.render import Layer
-
-Floats = NDArray[np.float64]
 
 FOV = np.radians(28.0)
 """A long lens: little perspective, sizes compare."""

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, map_coordinates, spline_filter
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
-
-Floats = NDArray[np.float64]
 
 STEP_PX = 0.25
 """Between two readings on a spoke: a quarter of the narrowest edge."""

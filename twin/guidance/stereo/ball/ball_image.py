@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.registration.registration import apply
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
 from puncture_twin.twin.guidance.stereo.cameras.lens import distortion_slope, undistort
-
-Floats = NDArray[np.float64]
 
 CELLS = 4
 """Cells per pixel and axis."""

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from puncture_twin.planning.base.arrays import Floats
 
 RADIUS_RANGE = (0.7, 1.4)
 """Radii that are looked for, in parts of the predicted one: wider than the gate, so that the gate can say no."""

@@ -14,13 +14,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.stereo.ball.ball_edges import Edges, Grey, Spokes, find_edges, grey_part, visible_share
 from puncture_twin.twin.guidance.stereo.ball.ball_image import Picture
 from puncture_twin.twin.guidance.stereo.ball.hough import Found, find_circles
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
 from puncture_twin.twin.guidance.stereo.cameras.circle import Circle, cone, consensus, refit
-
-Floats = NDArray[np.float64]
 
 Reason = Literal["not_in_view", "no_circle", "few_inliers", "wrong_radius", "low_contrast"]
 

@@ -21,12 +21,10 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.lens import coefficient_slope, distort
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 CAMERA_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "wx", "wy", "wz", "tx", "ty", "tz")
 """Order of a camera's parameters: px, 1, rad, mm; w and t turn and move the camera's frame (T_camera_c)."""

@@ -16,12 +16,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.stereo.cameras.bundle import CAMERA_PARAMETERS, Bundle, Observations, Spreads, adjust
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.dlt import LinearFit, decompose, fit_matrix, project
-
-Floats = NDArray[np.float64]
 
 MIN_POINTS = 6
 """Eleven unknowns, two equations per point."""

@@ -13,11 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.registration.registration import apply
 from puncture_twin.twin.guidance.stereo.cameras.lens import distort, distortion_slope, fold, undistort
-
-Floats = NDArray[np.float64]
 
 ROTATION_TOLERANCE = 1e-6
 """How far R^T R may be from the identity: a rotation typed with seven digits passes, a scaled one does not."""

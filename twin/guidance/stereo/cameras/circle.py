@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from puncture_twin.planning.base.arrays import Floats
 
 STEPS = (1 / 8, 1 / 6, 1 / 4, 1 / 3)
 """Spacing of the three points, in turns: short arcs survive occlusion, long ones fix the circle well."""

@@ -11,10 +11,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import rq
 
-Floats = NDArray[np.float64]
+from puncture_twin.planning.base.arrays import Floats
 
 
 class Decomposition(NamedTuple):

@@ -12,9 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from puncture_twin.planning.base.arrays import Floats
 
 CONVERGED = 1e-14
 """Newton's step, in tangents, that ends the undistortion: 4e-11 px at a focal length of 2560 px."""

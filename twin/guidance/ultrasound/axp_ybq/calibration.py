@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.stats import chi2, f
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, PARAMETERS, T_Q, Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
@@ -15,8 +16,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import log, tangent_basis
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.solve import Solution, solve
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import Spread
-
-Floats = NDArray[np.float64]
 
 SHAFT_BIAS = (
     "a constant error of the detected tip along the shaft moves the tip in the needle's flange frame and leaves every "

@@ -9,12 +9,10 @@ image is a plane, so that its third column is never excited and is left out.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-
-Floats = NDArray[np.float64]
 
 LENGTH_MM = 100.0
 """Lengths are counted in this unit, so that the columns of the system are of one size."""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
@@ -14,8 +15,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
     linearised_direction,
     needle_in_image,
 )
-
-Floats = NDArray[np.float64]
 
 HALF_NORMAL = 0.6745
 """Median of |x| for a standard normal x."""

@@ -7,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import exp, tangent_basis
-
-Floats = NDArray[np.float64]
 
 PARAMETERS = (
     *(f"w_X_{axis}_rad" for axis in "xyz"),

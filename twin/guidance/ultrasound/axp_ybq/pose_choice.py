@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, active_columns
@@ -15,7 +16,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import parameter_unit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import covariances, whitener
 
-Floats = NDArray[np.float64]
 Criterion = Literal["tre", "D"]
 
 PRIOR_WEIGHT = 1e-6

@@ -15,14 +15,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic, is_folder
 from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
 from puncture_twin.planning.formats.raw_mesh import decode_text
-
-Floats = NDArray[np.float64]
 
 FILE_NAME = "recording.csv"
 """What a folder is searched for."""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import LENGTH_MM
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
     DIRECTION,
@@ -28,7 +29,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import Spread, covariances, whitener
 
-Floats = NDArray[np.float64]
 Weights = Floats | NDArray[np.bool_]
 
 MAX_STEPS = 50

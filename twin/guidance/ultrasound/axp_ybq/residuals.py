@@ -14,8 +14,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
     DIRECTION,
     N_PARAMETERS,
@@ -29,8 +29,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import skew, tangent_basis
-
-Floats = NDArray[np.float64]
 
 
 class Linearised(NamedTuple):

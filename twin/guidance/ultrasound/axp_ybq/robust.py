@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import HALF_NORMAL
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
@@ -25,9 +25,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import (
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import directions_image, needle_in_image
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import Spread, whitener
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 FALSE_ALARMS = 0.01
 """Chance that a recording without outliers loses a pose."""
@@ -59,9 +56,9 @@ class RobustFit(NamedTuple):
     """A fit, and which poses made it."""
 
     estimate: Estimate
-    tip_kept: Flags
+    tip_kept: Bools
     """Shape (n,): the tip of this pose was used."""
-    direction_kept: Flags
+    direction_kept: Bools
     """Shape (n,): its direction was used."""
     iterations: int
 
@@ -170,7 +167,7 @@ def _chi_squared(level: float, freedom: int) -> float:
     return float(2 * gammaincinv(freedom / 2, level))
 
 
-def _judge(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[Flags, Flags]:
+def _judge(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[Bools, Bools]:
     """Which tips and which directions agree with the fit, given how far each one pulled it.
 
     Args:
@@ -191,7 +188,7 @@ def _judge(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[Fl
     return kept[0], kept[1] & _facing(problem, fit.estimate) if problem.with_direction else fit.direction_kept
 
 
-def _facing(problem: Problem, estimate: Estimate) -> Flags:
+def _facing(problem: Problem, estimate: Estimate) -> Bools:
     """Whether a direction points the way of V at all: one that is turned round has no residual."""
     m = needle_in_image(estimate, problem.recording) @ estimate.V
     return np.asarray(np.einsum("ni,ni->n", m, directions_image(problem.recording, estimate)) > 0)
@@ -228,7 +225,7 @@ def _reweighted(problem: Problem, fit: RobustFit) -> RobustFit:
     return RobustFit(estimate, weights[0] > STILL_USED, weights[1] > STILL_USED, steps)
 
 
-def _check_enough(problem: Problem, kept: Flags) -> None:
+def _check_enough(problem: Problem, kept: Bools) -> None:
     n, unknowns = len(problem.recording), len(problem.active)
     if kept.sum() < max(LEAST_KEPT * n, unknowns / 3 + 1):
         raise InputError(

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Floats = NDArray[np.float64]
+from puncture_twin.planning.base.arrays import Floats
 
 
 def skew(w: Floats) -> Floats:

@@ -12,13 +12,12 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
-Floats = NDArray[np.float64]
 Reading = Callable[[Recording], Recording]
 
 SUSPECT_MM = 1.5

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import LEAST_POSES, LEAST_POSES_KNOWN_TIP, closed_form
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import (
@@ -23,8 +24,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import RobustFit, fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.spread import found_spreads
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.suggested_poses import Cure, propose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import UNWEIGHTED, Spread
-
-Floats = NDArray[np.float64]
 
 SPREAD_ROUNDS = 2
 """How often the residuals' spread is found and the fit repeated with it; it settles to a few percent in two."""

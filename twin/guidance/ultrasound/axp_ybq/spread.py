@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Problem
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import LEAST_MM, Fitted, RobustFit, fitted
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import Spread
-
-Floats = NDArray[np.float64]
 
 LEAST_FREEDOM = 15
 """Residuals minus unknowns below which inside and across are not told apart: their ratio would be chance."""

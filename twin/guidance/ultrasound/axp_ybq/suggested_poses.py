@@ -14,13 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import LEAST_RATIO, scaled_jacobian
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import needle_in_image
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import exp, log
-
-Floats = NDArray[np.float64]
 
 TURN_RAD = float(np.radians(25.0))
 """How far the probe is turned, and the insertion angle changed."""

@@ -4,6 +4,5 @@ from .probe_image import (
     Lesion as Lesion,
     NeedleEcho as NeedleEcho,
     NeedlePose as NeedlePose,
-    Picture as Picture,
     render as render,
 )

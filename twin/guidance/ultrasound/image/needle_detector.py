@@ -17,13 +17,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.image.line_search import Segment, brightest_segment
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, Picture
-
-Floats = NDArray[np.float64]
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager
 
 MEAN_OVER_MEDIAN = float(np.sqrt(np.pi / 2.0) / np.sqrt(2.0 * np.log(2.0)))
 """Of a Rayleigh amplitude."""
@@ -124,7 +122,7 @@ class Detection(NamedTuple):
     """Amplitude of the last piece of shaft over the background."""
 
 
-def detect(picture: Picture, imager: Imager, settings: DetectorSettings | None = None) -> Detection | Missed:
+def detect(picture: Pixels, imager: Imager, settings: DetectorSettings | None = None) -> Detection | Missed:
     """Find the needle, or say why not.
 
     Args:
@@ -160,12 +158,12 @@ def detect(picture: Picture, imager: Imager, settings: DetectorSettings | None =
     return Detection(found, line.direction, segment.score, length, contrast)
 
 
-def search_score(picture: Picture, imager: Imager) -> float:
+def search_score(picture: Pixels, imager: Imager) -> float:
     """What the gate is held against: the largest sum along any segment, amplitude over background times mm."""
     return _segment(over_background(picture, imager), imager, DetectorSettings()).score
 
 
-def over_background(picture: Picture, imager: Imager) -> Floats:
+def over_background(picture: Pixels, imager: Imager) -> Floats:
     """Amplitude over the mean amplitude of the background around, shape (rows, columns)."""
     size = int(BACKGROUND_MM / imager.pixel_mm) // COARSE | 1
     coarse = np.ascontiguousarray(picture[::COARSE, ::COARSE])

@@ -13,11 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.image.speckle import FWHM_PER_SIGMA, Complexes, PointSpread, blurred_speckle
-
-Floats = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 WHITE = 255
 """The brightest grey level."""
@@ -67,7 +65,7 @@ class Imager:
         """Amplitude of what lies off the plane, over the same in it; any shape."""
         return np.asarray(np.exp(-0.5 * (off_plane_mm / self.slice_sigma) ** 2))
 
-    def grey(self, amplitude: Floats) -> Picture:
+    def grey(self, amplitude: Floats) -> Pixels:
         """Log compression: amplitude 1 is mean speckle."""
         level = 20.0 * np.log10(np.maximum(amplitude, 1e-12)) - self.speckle_db
         return np.clip(np.round(WHITE * (1.0 + level / self.range_db)), 0, WHITE).astype(np.uint8)
@@ -132,7 +130,7 @@ def render(
     *,
     echo: NeedleEcho | None = None,
     lesion: Lesion | None = None,
-) -> Picture:
+) -> Pixels:
     """One B-mode picture.
 
     Args:

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from puncture_twin.planning.base.arrays import Floats
+
 Complexes = NDArray[np.complexfloating]
 """Single precision on the way: the display has 256 greys."""
 
