@@ -20,6 +20,7 @@ from planning.export.ros2 import TIME_RESOLUTION_S, read_ros2, ros2_text
 from planning.export.urscript import read_urscript, urscript_text
 from planning.files import atomic
 from planning.plan import Plan, check_geometry
+from planning.provenance import Input
 from planning.robot.cell import StateChecker
 from planning.robot.ur import ur_model
 
@@ -32,11 +33,13 @@ class Exported:
         path: Where it lies.
         format_name: One of ``FORMATS``.
         notes: What whoever runs it should know, one sentence each.
+        inputs: Every file that decided it.
     """
 
     path: Path
     format_name: str
     notes: tuple[str, ...]
+    inputs: tuple[Input, ...]
 
 
 class _Draft(NamedTuple):
@@ -70,7 +73,7 @@ def export_plan(
     checked = FORMATS[format_name][1](plan, source, checker)
     with atomic(path) as temporary:
         temporary.write_bytes(checked.text.encode("ascii"))
-    return Exported(path, format_name, checked.notes)
+    return Exported(path, format_name, checked.notes, plan.inputs)
 
 
 def export_name(source: Path, format_name: str) -> str:

@@ -19,7 +19,7 @@ from planning.formats.volumes import read_volume
 from planning.placement import load_placement
 from planning.plan import read_plan
 from planning.pytest_plugin import read_checks
-from twin.mirror import recorded_states
+from twin.mirror import RecordedJoints
 from twin.stereo.servo_case import load_servo_case
 from twin.ultrasound.recording import read_recording
 from twin.ultrasound.selfcal_case import load_selfcal_case
@@ -201,6 +201,6 @@ TARGETS = [
     Target("plan", {"plan.json": "tree"}, read_plan, whole_plan),
     Target("output set", {"set.json": "tree"}, rewritten_set, whole_set),
     Target("recording", {"recording.csv": "table"}, read_recording, whole_recording),
-    Target("joints", {"joints.csv": "table"}, lambda path: list(recorded_states(path)), whole_states),
+    Target("joints", {"joints.csv": "table"}, lambda path: list(RecordedJoints.read(path).states()), whole_states),
     Target("times", {"times.csv": "table"}, read_times, whole_motion),
 ]
