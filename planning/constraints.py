@@ -15,6 +15,7 @@ from planning.clearance.engine import Floats
 from planning.clearance.measure import Clearances
 from planning.reasons import Reason
 from planning.skin_entry import SkinPaths
+from planning.standoff import waiting_flange
 
 Bools = NDArray[np.bool_]
 Column = NDArray[Any] | str | float
@@ -58,7 +59,8 @@ def judge(
 ) -> Verdicts:
     """Apply every constraint; the reason given is the first that is broken, in the order of the code.
 
-    Unknown regions come first among those on the path: nothing behind them can be judged.
+    Unknown regions come first among those on the path: nothing behind them can be judged. Those that only the needle
+    enters whose tip waits at its standoff come after the constraints on the path without which no tip ever waits.
 
     Args:
         paths: The skin along the n paths.
@@ -92,6 +94,8 @@ def judge(
     give(Reason.REENTERS_SKIN, ~np.isnan(paths.reentry_depth), skin, paths.reentry_depth)
     give(Reason.TOO_LONG, length > longest_path(needle), skin, length, length)
     give(Reason.SKIN_ANGLE, paths.skin_angle > max_skin_angle, skin, length, np.degrees(paths.skin_angle))
+    waiting = paths.view_depth < waiting_flange(needle, length, paths.skin_angle)
+    give(Reason.UNKNOWN_REGION, waiting, skin, paths.view_depth)
     worst = worst_violation(clearances, structures)
     names = np.array([s.name for s in structures] or [""], dtype=object)[worst]
     unknown = np.array([s.role is Role.UNKNOWN for s in structures] or [False])[worst]

@@ -21,6 +21,7 @@ from planning.certify.question import question_of
 from planning.clearance.containment import Side, side_of
 from planning.errors import InputError
 from planning.provenance import differing_input
+from planning.standoff import waiting_flange
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -83,7 +84,10 @@ class _Cell:
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """What is proven all over a cell: which triangles may be near, the skin, whether needles leave the image."""
+    """What is proven all over a cell: which triangles may be near, the skin, whether needles leave the image.
+
+    Needles count up to the flange while the tip waits, in directions along which one may wait.
+    """
 
     skin: Ints
     organs: Ints
@@ -127,6 +131,7 @@ class _Checker:
     def __init__(self, certificate: Certificate, case: Case, anatomy: Anatomy) -> None:
         self._certificate = certificate
         self._question = certificate.question
+        self._needle = case.needle
         self._view = anatomy.skin.field_of_view
         self._skin = PlainSkin(anatomy.skin, case.target_ct)
         self._even = self._skin.closed and not self._skin.odd()
@@ -166,16 +171,29 @@ class _Checker:
         skin, organs, facts, good, leaves = whole.skin, whole.organs, None, whole.skin_good, whole.leaves
         limit = self._limit[organs] + CLEARANCE_PAD_MM
         organs = organs[~_apart(self._organs[organs], limit, cell, self._length[organs])]
-        if not good:
+        if leaves is None:
+            leaves = self._leaves(cell, None)
+        if not good or leaves is None:
             everywhere = np.full(len(skin), MET_MM), cell, np.full(len(skin), question.farthest)
             skin = skin[~_apart(self._skin.corners[skin], *everywhere)]
             if cell.rho <= SKIN_BELOW:
                 lengths = {"length": question.farthest, "longest": question.longest}
                 facts = self._skin.facts(skin, cell.u, cell.rho, cell.ray(0.4142, 0.5432), **lengths)
-                good = self._skin_good(facts)
-        if leaves is None:
-            leaves = leaves_view(self._view, question.target_ct, cell.u, cell.rho, question.length, DEPTH_PAD_MM)
+                good = good or self._skin_good(facts)
+                leaves = self._leaves(cell, facts) if leaves is None else leaves
         return _Known(skin, organs, facts, good, leaves)
+
+    def _leaves(self, cell: _Cell, skin: SkinFacts | None) -> bool | None:
+        """Whether flanges of the cell leave the image, as far as the skin's facts, or none of them, tell (lemma 9)."""
+        near, far, low, high = 0.0, np.inf, 0.0, np.inf
+        if skin is not None:
+            near, far, low, high = skin.least_skin, skin.farthest, skin.least_angle, skin.largest_angle
+        longest, largest = self._question.longest, self._question.max_skin_angle
+        shallow, steep = max(low - ANGLE_PAD_RAD, 0.0), high + ANGLE_PAD_RAD
+        least = waiting_flange(self._needle, min(near, longest), min(shallow, largest))
+        most = waiting_flange(self._needle, min(far, longest), min(steep, largest))
+        flange = float(least), float(most)
+        return leaves_view(self._view, self._question.target_ct, cell.u, cell.rho, flange, DEPTH_PAD_MM)
 
     def _check_leaf(self, cell: _Cell, whole: _Known, letter: str, row: int) -> None:
         reason, structure = str(self._certificate.reason[row]), str(self._certificate.structure[row])
