@@ -40,11 +40,10 @@ from puncture_twin.twin.jobs.patient import main_job, text as words
 from puncture_twin.twin.jobs.patient.place_text import place_text
 from puncture_twin.twin.jobs.robot.mirror import (
     Mirror,
+    RecordedJoints,
     connect,
     live_states,
     mirror_text,
-    recorded_states,
-    recording_warnings,
 )
 from puncture_twin.twin.report.progress import progress_display
 
@@ -200,10 +199,11 @@ def mirror(
     if (host is None) == (recorded is None):
         raise InputError("one arm at a time", where="mirror", allowed="either HOST or --from joints.csv")
     followed = load_case(case)
-    mirrored = Mirror.of(followed)
+    mirrored, inputs = Mirror.of(followed), followed.inputs
     if recorded is not None:
-        states = recorded_states(recorded)
-        for warning in recording_warnings(recorded):
+        recording = RecordedJoints.read(recorded)
+        inputs, states = (recording.input, *inputs), recording.states()
+        for warning in recording.warnings():
             print(f"warning: {warning}", file=sys.stderr)
     else:
         states = live_states(connect(str(host)), period_s=1.0 / rate, seconds=seconds)
@@ -212,7 +212,7 @@ def mirror(
         for one in mirrored.follow(states):
             shown.append(one.summary()) if as_json else out.print(mirror_text(one), highlight=False, markup=False)
     if as_json:
-        _print({"case": str(case), "inputs": inputs_document(followed.inputs), "states": shown}, "", as_json)
+        _print({"case": str(case), "inputs": inputs_document(inputs), "states": shown}, "", as_json)
 
 
 @app.command()
@@ -230,7 +230,8 @@ def export(
         prepared = None if case is None else prepare(case, watcher=progress)
         done = main_job.export(plan, format_name, out_dir, prepared, progress.note)
     summary = {"format": format_name, "notes": list(done.notes), "case_checked": case is not None}
-    _print({**summary, "files": [str(done.path)]}, words.export_text(done, case is not None), as_json)
+    summary |= {"inputs": inputs_document(done.inputs), "files": [str(done.path)]}
+    _print(summary, words.export_text(done, case is not None), as_json)
 
 
 @app.command()

@@ -38,6 +38,7 @@ STANDOFF = (
     "test_the_padded_needle_is_clear_of_flat_skin",
     "test_steep_paths_keep_the_least_gap_and_oblique_ones_start_farther_out",
     "test_standoffs",
+    "test_the_waiting_flange",
     "test_the_farthest_flange",
     "test_axes_are_as_long_as_what_they_are_checked_against_demands",
 )

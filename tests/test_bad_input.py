@@ -63,10 +63,15 @@ def ball(path, radius=10.0, center=(0, 0, 0)):
     mesh.export(path)
 
 
-def opened(path, radius):
-    """A sphere about the target that lacks a few triangles."""
+def opened(path, radius, wound_at_random=False, shells=1):
+    """Spheres about the target, one in the other, that lack a few triangles."""
     mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-    trimesh.Trimesh(mesh.vertices, mesh.faces[5:], process=False).export(path)
+    faces = mesh.faces[5:]
+    if wound_at_random:
+        flip = np.random.default_rng(3).random((len(faces), 1)) < 0.5
+        faces = np.where(flip, faces[:, ::-1], faces)
+    parts = [trimesh.Trimesh(mesh.vertices * (1 + k / 5), faces, process=False) for k in range(shells)]
+    trimesh.util.concatenate(parts).export(path)
 
 
 def flat(path):
@@ -249,7 +254,16 @@ BREAKS = {
     ),
     "an open organ around the target": (
         lambda f: opened(f / "rib.stl", 30),
-        "is an open mesh that goes around the target",
+        "'rib' is an open mesh about the target: whether the target lies inside is not known (98 % of all rays",
+    ),
+    "an open organ around the target, wound at random": (
+        lambda f: opened(f / "rib.stl", 30, wound_at_random=True),
+        "whether the target lies inside is not known (98 % of all rays from it cross the mesh an odd number of times",
+    ),
+    "two open shells around the target": (
+        lambda f: opened(f / "rib.stl", 30, shells=2),
+        "whether the target lies inside is not known (0 % of all rays from it cross the mesh an odd number of times; "
+        "winding number 1.97)",
     ),
     "label map: ends inside the body": (
         patch_gz("labels.nii.gz", 80, struct.pack("<3f", 1.0, 1.0, 1.0)),

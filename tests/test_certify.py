@@ -20,7 +20,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case_file import EntryAxes
 from puncture_twin.planning.case.entry import Directions, angles, entry_frame, outward
-from puncture_twin.planning.certify.bounds import view_bounds
+from puncture_twin.planning.certify.bounds import FlangeBounds, view_bounds
 from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, angle_between, nearest_cell, split
 from puncture_twin.planning.certify.certificate import read_certificate, write_certificate
 from puncture_twin.planning.certify.checker import _apart, _Cell, verify
@@ -200,14 +200,15 @@ def _turned(u, rho, rng):
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=80)
 def test_the_field_of_view_bounds_hold(seed):
-    """Every ray of a cone exits as the cone's bound says, cut faces at random."""
+    """Every ray of a cone exits as the cone's bound says, cut faces at random, wherever in its bounds the flange is."""
     rng = np.random.default_rng(seed)
     view = FieldOfView(np.eye(4), rng.uniform(20, 100, 3), rng.random((3, 2)) < 0.5)
     target, u = rng.uniform(0.05, 0.95, 3) * view.size_mm, outward(rng.uniform(0, np.pi), rng.uniform(0, 6.3))
-    rho, length = 10 ** rng.uniform(-3, -0.2), rng.uniform(20, 150)
-    found = view_bounds(view, target, u[None], np.array([rho]), length)
+    rho, least = 10 ** rng.uniform(-3, -0.2), rng.uniform(20, 150)
+    most = least + rng.choice([0.0, rng.uniform(0, 60)])
+    found = view_bounds(view, target, u[None], np.array([rho]), FlangeBounds(np.array([least]), np.array([most])))
     out = view.exit(target, np.array([_turned(u, rho, rng) for _ in range(200)]))
-    leaves = out.cut & (out.depth_mm < length)
+    leaves = out.cut & (out.depth_mm < rng.uniform(least, most, 200))
     assert not (found.kept[0] and leaves.any())
     assert leaves.all() or not found.left[0]
 

@@ -3,8 +3,11 @@
 Each run may end in an `InputError` (one line, exit 2) or in a value that is whole; in 2 s and 1 GB at most.
 """
 
+from dataclasses import replace
+
 import pytest
 from fuzz.runner import Fuzzer
+from fuzz.targets import read_case, whole_case
 
 RUNS = 900
 """Of each of the four parts, which run side by side."""
@@ -36,6 +39,16 @@ def test_the_runs_reach_the_readers(fuzzer):
     accepted, refused = sum(fuzzer.accepted.values()) - before[0], sum(fuzzer.refused.values()) - before[1]
     assert accepted >= 5
     assert refused >= 75
+
+
+def test_a_case_that_lost_a_structure_is_noticed(fuzzer):
+    """The check of the case reader can fail: a stated number that is not there, and a schema that states none."""
+    case, anatomy = read_case(fuzzer.corpus / "stated.toml")
+    whole_case((case, anatomy))
+    with pytest.raises(AssertionError):
+        whole_case((case, replace(anatomy, structures=anatomy.structures[:-1])))
+    with pytest.raises(AssertionError):
+        whole_case((replace(case, stated_structures=None), anatomy))
 
 
 def test_a_run_is_decided_by_its_number(fuzzer):

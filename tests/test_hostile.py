@@ -1,5 +1,6 @@
 """Hostile inputs, each with its story in hostile/cases.toml: one line, no traceback, no hang, no gigabytes."""
 
+import csv
 import json
 import os
 import subprocess
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 from hostile.makers import MAKERS
 
+from puncture_twin.planning.base.output.manifest import problems
 from puncture_twin.planning.base.processes import worker_count
 from puncture_twin.planning.place.workers import ask_all
 
@@ -52,25 +54,38 @@ def task_of(case, folder, out):
         return {**task, "reader": case["reader"], "path": str(folder / case["file"])}
     longer = {word: text[0] * int(text[2:]) for word, text in case.get("replace", {}).items()}
     words = [longer.get(word, word).replace("{folder}", str(folder)).replace("{out}", str(out)) for word in case["run"]]
+    for word, digits in case.get("bytes", {}).items():
+        words = [one.replace(word, os.fsdecode(bytes.fromhex(digits))) for one in words]
     return {**task, "argv": words}
+
+
+def said_of(case, done, out):
+    """The lines of a refusal: those of stderr without progress, or the refused rows of a batch, which are written."""
+    if not case.get("row", False):
+        assert not out.exists() or not any(out.iterdir())
+        return [line for line in done["err"].splitlines() if not line.startswith(PROGRESS)]
+    rows = list(csv.DictReader((out / "batch.csv").read_text(encoding="utf-8").splitlines()))
+    assert [row["exit_code"] for row in rows] == ["2"] and rows[0]["said"] in done["out"]
+    assert problems(out) == ()
+    return [row["said"] for row in rows]
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case["name"])
 def test_a_hostile_input_costs_one_line(case, runner, tmp_path):
-    """The exit code and the line that the story's case states, in time and memory, and nothing is written."""
+    """The exit code and the line that the story's case states, in time and memory; only a batch's row is written."""
     folder, out = tmp_path / "in", tmp_path / "out"
     folder.mkdir()
     MAKERS[case["make"]](folder)
     done = runner(task_of(case, folder, out))
     assert done["exit"] == case.get("exit", 2), done
-    assert case["expect"] in done["err"]
+    assert case["expect"] in done["out" if case.get("row", False) else "err"]
     assert done["megabytes"] < case.get("megabytes", MEGABYTES)
     if done["exit"] == 2:
-        lines = [line for line in done["err"].splitlines() if not line.startswith(PROGRESS)]
+        lines = said_of(case, done, out)
         assert len(lines) == 1
         assert len(lines[0]) <= LONGEST_LINE
+        assert lines[0].isprintable()
         assert "allowed: " in lines[0]
-        assert not out.exists() or not any(out.iterdir())
 
 
 def test_every_maker_has_a_story():

@@ -9,6 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from puncture_twin.meshes import folder
+from puncture_twin.planning.base.files import sha256
 from puncture_twin.planning.base.output.manifest import problems
 from puncture_twin.run_twin import ANSWER_IS_NO, BAD_INPUT, INTERRUPTED, OK, PROGRAM_FAILED, main
 from puncture_twin.twin.report.progress import BarDisplay, LineDisplay, progress_display
@@ -133,6 +134,16 @@ def test_a_plan_of_a_set_is_read_only_as_it_was_written(rehearsed, tmp_path, cap
     assert main(["export", str(loose), "--format", "csv", "--out", str(tmp_path / "out")]) == OK
     said = capfd.readouterr().err
     assert "outside of any output set" in said and len(said.splitlines()) == 1
+
+
+def test_an_export_lists_what_decided_it(rehearsed, tmp_path, capfd):
+    """``--json``: the plan with its hash, then everything that the plan was made from; as in the manifest."""
+    plan = rehearsed / "plan.json"
+    assert main(["export", str(plan), "--format", "csv", "--out", str(tmp_path), "--json"]) == OK
+    listed = json.loads(capfd.readouterr().out)["inputs"]
+    assert listed[0] == {"role": "plan", "path": "plan.json", "sha256": sha256(plan)}
+    assert listed[1:] == json.loads(plan.read_text())["inputs"] != []
+    assert listed == json.loads((tmp_path / "manifest.json").read_text())["entries"]["export plan.csv"]["inputs"]
 
 
 def test_a_rehearsal_beside_its_plan_keeps_the_plan(carton, rehearsed, tmp_path, capfd):

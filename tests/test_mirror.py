@@ -15,6 +15,7 @@ from puncture_twin import run_twin
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.files import sha256
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import case_tool
@@ -193,7 +194,11 @@ def test_a_recording_is_mirrored(drive, tmp_path, capsys):
     lines = captured.out.strip().splitlines()
     assert len(lines) == 3 and "to target    0.00 mm" in lines[-1]
     assert run_twin.main(["mirror", "--case", str(ABDOMEN), "--from", str(path), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)["states"]
+    document = json.loads(capsys.readouterr().out)
+    listed = {one["role"]: one for one in document["inputs"]}
+    assert listed["recording"] == {"role": "recording", "path": "joints.csv", "sha256": sha256(path)}
+    assert "case" in listed and len(listed) > 2
+    said = document["states"]
     np.testing.assert_allclose(said[-1]["tip_ct_mm"], load_case(ABDOMEN).target_ct, atol=1e-6)
     np.testing.assert_allclose(np.radians(said[-1]["q_deg"]), drive.insertion_q[-1], atol=1e-12)
 
@@ -210,9 +215,9 @@ def test_recordings_that_cannot_be_read_are_refused(tmp_path, text, match):
     path = tmp_path / "joints.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=match):
-        list(mirror.recorded_states(path))
+        list(mirror.RecordedJoints.read(path).states())
     with pytest.raises(InputError, match="no such file"):
-        list(mirror.recorded_states(tmp_path / "none.csv"))
+        list(mirror.RecordedJoints.read(tmp_path / "none.csv").states())
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys):

@@ -132,6 +132,20 @@ def test_a_map_that_no_version_wrote_is_not_overwritten(tmp_path):
     assert names(tmp_path) == {"map.png"}
 
 
+@pytest.mark.parametrize("kind", ["file", "link"])
+def test_a_sub_folder_that_is_somebody_elses_is_refused(tmp_path, kind):
+    """A file where a sub-folder must be, or a link that leads out: refused before any work, and the old set stays."""
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    write(out, "batch", {"batch.csv": "old"})
+    (out / "0001").write_text("mine") if kind == "file" else (out / "0001").symlink_to(elsewhere)
+    for known in ((), ("0001/a.parquet",)):
+        with pytest.raises(InputError, match="0001/a.parquet is to be written, but the file 0001 there comes from no"):
+            write(out, "batch", {} if known else {"batch.csv": "new", "0001/a.parquet": "a"}, names=known)
+    assert problems(out) == () and read(out / "batch.csv").data == b"old"
+    assert list(elsewhere.iterdir()) == []
+
+
 @pytest.mark.parametrize("content", ['{"version": 1, "files": []}', "", "{", '{"format": "puncture-twin output set"}'])
 def test_another_manifest_is_not_overwritten(tmp_path, content):
     """Of another program, or damaged: one line, and nothing changes."""
@@ -142,9 +156,16 @@ def test_another_manifest_is_not_overwritten(tmp_path, content):
     assert names(tmp_path) == {MANIFEST_NAME}
 
 
-@pytest.mark.parametrize("name", ["../mine.txt", "/tmp/mine.txt", "a/../../mine.txt", "", "a//b", "./a", "..\\b"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *["../mine.txt", "/tmp/mine.txt", "a/../../mine.txt", "", "a//b", "./a", "..\\b"],
+        *["a\0b", "x" * 256, "é" * 128, "a/" * 600 + "b", "\ud800"],
+    ],
+    ids=ascii,
+)
 def test_a_manifest_cannot_name_a_file_elsewhere(tmp_path, name):
-    """What it lists is removed one day, so a name that leads out of the folder is refused."""
+    """What it lists is removed one day: a name that leads out of the folder is refused, and one that no file has."""
     out = tmp_path / "out"
     write(out, "search", {"a": "1"})
     manifest = json.loads((out / MANIFEST_NAME).read_text())
@@ -154,6 +175,19 @@ def test_a_manifest_cannot_name_a_file_elsewhere(tmp_path, name):
     with pytest.raises(InputError, match="damaged"):
         write(out, "search", {"a": "2"})
     assert (tmp_path / "mine.txt").exists()
+
+
+@pytest.mark.parametrize("also", ["plan", "unfinished"])
+def test_a_manifest_that_lists_a_file_twice_is_damaged(planned, also):
+    """Two entries with two hashes of one file: whichever counts, the other is no longer whole."""
+    manifest = json.loads((planned / MANIFEST_NAME).read_text())
+    manifest["entries"]["plan"]["files"]["plan.csv"] = digest("y")
+    if also == "unfinished":
+        del manifest["entries"]["plan"]["files"]["plan.csv"]
+        manifest["unfinished"] = ["plan.csv"]
+    (planned / MANIFEST_NAME).write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match=r"damaged \('plan.csv' is listed twice\)"):
+        read(planned / "plan.json")
 
 
 def test_readers_refuse_what_the_manifest_does_not_list(planned):

@@ -203,6 +203,19 @@ def test_the_nearest_triangle_of_a_packed_surface(rng, place):
     assert each[placed.nearest] == pytest.approx(min(each), abs=TIGHT_MM)
 
 
+@pytest.mark.parametrize("away_mm", [40.0, 5000.0])
+def test_of_two_far_specks_the_nearer_one_is_nearest(away_mm):
+    """Two groups of tiny triangles on either side, one nearer by 4e-6 of the way: a bound may not hide it for that."""
+    speck = np.array([[-1e-4, -1e-4, 0], [2e-4, 0, 0], [0, 1e-4, 0]])
+    for nearer in (-1, 1):
+        groups = [np.array([0, 0, side * away_mm * (1 - 4e-6 * (side == nearer))]) for side in (-1, 1)]
+        corners = np.concatenate([speck + place for place in groups for _ in range(32)])
+        blocks = pack(TriangleMesh(corners, np.arange(len(corners)).reshape(-1, 3)))
+        placed = _placed(blocks, np.zeros(3))
+        assert placed.distance == pytest.approx(away_mm * (1 - 4e-6), abs=TIGHT_MM)
+        assert np.sign(blocks.triangles[placed.nearest][2]) == nearer
+
+
 def test_the_row_of_the_nearest_triangle_is_its_own(rng):
     """From beside each of the first triangles of the packed order, that row is the nearest one."""
     corners = rng.normal(0, 60, (40, 1, 3)) + rng.normal(0, 1, (40, 3, 3))
@@ -282,6 +295,24 @@ def test_triangles_about_the_poles(rng):
     heights = np.array([c[0, 2] for c in corners])
     expected = [np.sort(heights[heights > 0]), np.sort(-heights[heights < 0])]
     np.testing.assert_allclose(found.depth, np.concatenate(expected), atol=1e-12)
+
+
+@pytest.mark.parametrize("along", ["down", "up", "left", "right"])
+def test_a_corner_that_leaves_its_bin_by_a_hair_is_met_there(along):
+    """A triangle's corner reaches 5e-8 rad across a border between bins: rays there and on this side both cross it.
+
+    Beside (1, 0, 0) lie borders of rows (90 degrees of polar angle) and of columns (0 degrees of azimuth).
+    """
+    turn = {"up": 0, "left": 90, "down": 180, "right": 270}[along]
+    c, s = np.round([np.cos(np.radians(turn)), np.sin(np.radians(turn))])
+    tip, rim = 5e-8, 0.1
+    corners = np.array([[1.0, 0, tip], [1, 0.02, -rim], [1, -0.02, -rim]]) * 30.0
+    rays = np.array([[1.0, 0, 2e-8], [1, 0, -2e-8], [1, 0, -0.05], [1, 0, 8e-8]])
+    rolled = np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]]).T
+    rays = rays @ rolled / np.linalg.norm(rays, axis=1, keepdims=True)
+    found = crossings(TriangleMesh(corners @ rolled, [[0, 1, 2]]), np.zeros(3), rays)
+    assert found.count.tolist() == [1, 1, 1, 0]
+    np.testing.assert_allclose(found.depth, 30.0, rtol=2e-3)
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2], [0, 2, 1]])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.reach.standoff import waiting_flange
 from puncture_twin.planning.search.context import prepare
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "totalseg_abdomen_3mm"
@@ -50,7 +51,7 @@ def test_every_structure_is_there_and_closed(searches):
 
 
 def test_the_cut_body_is_never_safe(searches):
-    """The field of view cuts four faces of this body; paths leaving there are unknown."""
+    """The field of view cuts four faces of this body; paths leaving there are unknown, also at standoff alone."""
     prepared, found = searches["v2"]
     field = prepared.anatomy.skin.field_of_view
     assert field.cut.sum() == 4
@@ -58,6 +59,10 @@ def test_the_cut_body_is_never_safe(searches):
     beyond = out.cut & (out.depth_mm < prepared.case.needle.length_mm)
     assert beyond.any()
     assert (found.reason[beyond] == Reason.UNKNOWN_REGION).all()
+    waiting = waiting_flange(prepared.case.needle, found.path_length, found.skin_angle)
+    later = out.cut & (out.depth_mm < waiting) & ~beyond
+    assert later.sum() > 20
+    assert not found.safe[later].any()
 
 
 def test_some_paths_are_safe_and_keep_every_margin(searches):

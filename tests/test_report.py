@@ -1,6 +1,7 @@
 """What a person looks at: map, scene, film, page; checked by geometry."""
 
 import json
+import os
 import re
 from dataclasses import replace
 
@@ -430,6 +431,22 @@ def test_many_structures_share_legend_lines():
     ]
     assert families(names) == [("rib (24)", (1, 1, 1)), ("aorta", (2, 2, 2)), ("liver", (3, 3, 3)), ("x", (4, 4, 4))]
     assert families(names[-3:]) == names[-3:]
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one core")
+def test_a_film_has_the_same_bytes_on_any_number_of_cores(rng, tmp_path):
+    """The encoder is told how many threads it has: it does not take as many as there are cores."""
+    across = np.linspace(0, 255, film.WIDTH)[None, :, None] * np.ones((film.HEIGHT, 1, 3))
+    frames = [np.roll(across, 9 * k, axis=1) + rng.normal(0, 20, across.shape) for k in range(30)]
+    frames = [np.clip(frame, 0, 255).astype(np.uint8) for frame in frames]
+    cores = os.sched_getaffinity(0)
+    try:
+        for count in (1, len(cores)):
+            os.sched_setaffinity(0, sorted(cores)[:count])
+            film._write_mp4(frames, tmp_path / f"{count}.mp4")
+    finally:
+        os.sched_setaffinity(0, cores)
+    assert (tmp_path / "1.mp4").read_bytes() == (tmp_path / f"{len(cores)}.mp4").read_bytes()
 
 
 @pytest.mark.parametrize("total_s", [0.5, 5.0, 11.0, 31.0, 400.0])

@@ -26,6 +26,7 @@ from puncture_twin.planning.reach.standoff import (
     farthest_flange,
     skin_gaps,
     standoffs,
+    waiting_flange,
 )
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.search import case_directions, organ_candidates
@@ -108,6 +109,15 @@ def test_no_direction_of_the_abdomen_is_lost_to_its_own_needle():
     assert needle_can_start(tool, skin, case.target_ct, wanted, ARM_PADDING_MM).all()
     oblique = found.skin_angle[found.safe] > 43.0 * DEG
     assert oblique.sum() > 100 and (wanted.standoff_mm - found.path_length[found.safe])[oblique].min() > 10.0
+
+
+def test_the_waiting_flange():
+    """Needle, path and gap; the case's own standoff where it states one; nothing where there is no skin entry."""
+    angles = np.array([0.0, 45.0, np.nan]) * DEG
+    paths = np.array([20.0, 150.0, np.nan])
+    np.testing.assert_allclose(waiting_flange(needle(), paths, angles), [230.0, 361.6, np.nan])
+    np.testing.assert_array_equal(waiting_flange(needle(standoff=60.0), paths, angles), 260.0)
+    assert waiting_flange(needle(), 150.0, 45.0 * DEG) == farthest_flange(needle(), 45.0 * DEG)
 
 
 def test_the_farthest_flange():

@@ -25,8 +25,9 @@ class SkinPaths:
         path_length: Shape (n,), target to entry.
         skin_angle: Shape (n,), between the path and the skin's inward normal.
         reentry_depth: Shape (n,), where the needle would meet skin again, before where its flange waits.
-        unknown_depth: Shape (n,), where the path leaves what the scan shows through a face that cuts the body, or
-            where the skin's crossings do not add up.
+        unknown_depth: Shape (n,), where the path leaves what the scan shows through a face that cuts the body, before
+            where the inserted needle's flange is, or where the skin's crossings do not add up.
+        view_depth: Shape (n,), where the path leaves the image through a face that cuts the body, however far.
     """
 
     entry_ct: Floats
@@ -34,6 +35,7 @@ class SkinPaths:
     skin_angle: Floats
     reentry_depth: Floats
     unknown_depth: Floats
+    view_depth: Floats
 
 
 def skin_paths(
@@ -45,7 +47,7 @@ def skin_paths(
         skin: The body's surface.
         target_ct: Shape (3,).
         outward_ct: Shape (n, 3), unit vectors.
-        length: Needle length, tip to flange: how far unknown regions matter, mm.
+        length: Needle length, tip to flange: how far unknown regions matter to an inserted needle, mm.
         farthest: How far skin matters, mm: to where the flange can be while the tip waits; ``length`` if left out.
     """
     found, odd = settled_crossings(skin.mesh, target_ct, outward_ct)
@@ -58,7 +60,8 @@ def skin_paths(
     reentry[again] = found.depth[found.first[again] + 1]
     reentry[reentry > (length if farthest is None else farthest)] = np.nan
     cut = has & skin.cut_faces[face]
-    unknown = _unknown_depth(skin, target_ct, outward_ct, length)
+    view = _view_depth(skin, target_ct, outward_ct)
+    unknown = np.where(view < length, view, np.nan)
     unknown[cut] = depth[cut]
     if skin.mesh.closed:
         unknown[~odd] = 0.0
@@ -66,7 +69,7 @@ def skin_paths(
     entry = target_ct + depth[:, None] * outward_ct
     cosine = np.abs(np.einsum("ij,ij->i", _normals(skin.mesh, face, entry), outward_ct))
     angle = np.where(np.isnan(depth), np.nan, np.arccos(np.minimum(cosine, 1)))
-    return SkinPaths(entry, depth, angle, reentry, unknown)
+    return SkinPaths(entry, depth, angle, reentry, unknown, view)
 
 
 def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) -> tuple[Crossings, Bools]:
@@ -91,17 +94,15 @@ def _turned(directions: Floats) -> Floats:
     return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
 
 
-def _unknown_depth(skin: Skin, target_ct: Floats, outward_ct: Floats, length: float) -> Floats:
-    """Where the needle leaves the field of view through a face beyond which the body goes on, NaN elsewhere.
+def _view_depth(skin: Skin, target_ct: Floats, outward_ct: Floats) -> Floats:
+    """Where each path leaves the field of view through a face beyond which the body goes on, NaN elsewhere.
 
     Also in the air: what lies beside the image at that face is a body of which nothing is known.
     """
-    unknown = np.full(len(outward_ct), np.nan)
-    if skin.field_of_view is not None:
-        out = skin.field_of_view.exit(target_ct, outward_ct)
-        leaves = out.cut & (out.depth_mm < length)
-        unknown[leaves] = out.depth_mm[leaves]
-    return unknown
+    if skin.field_of_view is None:
+        return np.full(len(outward_ct), np.nan)
+    out = skin.field_of_view.exit(target_ct, outward_ct)
+    return np.where(out.cut, out.depth_mm, np.nan)
 
 
 def _normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) -> Floats:

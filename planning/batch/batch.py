@@ -55,7 +55,8 @@ def run_batch(
     """
     rows: list[dict[str, Any]] = [{} for _ in cases]
     seconds: dict[str, float] = {}
-    with writing(out, "batch", seconds=seconds, names=("batch.csv",), note=watcher.note) as draft:
+    tables = [f"{folder_name(number)}/candidates.parquet" for number in range(1, len(cases) + 1)]
+    with writing(out, "batch", seconds=seconds, names=["batch.csv", *tables], note=watcher.note) as draft:
         for number, row in _searched(cases, draft.folder, jobs, arm, watcher):
             rows[number] = row
         draft.inputs = [
@@ -67,11 +68,16 @@ def run_batch(
     return rows
 
 
+def folder_name(number: int) -> str:
+    """Of the case of this number, from 1 on."""
+    return f"{number:04d}"
+
+
 def _searched(
     cases: Sequence[Path], out: Path, jobs: int, arm: bool | None, watcher: Watcher
 ) -> Iterator[tuple[int, dict[str, Any]]]:
     """Each case's number and row, as they are done."""
-    folders = [out / f"{number:04d}" for number in range(1, len(cases) + 1)]
+    folders = [out / folder_name(number) for number in range(1, len(cases) + 1)]
     context = multiprocessing.get_context("spawn")  # compiled libraries with threads do not survive a fork
     pool = ProcessPoolExecutor(max_workers=worker_count(jobs, len(cases)), mp_context=context)
     try:

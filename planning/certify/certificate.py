@@ -21,9 +21,9 @@ from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, nearest_cell, split
 from puncture_twin.planning.certify.question import Question
 
-CERTIFICATE_VERSION = 3
-"""Version of the file's layout. 3: lists its inputs with their roles, files that a file names included; a length each
-structure is checked to."""
+CERTIFICATE_VERSION = 4
+"""Version of the file's layout and of what a cell claims. 3: lists its inputs with their roles, files that a file names
+included; a length each structure is checked to. 4: a safe cell keeps the image up to the flange at standoff."""
 
 MAX_CERTIFICATE_BYTES = 500_000_000
 """A certificate has some ten thousand cells; a larger file is something else."""
@@ -38,9 +38,9 @@ CONE_ROUNDING_RAD = 1e-7
 
 CERTIFIED = (
     "clearance to every structure with a margin",
-    "field of view and faces that cut the body",
+    "field of view up to the flange at standoff, and faces that cut the body",
     "skin entry",
-    "skin re-entry within the needle's length",
+    "skin re-entry up to the flange at standoff",
     "path length",
     "skin angle",
 )
@@ -186,6 +186,8 @@ def write_certificate(certificate: Certificate, path: Path) -> None:
         "theta_rad": list(question.theta),
         "beta_rad": list(question.beta),
         "length_mm": question.length,
+        "standoff_mm": question.standoff,
+        "skin_gap_mm": question.skin_gap,
         "farthest_flange_mm": question.farthest,
         "radius_mm": question.radius,
         "longest_path_mm": question.longest,
@@ -265,6 +267,8 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
         theta=_range(document["theta_rad"]),
         beta=_range(document["beta_rad"]),
         length=_number(document["length_mm"]),
+        standoff=None if document["standoff_mm"] is None else _number(document["standoff_mm"]),
+        skin_gap=_number(document["skin_gap_mm"]),
         farthest=_number(document["farthest_flange_mm"]),
         radius=_number(document["radius_mm"]),
         longest=_number(document["longest_path_mm"]),

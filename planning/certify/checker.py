@@ -22,6 +22,7 @@ from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.certify.plain_skin import PlainSkin, SkinFacts, leaves_view
 from puncture_twin.planning.certify.question import question_of
 from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.reach.standoff import waiting_flange
 
 Progress = Callable[[int, int], None]
 
@@ -81,7 +82,10 @@ class _Cell:
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """What is proven all over a cell: which triangles may be near, the skin, whether needles leave the image."""
+    """What is proven all over a cell: which triangles may be near, the skin, whether needles leave the image.
+
+    Needles count up to the flange while the tip waits, in directions along which one may wait.
+    """
 
     skin: Ints
     organs: Ints
@@ -125,6 +129,7 @@ class _Checker:
     def __init__(self, certificate: Certificate, case: Case, anatomy: Anatomy) -> None:
         self._certificate = certificate
         self._question = certificate.question
+        self._needle = case.needle
         self._view = anatomy.skin.field_of_view
         self._skin = PlainSkin(anatomy.skin, case.target_ct)
         self._even = self._skin.closed and not self._skin.odd()
@@ -164,16 +169,29 @@ class _Checker:
         skin, organs, facts, good, leaves = whole.skin, whole.organs, None, whole.skin_good, whole.leaves
         limit = self._limit[organs] + CLEARANCE_PAD_MM
         organs = organs[~_apart(self._organs[organs], limit, cell, self._length[organs])]
-        if not good:
+        if leaves is None:
+            leaves = self._leaves(cell, None)
+        if not good or leaves is None:
             everywhere = np.full(len(skin), MET_MM), cell, np.full(len(skin), question.farthest)
             skin = skin[~_apart(self._skin.corners[skin], *everywhere)]
             if cell.rho <= SKIN_BELOW:
                 lengths = {"length": question.farthest, "longest": question.longest}
                 facts = self._skin.facts(skin, cell.u, cell.rho, cell.ray(0.4142, 0.5432), **lengths)
-                good = self._skin_good(facts)
-        if leaves is None:
-            leaves = leaves_view(self._view, question.target_ct, cell.u, cell.rho, question.length, DEPTH_PAD_MM)
+                good = good or self._skin_good(facts)
+                leaves = self._leaves(cell, facts) if leaves is None else leaves
         return _Known(skin, organs, facts, good, leaves)
+
+    def _leaves(self, cell: _Cell, skin: SkinFacts | None) -> bool | None:
+        """Whether flanges of the cell leave the image, as far as the skin's facts, or none of them, tell (lemma 9)."""
+        near, far, low, high = 0.0, np.inf, 0.0, np.inf
+        if skin is not None:
+            near, far, low, high = skin.least_skin, skin.farthest, skin.least_angle, skin.largest_angle
+        longest, largest = self._question.longest, self._question.max_skin_angle
+        shallow, steep = max(low - ANGLE_PAD_RAD, 0.0), high + ANGLE_PAD_RAD
+        least = waiting_flange(self._needle, min(near, longest), min(shallow, largest))
+        most = waiting_flange(self._needle, min(far, longest), min(steep, largest))
+        flange = float(least), float(most)
+        return leaves_view(self._view, self._question.target_ct, cell.u, cell.rho, flange, DEPTH_PAD_MM)
 
     def _check_leaf(self, cell: _Cell, whole: _Known, letter: str, row: int) -> None:
         reason, structure = str(self._certificate.reason[row]), str(self._certificate.structure[row])

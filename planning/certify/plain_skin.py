@@ -179,9 +179,18 @@ def _pierced(corners: Floats, ray: Floats) -> Ints:
 
 
 def leaves_view(
-    view: FieldOfView | None, target_ct: Floats, u: Floats, rho: float, length: float, pad: float
+    view: FieldOfView | None, target_ct: Floats, u: Floats, rho: float, flange: tuple[float, float], pad: float
 ) -> bool | None:
-    """Whether all needles of a cone leave the image through a face that cuts the body, none does, or unknown (None)."""
+    """Whether all needles of a cone leave the image through a face that cuts the body, none does, or unknown (None).
+
+    Args:
+        view: The image.
+        target_ct: Shape (3,).
+        u: Shape (3,), unit, the cone's axis.
+        rho: Its half-angle, rad.
+        flange: How far from the target the needles' flanges are, at least and at most, mm.
+        pad: Kept from limits on depths, mm.
+    """
     if view is None:
         return False
     R, start = view.T_ct_box[:3, :3], view.to_box(target_ct[None])[0]
@@ -192,6 +201,6 @@ def leaves_view(
     soonest = np.where(best > 0, height / np.where(best > 0, best, 1.0), np.inf)
     latest = np.where(worst > 0, height / np.where(worst > 0, worst, 1.0), np.inf)
     first_cut = latest[cut].min(initial=np.inf)
-    if first_cut < length - pad and soonest[~cut].min(initial=np.inf) > first_cut + pad:
+    if first_cut < flange[0] - pad and soonest[~cut].min(initial=np.inf) > first_cut + pad:
         return True
-    return False if (soonest[cut] > min(length, latest.min()) + pad).all() else None
+    return False if (soonest[cut] > min(flange[1], latest.min()) + pad).all() else None

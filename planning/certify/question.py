@@ -27,6 +27,8 @@ class Question:
         R_ct_entry: Shape (3, 3).
         theta, beta: The cap: lowest and highest angle.
         length: Needle, tip to flange.
+        standoff: Distance tip to target before the insertion where the case states one, else None.
+        skin_gap: The least distance from the waiting tip to the skin, along the needle.
         farthest: The flange's greatest distance from the target while the tip waits: how far skin matters.
         radius: Needle radius.
         longest: The longest path.
@@ -43,6 +45,8 @@ class Question:
     theta: tuple[float, float]
     beta: tuple[float, float]
     length: float
+    standoff: float | None
+    skin_gap: float
     farthest: float
     radius: float
     longest: float
@@ -76,6 +80,8 @@ def question_of(
         theta=(float(theta[0]), float(theta[1])),
         beta=(float(beta[0]), float(beta[1])),
         length=case.needle.length_mm,
+        standoff=case.needle.standoff_mm,
+        skin_gap=case.needle.skin_gap_mm,
         farthest=farthest_flange(case.needle, case.search.max_skin_angle),
         radius=case.needle.radius_mm,
         longest=longest_path(case.needle),

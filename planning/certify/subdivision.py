@@ -13,8 +13,16 @@ from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.certify.bounds import ANGLE_PAD_RAD, CLEARANCE_PAD_MM, DEPTH_PAD_MM, view_bounds
+from puncture_twin.planning.case.case import Case, Needle
+from puncture_twin.planning.certify.bounds import (
+    ANGLE_PAD_RAD,
+    CLEARANCE_PAD_MM,
+    DEPTH_PAD_MM,
+    FlangeBounds,
+    any_flange,
+    flange_bounds,
+    view_bounds,
+)
 from puncture_twin.planning.certify.cells import OFF_CENTRE, Cells, Cones, split
 from puncture_twin.planning.certify.certificate import REJECTED, SAFE, UNDECIDED, Certificate
 from puncture_twin.planning.certify.cones import Lists, narrowed, zones
@@ -65,7 +73,7 @@ def certify(
     if not SMALLEST_SIZE <= size <= np.pi:
         allowed = f"{np.degrees(SMALLEST_SIZE):g} to 180 degrees"
         raise InputError(f"size {np.degrees(size):g} degrees", where="certify", allowed=allowed)
-    judge = _Judge(question, anatomy)
+    judge = _Judge(question, anatomy, case.needle)
     record = _Record()
     cells, state = question.cap(), judge.start()
     while len(cells):
@@ -91,7 +99,7 @@ class _State:
         organs: Triangles of the organs that may matter.
         witness: Shape (n,), the organs' triangle that nearly rejected the whole, or -1.
         skin_good: Shape (n,), the skin's constraints hold.
-        view_good: Shape (n,), the field of view is kept.
+        view_good: Shape (n,), the field of view is kept up to the flange at standoff.
     """
 
     parent: Ints
@@ -132,9 +140,9 @@ class _Verdicts:
 class _Judge:
     """Judges the cells of one question, level by level."""
 
-    def __init__(self, question: Question, anatomy: Anatomy) -> None:
+    def __init__(self, question: Question, anatomy: Anatomy, needle: Needle) -> None:
         self.queries = 0
-        self._question = question
+        self._question, self._needle = question, needle
         self._view = anatomy.skin.field_of_view
         self._skin: SkinSurface = skin_surface(anatomy.skin, question.target_ct)
         demanding = [s for s in anatomy.checked if s.demands_margin]
@@ -165,7 +173,8 @@ class _Judge:
         verdicts.reject(organs.rejected, Reason.TOO_CLOSE, organs.largest - self._question.radius)
         verdicts.triangle[organs.rejected] = organs.witness[organs.rejected]
         if cones.radius.max() <= SKIN_BELOW:
-            self._judge_view(verdicts, cones)
+            open_rows = np.flatnonzero((verdicts.letter == UNDECIDED) & ~verdicts.state.view_good)
+            self._judge_view(verdicts, cones, open_rows, any_flange(self._needle, self._question))
             self._judge_skin(verdicts, cells, cones)
         clear = organs.near.start[1:] == organs.near.start[:-1]
         good_skin = verdicts.state.skin_good & verdicts.state.view_good
@@ -189,19 +198,15 @@ class _Judge:
         verdicts.reject(everywhere, Reason.UNKNOWN_REGION)
         return verdicts
 
-    def _judge_view(self, verdicts: _Verdicts, cones: Cones) -> None:
-        if self._view is None:
-            verdicts.state.view_good[:] = True
-            return
-        question, n = self._question, len(cones.radius)
-        rows = np.flatnonzero((verdicts.letter == UNDECIDED) & ~verdicts.state.view_good)
-        view = view_bounds(self._view, question.target_ct, cones.centres[rows], cones.radius[rows], question.length)
-        verdicts.state.view_good[rows] = view.kept
+    def _judge_view(self, verdicts: _Verdicts, cones: Cones, rows: Ints, flange: FlangeBounds) -> None:
+        target_ct, n = self._question.target_ct, len(cones.radius)
+        view = view_bounds(self._view, target_ct, cones.centres[rows], cones.radius[rows], flange)
+        verdicts.state.view_good[rows] |= view.kept
         verdicts.reject(_spread(view.left, rows, n), Reason.UNKNOWN_REGION, _spread(view.depth, rows, n))
 
     def _judge_skin(self, verdicts: _Verdicts, cells: Cells, cones: Cones) -> None:
         question, state = self._question, verdicts.state
-        rows = np.flatnonzero((verdicts.letter == UNDECIDED) & ~state.skin_good)
+        rows = np.flatnonzero((verdicts.letter == UNDECIDED) & ~(state.skin_good & state.view_good))
         if not len(rows):
             return
         found = skin_bounds(
@@ -213,7 +218,7 @@ class _Judge:
             length=question.farthest,
             longest=question.longest,
         )
-        state.skin_good[rows] = (
+        state.skin_good[rows] |= (
             (found.count == 1)
             & ~found.cut
             & (found.farthest <= question.longest - DEPTH_PAD_MM)
@@ -228,6 +233,7 @@ class _Judge:
         verdicts.reject(_spread(found.count > 1, rows, n), Reason.REENTERS_SKIN)
         angle = np.degrees(found.least_angle)
         verdicts.reject(_spread(steep, rows, n), Reason.SKIN_ANGLE, _spread(angle, rows, n))
+        self._judge_view(verdicts, cones, rows, flange_bounds(self._needle, question, found))
 
 
 def _organs(meshes: list[TriangleMesh], question: Question) -> Organs:

@@ -13,6 +13,7 @@ import numpy as np
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.collision.checker import StateChecker
 from puncture_twin.planning.export.blends import blend_radii_mm
 from puncture_twin.planning.export.csv_times import csv_text, read_csv
@@ -32,11 +33,13 @@ class Exported:
         path: Where it lies.
         format_name: One of ``FORMATS``.
         notes: What whoever runs it should know, one sentence each.
+        inputs: Every file that decided it.
     """
 
     path: Path
     format_name: str
     notes: tuple[str, ...]
+    inputs: tuple[Input, ...]
 
 
 class _Draft(NamedTuple):
@@ -70,7 +73,7 @@ def export_plan(
     checked = FORMATS[format_name][1](plan, source, checker)
     with atomic(path) as temporary:
         temporary.write_bytes(checked.text.encode("ascii"))
-    return Exported(path, format_name, checked.notes)
+    return Exported(path, format_name, checked.notes, plan.inputs)
 
 
 def export_name(source: Path, format_name: str) -> str:

@@ -5,4 +5,4 @@ from .decimation import decimated as decimated, squared_distance as squared_dist
 from .mesh import TriangleMesh as TriangleMesh
 from .spaces import Space as Space, Unit as Unit, parse_space as parse_space, parse_unit as parse_unit, to_lps as to_lps
 from .voxelize import voxels_inside as voxels_inside
-from .winding import winding_number as winding_number
+from .winding import odd_fraction as odd_fraction, winding_number as winding_number

@@ -143,9 +143,7 @@ def _azimuths(center, polar, radius):  # type: ignore[no-untyped-def]  # numba i
     azimuth = np.arctan2(center[1], center[0]) + np.pi
     low = int(np.floor((azimuth - half) * (POLAR_BINS / np.pi) - 1e-9))
     high = int(np.floor((azimuth + half) * (POLAR_BINS / np.pi) + 1e-9))
-    if high - low >= 2 * POLAR_BINS:
-        return 0, 2 * POLAR_BINS - 1
-    return low, high
+    return low, high  # half is a right angle at most: no bin twice
 
 
 @nb.njit(cache=True)

@@ -1,11 +1,15 @@
-"""The winding number: how often a surface goes around a point."""
+"""How far a surface goes around a point: the winding number, and by rays, which do not ask how triangles are wound."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.geometry.crossings import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+RAYS = 1000
+"""A fraction of all directions is found to about a percent."""
 
 
 def winding_number(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
@@ -26,3 +30,19 @@ def winding_number(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
     denominator += np.einsum("ij,ij->i", b, c) * na
     denominator += np.einsum("ij,ij->i", c, a) * nb
     return float(2 * np.sum(np.arctan2(triple, denominator)) / (4 * np.pi))
+
+
+def odd_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
+    """Of all directions from a point, the part in which a ray crosses the surface an odd number of times.
+
+    0 outside of a closed surface, 1 inside, in between for an open one; a triangle that is given twice counts once.
+
+    Args:
+        mesh: The surface, mm.
+        point: Shape (3,), mm, in the mesh's frame.
+    """
+    z = 1.0 - (2.0 * np.arange(RAYS) + 1.0) / RAYS  # a spiral of equal steps in z and golden turns
+    turn, ring = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(RAYS), np.sqrt(1.0 - z * z)
+    rays = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+    surface = TriangleMesh(mesh.vertices, mesh.faces[mesh.distinct])
+    return float(np.mean(crossings(surface, point, rays).count % 2))

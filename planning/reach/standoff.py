@@ -53,6 +53,11 @@ def standoffs(needle: Needle, path_length: Floats | float, skin_angle: Floats | 
     return np.full(path_length.shape, needle.standoff_mm)
 
 
+def waiting_flange(needle: Needle, path_length: Floats | float, skin_angle: Floats | float) -> Floats:
+    """How far from the target, along the needle, the flange is while the tip waits; see `standoffs`; mm."""
+    return np.asarray(needle.length_mm + standoffs(needle, path_length, skin_angle))
+
+
 def farthest_flange(needle: Needle, max_skin_angle: float) -> float:
     """How far from the target, along the needle, the flange can be while the tip waits at any standoff, mm.
 

@@ -15,7 +15,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.volumes.volume_files import parse_header
 from puncture_twin.planning.formats.volumes.volume_header import VolumeHeader
 from puncture_twin.planning.geometry.decimation import squared_distance
-from puncture_twin.planning.geometry.winding import winding_number
+from puncture_twin.planning.geometry.winding import odd_fraction, winding_number
 from puncture_twin.planning.registration.marker_check import check_markers
 from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.constraints import longest_path
@@ -36,6 +36,9 @@ ALLOWED_INSIDE = (
 
 CAUSES = "a part of the body that the skin does not hold (such as an arm), or a slip of space (LPS/RAS) or unit?"
 
+MOST_AROUND = 0.5
+"""An open mesh may go so far around the target: of the rays that cross it oddly, and of its winding number."""
+
 VOXELS_OF_SLACK = 1.0
 """A map may end so many voxels inside the skin's box: the skin itself is found to that."""
 
@@ -47,7 +50,7 @@ def check_consistency(case: Case, anatomy: Anatomy, placement: Placement | None)
         Warnings, one sentence each.
 
     Raises:
-        InputError: A structure of which too much lies outside the body, an open one that seems to hold the target, a
+        InputError: A structure of which too much lies outside the body, an open one that may hold the target, a
             label map that ends inside the body within the needle's reach, or markers whose names or axes have likely
             slipped.
     """
@@ -117,16 +120,22 @@ def volume_headers(case: Case) -> dict[str, VolumeHeader]:
 
 
 def _refuse_open_around_target(case: Case, anatomy: Anatomy) -> None:
-    """Of an open surface the inside is not known; but one that goes more than half around the target is no way out."""
+    """Of an open surface the inside is not known; but one that goes more than half around the target is no way out.
+
+    Two numbers tell: rays from the target say it however the triangles are wound, and the winding number says it of
+    shells in shells, which a ray leaves an even number of times. Neither is the inside, so none is claimed.
+    """
     for structure in anatomy.structures:
         if structure.role is not Role.AVOID or structure.mesh.closed:
             continue
-        around = abs(winding_number(structure.mesh, case.target_ct))
-        if around > 0.5:
+        odd, turns = odd_fraction(structure.mesh, case.target_ct), winding_number(structure.mesh, case.target_ct)
+        if max(odd, abs(turns)) > MOST_AROUND:
             raise InputError(
-                f"'{structure.name}' is an open mesh that goes around the target (by {100 * around:.0f} %)",
+                f"'{structure.name}' is an open mesh about the target: whether the target lies inside is not known "
+                f"({100 * odd:.0f} % of all rays from it cross the mesh an odd number of times; winding number "
+                f"{turns:.2f})",
                 where=case.path,
-                allowed="a closed mesh, or a target clearly outside",
+                allowed="a closed mesh, or one that goes less than half around the target",
             )
 
 

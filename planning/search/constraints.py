@@ -14,6 +14,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats, Texts
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Needle
 from puncture_twin.planning.clearance.measure import Clearances
+from puncture_twin.planning.reach.standoff import waiting_flange
 
 Column = NDArray[Any] | str | float
 
@@ -56,7 +57,8 @@ def judge(
 ) -> Verdicts:
     """Apply every constraint; the reason given is the first that is broken, in the order of the code.
 
-    Unknown regions come first among those on the path: nothing behind them can be judged.
+    Unknown regions come first among those on the path: nothing behind them can be judged. Those that only the needle
+    enters whose tip waits at its standoff come after the constraints on the path without which no tip ever waits.
 
     Args:
         paths: The skin along the n paths.
@@ -90,6 +92,8 @@ def judge(
     give(Reason.REENTERS_SKIN, ~np.isnan(paths.reentry_depth), skin, paths.reentry_depth)
     give(Reason.TOO_LONG, length > longest_path(needle), skin, length, length)
     give(Reason.SKIN_ANGLE, paths.skin_angle > max_skin_angle, skin, length, np.degrees(paths.skin_angle))
+    waiting = paths.view_depth < waiting_flange(needle, length, paths.skin_angle)
+    give(Reason.UNKNOWN_REGION, waiting, skin, paths.view_depth)
     worst = worst_violation(clearances, structures)
     names = np.array([s.name for s in structures] or [""], dtype=object)[worst]
     unknown = np.array([s.role is Role.UNKNOWN for s in structures] or [False])[worst]

@@ -126,11 +126,12 @@ class Explanation:
         entry = ", ".join(f"{x:.1f}" for x in row.entry_ct[0])
         limit = np.degrees(self.case.search.max_skin_angle)
         standoff = float(standoffs(needle, row.path_length[0], row.skin_angle[0]))
+        before, flange = standoff - row.path_length[0], standoff + needle.length_mm
         return [
             f"  skin entry     ({entry}) mm in the CT frame",
             f"  path length    {row.path_length[0]:8.2f} mm, allowed {longest_path(needle):g}",
             f"  skin angle     {np.degrees(row.skin_angle[0]):8.2f} deg, allowed {limit:g}",
-            f"  standoff       {standoff:8.2f} mm, its tip {standoff - row.path_length[0]:.1f} mm before the skin",
+            f"  standoff       {standoff:8.2f} mm, its tip {before:.1f} mm before the skin, the flange at {flange:.1f}",
             f"  tissue crossed {row.tissue[0]:8.2f} mm",
         ]
 

@@ -2,6 +2,7 @@
 
 import base64
 import gzip
+import hashlib
 import json
 import struct
 import zlib
@@ -13,6 +14,7 @@ from hostile.makers import CASE, MOUNT, RIB, certificate, glb, recording, sound_
 
 from puncture_twin.meshes import folder as embedded
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.output.manifest import Entry, Manifest
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.collision.checker import CellChecker
@@ -30,6 +32,9 @@ LABELS = (
     '[[structures]]\nlabelmap = "labels.seg.nrrd"\navoid = { "ves*" = 2.0 }\nignore = ["bone"]\n'
     '[[structure]]\nname = "lesion"\nlabelmap = "labels.nii.gz"\nlabel = 2\nrole = "unknown"\nmargin_mm = 1.0\n'
 )
+SCHEMA_TWO = 'schema = 2\nregion = "other"'
+STATED = 5
+"""Structures of ``stated.toml``, the skin among them: three balls and two labels."""
 CHECKS = (
     'case = "case.toml"\n[[check]]\ntheta_deg = 20\nbeta_deg = 135\nverdict = "rejected"\nreason = "too_close"\n'
     'structure = "rib"\nclearance_mm = { rib = 41.2 }\ntolerance_mm = 0.1\n[[check]]\ntheta_deg = 0\nbeta_deg = 0\n'
@@ -39,6 +44,9 @@ FCSV = (
     "# Markups fiducial file version = 4.11\n# CoordinateSystem = LPS\n# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,"
     "label,desc,associatedNodeID\n1,0,0,80,0,0,0,1,1,1,0,A,,\n2,50,0,75,0,0,0,1,1,1,0,B,,\n3,0,60,70,0,0,0,1,1,1,0,C,,\n"
 )
+
+SET_FILES = ("map.png", "sub/candidates.parquet", "plan.json", "sub/scene.png", "left.csv", "gone/report.html")
+"""Of an output folder: two of ``search``, two of ``plan``, two that an interrupted run left."""
 
 STANDOFF_MM = 8.0
 """Short, so that the plan has few rows."""
@@ -52,6 +60,7 @@ def make_corpus(folder):
     sound_case(folder, CASE + RIB)
     text = CASE + RIB + LABELS + REGISTRATION + TABLE
     (folder / "full.toml").write_text(text)
+    (folder / "stated.toml").write_text(text.replace("schema = 1", SCHEMA_TWO) + f"[end]\nstructures = {STATED}\n")
     (folder / "mount.toml").write_text(CASE + RIB + MOUNT)
     (folder / "x.collision.toml").write_text(CHECKS)
     for name in ("head/servo.toml", "head/head.ply", "head/markers.csv", "head/targets.csv", "selfcal/selfcal.toml"):
@@ -62,7 +71,22 @@ def make_corpus(folder):
     write_plan(plan, folder / "plan.json")
     (folder / "times.csv").write_text(csv_text(plan, case_checked=True))
     joints = [f"{number / 10},{','.join(map(repr, row))}" for number, row in enumerate(plan.insertion.q.tolist())]
+    (folder / "set.json").write_text(output_set_manifest())
     (folder / "joints.csv").write_text("\n".join(["time_s," + ",".join(f"q{j}_rad" for j in range(1, 7)), *joints]))
+
+
+def output_set_manifest():
+    """The manifest of a set of two commands, one made from the other, in which a third was interrupted."""
+    search = Entry(
+        "1.0", (Input("case", "case.toml", "0" * 64),), (), {name: digest_of(name) for name in SET_FILES[:2]}
+    )
+    plan = Entry("1.0", search.inputs, ("search",), {name: digest_of(name) for name in SET_FILES[2:4]})
+    return Manifest({"search": search, "plan": plan}, tuple(SET_FILES[4:])).text()
+
+
+def digest_of(name):
+    """SHA-256 of what a file of the set holds, which is its name."""
+    return hashlib.sha256(name.encode()).hexdigest()
 
 
 def make_meshes(folder):

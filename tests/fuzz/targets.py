@@ -4,8 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fuzz.output_sets import rewritten_set, whole_set
 from puncture_twin.planning.anatomy.anatomy import load_anatomy
 from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.case_schema import SCHEMA_ONE_NOTE
 from puncture_twin.planning.certify.certificate import read_certificate
 from puncture_twin.planning.collision_cases.pytest_plugin import read_checks
 from puncture_twin.planning.export.csv_times import read_csv
@@ -20,7 +22,7 @@ from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import read_recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import load_selfcal_case
-from puncture_twin.twin.jobs.robot.mirror import recorded_states
+from puncture_twin.twin.jobs.robot.mirror import RecordedJoints
 
 
 @dataclass(frozen=True)
@@ -109,8 +111,12 @@ def whole_certificate(certificate):
 
 
 def whole_case(read):
-    """Finite numbers, one skin, something to avoid, unique names, a target inside; meshes that are whole."""
+    """Finite numbers, one skin, something to avoid, unique names, a target inside; meshes that are whole.
+
+    And nothing is lost: there are as many structures as the file states, or a note says that it states none.
+    """
     case, anatomy = read
+    assert case.stated_structures == len(anatomy.structures) + 1 or SCHEMA_ONE_NOTE in case.warnings
     assert np.isfinite(case.target_ct).all() and np.isfinite(case.T_ct_entry).all()
     names = [structure.name for structure in anatomy.structures]
     assert len(set(names)) == len(names) and any(s.demands_margin for s in anatomy.structures)
@@ -175,6 +181,7 @@ LABELS = {
     "labels.seg.nrrd": "headed",
     "labels.nhdr": "text",
 }
+CASES = ("full.toml", "stated.toml", "case.toml", "mount.toml")
 TARGETS = [
     Target("mesh", MESHES, read_own_mesh, whole_mesh),
     Target("volume", {"ct.nii.gz": "gzip", "ct.nrrd": "headed", **LABELS}, read_volume, whole_volume),
@@ -186,13 +193,14 @@ TARGETS = [
         whole_points,
     ),
     Target("naming", {"names.csv": "table"}, read_names, whole_names),
-    Target("case", {"full.toml": "text", "case.toml": "text", "mount.toml": "text"}, read_case, whole_case, heavy=True),
+    Target("case", dict.fromkeys(CASES, "text"), read_case, whole_case, heavy=True),
     Target("servo case", {"servo.toml": "text"}, load_servo_case, whole_anything, heavy=True),
     Target("selfcal case", {"selfcal.toml": "text"}, load_selfcal_case, whole_anything),
     Target("collision file", {"x.collision.toml": "text"}, read_checks, whole_checks),
     Target("certificate", {"certificate.json": "tree"}, read_certificate, whole_certificate),
     Target("plan", {"plan.json": "tree"}, read_plan, whole_plan),
+    Target("output set", {"set.json": "tree"}, rewritten_set, whole_set),
     Target("recording", {"recording.csv": "table"}, read_recording, whole_recording),
-    Target("joints", {"joints.csv": "table"}, lambda path: list(recorded_states(path)), whole_states),
+    Target("joints", {"joints.csv": "table"}, lambda path: list(RecordedJoints.read(path).states()), whole_states),
     Target("times", {"times.csv": "table"}, read_times, whole_motion),
 ]

@@ -122,6 +122,8 @@ def certificate(folder):
         theta=(0.2, 0.4),
         beta=(0.1, 0.3),
         length=210.0,
+        standoff=None,
+        skin_gap=10.0,
         farthest=360.0,
         radius=0.6,
         longest=150.0,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -29,6 +30,12 @@ LAYOUT = 1
 
 MAX_MANIFEST_BYTES = 50_000_000
 """A line for each of a hundred thousand files; a larger one is something else."""
+
+LONGEST_NAME = 1000
+"""Bytes of a file's name with its sub-folders; we write some forty."""
+
+LONGEST_PART = 255
+"""Bytes of one part of it, which is what file systems take."""
 
 ANOTHER_FOLDER = "another output folder, or this one without that file"
 
@@ -198,7 +205,16 @@ def _manifest(document: dict[str, Any]) -> Manifest:
     if document["layout"] != LAYOUT:
         raise ValueError(f"layout {document['layout']}")
     entries = {str(name): _entry(entry) for name, entry in document["entries"].items()}
-    return Manifest(MappingProxyType(entries), tuple(map(_name, document["unfinished"])))
+    unfinished = tuple(map(_name, document["unfinished"]))
+    _refuse_twice([name for entry in entries.values() for name in entry.files] + list(unfinished))
+    return Manifest(MappingProxyType(entries), unfinished)
+
+
+def _refuse_twice(names: list[str]) -> None:
+    """A file belongs to one entry, or to none."""
+    twice = {name for name, count in Counter(names).items() if count > 1}
+    if twice:
+        raise ValueError(f"{min(twice)!r} is listed twice")
 
 
 def _entry(document: dict[str, Any]) -> Entry:
@@ -208,8 +224,10 @@ def _entry(document: dict[str, Any]) -> Entry:
 
 
 def _name(name: Any) -> str:
-    """A file's name that stays within the folder: what a manifest lists is removed one day."""
+    """A file's name that stays within the folder and that a file can have: what is listed is removed one day."""
     parts = PurePosixPath(name).parts
-    if not parts or "\\" in name or name != "/".join(parts) or {"..", "/", "."} & set(parts):
-        raise ValueError(f"the name {name!r}")
+    if not parts or set("\\\0") & set(name) or name != "/".join(parts) or {"..", "/", "."} & set(parts):
+        raise ValueError(f"the name {name[:LONGEST_PART]!r}")
+    if len(name.encode()) > LONGEST_NAME or max(len(part.encode()) for part in parts) > LONGEST_PART:
+        raise ValueError(f"the name {name[:LONGEST_PART]!r}, which no file has")
     return str(name)

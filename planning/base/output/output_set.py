@@ -297,9 +297,19 @@ def _refuse_foreign(draft: Draft, files: Iterable[str]) -> None:
     if (draft.out / MANIFEST_NAME).exists():
         known.add(TIMINGS_NAME)
     for name in sorted({*files, TIMINGS_NAME} - known):
-        if (draft.out / name).exists() or (draft.out / name).is_symlink():
-            what = f"{name} is to be written, but the file of this name there comes from no run of this program"
+        foreign = _in_the_way(draft.out, name)
+        if foreign is not None:
+            what = f"{name} is to be written, but the file {foreign} there comes from no run of this program"
             raise InputError(what, where=draft.out, allowed="another folder, or this one without that file")
+
+
+def _in_the_way(out: Path, name: str) -> str | None:
+    """What stands under a name that is to be written, or where a sub-folder of it must be; a link leads elsewhere."""
+    place = out / name
+    for folder in reversed(Path(name).parents[:-1]):
+        if (out / folder).is_symlink() or ((out / folder).exists() and not (out / folder).is_dir()):
+            return folder.as_posix()
+    return name if place.exists() or place.is_symlink() else None
 
 
 def _remove(out: Path, names: Iterable[str]) -> None:

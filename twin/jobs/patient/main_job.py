@@ -255,7 +255,7 @@ def export(
     inputs, made_from = (source, *plan.inputs), {source.path: source.sha256}
     with writing(out, f"export {name}", inputs=inputs, names=(name,), made_from=made_from, note=note) as draft:
         done = export_plan(plan, format_name, draft.folder, source=plan_path, checker=checker)
-    return replace(done, path=draft.final((done.path,))[0])
+    return replace(done, path=draft.final((done.path,))[0], inputs=inputs)
 
 
 def check_candidate(prepared: Prepared, theta_deg: float, beta_deg: float) -> Explanation:

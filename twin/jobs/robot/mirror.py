@@ -18,6 +18,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.base.whole_lines import unfinished_warnings
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.raw_mesh import decode_text
@@ -184,18 +185,43 @@ def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -
         time.sleep(period_s)
 
 
-def recorded_states(path: Path) -> Iterator[JointState]:
-    """A recording: CSV with ``time_s`` and ``q1_rad`` .. ``q6_rad``; other columns and lines with # do not count.
+@dataclass(frozen=True, eq=False)
+class RecordedJoints:
+    """A recording: CSV with ``time_s`` and ``q1_rad`` .. ``q6_rad``; other columns and lines with # do not count."""
 
-    Raises:
-        InputError: The file cannot be read, lacks a column, or holds something that is no number.
-    """
-    lines = decode_text(read_input(path, max_bytes=MAX_RECORDING_BYTES, where=str(path)), str(path)).splitlines()
-    table = csv.DictReader((line for line in lines if line.strip() and not line.startswith("#")), strict=True)
-    try:
-        yield from _states(table, path)
-    except csv.Error as error:
-        raise InputError(f"is no CSV ({error})", where=path, allowed="a CSV of joint angles") from error
+    path: Path
+    data: bytes
+
+    @classmethod
+    def read(cls, path: Path) -> RecordedJoints:
+        """Read the file, once.
+
+        Raises:
+            InputError: It cannot be read.
+        """
+        return cls(path, read_input(path, max_bytes=MAX_RECORDING_BYTES, where=str(path)))
+
+    @property
+    def input(self) -> Input:
+        """As an input of what is shown."""
+        return content_input("recording", self.path.name, self.data)
+
+    def states(self) -> Iterator[JointState]:
+        """One row after the other.
+
+        Raises:
+            InputError: A column is missing, or something is no number.
+        """
+        lines = decode_text(self.data, str(self.path)).splitlines()
+        table = csv.DictReader((line for line in lines if line.strip() and not line.startswith("#")), strict=True)
+        try:
+            yield from _states(table, self.path)
+        except csv.Error as error:
+            raise InputError(f"is no CSV ({error})", where=self.path, allowed="a CSV of joint angles") from error
+
+    def warnings(self) -> tuple[str, ...]:
+        """What the recording's end leaves open, one sentence each."""
+        return unfinished_warnings(self.data, self.path.name)
 
 
 def _states(table: csv.DictReader[str], path: Path) -> Iterator[JointState]:
@@ -209,15 +235,6 @@ def _states(table: csv.DictReader[str], path: Path) -> Iterator[JointState]:
         except (TypeError, ValueError) as error:
             raise InputError(f"row {number} holds no number", where=path, allowed="numbers: s and rad") from error
         yield checked(t, q, f"{path}: row {number}")
-
-
-def recording_warnings(path: Path) -> tuple[str, ...]:
-    """What a recording's end leaves open, one sentence each.
-
-    Raises:
-        InputError: The file cannot be read.
-    """
-    return unfinished_warnings(read_input(path, max_bytes=MAX_RECORDING_BYTES, where=str(path)), path.name)
 
 
 def checked(time_s: float, q: list[float], where: str) -> JointState:

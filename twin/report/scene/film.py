@@ -34,6 +34,9 @@ WIDTH, HEIGHT = 832, 608
 VIEW_WIDTH, VIEW_HEIGHT = 592, 528
 """The overview, upper left. Below it stand the numbers."""
 
+SAME_BYTES = ("-threads", "4", "-filter_threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact")
+"""x264 writes other bytes for another number of threads, and left alone it takes as many as there are cores."""
+
 INSET = 240
 """Side of the close-up, upper right; below it stand the names and the body's directions."""
 
@@ -206,7 +209,7 @@ def _write_mp4(frames: list[NDArray[np.uint8]], path: Path) -> None:
             fps=FRAMES_PER_SECOND,
             codec="libx264",
             quality=None,
-            output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"],
+            output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart", *SAME_BYTES],
             ffmpeg_log_level="quiet",
         )
         writer.send(None)

@@ -1,0 +1,208 @@
+"""An image that ends in the body: the flange must stay inside of it, inserted and while the tip waits at its standoff.
+
+The trunk is a box of 400 x 160 x 240 mm, cut at the head 60 mm from the target, which lies 80 mm below the front. A
+needle tilted by t toward the head leaves the image 60 / sin(t) mm from the target, its path is 80 / cos(t) long, and it
+meets the skin at the angle t.
+"""
+
+from dataclasses import replace
+from importlib import import_module
+
+import numpy as np
+import pytest
+import trimesh
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.case.entry import Directions, outward
+from puncture_twin.planning.certify.bounds import FlangeBounds
+from puncture_twin.planning.certify.certificate import read_certificate, write_certificate
+from puncture_twin.planning.certify.checker import verify
+from puncture_twin.planning.certify.subdivision import certify
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.search import organ_candidates
+
+DEG = np.pi / 180.0
+LENGTH = 210.0
+CAP = {"theta": (4 * DEG, 40 * DEG), "beta": (-30 * DEG, 30 * DEG)}
+"""Toward the head; angles from 0 to 25 degrees are imaged, waited for beyond the image, or inserted beyond it."""
+
+CASE = """
+schema = 1
+name = "cut"
+space = "LPS"
+[target]
+position_mm = [0.0, 0.0, 60.0]
+structure = "lesion"
+[needle]
+length_mm = 210.0
+shaft_mm = 150.0
+diameter_mm = 1.2
+{standoff}
+[search]
+step_deg = 2.0
+max_skin_angle_deg = 60
+[[structure]]
+name = "skin"
+role = "skin"
+mesh = "skin.ply"
+unit = "mm"
+cut = ["head"]
+[[structure]]
+name = "lesion"
+role = "target"
+mesh = "lesion.ply"
+unit = "mm"
+[[structure]]
+name = "spine"
+role = "avoid"
+margin_mm = 2.0
+mesh = "spine.ply"
+unit = "mm"
+"""
+
+
+def cut_case(folder, standoff=""):
+    """The trunk with its image's end, prepared without an arm."""
+    for name, size, middle in (
+        ("skin", (400, 160, 240), (0, 0, 0)),
+        ("lesion", (10, 10, 10), (0, 0, 60)),
+        ("spine", (30, 30, 200), (0, 50, 0)),
+    ):
+        mesh = trimesh.creation.box(extents=size)
+        mesh.apply_translation(middle)
+        mesh.export(folder / f"{name}.ply")
+    path = folder / "case.toml"
+    path.write_text(CASE.format(standoff=standoff))
+    return prepare(path, arm=False)
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory):
+    """The trunk, whose tips wait just outside the skin."""
+    return cut_case(tmp_path_factory.mktemp("cut"))
+
+
+@pytest.fixture(scope="module")
+def certified(cut):
+    """Its certificate toward the head."""
+    return certify(cut.case, cut.anatomy, size=0.5 * DEG, **CAP)
+
+
+def gap(angle):
+    """From the waiting tip to the skin, as docs/search.md states it, mm."""
+    return np.maximum(10.0, 5.0 + (0.6 + 5.0) * np.tan(angle) + 1.0)
+
+
+def leaves_while_waiting(tilt):
+    """By school geometry: the flange at standoff lies beyond the image's end."""
+    return 60.0 / np.sin(tilt) < LENGTH + 80.0 / np.cos(tilt) + gap(tilt)
+
+
+def judged(prepared, theta, beta):
+    """The search's verdicts on directions, rad."""
+    theta, beta = np.atleast_1d(theta), np.broadcast_to(beta, np.shape(np.atleast_1d(theta)))
+    directions = Directions(theta, beta, outward(theta, beta) @ prepared.case.T_ct_entry[:3, :3].T)
+    return organ_candidates(prepared.case, prepared.anatomy, prepared.engine, directions)
+
+
+def test_an_inserted_flange_inside_and_a_waiting_one_outside_is_unknown(cut):
+    """14 degrees: the image ends 248 mm from the target, the flange comes from 302 mm; the reason names that depth."""
+    found = cut.check(14 * DEG, 0.0)
+    assert found.reason[0] == Reason.UNKNOWN_REGION
+    assert found.reason_structure[0] == "skin"
+    assert found.reason_depth[0] == pytest.approx(60.0 / np.sin(14 * DEG))
+    assert LENGTH < found.reason_depth[0] < LENGTH + 80.0 / np.cos(14 * DEG) + 10.0
+
+
+def test_each_directions_own_standoff_decides(cut):
+    """Safe and unknown part where the own flange leaves, not where the flange of the longest path would."""
+    tilt = np.arange(4.0, 30.0, 0.01) * DEG
+    found = judged(cut, tilt, 0.0)
+    np.testing.assert_array_equal(found.safe, ~leaves_while_waiting(tilt))
+    assert (found.reason[~found.safe] == Reason.UNKNOWN_REGION).all()
+    longest = LENGTH + 150.0 + gap(60 * DEG)
+    assert found.safe[60.0 / np.sin(tilt) < longest].sum() > 100
+
+
+def test_a_stated_standoff_decides(tmp_path):
+    """With standoff_mm the flange waits as far out along every path: the image must reach to 330 mm."""
+    prepared = cut_case(tmp_path, "standoff_mm = 120.0")
+    tilt = np.arange(4.0, 30.0, 0.01) * DEG
+    np.testing.assert_array_equal(judged(prepared, tilt, 0.0).safe, 60.0 / np.sin(tilt) >= LENGTH + 120.0)
+
+
+def test_a_path_without_a_standoff_keeps_its_reason(cut):
+    """Where no tip ever waits, the constraint that forbids it is the reason, here a path of 170 mm to the side."""
+    found = cut.check(62 * DEG, 80 * DEG)
+    assert found.reason[0] == Reason.TOO_LONG
+
+
+def test_the_certificate_agrees_with_the_search(cut, certified, rng):
+    """Random directions of the cap: none of a safe cell is refused, none of a rejected one safe; few are undecided."""
+    theta, beta = rng.uniform(*CAP["theta"], 4000), rng.uniform(*CAP["beta"], 4000)
+    found = judged(cut, theta, beta)
+    letters = certified.at(theta, beta)
+    assert found.safe[letters == "S"].all()
+    assert not found.safe[letters == "R"].any()
+    assert min((letters == "S").sum(), (letters == "R").sum()) > 300
+    assert certified.share("U") < 0.05
+    verify(certified, cut.case, cut.anatomy)
+
+
+def beyond_image(case, certificate):
+    """Rejected cells all of whose needles are imaged when inserted, and not while the tip waits."""
+    sine = np.sin(certificate.leaves.theta) * np.cos(np.abs(certificate.leaves.beta))
+    middle = certificate.leaves.centres() @ case.T_ct_entry[:3, :3].T
+    own = LENGTH + 80.0 / -middle[:, 1] + 10.0
+    return (certificate.verdict == "R") & (60.0 / sine.max(axis=1) > LENGTH + 1.0) & (60.0 / middle[:, 2] < own - 3.0)
+
+
+def forged(certificate, rows, tmp_path):
+    """The certificate as a file in which cells are claimed safe, whole and agreeing with itself."""
+    verdict, reason, structure = certificate.verdict.copy(), certificate.reason.copy(), certificate.structure.copy()
+    verdict[rows], reason[rows], structure[rows] = "S", "", ""
+    letters = iter(verdict)
+    tree = tuple("".join(x if x.islower() else str(next(letters)) for x in level) for level in certificate.tree)
+    write_certificate(
+        replace(certificate, tree=tree, verdict=verdict, reason=reason, structure=structure), tmp_path / "c.json"
+    )
+    return read_certificate(tmp_path / "c.json")
+
+
+def test_a_cell_forged_safe_whose_waiting_flange_leaves_the_image_is_refused(cut, certified, tmp_path):
+    """Several such cells, each by itself, and all at once: the checker names the cell."""
+    rows = np.flatnonzero(beyond_image(cut.case, certified))
+    assert len(rows) > 20
+    for forgery in (*rows[:: len(rows) // 5, None], rows):
+        with pytest.raises(InputError, match=f"cell {forgery[0]} .* is not proven safe"):
+            verify(forged(certified, forgery, tmp_path), cut.case, cut.anatomy)
+
+
+def test_a_certificate_for_inserted_needles_alone_is_refused(cut, certified, monkeypatch):
+    """Whole and true of the inserted needle: with the flange at the needle's length the maker proves too much safe."""
+    module = import_module("planning.certify.certify")
+    for name in ("any_flange", "flange_bounds"):
+        monkeypatch.setattr(module, name, lambda *_: FlangeBounds(LENGTH, LENGTH))
+    careless = certify(cut.case, cut.anatomy, size=0.5 * DEG, **CAP)
+    assert careless.share("S") > certified.share("S") + 0.05
+    with pytest.raises(InputError, match="is not proven safe"):
+        verify(careless, cut.case, cut.anatomy)
+
+
+def test_a_cell_forged_out_of_the_image_is_refused(cut, certified, tmp_path):
+    """A safe cell beside the border, claimed to leave the image: not proven either."""
+    row = int(np.flatnonzero(certified.verdict == "S")[-1])
+    verdict, reason = certified.verdict.copy(), certified.reason.copy()
+    verdict[row], reason[row] = "R", Reason.UNKNOWN_REGION.value
+    letters = iter(verdict)
+    tree = tuple("".join(x if x.islower() else str(next(letters)) for x in level) for level in certified.tree)
+    with pytest.raises(InputError, match=f"cell {row} .* is not proven rejected"):
+        verify(replace(certified, tree=tree, verdict=verdict, reason=reason), cut.case, cut.anatomy)
+
+
+def test_another_gap_is_another_question(cut, certified):
+    """The certificate states what its standoffs follow from: with another gap or standoff it is refused."""
+    for needle in (replace(cut.case.needle, skin_gap_mm=11.0), replace(cut.case.needle, standoff_mm=170.0)):
+        with pytest.raises(InputError, match="is not that of the case"):
+            verify(certified, replace(cut.case, needle=needle), cut.anatomy)
