@@ -104,10 +104,10 @@ def search(
 ) -> None:
     """Judge every entry direction of a case; write the table, the map, the scene and the page."""
     with progress_display() as progress:
-        prepared = prepare(case, arm=arm, engine=engine, watcher=progress)
-        checked = prepared.cross_check(check_again) if check_again else None
+        context = prepare(case, arm=arm, engine=engine, watcher=progress)
+        checked = context.cross_check(check_again) if check_again else None
         run = main_job.search_case(
-            prepared, out_dir, pictures=pictures, checked=checked, certify_deg=certify_size if certified else None
+            context, out_dir, pictures=pictures, checked=checked, certify_deg=certify_size if certified else None
         )
     _print(run.summary(), words.search_text(run), as_json)
     if not run.candidates.safe.any():
@@ -227,8 +227,8 @@ def export(
     if format_name not in FORMATS:
         raise InputError(f"format '{format_name}' is not known", where="--format", allowed=", ".join(FORMATS))
     with progress_display() as progress:
-        prepared = None if case is None else prepare(case, watcher=progress)
-        done = main_job.export(plan, format_name, out_dir, prepared, progress.note)
+        context = None if case is None else prepare(case, watcher=progress)
+        done = main_job.export(plan, format_name, out_dir, context, progress.note)
     summary = {"format": format_name, "notes": list(done.notes), "case_checked": case is not None}
     summary |= {"inputs": inputs_document(done.inputs), "files": [str(done.path)]}
     _print(summary, words.export_text(done, case is not None), as_json)
@@ -313,11 +313,11 @@ def reproduce(
 
 def _rehearse(case: Path, out_dir: Path, as_json: bool, plan_path: Path | None = None) -> None:
     with progress_display() as progress:
-        prepared = prepare(case, watcher=progress)
+        context = prepare(case, watcher=progress)
         if plan_path is None:
-            run = main_job.rehearse_case(prepared, out_dir)
+            run = main_job.rehearse_case(context, out_dir)
         else:
-            run = main_job.rehearse_plan(prepared, plan_path, out_dir)
+            run = main_job.rehearse_plan(context, plan_path, out_dir)
     _print(run.summary(), words.rehearsal_text(run), as_json)
 
 

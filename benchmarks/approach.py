@@ -33,7 +33,7 @@ from puncture_twin.planning.motion.follow import MAX_JERK, follow
 from puncture_twin.planning.motion.path_check import dense_states, least_clearance, path_length
 from puncture_twin.planning.reach.answer import ReachRequest
 from puncture_twin.planning.reach.goals import approach_goals
-from puncture_twin.planning.search.context import Prepared, prepare
+from puncture_twin.planning.search.context import CaseContext, prepare
 
 STANDOFF_MM = 100.0
 
@@ -79,17 +79,17 @@ def main() -> None:
 
 def scenes(count: int) -> Iterator[Scene]:
     """The three rooms, a third of the problems each."""
-    prepared, rng = prepare(folder() / "abdomen", arm=False), np.random.default_rng(0)
-    assert prepared.placement is not None
-    case, T_base_ct = prepared.case, prepared.placement.T_base_ct
-    tool, home, skin = case_tool(case), home_configuration(case), prepared.anatomy.skin.mesh.transformed(T_base_ct)
+    context, rng = prepare(folder() / "abdomen", arm=False), np.random.default_rng(0)
+    assert context.placement is not None
+    case, T_base_ct = context.case, context.placement.T_base_ct
+    tool, home, skin = case_tool(case), home_configuration(case), context.anatomy.skin.mesh.transformed(T_base_ct)
     floor = np.eye(4)
     floor[2, 3] = -60.0
     boxes = case_boxes(case, T_base_ct)
     rooms = (
         ("free room", (Box("table", floor, (2000.0, 2000.0, 100.0)),), None),
         ("table and body", boxes, skin),
-        ("beside a gantry", (*boxes, *gantry_boxes(gantry(prepared, T_base_ct), **GANTRY_MM)), skin),
+        ("beside a gantry", (*boxes, *gantry_boxes(gantry(context, T_base_ct), **GANTRY_MM)), skin),
     )
     for part, (name, room, patient) in enumerate(rooms):
         fast, slow, built = build(case.robot.model, tool, room, patient)
@@ -97,7 +97,7 @@ def scenes(count: int) -> Iterator[Scene]:
         wanted = count // 3 + (part < count % 3)
         problems: list[tuple[np.ndarray, np.ndarray]] = []
         while len(problems) < wanted:
-            found = between(fast, rng) if patient is None else to_a_puncture(fast, prepared, T_base_ct, start, rng)
+            found = between(fast, rng) if patient is None else to_a_puncture(fast, context, T_base_ct, start, rng)
             problems += [] if found is None else [found]
         yield Scene(name, fast, slow, built, room, patient, problems)
 
@@ -108,13 +108,13 @@ FOLDED = [np.radians([pan, -120.0, 130.0, -100.0, -90.0, 0.0]) for pan in range(
 GANTRY_MM = {"bore_diameter_mm": 800.0, "wall_mm": 120.0, "depth_mm": 250.0}
 
 
-def gantry(prepared: Prepared, T_base_ct: np.ndarray) -> np.ndarray:
+def gantry(context: CaseContext, T_base_ct: np.ndarray) -> np.ndarray:
     """T_base_gantry: about the body, its wall 225 to 475 mm from the target toward the head."""
     T_ct_gantry = np.eye(4)
-    head = prepared.case.T_ct_entry[:3, 0]
+    head = context.case.T_ct_entry[:3, 0]
     T_ct_gantry[:3, :3] = np.stack([*np.linalg.svd(head[None])[2][1:], head], axis=1)
     T_ct_gantry[:3, 0] *= np.sign(np.linalg.det(T_ct_gantry[:3, :3]))
-    T_ct_gantry[:3, 3] = prepared.case.target_ct + 350.0 * head
+    T_ct_gantry[:3, 3] = context.case.target_ct + 350.0 * head
     return T_base_ct @ T_ct_gantry
 
 
@@ -145,10 +145,10 @@ def between(checker: FastChecker, rng: np.random.Generator) -> tuple[np.ndarray,
 
 
 def to_a_puncture(
-    checker: FastChecker, prepared: Prepared, T_base_ct: np.ndarray, home: np.ndarray, rng: np.random.Generator
+    checker: FastChecker, context: CaseContext, T_base_ct: np.ndarray, home: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """From the case's home to every pose that holds a direction from above; None where the arm holds none."""
-    case = prepared.case
+    case = context.case
     u = rng.normal(size=3)
     u = u / np.linalg.norm(u) + 1.2 * case.T_ct_entry[:3, 2]
     outward = T_base_ct[:3, :3] @ (u / np.linalg.norm(u))

@@ -104,10 +104,10 @@ def _missed(ours: np.ndarray, theirs: np.ndarray) -> int:
 def reach(name: str, case_file: Path, step_deg: float, n_states: int) -> None:
     """The reach of every organ-safe direction of a case with FCL alone and with the fast checker, and states."""
     case_file.write_text(case_file.read_text().replace("step_deg = 2.0", f"step_deg = {step_deg}"))
-    prepared = prepare(case_file)
-    case, anatomy, placed = prepared.case, prepared.anatomy, prepared.reach
+    context = prepare(case_file)
+    case, anatomy, placed = context.case, context.anatomy, context.reach
     assert placed is not None
-    found = organ_candidates(case, anatomy, prepared.engine, case_directions(case))
+    found = organ_candidates(case, anatomy, context.engine, case_directions(case))
     requests = [reach_request(case, found, int(row), placed.T_base_ct) for row in np.flatnonzero(found.safe)]
     skin = anatomy.skin.mesh.transformed(placed.T_base_ct)
     room = (ur_model(case.robot.model), case_tool(case), case_boxes(case, placed.T_base_ct), skin)

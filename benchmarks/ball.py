@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.twin.guidance.stereo.ball.ball_image import BallScene, render
-from puncture_twin.twin.guidance.stereo.ball.tracker import Ball, LostBall, find_ball
+from puncture_twin.twin.guidance.stereo.ball.tracker import DetectedBall, LostBall, find_ball
 from puncture_twin.twin.guidance.stereo.cameras.calibration import calibrate
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, stereo_pair
 from puncture_twin.twin.guidance.stereo.cameras.triangulation import triangulate
@@ -147,13 +147,13 @@ def look(camera: Camera, count: int, seed: int, *, noise: float = 2.0, **changes
         found = find_ball(picture, camera, predicted, RADIUS_MM, search_px=SEARCH_PX)
         spent += process_time() - start
         true = camera.project(center)
-        if isinstance(found, Ball):
+        if isinstance(found, DetectedBall):
             errors.append(found.pixel - true)
             squared.append(errors[-1] @ np.linalg.solve(found.covariance, errors[-1]) / 2)
         else:
             reasons[found.reason] += 1
         rough = find_ball(picture, camera, predicted, RADIUS_MM, search_px=SEARCH_PX, hough_only=True)
-        if isinstance(rough, Ball):
+        if isinstance(rough, DetectedBall):
             hough.append(rough.pixel - true)
     return Row(np.array(errors), np.array(squared), np.array(hough), reasons, 1000 * spent / count)
 
@@ -176,7 +176,7 @@ def in_space(
     planned = stereo_pair(*SIZE, FOCAL, baseline, 1000)
     errors, lost, reprojection = [], 0, []
 
-    def seen(point: np.ndarray, believed: tuple[Camera, ...]) -> list[Ball | LostBall]:
+    def seen(point: np.ndarray, believed: tuple[Camera, ...]) -> list[DetectedBall | LostBall]:
         scenes = scene(rng, point)
         pictures = [render(camera, scenes, rng=rng, noise=noise, half_px=50) for camera in true]
         return [
@@ -205,7 +205,7 @@ def in_space(
     return np.array(errors), lost, float(np.mean(reprojection))
 
 
-def any_lost(balls: list[Ball | LostBall]) -> bool:
+def any_lost(balls: list[DetectedBall | LostBall]) -> bool:
     """Whether a camera did not find it."""
     return any(isinstance(ball, LostBall) for ball in balls)
 

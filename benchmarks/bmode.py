@@ -23,7 +23,7 @@ from puncture_twin.twin.guidance.ultrasound.image.needle_detector import (
     detect,
     search_score,
 )
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleEcho, NeedlePose, render
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleEcho, NeedleInImage, render
 
 IMAGER = Imager()
 
@@ -64,11 +64,11 @@ def main() -> None:
     bias(max(10, arguments.pictures // 2))
 
 
-def draw_needle(rng: np.random.Generator, scene: Scene) -> NeedlePose:
+def draw_needle(rng: np.random.Generator, scene: Scene) -> NeedleInImage:
     """A needle somewhere in the picture."""
     steep, lean, side = np.radians(rng.uniform(20, 75)), np.radians(scene.lean_deg), rng.choice([-1.0, 1.0])
     direction = np.array([side * np.cos(steep) * np.cos(lean), np.sin(steep) * np.cos(lean), np.sin(lean)])
-    return NeedlePose(np.array([rng.uniform(12, 38), rng.uniform(15, 52), scene.off_plane_mm]), direction)
+    return NeedleInImage(np.array([rng.uniform(12, 38), rng.uniform(15, 52), scene.off_plane_mm]), direction)
 
 
 def compare(scene: Scene, count: int) -> None:
@@ -93,7 +93,7 @@ def compare(scene: Scene, count: int) -> None:
         print(f"{row} {ms:7.0f}")
 
 
-def error(found: Detection, needle: NeedlePose) -> tuple[float, float, float]:
+def error(found: Detection, needle: NeedleInImage) -> tuple[float, float, float]:
     """Detected minus true: along and across the shaft, mm, and the angle, rad."""
     d = needle.direction_image[:2] / np.linalg.norm(needle.direction_image[:2])
     e, v = found.tip_image - needle.tip_image[:2], found.direction_image
@@ -160,7 +160,7 @@ def bias(count: int) -> None:
             for contrast in (18.0, 26.0):
                 rng = np.random.default_rng([int(steep), int(depth), int(contrast)])
                 direction = np.array([np.cos(np.radians(steep)), np.sin(np.radians(steep)), 0.0])
-                needle = NeedlePose(np.array([25.0, depth, 0.0]), direction)
+                needle = NeedleInImage(np.array([25.0, depth, 0.0]), direction)
                 echo = NeedleEcho(contrast_db=contrast)
                 found = [detect(render(IMAGER, needle, rng, echo=echo), IMAGER, settings) for _ in range(count)]
                 errors = np.array([error(f, needle)[0] for f in found if isinstance(f, Detection)])

@@ -26,7 +26,7 @@ from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.fast_engine import FastEngine
-from puncture_twin.planning.search.context import Prepared, prepare
+from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.search import organ_candidates
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -45,27 +45,27 @@ def times(size_deg: float, repeats: int) -> None:
     print("|" + "---|" * 11)
     with tempfile.TemporaryDirectory() as temporary:
         for name, path in _anatomies(Path(temporary)).items():
-            prepared = prepare(path, arm=False)
+            context = prepare(path, arm=False)
             for size in (size_deg, size_deg / 2):
-                _row(name, prepared, size, size_deg, repeats)
-            found = certify(prepared.case, prepared.anatomy, size=np.radians(size_deg))
+                _row(name, context, size, size_deg, repeats)
+            found = certify(context.case, context.anatomy, size=np.radians(size_deg))
             start = time.thread_time()
             print(
-                f"  checked again: {verify(found, prepared.case, prepared.anatomy)}, {time.thread_time() - start:.0f} s"
+                f"  checked again: {verify(found, context.case, context.anatomy)}, {time.thread_time() - start:.0f} s"
             )
 
 
-def _row(name: str, prepared: Prepared, size_deg: float, step_deg: float, repeats: int) -> None:
-    case, meshes = prepared.case, tuple(s.mesh for s in prepared.anatomy.structures)
+def _row(name: str, context: CaseContext, size_deg: float, step_deg: float, repeats: int) -> None:
+    case, meshes = context.case, tuple(s.mesh for s in context.anatomy.structures)
     R, length = case.T_ct_entry[:3, :3], case.needle.length_mm
     coarse, fine = (grid(case.search.theta, case.search.beta, np.radians(step), R) for step in (1.0, step_deg))
-    own = _best(lambda: certify(case, prepared.anatomy, size=np.radians(size_deg)), repeats)
-    found = certify(case, prepared.anatomy, size=np.radians(size_deg))
+    own = _best(lambda: certify(case, context.anatomy, size=np.radians(size_deg)), repeats)
+    found = certify(case, context.anatomy, size=np.radians(size_deg))
     engine = FastEngine(meshes)
     trees = _best(lambda: FastEngine(meshes), repeats)
     dense = _best(lambda: engine.measure(case.target_ct, coarse.outward_ct, length), repeats)
     fewer, triangles = 100 * (1 - found.queries / len(fine)), sum(len(mesh.faces) for mesh in meshes)
-    shares = 100 * (found.share("S") or 0), 100 * (found.share("U") or 0), 100 * _mixed(prepared, found)
+    shares = 100 * (found.share("S") or 0), 100 * (found.share("U") or 0), 100 * _mixed(context, found)
     cells = " | ".join(
         [
             f"{name} ({triangles:,})",
@@ -82,15 +82,15 @@ def _row(name: str, prepared: Prepared, size_deg: float, step_deg: float, repeat
     print(f"| {cells} |", flush=True)
 
 
-def _mixed(prepared: Prepared, found: Certificate, across: int = 6) -> float:
+def _mixed(context: CaseContext, found: Certificate, across: int = 6) -> float:
     """Share of the cap in undecided cells that hold safe and unsafe directions: no proof can decide these."""
-    cells, case = found.leaves.take(found.verdict == "U"), prepared.case
+    cells, case = found.leaves.take(found.verdict == "U"), context.case
     at = (np.arange(across) + 0.5) / across
     theta = cells.theta[:, :1, None] + at[None, :, None] * np.diff(cells.theta)[:, :, None]
     beta = cells.beta[:, None, :1] + at[None, None, :] * np.diff(cells.beta)[:, :, None]
     angles = [np.ascontiguousarray(a).ravel() for a in np.broadcast_arrays(theta, beta)]
     outward_ct = outward(*angles) @ case.T_ct_entry[:3, :3].T
-    safe = organ_candidates(case, prepared.anatomy, prepared.engine, Directions(*angles, outward_ct)).safe
+    safe = organ_candidates(case, context.anatomy, context.engine, Directions(*angles, outward_ct)).safe
     share = safe.reshape(len(cells), -1).mean(axis=1)
     mixed = cells.take((share > 0) & (share < 1)).solid_angle().sum()
     return float(mixed / found.question.cap().solid_angle()[0])
@@ -101,10 +101,10 @@ def million(total: int, size_deg: float) -> int:
     wrong = 0
     with tempfile.TemporaryDirectory() as temporary:
         for name, path in _anatomies(Path(temporary)).items():
-            prepared = prepare(path, arm=False)
-            found = certify(prepared.case, prepared.anatomy, size=np.radians(size_deg))
+            context = prepare(path, arm=False)
+            found = certify(context.case, context.anatomy, size=np.radians(size_deg))
             _areas(name, found)
-            wrong += _contradictions(name, prepared, found, total)
+            wrong += _contradictions(name, context, found, total)
     return wrong
 
 
@@ -120,10 +120,10 @@ def _anatomies(temporary: Path) -> dict[str, Path]:
     return {**cases, "real CT": temporary / "case_v2.toml"}
 
 
-def _contradictions(name: str, prepared: Prepared, found: Certificate, total: int) -> int:
+def _contradictions(name: str, context: CaseContext, found: Certificate, total: int) -> int:
     """Half of the directions by area, half by cell, so that the small cells at the borders get theirs."""
     rng = np.random.default_rng(SEED)
-    R, start = prepared.case.T_ct_entry[:3, :3], time.perf_counter()
+    R, start = context.case.T_ct_entry[:3, :3], time.perf_counter()
     certified = np.flatnonzero(found.verdict != "U")
     area = found.leaves.take(certified).solid_angle()
     wrong = 0
@@ -136,7 +136,7 @@ def _contradictions(name: str, prepared: Prepared, found: Certificate, total: in
         height = bottom + (top - bottom) * rng.random(count)
         theta, beta = np.arccos(np.clip(height, -1, 1)), rng.uniform(*cells.beta.T)
         directions = Directions(theta, beta, outward(theta, beta) @ R.T)
-        judged = organ_candidates(prepared.case, prepared.anatomy, prepared.engine, directions)
+        judged = organ_candidates(context.case, context.anatomy, context.engine, directions)
         wrong += int(np.count_nonzero(judged.safe != (found.verdict[rows] == "S")))
     print(f"{name}: {total} directions, {wrong} contradict, {time.perf_counter() - start:.0f} s")
     return wrong

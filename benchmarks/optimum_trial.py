@@ -20,7 +20,7 @@ from puncture_twin.twin.guidance.stereo.stereo_room import (
     CAMERA_FOCAL,
     CAMERA_SHIFT_MM,
     CAMERA_TURN_RAD,
-    Room,
+    StereoWorkcell,
 )
 from puncture_twin.twin.plant.true_arm import ArmErrors, TrueArm
 
@@ -77,7 +77,7 @@ def first_stays(observed: Observed, count: int) -> Observed:
     )
 
 
-def room_bound(room: Room, observed: Observed, balls_c: Floats) -> Adjusted:
+def room_bound(room: StereoWorkcell, observed: Observed, balls_c: Floats) -> Adjusted:
     """The Cramer-Rao bound at the truth of a room, the ball having been at ``balls_c`` (s, 3)."""
     guess = Guess(room.T_c_base, room.T_c_m, balls_c)
     truth = Unknowns(

@@ -95,13 +95,13 @@ def best_positions() -> None:
 
 def search(path: Path, jobs: int) -> None:
     """The whole search on a case: seconds, and what was estimated beside what was judged."""
-    prepared = prepare(path, arm=False)
-    found = organ_candidates(prepared.case, prepared.anatomy, prepared.engine, case_directions(prepared.case))
+    context = prepare(path, arm=False)
+    found = organ_candidates(context.case, context.anatomy, context.engine, case_directions(context.case))
     begin, cpu = perf_counter(), _cpu()
-    done = search_placements(prepared.case, prepared.anatomy, found, prepared.placement, jobs=jobs)
+    done = search_placements(context.case, context.anatomy, found, context.placement, jobs=jobs)
     spent = f"{perf_counter() - begin:.1f} s, CPU {_cpu() - cpu:.1f} s"
     print(
-        f"{prepared.case.name}: {len(done.coarse)} + {done.refined} sites estimated, {len(done.judged)} judged over"
+        f"{context.case.name}: {len(done.coarse)} + {done.refined} sites estimated, {len(done.judged)} judged over"
         f" {int(found.safe.sum())} directions, {jobs} processes: {spent}"
     )
     print(f"possible {100 * done.possible:.1f} %; share % estimated and judged:")

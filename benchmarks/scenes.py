@@ -64,8 +64,8 @@ def scenes() -> Iterator[Scene]:
 
 
 def _case(name: str, path: Path) -> Scene:
-    prepared = prepare(path, arm=False)
-    case, structures = prepared.case, prepared.anatomy.structures
+    context = prepare(path, arm=False)
+    case, structures = context.case, context.anatomy.structures
     radius = case.needle.radius_mm
     thresholds = np.array([radius + s.margin_mm if s.demands_margin else -np.inf for s in structures])
     surfaces = tuple(s.mesh for s in structures)

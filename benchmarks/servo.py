@@ -24,7 +24,7 @@ from puncture_twin.twin.guidance.stereo.detection import Sight, picture_sight, p
 from puncture_twin.twin.guidance.stereo.experiment import Statistics, run_trials, statistics, varied
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.session import Eyes
-from puncture_twin.twin.guidance.stereo.stereo_room import Room
+from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell
 
 PIXEL_PX = 0.02
 """Error of a ball's centre, per axis, where the pictures are left out: what they give at noise 2."""
@@ -96,7 +96,7 @@ def sensitivity(case: ServoCase, seeds: int, jobs: int) -> None:
         study(name, varied(case, **changed), seeds, jobs)
 
 
-def pixels_alone(room: Room, rng: np.random.Generator) -> Sight:
+def pixels_alone(room: StereoWorkcell, rng: np.random.Generator) -> Sight:
     """True pixels with normal errors of ``PIXEL_PX``."""
     return pixel_sight(room, PIXEL_PX, rng)
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from puncture_twin.planning.plan.plan import Plan
     from puncture_twin.planning.registration.registration import Registration
     from puncture_twin.planning.search.candidates import Candidates
-    from puncture_twin.planning.search.context import Prepared
+    from puncture_twin.planning.search.context import CaseContext
     from puncture_twin.planning.search.explain import Explanation
     from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
 
@@ -44,7 +44,7 @@ def load_case(path: Path | str) -> Case:
     return load_case(path)
 
 
-def prepare(case: Path | str, *, arm: bool | None = None, engine: str = "fast") -> Prepared:
+def prepare(case: Path | str, *, arm: bool | None = None, engine: str = "fast") -> CaseContext:
     """Read a case and all that it names: structures, registration, arm.
 
     Args:
@@ -60,12 +60,12 @@ def prepare(case: Path | str, *, arm: bool | None = None, engine: str = "fast") 
     return prepare(case, arm=arm, engine=engine)
 
 
-def search(context: Prepared) -> Candidates:
+def search(context: CaseContext) -> Candidates:
     """Every direction of the case's grid with its verdict, ranked."""
     return context.search()
 
 
-def check(context: Prepared, theta_deg: float, beta_deg: float) -> Explanation:
+def check(context: CaseContext, theta_deg: float, beta_deg: float) -> Explanation:
     """One direction, explained: every constraint with its number and its limit.
 
     Args:
@@ -121,7 +121,7 @@ def register(
     return registration.register(pairs, method=method, target_ct=target, fle_mm=fle_mm)
 
 
-def certify(context: Prepared, *, size_deg: float = 0.25) -> Certificate:
+def certify(context: CaseContext, *, size_deg: float = 0.25) -> Certificate:
     """The map between the grid points: cells of directions that are proven safe for the organs, or rejected.
 
     Args:
@@ -133,7 +133,7 @@ def certify(context: Prepared, *, size_deg: float = 0.25) -> Certificate:
     return certify(context.case, context.anatomy, size=float(np.radians(size_deg)))
 
 
-def verify(certificate: Certificate, context: Prepared) -> Verification:
+def verify(certificate: Certificate, context: CaseContext) -> Verification:
     """Prove every cell of a certificate again, by a plain checker that shares none of the fast code.
 
     Raises:
@@ -144,7 +144,7 @@ def verify(certificate: Certificate, context: Prepared) -> Verification:
     return verify(certificate, context.case, context.anatomy)
 
 
-def make_plan(context: Prepared, candidates: Candidates, *, seed: int | None = None) -> Plan:
+def make_plan(context: CaseContext, candidates: Candidates, *, seed: int | None = None) -> Plan:
     """The best candidate that the arm can come to, with its approach and insertion.
 
     Args:
@@ -161,7 +161,7 @@ def make_plan(context: Prepared, candidates: Candidates, *, seed: int | None = N
     return make_plan(context, candidates, seed=context.case.rehearsal.seed if seed is None else seed).plan
 
 
-def read_plan(path: Path | str, context: Prepared) -> Plan:
+def read_plan(path: Path | str, context: CaseContext) -> Plan:
     """A plan from its file, checked against its case again: same inputs, still safe, a motion that touches nothing.
 
     Raises:
@@ -204,7 +204,7 @@ def write_plan(plan: Plan, path: Path | str) -> None:
     write_plan(plan, Path(path))
 
 
-def rehearse(context: Prepared, plan: Plan, *, seed: int | None = None) -> Rehearsal:
+def rehearse(context: CaseContext, plan: Plan, *, seed: int | None = None) -> Rehearsal:
     """Execute a plan in the twin, where the ground truth differs from the belief.
 
     Args:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.guidance.stereo.cameras.bundle import Bundle, Observations, Spreads, adjust
+from puncture_twin.twin.guidance.stereo.cameras.bundle import Bundle, Observations, PixelSpreads, adjust
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 
 Floats = NDArray[np.float64]
@@ -67,7 +67,7 @@ def _adjust(cameras: list[Camera], poses: Floats, board: Floats, pixels: Floats,
     seen = Observations(camera, view, corner, pixels.reshape(-1, 2), sigma_px**2 * np.eye(2))
     free = np.full((count, 14), np.inf)
     free[0, 8:] = 0.0
-    return adjust(cameras, poses, board, seen, Spreads(free, np.full((views, 6), np.inf), np.zeros_like(board)))
+    return adjust(cameras, poses, board, seen, PixelSpreads(free, np.full((views, 6), np.inf), np.zeros_like(board)))
 
 
 def _homography(flat: Floats, pixels: Floats) -> Floats:

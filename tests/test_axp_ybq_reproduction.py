@@ -9,8 +9,8 @@ import pytest
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.pose_choice import expected_tre_mm
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording
 from puncture_twin.twin.jobs.papers.axp_ybq import (
-    Reproduction,
-    Row,
+    AxpYbqRow,
+    AxpYbqTables,
     reproduce,
     reproduction_summary,
     reproduction_text,
@@ -55,7 +55,7 @@ def test_the_bound_is_the_known_one():
 
 def test_a_number_beyond_its_limit_does_not_hold():
     """A row, the whole and the text all say so."""
-    bad = Reproduction((Row("a", 0.1, 0.2, None, "mm"), Row("b", None, 0.31, 0.3, "mm")), 3, 1)
+    bad = AxpYbqTables((AxpYbqRow("a", 0.1, 0.2, None, "mm"), AxpYbqRow("b", None, 0.31, 0.3, "mm")), 3, 1)
     assert not bad.holds
     assert [row.holds for row in bad.rows] == [True, False]
     text = reproduction_text(bad)

@@ -15,12 +15,12 @@ from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.twin.phantoms import supine
-from puncture_twin.twin.phantoms.ct_image import Part, rendered
+from puncture_twin.twin.phantoms.ct_image import ScannedPart, rendered
 from puncture_twin.twin.phantoms.implicit import capsule, ellipsoid
 
 STEP_DEG = 6.0
 KIDNEY_FIELD = ellipsoid((75.0, 40.0, 0.0), (20, 15, 40))
-PLANK = Part("plank", supine.slab((-250, supine.BACK_MM - 6, -400), (250, supine.BACK_MM + 30, 400)), 60.0)
+PLANK = ScannedPart("plank", supine.slab((-250, supine.BACK_MM - 6, -400), (250, supine.BACK_MM + 30, 400)), 60.0)
 """A solid table on which the back lies, with nothing between."""
 NEEDLE = "length_mm = 210.0\nshaft_mm = 150.0\ndiameter_mm = 1.2"
 
@@ -120,9 +120,9 @@ def scene(tmp_path_factory):
     return make
 
 
-def hit_parts(prepared, found, parts, names):
+def hit_parts(context, found, parts, names):
     """Rows of safe needles whose axis enters a part's truth between skin and flange at standoff, by the part's name."""
-    case, hit = prepared.case, {}
+    case, hit = context.case, {}
     for row in np.flatnonzero(found.safe):
         standoff = float(standoffs(case.needle, found.path_length[row], found.skin_angle[row]))
         depths = np.arange(found.path_length[row] + 1.0, standoff + case.needle.length_mm, 0.5)
@@ -147,25 +147,25 @@ OUTER = ("arm_left", "arm_right", "humerus_left", "humerus_right", "mattress", "
 def test_no_safe_needle_passes_what_the_scan_shows_outside_of_the_trunk(scene, name):
     """Arms, table, mattress, sheet and line: none is entered by a safe needle, inserted or at its standoff."""
     folder, parts = scene(name)
-    prepared = prepare(write_case(folder), arm=False)
-    found = prepared.search()
+    context = prepare(write_case(folder), arm=False)
+    found = context.search()
 
-    assert hit_parts(prepared, found, parts, OUTER) == {}
+    assert hit_parts(context, found, parts, OUTER) == {}
     assert found.safe.sum() > 40
 
 
 def test_a_detached_arm_is_body(scene):
     """A path into an arm enters skin again; a warning names both arms, and a labelled humerus lies inside the skin."""
     folder, parts = scene("arms")
-    prepared = prepare(write_case(folder, structures=SPINE + HUMERI), arm=False)
-    found = prepared.search()
+    context = prepare(write_case(folder, structures=SPINE + HUMERI), arm=False)
+    found = context.search()
     arm = next(part for part in parts if part.name == "arm_right")
 
-    rows = through(found, prepared.case, arm)
+    rows = through(found, context.case, arm)
     assert rows.sum() > 20
     assert not found.safe[rows].any()
     assert (found.reason[rows] == Reason.REENTERS_SKIN).sum() > 10
-    said = " ".join(prepared.anatomy.warnings)
+    said = " ".join(context.anatomy.warnings)
     assert "do not touch the trunk" in said
     assert "left of it" in said
     assert "right of it" in said
@@ -174,11 +174,11 @@ def test_a_detached_arm_is_body(scene):
 def test_the_table_below_a_posterior_target_is_no_air(scene):
     """Every direction through the back meets mattress and table: none is safe, and the reason names the structure."""
     folder, parts = scene("bed")
-    prepared = prepare(write_case(folder), arm=False)
-    found = prepared.search()
+    context = prepare(write_case(folder), arm=False)
+    found = context.search()
     table = next(part for part in parts if part.name == "table")
 
-    rows = through(found, prepared.case, table)
+    rows = through(found, context.case, table)
     assert rows.sum() > 100
     assert not found.safe[rows].any()
     beyond_skin = rows & (found.reason == Reason.UNKNOWN_REGION) & (found.reason_structure == "outside_body")
@@ -188,10 +188,10 @@ def test_the_table_below_a_posterior_target_is_no_air(scene):
 def test_a_trunk_alone_has_nothing_outside(scene):
     """Arms up: no surface outside of the body, no warning of detached parts, and the same safe front as with a bed."""
     folder, _ = scene("alone")
-    prepared = prepare(write_case(folder), arm=False)
+    context = prepare(write_case(folder), arm=False)
 
-    assert prepared.anatomy.surroundings == ()
-    assert "do not touch" not in " ".join(prepared.anatomy.warnings)
+    assert context.anatomy.surroundings == ()
+    assert "do not touch" not in " ".join(context.anatomy.warnings)
 
 
 def test_a_skin_from_elsewhere_with_the_ct_beside_it(scene):
@@ -233,12 +233,12 @@ def test_a_named_bone_leaves_nothing_unnamed(scene):
 
 def test_gas_outside_of_hollow_organs_is_unknown(tmp_path):
     """A bubble of gas of 30 mm in the trunk that no bowel's label covers: no safe path through it."""
-    bubble = Part("bubble", ellipsoid((-55.0, -50.0, 0.0), (15, 15, 15)), -1000.0)
+    bubble = ScannedPart("bubble", ellipsoid((-55.0, -50.0, 0.0), (15, 15, 15)), -1000.0)
     write_scene(tmp_path, [*supine.trunk_parts(), bubble], supine.grid())
-    prepared = prepare(write_case(tmp_path), arm=False)
-    found = prepared.search()
+    context = prepare(write_case(tmp_path), arm=False)
+    found = context.search()
 
-    rows = through(found, prepared.case, bubble)
+    rows = through(found, context.case, bubble)
     assert rows.sum() > 3
     assert not found.safe[rows].any()
     assert set(found.reason_structure[rows & (found.reason == Reason.UNKNOWN_REGION)]) == {"unnamed_gas"}
@@ -270,10 +270,10 @@ def test_a_certificate_holds_outside_of_the_body_too(scene):
     """Between the grid points: no cell that is proven safe holds a direction that the search refuses."""
     folder, _ = scene("all")
     path = write_case(folder, step=3.0, name="certified")
-    prepared = prepare(path, arm=False)
-    found = prepared.search()
-    certificate = certify(prepared.case, prepared.anatomy, size=np.radians(4.0))
-    verify(certificate, prepared.case, prepared.anatomy)
+    context = prepare(path, arm=False)
+    found = context.search()
+    certificate = certify(context.case, context.anatomy, size=np.radians(4.0))
+    verify(certificate, context.case, context.anatomy)
 
     low_theta, high_theta = certificate.leaves.theta.T
     low_beta, high_beta = certificate.leaves.beta.T
@@ -304,14 +304,14 @@ def test_a_level_of_air_that_cannot_be_is_refused(scene, level):
 def test_a_table_that_touches_the_back_is_no_body(scene):
     """Back and solid table hold together; no path through the table is safe, the front stays free, it is said."""
     folder, _ = scene("plank")
-    prepared = prepare(write_case(folder), arm=False)
-    found = prepared.search()
+    context = prepare(write_case(folder), arm=False)
+    found = context.search()
 
-    rows = through(found, prepared.case, PLANK)
+    rows = through(found, context.case, PLANK)
     assert rows.sum() > 100
     assert not found.safe[rows].any()
     assert found.safe.sum() > 40
-    assert any("flat at its back side" in warning for warning in prepared.anatomy.warnings)
+    assert any("flat at its back side" in warning for warning in context.anatomy.warnings)
 
 
 def test_air_beside_a_label_of_the_skin_is_no_gas(tmp_path):
@@ -320,10 +320,10 @@ def test_air_beside_a_label_of_the_skin_is_no_gas(tmp_path):
     write_scene(tmp_path, supine.trunk_parts(), grid)
     write_trunk(tmp_path, supine.trunk_parts(), grid)
     beside = write_case(tmp_path, skin=TRUNK_SKIN, more='[ct]\nfile = "ct.nii.gz"', name="beside")
-    prepared = prepare(beside, arm=False)
+    context = prepare(beside, arm=False)
 
-    assert [structure.name for structure in prepared.anatomy.structures] == ["lesion", "spine"]
-    assert prepared.search().safe.sum() > 40
+    assert [structure.name for structure in context.anatomy.structures] == ["lesion", "spine"]
+    assert context.search().safe.sum() > 40
 
 
 def crop(folder, box, move_mm=(0.0, 0.0, 0.0)):
@@ -358,8 +358,8 @@ def test_an_obstacle_that_is_nowhere_is_mentioned(scene):
     """Without the base's place an obstacle of the frame ``base`` cannot be checked; a warning names it."""
     folder, _ = scene("alone")
     box = '[[obstacle]]\nname = "monitor"\nframe = "base"\ncenter_mm = [0, 0, 300]\nsize_mm = [60, 60, 60]'
-    prepared = prepare(write_case(folder, more=box, name="nowhere"), arm=False)
-    assert any("not checked" in warning and "monitor" in warning for warning in prepared.anatomy.warnings)
+    context = prepare(write_case(folder, more=box, name="nowhere"), arm=False)
+    assert any("not checked" in warning and "monitor" in warning for warning in context.anatomy.warnings)
 
 
 def disc(radius, size=80):
@@ -388,19 +388,19 @@ def test_constant_air_about_a_body_was_scanned():
 
 def test_an_arm_that_is_pressed_against_the_trunk_is_no_way_in(tmp_path):
     """No air between arm and trunk: paths through the arm are unknown, a warning says so, and the front stays free."""
-    arm = Part("arm", capsule((-196.0, 30.0, -300.0), (-196.0, 30.0, 300.0), 44.0), 20.0)
-    bone = Part("humerus", capsule((-196.0, 30.0, -300.0), (-196.0, 30.0, 300.0), 12.0), 700.0)
-    lesion = Part("lesion", ellipsoid((-111.0, 11.0, 1.0), (12, 12, 12)), 90.0)
+    arm = ScannedPart("arm", capsule((-196.0, 30.0, -300.0), (-196.0, 30.0, 300.0), 44.0), 20.0)
+    bone = ScannedPart("humerus", capsule((-196.0, 30.0, -300.0), (-196.0, 30.0, 300.0), 12.0), 700.0)
+    lesion = ScannedPart("lesion", ellipsoid((-111.0, 11.0, 1.0), (12, 12, 12)), 90.0)
     parts = [*supine.trunk_parts()[:3], lesion, arm, bone]
     write_scene(tmp_path, parts, supine.grid())
     path = write_case(tmp_path)
     path.write_text(path.read_text().replace("[-55.0, 20.0, 0.0]", "[-110.0, 10.0, 0.0]"))
-    prepared = prepare(path, arm=False)
-    found = prepared.search()
+    context = prepare(path, arm=False)
+    found = context.search()
 
-    assert hit_parts(prepared, found, parts, ("arm", "humerus")) == {}
+    assert hit_parts(context, found, parts, ("arm", "humerus")) == {}
     assert "attached_limb" in found.reason_structure
-    assert any("pressed against" in warning for warning in prepared.anatomy.warnings)
+    assert any("pressed against" in warning for warning in context.anatomy.warnings)
     assert found.safe.sum() > 40
 
 

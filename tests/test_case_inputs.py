@@ -16,7 +16,7 @@ import trimesh
 
 from puncture_twin.planning.base.provenance import differing_input, inputs_document
 from puncture_twin.planning.case.case import load_case
-from puncture_twin.planning.search.context import Prepared, prepare
+from puncture_twin.planning.search.context import CaseContext, prepare
 
 CASE = """
 schema = 1
@@ -156,16 +156,16 @@ def folder(tmp_path: Path) -> Path:
     return here
 
 
-def places(prepared: Prepared) -> list[tuple[str, str]]:
+def places(context: CaseContext) -> list[tuple[str, str]]:
     """Role and path of each input."""
-    return [(one.role, one.path) for one in prepared.case.inputs]
+    return [(one.role, one.path) for one in context.case.inputs]
 
 
 def test_every_file_is_listed_with_its_role(folder: Path) -> None:
     """Also the data that a detached header names; every result carries the same list."""
-    prepared = prepare(folder, arm=False)
-    assert places(prepared) == ROLES
-    assert prepared.provenance()["inputs"] == inputs_document(prepared.case.inputs)
+    context = prepare(folder, arm=False)
+    assert places(context) == ROLES
+    assert context.provenance()["inputs"] == inputs_document(context.case.inputs)
     assert {path for _, path in ROLES} == {
         str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file()
     }
@@ -217,8 +217,8 @@ def hook(event, arguments):
 sys.addaudithook(hook)
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.twin.plant.truth import draw_truth
-prepared = prepare(folder)
-draw_truth(prepared.case, prepared.placement.T_base_ct)
+context = prepare(folder)
+draw_truth(context.case, context.placement.T_base_ct)
 print(json.dumps(opened))
 """
 

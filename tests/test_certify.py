@@ -49,25 +49,25 @@ unit_interval = st.floats(0, 1)
 def certified(request):
     """A case and its certificate."""
     name, size = CASES[request.param]
-    prepared = prepare(folder() / name, arm=False)
-    return prepared, certify(prepared.case, prepared.anatomy, size=np.radians(size))
+    context = prepare(folder() / name, arm=False)
+    return context, certify(context.case, context.anatomy, size=np.radians(size))
 
 
 @pytest.fixture(scope="module")
 def carton():
     """The carton with its certificate at 4°."""
-    prepared = prepare(folder() / "carton" / "case_m.toml", arm=False)
-    return prepared, certify(prepared.case, prepared.anatomy, size=np.radians(4))
+    context = prepare(folder() / "carton" / "case_m.toml", arm=False)
+    return context, certify(context.case, context.anatomy, size=np.radians(4))
 
 
 def _directions(case, theta, beta):
     return Directions(theta, beta, outward(theta, beta) @ case.T_ct_entry[:3, :3].T)
 
 
-def _judged(prepared, anatomy, directions):
+def _judged(context, anatomy, directions):
     """The search's verdicts, with FCL."""
     engine = FclEngine([structure.mesh for structure in anatomy.checked])
-    return organ_candidates(prepared.case, anatomy, engine, directions)
+    return organ_candidates(context.case, anatomy, engine, directions)
 
 
 def _thrown_into(cells, rows, rng):
@@ -258,14 +258,14 @@ def _bumpy(mesh):
 
 def test_random_directions_never_contradict(certified, rng):
     """Directions thrown into the cells and at the cap: the search, with FCL, agrees with every certified one."""
-    prepared, found = certified
-    case = prepared.case
+    context, found = certified
+    case = context.case
     rows = rng.integers(0, len(found.leaves), 1500)
     theta, beta = _thrown_into(found.leaves, rows, rng)
     theta = np.concatenate([theta, np.arccos(rng.uniform(0, 1, 1000))])
     beta = np.concatenate([beta, rng.uniform(0, 2 * np.pi, 1000)])
     letters = found.at(theta, beta)
-    judged = _judged(prepared, prepared.anatomy, _directions(case, theta, beta))
+    judged = _judged(context, context.anatomy, _directions(case, theta, beta))
     assert judged.safe[letters == "S"].all()
     assert not judged.safe[letters == "R"].any()
     assert min((letters == "S").sum(), (letters == "R").sum()) > 300
@@ -283,9 +283,9 @@ def test_nearly_all_of_the_cap_is_decided(certified):
 
 def test_the_safe_cone_is_safe(certified, rng):
     """Directions anywhere within a candidate's safe cone, also at its rim, are safe."""
-    prepared, found = certified
+    context, found = certified
     rows = rng.choice(np.flatnonzero(found.verdict == "S"), 30, replace=False)
-    R = prepared.case.T_ct_entry[:3, :3]
+    R = context.case.T_ct_entry[:3, :3]
     centres = found.leaves.take(rows).centres() @ R.T
     cones = found.safe_cone(centres)
     assert (cones > 0).all()
@@ -294,14 +294,14 @@ def test_the_safe_cone_is_safe(certified, rng):
     )
     theta, beta = angles(around @ R)
     assert (found.at(theta, beta) == "S").all()
-    judged = _judged(prepared, prepared.anatomy, _directions(prepared.case, theta, beta))
+    judged = _judged(context, context.anatomy, _directions(context.case, theta, beta))
     assert judged.safe.all()
 
 
 def test_there_is_no_safe_cone_where_nothing_is_proven(certified):
     """0 in undecided and rejected cells, outside the cap, and at its border."""
-    prepared, found = certified
-    R = prepared.case.T_ct_entry[:3, :3]
+    context, found = certified
+    R = context.case.T_ct_entry[:3, :3]
     rows = np.flatnonzero(found.verdict != "S")[:200]
     assert (found.safe_cone(found.leaves.take(rows).centres() @ R.T) == 0).all()
     assert found.safe_cone(-R[:, 2][None])[0] == 0
@@ -310,16 +310,16 @@ def test_there_is_no_safe_cone_where_nothing_is_proven(certified):
 
 def test_fewer_queries_than_the_dense_grid(carton):
     """At half a degree distances are asked for less than a tenth of the directions of a grid of that spacing."""
-    prepared, _ = carton
-    found = certify(prepared.case, prepared.anatomy, size=np.radians(0.5))
+    context, _ = carton
+    found = certify(context.case, context.anatomy, size=np.radians(0.5))
     assert found.queries < 0.1 * 720 * 181
     assert found.share("U") < 0.01
 
 
 def test_the_checker_proves_every_cell(certified):
     """The plain checker comes to the same verdicts, cell by cell."""
-    prepared, found = certified
-    checked = verify(found, prepared.case, prepared.anatomy)
+    context, found = certified
+    checked = verify(found, context.case, context.anatomy)
     assert (checked.safe, checked.rejected, checked.undecided) == tuple(
         int((found.verdict == letter).sum()) for letter in "SRU"
     )
@@ -390,7 +390,7 @@ def test_no_certificate_is_refused(tmp_path, content):
 @pytest.mark.parametrize(("old", "new"), [("R", "S"), ("U", "S"), ("S", "R"), ("U", "R")])
 def test_a_flipped_cell_is_refused_even_with_a_matching_summary(carton, old, new):
     """The checker proves claims; it does not trust the file's own arithmetic."""
-    prepared, found = carton
+    context, found = carton
     verdict, reason, structure = found.verdict.copy(), found.reason.copy(), found.structure.copy()
     row = int(np.flatnonzero(verdict == old)[-1])
     verdict[row] = new
@@ -400,36 +400,36 @@ def test_a_flipped_cell_is_refused_even_with_a_matching_summary(carton, old, new
         tree.append("".join(letter if letter.islower() else str(next(letters)) for letter in level))
     forged = replace(found, tree=tuple(tree), verdict=verdict, reason=reason, structure=structure)
     with pytest.raises(InputError, match=f"cell {row} .* is not proven"):
-        verify(forged, prepared.case, prepared.anatomy)
+        verify(forged, context.case, context.anatomy)
 
 
 @pytest.mark.parametrize("reason", ["too_long", "unknown_region", "reenters_skin", "skin_angle", "no_skin_entry"])
 def test_a_false_reason_is_refused(carton, reason):
     """A cell that is too close does not break another constraint."""
-    prepared, found = carton
+    context, found = carton
     row = int(np.flatnonzero(found.reason == "too_close")[-1])
     reasons = found.reason.copy()
     reasons[row] = reason
     with pytest.raises(InputError, match=reason):
-        verify(replace(found, reason=reasons), prepared.case, prepared.anatomy)
+        verify(replace(found, reason=reasons), context.case, context.anatomy)
 
 
 def test_a_large_undecided_cell_is_refused(carton):
     """A certificate may not claim a smaller size than it has."""
-    prepared, found = carton
+    context, found = carton
     with pytest.raises(InputError, match="small"):
-        verify(replace(found, size=found.size / 3), prepared.case, prepared.anatomy)
+        verify(replace(found, size=found.size / 3), context.case, context.anatomy)
 
 
 @pytest.mark.parametrize("triangle", [-1, 10**6, 0])
 def test_a_witness_that_is_none_is_refused(carton, triangle):
     """A triangle that the structure does not have, or one that is far away."""
-    prepared, found = carton
+    context, found = carton
     row = int(np.flatnonzero(found.reason == "too_close")[0])
     triangles = found.triangle.copy()
     triangles[row] = triangle
     with pytest.raises(InputError, match=f"cell {row} .* not proven rejected"):
-        verify(replace(found, triangle=triangles), prepared.case, prepared.anatomy)
+        verify(replace(found, triangle=triangles), context.case, context.anatomy)
 
 
 def changed_files(case, name):
@@ -442,8 +442,8 @@ def changed_files(case, name):
 
 def test_other_inputs_are_refused(carton):
     """Another hash, needle, target, margin or case: the certificate was made for something else."""
-    prepared, found = carton
-    case, anatomy = prepared.case, prepared.anatomy
+    context, found = carton
+    case, anatomy = context.case, context.anatomy
     others = [
         replace(case, files=changed_files(case, "skin.ply")),
         replace(case, name="other"),
@@ -473,26 +473,26 @@ def test_other_inputs_are_refused(carton):
 )
 def test_a_cap_without_area_is_certified_too(carton, theta, beta):
     """An arc, a point and a pole: certified without an area to share, and the search agrees."""
-    prepared, _ = carton
-    found = certify(prepared.case, prepared.anatomy, size=np.radians(1), theta=theta, beta=beta)
+    context, _ = carton
+    found = certify(context.case, context.anatomy, size=np.radians(1), theta=theta, beta=beta)
     assert found.share("S") is None
     assert found.areas["S"] == 0
-    centres = found.leaves.centres() @ prepared.case.T_ct_entry[:3, :3].T
+    centres = found.leaves.centres() @ context.case.T_ct_entry[:3, :3].T
     middle = Directions(found.leaves.theta.mean(axis=1), found.leaves.beta.mean(axis=1), centres)
-    judged = _judged(prepared, prepared.anatomy, middle)
+    judged = _judged(context, context.anatomy, middle)
     assert judged.safe[found.verdict == "S"].all()
     assert not judged.safe[found.verdict == "R"].any()
     assert len(found.leaves) == 1 or (found.verdict != "U").any()  # a pole may run through a vertex
-    verify(found, prepared.case, prepared.anatomy)
+    verify(found, context.case, context.anatomy)
 
 
 def test_the_whole_sphere_is_certified(carton, rng):
     """θ to 180°: both poles, and the carton's bottom."""
-    prepared, _ = carton
-    found = certify(prepared.case, prepared.anatomy, size=np.radians(4), theta=(0, np.pi))
+    context, _ = carton
+    found = certify(context.case, context.anatomy, size=np.radians(4), theta=(0, np.pi))
     assert sum(found.areas.values()) == pytest.approx(41252.96, rel=1e-6)
     theta, beta = _thrown_into(found.leaves, rng.integers(0, len(found.leaves), 600), rng)
-    judged = _judged(prepared, prepared.anatomy, _directions(prepared.case, theta, beta))
+    judged = _judged(context, context.anatomy, _directions(context.case, theta, beta))
     letters = found.at(theta, beta)
     assert judged.safe[letters == "S"].all()
     assert not judged.safe[letters == "R"].any()
@@ -503,20 +503,20 @@ def test_the_whole_sphere_is_certified(carton, rng):
 )
 def test_a_cap_or_size_that_makes_no_sense_is_refused(carton, theta, beta, size):
     """Descending or too wide ranges, and a size below what rounding allows."""
-    prepared, _ = carton
+    context, _ = carton
     with pytest.raises(InputError):
-        certify(prepared.case, prepared.anatomy, size=size, theta=theta, beta=beta)
+        certify(context.case, context.anatomy, size=size, theta=theta, beta=beta)
 
 
 def test_when_nothing_is_safe_the_map_proves_it(carton):
     """With a margin that nothing keeps every cell is rejected, and the checker agrees."""
-    prepared, _ = carton
-    structures = tuple(replace(s, margin_mm=60.0) for s in prepared.anatomy.structures)
-    anatomy = replace(prepared.anatomy, structures=structures)
-    found = certify(prepared.case, anatomy, size=np.radians(4))
+    context, _ = carton
+    structures = tuple(replace(s, margin_mm=60.0) for s in context.anatomy.structures)
+    anatomy = replace(context.anatomy, structures=structures)
+    found = certify(context.case, anatomy, size=np.radians(4))
     assert found.areas["S"] == 0
     assert found.share("R") == pytest.approx(1)
-    verify(found, prepared.case, anatomy)
+    verify(found, context.case, anatomy)
 
 
 @pytest.mark.parametrize(
@@ -551,37 +551,37 @@ def certify_file_safe(path):
 
 def test_a_target_inside_an_organ_to_avoid_is_rejected_at_once(carton, ball):
     """Wholly inside is a hit, whatever the surface says; one cell, no query."""
-    prepared, _ = carton
-    around = Structure("around", Role.UNKNOWN, 0.0, ball(900, prepared.case.target_ct), "")
-    anatomy = Anatomy((around,), prepared.anatomy.skin, ())
-    found = certify(prepared.case, anatomy, size=0.1)
+    context, _ = carton
+    around = Structure("around", Role.UNKNOWN, 0.0, ball(900, context.case.target_ct), "")
+    anatomy = Anatomy((around,), context.anatomy.skin, ())
+    found = certify(context.case, anatomy, size=0.1)
     assert found.tree == ("R",)
     assert found.queries == 0
     assert found.structure[0] == "around"
-    verify(found, prepared.case, anatomy)
+    verify(found, context.case, anatomy)
 
 
 def test_without_organs_the_skin_alone_decides(carton):
     """No structure with a margin: no query, and still a map."""
-    prepared, _ = carton
-    anatomy = Anatomy((), prepared.anatomy.skin, ())
-    found = certify(prepared.case, anatomy, size=np.radians(3))
+    context, _ = carton
+    anatomy = Anatomy((), context.anatomy.skin, ())
+    found = certify(context.case, anatomy, size=np.radians(3))
     assert found.queries == 0
     assert found.share("S") > 0.5
-    verify(found, prepared.case, anatomy)
+    verify(found, context.case, anatomy)
 
 
 def test_an_open_skin_is_only_certified_where_it_stands(carton, rng):
     """With a hole in it, directions through the hole are never certified safe, and nothing contradicts the search."""
-    prepared, _ = carton
-    mesh = prepared.anatomy.skin.mesh
+    context, _ = carton
+    mesh = context.anatomy.skin.mesh
     keep = np.ones(len(mesh.faces), bool)
     keep[rng.choice(len(mesh.faces), 12, replace=False)] = False
     skin = Skin(TriangleMesh(mesh.vertices, mesh.faces[keep]), np.zeros(keep.sum(), bool), None, ())
-    anatomy = replace(prepared.anatomy, skin=skin)
-    found = certify(prepared.case, anatomy, size=np.radians(2))
+    anatomy = replace(context.anatomy, skin=skin)
+    found = certify(context.case, anatomy, size=np.radians(2))
     theta, beta = np.arccos(rng.uniform(0, 1, 3000)), rng.uniform(0, 2 * np.pi, 3000)
-    judged = _judged(prepared, anatomy, _directions(prepared.case, theta, beta))
+    judged = _judged(context, anatomy, _directions(context.case, theta, beta))
     letters = found.at(theta, beta)
     assert judged.safe[letters == "S"].all()
     assert not judged.safe[letters == "R"].any()
@@ -589,14 +589,14 @@ def test_an_open_skin_is_only_certified_where_it_stands(carton, rng):
 
 def test_the_frame_of_the_map_may_be_any(carton, rng):
     """In a tilted entry frame the same direction has the same verdict, or none."""
-    prepared, found = carton
+    context, found = carton
     tilted = np.eye(4)
     tilted[:3, :3] = entry_frame(EntryAxes(z=(0.3, -0.2, 0.9), x=(1.0, 0.1, 0.0)), Space.LOCAL)
-    tilted[:3, 3] = prepared.case.target_ct
-    case = replace(prepared.case, T_ct_entry=tilted)
-    other = certify(case, prepared.anatomy, size=np.radians(3))
+    tilted[:3, 3] = context.case.target_ct
+    case = replace(context.case, T_ct_entry=tilted)
+    other = certify(case, context.anatomy, size=np.radians(3))
     directions = outward(np.arccos(rng.uniform(0.6, 1, 3000)), rng.uniform(0, 6.28, 3000))
-    first = found.at(*angles(directions @ prepared.case.T_ct_entry[:3, :3]))
+    first = found.at(*angles(directions @ context.case.T_ct_entry[:3, :3]))
     second = other.at(*angles(directions @ tilted[:3, :3]))
     assert not (((first == "S") & (second == "R")) | ((first == "R") & (second == "S"))).any()
     assert (first == second).mean() > 0.7
@@ -609,12 +609,12 @@ def test_the_real_ct_never_contradicts(rng, tmp_path):
         shutil.copy(file, tmp_path)
     for name in ("ct", "labels_v1_normal", "labels_v2_fast"):
         (tmp_path / f"{name}.nii.gz").symlink_to(DATA / f"{name}.nii.gz")
-    prepared = prepare(tmp_path / "case_v2.toml", arm=False)
-    case = prepared.case
+    context = prepare(tmp_path / "case_v2.toml", arm=False)
+    case = context.case
     cap = {"theta": (np.radians(20), np.radians(60)), "beta": (np.radians(40), np.radians(140))}
-    found = certify(case, prepared.anatomy, size=np.radians(2), **cap)
+    found = certify(case, context.anatomy, size=np.radians(2), **cap)
     theta, beta = _thrown_into(found.leaves, rng.integers(0, len(found.leaves), 500), rng)
-    judged = _judged(prepared, prepared.anatomy, _directions(case, theta, beta))
+    judged = _judged(context, context.anatomy, _directions(case, theta, beta))
     letters = found.at(theta, beta)
     assert judged.safe[letters == "S"].all()
     assert not judged.safe[letters == "R"].any()

@@ -28,7 +28,7 @@ def test_the_worked_pose_is_out_of_a_ur3s_reach():
 
 def test_a_wrong_number_does_not_hold():
     """A difference of 0.02 mm is seen."""
-    assert not chen2019.Row("3", "x", (1.00, 2.00, 3.00), (1.00, 2.02, 3.00)).holds
+    assert not chen2019.Chen2019Row("3", "x", (1.00, 2.00, 3.00), (1.00, 2.02, 3.00)).holds
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the paper's tables as CSV are not on this machine")

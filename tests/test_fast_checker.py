@@ -27,7 +27,7 @@ from puncture_twin.planning.collision.triangle_tree import TriangleTree
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.reach.reach import ReachAnswer, assess_reach, assess_reach_all
-from puncture_twin.planning.search.context import Prepared, prepare
+from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.search import case_directions, organ_candidates, reach_request
 
 UR3 = ur_model("ur3")
@@ -289,7 +289,7 @@ def test_an_empty_room_and_a_needle_that_may_go_in() -> None:
 
 
 @pytest.fixture(scope="module")
-def abdomen(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
+def abdomen(tmp_path_factory: pytest.TempPathFactory) -> CaseContext:
     """The embedded abdomen at 6 degrees."""
     here = tmp_path_factory.mktemp("abdomen") / "case"
     shutil.copytree(Path(__file__).parents[1] / "meshes" / "abdomen", here)
@@ -298,7 +298,7 @@ def abdomen(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
     return prepare(case)
 
 
-def test_reach_answers_over_the_abdomen_are_those_of_fcl(abdomen: Prepared) -> None:
+def test_reach_answers_over_the_abdomen_are_those_of_fcl(abdomen: CaseContext) -> None:
     """Every organ-safe direction: the same verdict, reason, depth, contact, branch, roll and motion."""
     case, anatomy, reach = abdomen.case, abdomen.anatomy, abdomen.reach
     assert reach is not None

@@ -99,11 +99,11 @@ def leaves_while_waiting(tilt):
     return 60.0 / np.sin(tilt) < LENGTH + 80.0 / np.cos(tilt) + gap(tilt)
 
 
-def judged(prepared, theta, beta):
+def judged(context, theta, beta):
     """The search's verdicts on directions, rad."""
     theta, beta = np.atleast_1d(theta), np.broadcast_to(beta, np.shape(np.atleast_1d(theta)))
-    directions = Directions(theta, beta, outward(theta, beta) @ prepared.case.T_ct_entry[:3, :3].T)
-    return organ_candidates(prepared.case, prepared.anatomy, prepared.engine, directions)
+    directions = Directions(theta, beta, outward(theta, beta) @ context.case.T_ct_entry[:3, :3].T)
+    return organ_candidates(context.case, context.anatomy, context.engine, directions)
 
 
 def test_an_inserted_flange_inside_and_a_waiting_one_outside_is_unknown(cut):
@@ -127,9 +127,9 @@ def test_each_directions_own_standoff_decides(cut):
 
 def test_a_stated_standoff_decides(tmp_path):
     """With standoff_mm the flange waits as far out along every path: the image must reach to 330 mm."""
-    prepared = cut_case(tmp_path, "standoff_mm = 120.0")
+    context = cut_case(tmp_path, "standoff_mm = 120.0")
     tilt = np.arange(4.0, 30.0, 0.01) * DEG
-    np.testing.assert_array_equal(judged(prepared, tilt, 0.0).safe, 60.0 / np.sin(tilt) >= LENGTH + 120.0)
+    np.testing.assert_array_equal(judged(context, tilt, 0.0).safe, 60.0 / np.sin(tilt) >= LENGTH + 120.0)
 
 
 def test_a_path_without_a_standoff_keeps_its_reason(cut):

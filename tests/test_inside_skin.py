@@ -29,9 +29,9 @@ def carton():
     return prepare(folder() / "carton" / "case_m.toml", arm=False)
 
 
-def with_structure(prepared, structure):
+def with_structure(context, structure):
     """The case's anatomy and one structure more."""
-    return replace(prepared.anatomy, structures=(*prepared.anatomy.structures, structure))
+    return replace(context.anatomy, structures=(*context.anatomy.structures, structure))
 
 
 def joined(one, other):
@@ -102,8 +102,8 @@ def test_nearness_is_exact(ball, box, rng):
 @pytest.mark.parametrize("name", ["abdomen", "carton/case_m.toml", "carton/case_h.toml"])
 def test_the_embedded_cases_lie_inside_their_skin(name):
     """No structure of an embedded case is warned about."""
-    prepared = prepare(folder() / name, arm=False)
-    assert not [w for w in check_consistency(prepared.case, prepared.anatomy, None) if "outside the skin" in w]
+    context = prepare(folder() / name, arm=False)
+    assert not [w for w in check_consistency(context.case, context.anatomy, None) if "outside the skin" in w]
 
 
 def test_a_structure_of_role_unknown_may_lie_outside(carton, ball):

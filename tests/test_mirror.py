@@ -75,7 +75,7 @@ def test_the_tip_comes_straight_to_the_target(drive):
     """Along an insertion the target stays on the needle's line, and the distance is the standoff less the depth."""
     shown = mirror.Mirror.of(load_case(ABDOMEN))
     for q, depth in zip(drive.insertion_q, drive.insertion_depth_mm, strict=True):
-        one = shown.show(mirror.JointState(0.0, q))
+        one = shown.show(mirror.RecordedState(0.0, q))
         assert one.off_axis_mm < 1e-6 and one.to_target_mm == pytest.approx(120.0 - depth, abs=1e-6)
 
 

@@ -9,7 +9,7 @@ from scipy.ndimage import map_coordinates
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.image.line_search import brightest_segment
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, DetectorSettings, Missed, detect
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedlePose, render
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleInImage, render
 
 IMAGER = Imager()
 
@@ -18,7 +18,7 @@ def draw_needle(rng, off_mm=0.0, lean_deg=0.0):
     """20 to 75 degrees from either side, the tip anywhere in the middle."""
     steep, lean, side = np.radians(rng.uniform(20, 75)), np.radians(lean_deg), rng.choice([-1.0, 1.0])
     direction = np.array([side * np.cos(steep) * np.cos(lean), np.sin(steep) * np.cos(lean), np.sin(lean)])
-    return NeedlePose(np.array([rng.uniform(12, 38), rng.uniform(15, 52), off_mm]), direction)
+    return NeedleInImage(np.array([rng.uniform(12, 38), rng.uniform(15, 52), off_mm]), direction)
 
 
 def errors_of(found, needle):
@@ -90,7 +90,7 @@ def test_a_tip_that_left_the_slice_is_not_the_end_that_shows():
     rng = np.random.default_rng(14)
     lean = np.radians(8.0)
     direction = np.array([np.cos(0.7) * np.cos(lean), np.sin(0.7) * np.cos(lean), np.sin(lean)])
-    needle = NeedlePose(np.array([32.0, 40.0, 3.0]), direction)
+    needle = NeedleInImage(np.array([32.0, 40.0, 3.0]), direction)
     found = [detect(render(IMAGER, needle, rng), IMAGER) for _ in range(5)]
     along = [errors_of(one, needle)[0] for one in found if isinstance(one, Detection)]
     assert len(along) > 0
@@ -103,7 +103,9 @@ def test_a_needle_that_crosses_the_picture_has_no_tip_there():
     for u, steep in ((70.0, 30.0), (60.0, 20.0), (-12.0, 25.0)):
         side = 1.0 if u > 0 else -1.0
         direction = np.array([side * np.cos(np.radians(steep)), np.sin(np.radians(steep)), 0.0])
-        assert isinstance(detect(render(IMAGER, NeedlePose(np.array([u, 45.0, 0.0]), direction), rng), IMAGER), Missed)
+        assert isinstance(
+            detect(render(IMAGER, NeedleInImage(np.array([u, 45.0, 0.0]), direction), rng), IMAGER), Missed
+        )
 
 
 def test_another_size_is_refused():

@@ -25,7 +25,7 @@ from puncture_twin.twin.phantoms.guidance import (
 )
 from puncture_twin.twin.phantoms.implicit import capsule, ellipsoid, smooth_max
 from puncture_twin.twin.phantoms.manifest import ply_bytes
-from puncture_twin.twin.phantoms.mesher import Box, mesh_field
+from puncture_twin.twin.phantoms.mesher import SamplingBox, mesh_field
 from puncture_twin.twin.phantoms.sweep import tube
 
 FOLDER = meshes.folder()
@@ -299,7 +299,7 @@ def test_carton_case_has_the_papers_lesion(letter):
 
 def test_mesher_meets_a_sphere():
     """A sphere's mesh: vertices on it to 1e-5 mm, Euler number 2, volume of the inscribed polyhedron."""
-    mesh = mesh_field(ellipsoid((1.0, 2.0, 3.0), (10.0, 10.0, 10.0)), Box((-12, -11, -10), (14, 15, 16), 1.0))
+    mesh = mesh_field(ellipsoid((1.0, 2.0, 3.0), (10.0, 10.0, 10.0)), SamplingBox((-12, -11, -10), (14, 15, 16), 1.0))
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert np.abs(np.linalg.norm(mesh.vertices - [1.0, 2.0, 3.0], axis=1) - 10.0).max() < 1e-4
     assert solid.euler_number == 2
@@ -309,7 +309,7 @@ def test_mesher_meets_a_sphere():
 def test_mesher_refuses_a_body_that_leaves_its_box():
     """A cut body would be an open or capped one: refused."""
     with pytest.raises(ValueError, match="must lie inside the box"):
-        mesh_field(ellipsoid((0, 0, 0), (10.0, 10.0, 10.0)), Box((-8, -12, -12), (12, 12, 12), 1.0))
+        mesh_field(ellipsoid((0, 0, 0), (10.0, 10.0, 10.0)), SamplingBox((-8, -12, -12), (12, 12, 12), 1.0))
 
 
 def test_straight_tube_is_a_capsule():

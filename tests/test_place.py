@@ -35,7 +35,7 @@ from puncture_twin.planning.place.search import search_placements
 from puncture_twin.planning.place.workers import ask_all
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.search import Reach, case_directions, organ_candidates, with_reach
+from puncture_twin.planning.search.search import ArmReach, case_directions, organ_candidates, with_reach
 from puncture_twin.twin.jobs.patient.place_text import needle_line
 
 UR3 = ur_model("ur3")
@@ -348,9 +348,9 @@ def _same_as_the_search(here, best):
     mount = "\n".join(["[robot.mount]", *(f"{key} = {value}" for key, value in best["mount"].items())])
     pasted = here / "pasted.toml"
     pasted.write_text(text[:start] + text[end:] + "\n" + mount + "\n")
-    prepared = prepare(pasted)
-    found = organ_candidates(prepared.case, prepared.anatomy, prepared.engine, case_directions(prepared.case))
-    held = with_reach(prepared.case, found, Reach(prepared.reach.checker, prepared.reach.T_base_ct))
+    context = prepare(pasted)
+    found = organ_candidates(context.case, context.anatomy, context.engine, case_directions(context.case))
+    held = with_reach(context.case, found, ArmReach(context.reach.checker, context.reach.T_base_ct))
     assert int((held.reachable == 1).sum()) == best["held"] and int(found.safe.sum()) == best["asked"]
 
 
@@ -366,7 +366,7 @@ def test_no_placement_holds_anything(case_folder, tmp_path, capsys):
 
 def test_a_search_that_finds_nothing_safe_says_so(case_folder):
     """No direction is safe for the organs: nothing to hold."""
-    prepared = prepare(case_folder(("margin_mm = 2.0", "margin_mm = 400.0"), more=FEW), arm=False)
-    found = organ_candidates(prepared.case, prepared.anatomy, prepared.engine, case_directions(prepared.case))
+    context = prepare(case_folder(("margin_mm = 2.0", "margin_mm = 400.0"), more=FEW), arm=False)
+    found = organ_candidates(context.case, context.anatomy, context.engine, case_directions(context.case))
     with pytest.raises(Exception, match="no direction is safe"):
-        search_placements(prepared.case, prepared.anatomy, found, None)
+        search_placements(context.case, context.anatomy, found, None)

@@ -8,8 +8,8 @@ from embreex.rtcore_scene import EmbreeScene
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.report.map.map_raster import map_raster, row_colours
-from puncture_twin.twin.report.map_view import Cells, map_view, rows_at
-from puncture_twin.twin.report.raster.camera import Camera
+from puncture_twin.twin.report.map_view import MapCells, map_view, rows_at
+from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.line_of_sight import blocked
 from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, picture, put_moving, veils_of
 from puncture_twin.twin.report.raster.shading import corner_normals
@@ -26,7 +26,7 @@ def soup(rng, count, size=30.0, spread=80.0):
 
 def camera_at(eye, look_at=(0.0, 0.0, 0.0)):
     """A small picture."""
-    return Camera(
+    return ViewCamera(
         np.array(eye, dtype=float), np.array(look_at, dtype=float), np.array([0, 0, 1.0]), 0.6, SIZE[1], SIZE[0]
     )
 
@@ -153,7 +153,7 @@ def test_the_cells_of_a_picture_are_those_of_its_directions(grid):
     case = world.make_case()
     found = world.make_candidates(case, step_deg=5.0, **grid)
     view = map_view(case, found)
-    rows = Cells.of(found).picture(view, 101)
+    rows = MapCells.of(found).picture(view, 101)
     axis = (np.arange(101) + 0.5) / 101 * 2 - 1
     theta, beta = view.angles_at(np.stack(np.meshgrid(axis, -axis), axis=-1))
     assert (rows == rows_at(found, theta, beta)).mean() > 0.999  # a direction on a border may fall to either side
@@ -172,7 +172,7 @@ def test_only_pixels_at_borders_are_mixed():
     found = world.make_candidates(case, step_deg=5.0)
     size, view = 120, map_view(case, found)
     raster = map_raster(found, view, size)
-    fine = Cells.of(found).picture(view, 2 * size)
+    fine = MapCells.of(found).picture(view, 2 * size)
     table = np.vstack([np.c_[row_colours(found), np.full(len(found), 255)], np.zeros(4)])[fine]
     table[..., :3] *= table[..., 3:] / 255
     mean = table.reshape(size, 2, size, 2, 4).mean(axis=(1, 3))

@@ -35,8 +35,8 @@ def searches(tmp_path_factory):
 
 
 def _searched(path):
-    prepared = prepare(path, arm=False)
-    return prepared, prepared.search()
+    context = prepare(path, arm=False)
+    return context, context.search()
 
 
 def test_every_structure_is_there_and_closed(searches):
@@ -52,14 +52,14 @@ def test_every_structure_is_there_and_closed(searches):
 
 def test_the_cut_body_is_never_safe(searches):
     """The field of view cuts four faces of this body; paths leaving there are unknown, also at standoff alone."""
-    prepared, found = searches["v2"]
-    field = prepared.anatomy.skin.field_of_view
+    context, found = searches["v2"]
+    field = context.anatomy.skin.field_of_view
     assert field.cut.sum() == 4
-    out = field.exit(prepared.case.target_ct, found.outward_ct)
-    beyond = out.cut & (out.depth_mm < prepared.case.needle.length_mm)
+    out = field.exit(context.case.target_ct, found.outward_ct)
+    beyond = out.cut & (out.depth_mm < context.case.needle.length_mm)
     assert beyond.any()
     assert (found.reason[beyond] == Reason.UNKNOWN_REGION).all()
-    waiting = waiting_flange(prepared.case.needle, found.path_length, found.skin_angle)
+    waiting = waiting_flange(context.case.needle, found.path_length, found.skin_angle)
     later = out.cut & (out.depth_mm < waiting) & ~beyond
     assert later.sum() > 20
     assert not found.safe[later].any()
@@ -67,13 +67,13 @@ def test_the_cut_body_is_never_safe(searches):
 
 def test_some_paths_are_safe_and_keep_every_margin(searches):
     """Each safe row keeps each margin, enters through skin, and is short and steep enough."""
-    for prepared, found in searches.values():
+    for context, found in searches.values():
         rows = found.safe
         assert rows.sum() > 20
         demanding = ~np.isnan(found.margins)
         assert (found.clearance[rows][:, demanding] >= found.margins[demanding] - 1e-4).all()
-        assert (found.path_length[rows] <= prepared.case.needle.shaft_mm).all()
-        assert (found.skin_angle[rows] <= prepared.case.search.max_skin_angle).all()
+        assert (found.path_length[rows] <= context.case.needle.shaft_mm).all()
+        assert (found.skin_angle[rows] <= context.case.search.max_skin_angle).all()
 
 
 def test_two_label_maps_of_one_patient_disagree(searches, record_property):

@@ -26,12 +26,12 @@ from puncture_twin.twin.report.page.page import write_page
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import TRIANGLES, lightened
 from puncture_twin.twin.report.palette import REASON_COLOURS, SAFE_HIGH, SAFE_LOW
-from puncture_twin.twin.report.raster.camera import Camera, camera_around
-from puncture_twin.twin.report.raster.compositing import Shot, compose, empty_veil
+from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
+from puncture_twin.twin.report.raster.compositing import RasterShot, compose, empty_veil
 from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, put_moving, veils_of
 from puncture_twin.twin.report.scene import film, lighter_mesh, scene_picture
 from puncture_twin.twin.report.scene.film import draw_film
-from puncture_twin.twin.report.scene.scene_parts import Body, needle_bodies, patient
+from puncture_twin.twin.report.scene.scene_parts import SceneBody, needle_bodies, patient
 from puncture_twin.twin.report.scene.scene_picture import draw_scene, families, render_bodies
 from puncture_twin.twin.report.scene.shapes import LIFT_MM, corridor_mouth, corridor_walls
 from puncture_twin.twin.report.scene.views import overview, up_ct
@@ -104,7 +104,7 @@ def test_the_map_is_what_a_camera_outside_sees(name):
     R = case.T_ct_entry[:3, :3]
     up = R @ [np.cos(np.pi / 2 - view.turn), np.sin(np.pi / 2 - view.turn), 0.0]
     far = 1e6
-    camera = Camera(case.target_ct + far * R[:, 2], case.target_ct, up, 0.001, 1000, 1000)
+    camera = ViewCamera(case.target_ct + far * R[:, 2], case.target_ct, up, 0.001, 1000, 1000)
     rows = np.flatnonzero((found.theta > 0.1) & (found.theta < 3.0))
     seen = camera.project(case.target_ct + 100 * found.outward_ct[rows])[:, :2] - 500
     on_map = view.place(found.theta[rows], found.beta[rows])
@@ -234,7 +234,7 @@ def test_counts_and_solid_angles(case, candidates):
 def sphere_view(width=200, height=160):
     """A camera 400 mm from a ball of 60 mm, and the analytic depth of every ray."""
     centre = np.array([5.0, -8.0, 12.0])
-    camera = Camera(
+    camera = ViewCamera(
         centre - 400 * np.eye(3)[1], centre + np.array([10.0, 0.0, 5.0]), np.array([0, 0, 1.0]), 0.5, width, height
     )
     rows, columns = (g.ravel() for g in np.mgrid[0:height, 0:width])
@@ -270,7 +270,7 @@ def test_a_veil_has_both_shells(ball):
 
 def test_a_veil_behind_something_opaque_is_not_drawn():
     """Blending respects depth, and is Porter and Duff's over."""
-    opaque = Shot(np.full((2, 2, 3), 100, np.float32), np.full((2, 2), 50, np.float32))
+    opaque = RasterShot(np.full((2, 2, 3), 100, np.float32), np.full((2, 2), 50, np.float32))
     for depth, wanted in ((40, 0.25 * 200 + 0.75 * 100), (60, 100)):
         veil = replace(
             empty_veil((2, 2)),
@@ -287,9 +287,9 @@ def test_a_moved_body_looks_like_a_body_that_stands_there(ball, rng):
     T = np.eye(4)
     T[:3, :3] = Rotation.random(rng=rng).as_matrix()
     T[:3, 3] = [20.0, 10.0, -5.0]
-    camera = Camera(np.array([0, -300.0, 0]), np.zeros(3), np.array([0, 0, 1.0]), 0.5, 120, 90)
+    camera = ViewCamera(np.array([0, -300.0, 0]), np.zeros(3), np.array([0, 0, 1.0]), 0.5, 120, 90)
     still = opaque_shot(Layer([Surface(mesh.transformed(T), (90, 120, 200))]), camera)
-    shot = Shot(np.full((90, 120, 3), 7, np.float32), np.full((90, 120), np.inf, np.float32))
+    shot = RasterShot(np.full((90, 120, 3), 7, np.float32), np.full((90, 120), np.inf, np.float32))
     box = put_moving(shot, Layer([Surface(mesh, (90, 120, 200))]), T, camera)
     struck = np.isfinite(still.depth)
     # Rays through a shared edge may fall to either triangle: a few pixels differ by rounding.
@@ -304,7 +304,7 @@ def test_a_moved_body_looks_like_a_body_that_stands_there(ball, rng):
 
 def test_a_body_behind_another_stays_hidden(ball):
     """What moves behind what stands is not drawn."""
-    camera = Camera(np.array([0, -300.0, 0]), np.zeros(3), np.array([0, 0, 1.0]), 0.5, 60, 60)
+    camera = ViewCamera(np.array([0, -300.0, 0]), np.zeros(3), np.array([0, 0, 1.0]), 0.5, 60, 60)
     shot = opaque_shot(Layer([Surface(ball(40.0), (250, 0, 0))]), camera)
     before = shot.colour.copy()
     T = np.eye(4)
@@ -365,7 +365,7 @@ def test_what_holds_the_target_is_see_through(anatomy, case):
 def test_the_target_shows_where_it_is(anatomy, case):
     """The red ball shines through liver and skin where the camera's projection says, and changes nothing else."""
     bodies = patient(anatomy, case)
-    camera = Camera(
+    camera = ViewCamera(
         world.TARGET + np.array([30, -500, 20]), world.TARGET + np.array([10, 0, -5]), np.eye(3)[2], 0.4, 120, 90
     )
     with_ball = render_bodies(bodies, camera).astype(int)
@@ -384,7 +384,7 @@ def test_the_overview_looks_down_from_beside_the_patient(name, anatomy):
     case = world.make_case(space=FRAMES[name][0], frame=FRAMES[name][1])
     content = anatomy.skin.mesh.vertices
     camera = overview(
-        case, content, world.TARGET[None], Layer([Body("", "", anatomy.skin.mesh, (0, 0, 0)).surface]), (90, 60)
+        case, content, world.TARGET[None], Layer([SceneBody("", "", anatomy.skin.mesh, (0, 0, 0)).surface]), (90, 60)
     )
     toward = camera.axes[2]
     assert toward @ up_ct(case) < -0.3
@@ -399,7 +399,7 @@ def test_the_cross_of_directions_points_the_right_way(monkeypatch, case):
     """In a view from the feet on a patient on the back, the patient's left is on the left."""
     written = {}
     monkeypatch.setattr(annotate, "write", lambda draw, at, words, **look: written.update({words: np.array(at)}))
-    camera = Camera(np.array([0.0, 0, -500]), np.zeros(3), np.array([0, -1.0, 0]), 0.5, 200, 200)
+    camera = ViewCamera(np.array([0.0, 0, -500]), np.zeros(3), np.array([0, -1.0, 0]), 0.5, 200, 200)
     draw = ImageDraw.Draw(Image.new("RGB", (200, 200)))
     annotate.body_axes(draw, camera, case.space, (100.0, 100.0), 40.0)
     assert written.keys() == {"left", "right", "front", "back"}  # head and feet lie along the view
@@ -585,7 +585,10 @@ def test_the_page_s_map_knows_its_rows(case, candidates):
 
 def test_meshes_are_lightened_but_none_is_lost(ball):
     """The page's triangle budget holds, and the smallest body keeps its shape."""
-    bodies = [Body("big", "organ", ball(80.0, (0, 0, 0), 6), (1, 2, 3)), Body("small", "organ", ball(3.0), (1, 2, 3))]
+    bodies = [
+        SceneBody("big", "organ", ball(80.0, (0, 0, 0), 6), (1, 2, 3)),
+        SceneBody("small", "organ", ball(3.0), (1, 2, 3)),
+    ]
     light = lightened(bodies, 10_000)
     counts = [len(b.mesh.faces) for b in light]
     assert counts[0] == pytest.approx(10_000, rel=0.1) and counts[1] >= 300
@@ -596,7 +599,7 @@ def test_meshes_are_lightened_but_none_is_lost(ball):
 
 def test_lightened_meshes_are_kept(ball, tmp_path, monkeypatch):
     """The second time nothing is simplified, and the meshes are the same; another budget is another mesh."""
-    bodies = [Body("big", "organ", ball(80.0, (0, 0, 0), 5), (1, 2, 3))]
+    bodies = [SceneBody("big", "organ", ball(80.0, (0, 0, 0), 5), (1, 2, 3))]
     cache = Cache(tmp_path)
     (first,) = lightened(bodies, 2_000, cache)
     with monkeypatch.context() as patch:
@@ -618,7 +621,7 @@ def test_the_cross_s_words_keep_apart(monkeypatch, case, toward):
         boxes.append(draw.textbbox(at, words, font=annotate.font(size, bold), anchor=anchor))
 
     monkeypatch.setattr(annotate, "write", note)
-    camera = Camera(-500 * np.array(toward), np.zeros(3), np.array([0, -1.0, 0.1]), 0.5, 200, 200)
+    camera = ViewCamera(-500 * np.array(toward), np.zeros(3), np.array([0, -1.0, 0.1]), 0.5, 200, 200)
     annotate.body_axes(image, camera, case.space, (150.0, 150.0), 44.0)
     assert len(boxes) >= 4
     for i, a in enumerate(boxes):
@@ -641,4 +644,4 @@ def test_the_legend_names_the_room(anatomy, case, candidates, tmp_path, monkeypa
 def stand_in_room(anatomy):
     """Something to stand for a gantry and a table."""
     mesh = anatomy.skin.mesh
-    return (Body("gantry", "room", mesh, (1, 2, 3), 0.15), Body("table", "room", mesh, (1, 2, 3)))
+    return (SceneBody("gantry", "room", mesh, (1, 2, 3), 0.15), SceneBody("table", "room", mesh, (1, 2, 3)))

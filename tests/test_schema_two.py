@@ -31,9 +31,9 @@ def test_a_case_that_states_its_structures_is_read_without_a_note(tmp_path):
 )
 def test_the_embedded_cases_are_of_schema_two(name):
     """No note, and no usual organ is missing."""
-    prepared = prepare(folder() / name, arm=False)
-    assert prepared.case.region in {"abdomen", "phantom"}
-    assert not [w for w in prepared.anatomy.warnings if "schema" in w or "region" in w or "[end]" in w]
+    context = prepare(folder() / name, arm=False)
+    assert context.case.region in {"abdomen", "phantom"}
+    assert not [w for w in context.anatomy.warnings if "schema" in w or "region" in w or "[end]" in w]
 
 
 def test_a_case_cut_anywhere_is_refused(tmp_path):

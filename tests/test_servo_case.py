@@ -13,7 +13,7 @@ from puncture_twin.twin.guidance.stereo.poses import configurations, way_up
 from puncture_twin.twin.guidance.stereo.robot_calibration import grid_points, held_rod
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.stereo.servo_loop import way_contact
-from puncture_twin.twin.guidance.stereo.stereo_room import Room, draw_room, head_pose, room_checker
+from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_room, head_pose, room_checker
 from puncture_twin.twin.phantoms.head import FLOOR_MM, MARKERS_MM, RIM_MM, head_field, head_targets
 
 HEAD = folder() / "head"
@@ -118,7 +118,7 @@ def test_the_arm_reaches_everything_without_a_contact(case):
         assert not arm_hides_ball(room, aim)
 
 
-def arm_hides_ball(room: Room, q):
+def arm_hides_ball(room: StereoWorkcell, q):
     """Whether some link stands between a camera and the ball, by the links' own meshes."""
     poses = room.arm.link_poses(q)
     for link in collision_links(room.model)[1:]:

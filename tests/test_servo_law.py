@@ -8,8 +8,8 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.twin.guidance.stereo.servo_law import (
     MIN_SIGMA,
     Held,
+    ServoStop,
     StepLimits,
-    Stop,
     ball_base,
     ball_jacobian,
     damped,
@@ -79,7 +79,7 @@ def test_beyond_a_joint_limit_the_arm_stays():
     across = np.array([-np.sin(q[0]), np.cos(q[0]), 0.0]) * 5.0
     outcomes = [servo_step(held, q, sign * across, StepLimits()) for sign in (1.0, -1.0)]
     assert sorted(str(o.stop) for o in outcomes) == ["None", "joint_limit"]
-    refused = next(o for o in outcomes if o.stop is Stop.JOINT_LIMIT)
+    refused = next(o for o in outcomes if o.stop is ServoStop.JOINT_LIMIT)
     assert np.array_equal(refused.q_path, q[None])
 
 
@@ -97,7 +97,7 @@ def test_near_the_wrist_singularity_the_position_still_arrives():
         wish *= 1.5 / np.linalg.norm(wish)
         assert smallest_sigma(ball_jacobian(held, q)) < MIN_SIGMA
         step = servo_step(held, q, wish, StepLimits())
-        assert step.stop in {None, Stop.SINGULAR}
+        assert step.stop in {None, ServoStop.SINGULAR}
         turn = np.degrees(np.linalg.norm(orientation_error(held, step.q_path[-1])))
         assert turn <= 1.0
         ours += (
@@ -117,7 +117,7 @@ def test_where_the_needle_would_turn_too_far_it_stops():
     q[4] = np.radians(0.5)
     held = held_at(q)
     outcomes = [servo_step(held, q, move, StepLimits()) for move in 10.0 * np.eye(3)]
-    assert any(o.stop is Stop.SINGULAR and np.array_equal(o.q_path, q[None]) for o in outcomes)
+    assert any(o.stop is ServoStop.SINGULAR and np.array_equal(o.q_path, q[None]) for o in outcomes)
 
 
 def test_damping_is_nothing_far_from_singular_and_bounds_the_step_near():

@@ -7,7 +7,7 @@ from servo_world import CASE, HELD, NoContacts, start_configurations
 
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.collision.state_checker import Contact, Met
-from puncture_twin.twin.guidance.stereo.servo_law import StepLimits, Stop, ball_base
+from puncture_twin.twin.guidance.stereo.servo_law import ServoStop, StepLimits, ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen, Task, servo, way_contact
 from puncture_twin.twin.plant.true_arm import ArmErrors, draw_true_arm
 
@@ -77,7 +77,7 @@ def test_it_takes_the_arms_own_error_out(seed):
     twin = Twin(ArmErrors(0.3, 3e-4, 9e-4, np.radians(0.02), np.radians(0.003)), noise_mm=0.01, seed=seed)
     done = run(twin)
     before, after = (np.linalg.norm(twin.ball(q) - TARGET_C) for q in (Q_START, done.q_true))
-    assert done.stop is Stop.CONVERGED
+    assert done.stop is ServoStop.CONVERGED
     assert after < 0.1 + 4 * 0.01 < before
     assert done.steps <= 4
     assert len(done.errors_mm) == done.steps + 1
@@ -88,7 +88,7 @@ def test_a_perfect_arm_does_not_move():
     """Within the tolerance at the first look nothing is driven."""
     twin = Twin(ArmErrors())
     done = run(twin)
-    assert (done.stop, done.steps, twin.drives) == (Stop.CONVERGED, 0, 0)
+    assert (done.stop, done.steps, twin.drives) == (ServoStop.CONVERGED, 0, 0)
 
 
 def test_a_ball_that_is_not_seen_is_lost_and_the_arm_does_not_move():
@@ -100,7 +100,7 @@ def test_a_ball_that_is_not_seen_is_lost_and_the_arm_does_not_move():
         return Lost("camera 2: too few edges")
 
     done = servo(task(looks=4), Q_START, Q_START, blind, twin.drive)
-    assert (done.stop, twin.drives, len(looks)) == (Stop.LOST_BALL, 0, 4)
+    assert (done.stop, twin.drives, len(looks)) == (ServoStop.LOST_BALL, 0, 4)
     assert done.detail == "camera 2: too few edges"
     assert np.array_equal(done.q_command, Q_START)
 
@@ -113,7 +113,7 @@ def test_one_missed_look_is_tried_again():
     def now_and_then(q_command, q_true):
         return next(outcomes, None) or twin.look(q_command, q_true)
 
-    assert servo(task(), Q_START, Q_START, now_and_then, twin.drive).stop is Stop.CONVERGED
+    assert servo(task(), Q_START, Q_START, now_and_then, twin.drive).stop is ServoStop.CONVERGED
 
 
 def test_a_wrong_calibration_diverges():
@@ -123,7 +123,7 @@ def test_a_wrong_calibration_diverges():
     twin = Twin(ArmErrors(), T_base_c=wrong)
     target = twin.ball(Q_START) + np.array([1.0, 0.5, 0.0])
     done = servo(task(), Q_START, Q_START, lambda command, true: Seen(twin.ball(true), target, np.eye(3)), twin.drive)
-    assert done.stop is Stop.DIVERGING
+    assert done.stop is ServoStop.DIVERGING
     assert done.steps == 2
 
 
@@ -131,14 +131,14 @@ def test_a_hand_that_trembles_does_not_reach_a_fine_tolerance():
     """Repeatability of .05 deg against 0.02 mm: the steps run out, and that is what it says."""
     twin = Twin(ArmErrors(0.3, repeatability_rad=np.radians(0.05)), seed=3)
     done = run(twin, tolerance_mm=0.02, max_steps=6)
-    assert (done.stop, done.steps, twin.drives) == (Stop.TOLERANCE_NOT_REACHED, 6, 6)
+    assert (done.stop, done.steps, twin.drives) == (ServoStop.TOLERANCE_NOT_REACHED, 6, 6)
 
 
 def test_a_way_that_touches_something_is_not_driven():
     """The contact is named and the arm stays."""
     twin = Twin(ArmErrors(0.3))
     done = run(twin, checker=Touches())
-    assert (done.stop, twin.drives, done.detail) == (Stop.CONTACT, 0, "needle and table")
+    assert (done.stop, twin.drives, done.detail) == (ServoStop.CONTACT, 0, "needle and table")
 
 
 def test_a_singular_start_says_so():
@@ -149,7 +149,7 @@ def test_a_singular_start_says_so():
     held = HELD._replace(R_base_flange=HELD.R_base_flange)
     far = Task(held, T_BASE_C, 0.1, 10, 3, StepLimits(), NoContacts())
     done = servo(far, q, q, lambda command, true: Seen(np.zeros(3), np.full(3, 30.0), np.eye(3)), twin.drive)
-    assert (done.stop, twin.drives) == (Stop.SINGULAR, 0)
+    assert (done.stop, twin.drives) == (ServoStop.SINGULAR, 0)
 
 
 def test_joint_limit_is_a_reason_of_its_own():
@@ -172,7 +172,7 @@ def test_joint_limit_is_a_reason_of_its_own():
 
         stop = servo(task(held=held), q, q, look, drive).stop
         ends[stop] = len(drives)
-    assert ends == {Stop.JOINT_LIMIT: 0, Stop.CONVERGED: 1}
+    assert ends == {ServoStop.JOINT_LIMIT: 0, ServoStop.CONVERGED: 1}
 
 
 def test_the_judge_is_asked_about_states_between_the_waypoints():

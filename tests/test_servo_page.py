@@ -8,7 +8,7 @@ from PIL import Image
 from servo_world import CASE
 
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.twin.guidance.stereo.experiment import Row, Trial, statistics
+from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, TargetRow, statistics
 from puncture_twin.twin.jobs.servo.liu2007 import paper_columns
 from puncture_twin.twin.jobs.servo.page import write_servo_page
 from puncture_twin.twin.jobs.servo.text import servo_summary, servo_text
@@ -17,14 +17,14 @@ from puncture_twin.twin.jobs.servo.text import servo_summary, servo_text
 def trials():
     """Two seeds of two targets, one not confirmed; a third seed that could not be held."""
     rows = [
-        Row(1, "T1", 0.30, 0.25, 0.9, 0.31, 0.05, 1, "converged"),
-        Row(1, "T2", 0.20, 0.25, 1.1, 0.25, 0.15, 10, "tolerance_not_reached"),
-        Row(2, "T1", 0.10, 0.25, 0.7, 0.12, 0.04, 2, "converged"),
-        Row(2, "T2", 0.40, 0.25, 0.5, 0.32, 0.08, 1, "converged"),
+        TargetRow(1, "T1", 0.30, 0.25, 0.9, 0.31, 0.05, 1, "converged"),
+        TargetRow(1, "T2", 0.20, 0.25, 1.1, 0.25, 0.15, 10, "tolerance_not_reached"),
+        TargetRow(2, "T1", 0.10, 0.25, 0.7, 0.12, 0.04, 2, "converged"),
+        TargetRow(2, "T2", 0.40, 0.25, 0.5, 0.32, 0.08, 1, "converged"),
     ]
-    held = [Trial(seed, (0.01, 0.03), (0.02, 0.03), 0.4, 0.2, tuple(r for r in rows if r.seed == seed), "")
+    held = [ServoTrial(seed, (0.01, 0.03), (0.02, 0.03), 0.4, 0.2, tuple(r for r in rows if r.seed == seed), "")
             for seed in (1, 2)]  # fmt: skip
-    return [*held, Trial(3, (), (), float("nan"), float("nan"), (), "calibration, point 4: camera 1: few_inliers")]
+    return [*held, ServoTrial(3, (), (), float("nan"), float("nan"), (), "calibration, point 4: camera 1: few_inliers")]
 
 
 def test_statistics_are_those_of_the_rows():

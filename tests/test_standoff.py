@@ -101,11 +101,11 @@ def test_the_arms_checker_lets_an_oblique_needle_start():
 
 def test_no_direction_of_the_abdomen_is_lost_to_its_own_needle():
     """Every organ-safe direction can start, the most oblique ones too; with the least gap alone one in ten cannot."""
-    prepared = prepare(folder() / "abdomen", arm=False)
-    case = prepared.case
-    found = organ_candidates(case, prepared.anatomy, prepared.engine, case_directions(case))
+    context = prepare(folder() / "abdomen", arm=False)
+    case = context.case
+    found = organ_candidates(case, context.anatomy, context.engine, case_directions(case))
     wanted = wanted_directions(case, found)
-    tool, skin = case_tool(case), prepared.anatomy.skin.mesh
+    tool, skin = case_tool(case), context.anatomy.skin.mesh
     assert needle_can_start(tool, skin, case.target_ct, wanted, ARM_PADDING_MM).all()
     oblique = found.skin_angle[found.safe] > 43.0 * DEG
     assert oblique.sum() > 100 and (wanted.standoff_mm - found.path_length[found.safe])[oblique].min() > 10.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from puncture_twin.twin.guidance.stereo.ball.ball_image import BallScene, Picture, _paint, render
-from puncture_twin.twin.guidance.stereo.ball.tracker import Ball, LostBall, find_ball
+from puncture_twin.twin.guidance.stereo.ball.tracker import DetectedBall, LostBall, find_ball
 from puncture_twin.twin.guidance.stereo.cameras.camera import stereo_pair, tangent_axes
 from puncture_twin.twin.guidance.stereo.cameras.circle import Circle, cone, consensus, refit
 
@@ -37,7 +37,7 @@ def tracked(rng, count, *, noise=2.0, hough_only=False, **changes):
         predicted = ball.center_c + rng.normal(0, 1, 3)
         found = find_ball(picture, CAMERA, predicted, SPHERE_MM, search_px=12, hough_only=hough_only)
         answers.append(found)
-        if isinstance(found, Ball):
+        if isinstance(found, DetectedBall):
             errors.append(found.pixel - CAMERA.project(ball.center_c))
     return answers, np.array(errors)
 

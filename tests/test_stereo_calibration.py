@@ -7,7 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.guidance.stereo.cameras.bundle import Observations, Spreads, _camera_slope, _Problem, adjust
+from puncture_twin.twin.guidance.stereo.cameras.bundle import (
+    Observations,
+    PixelSpreads,
+    _camera_slope,
+    _Problem,
+    adjust,
+)
 from puncture_twin.twin.guidance.stereo.cameras.calibration import calibrate
 from puncture_twin.twin.guidance.stereo.cameras.camera import looking_at, stereo_pair
 from puncture_twin.twin.guidance.stereo.cameras.dlt import decompose, dlt
@@ -134,7 +140,7 @@ def world(rng):
 def test_the_bundles_slope_is_a_finite_difference(rng):
     """Of every parameter of cameras, bodies and points, away from the start."""
     cameras, T, points, seen = world(rng)
-    spreads = Spreads(np.full((2, 14), np.inf), np.full((3, 6), 2.0), np.full((8, 3), np.inf))
+    spreads = PixelSpreads(np.full((2, 14), np.inf), np.full((3, 6), 2.0), np.full((8, 3), np.inf))
     problem = _Problem(cameras, T, points, seen, spreads)
     scale = problem.scale()
     x, h = rng.normal(size=len(scale)) * scale * 3, 1e-4 * scale
@@ -149,7 +155,7 @@ def test_the_bundles_slope_is_a_finite_difference(rng):
 def test_the_bundle_finds_the_truth_from_a_wrong_start(rng):
     """Exact pixels, first camera and the points held: the other camera and the bodies come back."""
     cameras, T, points, seen = world(rng)
-    spreads = Spreads(np.zeros((2, 14)), np.full((3, 6), np.inf), np.zeros((8, 3)))
+    spreads = PixelSpreads(np.zeros((2, 14)), np.full((3, 6), np.inf), np.zeros((8, 3)))
     spreads.cameras[1] = np.inf
     wrong = cameras[1].moved(looking_at(np.array([2.0, -3, 1]), np.array([2.1, -3, 20]), SIZE, 1.0).T_camera_c)
     start = T.copy()
@@ -167,7 +173,7 @@ def test_a_prior_and_a_measurement_meet_at_their_weights(rng):
     pixels = np.concatenate([camera.project(true) for camera in cameras])
     both = np.arange(2)
     seen = Observations(both, 0 * both, 0 * both, pixels, 0.09 * np.eye(2))
-    spreads = Spreads(np.zeros((2, 14)), np.zeros((1, 6)), np.full((1, 3), sigma))
+    spreads = PixelSpreads(np.zeros((2, 14)), np.zeros((1, 6)), np.full((1, 3), sigma))
     found = adjust(cameras, np.eye(4)[None], prior[None], seen, spreads)
     J = np.concatenate([camera.jacobian(true[0]) for camera in cameras])
     information = J.T @ J / 0.09
@@ -181,6 +187,6 @@ def test_a_prior_and_a_measurement_meet_at_their_weights(rng):
 def test_what_nothing_determines_is_refused(rng):
     """All cameras, bodies and points free: the frame itself is."""
     cameras, T, points, seen = world(rng)
-    spreads = Spreads(np.full((2, 14), np.inf), np.full((3, 6), np.inf), np.full((8, 3), np.inf))
+    spreads = PixelSpreads(np.full((2, 14), np.inf), np.full((3, 6), np.inf), np.full((8, 3), np.inf))
     with pytest.raises(InputError, match="equations|nothing determines"):
         adjust(cameras, T, points, seen, spreads)

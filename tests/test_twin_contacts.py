@@ -18,7 +18,7 @@ from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.collision_cases.pytest_plugin import read_checks
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.search.context import Prepared, prepare
+from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.twin.world.bodies import load_capsule, load_surface, remove
 from puncture_twin.twin.world.client import physics_client
 from puncture_twin.twin.world.contacts import gap_mm
@@ -53,13 +53,13 @@ class Compared:
 class Card:
     """One card's case, and the directions of its needles in the CT frame, shape (n, 3)."""
 
-    prepared: Prepared
+    context: CaseContext
     directions: np.ndarray
 
     @property
     def structures(self) -> tuple[Structure, ...]:
         """Those that demand a margin."""
-        return tuple(s for s in self.prepared.anatomy.structures if s.demands_margin)
+        return tuple(s for s in self.context.anatomy.structures if s.demands_margin)
 
 
 @pytest.fixture(scope="module", params=["abdomen", "carton"])
@@ -68,9 +68,9 @@ def card(request: pytest.FixtureRequest) -> Card:
     path = CARDS / f"{request.param}.collision.toml"
     checks = read_checks(path)
     assert checks.case is not None
-    prepared = prepare(path.parent / checks.case, arm=False)
+    context = prepare(path.parent / checks.case, arm=False)
     theta, beta = np.radians([[check.theta_deg, check.beta_deg] for check in checks.check]).T
-    return Card(prepared, outward(theta, beta) @ prepared.case.T_ct_entry[:3, :3].T)
+    return Card(context, outward(theta, beta) @ context.case.T_ct_entry[:3, :3].T)
 
 
 def pose(target: np.ndarray, direction: np.ndarray, length: float) -> np.ndarray:
@@ -85,7 +85,7 @@ def pose(target: np.ndarray, direction: np.ndarray, length: float) -> np.ndarray
 
 def radii(card: Card) -> Iterator[float]:
     """The needle's own radius, and that with each margin that the card's case has, and wider ones."""
-    radius = card.prepared.case.needle.radius_mm
+    radius = card.context.case.needle.radius_mm
     yield from sorted({radius + margin for margin in (0.0, *(s.margin_mm for s in card.structures), *WIDER_MM)})
 
 
@@ -97,7 +97,7 @@ def compare(card: Card, shift_mm: dict[str, np.ndarray] | None = None) -> Compar
         shift_mm: By how much PyBullet's structures of these names are out of place, shape (3,) each; only these are
             compared then.
     """
-    case, found = card.prepared.case, Compared()
+    case, found = card.context.case, Compared()
     structures = tuple(s for s in card.structures if shift_mm is None or s.name in shift_mm)
     judge = FclEngine([s.mesh for s in structures])
     axes = judge.measure(case.target_ct, card.directions, case.needle.length_mm).distance
@@ -136,7 +136,7 @@ def test_contacts_are_fcls(card: Card) -> None:
 @pytest.mark.parametrize("axis", range(3))
 def test_a_structure_out_of_place_is_noticed(card: Card, axis: int) -> None:
     """With a structure 3 mm beside its place in the twin, along each axis, some needle's contact differs."""
-    name = "bolt_h" if card.prepared.case.name.startswith("carton") else "portal_vein"
+    name = "bolt_h" if card.context.case.name.startswith("carton") else "portal_vein"
     shift = 3.0 * np.eye(3)[axis]
     assert compare(card, {name: shift}).differ != []
     assert compare(card, {name: 0.0 * shift}).differ == []

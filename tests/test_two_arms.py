@@ -18,7 +18,7 @@ from puncture_twin.twin.guidance.ultrasound.candidate_poses import (
     drawing,
     find_candidates,
 )
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedlePose
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, SelfcalFile, load_selfcal_case
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_room, jog_into_slice
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE
@@ -192,7 +192,7 @@ def test_the_jog_brings_the_true_needle_into_the_slice(case, candidates):
     for row in range(5):
         before = truth.needle_in_image(candidates.q_probe[row], candidates.q_needle[row])
         assert np.linalg.norm(before.tip_image[:2] - candidates.poses.P[row]) > 0.5
-        wanted = NeedlePose(np.array([*candidates.poses.P[row], 0.1]), np.array([*candidates.poses.v[row], 0.0]))
+        wanted = NeedleInImage(np.array([*candidates.poses.P[row], 0.1]), np.array([*candidates.poses.v[row], 0.0]))
         start, roll = candidates.q_needle[row], float(candidates.roll[row])
         q = jog_into_slice(truth, candidates.q_probe[row], start, wanted, roll)
         after = truth.needle_in_image(candidates.q_probe[row], q)

@@ -9,7 +9,7 @@ from puncture_twin.twin.guidance.ultrasound.image.probe_image import (
     Imager,
     Lesion,
     NeedleEcho,
-    NeedlePose,
+    NeedleInImage,
     needle_signal,
     render,
 )
@@ -23,7 +23,7 @@ def needle(steep_deg, tip=(25.0, 30.0, 0.0), lean_deg=0.0):
     """A needle from the left."""
     steep, lean = np.radians(steep_deg), np.radians(lean_deg)
     direction = np.array([np.cos(steep) * np.cos(lean), np.sin(steep) * np.cos(lean), np.sin(lean)])
-    return NeedlePose(np.array(tip), direction)
+    return NeedleInImage(np.array(tip), direction)
 
 
 def speckle(rng, count):
@@ -165,9 +165,9 @@ def test_pictures_are_seeded():
 @pytest.mark.parametrize(
     "bad",
     [
-        NeedlePose(np.array([np.nan, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])),
-        NeedlePose(np.zeros(3), np.array([1.0, 1.0, 0.0])),
-        NeedlePose(np.zeros(2), np.array([1.0, 0.0, 0.0])),
+        NeedleInImage(np.array([np.nan, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])),
+        NeedleInImage(np.zeros(3), np.array([1.0, 1.0, 0.0])),
+        NeedleInImage(np.zeros(2), np.array([1.0, 0.0, 0.0])),
     ],
 )
 def test_unusable_needles_are_refused(bad):

@@ -19,7 +19,7 @@ from puncture_twin.planning.collision.checker import BODY_NAMES
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.world.arm import load_arm
 from puncture_twin.twin.world.bodies import load_box, load_surface, thinned
-from puncture_twin.twin.world.cameras import Camera, picture
+from puncture_twin.twin.world.cameras import SimulatedCamera, picture
 from puncture_twin.twin.world.client import STANDARD_GRAVITY_MM_S2, physics_client, step
 from puncture_twin.twin.world.contacts import touches
 from puncture_twin.twin.world.engine import pybullet
@@ -218,7 +218,7 @@ def test_large_surfaces_are_thinned_and_stay_in_place():
 
 def test_picture_shows_what_stands_there():
     """A red ball in the middle makes the middle red; the array is rows, columns, RGB."""
-    camera = Camera(np.array([500.0, 0, 0]), np.zeros(3), np.array([0.0, 0, 1]), 120, 80)
+    camera = SimulatedCamera(np.array([500.0, 0, 0]), np.zeros(3), np.array([0.0, 0, 1]), 120, 80)
     with physics_client() as client:
         empty = picture(client, camera)
         load_surface(client, sphere(60.0), np.eye(4), solid=False, rgba=(0.9, 0.1, 0.1, 1.0))

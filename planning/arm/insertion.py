@@ -25,7 +25,7 @@ FULL_MARGIN_RAD = math.pi / 2
 """A joint this far or farther from its limits has the full margin of 1."""
 
 
-class Stop(NamedTuple):
+class InsertionStop(NamedTuple):
     """Where a way along the needle ends, and why."""
 
     depth_mm: float
@@ -87,7 +87,7 @@ def away_from_singularities(model: UrModel, q: Floats, at_least: float = MIN_SIN
     return np.asarray(singularity(model, q).least() > at_least)
 
 
-def first_stop(model: UrModel, path: Floats, depths_mm: Floats) -> Stop | None:
+def first_stop(model: UrModel, path: Floats, depths_mm: Floats) -> InsertionStop | None:
     """Where a way stops being drivable: out of reach, at a singularity, or with a joint that jumps; None if nowhere.
 
     Args:
@@ -105,7 +105,7 @@ def first_stop(model: UrModel, path: Floats, depths_mm: Floats) -> Stop | None:
         what = "a joint would jump"
     else:
         what = f"too near the {far.nearest} singularity"
-    return Stop(float(depths_mm[at]), f"{what} {depths_mm[at]:.1f} mm after the standoff")
+    return InsertionStop(float(depths_mm[at]), f"{what} {depths_mm[at]:.1f} mm after the standoff")
 
 
 def reach_margin(model: UrModel, q: Floats) -> float:

@@ -119,14 +119,14 @@ def search_one(path: Path, out: Path, arm: bool | None) -> dict[str, Any]:
     row: dict[str, Any] = dict.fromkeys((*COLUMNS, "seconds"))
     row |= {"case": one_line(str(path)), "folder": out.name, "directions": 0, "safe": 0}
     try:
-        prepared = prepare(path, arm=arm)
-        found = prepared.search()
+        context = prepare(path, arm=arm)
+        found = context.search()
     except PlanningError as error:
         return row | {"exit_code": 2 if isinstance(error, InputError) else 3, "said": str(error)}
-    write_table(found, prepared.provenance(), out / "candidates.parquet")
-    row |= {"name": prepared.case.name, "directions": len(found), "safe": int(found.safe.sum())}
-    row["inputs"] = inputs_document(prepared.case.inputs)
-    row["seconds"] = sum(prepared.stages.seconds.values())
+    write_table(found, context.provenance(), out / "candidates.parquet")
+    row |= {"name": context.case.name, "directions": len(found), "safe": int(found.safe.sum())}
+    row["inputs"] = inputs_document(context.case.inputs)
+    row["seconds"] = sum(context.stages.seconds.values())
     if not found.safe.any():
         return row | {"exit_code": 1, "said": "no safe candidate"}
     best = int(found.ranked[0])

@@ -36,7 +36,7 @@ PRISM_SIDES = 24
 """Of the prism about a cylinder: 0.9 % fuller than it."""
 
 
-class Ball(NamedTuple):
+class BoundingSphere(NamedTuple):
     """A ball, mm."""
 
     centre: Floats
@@ -87,11 +87,11 @@ def settings() -> dict[str, float]:
     }
 
 
-def enclosing_ball(points: Floats) -> Ball:
+def enclosing_ball(points: Floats) -> BoundingSphere:
     """A small ball about points (n, 3): steps toward the farthest point, ever shorter (Badoiu and Clarkson 2003)."""
     centre = np.empty(3)
     radius = _walk_to_centre(np.ascontiguousarray(points), CENTRE_STEPS, centre)
-    return Ball(centre, radius + SLACK_MM)
+    return BoundingSphere(centre, radius + SLACK_MM)
 
 
 @nb.njit(cache=True)
@@ -162,7 +162,7 @@ def halves(corners: Floats) -> tuple[Floats, Floats]:
 
 def ball_tree(pieces: Sequence[Floats], leaf_radius_mm: float = LEAF_RADIUS_MM) -> BallTree:
     """Balls that enclose the union of convex pieces, each given by its corners (n, 3), mm."""
-    balls: list[Ball] = []
+    balls: list[BoundingSphere] = []
     children: list[tuple[int, int]] = []
 
     def add(parts: Sequence[Floats]) -> int:

@@ -27,7 +27,7 @@ from puncture_twin.planning.collision.bounding_spheres import (
 from puncture_twin.planning.collision.checker import Check
 from puncture_twin.planning.collision.kernels import proofs as proof_kernels
 from puncture_twin.planning.collision.kernels.hulls import Hulls
-from puncture_twin.planning.collision.kernels.proofs import Movers, Scene, Skin, scratch
+from puncture_twin.planning.collision.kernels.proofs import Movers, ProofScene, SkinTree, scratch
 from puncture_twin.planning.collision.kernels.surfaces import CELL_MM
 from puncture_twin.planning.collision.shapes import touch
 from puncture_twin.planning.collision.triangle_tree import TriangleTree
@@ -98,7 +98,7 @@ class Proofs:
                 pair = (hulls.add(check.hulls[0], check.first_body), hulls.add(check.hulls[1], check.second_body))
                 row = (proof_kernels.PAIR, *pair, check.first_body.frame, frame)
             rows.append(row)
-        self.scene = Scene(np.array(rows, dtype=np.int64), _skin(patient), balls, *hulls.packed(cache))
+        self.scene = ProofScene(np.array(rows, dtype=np.int64), _skin(patient), balls, *hulls.packed(cache))
         self._levers = np.array([_levers(model, check) for check in checks])
         self.movers = _moving(checks)
         self._work = scratch(len(rows), len(self.scene.hulls.radii))
@@ -218,7 +218,7 @@ class _Hulls:
         return row
 
     def packed(self, cache: Cache) -> tuple[Hulls, Floats, Floats]:
-        """``hulls``, ``T_box_base`` and ``halves`` of :class:`Scene`."""
+        """``hulls``, ``T_box_base`` and ``halves`` of :class:`ProofScene`."""
         count = len(self._boxes)
         boxes, bodies = _enclosed(self._corners[:count]), self._corners[count:]
         arm = cache.arrays(made_from("hulls", bodies), lambda: _enclosed(bodies), by=__name__)
@@ -272,11 +272,11 @@ def _axes(points: Floats) -> _Axes:
     return x, y, z
 
 
-def _skin(patient: TriangleMesh | None) -> Skin:
+def _skin(patient: TriangleMesh | None) -> SkinTree:
     """The skin's tree and its field, of which nothing is known yet; or some that no check asks for."""
     if patient is None:
         nothing = (np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 1, 3, 3)))
-        return Skin(nothing, np.zeros((1, 1, 1), np.float32), np.zeros(3))
+        return SkinTree(nothing, np.zeros((1, 1, 1), np.float32), np.zeros(3))
     tree, (low, high) = TriangleTree.of(patient), patient.bounds
     margin = FIELD_MARGIN_MM
     while np.prod(cells := np.ceil((high - low + 2.0 * margin) / CELL_MM).astype(np.int64)) > MOST_CELLS:
@@ -284,7 +284,7 @@ def _skin(patient: TriangleMesh | None) -> Skin:
         if margin == 0.0:
             cells = np.ones(3, np.int64)
             break
-    return Skin((tree.lows, tree.highs, tree.corners), np.full(cells, np.nan, np.float32), low - margin)
+    return SkinTree((tree.lows, tree.highs, tree.corners), np.full(cells, np.nan, np.float32), low - margin)
 
 
 def _tree_arrays(pieces: Sequence[Floats]) -> Arrays:

@@ -29,11 +29,11 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.base.toml_file import read_toml
 from puncture_twin.planning.case.case_file import Degrees180, Degrees360, NotNegative, Number, Section
-from puncture_twin.planning.search.context import Prepared, prepare
+from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation
 
 SUFFIX = ".collision.toml"
-PREPARED = pytest.StashKey[dict[tuple[Path, bool], Prepared]]()
+PREPARED = pytest.StashKey[dict[tuple[Path, bool], CaseContext]]()
 DEFAULT_TOLERANCE_MM = 0.01
 """A tenth of the 0.1 mm to which a robot repeats itself."""
 
@@ -150,9 +150,9 @@ def _judge(config: pytest.Config, path: Path, check: CheckSection) -> Explanatio
     cases, key = config.stash[PREPARED], (path.resolve(), check.arm)
     if key not in cases:
         cases[key] = prepare(path, arm=check.arm)  # True refuses a case that does not say where the base is
-    prepared = cases[key]
-    found = prepared.check(np.radians(check.theta_deg), np.radians(check.beta_deg))
-    return Explanation(prepared.case, prepared.anatomy, found)
+    context = cases[key]
+    found = context.check(np.radians(check.theta_deg), np.radians(check.beta_deg))
+    return Explanation(context.case, context.anatomy, found)
 
 
 @pytest.fixture(scope="session")

@@ -32,7 +32,7 @@ class Ways(NamedTuple):
     """Shape (n, 8): least distance from a singularity over the states, 0..1; 0 where a way is not drivable."""
 
 
-class Estimate(NamedTuple):
+class ReachEstimate(NamedTuple):
     """Shares of the directions, 0..1, each what the one before leaves."""
 
     reach: float
@@ -45,7 +45,7 @@ class Estimate(NamedTuple):
     """Mean distance of the held directions from singularities, 0..1; 0 where none is held."""
 
 
-NOTHING = Estimate(0.0, 0.0, 0.0, 0.0)
+NOTHING = ReachEstimate(0.0, 0.0, 0.0, 0.0)
 
 
 def insertion_ways(
@@ -87,7 +87,7 @@ class Estimator:
     wanted: WantedDirections
     itself: bool
 
-    def estimate(self, site: Site) -> Estimate:
+    def estimate(self, site: Site) -> ReachEstimate:
         """The shares at one site; ``NOTHING`` where the base would stand in something."""
         model, balls = ur_model(self.model), _balls(self.model, self.tool)
         T_ct_base = self.T_ct_bed @ site.T_bed_base()
@@ -102,7 +102,7 @@ class Estimator:
         best = self._clear_of_itself(found.q, open_margin) if self.itself else open_margin.max(axis=1)
         share = self._share(best)
         margin = float(best @ self.wanted.weight) / share if share > 0.0 else 0.0
-        return Estimate(self._share(found.margin.max(axis=1)), self._share(open_margin.max(axis=1)), share, margin)
+        return ReachEstimate(self._share(found.margin.max(axis=1)), self._share(open_margin.max(axis=1)), share, margin)
 
     def _open_margins(self, ways: Ways, T_ct_base: Floats) -> Floats:
         """The margins of the ways that keep clear of the room, shape (n, 8); 0 for the others.

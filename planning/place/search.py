@@ -24,7 +24,7 @@ from puncture_twin.planning.collision.workcell import (
 from puncture_twin.planning.place.arm_spheres import Surroundings
 from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.place.directions import wanted_directions
-from puncture_twin.planning.place.estimate import Estimate, Estimator
+from puncture_twin.planning.place.estimate import Estimator, ReachEstimate
 from puncture_twin.planning.place.evaluate import Judge, Verdict
 from puncture_twin.planning.place.mount_lines import mount_section
 from puncture_twin.planning.place.mounts import Site, regions
@@ -68,7 +68,7 @@ class Judged:
 
     site: Site | None
     mount: MountSection
-    estimate: Estimate | None
+    estimate: ReachEstimate | None
     verdict: Verdict
 
     @property
@@ -91,7 +91,7 @@ class PlaceSearch:
     """
 
     T_ct_bed: Floats
-    coarse: tuple[tuple[Site, Estimate], ...]
+    coarse: tuple[tuple[Site, ReachEstimate], ...]
     refined: int
     possible: float
     judged: tuple[Judged, ...]
@@ -154,7 +154,7 @@ def _judged(
     case: Case,
     judge: Judge,
     T_ct_bed: Floats,
-    finalists: Sequence[tuple[Site, Estimate]],
+    finalists: Sequence[tuple[Site, ReachEstimate]],
     placement: Placement | None,
     jobs: int,
     progress: Callable[[int, int], None],
@@ -203,15 +203,15 @@ class _Refiner:
         self._quick = replace(estimator, itself=False)
         self._full = replace(estimator, itself=True)
         self._progress = progress
-        self._hoped: dict[Site, Estimate] = {}
-        self._sure: dict[Site, Estimate] = {}
+        self._hoped: dict[Site, ReachEstimate] = {}
+        self._sure: dict[Site, ReachEstimate] = {}
 
     @property
     def asked(self) -> int:
         """How many sites were estimated."""
         return len(self._hoped)
 
-    def refine(self, seeds: Sequence[Site], step_mm: float) -> list[tuple[Site, Estimate]]:
+    def refine(self, seeds: Sequence[Site], step_mm: float) -> list[tuple[Site, ReachEstimate]]:
         """Where each seed ends, with its estimate; each end once."""
         ends = list(seeds)
         for halving in range(1, HALVINGS + 1):
@@ -227,7 +227,7 @@ class _Refiner:
                 return leaders
             self._ask(self._full, self._sure, leaders)
 
-    def _ask(self, estimator: Estimator, known: dict[Site, Estimate], sites: Sequence[Site]) -> None:
+    def _ask(self, estimator: Estimator, known: dict[Site, ReachEstimate], sites: Sequence[Site]) -> None:
         new = [site for site in dict.fromkeys(sites) if site not in known]
         # In this process: there are few of them, and a new process would have to build its arm first.
         known |= dict(zip(new, ask_all(estimator.estimate, new, jobs=1, progress=self._progress), strict=True))
@@ -238,17 +238,19 @@ def _neighbours(site: Site, step_mm: float) -> list[Site]:
     return [Site(site.region, (float(x), float(y), float(z))) for x, y, z in around]
 
 
-def _score(estimate: Estimate) -> tuple[float, float]:
+def _score(estimate: ReachEstimate) -> tuple[float, float]:
     """More is better."""
     return round(estimate.share, SHARE_DIGITS), estimate.margin
 
 
-def _order(estimate: Estimate) -> tuple[float, float]:
+def _order(estimate: ReachEstimate) -> tuple[float, float]:
     share, margin = _score(estimate)
     return -share, -margin
 
 
-def _best_apart(pairs: Sequence[tuple[Site, Estimate]], distance_mm: float, count: int) -> list[tuple[Site, Estimate]]:
+def _best_apart(
+    pairs: Sequence[tuple[Site, ReachEstimate]], distance_mm: float, count: int
+) -> list[tuple[Site, ReachEstimate]]:
     """Each mount's best, then the best of the others, as far as they hold anything.
 
     Args:
@@ -258,8 +260,8 @@ def _best_apart(pairs: Sequence[tuple[Site, Estimate]], distance_mm: float, coun
     """
     holding = [pair for pair in pairs if pair[1].share > 0.0]
     mounts = {site.region.mount for site, _ in holding}
-    firsts: list[tuple[Site, Estimate]] = []
-    others: list[tuple[Site, Estimate]] = []
+    firsts: list[tuple[Site, ReachEstimate]] = []
+    others: list[tuple[Site, ReachEstimate]] = []
     for pair in sorted(holding, key=lambda pair: _order(pair[1])):
         is_first = pair[0].region.mount not in {site.region.mount for site, _ in firsts}
         if is_first:

@@ -16,7 +16,7 @@ from puncture_twin.planning.plan.motion import motion_contact, phase_clearances
 from puncture_twin.planning.plan.plan import INSERTION_MM_S, Plan
 from puncture_twin.planning.reach.goals import approach_goals
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.context import Prepared
+from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.search import ranked, reach_request
 
 MAX_TRIES = 20
@@ -30,11 +30,11 @@ class Planned(NamedTuple):
     candidates: Candidates
 
 
-def make_plan(prepared: Prepared, candidates: Candidates, *, seed: int) -> Planned:
+def make_plan(context: CaseContext, candidates: Candidates, *, seed: int) -> Planned:
     """Plan to the best candidate for which an approach is found.
 
     Args:
-        prepared: The case.
+        context: The case.
         candidates: Its search result, with reach.
         seed: Of the approach's planner.
 
@@ -42,25 +42,25 @@ def make_plan(prepared: Prepared, candidates: Candidates, *, seed: int) -> Plann
         InputError: The case does not say where the arm stands.
         NoAnswerError: No candidate is safe, or none of the best can be come to.
     """
-    if prepared.reach is None:
+    if context.reach is None:
         raise InputError(
             "the case does not say where the robot stands",
-            where=prepared.case.path,
+            where=context.case.path,
             allowed="[registration] with markers, or [robot.mount]",
         )
     last = "no candidate is safe"
     for row in candidates.ranked[:MAX_TRIES]:
         try:
-            plan = _plan(prepared, candidates, int(row), seed)
+            plan = _plan(context, candidates, int(row), seed)
         except NoAnswerError as error:
             last = str(error)
-            candidates = _without(prepared, candidates, int(row), last)
+            candidates = _without(context, candidates, int(row), last)
             continue
         return Planned(plan, candidates)
     raise NoAnswerError(f"no plan: {last}", counts=candidates.counts())
 
 
-def _without(prepared: Prepared, candidates: Candidates, row: int, why: str) -> Candidates:
+def _without(context: CaseContext, candidates: Candidates, row: int, why: str) -> Candidates:
     """The same candidates with one marked ``approach_not_found``, ranked anew."""
     reason, detail = candidates.reason.copy(), candidates.reason_detail.copy()
     reason[row], detail[row] = Reason.APPROACH_NOT_FOUND.value, why
@@ -72,18 +72,18 @@ def _without(prepared: Prepared, candidates: Candidates, row: int, why: str) -> 
         rank=np.zeros(len(candidates), np.int32),
         pareto=np.zeros(len(candidates), bool),
     )
-    return ranked(prepared.case, blank)
+    return ranked(context.case, blank)
 
 
-def _plan(prepared: Prepared, candidates: Candidates, row: int, seed: int) -> Plan:
+def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> Plan:
     """The plan for one candidate; what it returns has been checked as it would be when it is loaded.
 
     Raises:
         NoAnswerError: No approach, or the timed motion touches something after all.
     """
-    assert prepared.reach is not None and prepared.placement is not None  # the caller has refused this
-    case, checker = prepared.case, prepared.reach.checker
-    request = reach_request(case, candidates, row, prepared.reach.T_base_ct)
+    assert context.reach is not None and context.placement is not None  # the caller has refused this
+    case, checker = context.case, context.reach.checker
+    request = reach_request(case, candidates, row, context.reach.T_base_ct)
     home = home_configuration(case)
     goals = approach_goals(checker, request, home)
     approach = plan_approach(checker, home, np.array([goal.insertion_q[0] for goal in goals]), seed=seed)
@@ -93,8 +93,8 @@ def _plan(prepared: Prepared, candidates: Candidates, row: int, seed: int) -> Pl
         inputs=case.inputs,
         seed=seed,
         model=case.robot.model,
-        T_base_ct=prepared.placement.T_base_ct,
-        expected_target_error_mm=prepared.placement.target_error_mm,
+        T_base_ct=context.placement.T_base_ct,
+        expected_target_error_mm=context.placement.target_error_mm,
         theta=float(candidates.theta[row]),
         beta=float(candidates.beta[row]),
         entry_ct=candidates.entry_ct[row],

@@ -13,7 +13,7 @@ from puncture_twin.planning.plan.motion import motion_contact, phase_clearances
 from puncture_twin.planning.plan.plan import Plan, check_angles, check_inputs
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.context import Prepared
+from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
 
 SAME_DIRECTION = 1e-6
@@ -24,12 +24,12 @@ SAME_NUMBER_MM = 1e-4
 """A number that is computed again may differ by this: FCL's own threshold."""
 
 
-def check_plan(plan: Plan, prepared: Prepared, path: Path, *, seed: int | None = None) -> Candidates:
+def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None = None) -> Candidates:
     """Judge a loaded plan's direction and motion anew.
 
     Args:
         plan: What was read.
-        prepared: Its case.
+        context: Its case.
         path: The plan's file, for errors.
         seed: That the plan must state: the command ``plan`` takes the case's. None where code chose another.
 
@@ -39,29 +39,29 @@ def check_plan(plan: Plan, prepared: Prepared, path: Path, *, seed: int | None =
     Raises:
         InputError: The inputs changed, the direction is not safe any more, or the motion touches something.
     """
-    check_inputs(plan, prepared.case, path)
-    if prepared.reach is None or not np.array_equal(plan.T_base_ct, prepared.reach.T_base_ct):
+    check_inputs(plan, context.case, path)
+    if context.reach is None or not np.array_equal(plan.T_base_ct, context.reach.T_base_ct):
         raise InputError("T_base_ct is not the case's", where=path, allowed="plan again")
-    candidates = prepared.check(plan.theta, plan.beta)
+    candidates = context.check(plan.theta, plan.beta)
     if not np.allclose(candidates.outward_ct[0], plan.outward_ct, atol=SAME_DIRECTION):
         raise InputError("outward_ct is not the direction of theta_deg, beta_deg", where=path, allowed="plan again")
     if not candidates.safe[0]:
         raise InputError(f"its direction is rejected: {reason_text(candidates, 0)}", where=path, allowed="plan again")
     if seed is not None:
         _check_same("seed", plan.seed, seed, path)
-    _check_labels(plan, prepared, candidates, path)
+    _check_labels(plan, context, candidates, path)
     check_angles(plan, path)
-    touched = motion_contact(plan, prepared.reach.checker)
+    touched = motion_contact(plan, context.reach.checker)
     if touched is not None:
         raise InputError(f"its {touched}", where=path, allowed="a motion that touches nothing")
-    for phase, known in phase_clearances(plan, prepared.reach.checker).items():
+    for phase, known in phase_clearances(plan, context.reach.checker).items():
         _check_same(f"clearance_mm.{phase}", plan.clearance_mm.get(phase, np.nan), known, path)
     return candidates
 
 
-def _check_labels(plan: Plan, prepared: Prepared, candidates: Candidates, path: Path) -> None:
+def _check_labels(plan: Plan, context: CaseContext, candidates: Candidates, path: Path) -> None:
     """Refuse what a plan says of itself where the case says otherwise: people read these numbers."""
-    case, placement = prepared.case, prepared.placement
+    case, placement = context.case, context.placement
     error = float("nan") if placement is None else placement.target_error_mm
     stated: tuple[tuple[str, Any, Any], ...] = (
         ("case", plan.case_name, case.name),

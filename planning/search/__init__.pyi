@@ -1,6 +1,6 @@
 from .candidates import ARM_CHECKED as ARM_CHECKED, Candidates as Candidates
 from .constraints import longest_path as longest_path
-from .context import Prepared as Prepared, Watcher as Watcher, prepare as prepare
+from .context import CaseContext as CaseContext, Watcher as Watcher, prepare as prepare
 from .explain import (
     Explanation as Explanation,
     finite as finite,
@@ -8,7 +8,7 @@ from .explain import (
     reason_text as reason_text,
 )
 from .search import (
-    Reach as Reach,
+    ArmReach as ArmReach,
     case_directions as case_directions,
     closest_miss as closest_miss,
     organ_candidates as organ_candidates,

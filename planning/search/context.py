@@ -28,7 +28,7 @@ from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.registration.placement import Placement, load_placement
 from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
 from puncture_twin.planning.search.consistency import check_consistency
-from puncture_twin.planning.search.search import Reach, case_directions, one_direction, search
+from puncture_twin.planning.search.search import ArmReach, case_directions, one_direction, search
 
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
 """Who measures clearance: the fast exact engine, or FCL alone as the plain reference."""
@@ -67,7 +67,7 @@ class Silent:
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
+class CaseContext:
     """What every question about a case needs, read once.
 
     Attributes:
@@ -80,7 +80,7 @@ class Prepared:
     anatomy: Anatomy
     placement: Placement | None
     engine: ClearanceEngine
-    reach: Reach | None
+    reach: ArmReach | None
     watcher: Watcher
     stages: Stages
 
@@ -138,7 +138,7 @@ class Prepared:
 
 def prepare(
     path: Path | str, *, arm: bool | None = None, engine: str = "fast", watcher: Watcher | None = None
-) -> Prepared:
+) -> CaseContext:
     """Read a case and everything that it names.
 
     Args:
@@ -171,5 +171,5 @@ def prepare(
         measurer = ENGINES[engine](meshes, partial(watcher.count, "directions"))
         reach = None
         if arm is not False and placement is not None:
-            reach = Reach(case_checker(case, anatomy, placement.T_base_ct), placement.T_base_ct)
-    return Prepared(case, anatomy, placement, measurer, reach, watcher, stages)
+            reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct), placement.T_base_ct)
+    return CaseContext(case, anatomy, placement, measurer, reach, watcher, stages)

@@ -28,7 +28,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Reach:
+class ArmReach:
     """Who answers whether the arm can hold a candidate: the checked room, and where the patient is in it."""
 
     checker: CellChecker
@@ -52,7 +52,7 @@ def search(
     engine: ClearanceEngine,
     directions: Directions,
     *,
-    reach: Reach | None = None,
+    reach: ArmReach | None = None,
     progress: Progress | None = None,
 ) -> Candidates:
     """Judge every direction against the organs, those that pass against the arm, and rank what is left.
@@ -117,7 +117,7 @@ def reach_request(case: Case, candidates: Candidates, row: int, T_base_ct: Float
     )
 
 
-def with_reach(case: Case, found: Candidates, reach: Reach, progress: Progress | None = None) -> Candidates:
+def with_reach(case: Case, found: Candidates, reach: ArmReach, progress: Progress | None = None) -> Candidates:
     """Ask the arm for every candidate that the organs allow."""
     rows = np.flatnonzero(found.safe)
     requests = [reach_request(case, found, int(row), reach.T_base_ct) for row in rows]

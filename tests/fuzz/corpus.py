@@ -14,7 +14,7 @@ from hostile.makers import CASE, MOUNT, RIB, certificate, glb, recording, sound_
 
 from puncture_twin.meshes import folder as embedded
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.base.output.manifest import Entry, Manifest
+from puncture_twin.planning.base.output.manifest import Manifest, ManifestEntry
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.collision.checker import CellChecker
@@ -77,10 +77,10 @@ def make_corpus(folder):
 
 def output_set_manifest():
     """The manifest of a set of two commands, one made from the other, in which a third was interrupted."""
-    search = Entry(
+    search = ManifestEntry(
         "1.0", (Input("case", "case.toml", "0" * 64),), (), {name: digest_of(name) for name in SET_FILES[:2]}
     )
-    plan = Entry("1.0", search.inputs, ("search",), {name: digest_of(name) for name in SET_FILES[2:4]})
+    plan = ManifestEntry("1.0", search.inputs, ("search",), {name: digest_of(name) for name in SET_FILES[2:4]})
     return Manifest({"search": search, "plan": plan}, tuple(SET_FILES[4:])).text()
 
 

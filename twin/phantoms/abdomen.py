@@ -14,7 +14,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.phantoms import bones, torso, vessels, viscera
 from puncture_twin.twin.phantoms.implicit import Field
-from puncture_twin.twin.phantoms.mesher import Box, mesh_field
+from puncture_twin.twin.phantoms.mesher import SamplingBox, mesh_field
 from puncture_twin.twin.phantoms.viscera import LESION_CENTRE_LPS_MM
 
 __all__ = ["LESION_CENTRE_LPS_MM", "STRUCTURES", "Part", "abdomen_field", "abdomen_mesh", "lesion_centre_ct"]
@@ -102,10 +102,10 @@ def lesion_centre_ct() -> Floats:
     return np.array(LESION_CENTRE_LPS_MM)
 
 
-def _box(field: Field, spacing_mm: float) -> Box:
+def _box(field: Field, spacing_mm: float) -> SamplingBox:
     """A box about a body, found on a coarse grid over the trunk."""
     axes = [np.arange(low, high + 1.0, _SEARCH_STEP_MM) for low, high in zip(_SEARCH_LOW, _SEARCH_HIGH, strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     held = nodes[field(nodes) < _SEARCH_REACH_MM]
     low, high = held.min(axis=0) - _SEARCH_STEP_MM / 2, held.max(axis=0) + _SEARCH_STEP_MM / 2
-    return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]), spacing_mm)
+    return SamplingBox((low[0], low[1], low[2]), (high[0], high[1], high[2]), spacing_mm)

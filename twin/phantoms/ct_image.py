@@ -14,7 +14,7 @@ from puncture_twin.twin.phantoms.implicit import Field
 AIR_HU = -1000.0
 
 
-class Part(NamedTuple):
+class ScannedPart(NamedTuple):
     """One material in a scene; a later part fills the place of an earlier one.
 
     Attributes:
@@ -55,7 +55,7 @@ class Grid:
         return np.asarray(index * self.spacing_mm + self.low_mm)
 
 
-def rendered(parts: Sequence[Part], grid: Grid, *, noise_hu: float, rng: np.random.Generator) -> Floats:
+def rendered(parts: Sequence[ScannedPart], grid: Grid, *, noise_hu: float, rng: np.random.Generator) -> Floats:
     """Hounsfield units of a scene, shape ``grid.shape``.
 
     A body's field grows by about 1 per mm, so a voxel as wide as w whose centre has the value d is filled by about

@@ -12,7 +12,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.phantoms.implicit import Field, above, below, capsule, carve, ellipsoid, union, within
-from puncture_twin.twin.phantoms.mesher import Box, mesh_field
+from puncture_twin.twin.phantoms.mesher import SamplingBox, mesh_field
 
 __all__ = ["MARKERS_MM", "RIM_MM", "head_field", "head_mesh", "head_targets"]
 
@@ -59,7 +59,7 @@ def head_field() -> Field:
 
 def head_mesh() -> TriangleMesh:
     """The head, closed, triangles outward, its own frame, mm."""
-    return mesh_field(head_field(), Box((-88.0, -122.0, -118.0), (88.0, 106.0, 38.0), SPACING_MM))
+    return mesh_field(head_field(), SamplingBox((-88.0, -122.0, -118.0), (88.0, 106.0, 38.0), SPACING_MM))
 
 
 def head_targets() -> dict[str, Floats]:

@@ -30,7 +30,7 @@ _ON_SURFACE_MM = 1e-5
 
 
 @dataclass(frozen=True)
-class Box:
+class SamplingBox:
     """Where to look for a body: opposite corners, mm, and the grid's spacing, mm."""
 
     low: tuple[float, float, float]
@@ -38,7 +38,7 @@ class Box:
     spacing_mm: float
 
 
-def mesh_field(field: Field, box: Box) -> TriangleMesh:
+def mesh_field(field: Field, box: SamplingBox) -> TriangleMesh:
     """The zero set of a field as a closed mesh, triangles outward.
 
     Args:
@@ -60,7 +60,7 @@ def mesh_field(field: Field, box: Box) -> TriangleMesh:
     return TriangleMesh(vertices, faces)
 
 
-def _sample(field: Field, box: Box) -> Floats:
+def _sample(field: Field, box: SamplingBox) -> Floats:
     """Field values on the grid, exact in a band about the surface, interpolated elsewhere."""
     low, high = np.asarray(box.low), np.asarray(box.high)
     cells = _COARSE * np.ceil((high - low) / (box.spacing_mm * _COARSE)).astype(int)

@@ -12,7 +12,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.phantoms import torso
-from puncture_twin.twin.phantoms.ct_image import Grid, Part
+from puncture_twin.twin.phantoms.ct_image import Grid, ScannedPart
 from puncture_twin.twin.phantoms.implicit import Field, capsule, ellipsoid, offset, within
 
 LESION_LPS_MM = (-55.0, 20.0, 0.0)
@@ -37,17 +37,17 @@ def slab(low: tuple[float, float, float], high: tuple[float, float, float]) -> F
     return field
 
 
-def trunk_parts() -> list[Part]:
+def trunk_parts() -> list[ScannedPart]:
     """Fat, muscle, spine and lesion of the trunk."""
     return [
-        Part("trunk", torso.skin, -100.0),
-        Part("muscle", offset(torso.skin, -22.0), 45.0),
-        Part("spine", capsule((0, 36, -300), (0, 36, 300), 21.0), 420.0),
-        Part("lesion", ellipsoid(LESION_LPS_MM, (12, 12, 12)), 90.0),
+        ScannedPart("trunk", torso.skin, -100.0),
+        ScannedPart("muscle", offset(torso.skin, -22.0), 45.0),
+        ScannedPart("spine", capsule((0, 36, -300), (0, 36, 300), 21.0), 420.0),
+        ScannedPart("lesion", ellipsoid(LESION_LPS_MM, (12, 12, 12)), 90.0),
     ]
 
 
-def arm_parts(arms: Arms) -> list[Part]:
+def arm_parts(arms: Arms) -> list[ScannedPart]:
     """Both arms beside the trunk (with a gap), or over the head, where this scan does not see them; skin and bone."""
     if arms != "down":
         return []
@@ -55,34 +55,34 @@ def arm_parts(arms: Arms) -> list[Part]:
     for side, x in (("left", 215.0), ("right", -215.0)):
         limb = capsule((x, 30, -320), (0.97 * x, 20, 320), 44.0, 40.0)
         bone = capsule((x, 30, -320), (0.97 * x, 20, 320), 12.0)
-        parts += [Part(f"arm_{side}", limb, 20.0), Part(f"humerus_{side}", bone, 700.0)]
+        parts += [ScannedPart(f"arm_{side}", limb, 20.0), ScannedPart(f"humerus_{side}", bone, 700.0)]
     return parts
 
 
-def bed_parts() -> list[Part]:
+def bed_parts() -> list[ScannedPart]:
     """A mattress of foam in a cover, and a table of two shells about foam."""
     wide, long = 280.0, 400.0
     mattress = slab((-wide, BACK_MM, -long), (wide, TABLE_MM - 2.0, long))
     table = slab((-wide, TABLE_MM, -long), (wide, TABLE_MM + 40.0, long))
     return [
-        Part("mattress", mattress, -120.0),
-        Part("mattress_foam", offset(mattress, -2.0), -960.0),
-        Part("table", table, 60.0),
-        Part("table_foam", offset(table, -3.0), -930.0),
+        ScannedPart("mattress", mattress, -120.0),
+        ScannedPart("mattress_foam", offset(mattress, -2.0), -960.0),
+        ScannedPart("table", table, 60.0),
+        ScannedPart("table_foam", offset(table, -3.0), -930.0),
     ]
 
 
-def line_part() -> Part:
+def line_part() -> ScannedPart:
     """An infusion line of 5 mm across the front of the trunk."""
     front = -112.0 - LINE_GAP_MM
-    return Part("line", capsule((-150, front, 30), (150, front, 30), 2.5), 80.0)
+    return ScannedPart("line", capsule((-150, front, 30), (150, front, 30), 2.5), 80.0)
 
 
-def sheet_part() -> Part:
+def sheet_part() -> ScannedPart:
     """A folded sheet of 6 mm over the front of the trunk, on its left."""
     band = within(offset(torso.skin, 18.0), [slab((20, -200, -400), (150, 0, 400))], 0.5)
     hollow = offset(torso.skin, 12.0)
-    return Part("sheet", within(band, [lambda points: -hollow(points)], 0.5), -550.0)
+    return ScannedPart("sheet", within(band, [lambda points: -hollow(points)], 0.5), -550.0)
 
 
 def grid(spacing_mm: float = 4.0, slice_mm: float = 4.0) -> Grid:

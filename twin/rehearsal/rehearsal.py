@@ -39,7 +39,7 @@ CLEARANCE_SAMPLES = 48
 
 
 @dataclass(frozen=True)
-class Contact:
+class RehearsalContact:
     """A body of the arm that touched something.
 
     Attributes:
@@ -91,7 +91,7 @@ class Rehearsal:
     tip_true_ct: Floats
     clearance_times_s: Floats
     clearance_mm: MappingProxyType[str, Floats]
-    contacts: tuple[Contact, ...]
+    contacts: tuple[RehearsalContact, ...]
     max_joint_speed: Floats
     speed_limits: Floats
     tip_error_mm: float
@@ -231,28 +231,28 @@ def _clearances(
 
 def _contacts(
     case: Case, anatomy: Anatomy, truth: Truth, done: Execution, times_s: Floats, phase: NDArray[np.str_]
-) -> tuple[Contact, ...]:
+) -> tuple[RehearsalContact, ...]:
     """What the physics felt at every step, and what FCL finds at every record, arm and patient where they truly were.
 
     The physics lets the needle pass the skin and the arm pass itself, and rounds large skins; FCL says the first
     contact of a record only.
     """
-    seen = [Contact(t.step * TIME_STEP_S, t.link, t.body, t.depth_mm) for t in done.touches]
+    seen = [RehearsalContact(t.step * TIME_STEP_S, t.link, t.body, t.depth_mm) for t in done.touches]
     checker = case_checker(case, anatomy, truth.T_base_ct_true)
     inside = (phase == "insertion") | (phase == "hold")
     for time, q, may_touch in zip(times_s.tolist(), done.q + truth.joint_offsets, inside.tolist(), strict=True):
         hit = checker.contact(q, needle_may_touch_patient=may_touch)
         if hit is not None:
-            seen.append(Contact(time, hit.body, hit.other, float("nan")))
+            seen.append(RehearsalContact(time, hit.body, hit.other, float("nan")))
     return _merged(seen)
 
 
-def _merged(contacts: Iterable[Contact]) -> tuple[Contact, ...]:
+def _merged(contacts: Iterable[RehearsalContact]) -> tuple[RehearsalContact, ...]:
     """One contact for each pair of bodies: its first time, its greatest depth."""
-    pairs: dict[tuple[str, str], Contact] = {}
+    pairs: dict[tuple[str, str], RehearsalContact] = {}
     for contact in contacts:
         key = (contact.link, contact.body)
         old = pairs.get(key, contact)
         depth = float(np.fmax(old.depth_mm, contact.depth_mm))
-        pairs[key] = Contact(min(old.time_s, contact.time_s), *key, depth)
+        pairs[key] = RehearsalContact(min(old.time_s, contact.time_s), *key, depth)
     return tuple(sorted(pairs.values(), key=lambda contact: (contact.time_s, contact.link, contact.body)))

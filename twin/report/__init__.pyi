@@ -1,5 +1,5 @@
 from .annotate import INK as INK, width_of as width_of, write as write
-from .map_view import Cells as Cells, MapView as MapView, body_directions as body_directions, step_of as step_of
+from .map_view import MapCells as MapCells, MapView as MapView, body_directions as body_directions, step_of as step_of
 from .mount_text import direction_words as direction_words, mount_words as mount_words
 from .numbers import (
     arm_words as arm_words,

@@ -13,7 +13,7 @@ from PIL import ImageDraw, ImageFont
 
 from puncture_twin.twin.report.map_view import body_directions
 from puncture_twin.twin.report.palette import Rgb
-from puncture_twin.twin.report.raster.camera import Camera
+from puncture_twin.twin.report.raster.camera import ViewCamera
 
 INK: Rgb = (25, 27, 32)
 FAINT: Rgb = (110, 114, 122)
@@ -56,7 +56,12 @@ def width_of(words: str, size: int, bold: bool = False) -> float:
 
 
 def body_axes(
-    draw: ImageDraw.ImageDraw, camera: Camera, space: str, centre: tuple[float, float], length: float, size: int = 15
+    draw: ImageDraw.ImageDraw,
+    camera: ViewCamera,
+    space: str,
+    centre: tuple[float, float],
+    length: float,
+    size: int = 15,
 ) -> None:
     """A small cross of the body's directions as they lie in this view; the far ends are pale.
 
@@ -105,7 +110,7 @@ def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float,
 
 def scale_bar(
     draw: ImageDraw.ImageDraw,
-    camera: Camera,
+    camera: ViewCamera,
     at_ct: NDArray[np.float64],
     left: float,
     bottom: float,

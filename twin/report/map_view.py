@@ -132,11 +132,11 @@ def rows_at(candidates: Candidates, theta: Floats, beta: Floats) -> NDArray[np.i
 
     A cell reaches half a step to each side in θ and in β. At θ = 0 the cell is the whole circle.
     """
-    return Cells.of(candidates).rows(theta, beta)
+    return MapCells.of(candidates).rows(theta, beta)
 
 
 @dataclass(frozen=True, eq=False)
-class Cells:
+class MapCells:
     """The grid's cells, ring after ring of equal θ, and in each ring by β in 0..2π.
 
     Attributes:
@@ -156,7 +156,7 @@ class Cells:
     half_beta: Floats
 
     @classmethod
-    def of(cls, candidates: Candidates) -> Cells:
+    def of(cls, candidates: Candidates) -> MapCells:
         """The cells of a search's grid."""
         step, wrapped = step_of(candidates), np.mod(candidates.beta, 2 * np.pi)
         by_theta = np.argsort(candidates.theta, kind="stable")

@@ -19,7 +19,7 @@ LAMP_UP = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class SimulatedCamera:
     """Where one looks from, and the picture's size.
 
     Attributes:
@@ -37,7 +37,7 @@ class Camera:
     height: int = 540
 
 
-def picture(client: int, camera: Camera) -> NDArray[np.uint8]:
+def picture(client: int, camera: SimulatedCamera) -> NDArray[np.uint8]:
     """The room as it stands, shape (height, width, 3), RGB."""
     view = pybullet.computeViewMatrix(
         to_m(camera.eye_mm).tolist(), to_m(camera.look_at_mm).tolist(), camera.up.tolist()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.world.client import TIME_STEP_S, step
 from puncture_twin.twin.world.contacts import touches
-from puncture_twin.twin.world.workcell import Room
+from puncture_twin.twin.world.workcell import SimulatedWorkcell
 
 RECORD_EVERY = 4
 """Physics steps between two records: 60 records a second."""
@@ -45,7 +45,7 @@ class Execution:
     max_speed: Floats
 
 
-def execute(room: Room, q_command: Floats, joint_offsets: Floats) -> Execution:
+def execute(room: SimulatedWorkcell, q_command: Floats, joint_offsets: Floats) -> Execution:
     """Drive the arm from rest at the first command through all of them, one a physics step.
 
     Args:

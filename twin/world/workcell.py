@@ -23,7 +23,7 @@ from puncture_twin.twin.world.client import physics_client
 
 
 @dataclass(frozen=True)
-class Room:
+class SimulatedWorkcell:
     """A room that is open.
 
     Attributes:
@@ -46,7 +46,7 @@ def open_room(
     boxes: Sequence[Box] = (),
     *,
     down_ct: Floats,
-) -> Iterator[Room]:
+) -> Iterator[SimulatedWorkcell]:
     """Build the room, yield it, and take it down.
 
     The needle's shaft passes the skin without resistance; its holder and the arm collide with it.
@@ -69,4 +69,4 @@ def open_room(
         names = {patient: PATIENT}
         for box in boxes:
             names[load_box(client, np.asarray(box.size_mm), box.T_base_box)] = box.name
-        yield Room(client, arm, MappingProxyType(names))
+        yield SimulatedWorkcell(client, arm, MappingProxyType(names))

@@ -18,7 +18,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from puncture_twin.planning.base.cache.cache_folder import Entry, store, touch
+from puncture_twin.planning.base.cache.cache_folder import StoredFile, store, touch
 from puncture_twin.planning.base.cache.entry_file import Arrays, DamagedError, packed, read_plain_file, unpacked
 from puncture_twin.planning.base.cache.source_stamp import library_versions, source_stamp
 from puncture_twin.planning.base.errors import CacheWarning, InputError
@@ -75,7 +75,7 @@ class Cache:
             self._store(entry, found)
         return found
 
-    def _store(self, entry: Entry, arrays: Arrays) -> None:
+    def _store(self, entry: StoredFile, arrays: Arrays) -> None:
         """Store the arrays; a folder that cannot be written to costs time, not the result."""
         assert self.folder is not None  # the caller has asked
         try:
@@ -112,10 +112,10 @@ def _most_bytes() -> int:
     return int(stated) * 1_000_000
 
 
-def _entry(made_from: Mapping[str, Any], by: str) -> Entry:
+def _entry(made_from: Mapping[str, Any], by: str) -> StoredFile:
     generation = _generation(by)
     key = hashlib.sha256(json.dumps({"generation": generation, **made_from}, sort_keys=True).encode()).hexdigest()
-    return Entry(by, generation[:16], key)
+    return StoredFile(by, generation[:16], key)
 
 
 @cache

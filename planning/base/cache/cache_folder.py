@@ -20,7 +20,7 @@ DEAD_AFTER_S = 24 * 3600.0
 """A temporary file of this age belongs to a process that was killed."""
 
 
-class Entry(NamedTuple):
+class StoredFile(NamedTuple):
     """The name of an entry.
 
     Attributes:
@@ -45,7 +45,7 @@ class _Kept(NamedTuple):
     path: Path
 
 
-def store(folder: Path, entry: Entry, content: bytes, most_bytes: int) -> None:
+def store(folder: Path, entry: StoredFile, content: bytes, most_bytes: int) -> None:
     """Write an entry, whole or not at all; then make the folder fit again.
 
     Raises:
@@ -69,7 +69,7 @@ def touch(path: Path) -> None:
         return
 
 
-def tidy(folder: Path, entry: Entry, most_bytes: int) -> None:
+def tidy(folder: Path, entry: StoredFile, most_bytes: int) -> None:
     """Remove what this version of the maker cannot use, what the dead have left, and the oldest beyond the bound."""
     kept = []
     for one in _files(folder):
@@ -85,7 +85,7 @@ def tidy(folder: Path, entry: Entry, most_bytes: int) -> None:
         total -= one.size
 
 
-def _outlived(one: _Kept, entry: Entry) -> bool:
+def _outlived(one: _Kept, entry: StoredFile) -> bool:
     name = one.path.name
     if TEMPORARY.fullmatch(name):
         return time.time() - one.used_ns / 1e9 > DEAD_AFTER_S

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 
-class _Family(NamedTuple):
+class _OldFiles(NamedTuple):
     """Files that were written together."""
 
     signs: tuple[str, ...]
@@ -15,7 +15,7 @@ class _Family(NamedTuple):
 
 
 FAMILIES = (
-    _Family(
+    _OldFiles(
         ("candidates.parquet", "plan.json", "rehearsal.json"),
         (
             *("candidates.parquet", "certificate.json", "map.png", "scene.png", "report.html", "timings.json"),
@@ -23,10 +23,12 @@ FAMILIES = (
             *("rehearsal.json", "rehearsal.mp4", "rehearsal.gif"),
         ),
     ),
-    _Family(("place.json",), ("placements.csv", "place.json", "placements.png", "map_best_place.png", "timings.json")),
-    _Family(("calibration.json",), ("calibration.json", "report.html", "bmode.png", "room.png", "timings.json")),
-    _Family(("servo.html",), ("servo.html", "convergence.png", "camera_1.png", "camera_2.png", "timings.json")),
-    _Family(("batch.csv",), ("batch.csv", "timings.json")),
+    _OldFiles(
+        ("place.json",), ("placements.csv", "place.json", "placements.png", "map_best_place.png", "timings.json")
+    ),
+    _OldFiles(("calibration.json",), ("calibration.json", "report.html", "bmode.png", "room.png", "timings.json")),
+    _OldFiles(("servo.html",), ("servo.html", "convergence.png", "camera_1.png", "camera_2.png", "timings.json")),
+    _OldFiles(("batch.csv",), ("batch.csv", "timings.json")),
 )
 """``recording.csv`` is not among them: it may be somebody's own."""
 

@@ -41,7 +41,7 @@ ANOTHER_FOLDER = "another output folder, or this one without that file"
 
 
 @dataclass(frozen=True)
-class Entry:
+class ManifestEntry:
     """What one command wrote.
 
     Attributes:
@@ -75,7 +75,7 @@ class Manifest:
         unfinished: Files that belong to no entry any more, or not yet; the next run removes them.
     """
 
-    entries: Mapping[str, Entry]
+    entries: Mapping[str, ManifestEntry]
     unfinished: tuple[str, ...] = ()
 
     @property
@@ -217,10 +217,10 @@ def _refuse_twice(names: list[str]) -> None:
         raise ValueError(f"{min(twice)!r} is listed twice")
 
 
-def _entry(document: dict[str, Any]) -> Entry:
+def _entry(document: dict[str, Any]) -> ManifestEntry:
     files = {_name(name): str(digest) for name, digest in document["files"].items()}
     depends_on = tuple(str(name) for name in document["depends_on"])
-    return Entry(str(document["version"]), read_inputs(document["inputs"]), depends_on, MappingProxyType(files))
+    return ManifestEntry(str(document["version"]), read_inputs(document["inputs"]), depends_on, MappingProxyType(files))
 
 
 def _name(name: Any) -> str:

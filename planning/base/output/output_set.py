@@ -35,8 +35,8 @@ from puncture_twin.planning.base.output.lock import locked
 from puncture_twin.planning.base.output.manifest import (
     MANIFEST_NAME,
     TIMINGS_NAME,
-    Entry,
     Manifest,
+    ManifestEntry,
     file_digest,
     read_manifest,
 )
@@ -258,7 +258,7 @@ def _publish(draft: Draft, started: datetime) -> None:
     _tell(draft, gone - {draft.command, *new} - _dependents(old, {draft.command, *new}))
 
 
-def _entries(draft: Draft) -> dict[str, Entry]:
+def _entries(draft: Draft) -> dict[str, ManifestEntry]:
     """The new entries, from the files in the draft."""
     files: dict[str, dict[str, str]] = {draft.command: {}}
     for path in sorted(draft.folder.rglob("*")):
@@ -267,7 +267,9 @@ def _entries(draft: Draft) -> dict[str, Entry]:
             files.setdefault(draft.parts.get(name, draft.command), {})[name] = file_digest(path)
     own = version("puncture-twin")
     return {
-        name: Entry(own, tuple(draft.inputs), draft.depends_on if name == draft.command else (draft.command,), listed)
+        name: ManifestEntry(
+            own, tuple(draft.inputs), draft.depends_on if name == draft.command else (draft.command,), listed
+        )
         for name, listed in files.items()
         if listed
     }

@@ -63,7 +63,7 @@ class Found(NamedTuple):
     counts: NDArray[np.int64]
 
 
-class Needle(NamedTuple):
+class NeedleAxes(NamedTuple):
     """What all axes share: where they start and how long they are; then three float32 numbers.
 
     Attributes:

@@ -9,7 +9,7 @@ from puncture_twin.planning.clearance.kernels.bare import bare
 from puncture_twin.planning.clearance.kernels.bounds import ZERO, disc_bounds, lower_upper_bounds
 from puncture_twin.planning.clearance.kernels.bundle_search import FOUR, GROWN, direction, measure_bundle
 from puncture_twin.planning.clearance.kernels.lanes import LANES, at_most, lowest
-from puncture_twin.planning.clearance.kernels.scratch import NODE_ROWS, Found, Needle, Scratch
+from puncture_twin.planning.clearance.kernels.scratch import NODE_ROWS, Found, NeedleAxes, Scratch
 
 BEHIND = np.float32(-1e6)
 """Radius of what only fills up the last group of found blocks: the disc bound takes it as behind the target, mm."""
@@ -43,7 +43,7 @@ def search_tiles(  # type: ignore[no-untyped-def]  # numba infers
     outward, starts, middle, chords = bare(tiles[0]), bare(tiles[1]), bare(tiles[2]), bare(tiles[3])
     nodes, room, answer = bare(all_nodes), _bare_scratch(scratch), _bare_found(found)
     target, seed, start = (origin[0], origin[1], origin[2]), nearest, min(at_target, cap)
-    needle = Needle(target, length, np.float32(length), np.float32(slack), np.float32(enough))
+    needle = NeedleAxes(target, length, np.float32(length), np.float32(slack), np.float32(enough))
     for tile in range(len(middle)):
         low, high = starts[tile], starts[tile + 1]
         _begin(outward, low, high, start, lanes, room, answer)

@@ -33,7 +33,7 @@ FAR_MM = 200.0
 """Larger distances to the skin are not told apart."""
 
 
-class Skin(NamedTuple):
+class SkinTree(NamedTuple):
     """The patient's surface."""
 
     tree: tuple[Floats, Floats, Floats]
@@ -44,13 +44,13 @@ class Skin(NamedTuple):
     """Shape (3,), mm: the lowest corner of the field."""
 
 
-class Scene(NamedTuple):
+class ProofScene(NamedTuple):
     """The checks of a cell and what they are about."""
 
     checks: Ints
     """Shape (k, 5): kind, first, second, and the frames of both. For ``SKIN`` the second is the row of the body's root
     among the balls, else both are rows of hulls."""
-    skin: Skin
+    skin: SkinTree
     balls: tuple[Floats, Floats, Ints]
     """Centres, radii and children of all bodies' trees of balls, each in the frame of its body."""
     hulls: Hulls
@@ -69,7 +69,7 @@ class Movers(NamedTuple):
     radii: Floats
 
 
-class Scratch(NamedTuple):
+class ProofScratch(NamedTuple):
     """What the search for a proof remembers and where it works: see :func:`scratch`."""
 
     axes: Floats
@@ -89,7 +89,7 @@ def scratch(checks, hulls):
     """Room to work in for so many checks and hulls."""
     axes, corners, balls = np.zeros((checks, 3)), np.zeros((checks, 2), np.int64), np.empty((hulls, 3))
     stacks = np.empty(STACK, np.int64), np.empty(STACK, np.int64)
-    return Scratch(axes, corners, balls, stacks[0], stacks[1], np.empty((3, 4)), np.empty((4, 3)))
+    return ProofScratch(axes, corners, balls, stacks[0], stacks[1], np.empty((3, 4)), np.empty((4, 3)))
 
 
 @nb.njit(cache=True)
@@ -149,13 +149,13 @@ def first_unproven(scene, levers, motion, work, proven, state, check, asked, cle
     A check whose gap was g stays clear until its two bodies have moved by g - ``clear_mm`` against one another.
 
     Args:
-        scene: See :class:`Scene`.
+        scene: See :class:`ProofScene`.
         levers: Shape (k, 6), mm: how far a radian of each joint may move the two bodies of a PAIR.
         motion: (frames, moved, turned), with
             frames: Shape (m, 7, 4, 4), mm: the states;
             moved: Shape (m, 7), mm: how far each frame's bodies may have moved since the first state; rising;
             turned: Shape (m, 6), rad: how far each joint has turned since the first state; rising.
-        work: See :class:`Scratch`.
+        work: See :class:`ProofScratch`.
         proven: Shape (k,): scratch, mm: what the motion must stay below; -inf at the beginning.
         state: Where to begin.
         check: The first check there.
@@ -217,11 +217,11 @@ def clear_about(scene, movers, frames, turns, work, gaps, unproven):
     """Which checks are not proven clear at some states and wherever each joint turns by ``turns`` either way from them.
 
     Args:
-        scene: See :class:`Scene`.
+        scene: See :class:`ProofScene`.
         movers: See :class:`Movers`.
         frames: Shape (m, 7, 4, 4), mm: the states.
         turns: Shape (6,), rad.
-        work: See :class:`Scratch`.
+        work: See :class:`ProofScratch`.
         gaps: Shape (m, k): filled with the bound at the state itself, ``TOUCHING`` included, for what is asked.
         unproven: Shape (m, k): True where a check is asked; left so where nothing is proven.
     """

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.guard import MAX_TRIANGLES
 from puncture_twin.planning.formats.meshes.gltf_document import Accessor, Document, Primitive
-from puncture_twin.planning.formats.meshes.gltf_scene import Placed, placed_meshes
+from puncture_twin.planning.formats.meshes.gltf_scene import PlacedPrimitive, placed_meshes
 from puncture_twin.planning.formats.raw_mesh import RawMesh, join, refuse
 
 _GLB_ALLOWED = "glTF, version 2: its length, then a JSON chunk and at most one BIN chunk, as long as they say"
@@ -135,7 +135,7 @@ def _check_sizes(document: Document, buffers: list[bytes], where: str) -> None:
             refuse(what, where, "views inside their buffer")
 
 
-def _part(document: Document, buffers: list[bytes], placed: Placed, where: str) -> list[RawMesh]:
+def _part(document: Document, buffers: list[bytes], placed: PlacedPrimitive, where: str) -> list[RawMesh]:
     T = placed.T_scene_mesh
     mirrored = np.linalg.det(T[:3, :3]) < 0.0  # section 3.7.4: then the winding turns
     parts = []

@@ -92,7 +92,7 @@ class Node(_Part):
     extensions: dict[str, Any] = {}
 
 
-class Scene(_Part):
+class GltfScene(_Part):
     """The nodes at the top."""
 
     nodes: Annotated[list[Index], Field(max_length=MAX_NODES)] = []
@@ -103,7 +103,7 @@ class Document(_Part):
 
     asset: Asset
     scene: Index | None = None
-    scenes: list[Scene] = []
+    scenes: list[GltfScene] = []
     nodes: Annotated[list[Node], Field(max_length=MAX_NODES)] = []
     meshes: list[Mesh] = []
     accessors: Annotated[list[Accessor], Field(max_length=MAX_NODES)] = []

@@ -22,7 +22,7 @@ _VERTEX_BYTES, _TRIANGLE_BYTES = 12, 3
 """Least size of a vertex, and of a triangle by indices of one byte."""
 
 
-class Placed(NamedTuple):
+class PlacedPrimitive(NamedTuple):
     """A mesh at one place of the scene.
 
     Attributes:
@@ -34,7 +34,7 @@ class Placed(NamedTuple):
     T_scene_mesh: NDArray[np.float64]
 
 
-def placed_meshes(document: Document, data_bytes: int, where: str) -> list[Placed]:
+def placed_meshes(document: Document, data_bytes: int, where: str) -> list[PlacedPrimitive]:
     """Every mesh of the document with its place, in the order of the nodes.
 
     Args:
@@ -55,7 +55,7 @@ def placed_meshes(document: Document, data_bytes: int, where: str) -> list[Place
             refuse(f"node {index} uses mesh {node.mesh}", where, f"one of the {len(document.meshes)} meshes")
         if index not in T_scene_node:
             refuse(f"node {index} holds a mesh but is not in the scene", where, "every mesh in the one scene")
-        placed.append(Placed(node.mesh, T_scene_node[index]))
+        placed.append(PlacedPrimitive(node.mesh, T_scene_node[index]))
     lost = set(range(len(document.meshes))) - {each.mesh for each in placed}
     if lost or not placed:
         what = f"mesh {min(lost)} is placed by no node" if lost else "no mesh"
@@ -107,7 +107,7 @@ class _Size(NamedTuple):
     triangles: int
 
 
-def _check_total(document: Document, placed: list[Placed], data_bytes: int, where: str) -> None:
+def _check_total(document: Document, placed: list[PlacedPrimitive], data_bytes: int, where: str) -> None:
     """Count before building: a small file may place one large mesh many times, or name one array in many parts."""
     sizes = [_size(document, mesh) for mesh in document.meshes]
     total = _Size(*(sum(sizes[each.mesh][kind] for each in placed) for kind in range(3)))

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.volumes.inflate import first_bytes
 from puncture_twin.planning.formats.volumes.volume_header import (
-    Cells,
     VolumeHeader,
+    VoxelLayout,
     check_affine,
     check_shape,
     corner_deviation_mm,
@@ -100,7 +100,7 @@ def parse_nifti_header(content: bytes, path: Path) -> VolumeHeader:
         raise InputError(f"vox_offset {offset}", where=path, allowed=f"a whole number >= {FIRST_VOXEL_BYTE}")
     dtype = np.dtype(fields.order + TYPES[fields.datatype])
     encoding = "gzip" if compressed else "raw"
-    cells = Cells(dtype, encoding, offset=int(offset), slope=slope, intercept=intercept)
+    cells = VoxelLayout(dtype, encoding, offset=int(offset), slope=slope, intercept=intercept)
     return VolumeHeader(shape, T_ct_index, {}, cells, path)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import is_plain_file
-from puncture_twin.planning.formats.volumes.volume_header import Cells, VolumeHeader, check_affine, check_shape
+from puncture_twin.planning.formats.volumes.volume_header import VolumeHeader, VoxelLayout, check_affine, check_shape
 
 MAX_HEADER_BYTES = 4_000_000
 """A .seg.nrrd with a thousand segments stays below 1 MB."""
@@ -237,7 +237,7 @@ def _check_axes(fields: dict[str, str], path: Path) -> None:
             raise InputError(f"{key} beside a space", where=path, allowed="space origin and space directions alone")
 
 
-def _cells(raw: _Raw, path: Path) -> Cells:
+def _cells(raw: _Raw, path: Path) -> VoxelLayout:
     for key in ("byteskip", "lineskip"):
         if raw.fields.get(key, "0") != "0":
             raise InputError(f"{key} {raw.fields[key]!r}", where=path, allowed="0")
@@ -245,7 +245,7 @@ def _cells(raw: _Raw, path: Path) -> Cells:
     encoding = "gzip" if stated in GZIP else "ascii" if stated in ASCII else stated
     if encoding not in {"raw", "gzip", "ascii"}:
         raise InputError(f"encoding {stated!r}", where=path, allowed="raw, gzip, ascii")
-    return Cells(_dtype(raw.fields, encoding, path), encoding, start=raw.data_offset)
+    return VoxelLayout(_dtype(raw.fields, encoding, path), encoding, start=raw.data_offset)
 
 
 def _dtype(fields: dict[str, str], encoding: str, path: Path) -> np.dtype[Any]:

@@ -20,7 +20,7 @@ from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.formats.volumes import nrrd_header
 from puncture_twin.planning.formats.volumes.nifti_header import parse_nifti_header
 from puncture_twin.planning.formats.volumes.nrrd_header import parse_nrrd_header
-from puncture_twin.planning.formats.volumes.volume_header import MAX_VOXELS, Cells, VolumeHeader
+from puncture_twin.planning.formats.volumes.volume_header import MAX_VOXELS, VolumeHeader, VoxelLayout
 from puncture_twin.planning.formats.volumes.voxels import decoded
 
 NIFTI_ENDINGS = (".nii", ".nii.gz")
@@ -128,7 +128,7 @@ def _parser(path: Path) -> Callable[[bytes, Path], VolumeHeader]:
     raise InputError("unknown file ending", where=path, allowed=", ".join(NIFTI_ENDINGS + NRRD_ENDINGS))
 
 
-def _scaled(stored: NDArray[Any], cells: Cells) -> NDArray[Any]:
+def _scaled(stored: NDArray[Any], cells: VoxelLayout) -> NDArray[Any]:
     """Stored values times the slope plus the intercept; of integers that makes single precision, as SimpleITK does."""
     if abs(cells.slope - 1.0) <= SCALING_ROUNDING and abs(cells.intercept) <= SCALING_ROUNDING:
         return stored

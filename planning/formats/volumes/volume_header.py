@@ -23,7 +23,7 @@ MAX_ORIGIN_MM = 100_000.0
 
 
 @dataclass(frozen=True)
-class Cells:
+class VoxelLayout:
     """How a file stores its voxels, axis i first.
 
     Attributes:
@@ -58,7 +58,7 @@ class VolumeHeader:
     shape: tuple[int, int, int]
     T_ct_index: NDArray[np.float64]
     fields: dict[str, str]
-    cells: Cells
+    cells: VoxelLayout
     data_path: Path
 
     @property

@@ -1,8 +1,8 @@
-from .detection import Placed as Placed, ball_scene as ball_scene
+from .detection import LocatedPair as LocatedPair, ball_scene as ball_scene
 from .experiment import (
-    Row as Row,
+    ServoTrial as ServoTrial,
     Statistics as Statistics,
-    Trial as Trial,
+    TargetRow as TargetRow,
     run_trials as run_trials,
     statistics as statistics,
     trial as trial,

@@ -19,7 +19,7 @@ from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.triangulation import Points, triangulate
 from puncture_twin.twin.guidance.stereo.servo_case import CamerasSection
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost
-from puncture_twin.twin.guidance.stereo.stereo_room import Room
+from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell
 
 DIFFUSE = {"diffuse": 0.8, "lamp": 0.4}
 """Share of the light that comes from everywhere; the rest is a lamp's."""
@@ -28,7 +28,7 @@ WINDOW_MARGIN_PX = 24
 """A picture, and the rod in it, are drawn this far beyond the region that is searched: the rest is never looked at."""
 
 
-class Placed(NamedTuple):
+class LocatedPair(NamedTuple):
     """A ball as it truly stands, C, mm."""
 
     center_c: Floats
@@ -59,7 +59,7 @@ class Search(NamedTuple):
     search_px: float
 
 
-Sight = Callable[[int, Placed, Search], Spot | Lost]
+Sight = Callable[[int, LocatedPair, Search], Spot | Lost]
 """Takes the camera's number, the ball as it truly is, and where to look."""
 
 
@@ -72,11 +72,11 @@ class Spots(NamedTuple):
     """Shape (c, 2, 2), px^2."""
 
 
-def picture_sight(room: Room, rng: np.random.Generator) -> Sight:
+def picture_sight(room: StereoWorkcell, rng: np.random.Generator) -> Sight:
     """Pictures of the true room, each drawn anew with noise; what the head hides is hidden."""
     plan = room.case.file.cameras
 
-    def see(number: int, ball: Placed, search: Search) -> Spot | Lost:
+    def see(number: int, ball: LocatedPair, search: Search) -> Spot | Lost:
         true = room.cameras[number]
         hidden = room.hidden_share(true, ball.center_c, ball.radius_mm) if ball.head_there else 0.0
         away = np.abs(true.project(ball.center_c) - search.camera.project(search.predicted_c)).max()
@@ -97,10 +97,10 @@ def picture_sight(room: Room, rng: np.random.Generator) -> Sight:
     return see
 
 
-def pixel_sight(room: Room, sigma_px: float, rng: np.random.Generator) -> Sight:
+def pixel_sight(room: StereoWorkcell, sigma_px: float, rng: np.random.Generator) -> Sight:
     """True pixels with normal errors of a standard deviation per axis."""
 
-    def see(number: int, ball: Placed, search: Search) -> Spot | Lost:
+    def see(number: int, ball: LocatedPair, search: Search) -> Spot | Lost:
         del search
         pixel = room.cameras[number].project(ball.center_c) + rng.normal(0.0, sigma_px, 2)
         return Spot(pixel, max(sigma_px, 1e-6) ** 2 * np.eye(2))
@@ -108,7 +108,7 @@ def pixel_sight(room: Room, sigma_px: float, rng: np.random.Generator) -> Sight:
     return see
 
 
-def ball_scene(plan: CamerasSection, ball: Placed, hidden: float, rng: np.random.Generator) -> BallScene:
+def ball_scene(plan: CamerasSection, ball: LocatedPair, hidden: float, rng: np.random.Generator) -> BallScene:
     """The ball for the picture; an occluder that the case asks for comes from any side."""
     share = min(max(plan.occlusion if ball.rod_c is not None else 0.0, hidden), 0.99)
     return BallScene(
@@ -122,7 +122,7 @@ def ball_scene(plan: CamerasSection, ball: Placed, hidden: float, rng: np.random
     )
 
 
-def look_at(sight: Sight, ball: Placed, searches: tuple[Search, ...], frames: int = 1) -> Spots | Lost:
+def look_at(sight: Sight, ball: LocatedPair, searches: tuple[Search, ...], frames: int = 1) -> Spots | Lost:
     """One ball in every camera, several pictures each; all must show it.
 
     Pictures of one camera are averaged by their inverse covariances.

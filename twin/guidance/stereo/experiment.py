@@ -15,7 +15,7 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import worker_count
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
-from puncture_twin.twin.guidance.stereo.servo_law import Stop
+from puncture_twin.twin.guidance.stereo.servo_law import ServoStop
 from puncture_twin.twin.guidance.stereo.session import Session, run_session
 from puncture_twin.twin.guidance.stereo.stereo_room import room_checker
 
@@ -23,7 +23,7 @@ SHARE = 5
 """Seeds that a process takes at a time; they share the judge of the empty room."""
 
 
-class Row(NamedTuple):
+class TargetRow(NamedTuple):
     """One target of one seed, as plain values; mm."""
 
     seed: int
@@ -37,7 +37,7 @@ class Row(NamedTuple):
     stop: str
 
 
-class Trial(NamedTuple):
+class ServoTrial(NamedTuple):
     """One seed."""
 
     seed: int
@@ -45,7 +45,7 @@ class Trial(NamedTuple):
     rms_px: tuple[float, ...]
     fre_mm: float
     robot_residual_mm: float
-    rows: tuple[Row, ...]
+    rows: tuple[TargetRow, ...]
     refused: str
     """Why the session could not be held at all; empty when it was."""
 
@@ -76,10 +76,10 @@ class Statistics(NamedTuple):
         return self.after_mean / self.mapping_mean
 
 
-def trial(session: Session) -> Trial:
+def trial(session: Session) -> ServoTrial:
     """A session as plain values."""
     rows = tuple(
-        Row(
+        TargetRow(
             session.seed,
             one.target,
             one.mapping_mm,
@@ -94,10 +94,10 @@ def trial(session: Session) -> Trial:
     )
     stereo = tuple(float(error) for error in session.stereo_mm)
     residual = float(np.mean(session.calibration.robot_residual_mm))
-    return Trial(session.seed, stereo, session.calibration.rms_px, session.mapping.fre_mm, residual, rows, "")
+    return ServoTrial(session.seed, stereo, session.calibration.rms_px, session.mapping.fre_mm, residual, rows, "")
 
 
-def run_trial(case: ServoCase, seed: int, empty: StateChecker | None = None) -> Trial:
+def run_trial(case: ServoCase, seed: int, empty: StateChecker | None = None) -> ServoTrial:
     """One seed; a session that cannot be held becomes a trial that says why.
 
     Args:
@@ -108,12 +108,12 @@ def run_trial(case: ServoCase, seed: int, empty: StateChecker | None = None) -> 
     try:
         return trial(run_session(case, seed, empty=empty))
     except NoAnswerError as error:
-        return Trial(seed, (), (), float("nan"), float("nan"), (), str(error))
+        return ServoTrial(seed, (), (), float("nan"), float("nan"), (), str(error))
 
 
 def run_trials(
     case: ServoCase, seeds: Sequence[int], *, jobs: int = 1, done: Callable[[int, int], None] | None = None
-) -> list[Trial]:
+) -> list[ServoTrial]:
     """Every seed, in the order given.
 
     Args:
@@ -123,7 +123,7 @@ def run_trials(
         done: Told how many of how many are done.
     """
     tell = done or (lambda at, of: None)
-    found: list[Trial] = []
+    found: list[ServoTrial] = []
     if jobs == 1:
         empty = room_checker(case, None)
         for seed in seeds:
@@ -139,7 +139,7 @@ def run_trials(
     return found
 
 
-def statistics(trials: Sequence[Trial]) -> Statistics:
+def statistics(trials: Sequence[ServoTrial]) -> Statistics:
     """What trials say together.
 
     Raises:
@@ -167,7 +167,7 @@ def statistics(trials: Sequence[Trial]) -> Statistics:
         float(only.mean()),
         float(only.max()),
         float(np.median([row.steps for row in rows])),
-        float(np.mean([row.stop != Stop.CONVERGED for row in rows])),
+        float(np.mean([row.stop != ServoStop.CONVERGED for row in rows])),
     )
 
 

@@ -8,20 +8,20 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.registration.registration import apply
-from puncture_twin.twin.guidance.stereo.detection import Placed, Search, Sight, Spots, in_space, look_at
+from puncture_twin.twin.guidance.stereo.detection import LocatedPair, Search, Sight, Spots, in_space, look_at
 from puncture_twin.twin.guidance.stereo.joint_model import Guess, Observed, Unknowns
 from puncture_twin.twin.guidance.stereo.mapping import Mapping
 from puncture_twin.twin.guidance.stereo.optimum import Adjusted, adjust
 from puncture_twin.twin.guidance.stereo.robot_calibration import RobotHeld, held_rod
 from puncture_twin.twin.guidance.stereo.servo_law import ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen
-from puncture_twin.twin.guidance.stereo.stereo_room import Room, arm_errors, planned_cameras
+from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, arm_errors, planned_cameras
 
 
 class Known(NamedTuple):
     """What a session knows when the servo begins, and the room for its pictures."""
 
-    room: Room
+    room: StereoWorkcell
     """Of which only the pictures are used."""
     calibration: RobotHeld
     mapping: Mapping
@@ -61,7 +61,7 @@ class Guide:
             q_true: Shape (6,), rad: where it truly is, for the pictures alone.
         """
         tool, limits = self._case.file.tool, self._case.file.servo
-        ball = Placed(self._room.ball_c(q_true), tool.ball_diameter_mm / 2, self._room.rod_c(q_true))
+        ball = LocatedPair(self._room.ball_c(q_true), tool.ball_diameter_mm / 2, self._room.rod_c(q_true))
         predicted = apply(self._T_c_base, ball_base(self._held, q_command))
         searches = tuple(Search(camera, predicted, limits.search_px) for camera in self._calibration.cameras)
         spots = look_at(self._sight, ball, searches, limits.frames)

@@ -15,14 +15,14 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.registration.registration import fit_rigid
-from puncture_twin.twin.guidance.stereo.cameras.calibration import Calibration, calibrate
+from puncture_twin.twin.guidance.stereo.cameras.calibration import CameraCalibration, calibrate
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
-from puncture_twin.twin.guidance.stereo.detection import Placed, Search, Sight, look_at
+from puncture_twin.twin.guidance.stereo.detection import LocatedPair, Search, Sight, look_at
 from puncture_twin.twin.guidance.stereo.poses import configurations, rod_orientation
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import Held, ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, way_contact
-from puncture_twin.twin.guidance.stereo.stereo_room import Room, planned_cameras
+from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, planned_cameras
 
 GRID = (3, 2, 2)
 """Points along the base's x, y and z."""
@@ -60,13 +60,13 @@ class RobotHeld:
     branch: int
 
 
-def held_rod(case: ServoCase, room: Room) -> Held:
+def held_rod(case: ServoCase, room: StereoWorkcell) -> Held:
     """The nominal arm with the case's rod, as it is held at the targets."""
     tool = case.file.tool
     return Held(room.model, tool.rod_mm, rod_orientation(float(np.radians(tool.tilt_deg))))
 
 
-def calibrating_rod(case: ServoCase, room: Room) -> Held:
+def calibrating_rod(case: ServoCase, room: StereoWorkcell) -> Held:
     """The same, as it is held during the calibration."""
     tilt = case.file.calibration.tilt_deg
     held = held_rod(case, room)
@@ -80,7 +80,9 @@ def grid_points(case: ServoCase) -> Floats:
     return np.asarray(cal.center_mm + steps * cal.size_mm)
 
 
-def calibrate_by_robot(room: Room, sight: Sight, checker: StateChecker, rng: np.random.Generator) -> RobotHeld:
+def calibrate_by_robot(
+    room: StereoWorkcell, sight: Sight, checker: StateChecker, rng: np.random.Generator
+) -> RobotHeld:
     """Drive to the points, look, measure, and fit.
 
     Args:
@@ -105,7 +107,9 @@ def calibrate_by_robot(room: Room, sight: Sight, checker: StateChecker, rng: np.
     for number, q in enumerate(q_command, start=1):
         q_true = room.arm.settle(q, q_true, rng)
         stood.append(q_true)
-        ball = Placed(room.ball_c(q_true), case.file.tool.ball_diameter_mm / 2, room.rod_c(q_true), head_there=False)
+        ball = LocatedPair(
+            room.ball_c(q_true), case.file.tool.ball_diameter_mm / 2, room.rod_c(q_true), head_there=False
+        )
         measured.append(ball.center_c + rng.normal(0.0, sigma, 3))
         searches = tuple(Search(camera, measured[-1], FIRST_SEARCH_PX) for camera in planned_cameras(case))
         seen = look_at(sight, ball, searches, case.file.servo.frames)
@@ -132,7 +136,7 @@ def calibrate_by_robot(room: Room, sight: Sight, checker: StateChecker, rng: np.
     )
 
 
-def _cameras(case: ServoCase, measured_c: Floats, pixels: Floats) -> list[Calibration]:
+def _cameras(case: ServoCase, measured_c: Floats, pixels: Floats) -> list[CameraCalibration]:
     """Each camera from the ball's images."""
     plan = case.file.cameras
     names = tuple(f"P{number}" for number in range(1, len(measured_c) + 1))

@@ -50,7 +50,7 @@ class CamerasSection(Section):
     centre: Literal["edges", "hough"] = "edges"
 
 
-class RobotSection(Section):
+class ServoRobotSection(Section):
     """The arm, and how far it is from its nominal model: standard deviations, and the full width of the play."""
 
     model: Name = "ur3"
@@ -137,7 +137,7 @@ class ServoFile(Section):
     name: Name
     seed: Annotated[int, Strict(), Field(ge=0, lt=2**31)] = 0
     cameras: CamerasSection = CamerasSection()
-    robot: RobotSection = RobotSection()
+    robot: ServoRobotSection = ServoRobotSection()
     tool: ToolSection = ToolSection()
     calibration: CalibrationSection
     head: HeadSection

@@ -34,7 +34,7 @@ PIECE_MM = 1.0
 """A step's way is cut into pieces no longer than this: over 1 mm the Jacobian of a UR3 errs by 2 or 3 micrometres."""
 
 
-class Stop(StrEnum):
+class ServoStop(StrEnum):
     """Why the servo ended."""
 
     CONVERGED = "converged"
@@ -61,7 +61,7 @@ class Step(NamedTuple):
 
     q_path: Floats
     """Shape (m, 6), rad: from where the arm stands; one row where it may not go anywhere."""
-    stop: Stop | None
+    stop: ServoStop | None
     """Why there is no way (on)."""
     position_only: bool
     """Whether some piece gave the orientation up."""
@@ -151,11 +151,11 @@ def damped(J: Floats, goal: Floats) -> Floats:
     return np.asarray(J.T @ np.linalg.solve(J @ J.T + squared * np.eye(len(J)), goal))
 
 
-def _refusal(held: Held, q: Floats, blind: bool, limits: StepLimits) -> Stop | None:
+def _refusal(held: Held, q: Floats, blind: bool, limits: StepLimits) -> ServoStop | None:
     if not held.model.within_limits(q):
-        return Stop.JOINT_LIMIT
+        return ServoStop.JOINT_LIMIT
     if blind and np.linalg.norm(orientation_error(held, q)) > limits.drift_rad:
-        return Stop.SINGULAR
+        return ServoStop.SINGULAR
     return None
 
 

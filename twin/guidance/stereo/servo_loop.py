@@ -16,7 +16,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.state_checker import Contact, StateChecker
 from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, dense_states, first_contact
-from puncture_twin.twin.guidance.stereo.servo_law import Held, StepLimits, Stop, servo_step
+from puncture_twin.twin.guidance.stereo.servo_law import Held, ServoStop, StepLimits, servo_step
 
 DIVERGING_RATIO = 1.5
 """A step that leaves this times the error it found makes things worse."""
@@ -98,7 +98,7 @@ class Servoed:
         position_only: Whether some step gave the orientation up.
     """
 
-    stop: Stop
+    stop: ServoStop
     visits: tuple[Visit, ...]
     q_command: Floats
     q_true: Floats
@@ -129,13 +129,13 @@ def servo(task: Task, q_command: Floats, q_true: Floats, look: Look, drive: Driv
     visits: list[Visit] = []
     blind = False
 
-    def ended(stop: Stop, detail: str = "") -> Servoed:
+    def ended(stop: ServoStop, detail: str = "") -> Servoed:
         return Servoed(stop, tuple(visits), q_command, q_true, detail, blind)
 
     while True:
         seen = _look(task, q_command, q_true, look)
         if isinstance(seen, Lost):
-            return ended(Stop.LOST_BALL, seen.reason)
+            return ended(ServoStop.LOST_BALL, seen.reason)
         miss = seen.target_c - seen.ball_c
         visits.append(Visit(q_command, q_true, seen, float(np.linalg.norm(miss))))
         stop = _judge(task, visits)
@@ -147,7 +147,7 @@ def servo(task: Task, q_command: Floats, q_true: Floats, look: Look, drive: Driv
             return ended(step.stop)
         contact = way_contact(task.checker, step.q_path)
         if contact is not None:
-            return ended(Stop.CONTACT, f"{contact.body} and {contact.other}")
+            return ended(ServoStop.CONTACT, f"{contact.body} and {contact.other}")
         q_command = step.q_path[-1]
         q_true = drive(q_command)
 
@@ -167,15 +167,15 @@ def _look(task: Task, q_command: Floats, q_true: Floats, look: Look) -> Seen | L
     return found
 
 
-def _judge(task: Task, visits: list[Visit]) -> Stop | None:
+def _judge(task: Task, visits: list[Visit]) -> ServoStop | None:
     """Whether to stop after the last look."""
     errors = [visit.error_mm for visit in visits]
     if errors[-1] <= task.tolerance_mm:
-        return Stop.CONVERGED
+        return ServoStop.CONVERGED
     last = errors[-DIVERGING_STEPS - 1 :]
     worse = [b > DIVERGING_RATIO * a for a, b in pairwise(last)]
     if len(worse) == DIVERGING_STEPS and all(worse) and errors[-1] > NOISE_TOLERANCES * task.tolerance_mm:
-        return Stop.DIVERGING
+        return ServoStop.DIVERGING
     if len(visits) > task.max_steps:
-        return Stop.TOLERANCE_NOT_REACHED
+        return ServoStop.TOLERANCE_NOT_REACHED
     return None

@@ -12,15 +12,23 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.registration.registration import apply
-from puncture_twin.twin.guidance.stereo.detection import Placed, Search, Sight, Spots, in_space, look_at, picture_sight
+from puncture_twin.twin.guidance.stereo.detection import (
+    LocatedPair,
+    Search,
+    Sight,
+    Spots,
+    in_space,
+    look_at,
+    picture_sight,
+)
 from puncture_twin.twin.guidance.stereo.guide import Guide, JointGuide, Known
 from puncture_twin.twin.guidance.stereo.mapping import Mapping, SeenMarkers, map_head
 from puncture_twin.twin.guidance.stereo.poses import configurations, way_up
 from puncture_twin.twin.guidance.stereo.robot_calibration import RobotHeld, calibrate_by_robot, grid_points, held_rod
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
-from puncture_twin.twin.guidance.stereo.servo_law import StepLimits, Stop
+from puncture_twin.twin.guidance.stereo.servo_law import ServoStop, StepLimits
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed, Task, servo, way_contact
-from puncture_twin.twin.guidance.stereo.stereo_room import Room, draw_room, room_checker
+from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_room, room_checker
 
 POINTED_MM = 3.0
 """How well an operator points at a marker in the pictures, per axis: where the search for it begins."""
@@ -28,7 +36,7 @@ POINTED_MM = 3.0
 TEST_POINTS = 10
 """Points at which the stereo is tried, as in the paper's Table 1."""
 
-Eyes = Callable[[Room, np.random.Generator], Sight]
+Eyes = Callable[[StereoWorkcell, np.random.Generator], Sight]
 """Makes a sight of a room."""
 
 
@@ -51,7 +59,7 @@ class Reached(NamedTuple):
     @property
     def confirmed(self) -> bool:
         """Whether the last look saw the ball within the tolerance."""
-        return self.servoed.stop is Stop.CONVERGED
+        return self.servoed.stop is ServoStop.CONVERGED
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +77,7 @@ class Session:
     """
 
     seed: int
-    room: Room
+    room: StereoWorkcell
     calibration: RobotHeld
     mapping: Mapping
     stereo_mm: Floats
@@ -123,7 +131,7 @@ def run_session(
     return Session(seed, room, calibration, mapping, stereo_mm, reached, guide)
 
 
-def see_markers(room: Room, calibration: RobotHeld, sight: Sight, rng: np.random.Generator) -> list[Spots]:
+def see_markers(room: StereoWorkcell, calibration: RobotHeld, sight: Sight, rng: np.random.Generator) -> list[Spots]:
     """Every marker in every camera.
 
     Raises:
@@ -133,7 +141,7 @@ def see_markers(room: Room, calibration: RobotHeld, sight: Sight, rng: np.random
     for name, point in zip(room.case.markers.names, room.markers_c, strict=True):
         predicted = point + rng.normal(0.0, POINTED_MM, 3)
         searches = tuple(Search(camera, predicted, servo_plan.search_px) for camera in calibration.cameras)
-        spots = look_at(sight, Placed(point, head.marker_diameter_mm / 2, None), searches, servo_plan.frames)
+        spots = look_at(sight, LocatedPair(point, head.marker_diameter_mm / 2, None), searches, servo_plan.frames)
         if isinstance(spots, Lost):
             raise NoAnswerError(f"marker {name}: {spots.reason}")
         found.append(spots)
@@ -147,7 +155,7 @@ def _map(case: ServoCase, calibration: RobotHeld, seen: list[Spots], markers_m: 
     return map_head(names, markers, markers_m, case.file.head.marker_mm, targets_m, where=f"{case.path}: mapping")
 
 
-def _try_stereo(room: Room, calibration: RobotHeld, sight: Sight, rng: np.random.Generator) -> Floats:
+def _try_stereo(room: StereoWorkcell, calibration: RobotHeld, sight: Sight, rng: np.random.Generator) -> Floats:
     """Error of the stereo at points anywhere in the calibrated volume, shape (10,), mm."""
     T_c_base = np.asarray(np.linalg.inv(calibration.T_base_c), dtype=np.float64)
     tool = room.case.file.tool
@@ -155,7 +163,7 @@ def _try_stereo(room: Room, calibration: RobotHeld, sight: Sight, rng: np.random
     rod_c = -T_c_base[:3, :3] @ held_rod(room.case, room).R_base_flange[:, 2]
     errors = []
     for point in rng.uniform(grid.min(axis=0), grid.max(axis=0), (TEST_POINTS, 3)):
-        ball = Placed(apply(room.T_c_base, point), tool.ball_diameter_mm / 2, rod_c, head_there=False)
+        ball = LocatedPair(apply(room.T_c_base, point), tool.ball_diameter_mm / 2, rod_c, head_there=False)
         searches = _searches(room.case, calibration, apply(T_c_base, point))
         spots = look_at(sight, ball, searches, room.case.file.servo.frames)
         if isinstance(spots, Lost):
@@ -169,7 +177,7 @@ def _searches(case: ServoCase, calibration: RobotHeld, predicted_c: Floats) -> t
 
 
 def _reach_all(
-    room: Room,
+    room: StereoWorkcell,
     guide: Guide,
     mapping: Mapping,
     targets_m: Floats,
@@ -208,7 +216,7 @@ class _Aim(NamedTuple):
 
 
 def _reach(
-    room: Room,
+    room: StereoWorkcell,
     guide: Guide,
     task: Task,
     q_hover: Floats,
@@ -231,7 +239,7 @@ def _reach(
 
         done = servo(task, q_aim, q_true, guide.look, drive)
     else:
-        done = Servoed(Stop.CONTACT, (), q_hover, q_true, f"{contact.body} and {contact.other}")
+        done = Servoed(ServoStop.CONTACT, (), q_hover, q_true, f"{contact.body} and {contact.other}")
     ball, estimated = room.ball_c(done.q_true), guide.target_c
     return Reached(
         aim.name,

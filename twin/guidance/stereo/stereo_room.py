@@ -35,7 +35,7 @@ CAMERA_FOCAL = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
+class StereoWorkcell:
     """One drawn room. Whoever guides must not look in here.
 
     Attributes:
@@ -114,7 +114,7 @@ class Room:
         return TriangleMesh(self.head_c.vertices, self.head_c.faces[near]) if near.any() else None
 
 
-def draw_room(case: ServoCase, rng: np.random.Generator) -> Room:
+def draw_room(case: ServoCase, rng: np.random.Generator) -> StereoWorkcell:
     """A room with its errors drawn from the case's standard deviations.
 
     Raises:
@@ -125,7 +125,7 @@ def draw_room(case: ServoCase, rng: np.random.Generator) -> Room:
     T_base_c = calibration_frame(case)
     T_c_base = np.asarray(np.linalg.inv(T_base_c), dtype=np.float64)
     cameras = tuple(_misplaced(camera, rng) for camera in planned_cameras(case))
-    return Room(case, arm, T_c_base, cameras, T_c_base @ head_pose(case))
+    return StereoWorkcell(case, arm, T_c_base, cameras, T_c_base @ head_pose(case))
 
 
 def planned_cameras(case: ServoCase) -> tuple[Camera, ...]:

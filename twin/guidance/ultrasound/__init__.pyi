@@ -1,5 +1,10 @@
-from .acquisition import Acquisition as Acquisition, Shot as Shot, acquire as acquire, choice_noise as choice_noise
-from .candidate_poses import Candidates as Candidates, drawing as drawing, find_candidates as find_candidates
+from .acquisition import (
+    Acquisition as Acquisition,
+    ProbeShot as ProbeShot,
+    acquire as acquire,
+    choice_noise as choice_noise,
+)
+from .candidate_poses import CandidatePoses as CandidatePoses, drawing as drawing, find_candidates as find_candidates
 from .puncture import (
     Puncture as Puncture,
     held_out_errors_mm as held_out_errors_mm,
@@ -8,7 +13,11 @@ from .puncture import (
 )
 from .selfcal_case import SelfcalCase as SelfcalCase, load_selfcal_case as load_selfcal_case
 from .selfcal_truth import draw_room as draw_room
-from .simulate import SPEC_NOISE as SPEC_NOISE, Truth as Truth, simulate_recording as simulate_recording
+from .simulate import (
+    SPEC_NOISE as SPEC_NOISE,
+    SimulatedTruth as SimulatedTruth,
+    simulate_recording as simulate_recording,
+)
 from .summaries import (
     calibration_summary as calibration_summary,
     choice_summary as choice_summary,
@@ -17,7 +26,7 @@ from .summaries import (
     puncture_summary as puncture_summary,
     trial_summary as trial_summary,
 )
-from .trial import Choice as Choice, Trial as Trial
+from .trial import Choice as Choice, SelfcalTrial as SelfcalTrial
 from .two_arms import (
     TwoArms as TwoArms,
     head_pose as head_pose,

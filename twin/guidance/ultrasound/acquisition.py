@@ -15,9 +15,9 @@ from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.pose_choice import choose_poses
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.candidate_poses import Candidates, drawing
+from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, drawing
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, Missed, detect
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedlePose, render
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage, render
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import RoomTruth, jog_into_slice
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE
@@ -27,7 +27,7 @@ JOG_FAILED = "jog out of reach"
 JOG_TOUCHES = "jog would touch"
 
 
-class Shot(NamedTuple):
+class ProbeShot(NamedTuple):
     """One picture with all that belongs to it."""
 
     candidate: int
@@ -37,7 +37,7 @@ class Shot(NamedTuple):
     """The same of the needle's arm, after the jog."""
     picture: Pixels
     found: Detection | Missed
-    true_needle: NeedlePose
+    true_needle: NeedleInImage
     """Where the needle truly was in the true image."""
     touched: bool
     """Whether the true arms truly touched each other."""
@@ -56,9 +56,9 @@ class Acquisition:
     """
 
     recording: Recording
-    shots: tuple[Shot, ...]
+    shots: tuple[ProbeShot, ...]
     missed: dict[str, int]
-    missed_shots: tuple[Shot, ...]
+    missed_shots: tuple[ProbeShot, ...]
     left: NDArray[np.int_]
 
     def detection_errors(self) -> Floats:
@@ -86,7 +86,7 @@ class _Motion:
 def acquire(
     case: SelfcalCase,
     room: TwoArms,
-    candidates: Candidates,
+    candidates: CandidatePoses,
     truth: RoomTruth,
     rng: np.random.Generator,
     count: Callable[[int, int], None] = lambda done, total: None,
@@ -105,8 +105,8 @@ def acquire(
         NoAnswerError: The candidates are used up before enough pictures show the needle.
     """
     motion, wanted = _Motion(case, truth, rng), case.content.poses.count
-    shots: list[Shot] = []
-    missed: list[Shot] = []
+    shots: list[ProbeShot] = []
+    missed: list[ProbeShot] = []
     given_up: Counter[str] = Counter()
     left = np.arange(len(candidates.q_probe))
     while len(shots) < wanted:
@@ -130,11 +130,11 @@ def acquire(
 
 def choose(
     case: SelfcalCase,
-    candidates: Candidates,
+    candidates: CandidatePoses,
     left: NDArray[np.int_],
     n: int,
     rng: np.random.Generator,
-    shots: list[Shot],
+    shots: list[ProbeShot],
 ) -> NDArray[np.int_]:
     """The next n candidates of those left: the most informative beside what is recorded, or at random."""
     if case.content.poses.choose == "random":
@@ -152,12 +152,12 @@ def choice_noise(case: SelfcalCase) -> Noise:
 def _shot(
     case: SelfcalCase,
     room: TwoArms,
-    candidates: Candidates,
+    candidates: CandidatePoses,
     truth: RoomTruth,
     motion: _Motion,
     row: int,
     rng: np.random.Generator,
-) -> Shot | str:
+) -> ProbeShot | str:
     """Go to one candidate and take its picture, or say why it was given up."""
     q_probe = candidates.q_probe[row]
     rest_probe = motion.settle(0, q_probe)
@@ -172,19 +172,19 @@ def _shot(
     imager = case.content.image.imager()
     picture = render(imager, needle, rng, echo=case.content.image.echo())
     touched = not motion.between.apart(rest_probe, rest_needle)
-    return Shot(row, q_probe, q_needle, picture, detect(picture, imager), needle, touched)
+    return ProbeShot(row, q_probe, q_needle, picture, detect(picture, imager), needle, touched)
 
 
-def _after_jog(case: SelfcalCase, poses: Recording, row: int, rng: np.random.Generator) -> NeedlePose:
+def _after_jog(case: SelfcalCase, poses: Recording, row: int, rng: np.random.Generator) -> NeedleInImage:
     """Where the needle is to stand in the image, with what the operator leaves: off the plane, and leaning."""
     off = case.content.truth
     assert poses.v is not None  # candidates are made with directions
     lean = rng.normal(0.0, np.radians(off.lean_deg))
     tip = np.array([*poses.P[row], rng.normal(0.0, off.off_plane_mm)])
-    return NeedlePose(tip, np.array([*(np.cos(lean) * poses.v[row]), np.sin(lean)]))
+    return NeedleInImage(tip, np.array([*(np.cos(lean) * poses.v[row]), np.sin(lean)]))
 
 
-def _recording(room: TwoArms, shots: list[Shot]) -> Recording:
+def _recording(room: TwoArms, shots: list[ProbeShot]) -> Recording:
     found = [shot.found for shot in shots if isinstance(shot.found, Detection)]
     return Recording(
         flange_pose(room.probe_model, np.array([shot.q_probe for shot in shots])),
@@ -194,7 +194,7 @@ def _recording(room: TwoArms, shots: list[Shot]) -> Recording:
     )
 
 
-def _detection_error(shot: Shot) -> tuple[float, float, float]:
+def _detection_error(shot: ProbeShot) -> tuple[float, float, float]:
     assert isinstance(shot.found, Detection)  # only those are kept as shots
     d = shot.true_needle.direction_image[:2] / np.linalg.norm(shot.true_needle.direction_image[:2])
     e = shot.found.tip_image - shot.true_needle.tip_image[:2]
@@ -203,7 +203,11 @@ def _detection_error(shot: Shot) -> tuple[float, float, float]:
 
 
 def _too_few(
-    case: SelfcalCase, candidates: Candidates, shots: list[Shot], missed: list[Shot], given_up: Counter[str]
+    case: SelfcalCase,
+    candidates: CandidatePoses,
+    shots: list[ProbeShot],
+    missed: list[ProbeShot],
+    given_up: Counter[str],
 ) -> str:
     return (
         f"{len(shots)} of {case.content.poses.count} poses show the needle; of {len(candidates.q_probe)} candidates "

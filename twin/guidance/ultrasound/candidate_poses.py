@@ -50,7 +50,7 @@ class ImageGeometry(NamedTuple):
     """The needle about itself, shape (n,), rad."""
 
 
-class Candidates(NamedTuple):
+class CandidatePoses(NamedTuple):
     """Poses that can be recorded, by the drawing, and what became of the other draws."""
 
     q_probe: Floats
@@ -104,7 +104,7 @@ def _lowest_corner(case: SelfcalCase, T_base1_image: Floats) -> Floats:
     return np.asarray(heights.min(axis=1))
 
 
-def find_candidates(case: SelfcalCase, room: TwoArms, rng: np.random.Generator) -> Candidates:
+def find_candidates(case: SelfcalCase, room: TwoArms, rng: np.random.Generator) -> CandidatePoses:
     """Draw, solve, judge.
 
     Args:
@@ -135,7 +135,7 @@ def find_candidates(case: SelfcalCase, room: TwoArms, rng: np.random.Generator) 
     if len(taken) == 0:
         raise NoAnswerError(f"no pose of {n} can be taken: {counts}", counts=counts)
     poses = Recording(goals[0][taken], goals[1][taken], seen.tip_mm[taken], seen.direction_image[taken])
-    return Candidates(q[:, 0], q[:, 1], poses, seen.roll[taken], counts)
+    return CandidatePoses(q[:, 0], q[:, 1], poses, seen.roll[taken], counts)
 
 
 def _flange_goals(case: SelfcalCase, belief: Estimate, seen: ImageGeometry) -> tuple[Floats, Floats]:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
-from puncture_twin.twin.guidance.ultrasound.candidate_poses import Candidates, needle_flange
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import Lesion, NeedlePose, render
+from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, needle_flange
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import Lesion, NeedleInImage, render
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import RoomTruth, nearest_configuration
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
@@ -28,7 +28,7 @@ class Puncture(NamedTuple):
     """True target in the true image, shape (3,), mm; it lies in the plane, for it is seen."""
     clicked_image: Floats
     """Where the operator read it, shape (2,), mm."""
-    needle: NeedlePose
+    needle: NeedleInImage
     """Where the needle truly ended, in the true image."""
     predicted_mm: float
     """Expected (rms) error from the calibration's covariance alone."""
@@ -64,7 +64,7 @@ class Puncture(NamedTuple):
 def punctures(
     case: SelfcalCase,
     room: TwoArms,
-    candidates: Candidates,
+    candidates: CandidatePoses,
     rows: NDArray[np.int_],
     truth: RoomTruth,
     calibration: Calibration,
@@ -88,7 +88,7 @@ def punctures(
 def _puncture(
     case: SelfcalCase,
     room: TwoArms,
-    candidates: Candidates,
+    candidates: CandidatePoses,
     row: int,
     truth: RoomTruth,
     calibration: Calibration,
@@ -107,7 +107,7 @@ def _puncture(
     return Puncture(row, target, clicked, ended, predicted, case.content.truth.click_mm)
 
 
-def aim(candidates: Candidates, row: int, target_mm: Floats, calibration: Calibration, truth: RoomTruth) -> Floats:
+def aim(candidates: CandidatePoses, row: int, target_mm: Floats, calibration: Calibration, truth: RoomTruth) -> Floats:
     """What the needle's arm is told: by its nominal kinematics and the calibration; (6,), rad, NaN if out of reach.
 
     Args:
@@ -128,7 +128,7 @@ def aim(candidates: Candidates, row: int, target_mm: Floats, calibration: Calibr
 
 
 def held_out_errors_mm(
-    candidates: Candidates,
+    candidates: CandidatePoses,
     rows: NDArray[np.int_],
     truth: RoomTruth,
     calibration: Calibration,

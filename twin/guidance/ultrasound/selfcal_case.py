@@ -90,7 +90,7 @@ class ProbeSection(Section):
         return self
 
 
-class NeedleSection(Section):
+class SelfcalNeedleSection(Section):
     """The needle along its flange's z axis; what lies between shaft and flange is the holder."""
 
     length_mm: Tool = 210.0
@@ -193,7 +193,7 @@ class SelfcalFile(Section):
     probe_arm: ArmSection = ArmSection()
     needle_arm: NeedleArmSection = NeedleArmSection()
     probe: ProbeSection = ProbeSection()
-    needle: NeedleSection = NeedleSection()
+    needle: SelfcalNeedleSection = SelfcalNeedleSection()
     phantom: PhantomSection = PhantomSection()
     image: ImageSection = ImageSection()
     poses: PosesSection = PosesSection()

@@ -11,7 +11,7 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import exp, tangent_basis
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import needle_flange
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedlePose
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.plant.true_arm import TrueArm, draw_true_arm
 
@@ -37,11 +37,11 @@ class RoomTruth(NamedTuple):
         """The true T_base1_image, shape (4, 4), mm, of the probe's arm at rest at ``q_probe`` (6,), rad."""
         return np.asarray(self.probe_arm.flange_pose(q_probe) @ self.X)
 
-    def needle_in_image(self, q_probe: Floats, q_needle: Floats) -> NeedlePose:
+    def needle_in_image(self, q_probe: Floats, q_needle: Floats) -> NeedleInImage:
         """The true needle in the true image, both arms at rest."""
         T = np.linalg.inv(self.image_pose(q_probe)) @ self.Y @ self.needle_arm.flange_pose(q_needle)
         direction = T[:3, :3] @ self.V
-        return NeedlePose(T[:3, :3] @ self.tip_end2 + T[:3, 3], direction / np.linalg.norm(direction))
+        return NeedleInImage(T[:3, :3] @ self.tip_end2 + T[:3, 3], direction / np.linalg.norm(direction))
 
 
 def draw_room(case: SelfcalCase, rng: np.random.Generator) -> RoomTruth:
@@ -65,7 +65,7 @@ def _shifted(T: Floats, mm: float, rad: float, rng: np.random.Generator) -> Floa
     return moved
 
 
-def jog_into_slice(truth: RoomTruth, q_probe: Floats, q_needle: Floats, wanted: NeedlePose, roll: float) -> Floats:
+def jog_into_slice(truth: RoomTruth, q_probe: Floats, q_needle: Floats, wanted: NeedleInImage, roll: float) -> Floats:
     """Move the needle's arm until the *true* needle stands in the *true* image as wanted.
 
     It stands for the operator, or a servo on the picture, that jogs until the needle shows: what is left is in

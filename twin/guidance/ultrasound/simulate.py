@@ -43,7 +43,7 @@ class PoseRanges(NamedTuple):
         return np.where(rng.random(size) < self.at_ends, ends, values)
 
 
-class Truth(NamedTuple):
+class SimulatedTruth(NamedTuple):
     """What a calibration is to find."""
 
     X: Floats
@@ -71,7 +71,7 @@ class ImagePose(NamedTuple):
     """Shape (n,), rad: out of the slice."""
 
 
-def draw_truth(rng: np.random.Generator) -> Truth:
+def draw_truth(rng: np.random.Generator) -> SimulatedTruth:
     """A probe, two bases 0.9 m apart and a needle of 140 to 200 mm, each at random about its usual place."""
     X = _pose(exp(rng.uniform(-0.5, 0.5, 3)), np.array([0.0, 30.0, 80.0]) + rng.uniform(-20, 20, 3))
     turned = exp(np.array([0.0, 0.0, np.pi])) @ exp(rng.uniform(-0.3, 0.3, 3))
@@ -79,10 +79,12 @@ def draw_truth(rng: np.random.Generator) -> Truth:
     direction = exp(rng.uniform(-0.3, 0.3, 3))[:, 2]
     tip = rng.uniform(140.0, 200.0) * direction + np.append(rng.uniform(-15, 15, 2), 0.0)
     A_mean = _pose(exp(np.array([np.pi, 0.0, 0.0])) @ exp(rng.uniform(-0.3, 0.3, 3)), np.array([450.0, 0.0, 300.0]))
-    return Truth(X, Y, tip, direction, A_mean)
+    return SimulatedTruth(X, Y, tip, direction, A_mean)
 
 
-def draw_probe_poses(rng: np.random.Generator, truth: Truth, n: int, ranges: PoseRanges | None = None) -> Floats:
+def draw_probe_poses(
+    rng: np.random.Generator, truth: SimulatedTruth, n: int, ranges: PoseRanges | None = None
+) -> Floats:
     """A within the ranges, shape (n, 4, 4)."""
     ranges = ranges or PoseRanges()
     A = np.tile(np.eye(4), (n, 1, 1))
@@ -99,7 +101,7 @@ def draw_image_poses(rng: np.random.Generator, n: int, ranges: PoseRanges | None
     return ImagePose(tip, *angles, rng.normal(0.0, ranges.lean, n) if ranges.lean else np.zeros(n))
 
 
-def exact_recording(truth: Truth, A: Floats, seen: ImagePose) -> Recording:
+def exact_recording(truth: SimulatedTruth, A: Floats, seen: ImagePose) -> Recording:
     """The recording without noise: B such that the needle shows in the image as wished.
 
     Args:
@@ -147,11 +149,11 @@ def with_noise(rng: np.random.Generator, exact: Recording, noise: Noise) -> Reco
 def simulate_recording(
     rng: np.random.Generator,
     n: int,
-    truth: Truth | None = None,
+    truth: SimulatedTruth | None = None,
     *,
     noise: Noise | None = SPEC_NOISE,
     ranges: PoseRanges | None = None,
-) -> tuple[Recording, Truth]:
+) -> tuple[Recording, SimulatedTruth]:
     """Draw a recording of n poses, and the truth where none is given; ``noise=None`` leaves it exact."""
     truth = draw_truth(rng) if truth is None else truth
     exact = exact_recording(truth, draw_probe_poses(rng, truth, n, ranges), draw_image_poses(rng, n, ranges))

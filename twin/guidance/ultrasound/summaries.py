@@ -10,7 +10,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture
-from puncture_twin.twin.guidance.ultrasound.trial import Choice, Trial
+from puncture_twin.twin.guidance.ultrasound.trial import Choice, SelfcalTrial
 
 
 def calibration_summary(found: Calibration, recording: Recording) -> dict[str, Any]:
@@ -66,7 +66,7 @@ def choice_summary(choice: Choice) -> dict[str, Any]:
     }
 
 
-def trial_summary(trial: Trial) -> dict[str, Any]:
+def trial_summary(trial: SelfcalTrial) -> dict[str, Any]:
     """One seed: mm and degrees."""
     found, truth, errors = trial.calibration, trial.truth, trial.acquisition.detection_errors()
     return {

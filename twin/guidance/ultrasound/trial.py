@@ -14,7 +14,7 @@ from puncture_twin.twin.guidance.ultrasound.selfcal_truth import RoomTruth
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class SelfcalTrial:
     """One seed in the twin: a room, its recording, its calibration, and what came of it.
 
     Attributes:

@@ -27,7 +27,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import tip_residua
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import plain_fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import log
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import UNWEIGHTED
-from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, Truth, simulate_recording
+from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, SimulatedTruth, simulate_recording
 
 SEED = 20230816
 RUNS = 200
@@ -62,7 +62,7 @@ SCALE_LIMIT_MM = 0.25
 
 
 @dataclass(frozen=True)
-class Row:
+class AxpYbqRow:
     """One number beside the known one.
 
     Attributes:
@@ -85,10 +85,10 @@ class Row:
         return self.limit is None or self.ours <= self.limit
 
 
-class Reproduction(NamedTuple):
+class AxpYbqTables(NamedTuple):
     """All numbers."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[AxpYbqRow, ...]
     runs: int
     seed: int
 
@@ -107,7 +107,7 @@ class _Run(NamedTuple):
     direction_deg: float
 
 
-def reproduce(out_dir: Path | None, seeds: int | None) -> Reproduction:
+def reproduce(out_dir: Path | None, seeds: int | None) -> AxpYbqTables:
     """Compute every number.
 
     Args:
@@ -117,16 +117,16 @@ def reproduce(out_dir: Path | None, seeds: int | None) -> Reproduction:
     del out_dir
     runs = seeds or RUNS
     rows = [_exact_row(), *_table(runs), *_outliers(runs), *_scales(runs)]
-    return Reproduction(tuple(rows), runs, SEED)
+    return AxpYbqTables(tuple(rows), runs, SEED)
 
 
-def truth_estimate(truth: Truth) -> Estimate:
+def truth_estimate(truth: SimulatedTruth) -> Estimate:
     """The truth in the form of an estimate."""
     X, Y = truth.X, truth.Y
     return Estimate(X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3], truth.tip_end2, np.ones(2), truth.direction_end2)
 
 
-def _exact_row() -> Row:
+def _exact_row() -> AxpYbqRow:
     """The closed form without noise: the largest error of any unknown, in mm or degrees."""
     worst = 0.0
     for n in (16, 20, 50):
@@ -135,10 +135,10 @@ def _exact_row() -> Row:
         turns = [log(a.T @ b) for a, b in ((found.R_X, exact.R_X), (found.R_Y, exact.R_Y))]
         moves = [found.t_X - exact.t_X, found.t_Y - exact.t_Y, found.t_Q - exact.t_Q]
         worst = max(worst, float(np.degrees(np.abs(turns).max())), float(np.abs(moves).max()))
-    return Row("closed form without noise, 16, 20 and 50 poses: largest error", None, worst, 1e-6, "mm or deg")
+    return AxpYbqRow("closed form without noise, 16, 20 and 50 poses: largest error", None, worst, 1e-6, "mm or deg")
 
 
-def _table(runs: int) -> list[Row]:
+def _table(runs: int) -> list[AxpYbqRow]:
     rows = []
     for n in COUNTS:
         found = [_run(np.random.default_rng([SEED, n, k]), n) for k in range(runs)]
@@ -146,12 +146,12 @@ def _table(runs: int) -> list[Row]:
         for method, known, error in zip(METHODS, TABLE[n], ours.tolist(), strict=True):
             limits = [LIMITS.get((n, method), np.inf), OVER_BOUND.get(method, np.inf) * float(ours[3])]
             limit = min(limits) if np.isfinite(min(limits)) else None
-            rows.append(Row(f"{n} poses, {method}", known, error, limit, "mm"))
+            rows.append(AxpYbqRow(f"{n} poses, {method}", known, error, limit, "mm"))
         if n >= 20:
-            rows.append(Row(f"{n} poses, most steps", None, max(run.steps for run in found), MOST_STEPS, "steps"))
+            rows.append(AxpYbqRow(f"{n} poses, most steps", None, max(run.steps for run in found), MOST_STEPS, "steps"))
         if n == 30:
             angle = float(np.sqrt(np.mean([run.direction_deg**2 for run in found])))
-            rows.append(Row("30 poses, needle direction V", None, angle, 0.2, "deg"))
+            rows.append(AxpYbqRow("30 poses, needle direction V", None, angle, 0.2, "deg"))
     return rows
 
 
@@ -173,7 +173,7 @@ def _squared(estimate: Estimate, held: Recording) -> float:
     return float(np.mean(np.sum(tip_residuals(estimate, held) ** 2, axis=1)))
 
 
-def _outliers(runs: int) -> list[Row]:
+def _outliers(runs: int) -> list[AxpYbqRow]:
     """30 poses, 10 % of the tips 5 mm off in the image."""
 
     def one(rng: np.random.Generator) -> list[float]:
@@ -187,9 +187,9 @@ def _outliers(runs: int) -> list[Row]:
 
     plain, unweighted, weighted = _rms(one, runs, 1)
     return [
-        Row("30 poses, 10 % outliers, plain least squares", 0.73, plain, None, "mm"),
-        Row("30 poses, 10 % outliers, robust, noise not told", 0.23, unweighted, 0.25, "mm"),
-        Row("30 poses, 10 % outliers, robust, noise told", 0.23, weighted, 0.25, "mm"),
+        AxpYbqRow("30 poses, 10 % outliers, plain least squares", 0.73, plain, None, "mm"),
+        AxpYbqRow("30 poses, 10 % outliers, robust, noise not told", 0.23, unweighted, 0.25, "mm"),
+        AxpYbqRow("30 poses, 10 % outliers, robust, noise told", 0.23, weighted, 0.25, "mm"),
     ]
 
 
@@ -202,7 +202,7 @@ def with_outliers(rng: np.random.Generator, recording: Recording, share: float, 
     return Recording(recording.A, recording.B, P, recording.v, recording.names)
 
 
-def _scales(runs: int) -> list[Row]:
+def _scales(runs: int) -> list[AxpYbqRow]:
     """30 poses, the pixels 1 and 3 % larger than believed."""
     rows = []
     for percent, known in ((1, 0.33), (3, 0.78)):
@@ -217,8 +217,8 @@ def _scales(runs: int) -> list[Row]:
 
         blind, found = _rms(one, runs, 100 + percent)
         rows += [
-            Row(f"30 poses, pixels {percent} % off, not estimated", known, blind, None, "mm"),
-            Row(f"30 poses, pixels {percent} % off, estimated", 0.239, found, SCALE_LIMIT_MM, "mm"),
+            AxpYbqRow(f"30 poses, pixels {percent} % off, not estimated", known, blind, None, "mm"),
+            AxpYbqRow(f"30 poses, pixels {percent} % off, estimated", 0.239, found, SCALE_LIMIT_MM, "mm"),
         ]
     return rows
 
@@ -229,7 +229,7 @@ def _rms(one: Callable[[np.random.Generator], list[float]], runs: int, key: int)
     return [float(value) for value in np.sqrt(np.mean(squared, axis=0))]
 
 
-def reproduction_text(result: Reproduction) -> str:
+def reproduction_text(result: AxpYbqTables) -> str:
     """For a person: the known numbers beside ours."""
     lines = [f"{'what':64s} {'known':>8s} {'ours':>10s} {'limit':>8s}  unit"]
     for row in result.rows:
@@ -240,7 +240,7 @@ def reproduction_text(result: Reproduction) -> str:
     return "\n".join([*lines, "", f"{result.runs} runs per row, seed {result.seed}: {verdict}"])
 
 
-def reproduction_summary(result: Reproduction) -> dict[str, Any]:
+def reproduction_summary(result: AxpYbqTables) -> dict[str, Any]:
     """The same as plain values."""
     rows = [
         {"what": r.what, "known": r.known, "ours": r.ours, "limit": r.limit, "unit": r.unit, "holds": r.holds}

@@ -65,7 +65,7 @@ WORKED_TOP: Point = (623.69, -313.01, 76.70)
 
 
 @dataclass(frozen=True)
-class Row:
+class Chen2019Row:
     """One printed quantity: a point (three numbers) or a distance (one), mm."""
 
     table: str
@@ -85,7 +85,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Reach:
+class SetupReach:
     """The worked pose against a UR3: distance of the flange from the shoulder, and what the links can span; mm."""
 
     flange_from_shoulder_mm: float
@@ -98,11 +98,11 @@ class Reach:
 
 
 @dataclass(frozen=True)
-class Reproduction:
+class Chen2019Tables:
     """All rows, and the finding about the worked pose."""
 
-    rows: tuple[Row, ...]
-    reach: Reach
+    rows: tuple[Chen2019Row, ...]
+    reach: SetupReach
 
     @property
     def holds(self) -> bool:
@@ -110,9 +110,9 @@ class Reproduction:
         return all(row.holds for row in self.rows) and self.reach.out_of_reach
 
 
-def reproduce() -> Reproduction:
+def reproduce() -> Chen2019Tables:
     """Recompute Tables 3, 5, 6, 7 and the worked example from Tables 1, 2 and 4."""
-    rows: list[Row] = []
+    rows: list[Chen2019Row] = []
     T = fit_triad(_points(TABLE_1, "ABC"), _points(TABLE_2, "ABC"))
     for name, (point, error) in TABLE_3.items():
         rows += _point_rows("3", f"{name} by A-B-C, setup 1", T, name, TABLE_2, point, error)
@@ -122,16 +122,16 @@ def reproduce() -> Reproduction:
     for markers, error in TABLE_6.items():
         fit = fit_triad if len(markers) == 3 else fit_affine
         other = fit(_points(TABLE_1, markers), _points(TABLE_4, markers))
-        rows.append(Row("6", f"error of M by {'-'.join(markers)}", (error,), (_error(other, "M", TABLE_4),)))
+        rows.append(Chen2019Row("6", f"error of M by {'-'.join(markers)}", (error,), (_error(other, "M", TABLE_4),)))
     for name, (point, error) in TABLE_7.items():
         rows += _point_rows("7", f"marker {name}, setup 1", T, name, TABLE_2, point, error)
     mean = float(np.mean([_error(T, name, TABLE_2) for name in TABLE_7]))
-    rows.append(Row("7", "mean error (Eq. 16)", (TABLE_7_MEAN,), (mean,)))
+    rows.append(Chen2019Row("7", "mean error (Eq. 16)", (TABLE_7_MEAN,), (mean,)))
     rows += _worked_rows(T)
-    return Reproduction(tuple(rows), worked_reach(T))
+    return Chen2019Tables(tuple(rows), worked_reach(T))
 
 
-def worked_reach(T_base_ct: Floats) -> Reach:
+def worked_reach(T_base_ct: Floats) -> SetupReach:
     """How far the worked pose's flange is from a UR3's shoulder, and how far the arm can span in any orientation.
 
     The span is an upper bound: all links and wrist offsets stretched in one plane, d4 at a right angle to it.
@@ -140,7 +140,7 @@ def worked_reach(T_base_ct: Floats) -> Reach:
     shoulder = np.array([0.0, 0.0, model.d[0]])
     flange = apply(T_base_ct, _worked_pose()[1])
     stretched = np.sum(np.abs(model.a)) + abs(model.d[4]) + abs(model.d[5])
-    return Reach(float(np.linalg.norm(flange - shoulder)), float(np.hypot(stretched, model.d[3])))
+    return SetupReach(float(np.linalg.norm(flange - shoulder)), float(np.hypot(stretched, model.d[3])))
 
 
 def _worked_pose() -> tuple[Floats, Floats]:
@@ -149,19 +149,22 @@ def _worked_pose() -> tuple[Floats, Floats]:
     return pose.tip_ct, pose.top_ct
 
 
-def _worked_rows(T_base_ct: Floats) -> list[Row]:
+def _worked_rows(T_base_ct: Floats) -> list[Chen2019Row]:
     tip, top = (apply(T_base_ct, point) for point in _worked_pose())
     return [
-        Row("3.3", "needle tip, theta 10 beta 45 r 150", WORKED_TIP, _triple(tip)),
-        Row("3.3", "needle top, l 401", WORKED_TOP, _triple(top)),
+        Chen2019Row("3.3", "needle tip, theta 10 beta 45 r 150", WORKED_TIP, _triple(tip)),
+        Chen2019Row("3.3", "needle top, l 401", WORKED_TOP, _triple(top)),
     ]
 
 
 def _point_rows(
     table: str, what: str, T: Floats, name: str, touched: Mapping[str, Point], point: Point, error: float
-) -> list[Row]:
+) -> list[Chen2019Row]:
     ours = _triple(apply(T, np.array(TABLE_1[name], float)))
-    return [Row(table, what, point, ours), Row(table, f"error of {what}", (error,), (_error(T, name, touched),))]
+    return [
+        Chen2019Row(table, what, point, ours),
+        Chen2019Row(table, f"error of {what}", (error,), (_error(T, name, touched),)),
+    ]
 
 
 def _points(table: Mapping[str, Point], names: str) -> Floats:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from puncture_twin.twin.jobs.papers.chen2019 import Reproduction
+from puncture_twin.twin.jobs.papers.chen2019 import Chen2019Tables
 
 
-def reproduction_text(result: Reproduction) -> str:
+def reproduction_text(result: Chen2019Tables) -> str:
     """The paper's numbers beside ours."""
     lines = [
         "table  what                                    paper                       ours                   differs"
@@ -27,7 +27,7 @@ def reproduction_text(result: Reproduction) -> str:
     return "\n".join(lines)
 
 
-def reproduction_summary(result: Reproduction) -> dict[str, Any]:
+def reproduction_summary(result: Chen2019Tables) -> dict[str, Any]:
     """A reproduction as plain values, mm, for ``--json``."""
     rows = [
         {"table": r.table, "what": r.what, "paper_mm": r.paper, "ours_mm": r.ours, "holds": r.holds}

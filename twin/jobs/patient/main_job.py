@@ -36,7 +36,7 @@ from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.registration.marker_check import checked_placement
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.context import Prepared
+from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation, finite, needle_warnings
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.twin.plant.truth import draw_truth
@@ -54,7 +54,7 @@ CERTIFICATE, FILM = "certificate.json", "rehearsal.mp4"
 class Run:
     """What a command has done so far, and the files that it wrote."""
 
-    prepared: Prepared
+    context: CaseContext
     candidates: Candidates
     files: tuple[Path, ...]
     plan: Plan | None = None
@@ -67,14 +67,14 @@ class Run:
     @property
     def inputs(self) -> tuple[Input, ...]:
         """The files that the command read beside the case's, then the case's."""
-        return (*self.read, *self.prepared.case.inputs)
+        return (*self.read, *self.context.case.inputs)
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees."""
-        found, provenance = self.candidates, self.prepared.provenance()
+        found, provenance = self.candidates, self.context.provenance()
         return {
             **provenance,
-            "warnings": [*provenance["warnings"], *needle_warnings(self.prepared.case, found)],
+            "warnings": [*provenance["warnings"], *needle_warnings(self.context.case, found)],
             "inputs": inputs_document(self.inputs),
             "directions": len(found),
             "counts": found.counts(),
@@ -83,13 +83,13 @@ class Run:
             "rehearsal": None if self.rehearsal is None else rehearsal_summary(self.rehearsal),
             "cross_check": None if self.checked is None else asdict(self.checked),
             "certificate": None if self.certificate is None else self.certificate.summary(),
-            "seconds": {stage: round(seconds, 3) for stage, seconds in self.prepared.stages.seconds.items()},
+            "seconds": {stage: round(seconds, 3) for stage, seconds in self.context.stages.seconds.items()},
             "files": [str(path) for path in self.files],
         }
 
 
 def search_case(
-    prepared: Prepared,
+    context: CaseContext,
     out: Path,
     *,
     pictures: bool = True,
@@ -98,8 +98,8 @@ def search_case(
 ) -> Run:
     """Search; write ``candidates.parquet`` and, if wanted, the certificate, the pictures and the page."""
     names = ("candidates.parquet", *(PICTURES if pictures else ()), *(() if certify_deg is None else (CERTIFICATE,)))
-    with _writing(out, "search", prepared, names) as draft:
-        run = Run(prepared, prepared.search(), (), checked=checked)
+    with _writing(out, "search", context, names) as draft:
+        run = Run(context, context.search(), (), checked=checked)
         if certify_deg is not None:
             run = _certified(run, certify_deg, draft.folder)
         run = _with_table(run, draft.folder)
@@ -107,30 +107,30 @@ def search_case(
     return _final(run, draft)
 
 
-def plan_case(prepared: Prepared, out: Path) -> Run:
+def plan_case(context: CaseContext, out: Path) -> Run:
     """Search and plan; write ``plan.json`` too.
 
     Raises:
         InputError: The case does not say where the arm stands.
         NoAnswerError: No plan; the search's files are written all the same.
     """
-    _refuse_without_arm(prepared)
-    with _writing(out, "plan", prepared, ("candidates.parquet", "plan.json", *PICTURES)) as draft:
-        run = _with_pictures(_searched_and_planned(prepared, draft.folder), draft.folder)
+    _refuse_without_arm(context)
+    with _writing(out, "plan", context, ("candidates.parquet", "plan.json", *PICTURES)) as draft:
+        run = _with_pictures(_searched_and_planned(context, draft.folder), draft.folder)
     return _answered(_final(run, draft), out)
 
 
-def rehearse_case(prepared: Prepared, out: Path) -> Run:
+def rehearse_case(context: CaseContext, out: Path) -> Run:
     """Plan, rehearse the plan, and write everything.
 
     Raises:
         InputError: The case does not say where the arm stands.
         NoAnswerError: No plan; the search's files are written all the same.
     """
-    _refuse_without_arm(prepared)
+    _refuse_without_arm(context)
     names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, *PICTURES)
-    with _writing(out, "plan", prepared, names) as draft:
-        run = _searched_and_planned(prepared, draft.folder)
+    with _writing(out, "plan", context, names) as draft:
+        run = _searched_and_planned(context, draft.folder)
         planned = run.files
         run = run if run.plan is None else _rehearsed(run, draft.folder)
         run = _with_pictures(run, draft.folder)
@@ -140,11 +140,11 @@ def rehearse_case(prepared: Prepared, out: Path) -> Run:
     return _answered(_final(run, draft), out)
 
 
-def _refuse_without_arm(prepared: Prepared) -> None:
-    if prepared.reach is None:
+def _refuse_without_arm(context: CaseContext) -> None:
+    if context.reach is None:
         raise InputError(
             "the case does not say where the robot stands, so nothing can be planned",
-            where=prepared.case.path,
+            where=context.case.path,
             allowed="[registration] with markers_ct and markers_base, or [robot.mount]",
         )
 
@@ -152,7 +152,7 @@ def _refuse_without_arm(prepared: Prepared) -> None:
 def _writing(
     out: Path,
     command: str,
-    prepared: Prepared,
+    context: CaseContext,
     names: Iterable[str],
     source: Input | None = None,
 ) -> AbstractContextManager[Draft]:
@@ -161,11 +161,11 @@ def _writing(
     return writing(
         out,
         command,
-        inputs=(*read, *prepared.case.inputs),
-        seconds=prepared.stages.seconds,
+        inputs=(*read, *context.case.inputs),
+        seconds=context.stages.seconds,
         names=names,
         made_from={one.path: one.sha256 for one in read},
-        note=prepared.watcher.note,
+        note=context.watcher.note,
     )
 
 
@@ -185,11 +185,11 @@ def _answered(run: Run, out: Path) -> Run:
     return run
 
 
-def _searched_and_planned(prepared: Prepared, out: Path) -> Run:
-    return _with_table(_planned(Run(prepared, prepared.search(), ()), out), out)
+def _searched_and_planned(context: CaseContext, out: Path) -> Run:
+    return _with_table(_planned(Run(context, context.search(), ()), out), out)
 
 
-def rehearse_plan(prepared: Prepared, plan_path: Path, out: Path) -> Run:
+def rehearse_plan(context: CaseContext, plan_path: Path, out: Path) -> Run:
     """Load a plan, check it again, rehearse it; write the rehearsal's files and the scene, but no map of one direction.
 
     The scene is left out where the plan's own stands beside it: it shows the same.
@@ -197,14 +197,14 @@ def rehearse_plan(prepared: Prepared, plan_path: Path, out: Path) -> Run:
     Raises:
         InputError: A plan that does not belong to the case or does not hold any more.
     """
-    source, plan = _read_plan(plan_path, prepared.watcher.note)
-    with prepared.stages.time("plan"):
-        candidates = check_plan(plan, prepared, plan_path, seed=prepared.case.rehearsal.seed)
-    with _writing(out, "rehearse", prepared, ("rehearsal.json", FILM), source) as draft:
-        run = _rehearsed(Run(prepared, candidates, (), plan, read=(source,)), draft.folder)
+    source, plan = _read_plan(plan_path, context.watcher.note)
+    with context.stages.time("plan"):
+        candidates = check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
+    with _writing(out, "rehearse", context, ("rehearsal.json", FILM), source) as draft:
+        run = _rehearsed(Run(context, candidates, (), plan, read=(source,)), draft.folder)
         if not draft.source_has("scene.png"):
-            with prepared.stages.time("scene"):
-                draw_scene(prepared.case, prepared.anatomy, candidates, plan, draft.folder / "scene.png")
+            with context.stages.time("scene"):
+                draw_scene(context.case, context.anatomy, candidates, plan, draft.folder / "scene.png")
             run = _with(run, draft.folder / "scene.png")
     return _final(run, draft)
 
@@ -221,26 +221,26 @@ def _read_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Plan]:
 def _rehearsed(run: Run, out: Path) -> Run:
     """Execute the run's plan where the truth differs, write the numbers and the film."""
     assert run.plan is not None
-    prepared = run.prepared
-    with prepared.stages.time("rehearsal"):
-        truth = draw_truth(prepared.case, run.plan.T_base_ct)
-        rehearsal = rehearse(run.plan, prepared.case, prepared.anatomy, truth)
+    context = run.context
+    with context.stages.time("rehearsal"):
+        truth = draw_truth(context.case, run.plan.T_base_ct)
+        rehearsal = rehearse(run.plan, context.case, context.anatomy, truth)
     document = {**rehearsal_summary(rehearsal), "inputs": inputs_document(run.inputs)}
     run = _with(replace(run, rehearsal=rehearsal), _write_json(document, out / "rehearsal.json"))
-    with prepared.stages.time("film"):
+    with context.stages.time("film"):
         film = draw_film(
             rehearsal,
             run.plan,
-            prepared.case,
-            prepared.anatomy,
+            context.case,
+            context.anatomy,
             out / FILM,
-            progress=partial(prepared.watcher.count, "film"),
+            progress=partial(context.watcher.count, "film"),
         )
     return _with(run, film)
 
 
 def export(
-    plan_path: Path, format_name: str, out: Path, prepared: Prepared | None, note: Callable[[str], None]
+    plan_path: Path, format_name: str, out: Path, context: CaseContext | None, note: Callable[[str], None]
 ) -> Exported:
     """Write a plan for a robot; with its case, after it has been checked again, and with rounded corners where free.
 
@@ -248,9 +248,9 @@ def export(
         InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
     """
     source, plan = _read_plan(plan_path, note)
-    if prepared is not None:
-        check_plan(plan, prepared, plan_path, seed=prepared.case.rehearsal.seed)
-    checker = None if prepared is None or prepared.reach is None else prepared.reach.checker
+    if context is not None:
+        check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
+    checker = None if context is None or context.reach is None else context.reach.checker
     name = export_name(plan_path, format_name)
     inputs, made_from = (source, *plan.inputs), {source.path: source.sha256}
     with writing(out, f"export {name}", inputs=inputs, names=(name,), made_from=made_from, note=note) as draft:
@@ -258,10 +258,10 @@ def export(
     return replace(done, path=draft.final((done.path,))[0], inputs=inputs)
 
 
-def check_candidate(prepared: Prepared, theta_deg: float, beta_deg: float) -> Explanation:
+def check_candidate(context: CaseContext, theta_deg: float, beta_deg: float) -> Explanation:
     """Judge one direction and explain it."""
-    found = prepared.check(np.radians(theta_deg), np.radians(beta_deg))
-    return Explanation(prepared.case, prepared.anatomy, found)
+    found = context.check(np.radians(theta_deg), np.radians(beta_deg))
+    return Explanation(context.case, context.anatomy, found)
 
 
 def registration_report(path: Path) -> dict[str, Any]:
@@ -355,7 +355,7 @@ def rehearsal_summary(rehearsal: Rehearsal) -> dict[str, Any]:
     }
 
 
-def verify_certificate(path: Path, prepared: Prepared) -> dict[str, Any]:
+def verify_certificate(path: Path, context: CaseContext) -> dict[str, Any]:
     """Prove every cell of a certificate again, by the plain checker.
 
     Raises:
@@ -364,28 +364,28 @@ def verify_certificate(path: Path, prepared: Prepared) -> dict[str, Any]:
     found = read_output(path, max_bytes=MAX_CERTIFICATE_BYTES)
     stated, certificate = found.input("certificate"), parse_certificate(found.data, path)
     if found.note:
-        prepared.watcher.note(f"warning: {found.note}")
-    done = verify(certificate, prepared.case, prepared.anatomy, partial(prepared.watcher.count, "cells"))
-    inputs = inputs_document((stated, *prepared.case.inputs))
+        context.watcher.note(f"warning: {found.note}")
+    done = verify(certificate, context.case, context.anatomy, partial(context.watcher.count, "cells"))
+    inputs = inputs_document((stated, *context.case.inputs))
     return {"certificate": str(path), "inputs": inputs, **certificate.summary(), "verified": asdict(done)}
 
 
 def _certified(run: Run, size_deg: float, out: Path) -> Run:
     """Certify the cap to a cell size, and rank again with the safe cones."""
-    prepared = run.prepared
-    with prepared.stages.time("certify"):
-        certificate = certify(prepared.case, prepared.anatomy, size=float(np.radians(size_deg)))
-    with prepared.stages.time("safe cones"):
-        found = with_safe_cone(prepared.case, run.candidates, certificate)
+    context = run.context
+    with context.stages.time("certify"):
+        certificate = certify(context.case, context.anatomy, size=float(np.radians(size_deg)))
+    with context.stages.time("safe cones"):
+        found = with_safe_cone(context.case, run.candidates, certificate)
     write_certificate(certificate, out / CERTIFICATE)
     return _with(replace(run, candidates=found, certificate=certificate), out / CERTIFICATE)
 
 
 def _planned(run: Run, out: Path) -> Run:
-    prepared = run.prepared
+    context = run.context
     try:
-        with prepared.stages.time("plan"):
-            plan, candidates = make_plan(prepared, run.candidates, seed=prepared.case.rehearsal.seed)
+        with context.stages.time("plan"):
+            plan, candidates = make_plan(context, run.candidates, seed=context.case.rehearsal.seed)
     except NoAnswerError as error:
         return replace(run, refusal=str(error))
     write_plan(plan, out / "plan.json")
@@ -394,20 +394,20 @@ def _planned(run: Run, out: Path) -> Run:
 
 def _with_table(run: Run, out: Path) -> Run:
     path = out / "candidates.parquet"
-    with run.prepared.stages.time("table"):
-        write_table(run.candidates, run.prepared.provenance(), path)
+    with run.context.stages.time("table"):
+        write_table(run.candidates, run.context.provenance(), path)
     return _with(run, path)
 
 
 def _with_pictures(run: Run, out: Path) -> Run:
     """Draw the map, the scene and the page of what is known."""
-    prepared, found = run.prepared, run.candidates
-    case, anatomy, stages = prepared.case, prepared.anatomy, prepared.stages
+    context, found = run.context, run.candidates
+    case, anatomy, stages = context.case, context.anatomy, context.stages
     with stages.time("map"):
         draw_map(found, case, out / "map.png")
     with stages.time("scene"):
         draw_scene(case, anatomy, found, run.plan, out / "scene.png")
-    registration = prepared.placement.registration if prepared.placement is not None else None
+    registration = context.placement.registration if context.placement is not None else None
     shown = None if registration is None else registration_summary(registration)
     film = next((path.name for path in run.files if path.stem == Path(FILM).stem and path.suffix != ".json"), None)
     with stages.time("page"):

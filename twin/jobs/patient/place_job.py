@@ -15,8 +15,8 @@ from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.place.document import place_document, write_place_document, write_placements
 from puncture_twin.planning.place.search import PlaceSearch, search_placements
 from puncture_twin.planning.search.candidates import ARM_CHECKED
-from puncture_twin.planning.search.context import Prepared
-from puncture_twin.planning.search.search import Reach, case_directions, organ_candidates, ranked, with_reach
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.search import ArmReach, case_directions, organ_candidates, ranked, with_reach
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.placement_picture import draw_placements
 
@@ -25,7 +25,7 @@ from puncture_twin.twin.report.map.placement_picture import draw_placements
 class PlaceRun:
     """What ``place`` has found, and the files that it wrote."""
 
-    prepared: Prepared
+    context: CaseContext
     found: PlaceSearch
     document: dict[str, Any]
     files: tuple[Path, ...]
@@ -34,11 +34,11 @@ class PlaceRun:
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm; shares 0..1."""
-        seconds = {stage: round(spent, 3) for stage, spent in self.prepared.stages.seconds.items()}
+        seconds = {stage: round(spent, 3) for stage, spent in self.context.stages.seconds.items()}
         return {**self.document, "seconds": seconds, "files": [str(path) for path in self.files]}
 
 
-def place_case(prepared: Prepared, out: Path, *, jobs: int, pictures: bool = True) -> PlaceRun:
+def place_case(context: CaseContext, out: Path, *, jobs: int, pictures: bool = True) -> PlaceRun:
     """Search; write ``placements.csv``, ``place.json`` and, if wanted, the two pictures.
 
     Raises:
@@ -51,12 +51,12 @@ def place_case(prepared: Prepared, out: Path, *, jobs: int, pictures: bool = Tru
         with writing(
             out,
             "place",
-            inputs=prepared.case.inputs,
-            seconds=prepared.stages.seconds,
+            inputs=context.case.inputs,
+            seconds=context.stages.seconds,
             names=names,
-            note=prepared.watcher.note,
+            note=context.watcher.note,
         ) as draft:
-            run = _placed(prepared, draft.folder, jobs, pictures)
+            run = _placed(context, draft.folder, jobs, pictures)
     except NoAnswerError:
         withdraw(out, "place")
         raise
@@ -65,33 +65,33 @@ def place_case(prepared: Prepared, out: Path, *, jobs: int, pictures: bool = Tru
     return replace(run, files=draft.final(run.files))
 
 
-def _placed(prepared: Prepared, out: Path, jobs: int, pictures: bool) -> PlaceRun:
+def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool) -> PlaceRun:
     """Search, and write everything into a folder."""
-    case, stages = prepared.case, prepared.stages
+    case, stages = context.case, context.stages
     with stages.time("organs"):
-        candidates = organ_candidates(case, prepared.anatomy, prepared.engine, case_directions(case))
+        candidates = organ_candidates(case, context.anatomy, context.engine, case_directions(case))
     with stages.time("placements"):
         found = search_placements(
             case,
-            prepared.anatomy,
+            context.anatomy,
             candidates,
-            prepared.placement,
+            context.placement,
             jobs=jobs,
-            progress=prepared.watcher.count,
+            progress=context.watcher.count,
         )
-    document = place_document(found, prepared.provenance() | {"arm": ARM_CHECKED})
+    document = place_document(found, context.provenance() | {"arm": ARM_CHECKED})
     write_placements(found, out / "placements.csv")
     write_place_document(document, out / "place.json")
     files = [out / "placements.csv", out / "place.json"]
     if pictures:
         with stages.time("pictures"):
-            draw_placements(found, case, prepared.anatomy.skin.mesh, out / "placements.png")
+            draw_placements(found, case, context.anatomy.skin.mesh, out / "placements.png")
             files.append(out / "placements.png")
     if pictures and any(one.verdict.held for one in found.judged):
         T_base_ct = mount_pose(found.judged[0].mount, case.space, case.path)
         with stages.time("map"):
-            reach = Reach(case_checker(case, prepared.anatomy, T_base_ct), np.asarray(T_base_ct))
+            reach = ArmReach(case_checker(case, context.anatomy, T_base_ct), np.asarray(T_base_ct))
             held = ranked(case, with_reach(case, candidates, reach))
             draw_map(held, replace(case, name=f"{case.name}, arm at the best place"), out / "map_best_place.png")
             files.append(out / "map_best_place.png")
-    return PlaceRun(prepared, found, document, tuple(files), int(candidates.safe.sum()))
+    return PlaceRun(context, found, document, tuple(files), int(candidates.safe.sum()))

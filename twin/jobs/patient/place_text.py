@@ -12,7 +12,7 @@ HALF_A_DIGIT = 5e-4
 
 def place_text(run: PlaceRun) -> str:
     """The ranked placements, the case's own, the lines to paste, and the files."""
-    case, found = run.prepared.case, run.found
+    case, found = run.context.case, run.found
     asked = found.judged[0].verdict.asked if found.judged else 0
     x, y, z = (direction_words(found.T_ct_bed[:3, axis], str(case.space)) for axis in range(3))
     lines = [
@@ -30,7 +30,7 @@ def place_text(run: PlaceRun) -> str:
         lines += ["the best, for the case (in place of its [registration] or [robot.mount]):", ""]
         lines += [f"  {line}" for line in str(best).splitlines()]
         lines += ["", "a proposal: where the arm then really stands, markers must say ([registration])"]
-    seconds = ", ".join(f"{stage} {spent:.1f}" for stage, spent in run.prepared.stages.seconds.items())
+    seconds = ", ".join(f"{stage} {spent:.1f}" for stage, spent in run.context.stages.seconds.items())
     return "\n".join([*lines, f"seconds: {seconds}", "look at:", *(f"  {path}" for path in run.files)])
 
 
@@ -43,7 +43,7 @@ def needle_line(possible: float) -> list[str]:
 
 
 def _line(rank: str, one: Judged, run: PlaceRun) -> str:
-    verdict, space = one.verdict, str(run.prepared.case.space)
+    verdict, space = one.verdict, str(run.context.case.space)
     where = "     -       -       -" if one.site is None else "{:6.0f}  {:6.0f}  {:6.0f}".format(*one.site.position)
     name = one.name if one.site is None else mount_words(one.site.region, run.found.T_ct_bed, space)
     home = f"; home: {verdict.home_contact}" if verdict.home_contact else ""

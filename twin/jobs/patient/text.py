@@ -28,10 +28,10 @@ def rehearsal_text(run: Run) -> str:
 
 def _search(run: Run) -> list[str]:
     found = run.candidates
-    lines = [f"case {run.prepared.case.name}: {len(found)} direction{'s' if len(found) != 1 else ''}"]
+    lines = [f"case {run.context.case.name}: {len(found)} direction{'s' if len(found) != 1 else ''}"]
     counts = ((found.safe_text if reason == "safe" else reason, count) for reason, count in found.counts().items())
     lines += [f"  {count:7d}  {reason}" for reason, count in counts]
-    lines += needle_warnings(run.prepared.case, found)
+    lines += needle_warnings(run.context.case, found)
     lines += [] if found.arm_checked else [f"arm {found.arm}"]
     return lines + (_best(run) if found.safe.any() else _nothing_safe(run))
 
@@ -50,7 +50,7 @@ def _plan(run: Run) -> list[str]:
 def _rehearsal(run: Run) -> list[str]:
     assert run.rehearsal is not None
     done = rehearsal_summary(run.rehearsal)
-    kept = {s.name: done["least_clearance_mm"][s.name] for s in run.prepared.anatomy.structures if s.demands_margin}
+    kept = {s.name: done["least_clearance_mm"][s.name] for s in run.context.anatomy.structures if s.demands_margin}
     nearest = min(kept.items(), key=lambda item: item[1], default=("nothing", float("nan")))
     return [
         f"rehearsal (seed {done['seed']}): the tip ended {done['tip_error_mm']:.2f} mm from the true target",
@@ -154,7 +154,7 @@ def _nothing_safe(run: Run) -> list[str]:
 
 
 def _footer(run: Run) -> list[str]:
-    lines = [f"warning: {warning}" for warning in run.prepared.anatomy.warnings]
+    lines = [f"warning: {warning}" for warning in run.context.anatomy.warnings]
     if run.certificate is not None:
         lines += certificate_lines(run.certificate.summary())
     if run.checked is not None:
@@ -163,5 +163,5 @@ def _footer(run: Run) -> list[str]:
             f"cross-check: FCL measured {checked.directions} directions again; {checked.pairs} distances agree,"
             f" largest difference {checked.largest_mm:.1e} mm"
         )
-    stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in run.prepared.stages.seconds.items())
+    stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in run.context.stages.seconds.items())
     return [*lines, f"seconds: {stages}", "look at:", *(f"  {path}" for path in run.files)]

@@ -64,7 +64,7 @@ class Receiver(Protocol):
         ...
 
 
-class JointState(NamedTuple):
+class RecordedState(NamedTuple):
     """The joints at one time."""
 
     time_s: float
@@ -118,7 +118,7 @@ class Mirror:
             raise InputError("the case does not say where the robot stands", where=case.path, allowed=allowed)
         return cls(ur_model(case.robot.model), checked.placement.T_base_ct, case.needle.length_mm, case.target_ct)
 
-    def show(self, state: JointState) -> Mirrored:
+    def show(self, state: RecordedState) -> Mirrored:
         """One joint state."""
         T = np.linalg.inv(self.T_base_ct) @ flange_pose(self.model, state.q)
         forward = T[:3, 2]
@@ -127,7 +127,7 @@ class Mirror:
         off = np.linalg.norm(way - (way @ forward) * forward)
         return Mirrored(state.time_s, state.q, T, tip, float(np.linalg.norm(way)), float(off))
 
-    def follow(self, states: Iterable[JointState]) -> Iterator[Mirrored]:
+    def follow(self, states: Iterable[RecordedState]) -> Iterator[Mirrored]:
         """One after the other."""
         return map(self.show, states)
 
@@ -158,7 +158,7 @@ def _check_host(host: str) -> None:
         raise InputError(what, where=f"mirror {host}", allowed=f"a name or address of 1 to {MAX_HOST} characters")
 
 
-def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -> Iterator[JointState]:
+def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -> Iterator[RecordedState]:
     """What a receiver reads, every so often; nothing twice. Time and angles may be one package (8 ms) apart.
 
     Args:
@@ -206,7 +206,7 @@ class RecordedJoints:
         """As an input of what is shown."""
         return content_input("recording", self.path.name, self.data)
 
-    def states(self) -> Iterator[JointState]:
+    def states(self) -> Iterator[RecordedState]:
         """One row after the other.
 
         Raises:
@@ -224,7 +224,7 @@ class RecordedJoints:
         return unfinished_warnings(self.data, self.path.name)
 
 
-def _states(table: csv.DictReader[str], path: Path) -> Iterator[JointState]:
+def _states(table: csv.DictReader[str], path: Path) -> Iterator[RecordedState]:
     wanted = ("time_s", *JOINT_COLUMNS)
     missing = [name for name in wanted if name not in (table.fieldnames or ())]
     if missing:
@@ -237,7 +237,7 @@ def _states(table: csv.DictReader[str], path: Path) -> Iterator[JointState]:
         yield checked(t, q, f"{path}: row {number}")
 
 
-def checked(time_s: float, q: list[float], where: str) -> JointState:
+def checked(time_s: float, q: list[float], where: str) -> RecordedState:
     """Joint angles that are six finite numbers.
 
     Raises:
@@ -246,7 +246,7 @@ def checked(time_s: float, q: list[float], where: str) -> JointState:
     angles = np.asarray(q, dtype=np.float64)
     if angles.shape != (6,) or not np.isfinite(angles).all() or not np.isfinite(time_s):
         raise InputError(f"joint angles {q} at {time_s} s", where=where, allowed="a time and six finite angles, rad")
-    return JointState(float(time_s), angles)
+    return RecordedState(float(time_s), angles)
 
 
 def mirror_text(shown: Mirrored) -> str:

@@ -16,12 +16,12 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, Shot
+from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, ProbeShot
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedlePose
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleInImage
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, puncture_picture
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.trial import Trial
+from puncture_twin.twin.guidance.ultrasound.trial import SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import head_pose, needle_tool, phantom_mesh, probe_tool, table_box
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.annotate import width_of, write
@@ -58,11 +58,11 @@ class Panel(NamedTuple):
     title: str
     words: str
     found: Detection | None
-    true: NeedlePose
+    true: NeedleInImage
     target: Floats | None = None
 
 
-def detection_sheet(case: SelfcalCase, trial: Trial, path: Path) -> Path:
+def detection_sheet(case: SelfcalCase, trial: SelfcalTrial, path: Path) -> Path:
     """Six pictures: three detections from best to worst, what was set aside or missed, and two punctures."""
     rng = np.random.default_rng([trial.seed, 1])
     panels = [*_recorded_panels(trial), *_puncture_panels(case, trial, rng)]
@@ -82,7 +82,7 @@ def detection_sheet(case: SelfcalCase, trial: Trial, path: Path) -> Path:
     return path
 
 
-def _recorded_panels(trial: Trial) -> list[Panel]:
+def _recorded_panels(trial: SelfcalTrial) -> list[Panel]:
     taken = trial.acquisition
     errors = np.linalg.norm(taken.detection_errors()[:, :2], axis=1)
     order = np.argsort(errors)
@@ -95,14 +95,14 @@ def _recorded_panels(trial: Trial) -> list[Panel]:
 
 
 def _shot_panel(taken: Acquisition, index: int, title: str) -> Panel:
-    shot: Shot = taken.shots[index]
+    shot: ProbeShot = taken.shots[index]
     assert isinstance(shot.found, Detection)  # only those are kept as shots
     steep = np.degrees(np.arcsin(abs(shot.true_needle.direction_image[1])))
     words = f"insertion {steep:.0f}°, off the plane {shot.true_needle.tip_image[2]:+.2f} mm"
     return Panel(shot.picture, title, words.replace("-", "−"), shot.found, shot.true_needle)
 
 
-def _puncture_panels(case: SelfcalCase, trial: Trial, rng: np.random.Generator) -> list[Panel]:
+def _puncture_panels(case: SelfcalCase, trial: SelfcalTrial, rng: np.random.Generator) -> list[Panel]:
     def panel(one: Puncture) -> Panel:
         title = f"puncture: {one.error_mm:.2f} mm from the target"
         words = f"lateral {one.lateral_mm:.2f} mm, depth {one.depth_mm:+.2f} mm".replace("-", "−")

@@ -29,7 +29,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import (
     write_recording,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.slips import checked_calibration
-from puncture_twin.twin.guidance.ultrasound.candidate_poses import Candidates, drawing, find_candidates
+from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, drawing, find_candidates
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, held_out_errors_mm, punctures
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_room
@@ -39,7 +39,7 @@ from puncture_twin.twin.guidance.ultrasound.summaries import (
     puncture_summary,
     trial_summary,
 )
-from puncture_twin.twin.guidance.ultrasound.trial import Choice, Trial
+from puncture_twin.twin.guidance.ultrasound.trial import Choice, SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 
 VERSION = 2
@@ -77,9 +77,9 @@ class SelfcalRun:
     calibration: Calibration
     recording: Recording
     inputs: tuple[Input, ...]
-    trials: tuple[Trial, ...] = ()
+    trials: tuple[SelfcalTrial, ...] = ()
     case: SelfcalCase | None = None
-    candidates: Candidates | None = None
+    candidates: CandidatePoses | None = None
     choice: Choice | None = None
     stages: Stages = field(default_factory=Stages)
     files: tuple[Path, ...] = ()
@@ -168,8 +168,8 @@ def calibrate_case(recording: Recording, case: SelfcalCase | None) -> Calibratio
 
 
 def _trial(
-    case: SelfcalCase, room: TwoArms, candidates: Candidates, seed: int, stages: Stages, watcher: Watcher
-) -> Trial:
+    case: SelfcalCase, room: TwoArms, candidates: CandidatePoses, seed: int, stages: Stages, watcher: Watcher
+) -> SelfcalTrial:
     rng = np.random.default_rng(seed)
     truth = draw_room(case, rng)
     with stages.time("recording"):
@@ -182,10 +182,10 @@ def _trial(
     with stages.time("puncture"):
         held_out = held_out_errors_mm(candidates, others[:HELD_OUT], truth, calibration, rng)
         reached = punctures(case, room, candidates, others[:TARGETS], truth, calibration, rng)
-    return Trial(seed, truth, taken, calibration, held_out, reached)
+    return SelfcalTrial(seed, truth, taken, calibration, held_out, reached)
 
 
-def compare_choice(case: SelfcalCase, candidates: Candidates, taken: Acquisition) -> Choice:
+def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisition) -> Choice:
     """The expected error of the poses that were recorded, and of random choices of as many."""
     noise, belief, poses = choice_noise(case), drawing(case), candidates.poses
     rng = np.random.default_rng(case.content.seed)

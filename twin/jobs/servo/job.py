@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from puncture_twin.planning.base.output.output_set import writing
-from puncture_twin.twin.guidance.stereo.experiment import Statistics, Trial
+from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, Statistics
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.session import Session
 from puncture_twin.twin.jobs.servo import liu2007, text as servo_words
-from puncture_twin.twin.jobs.servo.liu2007 import Reproduction, held_sessions
+from puncture_twin.twin.jobs.servo.liu2007 import Liu2007Tables, held_sessions
 from puncture_twin.twin.jobs.servo.page import write_servo_page
 from puncture_twin.twin.jobs.servo.pictures import draw_cameras, draw_convergence
 
@@ -73,10 +73,10 @@ def reproduce_paper(out_dir: Path, seeds: int | None) -> ServoJob:
 def _files(
     case: ServoCase,
     first: Session,
-    trials: tuple[Trial, ...],
+    trials: tuple[ServoTrial, ...],
     ours: Statistics,
     out_dir: Path,
-    paper: Reproduction | None = None,
+    paper: Liu2007Tables | None = None,
 ) -> list[Path]:
     """Write everything; returns the paths."""
     pictures = draw_cameras(first, out_dir)

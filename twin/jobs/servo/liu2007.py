@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.meshes import folder
-from puncture_twin.twin.guidance.stereo.experiment import Statistics, Trial, run_trials, statistics, trial
+from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, Statistics, run_trials, statistics, trial
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.session import Session, run_session
 
@@ -73,7 +73,7 @@ class PaperMean(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Reproduction:
+class Liu2007Tables:
     """The paper's numbers, and ours.
 
     Attributes:
@@ -87,7 +87,7 @@ class Reproduction:
     case: ServoCase
     columns: tuple[PaperMean, ...]
     first: Session
-    trials: tuple[Trial, ...]
+    trials: tuple[ServoTrial, ...]
     ours: Statistics
 
     @property
@@ -120,7 +120,7 @@ def paper_case() -> ServoCase:
     return load_servo_case(folder() / "head" / CASE)
 
 
-def reproduce(seeds: int | None = None, done: Callable[[int, int], None] | None = None) -> Reproduction:
+def reproduce(seeds: int | None = None, done: Callable[[int, int], None] | None = None) -> Liu2007Tables:
     """Hold the paper's sessions in the twin.
 
     Args:
@@ -130,13 +130,13 @@ def reproduce(seeds: int | None = None, done: Callable[[int, int], None] | None 
     return held_sessions(paper_case(), seeds or DEFAULT_SEEDS, done)
 
 
-def held_sessions(case: ServoCase, seeds: int, done: Callable[[int, int], None] | None = None) -> Reproduction:
+def held_sessions(case: ServoCase, seeds: int, done: Callable[[int, int], None] | None = None) -> Liu2007Tables:
     """The sessions of a case beside the paper's numbers."""
     first = run_session(case, case.file.seed)
     tell = done or (lambda at, of: None)
     tell(1, seeds)
-    others: Sequence[Trial] = run_trials(
+    others: Sequence[ServoTrial] = run_trials(
         case, range(case.file.seed + 1, case.file.seed + seeds), done=lambda at, of: tell(at + 1, seeds)
     )
     trials = (trial(first), *others)
-    return Reproduction(case, paper_columns(), first, trials, statistics(trials))
+    return Liu2007Tables(case, paper_columns(), first, trials, statistics(trials))

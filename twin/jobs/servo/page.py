@@ -8,7 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from puncture_twin.planning.base.files import atomic
-from puncture_twin.twin.guidance.stereo.experiment import Row, Statistics, Trial
+from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, Statistics, TargetRow
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.jobs.servo.liu2007 import TABLE_2, PaperMean, paper_servo_only_at_least
 from puncture_twin.twin.report.numbers import number, percent
@@ -20,7 +20,7 @@ ROW_HEAD = ("target", "mapping", "expected", "before", "after", "servo-only", "c
 
 def write_servo_page(
     case: ServoCase,
-    trials: Sequence[Trial],
+    trials: Sequence[ServoTrial],
     ours: Statistics,
     pictures: Sequence[Path],
     convergence: Path,
@@ -85,7 +85,7 @@ def _cards(case: ServoCase, ours: Statistics) -> str:
     )
 
 
-def _cells(row: Row) -> tuple[str, ...]:
+def _cells(row: TargetRow) -> tuple[str, ...]:
     lengths = (row.mapping_mm, row.expected_tre_mm, row.before_mm, row.after_mm)
     return (
         escape(row.target),
@@ -120,7 +120,7 @@ def _statistics(ours: Statistics) -> str:
     )
 
 
-def _calibration(case: ServoCase, first: Trial) -> str:
+def _calibration(case: ServoCase, first: ServoTrial) -> str:
     residuals = " and ".join(number(px, 3) for px in first.rms_px)
     cal = case.file.calibration
     return pairs(
@@ -134,7 +134,7 @@ def _calibration(case: ServoCase, first: Trial) -> str:
     )
 
 
-def _paper(paper: Sequence[PaperMean], ours: Statistics, trials: Sequence[Trial]) -> str:
+def _paper(paper: Sequence[PaperMean], ours: Statistics, trials: Sequence[ServoTrial]) -> str:
     """The paper's tables beside ours."""
     rows = [row for one in trials for row in one.rows]
     most = {

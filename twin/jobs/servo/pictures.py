@@ -17,7 +17,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.twin.guidance.stereo.ball.ball_image import render
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
-from puncture_twin.twin.guidance.stereo.detection import Placed, ball_scene
+from puncture_twin.twin.guidance.stereo.detection import LocatedPair, ball_scene
 from puncture_twin.twin.guidance.stereo.session import Reached, Session
 from puncture_twin.twin.report.annotate import INK, write
 from puncture_twin.twin.report.palette import Rgb
@@ -120,7 +120,7 @@ def _inset(picture: Image.Image, session: Session, reached: Reached, number: int
     camera, believed = room.cameras[number], session.calibration.cameras[number]
     seen, plan = reached.servoed.visits[-1].seen.ball_c, room.case.file.cameras
     q_true, rng = reached.servoed.q_true, np.random.default_rng(session.seed)
-    ball = Placed(room.ball_c(q_true), tool.ball_diameter_mm / 2, room.rod_c(q_true))
+    ball = LocatedPair(room.ball_c(q_true), tool.ball_diameter_mm / 2, room.rod_c(q_true))
     half = round(INSET_HALF_PX * camera.width / WIDTH_PX)
     grey = render(
         camera, ball_scene(plan, ball, 0.0, rng), rng=rng, noise=plan.noise_grey, blur_px=plan.blur_px, half_px=half

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.base.provenance import inputs_document
-from puncture_twin.twin.guidance.stereo.experiment import Row, Statistics, Trial
+from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, Statistics, TargetRow
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
-from puncture_twin.twin.jobs.servo.liu2007 import TABLE_1, TABLE_2, Reproduction, paper_servo_only_at_least
+from puncture_twin.twin.jobs.servo.liu2007 import TABLE_1, TABLE_2, Liu2007Tables, paper_servo_only_at_least
 
 HEAD = "target  mapping  expected  before   after  servo-only  steps  stop"
 
 
-def servo_text(case: ServoCase, trials: Sequence[Trial], ours: Statistics | None, files: Sequence[str]) -> str:
+def servo_text(case: ServoCase, trials: Sequence[ServoTrial], ours: Statistics | None, files: Sequence[str]) -> str:
     """A case's sessions: the first in full, all together."""
     first = trials[0]
     lines = [f"case {case.name}, seed {first.seed}, errors in mm"]
@@ -29,7 +29,7 @@ def servo_text(case: ServoCase, trials: Sequence[Trial], ours: Statistics | None
     return "\n".join([*lines, *(f"  {name}" for name in files)])
 
 
-def _session_lines(first: Trial) -> list[str]:
+def _session_lines(first: ServoTrial) -> list[str]:
     stereo = np.array(first.stereo_mm)
     return [
         f"  calibration: residual {' and '.join(f'{px:.3f}' for px in first.rms_px)} px (rms), "
@@ -41,7 +41,7 @@ def _session_lines(first: Trial) -> list[str]:
     ]
 
 
-def _row_line(row: Row) -> str:
+def _row_line(row: TargetRow) -> str:
     return (
         f"{row.target:6s} {row.mapping_mm:8.2f} {row.expected_tre_mm:9.2f} {row.before_mm:7.2f} {row.after_mm:7.2f} "
         f"{row.servo_only_mm:11.3f} {row.steps:6d}  {row.stop.replace('_', ' ')}"
@@ -61,7 +61,7 @@ def statistics_lines(ours: Statistics) -> list[str]:
     ]
 
 
-def servo_summary(case: ServoCase, trials: Sequence[Trial], ours: Statistics | None) -> dict[str, Any]:
+def servo_summary(case: ServoCase, trials: Sequence[ServoTrial], ours: Statistics | None) -> dict[str, Any]:
     """The same as plain values."""
     stops = Counter(row.stop for one in trials for row in one.rows)
     return {
@@ -75,7 +75,7 @@ def servo_summary(case: ServoCase, trials: Sequence[Trial], ours: Statistics | N
     }
 
 
-def _trial_summary(one: Trial) -> dict[str, Any]:
+def _trial_summary(one: ServoTrial) -> dict[str, Any]:
     held = not one.refused
     return {
         "seed": one.seed,
@@ -88,7 +88,7 @@ def _trial_summary(one: Trial) -> dict[str, Any]:
     }
 
 
-def reproduction_text(result: Reproduction, files: Sequence[str]) -> str:
+def reproduction_text(result: Liu2007Tables, files: Sequence[str]) -> str:
     """The paper's tables beside ours."""
     first, ours = result.trials[0], result.ours
     lines = ["Table 1, stereo, mm (the paper's points are not ours: compare mean and maximum)"]
@@ -129,7 +129,7 @@ def reproduction_text(result: Reproduction, files: Sequence[str]) -> str:
     return "\n".join([*lines, *(f"  {name}" for name in files)])
 
 
-def reproduction_summary(result: Reproduction) -> dict[str, Any]:
+def reproduction_summary(result: Liu2007Tables) -> dict[str, Any]:
     """The same as plain values."""
     return {
         "holds": result.holds,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.twin.report.map_view import Cells, MapView
+from puncture_twin.twin.report.map_view import MapCells, MapView
 from puncture_twin.twin.report.palette import REASON_COLOURS, reason_of, safe_shades
 
 OVERSAMPLING = 2
@@ -62,7 +62,7 @@ def map_raster(candidates: Candidates, view: MapView, size: int) -> MapRaster:
         view: The map's geometry.
         size: Pixels per side.
     """
-    cells = Cells.of(candidates)
+    cells = MapCells.of(candidates)
     rows = cells.picture(view, size)
     table = np.zeros((len(candidates) + 1, 4), dtype=np.uint8)
     table[:-1, :3] = row_colours(candidates)

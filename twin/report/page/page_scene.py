@@ -18,7 +18,7 @@ from puncture_twin.twin.report.raster.render import Layer
 from puncture_twin.twin.report.scene.lighter_mesh import lighter_mesh
 from puncture_twin.twin.report.scene.scene_parts import (
     ArmPicture,
-    Body,
+    SceneBody,
     chosen_direction,
     needle_bodies,
     patient,
@@ -70,14 +70,16 @@ def scene_figure(
     return {"data": [*traces, _probe()], "layout": _layout(case, bodies)}
 
 
-def lightened(bodies: Sequence[Body], triangles: int, cache: Cache = NO_CACHE) -> list[Body]:
+def lightened(bodies: Sequence[SceneBody], triangles: int, cache: Cache = NO_CACHE) -> list[SceneBody]:
     """The bodies with about so many triangles altogether, each cut by the same share."""
     share = min(1.0, triangles / max(1, sum(len(b.mesh.faces) for b in bodies)))
     wanted = [max(LEAST_TRIANGLES, int(share * len(body.mesh.faces))) for body in bodies]
     return [replace(body, mesh=lighter_mesh(body.mesh, most, cache)) for body, most in zip(bodies, wanted, strict=True)]
 
 
-def _bodies(case: Any, anatomy: Any, candidates: Candidates, plan: Any | None) -> tuple[list[Body], list[Body]]:
+def _bodies(
+    case: Any, anatomy: Any, candidates: Candidates, plan: Any | None
+) -> tuple[list[SceneBody], list[SceneBody]]:
     """What is shown at first (the needle on the target), and what the standoff pose adds."""
     T_base_ct = None if plan is None else plan.T_base_ct
     bodies = [*patient(anatomy, case), *room(case, T_base_ct), *safe_region(candidates, case)]
@@ -90,15 +92,15 @@ def _bodies(case: Any, anatomy: Any, candidates: Candidates, plan: Any | None) -
     bodies += arm.bodies(plan.insertion.q[-1])
     tip = case.target_ct + plan.standoff_mm * direction
     waiting = [*arm.bodies(plan.insertion.q[0]), *needle_bodies(case.needle, tip, direction).all]
-    return bodies, [Body(f"{b.name}, standoff", f"{b.group}-standoff", b.mesh, b.colour) for b in waiting]
+    return bodies, [SceneBody(f"{b.name}, standoff", f"{b.group}-standoff", b.mesh, b.colour) for b in waiting]
 
 
-def _legend_name(body: Body) -> str:
+def _legend_name(body: SceneBody) -> str:
     base = body.group.removesuffix("-standoff")
     return GROUP_NAMES.get(base, body.name).replace("_", " ")
 
 
-def _trace(body: Body, *, hidden: bool, in_legend: bool) -> dict[str, Any]:
+def _trace(body: SceneBody, *, hidden: bool, in_legend: bool) -> dict[str, Any]:
     base, group = body.group.removesuffix("-standoff"), _legend_name(body)
     moving = base in {"arm", "needle"}
     return {
@@ -155,7 +157,7 @@ def _probe() -> dict[str, Any]:
     }
 
 
-def _layout(case: Any, bodies: Sequence[Body]) -> dict[str, Any]:
+def _layout(case: Any, bodies: Sequence[SceneBody]) -> dict[str, Any]:
     axis = {"visible": False, "showspikes": False}
     content = np.concatenate([b.mesh.vertices for b in bodies if b.group != "room"])
     blockers = Layer([b.surface for b in bodies if b.group in {"arm", "room", "target"}])

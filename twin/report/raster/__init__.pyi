@@ -1,9 +1,9 @@
-from .camera import Camera as Camera, camera_around as camera_around
+from .camera import ViewCamera as ViewCamera, camera_around as camera_around
 from .compositing import (
     NOWHERE as NOWHERE,
     SAMPLES as SAMPLES,
     PixelBox as PixelBox,
-    Shot as Shot,
+    RasterShot as RasterShot,
     Veil as Veil,
     compose as compose,
 )

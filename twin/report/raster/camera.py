@@ -12,7 +12,7 @@ from puncture_twin.planning.base.arrays import Floats
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class ViewCamera:
     """Where one looks from, in the CT frame.
 
     Attributes:
@@ -45,7 +45,7 @@ class Camera:
         """Pixels per unit of the tangent: px = width / 2 + scale x / z."""
         return float(self.height / 2 / np.tan(self.fov / 2))
 
-    def finer(self, factor: int) -> Camera:
+    def finer(self, factor: int) -> ViewCamera:
         """The same view with more pixels."""
         return replace(self, width=self.width * factor, height=self.height * factor)
 
@@ -70,7 +70,7 @@ class Camera:
 
 def camera_around(
     points_ct: Floats, toward: Floats, up: Floats, *, fov: float, width: int, height: int, spare: float = 1.05
-) -> Camera:
+) -> ViewCamera:
     """A camera that looks along ``toward`` and has every point in the picture.
 
     Args:
@@ -85,7 +85,7 @@ def camera_around(
     points = np.asarray(points_ct, dtype=float)
     toward = np.asarray(toward, dtype=float) / np.linalg.norm(toward)
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
-    axes = Camera(centre - toward, centre, up, fov, width, height).axes
+    axes = ViewCamera(centre - toward, centre, up, fov, width, height).axes
     for _ in range(3):  # centring shifts the perspective a little; three rounds leave less than a pixel
         local = (points - centre) @ axes.T
         slope = np.tan(fov / 2) / spare * np.array([width / height, 1.0])
@@ -93,4 +93,4 @@ def camera_around(
         seen = local[:, :2] / (local[:, 2:] + distance)
         middle = (seen.min(axis=0) + seen.max(axis=0)) / 2 * distance
         centre = centre + middle @ axes[:2]
-    return Camera(centre - distance * toward, centre, np.asarray(up, dtype=float), fov, width, height)
+    return ViewCamera(centre - distance * toward, centre, np.asarray(up, dtype=float), fov, width, height)

@@ -18,7 +18,7 @@ SAMPLES = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class RasterShot:
     """What a camera saw of opaque things, in the sample grid.
 
     Attributes:
@@ -76,7 +76,7 @@ class PixelBox(NamedTuple):
 NOWHERE = PixelBox(0, 0, 0, 0)
 
 
-def compose(shot: Shot, veils: Sequence[Veil], box: PixelBox | None = None) -> NDArray[np.uint8]:
+def compose(shot: RasterShot, veils: Sequence[Veil], box: PixelBox | None = None) -> NDArray[np.uint8]:
     """Blend the veils over the opaque shot and average the samples to pixels, shape (h, w, 3).
 
     The "over" operator of Porter and Duff, Compositing Digital Images (SIGGRAPH 1984), from back to front.

@@ -19,8 +19,16 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats, Ints32
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.report.palette import Rgb
-from puncture_twin.twin.report.raster.camera import Camera
-from puncture_twin.twin.report.raster.compositing import NOWHERE, SAMPLES, PixelBox, Shot, Veil, compose, empty_veil
+from puncture_twin.twin.report.raster.camera import ViewCamera
+from puncture_twin.twin.report.raster.compositing import (
+    NOWHERE,
+    SAMPLES,
+    PixelBox,
+    RasterShot,
+    Veil,
+    compose,
+    empty_veil,
+)
 from puncture_twin.twin.report.raster.line_of_sight import blocked
 from puncture_twin.twin.report.raster.raster import depth_before, draw, outlines, sorted_by_band
 from puncture_twin.twin.report.raster.shading import corner_normals, flat_normals, shade_nearest, shade_shells, turned
@@ -96,7 +104,7 @@ class _View:
         T_ct_layer: The layer's pose, shape (4, 4), mm; the CT frame itself when None.
     """
 
-    def __init__(self, layer: Layer, camera: Camera, T_ct_layer: Floats | None = None) -> None:
+    def __init__(self, layer: Layer, camera: ViewCamera, T_ct_layer: Floats | None = None) -> None:
         turn, eye = camera.axes, np.asarray(camera.eye, dtype=float)
         if T_ct_layer is not None:
             turn, eye = camera.axes @ T_ct_layer[:3, :3], (eye - T_ct_layer[:3, 3]) @ T_ct_layer[:3, :3]
@@ -113,7 +121,7 @@ class _View:
         """The rows of ``spans`` that a band of the picture needs."""
         return np.asarray(self._in_bands[self._starts[band] : self._starts[band + 1]])
 
-    def put_opaque(self, shot: Shot, corner: tuple[int, int], spans: Ints32) -> None:
+    def put_opaque(self, shot: RasterShot, corner: tuple[int, int], spans: Ints32) -> None:
         """Draw what is opaque into a picture, where it is nearer than what is there; in place.
 
         Args:
@@ -150,18 +158,18 @@ class _View:
         return inverse, triangle
 
 
-def opaque_shot(layer: Layer, camera: Camera) -> Shot:
+def opaque_shot(layer: Layer, camera: ViewCamera) -> RasterShot:
     """Everything opaque of one layer in the CT frame, at the camera's own resolution."""
     view, shot = _View(layer, camera), _background(camera.height, camera.width)
 
     def draw_band(band: int, rows: slice) -> None:
-        view.put_opaque(Shot(shot.colour[rows], shot.depth[rows]), (rows.start, 0), view.of_band(band))
+        view.put_opaque(RasterShot(shot.colour[rows], shot.depth[rows]), (rows.start, 0), view.of_band(band))
 
     _in_bands(camera, draw_band)
     return shot
 
 
-def veils_of(layer: Layer, camera: Camera, behind: Shot | None = None) -> tuple[Veil, ...]:
+def veils_of(layer: Layer, camera: ViewCamera, behind: RasterShot | None = None) -> tuple[Veil, ...]:
     """The shells of a see-through layer: the nearest hit of every sample first, then the one behind it, and so on.
 
     Args:
@@ -180,7 +188,7 @@ def veils_of(layer: Layer, camera: Camera, behind: Shot | None = None) -> tuple[
     return tuple(veil for veil in veils if np.isfinite(veil.depth).any())
 
 
-def picture(opaque: Layer, veils: Layer, camera: Camera) -> NDArray[np.uint8]:
+def picture(opaque: Layer, veils: Layer, camera: ViewCamera) -> NDArray[np.uint8]:
     """A scene in the CT frame in pixels, shape (h, w, 3): what is opaque, and what is see-through over it.
 
     Args:
@@ -199,7 +207,7 @@ def picture(opaque: Layer, veils: Layer, camera: Camera) -> NDArray[np.uint8]:
     return np.concatenate(_in_bands(fine, draw_band))
 
 
-def put_moving(shot: Shot, layer: Layer, T_ct_layer: Floats, camera: Camera) -> PixelBox:
+def put_moving(shot: RasterShot, layer: Layer, T_ct_layer: Floats, camera: ViewCamera) -> PixelBox:
     """Draw one more rigid body into a shot, in place, where it is nearer than what is there.
 
     Args:
@@ -217,27 +225,27 @@ def put_moving(shot: Shot, layer: Layer, T_ct_layer: Floats, camera: Camera) -> 
     first, last, begin, end = view.spans[:, 1:].T
     top, left = (int(low.min()) // SAMPLES * SAMPLES for low in (first, begin))
     box = PixelBox(left, top, int(end.max()) + 1, int(last.max()) + 1)
-    view.put_opaque(Shot(shot.colour[box.slices], shot.depth[box.slices]), (top, left), view.spans)
+    view.put_opaque(RasterShot(shot.colour[box.slices], shot.depth[box.slices]), (top, left), view.spans)
     return box
 
 
-def _background(height: int, width: int) -> Shot:
+def _background(height: int, width: int) -> RasterShot:
     colour = np.empty((height, width, 3), dtype=np.float32)
     colour[:] = BACKGROUND
-    return Shot(colour, np.full((height, width), np.inf, dtype=np.float32))
+    return RasterShot(colour, np.full((height, width), np.inf, dtype=np.float32))
 
 
-def _band_rows(camera: Camera) -> int:
+def _band_rows(camera: ViewCamera) -> int:
     return max(1, BAND // (camera.width * SAMPLES)) * SAMPLES
 
 
-def _bands(camera: Camera) -> list[slice]:
+def _bands(camera: ViewCamera) -> list[slice]:
     """The picture's rows, band by band, whole pixels of ``SAMPLES`` rows, from the top."""
     rows = _band_rows(camera)
     return [slice(top, min(top + rows, camera.height)) for top in range(0, camera.height, rows)]
 
 
-def _in_bands(camera: Camera, work: Callable[[int, slice], T]) -> list[T]:
+def _in_bands(camera: ViewCamera, work: Callable[[int, slice], T]) -> list[T]:
     """What a function makes of the number and the rows of every band; the processors share them."""
     bands = _bands(camera)
     with ThreadPoolExecutor(os.cpu_count()) as pool:

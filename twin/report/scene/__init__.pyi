@@ -1,7 +1,7 @@
 from .film import draw_film as draw_film
 from .scene_parts import (
     ArmPicture as ArmPicture,
-    Body as Body,
+    SceneBody as SceneBody,
     chosen_direction as chosen_direction,
     needle_bodies as needle_bodies,
     patient as patient,

@@ -20,11 +20,11 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.numbers import demanding
-from puncture_twin.twin.report.raster.camera import Camera
-from puncture_twin.twin.report.raster.compositing import NOWHERE, SAMPLES, PixelBox, Shot, Veil, compose
+from puncture_twin.twin.report.raster.camera import ViewCamera
+from puncture_twin.twin.report.raster.compositing import NOWHERE, SAMPLES, PixelBox, RasterShot, Veil, compose
 from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, put_moving, veils_of
 from puncture_twin.twin.report.scene.film_text import FrameWords, draw_words
-from puncture_twin.twin.report.scene.scene_parts import ArmPicture, Body, needle_bodies, patient, room
+from puncture_twin.twin.report.scene.scene_parts import ArmPicture, SceneBody, needle_bodies, patient, room
 from puncture_twin.twin.report.scene.shapes import bar
 from puncture_twin.twin.report.scene.views import close_up, overview
 
@@ -147,17 +147,17 @@ class _Stage:
         camera: The view, in pixels.
     """
 
-    def __init__(self, bodies: list[Body], camera: Camera) -> None:
+    def __init__(self, bodies: list[SceneBody], camera: ViewCamera) -> None:
         self.camera = camera
         self._fine = camera.finer(SAMPLES)
-        self._still: Shot = opaque_shot(Layer([b.surface for b in bodies if b.alpha >= 1]), self._fine)
+        self._still: RasterShot = opaque_shot(Layer([b.surface for b in bodies if b.alpha >= 1]), self._fine)
         veils = [b.surface for b in bodies if b.alpha < 1]
         self._veils: tuple[Veil, ...] = veils_of(Layer(veils), self._fine) if veils else ()
         self._picture = compose(self._still, self._veils)
 
     def picture(self, moving: list[tuple[Layer, Floats]]) -> NDArray[np.uint8]:
         """The view with bodies at their poses T_ct_body, shape (h, w, 3)."""
-        shot = Shot(self._still.colour.copy(), self._still.depth.copy())
+        shot = RasterShot(self._still.colour.copy(), self._still.depth.copy())
         changed = NOWHERE
         for layer, T_ct_layer in moving:
             changed = changed.around(put_moving(shot, layer, T_ct_layer, self._fine))
@@ -170,11 +170,11 @@ class _Stage:
         return picture
 
 
-def _planned_path(plan: Any) -> Body:
+def _planned_path(plan: Any) -> SceneBody:
     """The line that the tip should follow, from standoff to target."""
     way = (plan.entry_ct - plan.target_ct) / np.linalg.norm(plan.entry_ct - plan.target_ct)
     line = bar(plan.target_ct, plan.target_ct + plan.standoff_mm * way, PLANNED_RADIUS_MM)
-    return Body("planned path", "safe", line, PLANNED)
+    return SceneBody("planned path", "safe", line, PLANNED)
 
 
 def _tool_layer(case: Any) -> Layer:
@@ -184,7 +184,7 @@ def _tool_layer(case: Any) -> Layer:
     return Layer([Surface(b.mesh, b.colour) for b in bodies])
 
 
-def _wide_camera(case: Any, still: list[Body], arm: ArmPicture, rehearsal: Any, plan: Any) -> Camera:
+def _wide_camera(case: Any, still: list[SceneBody], arm: ArmPicture, rehearsal: Any, plan: Any) -> ViewCamera:
     poses = [rehearsal.q[0], plan.insertion.q[0], rehearsal.q[-1]]
     moving = [body for q in poses for body in arm.bodies(q)]
     content = [b.mesh.vertices for b in [*still, *moving] if b.group in {"skin", "arm"}]
@@ -195,7 +195,7 @@ def _wide_camera(case: Any, still: list[Body], arm: ArmPicture, rehearsal: Any, 
     return overview(case, np.concatenate(content), focus, blockers, (VIEW_WIDTH, VIEW_HEIGHT))
 
 
-def _near_camera(case: Any, still: list[Body], plan: Any) -> Camera:
+def _near_camera(case: Any, still: list[SceneBody], plan: Any) -> ViewCamera:
     blockers = Layer([b.surface for b in still if b.alpha >= 1 and b.group in {"organ", "target"}])
     path_ct = np.stack([plan.target_ct, plan.entry_ct])
     return close_up(case, path_ct, INSET_RADIUS_MM, blockers, (INSET, INSET))

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 
 from puncture_twin.twin.report import annotate
 from puncture_twin.twin.report.numbers import number
-from puncture_twin.twin.report.raster.camera import Camera
+from puncture_twin.twin.report.raster.camera import ViewCamera
 
 PHASES = {
     "approach": "approach to standoff",
@@ -53,7 +53,7 @@ class FrameWords:
 
 
 def draw_words(
-    frame: Image.Image, words: FrameWords, row: int, moment: float, cameras: tuple[Camera, Camera], case: Any
+    frame: Image.Image, words: FrameWords, row: int, moment: float, cameras: tuple[ViewCamera, ViewCamera], case: Any
 ) -> None:
     """Write a frame's words.
 

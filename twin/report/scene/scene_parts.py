@@ -43,7 +43,7 @@ LEAST_NEEDLE_MM = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class SceneBody:
     """One thing of the scene.
 
     Attributes:
@@ -70,27 +70,27 @@ class Body:
 class NeedleBodies:
     """Needle and holder at one place."""
 
-    needle: Body
-    holder: Body | None
+    needle: SceneBody
+    holder: SceneBody | None
 
     @property
-    def all(self) -> tuple[Body, ...]:
+    def all(self) -> tuple[SceneBody, ...]:
         """Both, or the needle alone where the shaft reaches the flange."""
         return (self.needle,) if self.holder is None else (self.needle, self.holder)
 
 
-def patient(anatomy: Any, case: Any) -> tuple[Body, ...]:
+def patient(anatomy: Any, case: Any) -> tuple[SceneBody, ...]:
     """Organs, skin and the target's mark; what holds the target, and unknown structures, are see-through."""
     structures = anatomy.structures
     colours = palette.organ_colours(tuple(s.name for s in structures))
-    bodies = [Body(s.name, "organ", s.mesh, colours[s.name], _opacity(s, case)) for s in structures]
+    bodies = [SceneBody(s.name, "organ", s.mesh, colours[s.name], _opacity(s, case)) for s in structures]
     bodies += [
-        Body(s.name, "organ", _near(s.mesh, anatomy.skin.mesh), palette.OUTSIDE, UNKNOWN_VEIL)
+        SceneBody(s.name, "organ", _near(s.mesh, anatomy.skin.mesh), palette.OUTSIDE, UNKNOWN_VEIL)
         for s in anatomy.surroundings
         if str(s.role) == "unknown"
     ]
-    bodies.append(Body("skin", "skin", anatomy.skin.mesh, palette.SKIN, SKIN_VEIL))
-    bodies.append(Body("target", "target", ball(case.target_ct, TARGET_BALL_MM), palette.TARGET_POINT))
+    bodies.append(SceneBody("skin", "skin", anatomy.skin.mesh, palette.SKIN, SKIN_VEIL))
+    bodies.append(SceneBody("target", "target", ball(case.target_ct, TARGET_BALL_MM), palette.TARGET_POINT))
     return tuple(bodies)
 
 
@@ -110,14 +110,14 @@ def _opacity(structure: Any, case: Any) -> float:
     return ORGAN_VEIL if near and abs(winding_number(structure.mesh, case.target_ct)) > 0.5 else 1.0
 
 
-def safe_region(candidates: Candidates, case: Any) -> tuple[Body, ...]:
+def safe_region(candidates: Candidates, case: Any) -> tuple[SceneBody, ...]:
     """The safe directions: where they pierce the skin, and the walls of the corridor; empty when nothing is safe."""
     mouth, walls = corridor_mouth(candidates, case), corridor_walls(candidates, case)
     bodies = []
     if mouth is not None:
-        bodies.append(Body("safe entry", "safe", mouth, palette.SAFE, MOUTH_VEIL))
+        bodies.append(SceneBody("safe entry", "safe", mouth, palette.SAFE, MOUTH_VEIL))
     if walls is not None:
-        bodies.append(Body("safe corridor", "safe", walls, palette.SAFE, WALL_VEIL))
+        bodies.append(SceneBody("safe corridor", "safe", walls, palette.SAFE, WALL_VEIL))
     return tuple(bodies)
 
 
@@ -131,11 +131,11 @@ def needle_bodies(needle: Any, tip_ct: Floats, outward_ct: Floats) -> NeedleBodi
     """
     radius = max(needle.radius_mm, LEAST_NEEDLE_MM)
     shaft, top = tip_ct + needle.shaft_mm * outward_ct, tip_ct + needle.length_mm * outward_ct
-    body = Body("needle", "needle", bar(tip_ct, shaft, radius), palette.NEEDLE)
+    body = SceneBody("needle", "needle", bar(tip_ct, shaft, radius), palette.NEEDLE)
     if needle.length_mm - needle.shaft_mm < 1e-6:
         return NeedleBodies(body, None)
     holder = bar(shaft, top, needle.holder_diameter_mm / 2)
-    return NeedleBodies(body, Body("needle holder", "needle", holder, palette.HOLDER))
+    return NeedleBodies(body, SceneBody("needle holder", "needle", holder, palette.HOLDER))
 
 
 def chosen_direction(candidates: Candidates, case: Any, plan: Any | None) -> Floats | None:
@@ -173,16 +173,16 @@ class ArmPicture:
         frames = [link.frame for link in self._links]
         return np.asarray(self._T_ct_base @ link_poses(self._model, np.asarray(q))[frames])
 
-    def bodies(self, q: Floats) -> tuple[Body, ...]:
+    def bodies(self, q: Floats) -> tuple[SceneBody, ...]:
         """The links in the CT frame at one configuration."""
         poses = self.poses_ct(q)
         return tuple(
-            Body(link.name, "arm", link.mesh.transformed(T), palette.ARM)
+            SceneBody(link.name, "arm", link.mesh.transformed(T), palette.ARM)
             for link, T in zip(self._links, poses, strict=True)
         )
 
 
-def room(case: Any, T_base_ct: Floats | None) -> tuple[Body, ...]:
+def room(case: Any, T_base_ct: Floats | None) -> tuple[SceneBody, ...]:
     """The case's gantry and obstacles (table and the like); those given in the base frame need to know where it is."""
     bodies = [] if case.gantry is None else [_gantry(case.gantry)]
     for obstacle in case.obstacles:
@@ -192,11 +192,11 @@ def room(case: Any, T_base_ct: Floats | None) -> tuple[Body, ...]:
             if T_base_ct is None:
                 continue
             T = np.linalg.inv(T_base_ct) @ T
-        bodies.append(Body(obstacle.name, "room", box(T, obstacle.size_mm), palette.TABLE))
+        bodies.append(SceneBody(obstacle.name, "room", box(T, obstacle.size_mm), palette.TABLE))
     return tuple(bodies)
 
 
-def _gantry(gantry: Any) -> Body:
+def _gantry(gantry: Any) -> SceneBody:
     radius = gantry.bore_diameter_mm / 2
     wall = ring(gantry.T_ct_gantry, radius, radius + gantry.wall_mm, gantry.thickness_mm)
-    return Body("gantry", "room", wall, palette.TABLE, GANTRY_VEIL)
+    return SceneBody("gantry", "room", wall, palette.TABLE, GANTRY_VEIL)

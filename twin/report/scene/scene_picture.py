@@ -14,11 +14,11 @@ from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report import annotate, palette
 from puncture_twin.twin.report.numbers import chosen_row, nearest_structure, number, target_words
-from puncture_twin.twin.report.raster.camera import Camera
+from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import BACKGROUND, Layer, picture
 from puncture_twin.twin.report.scene.scene_parts import (
     ArmPicture,
-    Body,
+    SceneBody,
     chosen_direction,
     needle_bodies,
     needle_words,
@@ -83,7 +83,7 @@ def draw_scene(case: Any, anatomy: Any, candidates: Candidates, plan: Any | None
         image.save(temporary, format="PNG", compress_level=palette.PNG_LEVEL)
 
 
-def render_bodies(bodies: Sequence[Body], camera: Camera) -> NDArray[np.uint8]:
+def render_bodies(bodies: Sequence[SceneBody], camera: ViewCamera) -> NDArray[np.uint8]:
     """One view of a scene, anti-aliased: the opaque bodies, and the see-through ones over them."""
     opaque = Layer([b.surface for b in bodies if b.alpha >= 1])
     return picture(opaque, Layer([b.surface for b in bodies if b.alpha < 1]), camera)
@@ -99,7 +99,7 @@ def _path(case: Any, candidates: Candidates, plan: Any | None, direction: Any) -
     return np.stack([case.target_ct, case.target_ct + candidates.path_length[row] * direction])
 
 
-def _overview_camera(case: Any, bodies: Sequence[Body], path_ct: Any) -> Camera:
+def _overview_camera(case: Any, bodies: Sequence[SceneBody], path_ct: Any) -> ViewCamera:
     size = _size(LEFT_BOX)
     points = []
     for body in bodies:
@@ -119,7 +119,7 @@ def _needle_line(case: Any, path_ct: NDArray[np.float64]) -> NDArray[np.float64]
     return np.asarray(path_ct[0] + np.linspace(0, case.needle.length_mm, 24)[:, None] * way)
 
 
-def _close_camera(case: Any, bodies: Sequence[Body], path_ct: Any) -> Camera:
+def _close_camera(case: Any, bodies: Sequence[SceneBody], path_ct: Any) -> ViewCamera:
     radius = CLOSE_RADIUS_MM
     if path_ct is None:
         z = np.asarray(case.T_ct_entry)[:3, 2]
@@ -135,8 +135,8 @@ def _size(box: tuple[int, int, int, int]) -> tuple[int, int]:
 def _view(
     image: Image.Image,
     draw: ImageDraw.ImageDraw,
-    bodies: Sequence[Body],
-    camera: Camera,
+    bodies: Sequence[SceneBody],
+    camera: ViewCamera,
     box: tuple[int, int, int, int],
     case: Any,
     title: str,
@@ -170,7 +170,7 @@ def _words(
     candidates: Candidates,
     plan: Any | None,
     arm: bool,
-    bodies: Sequence[Body],
+    bodies: Sequence[SceneBody],
 ) -> float:
     """Everything around the views; returns the row below the legend."""
     annotate.write(draw, (18, 12), f"{case.name}: needle path to {target_words(case)}", size=28, bold=True)
@@ -197,7 +197,7 @@ def _words(
     return annotate.legend(draw, families(names), 20, below, WIDTH - 20)
 
 
-def _see_through(body: Body) -> str:
+def _see_through(body: SceneBody) -> str:
     return body.name + (" (see-through)" if body.alpha < 1 else "")
 
 

@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
-from puncture_twin.twin.report.raster.camera import Camera, camera_around
+from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
 from puncture_twin.twin.report.raster.render import Layer
 
 FOV = np.radians(28.0)
@@ -37,7 +37,7 @@ def up_ct(case: Any) -> Floats:
     return z
 
 
-def overview(case: Any, content_ct: Floats, focus_ct: Floats, blockers: Layer, size: tuple[int, int]) -> Camera:
+def overview(case: Any, content_ct: Floats, focus_ct: Floats, blockers: Layer, size: tuple[int, int]) -> ViewCamera:
     """A view of everything from above the table, from the side where the needle is best seen.
 
     Args:
@@ -59,7 +59,7 @@ def overview(case: Any, content_ct: Floats, focus_ct: Floats, blockers: Layer, s
     return _best(options, up, content_ct, focus_ct, blockers, size)
 
 
-def close_up(case: Any, path_ct: Floats, radius: float, blockers: Layer, size: tuple[int, int]) -> Camera:
+def close_up(case: Any, path_ct: Floats, radius: float, blockers: Layer, size: tuple[int, int]) -> ViewCamera:
     """A view across the needle's path, from where the fewest structures hide it.
 
     Args:
@@ -94,7 +94,7 @@ def _across(direction: Floats) -> Floats:
 
 def _best(
     options: list[Floats], up: Floats, content: Floats, focus: Floats, blockers: Layer, size: tuple[int, int]
-) -> Camera:
+) -> ViewCamera:
     """The option that sees most of the focus; among equals, the one that sees it longest in the picture."""
     content = content[ConvexHull(content).vertices]
     best, best_score = None, -np.inf

@@ -22,7 +22,7 @@ MOST = 8
 """Circles that are handed on."""
 
 
-class Found(NamedTuple):
+class FoundCircle(NamedTuple):
     """Circles, best first."""
 
     centers: Floats
@@ -31,7 +31,7 @@ class Found(NamedTuple):
     """Shape (n,), px."""
 
 
-def find_circles(grey: NDArray[np.uint8], radius_px: float) -> Found:
+def find_circles(grey: NDArray[np.uint8], radius_px: float) -> FoundCircle:
     """Circles of about a radius, by the gradient method of OpenCV (Yuen et al. 1990).
 
     Args:
@@ -52,6 +52,6 @@ def find_circles(grey: NDArray[np.uint8], radius_px: float) -> Found:
         maxRadius=int(np.ceil(RADIUS_RANGE[1] * radius_px)),
     )
     if circles is None:
-        return Found(np.zeros((0, 2)), np.zeros(0))
+        return FoundCircle(np.zeros((0, 2)), np.zeros(0))
     rows = np.asarray(circles, dtype=np.float64).reshape(-1, np.shape(circles)[-1])[:MOST]
-    return Found(rows[:, :2], rows[:, 2])
+    return FoundCircle(rows[:, :2], rows[:, 2])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.stereo.ball.ball_edges import Edges, Grey, Spokes, find_edges, grey_part, visible_share
 from puncture_twin.twin.guidance.stereo.ball.ball_image import Picture
-from puncture_twin.twin.guidance.stereo.ball.hough import Found, find_circles
+from puncture_twin.twin.guidance.stereo.ball.hough import FoundCircle, find_circles
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
 from puncture_twin.twin.guidance.stereo.cameras.circle import Circle, cone, consensus, refit
 
@@ -65,7 +65,7 @@ class TrackerSettings:
 DEFAULT = TrackerSettings()
 
 
-class Ball(NamedTuple):
+class DetectedBall(NamedTuple):
     """A ball that was found."""
 
     pixel: Floats
@@ -97,7 +97,7 @@ def find_ball(
     search_px: float,
     settings: TrackerSettings = DEFAULT,
     hough_only: bool = False,
-) -> Ball | LostBall:
+) -> DetectedBall | LostBall:
     """Find and measure the ball.
 
     Args:
@@ -127,8 +127,8 @@ def find_ball(
         return LostBall("no_circle")
     if hough_only:
         best = int(np.flatnonzero(near)[0])
-        return Ball(centers[best], HOUGH_SIGMA_PX**2 * np.eye(2), float(found.radii[best]), 0, 0)
-    return _best(grey, camera, Found(centers[near], found.radii[near]), radius, settings)
+        return DetectedBall(centers[best], HOUGH_SIGMA_PX**2 * np.eye(2), float(found.radii[best]), 0, 0)
+    return _best(grey, camera, FoundCircle(centers[near], found.radii[near]), radius, settings)
 
 
 def _cut(picture: Picture, center: Floats, half: float) -> Picture:
@@ -148,18 +148,22 @@ def _threshold(grey: Grey, settings: TrackerSettings) -> float:
     return max(settings.min_contrast, settings.noise_factor * grey.noise)
 
 
-def _best(grey: Grey, camera: Camera, found: Found, radius: float, settings: TrackerSettings) -> Ball | LostBall:
+def _best(
+    grey: Grey, camera: Camera, found: FoundCircle, radius: float, settings: TrackerSettings
+) -> DetectedBall | LostBall:
     """The first circle that stands the test, or why the one with most inliers did not."""
     lost = []
     for center in found.centers:
         ball = _measure(grey, camera, center, radius, settings)
-        if isinstance(ball, Ball):
+        if isinstance(ball, DetectedBall):
             return ball
         lost.append(ball)
     return max(lost, key=lambda one: one.inliers)
 
 
-def _measure(grey: Grey, camera: Camera, center: Floats, radius: float, settings: TrackerSettings) -> Ball | LostBall:
+def _measure(
+    grey: Grey, camera: Camera, center: Floats, radius: float, settings: TrackerSettings
+) -> DetectedBall | LostBall:
     """One circle: edges about Hough's place, the vote, then edges about the measured place until they agree."""
     direction = camera.rays(center)
     spokes = Spokes(direction, radius / camera.local_scale(direction), settings.spokes, settings.first_reach_px)
@@ -177,7 +181,7 @@ def _measure(grey: Grey, camera: Camera, center: Floats, radius: float, settings
     slope = camera.angle_slope(direction)
     noise = fitted.covariance[:2, :2] / _independent(settings.spokes, size)
     covariance = slope @ noise @ slope.T + settings.model_px**2 * np.eye(2)
-    return Ball(camera.project(camera.center_c + direction), covariance, size, fitted.inliers, settings.spokes)
+    return DetectedBall(camera.project(camera.center_c + direction), covariance, size, fitted.inliers, settings.spokes)
 
 
 class _Fitted(NamedTuple):

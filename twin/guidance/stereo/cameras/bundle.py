@@ -49,7 +49,7 @@ class Observations(NamedTuple):
     """Shape (n, 2, 2), px^2, or (2, 2) for all."""
 
 
-class Spreads(NamedTuple):
+class PixelSpreads(NamedTuple):
     """Standard deviations of the parameters around their start: 0 holds, infinity frees."""
 
     cameras: Floats
@@ -99,7 +99,7 @@ class Bundle:
 
 
 def adjust(
-    cameras: Sequence[Camera], T_c_bodies: Floats, points: Floats, seen: Observations, spreads: Spreads
+    cameras: Sequence[Camera], T_c_bodies: Floats, points: Floats, seen: Observations, spreads: PixelSpreads
 ) -> Bundle:
     """Adjust everything that is not held.
 
@@ -140,7 +140,7 @@ def _inverse(information: Floats) -> Floats:
     return np.asarray(np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))
 
 
-class _State(NamedTuple):
+class _Iterate(NamedTuple):
     """Cameras, bodies and points somewhere on the way."""
 
     cameras: tuple[Camera, ...]
@@ -163,9 +163,9 @@ class _Problem:
     """The residuals and their slope as functions of the free parameters."""
 
     def __init__(
-        self, cameras: tuple[Camera, ...], T_c_bodies: Floats, points: Floats, seen: Observations, spreads: Spreads
+        self, cameras: tuple[Camera, ...], T_c_bodies: Floats, points: Floats, seen: Observations, spreads: PixelSpreads
     ) -> None:
-        self.start = _State(cameras, T_c_bodies, points)
+        self.start = _Iterate(cameras, T_c_bodies, points)
         self.seen = seen
         self.sigma = np.concatenate([np.ravel(part) for part in spreads])
         self.free = self.sigma > 0
@@ -187,14 +187,14 @@ class _Problem:
         every[self.free] = x
         return every
 
-    def at(self, x: Floats) -> _State:
+    def at(self, x: Floats) -> _Iterate:
         every = self._all(x)
         cameras = tuple(
             _moved_camera(camera, every[14 * i : 14 * i + 14]) for i, camera in enumerate(self.start.cameras)
         )
         moves = every[self.first_body : self.first_point].reshape(-1, 6)
         bodies = np.stack([_move(move) @ T for move, T in zip(moves, self.start.T_c_bodies, strict=True)])
-        return _State(cameras, bodies, self.start.points + every[self.first_point :].reshape(-1, 3))
+        return _Iterate(cameras, bodies, self.start.points + every[self.first_point :].reshape(-1, 3))
 
     def errors(self, x: Floats) -> Floats:
         miss = self.at(x).predicted(self.seen) - self.seen.pixels
@@ -215,7 +215,7 @@ class _Problem:
         observed = white.reshape(-1, len(self.free))[:, self.free]
         return np.concatenate([observed, np.diag(1 / self.sigma[self.free])[self.prior]])
 
-    def _body_and_point_slope(self, slope: Floats, rows: Ints, camera: Camera, state: _State, every: Floats) -> None:
+    def _body_and_point_slope(self, slope: Floats, rows: Ints, camera: Camera, state: _Iterate, every: Floats) -> None:
         seen = self.seen
         by_point_c = camera.jacobian(state.points_c(seen)[rows])
         for body in np.unique(seen.body[rows]):

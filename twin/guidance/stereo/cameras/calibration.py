@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.guidance.stereo.cameras.bundle import CAMERA_PARAMETERS, Bundle, Observations, Spreads, adjust
+from puncture_twin.twin.guidance.stereo.cameras.bundle import (
+    CAMERA_PARAMETERS,
+    Bundle,
+    Observations,
+    PixelSpreads,
+    adjust,
+)
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.dlt import LinearFit, decompose, fit_matrix, project
 
@@ -41,7 +47,7 @@ ROUNDS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class CameraCalibration:
     """A camera, and how well it is known.
 
     Attributes:
@@ -70,7 +76,7 @@ def calibrate(
     distortion: bool = True,
     sigma_px: float | None = None,
     where: str | Path = "camera calibration",
-) -> Calibration:
+) -> CameraCalibration:
     """Calibrate one camera (Liu 2007, section 2, with a refinement that the paper does not have).
 
     Args:
@@ -98,7 +104,7 @@ def calibrate(
     covariance = bundle.camera_covariance(0)
     told = np.sqrt(np.diag(covariance)[4:8]) <= IDENTIFIED * np.array(LENS_PRIOR)
     identified = tuple(np.array(CAMERA_PARAMETERS[4:8])[told].tolist()) if distortion else ()
-    return Calibration(bundle.cameras[0], bundle.residuals_px, bundle.rms_px, covariance, sigma, identified)
+    return CameraCalibration(bundle.cameras[0], bundle.residuals_px, bundle.rms_px, covariance, sigma, identified)
 
 
 def _start(M: Floats, size: tuple[int, int]) -> Camera:
@@ -113,7 +119,7 @@ def _refine(
     """The optimum, and the pixels' standard deviation that it was found with."""
     spread = np.full((1, 14), np.inf)
     spread[0, 4:8] = LENS_PRIOR if distortion else 0.0
-    held = Spreads(spread, np.zeros((1, 6)), np.zeros_like(points))
+    held = PixelSpreads(spread, np.zeros((1, 6)), np.zeros_like(points))
     count = np.arange(len(points))
     sigma = 0.05 if sigma_px is None else sigma_px
     for _ in range(ROUNDS):

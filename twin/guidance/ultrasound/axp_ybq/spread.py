@@ -21,7 +21,7 @@ WIDEST_RATIO = 30.0
 """Inside and across the image are not taken to differ by more."""
 
 
-class Spreads(NamedTuple):
+class ResidualSpreads(NamedTuple):
     """What the residuals show."""
 
     spread: Spread
@@ -29,7 +29,7 @@ class Spreads(NamedTuple):
     """How far the needle leans out of the measured direction's plane across the image."""
 
 
-def found_spreads(problem: Problem, fit: RobustFit) -> Spreads:
+def found_spreads(problem: Problem, fit: RobustFit) -> ResidualSpreads:
     """One step of variance component estimation: squares of residuals over what the fit left free of them.
 
     The fixed point is the restricted maximum likelihood estimate (Förstner 1979).
@@ -44,7 +44,7 @@ def found_spreads(problem: Problem, fit: RobustFit) -> Spreads:
         turn, lean = (_direction_part(at_fit, fit, column) for column in (3, 4))
         arms = 0.0 if isinstance(problem.noise, Spread) else 2 * problem.noise.robot_rad**2
         lean = float(np.sqrt(max(lean**2 - arms, arms / 100, LEAST_RAD**2)))
-    return Spreads(Spread(*_tip_parts(problem, at_fit, fit), turn), lean)
+    return ResidualSpreads(Spread(*_tip_parts(problem, at_fit, fit), turn), lean)
 
 
 def _tip_parts(problem: Problem, at_fit: Fitted, fit: RobustFit) -> tuple[float, float]:

@@ -3,6 +3,6 @@ from .probe_image import (
     Imager as Imager,
     Lesion as Lesion,
     NeedleEcho as NeedleEcho,
-    NeedlePose as NeedlePose,
+    NeedleInImage as NeedleInImage,
     render as render,
 )

@@ -104,7 +104,7 @@ class NeedleEcho:
     shadow: float = 0.5
 
 
-class NeedlePose(NamedTuple):
+class NeedleInImage(NamedTuple):
     """Where the needle is, in the frame ``image``."""
 
     tip_image: Floats
@@ -125,7 +125,7 @@ class Lesion(NamedTuple):
 
 def render(
     imager: Imager,
-    needle: NeedlePose | None,
+    needle: NeedleInImage | None,
     rng: np.random.Generator,
     *,
     echo: NeedleEcho | None = None,
@@ -160,7 +160,7 @@ def render(
     return imager.grey(np.abs(signal))
 
 
-def needle_signal(imager: Imager, needle: NeedlePose, echo: NeedleEcho, rng: np.random.Generator) -> Complexes:
+def needle_signal(imager: Imager, needle: NeedleInImage, echo: NeedleEcho, rng: np.random.Generator) -> Complexes:
     """The needle's echoes, complex, shape (rows, columns), before the envelope is taken."""
     points, s = _shaft(imager, needle)
     size = (imager.rows, imager.columns)
@@ -179,7 +179,7 @@ def needle_signal(imager: Imager, needle: NeedlePose, echo: NeedleEcho, rng: np.
     return signal
 
 
-def _brightness(imager: Imager, needle: NeedlePose, echo: NeedleEcho) -> float:
+def _brightness(imager: Imager, needle: NeedleInImage, echo: NeedleEcho) -> float:
     """Amplitude of one sample, such that a level shaft at the middle depth has the stated contrast."""
     middle = imager.spread.axial_sigma(np.array(imager.size_mm[1] / 2.0))
     steep = float(needle.direction_image[1] ** 2)
@@ -204,7 +204,7 @@ def _gaussians(at: Floats, middles: Floats, sigmas: Floats) -> NDArray[np.float3
     return np.asarray(np.exp(np.float32(-0.5) * away * away))
 
 
-def _shaft(imager: Imager, needle: NeedlePose) -> tuple[Floats, Floats]:
+def _shaft(imager: Imager, needle: NeedleInImage) -> tuple[Floats, Floats]:
     """Points along the shaft that may show, shape (n, 3), and their distances from the tip, shape (n,), mm."""
     longest = float(np.hypot(*imager.size_mm)) + 20.0
     s = SAMPLE_MM * (np.arange(int(longest / SAMPLE_MM)) + 0.5)
@@ -216,7 +216,7 @@ def _shaft(imager: Imager, needle: NeedlePose) -> tuple[Floats, Floats]:
     return points[seen], s[seen]
 
 
-def _shadow(imager: Imager, needle: NeedlePose, echo: NeedleEcho) -> Floats:
+def _shadow(imager: Imager, needle: NeedleInImage, echo: NeedleEcho) -> Floats:
     """What the needle leaves of the sound, shape (rows, columns)."""
     points, _ = _shaft(imager, needle)
     left = np.ones((imager.rows, imager.columns))
@@ -243,7 +243,7 @@ def _lesion_gain(imager: Imager, lesion: Lesion | None) -> Floats:
     return np.where(inside, lesion.gain, gain)
 
 
-def _require_usable(needle: NeedlePose) -> None:
+def _require_usable(needle: NeedleInImage) -> None:
     tip, direction = np.asarray(needle.tip_image), np.asarray(needle.direction_image)
     usable = tip.shape == (3,) and direction.shape == (3,) and bool(np.isfinite([*tip, *direction]).all())
     if not usable or abs(float(np.linalg.norm(direction)) - 1.0) > UNIT:
