@@ -27,6 +27,7 @@ from planning.mesh import TriangleMesh
 from planning.scan import Scan
 from planning.second_witness import Named
 from planning.skin import Skin, flat_ends, skin_from_mesh
+from planning.support import support_warnings
 from planning.surfaces import VolumeSurfaces
 
 Progress = Callable[[str], None]
@@ -151,7 +152,7 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
     if scan is None:
         loader.warnings.append(OUTSIDE_NOT_KNOWN)
     else:
-        outside = _outside(case, scan)
+        outside = _outside(case, scan, loader.warnings)
         if any(structure.name == ATTACHED_LIMB for structure in outside):
             loader.warnings.append(LIMB_ATTACHED)
         if case.ct.trust_labels:
@@ -165,9 +166,11 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
     return Anatomy(tuple(structures), skin, tuple(warnings), outside, scan, tuple(loader.ignored))
 
 
-def _outside(case: Case, scan: Scan) -> tuple[Structure, ...]:
+def _outside(case: Case, scan: Scan, warnings: list[str]) -> tuple[Structure, ...]:
     """What the CT shows outside of the body that is not air, and limbs that are pressed against it."""
-    found = ((OUTSIDE_BODY, scan.outside(case.ct.air_hu)), (ATTACHED_LIMB, scan.attached_limbs(case.target_ct)))
+    outside = scan.outside(case.ct.air_hu)
+    warnings.extend(support_warnings(outside.supported, outside.open_faces))
+    found = ((OUTSIDE_BODY, outside.mesh), (ATTACHED_LIMB, scan.attached_limbs(case.target_ct)))
     return tuple(
         Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: {name}", outside=True)
         for name, mesh in found

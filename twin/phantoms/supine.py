@@ -1,7 +1,7 @@
 """A patient on a CT table, with what else a scan shows: arms, mattress, table, sheet and line, each of known shape.
 
-LPS, mm; z along the bed, the patient on the back. The trunk is that of the embedded abdomen, cut by the image at head
-and feet.
+LPS, mm; z along the bed, the patient on the back. The trunk is that of the embedded abdomen with a belly that changes
+along the bed, as a patient's does; the image cuts it at head and feet.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from twin.phantoms import torso
-from twin.phantoms.ct_image import Grid, Part
+from twin.phantoms.ct_image import AIR_HU, Grid, Part
 from twin.phantoms.implicit import Array, Field, capsule, ellipsoid, offset, within
 
 LESION_LPS_MM = (-55.0, 20.0, 0.0)
@@ -20,6 +20,9 @@ BACK_MM = 106.0
 """Where the back ends: here the mattress begins, mm along y."""
 TABLE_MM = BACK_MM + 32.0
 """Where the table begins."""
+BELLY_MM, WAVE_MM = 8.0, 90.0
+"""How much the belly's surface changes along the bed, and over which length. Without it the trunk is nearly a cylinder,
+which no patient is, and a table that touches a patient is known by being one."""
 LINE_GAP_MM = 14.0
 """How far the line runs in front of the trunk, mm."""
 
@@ -36,10 +39,17 @@ def slab(low: tuple[float, float, float], high: tuple[float, float, float]) -> F
     return field
 
 
+def skin(points: Array) -> Array:
+    """Field of the trunk: that of the embedded abdomen, up to ``BELLY_MM`` flatter in front, in waves along the bed."""
+    front = np.clip(0.5 - points[:, 1] / 60.0, 0.0, 1.0)
+    waves = 0.5 + 0.5 * np.sin(2.0 * np.pi * points[:, 2] / WAVE_MM)
+    return np.asarray(torso.skin(points) + BELLY_MM * front * waves)
+
+
 def trunk_parts() -> list[Part]:
     """Fat, muscle, spine and lesion of the trunk."""
     return [
-        Part("trunk", torso.skin, -100.0),
+        Part("trunk", skin, -100.0),
         Part("muscle", offset(torso.skin, -22.0), 45.0),
         Part("spine", capsule((0, 36, -300), (0, 36, 300), 21.0), 420.0),
         Part("lesion", ellipsoid(LESION_LPS_MM, (12, 12, 12)), 90.0),
@@ -58,17 +68,42 @@ def arm_parts(arms: Arms) -> list[Part]:
     return parts
 
 
-def bed_parts() -> list[Part]:
-    """A mattress of foam in a cover, and a table of two shells about foam."""
+def bed_parts(gap_mm: float = 0.0) -> list[Part]:
+    """A mattress of foam in a cover, and a table of two shells about foam; so far behind the back, mm."""
     wide, long = 280.0, 400.0
-    mattress = slab((-wide, BACK_MM, -long), (wide, TABLE_MM - 2.0, long))
-    table = slab((-wide, TABLE_MM, -long), (wide, TABLE_MM + 40.0, long))
+    mattress = slab((-wide, BACK_MM + gap_mm, -long), (wide, TABLE_MM + gap_mm - 2.0, long))
+    table = slab((-wide, TABLE_MM + gap_mm, -long), (wide, TABLE_MM + gap_mm + 40.0, long))
     return [
         Part("mattress", mattress, -120.0),
         Part("mattress_foam", offset(mattress, -2.0), -960.0),
         Part("table", table, 60.0),
         Part("table_foam", offset(table, -3.0), -930.0),
     ]
+
+
+def cradle_parts(
+    radius_mm: float = 300.0, thick_mm: float = 20.0, half_width_mm: float = 180.0, slope: float = 0.0
+) -> list[Part]:
+    """A cradle as dense as the body, bent about the bed's direction, into which the back is pressed; air beneath.
+
+    Args:
+        radius_mm: Of its upper side.
+        thick_mm: How thick it is.
+        half_width_mm: From its middle to its edges.
+        slope: How much it descends to the head, mm per mm, as a bed does in the images of a tilted gantry.
+    """
+
+    def beneath(points: Array) -> Array:
+        y = points[:, 1] - slope * points[:, 2] - (BACK_MM - 10.0 - radius_mm)
+        upper = radius_mm - np.hypot(points[:, 0], y)
+        return np.asarray(np.maximum.reduce([upper, np.abs(points[:, 0]) - half_width_mm, -y]))
+
+    def cradle(points: Array) -> Array:
+        y = points[:, 1] - slope * points[:, 2] - (BACK_MM - 10.0 - radius_mm)
+        lower = np.hypot(points[:, 0], y) - radius_mm - thick_mm
+        return np.asarray(np.maximum(beneath(points), lower))
+
+    return [Part("beneath", beneath, AIR_HU), Part("cradle", cradle, 20.0)]
 
 
 def line_part() -> Part:
