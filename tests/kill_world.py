@@ -51,11 +51,18 @@ def coarse_cases(here):
 
 
 def start(arguments):
-    """The command line in a process of its own."""
+    """The command line in a process of its own, behind the one that is to kill it in time."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")])}
     program = [sys.executable, str(REPOSITORY / "run_twin.py"), *map(str, arguments)]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    return subprocess.Popen(program, cwd=REPOSITORY, env=environment, start_new_session=True, **quiet)
+    return subprocess.Popen(
+        program, cwd=REPOSITORY, env=environment, start_new_session=True, preexec_fn=_behind, **quiet
+    )
+
+
+def _behind():
+    """Whoever watches it must see it move its files, which takes milliseconds, on a busy machine too."""
+    os.nice(5)
 
 
 def kill_while_writing(process, out, rng):

@@ -110,6 +110,7 @@ def scene(tmp_path_factory):
                     supine.sheet_part(),
                 ],
                 "alone": supine.trunk_parts() + supine.arm_parts("up"),
+                "gap": [*supine.trunk_parts(), *supine.bed_parts(gap_mm=12.0)],
                 "plank": [*supine.trunk_parts(), PLANK],
             }[name]
             folder = tmp_path_factory.mktemp(name)
@@ -312,6 +313,54 @@ def test_a_table_that_touches_the_back_is_no_body(scene):
     assert not found.safe[rows].any()
     assert found.safe.sum() > 40
     assert any("flat at its back side" in warning for warning in context.anatomy.warnings)
+
+
+@pytest.mark.parametrize(
+    "cradle",
+    [supine.cradle_parts(), supine.cradle_parts(radius_mm=180.0, thick_mm=10.0, half_width_mm=150.0, slope=0.04)],
+    ids=["wide", "narrow and tilted"],
+)
+def test_a_curved_cradle_that_touches_the_back_is_no_body(tmp_path, cradle):
+    """Skin and cradle are of one density and hold together: no safe needle enters the cradle, the front stays free."""
+    parts = [*supine.trunk_parts(), *cradle]
+    write_scene(tmp_path, parts, supine.grid())
+    prepared = prepare(write_case(tmp_path), arm=False)
+    found = prepared.search()
+
+    rows = through(found, prepared.case, cradle[1])
+    assert rows.sum() > 100
+    assert not found.safe[rows].any()
+    assert hit_parts(prepared, found, parts, ("cradle",)) == {}
+    assert found.safe.sum() > 40
+    assert any("one section along the bed at its back side" in warning for warning in prepared.anatomy.warnings)
+
+
+def test_an_image_that_ends_before_the_table_does_not_make_it_air(scene):
+    """The face between back and mattress cuts nothing: what is beyond it is unknown, and one warning names it."""
+    folder, parts = scene("gap")
+    crop(folder, np.s_[:, :76, :])
+    path = write_case(folder, skin='ct = "crop.nii.gz"', name="ends")
+    prepared = prepare(path, arm=False)
+    found = prepared.search()
+
+    assert hit_parts(prepared, found, parts, OUTER) == {}
+    assert found.safe.sum() > 40
+    said = [warning for warning in prepared.anatomy.warnings if "nothing that the body lies on" in warning]
+    assert len(said) == 1
+    assert "its back face" in said[0]
+
+
+def test_a_face_that_cuts_the_table_beside_the_body_does_not_make_arms_air(scene):
+    """Arms beyond an image that is narrower than the table: its left and right face are unknown, the front is free."""
+    folder, parts = scene("all")
+    crop(folder, np.s_[34:116, :, :])
+    prepared = prepare(write_case(folder, skin='ct = "crop.nii.gz"', name="slim"), arm=False)
+    found = prepared.search()
+
+    assert hit_parts(prepared, found, parts, ("arm_left", "arm_right", "table")) == {}
+    assert found.safe.sum() > 10
+    said = [warning for warning in prepared.anatomy.warnings if "cuts what the body lies on" in warning]
+    assert "right and left face" in said[0]
 
 
 def test_air_beside_a_label_of_the_skin_is_no_gas(tmp_path):

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.anatomy.body.support import support_warnings
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.anatomy.skin import Skin, flat_ends, skin_from_mesh
@@ -151,7 +152,7 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
     if scan is None:
         loader.warnings.append(OUTSIDE_NOT_KNOWN)
     else:
-        outside = _outside(case, scan)
+        outside = _outside(case, scan, loader.warnings)
         if any(structure.name == ATTACHED_LIMB for structure in outside):
             loader.warnings.append(LIMB_ATTACHED)
         if case.ct.trust_labels:
@@ -165,9 +166,11 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
     return Anatomy(tuple(structures), skin, tuple(warnings), outside, scan, tuple(loader.ignored))
 
 
-def _outside(case: Case, scan: Scan) -> tuple[Structure, ...]:
+def _outside(case: Case, scan: Scan, warnings: list[str]) -> tuple[Structure, ...]:
     """What the CT shows outside of the body that is not air, and limbs that are pressed against it."""
-    found = ((OUTSIDE_BODY, scan.outside(case.ct.air_hu)), (ATTACHED_LIMB, scan.attached_limbs(case.target_ct)))
+    outside = scan.outside(case.ct.air_hu)
+    warnings.extend(support_warnings(outside.supported, outside.open_faces))
+    found = ((OUTSIDE_BODY, outside.mesh), (ATTACHED_LIMB, scan.attached_limbs(case.target_ct)))
     return tuple(
         Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: {name}", outside=True)
         for name, mesh in found

@@ -6,21 +6,28 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from puncture_twin.planning.anatomy.body.attached_limbs import attached_limbs
-from puncture_twin.planning.anatomy.body.body_mask import BodyMask, body_mask
+from puncture_twin.planning.anatomy.body.body_mask import BodyMask, body_mask, unscanned_voxels
+from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
+from puncture_twin.planning.anatomy.body.flat_side import FlatSide
 from puncture_twin.planning.anatomy.body.outside_body import (
+    BEYOND_MM,
     OutsideImage,
     beyond_body,
+    beyond_drawn_sides,
+    beyond_face,
     beyond_flat_sides,
     joined,
+    outside_mask,
     outside_surface,
 )
+from puncture_twin.planning.anatomy.body.support import FACES, find_support
 from puncture_twin.planning.anatomy.second_witness import BodyImage, Named, Unnamed, unnamed_surfaces
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces, kept_mesh
@@ -37,6 +44,20 @@ SKIN_TOLERANCE_MM = 3.0
 dense counts as body. Beyond, it is outside, as an arm is that the skin lacks."""
 
 
+class Outside(NamedTuple):
+    """What a CT shows outside of the body.
+
+    Attributes:
+        mesh: The surface of what is not known to be free, LPS mm; None for air alone.
+        supported: Whether the image shows what the body lies on.
+        open_faces: Faces of the image near the body, beyond which nothing is known.
+    """
+
+    mesh: TriangleMesh | None
+    supported: bool
+    open_faces: tuple[tuple[int, int], ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Scan:
     """A CT beside the skin of its case. Its voxels are decoded only if something is not in the cache.
@@ -51,18 +72,31 @@ class Scan:
     source: VolumeSurfaces
     skin: Skin | None
 
-    def outside(self, air_hu: float) -> TriangleMesh | None:
-        """The surface of what is denser than air outside of the body, LPS mm; None for air alone."""
+    def outside(self, air_hu: float) -> Outside:
+        """What is denser than air outside of the body, and beyond which faces of the image nothing is known."""
 
-        def make() -> TriangleMesh | None:
+        def make() -> list[TriangleMesh | None]:
             ct = self._ct
             image = OutsideImage(self._hu, self._body, ct.T_ct_index, ct.spacing_mm)
-            found = outside_surface(image, air_hu=air_hu, where=self.source.path)
-            beyond = beyond_flat_sides(image, self._found.flat_sides) if self.skin is None else beyond_body(image)
-            meshes = [*([] if found is None else [found]), *beyond]
-            return joined(meshes) if meshes else None
+            mask = outside_mask(image, air_hu)
+            flat, drawn = self._tables
+            support = find_support(mask & ~unscanned_voxels(self._hu), self._body, ct.spacing_mm, [*flat, *drawn])
+            solids = [outside_surface(image, mask, where=self.source.path)]
+            solids += [] if self.skin is None else beyond_body(image)
+            supports = beyond_flat_sides(image, flat) + beyond_drawn_sides(image, drawn, edges=True)
+            supports += beyond_drawn_sides(image, support.drawn, edges=False)
+            near = support.open_faces
+            faces = [beyond_face(image, *face, wider_mm=BEYOND_MM[0]) if face in near else None for face in FACES]
+            return [_joined(solids), _joined(supports), *faces]
 
-        return self._kept({"what": "outside", "air_hu": air_hu}, lambda: [make()])[0]
+        solids, supports, *faces = self._kept({"what": "outside", "air_hu": air_hu}, make)
+        open_faces = tuple(face for face, box in zip(FACES, faces, strict=True) if box is not None)
+        return Outside(_joined([solids, supports, *faces]), supports is not None, open_faces)
+
+    @property
+    def _tables(self) -> tuple[tuple[FlatSide, ...], tuple[DrawnSide, ...]]:
+        """Sides at which a table holds together with the body that this CT shows."""
+        return ((), ()) if self.skin is not None else (self._found.flat_sides, self._found.drawn_sides)
 
     def attached_limbs(self, target_ct: NDArray[np.float64]) -> TriangleMesh | None:
         """The surface of limbs that are pressed against the part of the body that holds the target, LPS mm, or None."""
@@ -148,6 +182,12 @@ class Scan:
         skin = None if self.skin is None else _digest(self.skin.mesh)
         made_from = {"skin": skin, **made_from}
         return _to_meshes(self.source.kept(made_from, lambda: _of_meshes(make()), by=__name__, check=_to_meshes))
+
+
+def _joined(meshes: Sequence[TriangleMesh | None]) -> TriangleMesh | None:
+    """Those that are there as one, or None."""
+    found = [mesh for mesh in meshes if mesh is not None]
+    return joined(found) if found else None
 
 
 def _digest(mesh: TriangleMesh) -> str:

@@ -1,7 +1,7 @@
 """A patient on a CT table, with what else a scan shows: arms, mattress, table, sheet and line, each of known shape.
 
-LPS, mm; z along the bed, the patient on the back. The trunk is that of the embedded abdomen, cut by the image at head
-and feet.
+LPS, mm; z along the bed, the patient on the back. The trunk is that of the embedded abdomen with a belly that changes
+along the bed, as a patient's does; the image cuts it at head and feet.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.phantoms import torso
-from puncture_twin.twin.phantoms.ct_image import Grid, ScannedPart
+from puncture_twin.twin.phantoms.ct_image import AIR_HU, Grid, ScannedPart
 from puncture_twin.twin.phantoms.implicit import Field, capsule, ellipsoid, offset, within
 
 LESION_LPS_MM = (-55.0, 20.0, 0.0)
@@ -21,6 +21,9 @@ BACK_MM = 106.0
 """Where the back ends: here the mattress begins, mm along y."""
 TABLE_MM = BACK_MM + 32.0
 """Where the table begins."""
+BELLY_MM, WAVE_MM = 8.0, 90.0
+"""How much the belly's surface changes along the bed, and over which length. Without it the trunk is nearly a cylinder,
+which no patient is, and a table that touches a patient is known by being one."""
 LINE_GAP_MM = 14.0
 """How far the line runs in front of the trunk, mm."""
 
@@ -37,10 +40,17 @@ def slab(low: tuple[float, float, float], high: tuple[float, float, float]) -> F
     return field
 
 
+def skin(points: Floats) -> Floats:
+    """Field of the trunk: that of the embedded abdomen, up to ``BELLY_MM`` flatter in front, in waves along the bed."""
+    front = np.clip(0.5 - points[:, 1] / 60.0, 0.0, 1.0)
+    waves = 0.5 + 0.5 * np.sin(2.0 * np.pi * points[:, 2] / WAVE_MM)
+    return np.asarray(torso.skin(points) + BELLY_MM * front * waves)
+
+
 def trunk_parts() -> list[ScannedPart]:
     """Fat, muscle, spine and lesion of the trunk."""
     return [
-        ScannedPart("trunk", torso.skin, -100.0),
+        ScannedPart("trunk", skin, -100.0),
         ScannedPart("muscle", offset(torso.skin, -22.0), 45.0),
         ScannedPart("spine", capsule((0, 36, -300), (0, 36, 300), 21.0), 420.0),
         ScannedPart("lesion", ellipsoid(LESION_LPS_MM, (12, 12, 12)), 90.0),
@@ -59,17 +69,42 @@ def arm_parts(arms: Arms) -> list[ScannedPart]:
     return parts
 
 
-def bed_parts() -> list[ScannedPart]:
-    """A mattress of foam in a cover, and a table of two shells about foam."""
+def bed_parts(gap_mm: float = 0.0) -> list[ScannedPart]:
+    """A mattress of foam in a cover, and a table of two shells about foam; so far behind the back, mm."""
     wide, long = 280.0, 400.0
-    mattress = slab((-wide, BACK_MM, -long), (wide, TABLE_MM - 2.0, long))
-    table = slab((-wide, TABLE_MM, -long), (wide, TABLE_MM + 40.0, long))
+    mattress = slab((-wide, BACK_MM + gap_mm, -long), (wide, TABLE_MM + gap_mm - 2.0, long))
+    table = slab((-wide, TABLE_MM + gap_mm, -long), (wide, TABLE_MM + gap_mm + 40.0, long))
     return [
         ScannedPart("mattress", mattress, -120.0),
         ScannedPart("mattress_foam", offset(mattress, -2.0), -960.0),
         ScannedPart("table", table, 60.0),
         ScannedPart("table_foam", offset(table, -3.0), -930.0),
     ]
+
+
+def cradle_parts(
+    radius_mm: float = 300.0, thick_mm: float = 20.0, half_width_mm: float = 180.0, slope: float = 0.0
+) -> list[ScannedPart]:
+    """A cradle as dense as the body, bent about the bed's direction, into which the back is pressed; air beneath.
+
+    Args:
+        radius_mm: Of its upper side.
+        thick_mm: How thick it is.
+        half_width_mm: From its middle to its edges.
+        slope: How much it descends to the head, mm per mm, as a bed does in the images of a tilted gantry.
+    """
+
+    def beneath(points: Floats) -> Floats:
+        y = points[:, 1] - slope * points[:, 2] - (BACK_MM - 10.0 - radius_mm)
+        upper = radius_mm - np.hypot(points[:, 0], y)
+        return np.asarray(np.maximum.reduce([upper, np.abs(points[:, 0]) - half_width_mm, -y]))
+
+    def cradle(points: Floats) -> Floats:
+        y = points[:, 1] - slope * points[:, 2] - (BACK_MM - 10.0 - radius_mm)
+        lower = np.hypot(points[:, 0], y) - radius_mm - thick_mm
+        return np.asarray(np.maximum(beneath(points), lower))
+
+    return [ScannedPart("beneath", beneath, AIR_HU), ScannedPart("cradle", cradle, 20.0)]
 
 
 def line_part() -> ScannedPart:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from puncture_twin.planning.anatomy.body.detached_parts import (
     limb_warnings,
     thick_parts,
 )
+from puncture_twin.planning.anatomy.body.drawn_side import LEAST_LENGTH_MM, TOO_SHORT, DrawnSide, drawn_sides
 from puncture_twin.planning.anatomy.body.flat_side import FlatSide, flat_sides
 from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.errors import InputError
@@ -49,12 +51,14 @@ class BodyMask:
         unscanned: Same shape, voxels that the scanner did not measure.
         warnings: What the user should know.
         flat_sides: Where the body ends in a plane, as a table does that touches it.
+        drawn_sides: Where it ends in one section along the bed, as a curved table or cradle does that touches it.
     """
 
     body: Bools
     unscanned: Bools
     warnings: tuple[str, ...]
     flat_sides: tuple[FlatSide, ...] = ()
+    drawn_sides: tuple[DrawnSide, ...] = ()
 
 
 def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where: str | Path) -> BodyMask:
@@ -92,9 +96,19 @@ def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where
     unscanned = unscanned_voxels(hu)
     if (ndimage.binary_dilation(body) & unscanned & ~body).any():
         warnings.append("the scanner's field of view (a circle in the image) cuts the body; no skin is known there")
-    sides = flat_sides(hu - BODY_HU, body, spacing_mm)
-    warnings.extend(side.warning for side in sides)
-    return BodyMask(body, unscanned, tuple(warnings), sides)
+    flat = flat_sides(hu - BODY_HU, body, spacing_mm)
+    drawn = drawn_sides(hu - BODY_HU, trunk, spacing_mm)
+    warnings.extend(_table_warnings(flat, drawn, body.shape[2] * float(spacing_mm[2])))
+    return BodyMask(body, unscanned, tuple(warnings), flat, drawn)
+
+
+def _table_warnings(flat: Sequence[FlatSide], drawn: Sequence[DrawnSide], length_mm: float) -> Iterator[str]:
+    """One sentence for each side at which a table touches the body, or that none could be told."""
+    yield from (side.warning for side in flat)
+    named = {(side.axis, side.end) for side in flat}
+    yield from (side.warning for side in drawn if side.whole and (side.axis, side.end) not in named)
+    if length_mm < LEAST_LENGTH_MM:
+        yield TOO_SHORT.format(length=length_mm)
 
 
 def unscanned_voxels(hu: NDArray[np.float32]) -> Bools:

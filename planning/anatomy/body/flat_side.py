@@ -63,7 +63,7 @@ def flat_sides(above: NDArray[np.floating], body: Bools, spacing_mm: Floats) -> 
 def _flat_sides(above: NDArray[np.floating], body: Bools, spacing_mm: Floats) -> Iterator[FlatSide]:
     for axis, end in itertools.product((0, 1), (0, -1)):
         step_mm, across_mm = float(spacing_mm[axis]), float(spacing_mm[1 - axis])
-        ends = _ends(above, body, axis, end)
+        ends = surface_ends(above, body, axis, end)
         plane = _commonest(ends[np.isfinite(ends)], FLAT_MM / step_mm)
         outward_mm = (ends - plane) * (step_mm if end else -step_mm)
         width_mm = float(np.median((np.abs(outward_mm) <= FLAT_MM / 2).sum(axis=0))) * across_mm
@@ -71,8 +71,18 @@ def _flat_sides(above: NDArray[np.floating], body: Bools, spacing_mm: Floats) ->
             yield FlatSide(axis, end, plane, width_mm)
 
 
-def _ends(above: NDArray[np.floating], body: Bools, axis: int, end: int) -> Floats:
-    """Where the body's surface is along each line of an axis, in voxels, shape (n, nz); NaN where the image cuts it."""
+def surface_ends(above: NDArray[np.floating], body: Bools, axis: int, end: int) -> Floats:
+    """Where a body's surface is along each line of an axis, seen from one of its ends.
+
+    Args:
+        above: Shape (nx, ny, nz), Hounsfield units above those of the body's surface, axis 2 along the bed.
+        body: Same shape.
+        axis: 0 or 1, along the lines.
+        end: 0 or -1, from which end of the axis.
+
+    Returns:
+        Voxels along the axis, shape (n, nz); NaN where there is no body, and where the image cuts it.
+    """
     turn = slice(None, None, -1) if end else slice(None)
     inside = np.moveaxis(body, axis, 0)[turn]
     values = np.moveaxis(above, axis, 0)[turn]

@@ -17,6 +17,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, unscanned_voxels
+from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
 from puncture_twin.planning.anatomy.body.flat_side import FlatSide
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.formats.labels.label_surface import field_surface
@@ -34,6 +35,8 @@ places where they are cut: of a table that sags below the image both ends are se
 BEYOND_MM = (100.0, 100.0, 2000.0)
 """How far what the border cuts is taken to go on to the sides, to front and back, and along the bed. A CT table is at
 most 550 mm wide and an image at least 350; along the bed table and mattress go on farther than a needle reaches."""
+EDGE_MM = 40.0
+"""The edge of a table or cradle is no thicker."""
 RIM_MM = 50.0
 """Where what is dense ends at voxels that were not scanned, they count as dense so far from it."""
 
@@ -86,7 +89,7 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     return dense | _unscanned_beside(dense | body, ~scanned & ~body, image.spacing_mm)
 
 
-def outside_surface(image: OutsideImage, *, air_hu: float, where: str | Path) -> TriangleMesh | None:
+def outside_surface(image: OutsideImage, mask: Bools, *, where: str | Path) -> TriangleMesh | None:
     """The closed surface of what is dense outside of the body, LPS mm; None where there is only air.
 
     Where the border of the image cuts it, it goes on beyond: every cut section is drawn out by ``BEYOND_MM``, and of
@@ -94,10 +97,9 @@ def outside_surface(image: OutsideImage, *, air_hu: float, where: str | Path) ->
 
     Args:
         image: The CT and its body.
-        air_hu: See `outside_mask`.
+        mask: Of `outside_mask`.
         where: The file, for messages.
     """
-    mask = outside_mask(image, air_hu)
     if not mask.any():
         return None
     surface = field_surface(mask.astype(np.float32) - 0.5, image.T_ct_index, where=where)
@@ -110,25 +112,92 @@ def beyond_body(image: OutsideImage) -> list[TriangleMesh]:
 
     Of a skin that comes from the image itself the same is known from its cut triangles.
     """
-    boxes = []
-    for axis, end in itertools.product(range(3), (0, -1)):
-        if image.body.take(end, axis=axis).any():
-            across = np.delete(image.hu.shape, axis) - 0.5
-            corners = np.array([[x, y] for x in (-0.5, across[0]) for y in (-0.5, across[1])])
-            boxes.append(_prism(corners, axis, end, image))
-    return [box for box in boxes if box is not None]
+    faces = itertools.product(range(3), (0, -1))
+    return [beyond_face(image, axis, end) for axis, end in faces if image.body.take(end, axis=axis).any()]
+
+
+def beyond_face(image: OutsideImage, axis: int, end: int, *, wider_mm: float = 0.0) -> TriangleMesh:
+    """A box beyond a whole face of the image, at the low (0) or high (-1) end of an axis, and so much wider."""
+    low, high = np.full(3, -0.5) - wider_mm / image.spacing_mm, image.hu.shape + wider_mm / image.spacing_mm - 0.5
+    away = BEYOND_MM[axis] / image.spacing_mm[axis]
+    near = -0.5 if end == 0 else image.hu.shape[axis] - 0.5
+    low[axis], high[axis] = (near - away, near) if end == 0 else (near, near + away)
+    return _box(low, high, image)
 
 
 def beyond_flat_sides(image: OutsideImage, sides: Sequence[FlatSide]) -> list[TriangleMesh]:
     """Boxes beyond the planes in which a body ends that lies on something: to both sides and along the bed too."""
-    T, shape = image.T_ct_index, np.array(image.hu.shape)
+    shape = np.array(image.hu.shape)
     boxes = []
     for side in sides:
         low, high = -np.array(BEYOND_MM) / image.spacing_mm, shape - 1.0 + np.array(BEYOND_MM) / image.spacing_mm
         (high if side.end == 0 else low)[side.axis] = side.plane
-        index = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-        boxes.append(TriangleMesh(index @ T[:3, :3].T + T[:3, 3], BOX_FACES))
+        boxes.append(_box(low, high, image))
     return boxes
+
+
+def _box(low: Floats, high: Floats, image: OutsideImage) -> TriangleMesh:
+    """A box between two corners, voxels."""
+    index = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    return TriangleMesh(index @ image.T_ct_index[:3, :3].T + image.T_ct_index[:3, 3], BOX_FACES)
+
+
+def beyond_drawn_sides(image: OutsideImage, sides: Sequence[DrawnSide], *, edges: bool) -> list[TriangleMesh]:
+    """What lies beyond a section that is drawn along the bed: a table's far side, and on along the bed.
+
+    Args:
+        image: The CT and its body.
+        sides: The sections.
+        edges: Whether the table counts as body, so that its edges do too: then what is beyond it goes on to both
+            sides, from ``EDGE_MM`` before the section, and what comes out of an edge is not free.
+    """
+    return [_beyond_line(image, side, edges=edges and side.whole) for side in sides]
+
+
+def _beyond_line(image: OutsideImage, side: DrawnSide, *, edges: bool) -> TriangleMesh:
+    along_mm, across_mm, step_mm = (float(image.spacing_mm[axis]) for axis in (side.axis, 1 - side.axis, 2))
+    outward = 1.0 if side.end else -1.0
+    away, edge = (BEYOND_MM[1 - side.axis] / across_mm, outward * EDGE_MM / along_mm) if edges else (1.0, 0.0)
+    last = image.hu.shape[1 - side.axis] - 1.0 if edges else 0.0
+    before = [min(0.0 if edges else np.inf, side.across[0]) - away, side.across[0] - 0.5]
+    after = [side.across[-1] + 0.5, max(last, side.across[-1]) + away]
+    across = np.concatenate([before, side.across, after])
+    along = np.concatenate([np.full(2, side.along[0] - edge), side.along, np.full(2, side.along[-1] - edge)])
+    far = (image.hu.shape[side.axis] - 1.0 if side.end else 0.0) + outward * BEYOND_MM[side.axis] / along_mm
+    reach = BEYOND_MM[2] / step_mm
+    slices = np.array([-reach, image.hu.shape[2] - 1.0 + reach])
+    sink = outward * abs(side.slope[1]) * float(np.abs(slices).max())
+    rows = [_row(side, across, values, z) for z in slices for values in (along, np.full(len(along), far + sink))]
+    index = np.concatenate(rows)
+    T = image.T_ct_index
+    vertices = index @ T[:3, :3].T + T[:3, 3]
+    return TriangleMesh(vertices, _outward_faces(vertices, len(across)))
+
+
+def _row(side: DrawnSide, across: Floats, along: Floats, at_slice: float) -> Floats:
+    """Voxel indices (n, 3) of points in one slice of a bed that may run at an angle to the slices' axis."""
+    index = np.empty((len(across), 3))
+    index[:, side.axis] = along + side.slope[1] * at_slice
+    index[:, 1 - side.axis] = across + side.slope[0] * at_slice
+    index[:, 2] = at_slice
+    return index
+
+
+def _outward_faces(vertices: Floats, n: int) -> NDArray[np.int32]:
+    """Triangles of a strip's prism: near and far row (n vertices each) of its first end, then of its last."""
+    i, j = np.arange(n - 1), np.arange(1, n)
+    quads = [
+        np.stack([i, j, j + n, i + n], axis=1),
+        np.stack([i + 2 * n, i + 3 * n, j + 3 * n, j + 2 * n], axis=1),
+        np.stack([i, i + 2 * n, j + 2 * n, j], axis=1),
+        np.stack([i + n, j + n, j + 3 * n, i + 3 * n], axis=1),
+        np.array([[0, n, 3 * n, 2 * n], [n - 1, 3 * n - 1, 4 * n - 1, 2 * n - 1][::-1]]),
+    ]
+    corners = np.concatenate(quads)
+    faces = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]).astype(np.int32)
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    inward = float(np.einsum("ij,ij->", a, np.cross(b, c))) < 0.0
+    return faces[:, ::-1] if inward else faces
 
 
 def joined(meshes: list[TriangleMesh]) -> TriangleMesh:

@@ -1,0 +1,116 @@
+"""Which sides of a body in a CT count as those of a table that touches it, and which side shows what it lies on."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813
+
+from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, body_mask
+from puncture_twin.planning.anatomy.body.drawn_side import drawn_sides, support_side
+from puncture_twin.planning.anatomy.body.outside_body import OutsideImage, outside_mask
+from puncture_twin.planning.anatomy.body.support import find_support, support_warnings
+
+CT = Path(__file__).parents[2] / "shared" / "data" / "totalseg_abdomen_3mm" / "ct.nii.gz"
+SPACING = np.array([4.0, 4.0, 5.0])
+SHAPE = (100, 80, 32)
+X, Y, Z = np.indices(SHAPE) * SPACING.reshape(3, 1, 1, 1)
+"""mm from the first voxel."""
+
+
+def trunk(wave_mm=8.0):
+    """A trunk of 280 x 180 mm whose section changes along the bed by waves, Hounsfield units above the threshold."""
+    radius = np.hypot((X - 198.0) / 140.0, (Y - 150.0) / 90.0)
+    return 500.0 * np.clip((1.0 - radius) * 90.0 + wave_mm * np.sin(Z / 14.0), -4.0, 4.0) / 4.0
+
+
+def cradle(radius_mm=250.0, thick_mm=24.0, half_mm=150.0, slope=(0.0, 0.0)):
+    """A shell below the trunk, drawn along a bed that runs at slopes to the slices' axis."""
+    x, y = X - 198.0 - slope[0] * (Z - 80.0), Y - slope[1] * (Z - 80.0) - (232.0 - radius_mm)
+    shell = thick_mm / 2.0 - np.abs(np.hypot(x, y) - radius_mm - thick_mm / 2.0)
+    return 500.0 * np.clip(np.minimum.reduce([shell, half_mm - np.abs(x), y]), -4.0, 4.0) / 4.0
+
+
+def noisy(field, hu=20.0):
+    """With a scan's noise."""
+    return field + np.random.default_rng(5).normal(0.0, hu, SHAPE)
+
+
+def test_a_body_in_air_has_no_drawn_side():
+    """What changes along the bed is no table."""
+    above = noisy(trunk())
+    assert drawn_sides(above, trunk() > 0.0, SPACING) == ()
+
+
+@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.03, 0.0), (0.0, 0.06), (-0.02, 0.05)])
+def test_a_cradle_that_holds_together_with_the_body_is_drawn(slope):
+    """Its far side is found to a millimetre, at any angle between bed and slices."""
+    scene = np.maximum(trunk(), cradle(slope=slope))
+    back = next(side for side in drawn_sides(noisy(scene), scene > 0.0, SPACING) if (side.axis, side.end) == (1, -1))
+
+    for k in (0, 31):
+        across_mm = (back.across + back.slope[0] * k) * 4.0 - 198.0 - slope[0] * (k * 5.0 - 80.0)
+        along_mm = (back.along + back.slope[1] * k) * 4.0
+        truth = 232.0 - 250.0 + np.sqrt(274.0**2 - across_mm**2) + slope[1] * (k * 5.0 - 80.0)
+        flat = np.abs(across_mm) < 110.0
+        assert flat.sum() > 40
+        assert np.abs(along_mm - truth)[flat].max() < 1.5
+    assert back.whole
+    assert "back side" in back.warning
+
+
+def test_a_short_image_shows_no_drawn_side():
+    """Over 40 mm every body is nearly one section: nothing is said of its sides."""
+    scene = np.maximum(trunk(), cradle())[:, :, :8]
+    assert drawn_sides(scene, scene > 0.0, SPACING) == ()
+
+
+def test_the_top_of_a_table_beside_the_body_is_no_support():
+    """Seen from the front a table's top lies behind the body's middle; the side it is on is the back."""
+    inside = trunk() > 0.0
+    table = (Y > 250.0) & (Y < 275.0) & (X > 20.0) & (X < 380.0)
+    side = support_side(table & ~inside, inside, SPACING)
+    assert side is not None
+    assert (side.axis, side.end) == (1, -1)
+
+
+@pytest.mark.parametrize(("rows", "faces"), [(slice(8, 68), ((1, 0), (1, -1))), (slice(8, None), ((1, 0),))])
+def test_faces_near_a_body_that_nothing_supports_are_open(rows, faces):
+    """Within 60 mm of the body nothing is known beyond a face that does not cut it, and one sentence names it."""
+    inside = (trunk() > 0.0)[:, rows]
+    nothing = np.zeros_like(inside)
+    support = find_support(nothing, inside, SPACING)
+    assert not support.seen
+    assert set(support.open_faces) - {(0, 0), (0, -1)} == set(faces)
+    assert len(list(support_warnings(support.seen, support.open_faces))) == 1
+
+
+def test_a_support_that_ends_in_the_image_leaves_the_faces_free():
+    """Table seen, ending before the faces at its sides: they count as air. Cut by them, they do not."""
+    inside = trunk() > 0.0
+    for low, expected in ((20.0, ()), (-1.0, ((0, 0), (0, -1)))):
+        table = (Y > 250.0) & (Y < 275.0) & (np.abs(X - 198.0) < 198.0 - low)
+        support = find_support(table & ~inside, inside, SPACING)
+        assert support.seen
+        assert support.open_faces == expected
+
+
+@pytest.mark.skipif(not CT.is_file(), reason="the real CT (totalseg_abdomen_3mm) is not on this machine")
+@pytest.mark.parametrize(
+    "slices", [slice(None), slice(0, 33), slice(16, 49), slice(40, 73), slice(79, 112), slice(60, 80)]
+)
+def test_of_a_real_patient_only_the_back_lies_on_something(slices):
+    """Of the whole abdomen and of 60 to 100 mm of it: front and flanks are no table's, and what it lies on is seen."""
+    image = sitk.ReadImage(str(CT))
+    hu = sitk.GetArrayFromImage(image).transpose(2, 1, 0).astype(np.float32)[:, :, slices]
+    directions = np.array(image.GetDirection()).reshape(3, 3)
+    hu = hu[tuple(slice(None, None, int(step)) for step in np.sign(np.diag(directions)))]
+    spacing = np.array(image.GetSpacing())
+    found = body_mask(hu, spacing, where=CT)
+    sides = drawn_sides(hu - BODY_HU, found.body, spacing)
+    outside = outside_mask(OutsideImage(hu, found.body, np.eye(4), spacing), -900.0)
+    support = find_support(outside, found.body, spacing, sides)
+
+    assert {(side.axis, side.end) for side in sides if side.whole} <= {(1, -1)}
+    assert (support.drawn[0].axis, support.drawn[0].end) == (1, -1)
+    assert (1, 0) not in support.open_faces
