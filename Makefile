@@ -18,7 +18,7 @@ test: install lint
 	$(BIN)/pytest -q -n auto
 
 kill: install
-	KILLS=$(KILLS) $(BIN)/python -m pytest -q -s tests/test_kill.py
+	KILLS=$(KILLS) $(BIN)/python -m pytest -q -s tests/jobs/test_kill.py
 
 lint: install
 	$(BIN)/ruff check .

@@ -45,7 +45,7 @@ STANDOFF = (
 """Without those that prepare a whole case or an arm."""
 
 RESIDUALS = tuple(
-    f"tests/test_registration_residuals.py::{name}"
+    f"tests/registration/test_registration_residuals.py::{name}"
     for name in (
         "test_residuals_of_11_mm_are_refused",
         "test_accepted_residuals_are_flagged",
@@ -57,14 +57,17 @@ RESIDUALS = tuple(
 
 PLAIN = MappingProxyType(
     {
-        "puncture_twin.planning.case.entry": ("tests/test_entry.py",),
-        "puncture_twin.planning.anatomy.skin_entry": ("tests/test_skin_entry.py", "tests/test_constraints.py"),
-        "puncture_twin.planning.reach.standoff": tuple(f"tests/test_standoff.py::{name}" for name in STANDOFF),
-        "puncture_twin.planning.geometry.containment": ("tests/test_containment.py",),
-        "puncture_twin.planning.search.constraints": ("tests/test_verdict_order.py",),
+        "puncture_twin.planning.case.entry": ("tests/case/test_entry.py",),
+        "puncture_twin.planning.anatomy.skin_entry": (
+            "tests/anatomy/test_skin_entry.py",
+            "tests/search/test_constraints.py",
+        ),
+        "puncture_twin.planning.reach.standoff": tuple(f"tests/reach/test_standoff.py::{name}" for name in STANDOFF),
+        "puncture_twin.planning.geometry.containment": ("tests/geometry/test_containment.py",),
+        "puncture_twin.planning.search.constraints": ("tests/search/test_verdict_order.py",),
         "puncture_twin.planning.registration.registration": (
-            "tests/test_registration_limits.py",
-            "tests/test_registration.py",
+            "tests/registration/test_registration_limits.py",
+            "tests/registration/test_registration.py",
             *RESIDUALS,
         ),
     }
@@ -73,10 +76,10 @@ PLAIN = MappingProxyType(
 
 KERNELS = MappingProxyType(
     {
-        "puncture_twin.planning.clearance.kernels.segment_triangle": ("tests/test_plain_kernels.py",),
-        "puncture_twin.planning.clearance.kernels.side_by_side": ("tests/test_plain_kernels.py",),
-        "puncture_twin.planning.clearance.kernels.nearest_triangle": ("tests/test_plain_kernels.py",),
-        "puncture_twin.planning.geometry.crossings": ("tests/test_plain_kernels.py",),
+        "puncture_twin.planning.clearance.kernels.segment_triangle": ("tests/clearance/test_plain_kernels.py",),
+        "puncture_twin.planning.clearance.kernels.side_by_side": ("tests/clearance/test_plain_kernels.py",),
+        "puncture_twin.planning.clearance.kernels.nearest_triangle": ("tests/clearance/test_plain_kernels.py",),
+        "puncture_twin.planning.geometry.crossings": ("tests/clearance/test_plain_kernels.py",),
     }
 )
 """A sample of these."""

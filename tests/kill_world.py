@@ -8,9 +8,9 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
+from places import ROOT
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import InputError
@@ -24,7 +24,7 @@ from puncture_twin.planning.base.output.manifest import (
 )
 from puncture_twin.planning.base.output.output_set import DRAFT_PREFIX
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+REPOSITORY = ROOT
 RUN_TIMEOUT_S = 600.0
 
 SELFCAL = 'schema = 1\nname = "small"\nseed = 3\n[poses]\nsamples = 240\ncount = 20\n'

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
 from hypothesis import given, settings, strategies as st
+from places import REAL_CT
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -20,7 +21,7 @@ from puncture_twin.planning.formats.labels.labelmaps import LabelMap, read_label
 from puncture_twin.planning.geometry.decimation import decimated, squared_distance
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
-REAL = Path(__file__).parents[1] / ".." / "shared" / "data" / "totalseg_abdomen_3mm"
+REAL = REAL_CT
 needs_real = pytest.mark.skipif(not REAL.is_dir(), reason=f"the real CT is not at {REAL}")
 OBLIQUE = np.array([[0.8, 0.0, -1.8, 15.0], [0.36, 1.6, 1.44, -40.0], [0.48, -1.2, 1.92, 300.0], [0.0, 0.0, 0.0, 1.0]])
 """Spacing 1, 2, 3 mm, oblique in all axes, determinant positive."""

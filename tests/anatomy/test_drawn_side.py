@@ -1,17 +1,16 @@
 """Which sides of a body in a CT count as those of a table that touches it, and which side shows what it lies on."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
+from places import REAL_CT
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, body_mask
 from puncture_twin.planning.anatomy.body.drawn_side import drawn_sides, support_side
 from puncture_twin.planning.anatomy.body.outside_body import OutsideImage, outside_mask
 from puncture_twin.planning.anatomy.body.support import find_support, support_warnings
 
-CT = Path(__file__).parents[2] / "shared" / "data" / "totalseg_abdomen_3mm" / "ct.nii.gz"
+CT = REAL_CT / "ct.nii.gz"
 SPACING = np.array([4.0, 4.0, 5.0])
 SHAPE = (100, 80, 32)
 X, Y, Z = np.indices(SHAPE) * SPACING.reshape(3, 1, 1, 1)

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import cv2
 import numpy as np
+import places
 import pytest
 from planar import calibrate_planar
 
 from puncture_twin.twin.guidance.stereo.cameras.dlt import dlt, project, reconstruct
 
-DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
+DATA = places.DATA
 CUBE = DATA / "dlt_cube_kwon_duarte" / "dlt_cube.json"
 BOARDS = DATA / "opencv_stereo_chessboard"
 SIZE = (640, 480)

@@ -3,16 +3,16 @@
 import ast
 import inspect
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from places import ROOT
 
 import puncture_twin.planning.reach.standoff
 from puncture_twin.planning.case.case import Needle
 from puncture_twin.planning.reach.standoff import skin_gaps
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(ROOT))
 
 from benchmarks.mutant_patch import mutated
 from benchmarks.mutation import mutants

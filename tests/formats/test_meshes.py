@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 from hypothesis import HealthCheck, given, settings, strategies as st
+from places import DATA
 from scipy.spatial import cKDTree
 
 from puncture_twin.planning.base.errors import InputError
@@ -22,7 +23,7 @@ from puncture_twin.planning.geometry.spaces import Space, Unit
 
 BALL = trimesh.creation.icosphere(1, 30.0)
 BALL.apply_translation([5.0, -7.0, 11.0])
-VH_MALE = Path(__file__).parents[2] / "shared" / "data" / "hubmap_vh_male"
+VH_MALE = DATA / "hubmap_vh_male"
 
 
 def read(folder: Path, suffix: str, data: bytes, unit: Unit = Unit.MM, space: Space = Space.LPS) -> TriangleMesh:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from places import REAL_CT
 
 from puncture_twin.planning.anatomy.skin import FieldOfView, Skin, skin_from_ct, skin_from_label, skin_from_mesh
 from puncture_twin.planning.base.errors import InputError
@@ -15,7 +16,7 @@ from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.volumes.volume_files import Volume, read_volume
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
-REAL = Path(__file__).parents[1] / ".." / "shared" / "data" / "totalseg_abdomen_3mm"
+REAL = REAL_CT
 SHAPE = (60, 56, 30)
 SPACING = np.array([3.0, 3.0, 5.0])
 RADIUS = 55.0

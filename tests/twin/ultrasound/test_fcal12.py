@@ -1,15 +1,14 @@
 """Real tracked images of an N-wire phantom (PLUS, BSD-3): the published matrix and our own fit, by their distances."""
 
-from pathlib import Path
-
 import numpy as np
+import places
 import pytest
 from linear_wires import WireFrames, Wires, fit_image, point_to_wire_mm
 from plus_files import read_results, read_wires
 
 from puncture_twin.planning.base.errors import InputError
 
-DATA = Path(__file__).parents[2] / "shared" / "data" / "plus_uscal_fcal12"
+DATA = places.DATA / "plus_uscal_fcal12"
 DEVICE_SET = DATA / "PlusDeviceSet_fCal_Sim_SpatialCalibration_1.2.xml"
 RESULTS = DATA / "FreehandCalibration3NWires.results.xml"
 PLACED = '<a><Transform From="Phantom" To="Reference" Matrix="{}"/></a>'

@@ -1,14 +1,14 @@
 """The paper's tables, recomputed."""
 
 import csv
-from pathlib import Path
 
+import places
 import pytest
 
 from puncture_twin.twin.jobs.papers import chen2019
 from puncture_twin.twin.phantoms import chen2019_tables
 
-DATA = Path(__file__).parents[2] / "shared" / "data" / "chen2019"
+DATA = places.DATA / "chen2019"
 
 
 def test_every_number_of_the_paper_holds():

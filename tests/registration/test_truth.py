@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from places import ROOT
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.errors import InputError
@@ -18,7 +19,7 @@ from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.registration import apply, fit_rigid, fit_triad, leverage
 from puncture_twin.twin.plant.truth import MarkerNoise, draw_truth, registration_error
 
-MESHES = Path(__file__).parents[1] / "meshes"
+MESHES = ROOT / "meshes"
 MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [90, -10, 20], [20, 150, 147]])
 NAMES = ("A", "B", "C", "D", "E")
 TARGET = np.array([50.0, 130, 63])

@@ -5,17 +5,17 @@ The markers beside the cases are simulated: points on the CT's skin, read with Â
 """
 
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
+from places import REAL_CT, TESTS
 
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.reach.standoff import waiting_flange
 from puncture_twin.planning.search.context import prepare
 
-DATA = Path(__file__).parents[2] / "shared" / "data" / "totalseg_abdomen_3mm"
-CASES = Path(__file__).parent / "real"
+DATA = REAL_CT
+CASES = TESTS / "real"
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="the real CT (totalseg_abdomen_3mm) is not on this machine")
 

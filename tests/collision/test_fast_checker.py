@@ -10,6 +10,7 @@ import fcl
 import numpy as np
 import pytest
 import trimesh
+from places import ROOT
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import ur_model
@@ -292,7 +293,7 @@ def test_an_empty_room_and_a_needle_that_may_go_in() -> None:
 def abdomen(tmp_path_factory: pytest.TempPathFactory) -> CaseContext:
     """The embedded abdomen at 6 degrees."""
     here = tmp_path_factory.mktemp("abdomen") / "case"
-    shutil.copytree(Path(__file__).parents[1] / "meshes" / "abdomen", here)
+    shutil.copytree(ROOT / "meshes" / "abdomen", here)
     case = here / "case.toml"
     case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 6.0"))
     return prepare(case)

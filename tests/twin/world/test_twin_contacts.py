@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import pytest
+from places import TESTS
 
 from puncture_twin.planning.anatomy.anatomy import Structure
 from puncture_twin.planning.case.entry import outward
@@ -23,7 +23,7 @@ from puncture_twin.twin.world.bodies import load_capsule, load_surface, remove
 from puncture_twin.twin.world.client import physics_client
 from puncture_twin.twin.world.contacts import gap_mm
 
-CARDS = Path(__file__).parent / "collision"
+CARDS = TESTS / "collision"
 
 TOLERANCE_MM = 1e-3
 """PyBullet reads surfaces from text, whose coordinates are rounded to 1e-4 mm: its gaps on these cards differ from the

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
+from places import DATA
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.guard import guard_points
 from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points, write_points
 from puncture_twin.planning.geometry.spaces import Space, Unit
 
-CHEN_2019 = Path(__file__).parents[2] / "shared" / "data" / "chen2019"
+CHEN_2019 = DATA / "chen2019"
 CSV = "name,x_mm,y_mm,z_mm\nA,10,20,147\nB,110,120.5,-1e2\n"
 FCSV = """# Markups fiducial file version = 4.11
 # CoordinateSystem = LPS

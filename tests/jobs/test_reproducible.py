@@ -4,9 +4,9 @@ import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from places import ROOT
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.output.manifest import TIMINGS_NAME
@@ -29,7 +29,7 @@ CORES = sorted(os.sched_getaffinity(0))
 def start(command, case, out, environment, working_folder):
     """The command in a process of its own, in one of the environments; the one with one thread has one core."""
     cores = CORES[: int(environment["NUMBA_NUM_THREADS"])]
-    program = Path(__file__).resolve().parent.parent / "run_twin.py"
+    program = ROOT / "run_twin.py"
     paths = [str(program.parent), os.environ.get("PYTHONPATH", "")]
     return subprocess.Popen(
         [sys.executable, str(program), command, str(case), "--out", str(out), *COMMANDS[command]],

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from places import REAL_CT
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.labels.naming import LabelRule, RuleKind, names_for, select
 from puncture_twin.planning.formats.labels.totalsegmentator import V1, V2
 
-REAL = Path(__file__).parents[1] / ".." / "shared" / "data" / "totalseg_abdomen_3mm"
+REAL = REAL_CT
 NAMES = {1: "liver", 2: "rib_left_7", 3: "rib_left_8", 4: "lung_lower_lobe_left", 5: "aorta"}
 
 

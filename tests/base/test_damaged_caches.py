@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
 import trimesh
+from places import ROOT
 
 CASE = """
 schema = 1
@@ -65,7 +66,7 @@ def search(world: Path) -> tuple[dict[str, object], list[str]]:
     """The summary of a search in a process of its own, without times, and what stderr says."""
     folders = {"NUMBA_CACHE_DIR": str(world / "kernels"), "PUNCTURE_TWIN_CACHE": str(world / "surfaces")}
     options = ["--no-arm", "--no-pictures", "--json", "--out", str(world / "out")]
-    root = Path(__file__).parents[1]
+    root = ROOT
     command = [sys.executable, str(root / "run_twin.py"), "search", str(world), *options]
     environment = os.environ | folders | {"PYTHONPATH": str(root)}
     run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)

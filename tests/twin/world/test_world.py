@@ -5,11 +5,11 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from places import ROOT
 
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.tool import Box, Tool
@@ -27,7 +27,7 @@ from puncture_twin.twin.world.execution import execute
 from puncture_twin.twin.world.units import pose_to_m, pose_to_mm, to_m, to_mm
 from puncture_twin.twin.world.workcell import open_room
 
-REPO = Path(__file__).parents[1]
+REPO = ROOT
 TOOL = Tool(210.0, 150.0, 1.2, 30.0)
 HOME = np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])
 DOWN = np.array([0.0, 0.0, -1.0])

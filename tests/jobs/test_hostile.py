@@ -6,16 +6,16 @@ import os
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import pytest
 from hostile.makers import MAKERS
+from places import TESTS
 
 from puncture_twin.planning.base.output.manifest import problems
 from puncture_twin.planning.base.processes import worker_count
 from puncture_twin.planning.place.workers import ask_all
 
-HERE = Path(__file__).parent
+HERE = TESTS
 CASES = tomllib.loads((HERE / "hostile" / "cases.toml").read_text())["case"]
 SECONDS, MEGABYTES = 10, 1000
 """Bounds of a case that states none, generous: the machine may be shared."""

@@ -1,13 +1,12 @@
 """The fast engine judged by FCL: verdicts of capsules, on anatomy, anywhere, and within a hair of the threshold."""
 
-from pathlib import Path
-
 import fcl
 import numpy as np
 import pytest
 import trimesh
 from hypothesis import given, settings, strategies as st
 from oracles import segment_mesh_distance
+from places import DATA
 
 from puncture_twin import meshes
 from puncture_twin.planning.clearance.engine import AxisDistances
@@ -17,7 +16,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 LENGTH = 210.0
 RADII_MM = (0.5, 3.0, 5.5)
-HUBMAP = Path(__file__).parents[2] / "shared" / "data" / "hubmap_vh_male"
+HUBMAP = DATA / "hubmap_vh_male"
 
 
 def units(rng, count):

@@ -3,12 +3,12 @@
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from oracles import segment_mesh_distance
+from places import REAL_CT, TESTS
 from scipy.optimize import nnls
 
 from puncture_twin.meshes import folder
@@ -36,8 +36,8 @@ from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.search import organ_candidates
 from puncture_twin.run_twin import OK, main
 
-REAL = Path(__file__).parent / "real"
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "totalseg_abdomen_3mm"
+REAL = TESTS / "real"
+DATA = REAL_CT
 
 CASES = {"abdomen": ("abdomen", 2.0), "carton": ("carton/case_m.toml", 2.0)}
 """Case, and the size in degrees to which the tests certify it."""
