@@ -19,6 +19,8 @@ NECK_MM = 30.0
 is pressed against the trunk, some 50 mm wide."""
 FLAT, SLACK_MM = 1.5, 5.0
 """From its bone a limb that is pressed flat reaches so many times as far as the air is away, and so much farther."""
+HELD = 0.9
+"""Of a bone's slices: where less of it is known by a neck, such as one end of an arm, the bone tells the rest."""
 BEYOND_ENDS_MM = 50.0
 """So far beyond the end of its bone a limb goes on, to a joint and the next bone."""
 SAMPLING_MM = 4.0
@@ -54,15 +56,15 @@ def attached_limbs(hu: NDArray[np.float32], body: Mask, spacing_mm: Floats, targ
                 limbs |= part
     held = _holding(body, tuple(np.clip(np.round(target_index).astype(int), 0, np.array(body.shape) - 1)))
     for bone in limb_bones(hu, held, spacing_mm):
-        if not _holds_most(limbs, bone) and not _about(bone, target_index, spacing_mm):
+        if not _holds_whole(limbs, bone) and not _about(bone, target_index, spacing_mm):
             limbs |= _surroundings(bone, body.shape, spacing_mm) & held
     return limbs
 
 
-def _holds_most(limbs: Mask, bone: LimbBone) -> bool:
-    """Whether a bone lies in limbs that are known by their necks."""
+def _holds_whole(limbs: Mask, bone: LimbBone) -> bool:
+    """Whether a bone lies in limbs that are known by their necks, in all slices but a few at its ends."""
     x, y = np.round(bone.middle).astype(int).T
-    return bool(limbs[x, y, bone.slices].mean() > 0.5)
+    return bool(limbs[x, y, bone.slices].mean() > HELD)
 
 
 def _about(bone: LimbBone, at: Floats, spacing_mm: Floats) -> bool:
