@@ -453,6 +453,38 @@ def test_an_arm_that_is_pressed_against_the_trunk_is_no_way_in(tmp_path):
     assert found.safe.sum() > 40
 
 
+@pytest.mark.parametrize(("thick_mm", "wide_mm"), [(25.0, 25.0), (32.0, 48.0)], ids=["thin", "flat"])
+def test_a_thin_or_flat_arm_that_is_pressed_against_the_trunk_is_no_way_in(tmp_path, thick_mm, wide_mm):
+    """No ball tells it from the trunk; its bone does, although a structure names it. The front stays free."""
+    middle = np.array([-150.0 - thick_mm, 10.0])
+
+    def arm_field(points):
+        off = (points[:, :2] - middle) / [thick_mm, wide_mm]
+        return (np.linalg.norm(off, axis=1) - 1.0) * thick_mm
+
+    arm = ScannedPart("arm", arm_field, 20.0)
+    bone = ScannedPart("humerus_left", capsule((*middle, -300.0), (*middle, 300.0), 9.0), 700.0)
+    lesion = ScannedPart("lesion", ellipsoid((-86.0, 11.0, 1.0), (12, 12, 12)), 90.0)
+    parts = [*supine.trunk_parts()[:3], lesion, arm, bone]
+    write_scene(tmp_path, parts, supine.grid())
+    path = write_case(tmp_path, structures=SPINE + HUMERI.split("[[structure]]")[1].join(["[[structure]]", ""]))
+    path.write_text(path.read_text().replace("[-55.0, 20.0, 0.0]", "[-85.0, 10.0, 0.0]"))
+    prepared = prepare(path, arm=False)
+    found = prepared.search()
+
+    assert hit_parts_from_target(prepared, found, arm) == 0
+    assert any("pressed against" in warning for warning in prepared.anatomy.warnings)
+    assert found.safe.sum() > 40
+
+
+def hit_parts_from_target(prepared, found, part):
+    """Safe needles whose path in the body passes a part's truth by more than a voxel."""
+    depths = np.arange(0.0, 210.0, 0.5)
+    points = prepared.case.target_ct + depths[:, None, None] * found.outward_ct[found.safe]
+    deepest = part.field(points.reshape(-1, 3)).reshape(points.shape[:2]).min(axis=0)
+    return int((deepest < -4.0).sum())
+
+
 @pytest.mark.parametrize(
     ("name", "holds"),
     [("lung_upper_lobe_left", True), ("small_bowel", True), ("femoral_artery", False), ("pectoral_muscle", False),

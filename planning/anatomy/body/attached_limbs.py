@@ -1,7 +1,8 @@
 """Limbs that are pressed against the trunk: one body in the CT, but no way for a needle to go from one into the other.
 
 Between an arm and the trunk that it touches there is skin, which a CT does not show. What tells them apart is the neck:
-a ball that fits into either does not fit through where they touch.
+a ball that fits into either does not fit through where they touch. Where there is no neck, because the arm is thin or
+pressed flat, it is known by its bone, and what is as near to it as the arm may be thick belongs to it.
 """
 
 from __future__ import annotations
@@ -11,11 +12,18 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from puncture_twin.planning.anatomy.body.detached_parts import BONE_HU, MIN_BONE_ML
+from puncture_twin.planning.anatomy.body.limb_bones import LimbBone, limb_bones
 from puncture_twin.planning.base.arrays import Bools, Floats
 
 NECK_MM = 30.0
 """Radius of a ball that fits into an adult's upper arm (35 to 50 mm) and thigh, and not through the place where an arm
-is pressed against the trunk, some 50 mm wide. A thinner arm, and one that is pressed flat, is not told apart."""
+is pressed against the trunk, some 50 mm wide."""
+FLAT, SLACK_MM = 1.5, 5.0
+"""From its bone a limb that is pressed flat reaches so many times as far as the air is away, and so much farther."""
+HELD = 0.9
+"""Of a bone's slices: where less of it is known by a neck, such as one end of an arm, the bone tells the rest."""
+BEYOND_ENDS_MM = 50.0
+"""So far beyond the end of its bone a limb goes on, to a joint and the next bone."""
 SAMPLING_MM = 4.0
 """Spacing at which necks are looked for."""
 
@@ -44,7 +52,35 @@ def attached_limbs(hu: NDArray[np.float32], body: Bools, spacing_mm: Floats, tar
             part = parts == number
             if np.count_nonzero(hu[part] > BONE_HU) * voxel_ml >= MIN_BONE_ML:
                 limbs |= part
+    held = _holding(body, tuple(np.clip(np.round(target_index).astype(int), 0, np.array(body.shape) - 1)))
+    for bone in limb_bones(hu, held, spacing_mm):
+        if not _holds_whole(limbs, bone) and not _about(bone, target_index, spacing_mm):
+            limbs |= _surroundings(bone, body.shape, spacing_mm) & held
     return limbs
+
+
+def _holds_whole(limbs: Bools, bone: LimbBone) -> bool:
+    """Whether a bone lies in limbs that are known by their necks, in all slices but a few at its ends."""
+    x, y = np.round(bone.middle).astype(int).T
+    return bool(limbs[x, y, bone.slices].mean() > HELD)
+
+
+def _about(bone: LimbBone, at: Floats, spacing_mm: Floats) -> bool:
+    """Whether a point (3,), voxels, lies in the limb about a bone."""
+    nearest = bone.middle[np.argmin(np.abs(bone.slices - at[2]))]
+    return bool(np.linalg.norm((at[:2] - nearest) * spacing_mm[:2]) < bone.radius_mm)
+
+
+def _surroundings(bone: LimbBone, shape: tuple[int, ...], spacing_mm: Floats) -> Bools:
+    """Voxels about a bone that may belong to its limb, also some way beyond its ends."""
+    reach_mm, beyond = FLAT * bone.radius_mm + SLACK_MM, int(BEYOND_ENDS_MM / spacing_mm[2])
+    x, y = np.ogrid[: shape[0], : shape[1]]
+    about = np.zeros(shape, bool)
+    for k in range(max(0, bone.slices[0] - beyond), min(shape[2], bone.slices[-1] + beyond + 1)):
+        middle = bone.middle[np.argmin(np.abs(bone.slices - k))]
+        across_mm = np.hypot((x - middle[0]) * spacing_mm[0], (y - middle[1]) * spacing_mm[1])
+        about[:, :, k] = across_mm <= reach_mm
+    return about
 
 
 def _holding(body: Bools, at: tuple[int, ...]) -> Bools:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from puncture_twin.planning.anatomy.body.flat_side import SIDES, surface_ends
+from puncture_twin.planning.base.arrays import Bools, Floats
 
 DRAWN_MM = 0.75
 """A line of sight is drawn where the surface keeps within this of its median; noise moves it by some 0.3 mm."""
@@ -41,9 +42,6 @@ TOO_SHORT = (
     "the image is only {length:.0f} mm long: a curved table or cradle that is as dense as the body and touches it "
     "cannot be told from the body"
 )
-
-Mask = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 
 
 class DrawnSide(NamedTuple):
@@ -93,7 +91,7 @@ class _Ends(NamedTuple):
     axis: int
     end: int
     ends_mm: Floats
-    firm: Mask
+    firm: Bools
     spacing_mm: Floats
     near_mm: float
     middle_mm: Floats
@@ -117,12 +115,12 @@ class _Bed(NamedTuple):
 
     at: Floats
     farthest: Floats
-    drawn: Mask
+    drawn: Bools
     slopes: tuple[float, float]
     width_mm: float
 
 
-def drawn_sides(above: NDArray[np.floating], trunk: Mask, spacing_mm: Floats) -> tuple[DrawnSide, ...]:
+def drawn_sides(above: NDArray[np.floating], trunk: Bools, spacing_mm: Floats) -> tuple[DrawnSide, ...]:
     """The sides at which a body, or what holds together with it, ends in one section along the bed.
 
     Args:
@@ -138,7 +136,7 @@ def drawn_sides(above: NDArray[np.floating], trunk: Mask, spacing_mm: Floats) ->
     return _sides(views)
 
 
-def support_side(outside: Mask, body: Mask, spacing_mm: Floats) -> DrawnSide | None:
+def support_side(outside: Bools, body: Bools, spacing_mm: Floats) -> DrawnSide | None:
     """The side at which something outside of the body ends in one section along the bed: what it lies on.
 
     None where there is nothing like it; of several the widest. Between its parts, where the body lies before it, the
@@ -161,12 +159,12 @@ def support_side(outside: Mask, body: Mask, spacing_mm: Floats) -> DrawnSide | N
     return max(sides, key=lambda side: side.width_mm, default=None)
 
 
-def _middle_mm(body: Mask, spacing_mm: Floats) -> Floats:
+def _middle_mm(body: Bools, spacing_mm: Floats) -> Floats:
     """The body's middle, shape (3,), from the first voxel's centre."""
     return np.asarray(ndimage.center_of_mass(body)) * spacing_mm
 
 
-def _first(mask: Mask, axis: int, end: int) -> Floats:
+def _first(mask: Bools, axis: int, end: int) -> Floats:
     """Outer face of the first voxel of a mask along each line of an axis, from one end; NaN without any."""
     seen = np.moveaxis(mask, axis, 0)[:: -1 if end else 1]
     first = np.where(seen.any(axis=0), np.argmax(seen, axis=0) - 0.5, np.nan)
@@ -191,7 +189,7 @@ def _sides(views: Sequence[_Ends]) -> tuple[DrawnSide, ...]:
     return tuple(side for side in sides if side is not None)
 
 
-def _connected(dense: Mask, body: Mask) -> Mask:
+def _connected(dense: Bools, body: Bools) -> Bools:
     """What is dense and holds together with the body, which is part of it."""
     labels, count = ndimage.label(dense | body)
     kept = np.zeros(count + 1, bool)

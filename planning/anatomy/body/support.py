@@ -11,10 +11,10 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide, support_side
 from puncture_twin.planning.anatomy.body.flat_side import SIDES, FlatSide
+from puncture_twin.planning.base.arrays import Bools, Floats
 
 NEAR_MM = 60.0
 """A face is near the body up to this distance. Mattresses are at most some 50 mm thick; of their foam a CT shows
@@ -22,8 +22,6 @@ nothing that is denser than air."""
 CUT_FRACTION = 0.5
 """A face cuts what the body lies on where something outside of the body ends at it in so many of the slices."""
 
-Mask = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 
 Side = tuple[int, int]
 """Axis and end of a face, as `planning.flat_side.SIDES` names them."""
@@ -47,7 +45,7 @@ class Support(NamedTuple):
 
 
 def find_support(
-    outside: Mask, body: Mask, spacing_mm: Floats, touching: Sequence[FlatSide | DrawnSide] = ()
+    outside: Bools, body: Bools, spacing_mm: Floats, touching: Sequence[FlatSide | DrawnSide] = ()
 ) -> Support:
     """What the body lies on, and the faces of the image beyond which nothing is known.
 
@@ -84,12 +82,12 @@ def support_warnings(seen: bool, open_faces: Sequence[Side]) -> Iterator[str]:
         yield f"the CT cuts what the body lies on; {beyond}"
 
 
-def _cuts(outside: Mask, face: Side) -> bool:
+def _cuts(outside: Bools, face: Side) -> bool:
     axis, end = face
     return bool(outside.take(end, axis=axis).any(axis=0).mean() >= CUT_FRACTION)
 
 
-def _gap_mm(body: Mask, face: Side, spacing_mm: Floats) -> float:
+def _gap_mm(body: Bools, face: Side, spacing_mm: Floats) -> float:
     """From the body to a face of the image; 0 where the face cuts it."""
     axis, end = face
     held = np.flatnonzero(body.any(axis=(1 - axis, 2)))
