@@ -37,12 +37,15 @@ def main() -> None:
     differ = one.safe != two.safe
     print(f"directions {len(one)}, safe by v1 {one.safe.sum()}, by v2 {two.safe.sum()}")
     print(f"verdicts that differ: {differ.sum()}")
-    print("rejected by v2 alone, by structure:", dict(Counter(map(str, two.reason_structure[one.safe & ~two.safe]))))
-    print("rejected by v1 alone, by structure:", dict(Counter(map(str, one.reason_structure[~one.safe & two.safe]))))
+    print("rejected by v2 alone, by structure:", dict(Counter(map(str, two.verdict.structure[one.safe & ~two.safe]))))
+    print("rejected by v1 alone, by structure:", dict(Counter(map(str, one.verdict.structure[~one.safe & two.safe]))))
     both = one.safe & two.safe
-    shared = [name for name in one.structures if name in two.structures]
+    shared = [name for name in one.clearance.structures if name in two.clearance.structures]
     columns = [
-        np.abs(one.clearance[both, one.structures.index(n)] - two.clearance[both, two.structures.index(n)])
+        np.abs(
+            one.clearance.distance[both, one.clearance.structures.index(n)]
+            - two.clearance.distance[both, two.clearance.structures.index(n)]
+        )
         for n in shared
     ]
     print(f"clearances of {len(shared)} shared structures differ by {np.median(columns):.2f} mm in the median")

@@ -12,7 +12,7 @@ from puncture_twin.planning.case.entry import entry_frame, grid, view_frame
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
-from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking, Verdict
 
 TARGET = np.array([10.0, -20.0, 30.0])
 SKIN_RADIUS = 100.0
@@ -60,26 +60,29 @@ def make_candidates(case, *, step_deg=5.0, theta_deg=(0, 90), beta_deg=(0, 360),
         theta=ways.theta.copy(),
         beta=ways.beta.copy(),
         outward_ct=ways.outward_ct.copy(),
-        reason=reason,
-        reason_structure=np.where(rib, "rib_right_9", ""),
-        reason_depth=np.where(rib, 55.5, np.nan),
-        reason_amount=np.where(rib, 0.25, np.nan),
-        safe_cone=np.full(len(rib), np.nan),
-        reason_detail=np.where(reason == "too_long", "the shaft ends at 150 mm", ""),
-        entry_ct=TARGET + SKIN_RADIUS * ways.outward_ct,
-        path_length=np.full(n, SKIN_RADIUS),
-        skin_angle=np.zeros(n),
-        structures=("rib_right_9", "aorta"),
-        margins=np.array([1.0, 5.0]),
-        clearance=clearance,
-        min_clearance=clearance.min(axis=1),
-        tissue=np.zeros(n),
-        reachable=np.where(good, 1, -1).astype(np.int8),
-        reach_margin=np.where(good, 0.5, np.nan),
-        cost=np.where(good, 0.1 * rank, np.nan),
-        rank=rank,
-        pareto=(rank > 0) & (rank < 4),
-        arm="checked",
+        verdict=Verdict(
+            reason=reason,
+            structure=np.where(rib, "rib_right_9", ""),
+            depth=np.where(rib, 55.5, np.nan),
+            amount=np.where(rib, 0.25, np.nan),
+            detail=np.where(reason == "too_long", "the shaft ends at 150 mm", ""),
+        ),
+        path=Path(
+            entry_ct=TARGET + SKIN_RADIUS * ways.outward_ct,
+            length=np.full(n, SKIN_RADIUS),
+            skin_angle=np.zeros(n),
+            tissue=np.zeros(n),
+        ),
+        clearance=Clearance(
+            structures=("rib_right_9", "aorta"),
+            margins=np.array([1.0, 5.0]),
+            distance=clearance,
+            least=clearance.min(axis=1),
+        ),
+        arm=ArmColumns(np.where(good, 1, -1).astype(np.int8), np.where(good, 0.5, np.nan)),
+        ranking=Ranking(np.where(good, 0.1 * rank, np.nan), rank, (rank > 0) & (rank < 4)),
+        safe_cone=np.full(n, np.nan),
+        arm_note="checked",
     )
 
 

@@ -126,9 +126,9 @@ def compare(check: CheckSection, found: Explanation) -> None:
     row = found.candidates
     wanted: list[tuple[str, Any, Any]] = [("verdict", check.verdict, found.verdict)]
     if check.reason is not None:
-        wanted.append(("reason", check.reason.value, str(row.reason[0])))
+        wanted.append(("reason", check.reason.value, str(row.verdict.reason[0])))
     if check.structure is not None:
-        wanted.append(("structure", check.structure, str(row.reason_structure[0])))
+        wanted.append(("structure", check.structure, str(row.verdict.structure[0])))
     wrong = [f"{what}: expected {want!r}, found {got!r}" for what, want, got in wanted if want != got]
     clearances = found.clearances()
     for name, want in check.clearance_mm.items():

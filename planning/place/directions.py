@@ -57,7 +57,7 @@ def wanted_directions(case: Case, found: Candidates) -> WantedDirections:
     weight = ring_weights(found.theta, case.search.step)[rows]
     return WantedDirections(
         found.outward_ct[rows],
-        standoffs(case.needle, found.path_length[rows], found.skin_angle[rows]),
+        standoffs(case.needle, found.path.length[rows], found.path.skin_angle[rows]),
         weight / weight.sum() if len(rows) else weight,
     )
 

@@ -62,17 +62,10 @@ def make_plan(context: CaseContext, candidates: Candidates, *, seed: int) -> Pla
 
 def _without(context: CaseContext, candidates: Candidates, row: int, why: str) -> Candidates:
     """The same candidates with one marked ``approach_not_found``, ranked anew."""
-    reason, detail = candidates.reason.copy(), candidates.reason_detail.copy()
+    reason, detail = candidates.verdict.reason.copy(), candidates.verdict.detail.copy()
     reason[row], detail[row] = Reason.APPROACH_NOT_FOUND.value, why
-    blank = replace(
-        candidates,
-        reason=reason,
-        reason_detail=detail,
-        cost=np.full(len(candidates), np.nan),
-        rank=np.zeros(len(candidates), np.int32),
-        pareto=np.zeros(len(candidates), bool),
-    )
-    return ranked(context.case, blank)
+    verdict = replace(candidates.verdict, reason=reason, detail=detail)
+    return ranked(context.case, replace(candidates, verdict=verdict))
 
 
 def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> Plan:
@@ -97,7 +90,7 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
         expected_target_error_mm=context.placement.target_error_mm,
         theta=float(candidates.theta[row]),
         beta=float(candidates.beta[row]),
-        entry_ct=candidates.entry_ct[row],
+        entry_ct=candidates.path.entry_ct[row],
         target_ct=case.target_ct,
         outward_ct=candidates.outward_ct[row],
         roll=answer.roll,
@@ -107,7 +100,7 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
         insertion=drive_smoothly(
             checker.model, answer.insertion_q, answer.insertion_depth_mm, max_tip_speed_mm_s=INSERTION_MM_S
         ),
-        clearance_mm={"needle": float(candidates.min_clearance[row])},
+        clearance_mm={"needle": float(candidates.clearance.least[row])},
     )
     touched = motion_contact(plan, checker)
     if touched is not None:

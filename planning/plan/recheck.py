@@ -68,10 +68,14 @@ def _check_labels(plan: Plan, context: CaseContext, candidates: Candidates, path
         ("robot", plan.model, case.robot.model),
         ("needle_length_mm", plan.needle_length_mm, case.needle.length_mm),
         ("target_ct_mm", plan.target_ct, case.target_ct),
-        ("entry_ct_mm", plan.entry_ct, candidates.entry_ct[0]),
-        ("standoff_mm", plan.standoff_mm, standoffs(case.needle, candidates.path_length[0], candidates.skin_angle[0])),
+        ("entry_ct_mm", plan.entry_ct, candidates.path.entry_ct[0]),
+        (
+            "standoff_mm",
+            plan.standoff_mm,
+            standoffs(case.needle, candidates.path.length[0], candidates.path.skin_angle[0]),
+        ),
         ("expected_target_error_mm", plan.expected_target_error_mm, error),
-        ("clearance_mm.needle", plan.clearance_mm.get("needle", np.nan), candidates.min_clearance[0]),
+        ("clearance_mm.needle", plan.clearance_mm.get("needle", np.nan), candidates.clearance.least[0]),
         ("the approach's first row", plan.approach.q[0], home_configuration(case)),
     )
     for name, said, known in stated:

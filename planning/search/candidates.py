@@ -8,87 +8,156 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats, Texts
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Ints32, Texts
 from puncture_twin.planning.base.reasons import Reason
 
 ARM_CHECKED = "checked"
-"""What ``Candidates.arm`` says where a safe candidate is one that the arm can reach and insert along."""
+"""What ``Candidates.arm_note`` says where a safe candidate is one that the arm can reach and insert along."""
+
+
+class Columns:
+    """Arrays of one length, row by row; read-only."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):  # type: ignore[arg-type]  # every class below is a dataclass
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
-    """Every direction of the grid, column by column: mm, radians, points in the CT frame.
+class Verdict(Columns):
+    """The first constraint that each candidate breaks.
+
+    Attributes:
+        reason: Shape (n,), values of `Reason`; the empty string where the candidate is safe.
+        structure: Shape (n,), the structure (or arm body and what it touches) that the reason names, or "".
+        depth: Shape (n,), distance from the target along the needle, mm; NaN where it means nothing.
+        amount: Shape (n,), the number that fell short: clearance for ``too_close``, path length for ``too_long``, the
+            skin angle in degrees for ``skin_angle``; NaN otherwise.
+        detail: Shape (n,), what kept the arm, in one sentence; "" for the organs' reasons.
+    """
+
+    reason: Texts
+    structure: Texts
+    depth: Floats
+    amount: Floats
+    detail: Texts
+
+
+@dataclass(frozen=True, eq=False)
+class Path(Columns):
+    """The way from the skin to the target.
+
+    Attributes:
+        entry_ct: Shape (n, 3), where the path crosses the skin, mm; NaN without an entry.
+        length: Shape (n,), target to entry, mm.
+        skin_angle: Shape (n,), between the path and the skin's inward normal, rad; 0 is straight in.
+        tissue: Shape (n,), length of path inside structures that may be crossed, mm.
+    """
+
+    entry_ct: Floats
+    length: Floats
+    skin_angle: Floats
+    tissue: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Clearance(Columns):
+    """How far the needle's surface stays from each of k structures, mm.
+
+    Attributes:
+        structures: The k names.
+        margins: Shape (k,), what each structure demands; NaN for one that demands nothing.
+        distance: Shape (n, k), axis distance minus needle radius.
+        least: Shape (n,), smallest over the structures with a margin.
+    """
+
+    structures: tuple[str, ...]
+    margins: Floats
+    distance: Floats
+    least: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class ArmColumns(Columns):
+    """What the arm answers.
+
+    Attributes:
+        reachable: Shape (n,), 1 yes, 0 no, -1 not queried.
+        margin: Shape (n,), 0..1 distance from joint limits and singularities; NaN where not queried.
+    """
+
+    reachable: NDArray[np.int8]
+    margin: Floats
+
+    @classmethod
+    def unknown(cls, count: int) -> ArmColumns:
+        """Of an arm that was not queried."""
+        return cls(np.full(count, -1, np.int8), np.full(count, np.nan))
+
+
+@dataclass(frozen=True, eq=False)
+class Ranking(Columns):
+    """The order of the safe candidates.
+
+    Attributes:
+        cost: Shape (n,), NaN for rejected candidates.
+        rank: Shape (n,), 1 is best, 0 for rejected candidates.
+        pareto: Shape (n,), on the Pareto front of the cost's terms.
+    """
+
+    cost: Floats
+    rank: Ints32
+    pareto: Bools
+
+    @classmethod
+    def none(cls, count: int) -> Ranking:
+        """Of candidates that nobody has ranked."""
+        return cls(np.full(count, np.nan), np.zeros(count, np.int32), np.zeros(count, bool))
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates(Columns):
+    """Every direction of the grid: n rows in groups of columns; mm, radians, points in the CT frame.
 
     Attributes:
         theta: Shape (n,), puncture angle.
         beta: Shape (n,), azimuth.
         outward_ct: Shape (n, 3), unit vectors from the target outward.
-        reason: Shape (n,), values of `Reason`; the empty string where the candidate is safe.
-        reason_structure: Shape (n,), the structure (or arm body and what it touches) that the reason names.
-        reason_depth: Shape (n,), distance from the target along the needle, NaN where it means nothing.
-        reason_amount: Shape (n,), the number that fell short: clearance for ``too_close``, path length for
-            ``too_long``, the skin angle in degrees for ``skin_angle``; NaN otherwise.
-        reason_detail: Shape (n,), what kept the arm, in one sentence; "" for the organs' reasons.
-        entry_ct: Shape (n, 3), where the path crosses the skin, NaN without an entry.
-        path_length: Shape (n,), target to entry.
-        skin_angle: Shape (n,), between the path and the skin's inward normal, 0 is straight in.
-        structures: The k names of the clearance columns.
-        margins: Shape (k,), the clearance that each structure demands, NaN for one that demands none.
-        clearance: Shape (n, k), axis distance minus needle radius.
-        min_clearance: Shape (n,), smallest over the structures with a margin.
-        tissue: Shape (n,), length of path inside structures that may be crossed.
-        reachable: Shape (n,), 1 yes, 0 no, -1 not asked.
+        verdict: Safe, or why not.
+        path: From the skin to the target.
+        clearance: To every structure.
+        arm: Whether the arm reaches it.
+        ranking: Which of the safe ones to prefer.
         safe_cone: Shape (n,), by how much one may be off in any direction and still be safe for the organs, rad; NaN
-            where no certificate was asked for.
-        reach_margin: Shape (n,), 0..1 distance from joint limits and singularities, NaN when not asked.
-        cost: Shape (n,), NaN for rejected candidates.
-        rank: Shape (n,), 1 is best, 0 for rejected candidates.
-        pareto: Shape (n,), on the Pareto front of the cost's terms.
-        arm: `ARM_CHECKED`, or "not checked: " and why: then a safe candidate is safe for the organs alone.
+            without a certificate.
+        arm_note: `ARM_CHECKED`, or "not checked: " and why: then a safe candidate is safe for the organs alone.
     """
 
     theta: Floats
     beta: Floats
     outward_ct: Floats
-    reason: Texts
-    reason_structure: Texts
-    reason_depth: Floats
-    reason_amount: Floats
-    reason_detail: Texts
-    entry_ct: Floats
-    path_length: Floats
-    skin_angle: Floats
-    structures: tuple[str, ...]
-    margins: Floats
-    clearance: Floats
-    min_clearance: Floats
-    tissue: Floats
-    reachable: NDArray[np.int8]
-    reach_margin: Floats
+    verdict: Verdict
+    path: Path
+    clearance: Clearance
+    arm: ArmColumns
+    ranking: Ranking
     safe_cone: Floats
-    cost: Floats
-    rank: NDArray[np.int32]
-    pareto: NDArray[np.bool_]
-    arm: str = "not checked"
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                value.setflags(write=False)
+    arm_note: str = "not checked"
 
     def __len__(self) -> int:
         return len(self.theta)
 
     @property
-    def safe(self) -> NDArray[np.bool_]:
+    def safe(self) -> Bools:
         """Which rows are not rejected, shape (n,)."""
-        return self.reason == Reason.NONE.value
+        return self.verdict.reason == Reason.NONE.value
 
     @property
     def arm_checked(self) -> bool:
         """Whether "safe" includes the arm."""
-        return self.arm == ARM_CHECKED
+        return self.arm_note == ARM_CHECKED
 
     @property
     def safe_text(self) -> str:
@@ -96,14 +165,14 @@ class Candidates:
         return "safe" if self.arm_checked else "safe for the organs"
 
     @property
-    def ranked(self) -> NDArray[np.int64]:
+    def ranked(self) -> Ints:
         """Row numbers of the safe candidates, best first."""
-        rows = np.flatnonzero(self.rank > 0)
-        return rows[np.argsort(self.rank[rows], kind="stable")]
+        rows = np.flatnonzero(self.ranking.rank > 0)
+        return rows[np.argsort(self.ranking.rank[rows], kind="stable")]
 
     def counts(self) -> dict[str, int]:
         """How many candidates fell to which reason, most frequent first; "safe" among them."""
-        return dict(Counter(str(reason) or "safe" for reason in self.reason).most_common())
+        return dict(Counter(str(reason) or "safe" for reason in self.verdict.reason).most_common())
 
     def at(self, row: int) -> dict[str, float]:
         """The angles of one row, degrees, rounded to what a person types."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,30 +9,14 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Role, Structure
 from puncture_twin.planning.anatomy.skin_entry import SkinPaths
-from puncture_twin.planning.base.arrays import Bools, Floats, Texts
+from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Needle
 from puncture_twin.planning.clearance.measure import Clearances
 from puncture_twin.planning.reach.standoff import waiting_flange
+from puncture_twin.planning.search.candidates import Verdict
 
 Column = NDArray[Any] | str | float
-
-
-@dataclass(frozen=True, eq=False)
-class Verdicts:
-    """The first constraint that each of n candidates breaks.
-
-    Attributes:
-        reason: Shape (n,), values of `Reason`, the empty string where none is broken.
-        structure: Shape (n,), the structure that the reason names, or "".
-        depth: Shape (n,), from the target along the needle, mm, or NaN.
-        amount: Shape (n,), what fell short (see `puncture_twin.planning.search.candidates.Candidates.reason_amount`).
-    """
-
-    reason: Texts
-    structure: Texts
-    depth: Floats
-    amount: Floats
 
 
 def longest_path(needle: Needle) -> float:
@@ -54,7 +37,7 @@ def judge(
     needle: Needle,
     max_skin_angle: float,
     skin: str = "skin",
-) -> Verdicts:
+) -> Verdict:
     """Apply every constraint; the reason given is the first that is broken, in the order of the code.
 
     Unknown regions come first among those on the path: nothing behind them can be judged. Those that only the needle
@@ -69,20 +52,16 @@ def judge(
         skin: Name of the skin in the reasons.
     """
     count = len(paths.path_length)
-    verdicts = Verdicts(
-        np.full(count, Reason.NONE.value, dtype=object),
-        np.full(count, "", dtype=object),
-        np.full(count, np.nan),
-        np.full(count, np.nan),
-    )
+    reasons, names_of, details = (np.full(count, "", dtype=object) for _ in range(3))
+    depths, amounts = np.full(count, np.nan), np.full(count, np.nan)
     unset = np.ones(count, bool)
 
     def give(reason: Reason, where: Bools, names: Column, depth: Column, amount: Column = np.nan) -> None:
         rows = np.flatnonzero(where & unset)
         unset[rows] = False
-        verdicts.reason[rows] = reason.value
+        reasons[rows] = reason.value
         columns: tuple[tuple[NDArray[Any], Column], ...]
-        columns = ((verdicts.structure, names), (verdicts.depth, depth), (verdicts.amount, amount))
+        columns = ((names_of, names), (depths, depth), (amounts, amount))
         for column, value in columns:
             column[rows] = value[rows] if isinstance(value, np.ndarray) else value
 
@@ -103,7 +82,7 @@ def judge(
         depth, amount = clearances.depth[rows, worst], clearances.clearance[rows, worst]
         give(Reason.UNKNOWN_REGION, broken & unknown, names, depth, amount)
         give(Reason.TOO_CLOSE, broken, names, depth, amount)
-    return verdicts
+    return Verdict(reasons, names_of, depths, amounts, details)
 
 
 def worst_violation(clearances: Clearances, structures: tuple[Structure, ...]) -> NDArray[np.int64]:

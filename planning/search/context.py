@@ -86,7 +86,7 @@ class CaseContext:
 
     @property
     def arm(self) -> str:
-        """Whether the arm is checked, and if not, why: see `Candidates.arm`."""
+        """Whether the arm is checked, and if not, why: see `Candidates.arm_note`."""
         if self.reach is not None:
             return ARM_CHECKED
         return f"not checked: {NO_BASE if self.placement is None else 'switched off (--no-arm)'}"
@@ -102,13 +102,13 @@ class CaseContext:
                 reach=self.reach,
                 progress=partial(self.watcher.count, "arm"),
             )
-        return replace(found, arm=self.arm)
+        return replace(found, arm_note=self.arm)
 
     def check(self, theta: float, beta: float) -> Candidates:
         """Judge a single direction (rad)."""
         directions = one_direction(self.case, theta, beta)
         found = search(self.case, self.anatomy, self.engine, directions, reach=self.reach)
-        return replace(found, arm=self.arm)
+        return replace(found, arm_note=self.arm)
 
     def cross_check(self, count: int) -> CrossChecked:
         """Measure random directions of the grid again with FCL.

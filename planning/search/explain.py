@@ -50,7 +50,8 @@ class Explanation:
 
     def clearances(self) -> dict[str, float]:
         """Structure to clearance, mm."""
-        return dict(zip(self.candidates.structures, map(float, self.candidates.clearance[0]), strict=True))
+        found = self.candidates.clearance
+        return dict(zip(found.structures, map(float, found.distance[0]), strict=True))
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees; null where there is no number."""
@@ -62,21 +63,21 @@ class Explanation:
             "beta_deg": float(np.degrees(row.beta[0])),
             "verdict": self.verdict,
             "arm": row.arm,
-            "reason": str(row.reason[0]),
-            "reason_structure": str(row.reason_structure[0]),
-            "reason_depth_mm": finite(row.reason_depth[0]),
-            "reason_amount": finite(row.reason_amount[0]),
-            "reason_detail": str(row.reason_detail[0]),
-            "entry_ct_mm": [finite(x) for x in row.entry_ct[0]],
+            "reason": str(row.verdict.reason[0]),
+            "reason_structure": str(row.verdict.structure[0]),
+            "reason_depth_mm": finite(row.verdict.depth[0]),
+            "reason_amount": finite(row.verdict.amount[0]),
+            "reason_detail": str(row.verdict.detail[0]),
+            "entry_ct_mm": [finite(x) for x in row.path.entry_ct[0]],
             "target_depth_mm": self.target_depth_mm,
-            "path_length_mm": finite(row.path_length[0]),
-            "skin_angle_deg": finite(np.degrees(row.skin_angle[0])),
-            "tissue_mm": finite(row.tissue[0]),
+            "path_length_mm": finite(row.path.length[0]),
+            "skin_angle_deg": finite(np.degrees(row.path.skin_angle[0])),
+            "tissue_mm": finite(row.path.tissue[0]),
             "clearance_mm": self.clearances(),
-            "reachable": None if row.reachable[0] < 0 else bool(row.reachable[0]),
-            "reach_margin": finite(row.reach_margin[0]),
+            "reachable": None if row.arm.reachable[0] < 0 else bool(row.arm.reachable[0]),
+            "reach_margin": finite(row.arm.margin[0]),
             "safe_cone_deg": finite(np.degrees(row.safe_cone[0])),
-            "cost": finite(row.cost[0]),
+            "cost": finite(row.ranking.cost[0]),
             "along_path": [
                 {
                     "start_mm": part.start_mm,
@@ -93,7 +94,7 @@ class Explanation:
     def along_path(self) -> tuple[Stretch, ...]:
         """The CT along the path, beside the structures; empty without a CT."""
         row = self.candidates
-        return stretches(self.anatomy, self.case.target_ct, row.outward_ct[0], float(row.path_length[0]))
+        return stretches(self.anatomy, self.case.target_ct, row.outward_ct[0], float(row.path.length[0]))
 
     def text(self) -> str:
         """The same for a person."""
@@ -121,18 +122,18 @@ class Explanation:
 
     def _path(self) -> list[str]:
         row, needle = self.candidates, self.case.needle
-        if np.isnan(row.path_length[0]):
+        if np.isnan(row.path.length[0]):
             return ["  no skin entry on this path"]
-        entry = ", ".join(f"{x:.1f}" for x in row.entry_ct[0])
+        entry = ", ".join(f"{x:.1f}" for x in row.path.entry_ct[0])
         limit = np.degrees(self.case.search.max_skin_angle)
-        standoff = float(standoffs(needle, row.path_length[0], row.skin_angle[0]))
-        before, flange = standoff - row.path_length[0], standoff + needle.length_mm
+        standoff = float(standoffs(needle, row.path.length[0], row.path.skin_angle[0]))
+        before, flange = standoff - row.path.length[0], standoff + needle.length_mm
         return [
             f"  skin entry     ({entry}) mm in the CT frame",
-            f"  path length    {row.path_length[0]:8.2f} mm, allowed {longest_path(needle):g}",
-            f"  skin angle     {np.degrees(row.skin_angle[0]):8.2f} deg, allowed {limit:g}",
+            f"  path length    {row.path.length[0]:8.2f} mm, allowed {longest_path(needle):g}",
+            f"  skin angle     {np.degrees(row.path.skin_angle[0]):8.2f} deg, allowed {limit:g}",
             f"  standoff       {standoff:8.2f} mm, its tip {before:.1f} mm before the skin, the flange at {flange:.1f}",
-            f"  tissue crossed {row.tissue[0]:8.2f} mm",
+            f"  tissue crossed {row.path.tissue[0]:8.2f} mm",
         ]
 
     def _scan(self) -> list[str]:
@@ -149,7 +150,7 @@ class Explanation:
 
     def _table(self) -> list[str]:
         lines = ["  structure                        role       clearance mm   margin mm"]
-        clearances = self.candidates.clearance[0]
+        clearances = self.candidates.clearance.distance[0]
         for column in np.argsort(clearances, kind="stable"):
             structure = self.anatomy.checked[column]
             margin = f"{structure.margin_mm:11.2f}" if structure.demands_margin else "          -"
@@ -168,13 +169,13 @@ class Explanation:
         if not row.arm_checked:
             return f"arm {row.arm}"
         no_need = "not computed, the organs reject the direction"
-        reached = {-1: no_need, 0: "no", 1: f"yes, margin {row.reach_margin[0]:.2f}"}
-        return f"arm reaches it: {reached[int(row.reachable[0])]}"
+        reached = {-1: no_need, 0: "no", 1: f"yes, margin {row.arm.margin[0]:.2f}"}
+        return f"arm reaches it: {reached[int(row.arm.reachable[0])]}"
 
 
 def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
     """What to say where the needle is too short for most of the directions."""
-    short = int((candidates.reason == Reason.TOO_LONG.value).sum())
+    short = int((candidates.verdict.reason == Reason.TOO_LONG.value).sum())
     if short <= MOST * len(candidates):
         return []
     return [
@@ -185,15 +186,15 @@ def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
 
 def reason_text(candidates: Candidates, row: int) -> str:
     """Reason, structure, depth and number of a rejected candidate, in one line."""
-    parts = [str(candidates.reason[row])]
-    if candidates.reason_structure[row]:
-        parts.append(f"({candidates.reason_structure[row]})")
-    if np.isfinite(candidates.reason_depth[row]):
-        parts.append(f"at {candidates.reason_depth[row]:.1f} mm from the target")
-    if np.isfinite(candidates.reason_amount[row]):
-        parts.append(f"with {candidates.reason_amount[row]:.2f} {_unit(str(candidates.reason[row]))}")
-    if candidates.reason_detail[row]:
-        parts.append(f"- {candidates.reason_detail[row]}")
+    parts = [str(candidates.verdict.reason[row])]
+    if candidates.verdict.structure[row]:
+        parts.append(f"({candidates.verdict.structure[row]})")
+    if np.isfinite(candidates.verdict.depth[row]):
+        parts.append(f"at {candidates.verdict.depth[row]:.1f} mm from the target")
+    if np.isfinite(candidates.verdict.amount[row]):
+        parts.append(f"with {candidates.verdict.amount[row]:.2f} {_unit(str(candidates.verdict.reason[row]))}")
+    if candidates.verdict.detail[row]:
+        parts.append(f"- {candidates.verdict.detail[row]}")
     return " ".join(parts)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -19,7 +19,15 @@ from puncture_twin.planning.clearance.measure import measure
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.reach.reach import ReachRequest, assess_reach_all
 from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange, standoffs
-from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
+from puncture_twin.planning.search.candidates import (
+    ARM_CHECKED,
+    ArmColumns,
+    Candidates,
+    Clearance,
+    Path,
+    Ranking,
+    Verdict,
+)
 from puncture_twin.planning.search.constraints import judge
 from puncture_twin.planning.search.ranking import rank
 from puncture_twin.planning.search.tissue import tissue_crossed
@@ -85,25 +93,22 @@ def organ_candidates(case: Case, anatomy: Anatomy, engine: ClearanceEngine, dire
         theta=directions.theta,
         beta=directions.beta,
         outward_ct=outward,
-        reason=verdicts.reason,
-        reason_structure=verdicts.structure,
-        reason_depth=verdicts.depth,
-        reason_amount=verdicts.amount,
-        reason_detail=np.full(count, "", dtype=object),
-        entry_ct=paths.entry_ct,
-        path_length=paths.path_length,
-        skin_angle=paths.skin_angle,
-        structures=tuple(s.name for s in checked),
-        margins=np.array([s.margin_mm if s.demands_margin else np.nan for s in checked]),
-        clearance=clearances.clearance,
-        min_clearance=clearances.clearance[:, demanding].min(axis=1, initial=np.inf),
-        tissue=tissue_crossed(checked, case.target_structure, case.target_ct, outward, paths.path_length),
-        reachable=np.full(count, -1, np.int8),
-        reach_margin=np.full(count, np.nan),
+        verdict=verdicts,
+        path=Path(
+            entry_ct=paths.entry_ct,
+            length=paths.path_length,
+            skin_angle=paths.skin_angle,
+            tissue=tissue_crossed(checked, case.target_structure, case.target_ct, outward, paths.path_length),
+        ),
+        clearance=Clearance(
+            structures=tuple(s.name for s in checked),
+            margins=np.array([s.margin_mm if s.demands_margin else np.nan for s in checked]),
+            distance=clearances.clearance,
+            least=clearances.clearance[:, demanding].min(axis=1, initial=np.inf),
+        ),
+        arm=ArmColumns.unknown(count),
+        ranking=Ranking.none(count),
         safe_cone=np.full(count, np.nan),
-        cost=np.full(count, np.nan),
-        rank=np.zeros(count, np.int32),
-        pareto=np.zeros(count, bool),
     )
 
 
@@ -113,7 +118,7 @@ def reach_request(case: Case, candidates: Candidates, row: int, T_base_ct: Float
         target_base=T_base_ct[:3, :3] @ case.target_ct + T_base_ct[:3, 3],
         outward_base=T_base_ct[:3, :3] @ candidates.outward_ct[row],
         needle_length_mm=case.needle.length_mm,
-        standoff_mm=float(standoffs(case.needle, candidates.path_length[row], candidates.skin_angle[row])),
+        standoff_mm=float(standoffs(case.needle, candidates.path.length[row], candidates.path.skin_angle[row])),
     )
 
 
@@ -122,49 +127,42 @@ def with_reach(case: Case, found: Candidates, reach: ArmReach, progress: Progres
     rows = np.flatnonzero(found.safe)
     requests = [reach_request(case, found, int(row), reach.T_base_ct) for row in rows]
     answers = assess_reach_all(reach.checker, requests, progress)
-    reason, structure, detail = found.reason.copy(), found.reason_structure.copy(), found.reason_detail.copy()
-    depth, reachable, margin = found.reason_depth.copy(), found.reachable.copy(), found.reach_margin.copy()
+    verdict = {field.name: getattr(found.verdict, field.name).copy() for field in fields(found.verdict)}
+    reachable, margin = found.arm.reachable.copy(), found.arm.margin.copy()
     for row, answer in zip(rows, answers, strict=True):
         reachable[row] = int(answer.reachable)
         margin[row] = answer.margin
         if not answer.reachable:
-            reason[row], detail[row] = answer.reason.value, answer.detail
-            structure[row] = "" if answer.contact is None else "/".join(answer.contact)
-            depth[row] = np.nan if answer.depth_mm is None else reach_depth(case, found, int(row), answer.depth_mm)
-    return replace(
-        found,
-        reason=reason,
-        reason_structure=structure,
-        reason_detail=detail,
-        reason_depth=depth,
-        reachable=reachable,
-        reach_margin=margin,
-        arm=ARM_CHECKED,
-    )
+            verdict["reason"][row], verdict["detail"][row] = answer.reason.value, answer.detail
+            verdict["structure"][row] = "" if answer.contact is None else "/".join(answer.contact)
+            depth = answer.depth_mm
+            verdict["depth"][row] = np.nan if depth is None else reach_depth(case, found, int(row), depth)
+    return replace(found, verdict=Verdict(**verdict), arm=ArmColumns(reachable, margin), arm_note=ARM_CHECKED)
 
 
 def reach_depth(case: Case, found: Candidates, row: int, driven_mm: float) -> float:
     """Where the tip stands, from the target along the needle, after so many mm of insertion; mm."""
-    return float(standoffs(case.needle, found.path_length[row], found.skin_angle[row])) - driven_mm
+    return float(standoffs(case.needle, found.path.length[row], found.path.skin_angle[row])) - driven_mm
 
 
 def ranked(case: Case, found: Candidates) -> Candidates:
     """Give cost, rank and Pareto mark to the safe candidates."""
     rows = np.flatnonzero(found.safe)
-    cost, ranks, pareto = found.cost.copy(), found.rank.copy(), found.pareto.copy()
     order = rank(
-        min_clearance=found.min_clearance[rows],
-        path_length=found.path_length[rows],
-        skin_angle=found.skin_angle[rows],
-        tissue=found.tissue[rows],
-        reach_margin=found.reach_margin[rows],
+        min_clearance=found.clearance.least[rows],
+        path_length=found.path.length[rows],
+        skin_angle=found.path.skin_angle[rows],
+        tissue=found.path.tissue[rows],
+        reach_margin=found.arm.margin[rows],
         safe_cone=found.safe_cone[rows],
         shaft=case.needle.shaft_mm,
         max_skin_angle=case.search.max_skin_angle,
         weights=case.ranking,
     )
+    blank = Ranking.none(len(found))
+    cost, ranks, pareto = blank.cost.copy(), blank.rank.copy(), blank.pareto.copy()
     cost[rows], ranks[rows], pareto[rows] = order.cost, order.rank, order.pareto
-    return replace(found, cost=cost, rank=ranks, pareto=pareto)
+    return replace(found, ranking=Ranking(cost, ranks, pareto))
 
 
 def ranked_by(found: Candidates, cost: Floats) -> Candidates:
@@ -183,7 +181,8 @@ def ranked_by(found: Candidates, cost: Floats) -> Candidates:
         raise InputError(f"a cost of shape {cost.shape}", where="rerank", allowed=allowed)
     ranks = np.zeros(len(found), np.int32)
     ranks[rows[np.argsort(cost[rows], kind="stable")]] = np.arange(1, len(rows) + 1)
-    return replace(found, cost=np.where(found.safe, cost, np.nan), rank=ranks)
+    ranking = Ranking(np.where(found.safe, cost, np.nan), ranks, found.ranking.pareto)
+    return replace(found, ranking=ranking)
 
 
 def closest_miss(found: Candidates) -> int | None:
@@ -191,14 +190,14 @@ def closest_miss(found: Candidates) -> int | None:
 
     Without such a row, the one that passed most constraints; None for no rows at all.
     """
-    lacking = np.flatnonzero(found.reason == Reason.TOO_CLOSE.value)
+    lacking = np.flatnonzero(found.verdict.reason == Reason.TOO_CLOSE.value)
     if len(lacking):
-        demanded = ~np.isnan(found.margins)
-        lack = (found.margins - found.clearance)[:, demanded].max(axis=1)
+        demanded = ~np.isnan(found.clearance.margins)
+        lack = (found.clearance.margins - found.clearance.distance)[:, demanded].max(axis=1)
         return int(lacking[np.argmin(lack[lacking])])
     order = (Reason.APPROACH_NOT_FOUND, Reason.INSERTION_BLOCKED, Reason.ARM_COLLISION, Reason.UNREACHABLE)
     for reason in (*order, Reason.SKIN_ANGLE, Reason.TOO_LONG, Reason.REENTERS_SKIN, Reason.UNKNOWN_REGION):
-        rows = np.flatnonzero(found.reason == reason.value)
+        rows = np.flatnonzero(found.verdict.reason == reason.value)
         if len(rows):
             return int(rows[0])
     return None

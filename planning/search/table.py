@@ -22,33 +22,33 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
         candidates: The search's result.
         provenance: Case name, input hashes, version, seed, step; stored under the key ``run`` as JSON.
     """
-    reachable = [None if asked < 0 else bool(asked) for asked in candidates.reachable]
+    reachable = [None if asked < 0 else bool(asked) for asked in candidates.arm.reachable]
     columns: dict[str, Any] = {
         "theta_deg": np.degrees(candidates.theta),
         "beta_deg": np.degrees(candidates.beta),
         "verdict": np.where(candidates.safe, "safe", "rejected"),
-        "reason": candidates.reason,
-        "reason_structure": candidates.reason_structure,
-        "reason_depth_mm": candidates.reason_depth,
-        "reason_amount": candidates.reason_amount,
-        "reason_detail": candidates.reason_detail,
-        "entry_x_mm": candidates.entry_ct[:, 0],
-        "entry_y_mm": candidates.entry_ct[:, 1],
-        "entry_z_mm": candidates.entry_ct[:, 2],
-        "path_length_mm": candidates.path_length,
-        "skin_angle_deg": np.degrees(candidates.skin_angle),
-        "min_clearance_mm": candidates.min_clearance,
+        "reason": candidates.verdict.reason,
+        "reason_structure": candidates.verdict.structure,
+        "reason_depth_mm": candidates.verdict.depth,
+        "reason_amount": candidates.verdict.amount,
+        "reason_detail": candidates.verdict.detail,
+        "entry_x_mm": candidates.path.entry_ct[:, 0],
+        "entry_y_mm": candidates.path.entry_ct[:, 1],
+        "entry_z_mm": candidates.path.entry_ct[:, 2],
+        "path_length_mm": candidates.path.length,
+        "skin_angle_deg": np.degrees(candidates.path.skin_angle),
+        "min_clearance_mm": candidates.clearance.least,
     }
-    for column, name in enumerate(candidates.structures):
-        columns[f"clearance_{name}_mm"] = candidates.clearance[:, column]
+    for column, name in enumerate(candidates.clearance.structures):
+        columns[f"clearance_{name}_mm"] = candidates.clearance.distance[:, column]
     columns |= {
-        "tissue_mm": candidates.tissue,
+        "tissue_mm": candidates.path.tissue,
         "reachable": pa.array(reachable, pa.bool_()),
-        "reach_margin": candidates.reach_margin,
+        "reach_margin": candidates.arm.margin,
         "safe_cone_deg": np.degrees(candidates.safe_cone),
-        "cost": candidates.cost,
-        "rank": candidates.rank,
-        "pareto": candidates.pareto,
+        "cost": candidates.ranking.cost,
+        "rank": candidates.ranking.rank,
+        "pareto": candidates.ranking.pareto,
     }
     table = pa.table({name: _array(value) for name, value in columns.items()})
     return table.replace_schema_metadata({"run": json.dumps(dict(provenance), sort_keys=True)})

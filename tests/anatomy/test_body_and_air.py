@@ -125,8 +125,8 @@ def hit_parts(context, found, parts, names):
     """Rows of safe needles whose axis enters a part's truth between skin and flange at standoff, by the part's name."""
     case, hit = context.case, {}
     for row in np.flatnonzero(found.safe):
-        standoff = float(standoffs(case.needle, found.path_length[row], found.skin_angle[row]))
-        depths = np.arange(found.path_length[row] + 1.0, standoff + case.needle.length_mm, 0.5)
+        standoff = float(standoffs(case.needle, found.path.length[row], found.path.skin_angle[row]))
+        depths = np.arange(found.path.length[row] + 1.0, standoff + case.needle.length_mm, 0.5)
         points = case.target_ct + depths[:, None] * found.outward_ct[row]
         for part in parts:
             if part.name in names and part.field(points).min() < 0.0:
@@ -165,7 +165,7 @@ def test_a_detached_arm_is_body(scene):
     rows = through(found, context.case, arm)
     assert rows.sum() > 20
     assert not found.safe[rows].any()
-    assert (found.reason[rows] == Reason.REENTERS_SKIN).sum() > 10
+    assert (found.verdict.reason[rows] == Reason.REENTERS_SKIN).sum() > 10
     said = " ".join(context.anatomy.warnings)
     assert "do not touch the trunk" in said
     assert "left of it" in said
@@ -182,7 +182,7 @@ def test_the_table_below_a_posterior_target_is_no_air(scene):
     rows = through(found, context.case, table)
     assert rows.sum() > 100
     assert not found.safe[rows].any()
-    beyond_skin = rows & (found.reason == Reason.UNKNOWN_REGION) & (found.reason_structure == "outside_body")
+    beyond_skin = rows & (found.verdict.reason == Reason.UNKNOWN_REGION) & (found.verdict.structure == "outside_body")
     assert beyond_skin.sum() > 50
 
 
@@ -220,7 +220,7 @@ def test_a_bone_that_nobody_labelled_is_unknown(scene):
     rows = through(found, trusted.case, spine)
     assert rows.sum() > 20
     assert not found.safe[rows].any()
-    assert "unnamed_dense" in found.structures
+    assert "unnamed_dense" in found.clearance.structures
     assert trusted.search().safe[rows].any()
     assert any("trust_labels" in warning for warning in trusted.anatomy.warnings)
 
@@ -242,7 +242,7 @@ def test_gas_outside_of_hollow_organs_is_unknown(tmp_path):
     rows = through(found, context.case, bubble)
     assert rows.sum() > 3
     assert not found.safe[rows].any()
-    assert set(found.reason_structure[rows & (found.reason == Reason.UNKNOWN_REGION)]) == {"unnamed_gas"}
+    assert set(found.verdict.structure[rows & (found.verdict.reason == Reason.UNKNOWN_REGION)]) == {"unnamed_gas"}
 
 
 def test_an_obstacle_stops_the_needle_without_an_arm_too(scene):
@@ -253,8 +253,8 @@ def test_an_obstacle_stops_the_needle_without_an_arm_too(scene):
     stopped = prepare(write_case(folder, more=box, name="boxed"), arm=False).check(0.0, 0.0)
 
     assert free.safe[0]
-    assert stopped.reason[0] == Reason.TOO_CLOSE
-    assert stopped.reason_structure[0] == "monitor"
+    assert stopped.verdict.reason[0] == Reason.TOO_CLOSE
+    assert stopped.verdict.structure[0] == "monitor"
 
 
 def test_the_flange_at_standoff_counts(scene):
@@ -263,8 +263,8 @@ def test_the_flange_at_standoff_counts(scene):
     box = '[[obstacle]]\nname = "lamp"\nframe = "ct"\ncenter_mm = [-55, -280, 0]\nsize_mm = [40, 40, 40]'
     stopped = prepare(write_case(folder, more=box, name="lamp"), arm=False).check(0.0, 0.0)
 
-    assert stopped.reason_structure[0] == "lamp"
-    assert stopped.reason_depth[0] > 210.0
+    assert stopped.verdict.structure[0] == "lamp"
+    assert stopped.verdict.depth[0] > 210.0
 
 
 def test_a_certificate_holds_outside_of_the_body_too(scene):
@@ -448,7 +448,7 @@ def test_an_arm_that_is_pressed_against_the_trunk_is_no_way_in(tmp_path):
     found = context.search()
 
     assert hit_parts(context, found, parts, ("arm", "humerus")) == {}
-    assert "attached_limb" in found.reason_structure
+    assert "attached_limb" in found.verdict.structure
     assert any("pressed against" in warning for warning in context.anatomy.warnings)
     assert found.safe.sum() > 40
 

@@ -109,10 +109,10 @@ def judged(context, theta, beta):
 def test_an_inserted_flange_inside_and_a_waiting_one_outside_is_unknown(cut):
     """14 degrees: the image ends 248 mm from the target, the flange comes from 302 mm; the reason names that depth."""
     found = cut.check(14 * DEG, 0.0)
-    assert found.reason[0] == Reason.UNKNOWN_REGION
-    assert found.reason_structure[0] == "skin"
-    assert found.reason_depth[0] == pytest.approx(60.0 / np.sin(14 * DEG))
-    assert LENGTH < found.reason_depth[0] < LENGTH + 80.0 / np.cos(14 * DEG) + 10.0
+    assert found.verdict.reason[0] == Reason.UNKNOWN_REGION
+    assert found.verdict.structure[0] == "skin"
+    assert found.verdict.depth[0] == pytest.approx(60.0 / np.sin(14 * DEG))
+    assert LENGTH < found.verdict.depth[0] < LENGTH + 80.0 / np.cos(14 * DEG) + 10.0
 
 
 def test_each_directions_own_standoff_decides(cut):
@@ -120,7 +120,7 @@ def test_each_directions_own_standoff_decides(cut):
     tilt = np.arange(4.0, 30.0, 0.01) * DEG
     found = judged(cut, tilt, 0.0)
     np.testing.assert_array_equal(found.safe, ~leaves_while_waiting(tilt))
-    assert (found.reason[~found.safe] == Reason.UNKNOWN_REGION).all()
+    assert (found.verdict.reason[~found.safe] == Reason.UNKNOWN_REGION).all()
     longest = LENGTH + 150.0 + gap(60 * DEG)
     assert found.safe[60.0 / np.sin(tilt) < longest].sum() > 100
 
@@ -135,7 +135,7 @@ def test_a_stated_standoff_decides(tmp_path):
 def test_a_path_without_a_standoff_keeps_its_reason(cut):
     """Where no tip ever waits, the constraint that forbids it is the reason, here a path of 170 mm to the side."""
     found = cut.check(62 * DEG, 80 * DEG)
-    assert found.reason[0] == Reason.TOO_LONG
+    assert found.verdict.reason[0] == Reason.TOO_LONG
 
 
 def test_the_certificate_agrees_with_the_search(cut, certified, rng):
@@ -181,7 +181,7 @@ def test_a_cell_forged_safe_whose_waiting_flange_leaves_the_image_is_refused(cut
 
 def test_a_certificate_for_inserted_needles_alone_is_refused(cut, certified, monkeypatch):
     """Whole and true of the inserted needle: with the flange at the needle's length the maker proves too much safe."""
-    module = import_module("planning.certify.certify")
+    module = import_module("puncture_twin.planning.certify.subdivision")
     for name in ("any_flange", "flange_bounds"):
         monkeypatch.setattr(module, name, lambda *_: FlangeBounds(LENGTH, LENGTH))
     careless = certify(cut.case, cut.anatomy, size=0.5 * DEG, **CAP)

@@ -133,12 +133,12 @@ def test_an_arm_through_the_wall_is_a_collision_that_names_the_gantry(in_gantry)
     free_case = in_gantry(mount, changes=placed)
     free_case.write_text(free_case.read_text().replace(GANTRY.format(tilt=0.0), ""))
     free = prepare(free_case).search()
-    hits = walled.reason == Reason.ARM_COLLISION.value
-    named = np.char.find(walled.reason_structure.astype(str), "/gantry_") >= 0
-    held = hits & named & (free.reachable == 1)
-    assert held.any() and not np.char.startswith(free.reason_structure.astype(str), "gantry").any()
+    hits = walled.verdict.reason == Reason.ARM_COLLISION.value
+    named = np.char.find(walled.verdict.structure.astype(str), "/gantry_") >= 0
+    held = hits & named & (free.arm.reachable == 1)
+    assert held.any() and not np.char.startswith(free.verdict.structure.astype(str), "gantry").any()
     row = int(np.flatnonzero(held)[0])
-    assert "touches gantry_" in walled.reason_detail[row]
+    assert "touches gantry_" in walled.verdict.detail[row]
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def test_a_long_name_is_whole_in_the_verdict_and_in_the_table(long_named, tmp_pa
     """Reason, text, JSON and Parquet hold every character of a name."""
     found = long_named.check(np.radians(50), np.radians(270))
     name = 199 * "v" + "h"
-    assert found.reason_structure[0] == name
+    assert found.verdict.structure[0] == name
     explained = Explanation(long_named.case, long_named.anatomy, found)
     assert f"too_close ({name})" in explained.text()
     assert f"  {name} avoid" in explained.text()
@@ -56,9 +56,10 @@ def test_a_long_name_is_whole_in_the_verdict_and_in_the_table(long_named, tmp_pa
 def test_a_long_sentence_is_whole(long_named):
     """What kept the arm may take more than 200 characters."""
     found = long_named.check(0.0, 0.0)
-    detail = found.reason_detail.copy()
+    detail = found.verdict.detail.copy()
     detail[0] = 300 * "a" + " end"
-    assert to_table(replace(found, reason_detail=detail), {})["reason_detail"].to_pylist()[0].endswith("a end")
+    long = replace(found, verdict=replace(found.verdict, detail=detail))
+    assert to_table(long, {})["reason_detail"].to_pylist()[0].endswith("a end")
 
 
 @pytest.mark.parametrize("name", HOSTILE)

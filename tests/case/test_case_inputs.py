@@ -181,8 +181,8 @@ def test_data_rewritten_beside_their_header_change_the_verdict(folder: Path) -> 
     after = prepare(folder, arm=False)
     found = after.check(0.0, 0.0)
     assert (folder / "vessels" / "labels.nhdr").read_bytes() == header
-    assert (str(found.reason[0]), str(found.reason_structure[0])) == ("too_close", "v1")
-    assert found.min_clearance[0] < 0
+    assert (str(found.verdict.reason[0]), str(found.verdict.structure[0])) == ("too_close", "v1")
+    assert found.clearance.least[0] < 0
     assert differing_input(before.case.inputs, after.case.inputs) == "labelmap data (vessels/labels.raw)"
     (folder / "vessels" / "labels.raw").write_bytes(vessel((80, 50, 50)).tobytes(order="F"))
     assert prepare(folder, arm=False).check(0.0, 0.0).safe[0]

@@ -36,8 +36,8 @@ def test_importing_it_loads_nothing_heavy_and_prints_nothing():
 def test_search_gives_what_the_context_gives(context):
     """No second way to an answer."""
     ours, theirs = pt.search(context), prepare(folder() / "carton" / "case_m.toml", arm=False).search()
-    assert np.array_equal(ours.reason, theirs.reason)
-    assert np.array_equal(ours.cost, theirs.cost, equal_nan=True)
+    assert np.array_equal(ours.verdict.reason, theirs.verdict.reason)
+    assert np.array_equal(ours.ranking.cost, theirs.ranking.cost, equal_nan=True)
 
 
 def test_check_takes_degrees(context):
@@ -51,11 +51,11 @@ def test_check_takes_degrees(context):
 def test_rerank_orders_the_safe_ones_alone(context):
     """Rejected candidates keep rank 0 whatever their cost, and no verdict changes."""
     candidates = pt.search(context)
-    mine = pt.rerank(candidates, -candidates.path_length)
+    mine = pt.rerank(candidates, -candidates.path.length)
     assert np.array_equal(mine.safe, candidates.safe)
-    assert (mine.rank[~mine.safe] == 0).all()
-    assert (np.diff(mine.path_length[mine.ranked]) <= 0).all()
-    assert sorted(mine.rank[mine.safe]) == list(range(1, int(mine.safe.sum()) + 1))
+    assert (mine.ranking.rank[~mine.safe] == 0).all()
+    assert (np.diff(mine.path.length[mine.ranked]) <= 0).all()
+    assert sorted(mine.ranking.rank[mine.safe]) == list(range(1, int(mine.safe.sum()) + 1))
 
 
 @pytest.mark.parametrize("cost", [np.zeros(3), "nan"], ids=["another shape", "not a number"])

@@ -236,5 +236,5 @@ def test_one_arm_at_a_time(capsys):
 
 def test_only_the_receiving_half_is_ever_named():
     """The library's controlling half stands nowhere in the mirror."""
-    text = (folder().parent / "twin" / "mirror.py").read_text()
+    text = (folder().parent / "twin" / "jobs" / "robot" / "mirror.py").read_text()
     assert "rtde_receive" in text and not any(word in text for word in ("rtde_control", "rtde_io", "RTDEControl"))

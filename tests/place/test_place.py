@@ -351,7 +351,7 @@ def _same_as_the_search(here, best):
     context = prepare(pasted)
     found = organ_candidates(context.case, context.anatomy, context.engine, case_directions(context.case))
     held = with_reach(context.case, found, ArmReach(context.reach.checker, context.reach.T_base_ct))
-    assert int((held.reachable == 1).sum()) == best["held"] and int(found.safe.sum()) == best["asked"]
+    assert int((held.arm.reachable == 1).sum()) == best["held"] and int(found.safe.sum()) == best["asked"]
 
 
 def test_no_placement_holds_anything(case_folder, tmp_path, capsys):

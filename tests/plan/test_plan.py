@@ -15,6 +15,7 @@ from puncture_twin.planning.plan.motion import motion_contact
 from puncture_twin.planning.plan.plan import read_plan, write_plan
 from puncture_twin.planning.plan.planner import make_plan
 from puncture_twin.planning.plan.recheck import check_plan
+from puncture_twin.planning.search.candidates import Ranking
 from puncture_twin.planning.search.context import prepare
 
 
@@ -53,12 +54,12 @@ def test_reach_is_inside_the_verdict(carton, planned):
     """Every safe candidate can be held by the arm, and the refused ones say why."""
     found = planned.candidates
     assert found.safe.any()
-    assert (found.reachable[found.safe] == 1).all()
-    refused = np.isin(found.reason, [Reason.UNREACHABLE, Reason.ARM_COLLISION, Reason.INSERTION_BLOCKED])
+    assert (found.arm.reachable[found.safe] == 1).all()
+    refused = np.isin(found.verdict.reason, [Reason.UNREACHABLE, Reason.ARM_COLLISION, Reason.INSERTION_BLOCKED])
     assert refused.any()
-    assert (found.reachable[refused] == 0).all()
-    assert (found.reason_detail[refused] != "").all()
-    assert np.isnan(found.reach_margin[found.reachable == -1]).all()
+    assert (found.arm.reachable[refused] == 0).all()
+    assert (found.verdict.detail[refused] != "").all()
+    assert np.isnan(found.arm.margin[found.arm.reachable == -1]).all()
 
 
 def test_the_plan_is_the_best_candidate(planned):
@@ -347,7 +348,11 @@ def test_a_motion_through_the_patient_is_refused_on_loading(carton, planned):
 def test_no_safe_candidate_means_no_plan(carton):
     """The error carries the counts of each reason."""
     found = carton.search()
-    none = replace(found, reason=np.full(len(found), Reason.TOO_CLOSE.value), rank=np.zeros(len(found), np.int32))
+    none = replace(
+        found,
+        verdict=replace(found.verdict, reason=np.full(len(found), Reason.TOO_CLOSE.value)),
+        ranking=Ranking.none(len(found)),
+    )
     with pytest.raises(NoAnswerError, match="no candidate is safe") as caught:
         make_plan(carton, none, seed=0)
     assert caught.value.counts == {"too_close": len(found)}

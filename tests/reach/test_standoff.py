@@ -107,8 +107,8 @@ def test_no_direction_of_the_abdomen_is_lost_to_its_own_needle():
     wanted = wanted_directions(case, found)
     tool, skin = case_tool(case), context.anatomy.skin.mesh
     assert needle_can_start(tool, skin, case.target_ct, wanted, ARM_PADDING_MM).all()
-    oblique = found.skin_angle[found.safe] > 43.0 * DEG
-    assert oblique.sum() > 100 and (wanted.standoff_mm - found.path_length[found.safe])[oblique].min() > 10.0
+    oblique = found.path.skin_angle[found.safe] > 43.0 * DEG
+    assert oblique.sum() > 100 and (wanted.standoff_mm - found.path.length[found.safe])[oblique].min() > 10.0
 
 
 def test_the_waiting_flange():

@@ -58,8 +58,8 @@ def test_the_cut_body_is_never_safe(searches):
     out = field.exit(context.case.target_ct, found.outward_ct)
     beyond = out.cut & (out.depth_mm < context.case.needle.length_mm)
     assert beyond.any()
-    assert (found.reason[beyond] == Reason.UNKNOWN_REGION).all()
-    waiting = waiting_flange(context.case.needle, found.path_length, found.skin_angle)
+    assert (found.verdict.reason[beyond] == Reason.UNKNOWN_REGION).all()
+    waiting = waiting_flange(context.case.needle, found.path.length, found.path.skin_angle)
     later = out.cut & (out.depth_mm < waiting) & ~beyond
     assert later.sum() > 20
     assert not found.safe[later].any()
@@ -70,10 +70,10 @@ def test_some_paths_are_safe_and_keep_every_margin(searches):
     for context, found in searches.values():
         rows = found.safe
         assert rows.sum() > 20
-        demanding = ~np.isnan(found.margins)
-        assert (found.clearance[rows][:, demanding] >= found.margins[demanding] - 1e-4).all()
-        assert (found.path_length[rows] <= context.case.needle.shaft_mm).all()
-        assert (found.skin_angle[rows] <= context.case.search.max_skin_angle).all()
+        demanding = ~np.isnan(found.clearance.margins)
+        assert (found.clearance.distance[rows][:, demanding] >= found.clearance.margins[demanding] - 1e-4).all()
+        assert (found.path.length[rows] <= context.case.needle.shaft_mm).all()
+        assert (found.path.skin_angle[rows] <= context.case.search.max_skin_angle).all()
 
 
 def test_two_label_maps_of_one_patient_disagree(searches, record_property):

@@ -42,7 +42,7 @@ def test_every_direction_has_one_row(carton, found):
     assert len(found) == 46 * 180
     R = carton.case.T_ct_entry[:3, :3]
     np.testing.assert_allclose(found.outward_ct, outward(found.theta, found.beta) @ R.T, atol=1e-12)
-    assert set(found.reason) <= {reason.value for reason in Reason}
+    assert set(found.verdict.reason) <= {reason.value for reason in Reason}
     assert sum(found.counts().values()) == len(found)
 
 
@@ -54,22 +54,24 @@ def test_clearances_equal_the_analytic_truth(carton, found, rng):
         for column, name in enumerate(s.name for s in carton.anatomy.structures):
             truth = max(carton_field(name)(points).min(), 0) - carton.case.needle.radius_mm
             if name != "bolt_m":  # the target lies in its end face, where mesh and field differ by rounding
-                assert found.clearance[row, column] == pytest.approx(truth, abs=0.02)
+                assert found.clearance.distance[row, column] == pytest.approx(truth, abs=0.02)
 
 
 def test_the_ranks_follow_the_cost(found):
     """Safe rows are ranked 1..n by rising cost; rejected rows have neither."""
     order = found.ranked
-    assert (np.diff(found.cost[order]) >= -1e-9).all()  # costs that agree to nine digits keep the order of the grid
-    np.testing.assert_array_equal(np.sort(found.rank[found.safe]), np.arange(1, found.safe.sum() + 1))
-    assert np.isnan(found.cost[~found.safe]).all()
-    assert not found.pareto[~found.safe].any()
-    assert found.pareto[order[0]]
+    assert (
+        np.diff(found.ranking.cost[order]) >= -1e-9
+    ).all()  # costs that agree to nine digits keep the order of the grid
+    np.testing.assert_array_equal(np.sort(found.ranking.rank[found.safe]), np.arange(1, found.safe.sum() + 1))
+    assert np.isnan(found.ranking.cost[~found.safe]).all()
+    assert not found.ranking.pareto[~found.safe].any()
+    assert found.ranking.pareto[order[0]]
 
 
 def test_no_reach_is_asked_without_an_arm(found):
     """``reachable`` is null when the arm was not asked."""
-    assert (found.reachable == -1).all()
+    assert (found.arm.reachable == -1).all()
 
 
 def test_the_table_holds_what_was_found(carton, found, tmp_path):
@@ -98,10 +100,12 @@ def test_when_nothing_is_safe_the_closest_miss_is_named(carton, found):
     refused = ranked(carton.case, organ_candidates(carton.case, anatomy, carton.engine, _directions(found)))
     assert not refused.safe.any()
     row = closest_miss(refused)
-    assert refused.reason[row] == Reason.TOO_CLOSE
-    demanding = ~np.isnan(refused.margins)
-    least = np.where(refused.reason == Reason.TOO_CLOSE, refused.clearance[:, demanding].min(axis=1), -np.inf)
-    assert refused.clearance[row, demanding].min() == least.max()
+    assert refused.verdict.reason[row] == Reason.TOO_CLOSE
+    demanding = ~np.isnan(refused.clearance.margins)
+    least = np.where(
+        refused.verdict.reason == Reason.TOO_CLOSE, refused.clearance.distance[:, demanding].min(axis=1), -np.inf
+    )
+    assert refused.clearance.distance[row, demanding].min() == least.max()
 
 
 def _directions(found):
@@ -165,10 +169,10 @@ def test_a_batch_row_says_what_happened(tmp_path):
 def test_the_fast_engine_and_fcl_give_the_same_table(carton, found):
     """Every verdict, reason and number of the grid, by both engines."""
     plain = prepare(folder() / "carton" / "case_m.toml", arm=False, engine="fcl").search()
-    np.testing.assert_array_equal(plain.reason, found.reason)
-    np.testing.assert_array_equal(plain.reason_structure, found.reason_structure)
-    np.testing.assert_allclose(plain.clearance, found.clearance, atol=1e-9)
-    np.testing.assert_array_equal(plain.rank, found.rank)
+    np.testing.assert_array_equal(plain.verdict.reason, found.verdict.reason)
+    np.testing.assert_array_equal(plain.verdict.structure, found.verdict.structure)
+    np.testing.assert_allclose(plain.clearance.distance, found.clearance.distance, atol=1e-9)
+    np.testing.assert_array_equal(plain.ranking.rank, found.ranking.rank)
 
 
 def test_the_cross_check_sees_a_wrong_engine(carton):

@@ -39,8 +39,8 @@ def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
     """Safe first, then the reasons that occur, most frequent first."""
     weights = ring_weights(candidates.theta, step_of(candidates))
     lines = []
-    for value in np.unique(candidates.reason):
-        here = candidates.reason == value
+    for value in np.unique(candidates.verdict.reason):
+        here = candidates.verdict.reason == value
         reason = reason_of(str(value))
         colour = REASON_COLOURS.get(reason, SAFE)
         words = REASON_WORDS[reason] if reason else candidates.safe_text
@@ -60,11 +60,11 @@ def chosen_row(candidates: Candidates) -> int | None:
 
 def nearest_structure(candidates: Candidates, row: int) -> tuple[str, float]:
     """The structure with a margin that lies nearest to a candidate's needle, and its clearance in mm."""
-    demanding = np.flatnonzero(np.isfinite(candidates.margins))
+    demanding = np.flatnonzero(np.isfinite(candidates.clearance.margins))
     if len(demanding) == 0:
         return "", math.nan
-    best = demanding[np.argmin(candidates.clearance[row, demanding])]
-    return candidates.structures[best], float(candidates.clearance[row, best])
+    best = demanding[np.argmin(candidates.clearance.distance[row, demanding])]
+    return candidates.clearance.structures[best], float(candidates.clearance.distance[row, best])
 
 
 def needle_words(case: Any) -> str:

@@ -118,7 +118,7 @@ CUSTOM_COLOURS: tuple[tuple[str, Rgb], ...] = (
 
 
 def reason_of(value: str) -> Reason:
-    """The reason behind a value of ``Candidates.reason``."""
+    """The reason behind a value of ``Candidates.verdict.reason``."""
     return Reason(value)
 
 

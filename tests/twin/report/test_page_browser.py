@@ -192,7 +192,7 @@ def test_hover_shows_a_safe_direction(browser, case, candidates):
         np.flatnonzero(np.isclose(candidates.theta, np.radians(40)) & np.isclose(candidates.beta, np.radians(220)))[0]
     )
     assert "θ 40°, β 220°" in words
-    assert f"safe, rank {candidates.rank[row]}" in words
+    assert f"safe, rank {candidates.ranking.rank[row]}" in words
     assert "least clearance 9.0 mm (rib right 9)" in words and "100.0 mm" in words
 
 

@@ -164,7 +164,7 @@ def test_the_map_has_no_gap(case, theta_max):
 
 def expected_colour(found, row):
     """The colour of a refused direction, None for a safe one."""
-    reason = str(found.reason[row])
+    reason = str(found.verdict.reason[row])
     return None if reason == "" else REASON_COLOURS[reason]
 
 
@@ -558,7 +558,11 @@ def test_names_from_files_cannot_become_markup(case, candidates, tmp_path):
     anatomy = world.make_anatomy(warnings=(evil,))
     case = world.make_case(name=evil)
     anatomy.structures[1].name = evil
-    named = replace(candidates, structures=(evil, "aorta"), reason_structure=np.full(len(candidates), evil))
+    named = replace(
+        candidates,
+        clearance=replace(candidates.clearance, structures=(evil, "aorta")),
+        verdict=replace(candidates.verdict, structure=np.full(len(candidates), evil)),
+    )
     write_page(case, anatomy, named, None, None, {"method": evil, "flags": [evil]}, tmp_path / "page.html", film=evil)
     assert evil not in (tmp_path / "page.html").read_text(encoding="utf-8")
 
@@ -578,7 +582,7 @@ def test_the_page_s_map_knows_its_rows(case, candidates):
     for row in np.flatnonzero(candidates.theta > 0.2)[::11]:
         x, y = view.place(candidates.theta[row], candidates.beta[row])
         assert table[int((1 - y) * data["size"] / 2), int((1 + x) * data["size"] / 2)] == row
-    rib = int(np.flatnonzero(candidates.reason == "too_close")[0])
+    rib = int(np.flatnonzero(candidates.verdict.reason == "too_close")[0])
     assert data["structures"][data["structure"][rib]] == "rib_right_9"
     assert data["depth"][rib] == 55.5 and data["details"][data["reason"][rib]] == ("clearance", "mm")
 

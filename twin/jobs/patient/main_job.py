@@ -312,17 +312,17 @@ def registration_summary(registration: Registration) -> dict[str, Any]:
 def candidate_summary(found: Candidates, row: int) -> dict[str, Any]:
     """One ranked candidate as plain values: mm and degrees."""
     return {
-        "rank": int(found.rank[row]),
+        "rank": int(found.ranking.rank[row]),
         "theta_deg": float(np.degrees(found.theta[row])),
         "beta_deg": float(np.degrees(found.beta[row])),
-        "cost": finite(found.cost[row]),
-        "min_clearance_mm": finite(found.min_clearance[row]),
-        "path_length_mm": finite(found.path_length[row]),
-        "skin_angle_deg": finite(np.degrees(found.skin_angle[row])),
-        "tissue_mm": finite(found.tissue[row]),
-        "reach_margin": finite(found.reach_margin[row]),
+        "cost": finite(found.ranking.cost[row]),
+        "min_clearance_mm": finite(found.clearance.least[row]),
+        "path_length_mm": finite(found.path.length[row]),
+        "skin_angle_deg": finite(np.degrees(found.path.skin_angle[row])),
+        "tissue_mm": finite(found.path.tissue[row]),
+        "reach_margin": finite(found.arm.margin[row]),
         "safe_cone_deg": finite(np.degrees(found.safe_cone[row])),
-        "pareto": bool(found.pareto[row]),
+        "pareto": bool(found.ranking.pareto[row]),
     }
 
 

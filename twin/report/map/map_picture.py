@@ -121,8 +121,8 @@ def _outline(axes: Axes, raster: MapRaster, candidates: Candidates) -> None:
 
 def _names(axes: Axes, raster: MapRaster, candidates: Candidates) -> None:
     """Write the structure's name into every large enough region that it forbids, and part the regions by a line."""
-    named = np.isin(candidates.reason, [reason.value for reason in NAMED_REASONS])
-    every, coded = np.unique(np.append(np.where(named, candidates.reason_structure, ""), ""), return_inverse=True)
+    named = np.isin(candidates.verdict.reason, [reason.value for reason in NAMED_REASONS])
+    every, coded = np.unique(np.append(np.where(named, candidates.verdict.structure, ""), ""), return_inverse=True)
     codes = coded[raster.rows]
     parted = np.zeros(codes.shape, dtype=bool)
     parted[:-1] = (codes[1:] != codes[:-1]) & (codes[1:] * codes[:-1] > 0)
@@ -167,7 +167,7 @@ def _marks(axes: Axes, view: MapView, candidates: Candidates) -> None:
 
     axes.plot([0], [0], marker="+", color="black", ms=9, mew=1.2, zorder=5)
     put(
-        np.flatnonzero(candidates.pareto & candidates.safe),
+        np.flatnonzero(candidates.ranking.pareto & candidates.safe),
         s=9,
         c="white",
         edgecolors="black",
@@ -262,7 +262,7 @@ def _mark_legend(axes: Axes, candidates: Candidates, y: float) -> float:
     axes.text(0.075, y, "best", fontsize=10.5, va="center")
     axes.scatter([0.32], [y], s=46, facecolors="none", edgecolors="black", linewidths=1.2)
     axes.text(0.36, y, "ten best", fontsize=10.5, va="center")
-    if candidates.pareto.any():
+    if candidates.ranking.pareto.any():
         axes.scatter([0.63], [y], s=9, c="white", edgecolors="black", linewidths=0.5)
         axes.text(0.66, y, "Pareto front", fontsize=10.5, va="center")
     return y
@@ -279,8 +279,8 @@ def _chosen(axes: Axes, candidates: Candidates, y: float) -> float:
     theta, beta = np.degrees(candidates.theta[row]), np.degrees(candidates.beta[row])
     lines = (
         f"Best: θ {theta:g}°, β {beta:g}°",
-        f"path in the body {number(candidates.path_length[row], 1, 'mm')}, "
-        f"skin angle {number(float(np.degrees(candidates.skin_angle[row])), 0)}°",
+        f"path in the body {number(candidates.path.length[row], 1, 'mm')}, "
+        f"skin angle {number(float(np.degrees(candidates.path.skin_angle[row])), 0)}°",
         f"nearest: {name.replace('_', ' ') or 'none'}, {number(clearance, 1, 'mm')}",
     )
     box = {"facecolor": "#eef7f2", "edgecolor": "#00684a", "boxstyle": "round,pad=0.5"}

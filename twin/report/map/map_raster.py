@@ -33,7 +33,7 @@ class MapRaster:
 
 def clearance_range(candidates: Candidates) -> tuple[float, float]:
     """Least and greatest clearance among the safe directions, mm; (0, 1) when there is none to speak of."""
-    values = candidates.min_clearance[candidates.safe]
+    values = candidates.clearance.least[candidates.safe]
     values = values[np.isfinite(values)]
     if len(values) == 0:
         return 0.0, 1.0
@@ -44,13 +44,13 @@ def clearance_range(candidates: Candidates) -> tuple[float, float]:
 def row_colours(candidates: Candidates) -> NDArray[np.uint8]:
     """The colour of every direction, shape (n, 3)."""
     colours = np.zeros((len(candidates), 3), dtype=np.uint8)
-    for value in np.unique(candidates.reason):
+    for value in np.unique(candidates.verdict.reason):
         reason = reason_of(str(value))
         if reason in REASON_COLOURS:
-            colours[candidates.reason == value] = REASON_COLOURS[reason]
+            colours[candidates.verdict.reason == value] = REASON_COLOURS[reason]
     low, high = clearance_range(candidates)
     safe = candidates.safe
-    colours[safe] = safe_shades((candidates.min_clearance[safe] - low) / (high - low))
+    colours[safe] = safe_shades((candidates.clearance.least[safe] - low) / (high - low))
     return colours
 
 

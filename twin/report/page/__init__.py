@@ -1,4 +1,4 @@
-"""`report.html`: one page that needs no network."""
+"""`report.html`: map, scene, tables and the rehearsal on one page that needs no network."""
 
 import lazy_loader
 

@@ -124,12 +124,12 @@ def _verdict(candidates: Candidates, plan: Any | None, rehearsal: Any | None) ->
     if row is not None:
         name, clearance = nearest_structure(candidates, row)
         where = f"θ {np.degrees(candidates.theta[row]):g}°, β {np.degrees(candidates.beta[row]):g}°"
-        detail = f"{number(float(candidates.path_length[row]), 1, 'mm')} in the body"
+        detail = f"{number(float(candidates.path.length[row]), 1, 'mm')} in the body"
         if name:
             detail += f"; nearest {tables.escape(name.replace('_', ' '))}, {number(clearance, 1, 'mm')}"
         cards.append(("best direction", where, detail))
     if not candidates.arm_checked:
-        cards.append(("arm", "not checked", tables.escape(candidates.arm.removeprefix("not checked: "))))
+        cards.append(("arm", "not checked", tables.escape(candidates.arm_note.removeprefix("not checked: "))))
     if plan is None:
         cards.append(("plan", "none", "the arm's motion was not planned or not found"))
     if rehearsal is not None:

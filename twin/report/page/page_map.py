@@ -24,7 +24,7 @@ DETAIL_UNITS = {
     Reason.TOO_LONG: ("path", "mm"),
     Reason.SKIN_ANGLE: ("skin angle", "°"),
 }
-"""What ``Candidates.reason_amount`` is, by reason."""
+"""What ``Candidates.verdict.amount`` is, by reason."""
 
 
 def map_data(case: Any, candidates: Candidates) -> dict[str, Any]:
@@ -36,11 +36,11 @@ def map_data(case: Any, candidates: Candidates) -> dict[str, Any]:
     view = map_view(case, candidates)
     raster = map_raster(candidates, view, 2 * PIXELS)
     rows = map_raster_rows(raster.rows[::2, ::2])
-    structures = sorted({*map(str, candidates.reason_structure), *candidates.structures})
+    structures = sorted({*map(str, candidates.verdict.structure), *candidates.clearance.structures})
     index = {name: i for i, name in enumerate(structures)}
     nearest, amounts = _nearest(candidates)
-    reasons = [str(r) for r in np.unique(candidates.reason)]
-    sentences, sentence = np.unique(candidates.reason_detail, return_inverse=True)
+    reasons = [str(r) for r in np.unique(candidates.verdict.reason)]
+    sentences, sentence = np.unique(candidates.verdict.detail, return_inverse=True)
     return {
         "size": PIXELS,
         "image": _png(raster.rgba),
@@ -57,21 +57,21 @@ def map_data(case: Any, candidates: Candidates) -> dict[str, Any]:
         "details": [DETAIL_UNITS.get(reason_of(r), ("", "")) for r in reasons],
         "theta": _rounded(np.degrees(candidates.theta), 3),
         "beta": _rounded(np.degrees(candidates.beta), 3),
-        "reason": [reasons.index(str(r)) for r in candidates.reason],
-        "structure": [index[str(s)] for s in candidates.reason_structure],
+        "reason": [reasons.index(str(r)) for r in candidates.verdict.reason],
+        "structure": [index[str(s)] for s in candidates.verdict.structure],
         "sentences": [str(s) for s in sentences],
         "sentence": sentence.tolist(),
-        "depth": _rounded(candidates.reason_depth, 1),
-        "amount": _rounded(candidates.reason_amount, 2),
+        "depth": _rounded(candidates.verdict.depth, 1),
+        "amount": _rounded(candidates.verdict.amount, 2),
         "nearest": [index[name] if name else -1 for name in nearest],
         "clearance": _rounded(amounts, 2),
-        "path": _rounded(candidates.path_length, 1),
-        "skin_angle": _rounded(np.degrees(candidates.skin_angle), 1),
-        "rank": candidates.rank.tolist(),
-        "reachable": candidates.reachable.tolist(),
+        "path": _rounded(candidates.path.length, 1),
+        "skin_angle": _rounded(np.degrees(candidates.path.skin_angle), 1),
+        "rank": candidates.ranking.rank.tolist(),
+        "reachable": candidates.arm.reachable.tolist(),
         "outward": _rounded(candidates.outward_ct.ravel(), 5),
         "best": candidates.ranked[:10].tolist(),
-        "pareto": np.flatnonzero(candidates.pareto & candidates.safe).tolist(),
+        "pareto": np.flatnonzero(candidates.ranking.pareto & candidates.safe).tolist(),
     }
 
 
@@ -85,11 +85,13 @@ def map_raster_rows(rows: Any) -> list[int]:
 
 def _nearest(candidates: Candidates) -> tuple[list[str], Any]:
     """For every row the nearest structure that demands a margin, and its clearance."""
-    demanding = np.flatnonzero(np.isfinite(candidates.margins))
+    demanding = np.flatnonzero(np.isfinite(candidates.clearance.margins))
     if len(demanding) == 0:
         return [""] * len(candidates), np.full(len(candidates), np.nan)
-    columns = demanding[np.argmin(np.nan_to_num(candidates.clearance[:, demanding], nan=np.inf), axis=1)]
-    return [candidates.structures[c] for c in columns], candidates.clearance[np.arange(len(candidates)), columns]
+    clearance = candidates.clearance
+    columns = demanding[np.argmin(np.nan_to_num(clearance.distance[:, demanding], nan=np.inf), axis=1)]
+    nearest = clearance.distance[np.arange(len(candidates)), columns]
+    return [clearance.structures[column] for column in columns], nearest
 
 
 def _png(rgba: Any) -> str:

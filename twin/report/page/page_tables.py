@@ -62,17 +62,17 @@ def best_table(candidates: Candidates) -> str:
         name, clearance = nearest_structure(candidates, int(row))
         lines.append(
             (
-                str(candidates.rank[row]),
+                str(candidates.ranking.rank[row]),
                 f"{np.degrees(candidates.theta[row]):g}",
                 f"{np.degrees(candidates.beta[row]):g}",
-                number(float(candidates.cost[row]), 3),
+                number(float(candidates.ranking.cost[row]), 3),
                 number(clearance, 1),
                 escape(name.replace("_", " ") or "–"),
-                number(float(candidates.path_length[row]), 1),
-                number(float(np.degrees(candidates.skin_angle[row])), 1),
-                number(float(candidates.tissue[row]), 1),
-                number(float(candidates.reach_margin[row]), 2),
-                "yes" if candidates.pareto[row] else "",
+                number(float(candidates.path.length[row]), 1),
+                number(float(np.degrees(candidates.path.skin_angle[row])), 1),
+                number(float(candidates.path.tissue[row]), 1),
+                number(float(candidates.arm.margin[row]), 2),
+                "yes" if candidates.ranking.pareto[row] else "",
             )
         )
     return table(BEST_COLUMNS, lines, kind="numbers")

@@ -96,7 +96,7 @@ def _path(case: Any, candidates: Candidates, plan: Any | None, direction: Any) -
     row = chosen_row(candidates)
     if row is None or direction is None:
         return None
-    return np.stack([case.target_ct, case.target_ct + candidates.path_length[row] * direction])
+    return np.stack([case.target_ct, case.target_ct + candidates.path.length[row] * direction])
 
 
 def _overview_camera(case: Any, bodies: Sequence[SceneBody], path_ct: Any) -> ViewCamera:
@@ -207,7 +207,7 @@ def _path_words(candidates: Candidates, plan: Any | None, row: int | None) -> st
         length = float(np.linalg.norm(plan.entry_ct - plan.target_ct))
     else:
         theta, beta = np.degrees(candidates.theta[row]), np.degrees(candidates.beta[row])
-        length = float(candidates.path_length[row])
+        length = float(candidates.path.length[row])
     words = f"θ {theta:g}°, β {beta:g}°, {number(length, 1, 'mm')} in the body"
     if row is not None:
         name, clearance = nearest_structure(candidates, row)

@@ -76,7 +76,7 @@ def corridor_walls(candidates: Candidates, case: Any) -> TriangleMesh | None:
 
 def _cells(candidates: Candidates, case: Any) -> tuple[Floats, NDArray[np.int64]] | None:
     """Corner points (n, 3), shared between cells, and the four corners (m, 4) of every safe cell."""
-    rows = np.flatnonzero(candidates.safe & np.isfinite(candidates.path_length))
+    rows = np.flatnonzero(candidates.safe & np.isfinite(candidates.path.length))
     if len(rows) == 0:
         return None
     half = step_of(candidates) / 2
@@ -88,7 +88,7 @@ def _cells(candidates: Candidates, case: Any) -> tuple[Floats, NDArray[np.int64]
     keys = np.stack([np.round(theta / KEY), around], axis=-1).reshape(-1, 2)
     _, first, shared = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     shared = shared.reshape(-1)
-    lengths = np.repeat(candidates.path_length[rows], 4)
+    lengths = np.repeat(candidates.path.length[rows], 4)
     length = np.bincount(shared, weights=lengths) / np.bincount(shared) + LIFT_MM
     T = np.asarray(case.T_ct_entry)
     points = case.target_ct + length[:, None] * (outward(theta.ravel()[first], beta.ravel()[first]) @ T[:3, :3].T)
