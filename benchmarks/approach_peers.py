@@ -104,7 +104,7 @@ def turned(checker: FastChecker, goals: Array) -> Array:
 
 def ours(checker: FastChecker, home: Array, goals: Array, seed: int) -> Array | None:
     """The search alone, as :func:`plan_approach` begins; None without a way."""
-    found = approach._shortest(checker, checker.segment_judge(), home, goals, seed, approach.MAX_SAMPLES)
+    found = approach._shortest(checker, checker.segment_checker(), home, goals, seed, approach.MAX_SAMPLES)
     return None if isinstance(found, Connected) else found.waypoints
 
 

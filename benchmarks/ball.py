@@ -185,29 +185,29 @@ def in_space(
         ]
 
     for _ in range(int(np.ceil(count / POINTS_PER_CALIBRATION))):
-        held = [(point, balls) for point in GRID if not any_lost(balls := seen(point, planned))]
+        held = [(point, spheres) for point in GRID if not any_lost(spheres := seen(point, planned))]
         known = np.array([point for point, _ in held]) + rng.normal(0, point_mm, (len(held), 3))
         cameras = []
         for number in (0, 1):
-            pixels = np.array([balls[number].pixel for _, balls in held])
+            pixels = np.array([spheres[number].pixel for _, spheres in held])
             fit = calibrate(known, pixels, SIZE, distortion=modelled)
             cameras.append(fit.camera)
             reprojection.append(fit.rms_px)
         for _ in range(POINTS_PER_CALIBRATION):
             point = rng.uniform(-1, 1, 3) * half_mm
-            balls = seen(point, tuple(cameras))
-            if any_lost(balls):
+            spheres = seen(point, tuple(cameras))
+            if any_lost(spheres):
                 lost += 1
                 continue
-            pixels = np.stack([[ball.pixel] for ball in balls])
-            found = triangulate(cameras, pixels, np.stack([[ball.covariance] for ball in balls])).points_c[0]
+            pixels = np.stack([[ball.pixel] for ball in spheres])
+            found = triangulate(cameras, pixels, np.stack([[ball.covariance] for ball in spheres])).points_c[0]
             errors.append(np.linalg.norm(found - point))
     return np.array(errors), lost, float(np.mean(reprojection))
 
 
-def any_lost(balls: list[DetectedBall | LostBall]) -> bool:
+def any_lost(spheres: list[DetectedBall | LostBall]) -> bool:
     """Whether a camera did not find it."""
-    return any(isinstance(ball, LostBall) for ball in balls)
+    return any(isinstance(ball, LostBall) for ball in spheres)
 
 
 def rms(errors: np.ndarray) -> float:

@@ -136,8 +136,8 @@ def _contradictions(name: str, context: CaseContext, found: Certificate, total: 
         height = bottom + (top - bottom) * rng.random(count)
         theta, beta = np.arccos(np.clip(height, -1, 1)), rng.uniform(*cells.beta.T)
         directions = Directions(theta, beta, outward(theta, beta) @ R.T)
-        judged = organ_candidates(context.case, context.anatomy, context.engine, directions)
-        wrong += int(np.count_nonzero(judged.safe != (found.verdict[rows] == "S")))
+        rated = organ_candidates(context.case, context.anatomy, context.engine, directions)
+        wrong += int(np.count_nonzero(rated.safe != (found.verdict[rows] == "S")))
     print(f"{name}: {total} directions, {wrong} contradict, {time.perf_counter() - start:.0f} s")
     return wrong
 

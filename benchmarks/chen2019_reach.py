@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.insertion import MIN_SINGULARITY, flange_poses
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.entry import outward
-from puncture_twin.planning.place.estimate import insertion_ways
+from puncture_twin.planning.place.estimate import insertion_branches
 from puncture_twin.planning.place.mounts import Region, Site
 
 Floats = NDArray[np.float64]
@@ -85,7 +85,7 @@ def held_share(
     """The share of directions that `place` counts as within reach at one distance, no collisions asked."""
     distances = np.full((len(outward_base), 1), distance_mm)
     return float(
-        insertion_ways(ur_model(MODEL), target_base, outward_base, distances, at_least)
+        insertion_branches(ur_model(MODEL), target_base, outward_base, distances, at_least)
         .margin.max(axis=1)
         .astype(bool)
         .mean()
@@ -106,7 +106,7 @@ def our_windows(T_base_ct: Floats, target_ct: Floats, theta_deg: int) -> tuple[W
     """First and last β, deg, of each run of 1-degree steps that `place` counts as within reach at standoff."""
     u = outward(np.radians(theta_deg), np.radians(np.arange(360.0))) @ T_base_ct[:3, :3].T
     target = T_base_ct[:3, :3] @ target_ct + T_base_ct[:3, 3]
-    ways = insertion_ways(ur_model(MODEL), target, u, np.full((360, 1), LENGTH_MM + STANDOFF_MM))
+    ways = insertion_branches(ur_model(MODEL), target, u, np.full((360, 1), LENGTH_MM + STANDOFF_MM))
     return runs(ways.margin.max(axis=1) > 0.0)
 
 

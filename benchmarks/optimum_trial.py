@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
-from puncture_twin.twin.guidance.stereo.detection import picture_sight
+from puncture_twin.twin.guidance.stereo.detection import picture_detector
 from puncture_twin.twin.guidance.stereo.joint_model import LENS, Guess, Observed, Unknowns
 from puncture_twin.twin.guidance.stereo.optimum import Adjusted, bound
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
-from puncture_twin.twin.guidance.stereo.session import Eyes, run_session
+from puncture_twin.twin.guidance.stereo.session import DetectorOf, run_session
 from puncture_twin.twin.guidance.stereo.stereo_room import (
     CAMERA_AXIS_PX,
     CAMERA_FOCAL,
@@ -43,14 +43,14 @@ class OptimumTrial(NamedTuple):
     offset_bound_mm: Floats
 
 
-def optimum_trial(case: ServoCase, seed: int, eyes: Eyes = picture_sight) -> OptimumTrial:
+def optimum_trial(case: ServoCase, seed: int, detector_of: DetectorOf = picture_detector) -> OptimumTrial:
     """Hold a session and bound it by all that was measured in it until each target's end."""
-    session = run_session(case, seed, eyes=eyes)
+    session = run_session(case, seed, detector_of=detector_of)
     room = session.room
     stays = [visit for one in session.reached for visit in one.servoed.visits]
     ends = np.cumsum([len(one.servoed.visits) for one in session.reached])
     q_true = np.concatenate([session.calibration.q_true, np.reshape([visit.q_true for visit in stays], (-1, 6))])
-    balls = room.ball_c(q_true)
+    spheres = room.ball_c(q_true)
     observed = session.guide.observed()
     rows = []
     for one, end in zip(session.reached, ends, strict=True):
@@ -58,9 +58,9 @@ def optimum_trial(case: ServoCase, seed: int, eyes: Eyes = picture_sight) -> Opt
             continue
         index = case.targets.names.index(one.target)
         until = len(session.calibration.q_command) + int(end)
-        floor = room_bound(room, first_stays(observed, until), balls[:until])
+        floor = room_bound(room, first_stays(observed, until), spheres[:until])
         offset = floor.offset(-1, case.targets.points[index], case.file.head.target_mm)
-        seen, ball, target = one.servoed.visits[-1].seen, balls[until - 1], room.targets_c[index]
+        seen, ball, target = one.servoed.visits[-1].seen, spheres[until - 1], room.targets_c[index]
         errors = (seen.ball_c - ball, seen.target_c - target, (seen.target_c - seen.ball_c) - (target - ball))
         bounds = (offset.ball_covariance, offset.target_covariance, offset.covariance)
         rows.append([*(np.linalg.norm(e) for e in errors), one.after_mm, *(np.sqrt(np.trace(b)) for b in bounds)])

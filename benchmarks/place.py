@@ -101,11 +101,11 @@ def search(path: Path, jobs: int) -> None:
     done = search_placements(context.case, context.anatomy, found, context.placement, jobs=jobs)
     spent = f"{perf_counter() - begin:.1f} s, CPU {_cpu() - cpu:.1f} s"
     print(
-        f"{context.case.name}: {len(done.coarse)} + {done.refined} sites estimated, {len(done.judged)} judged over"
+        f"{context.case.name}: {len(done.coarse)} + {done.refined} sites estimated, {len(done.rated)} judged over"
         f" {int(found.safe.sum())} directions, {jobs} processes: {spent}"
     )
     print(f"possible {100 * done.possible:.1f} %; share % estimated and judged:")
-    for one in done.judged:
+    for one in done.rated:
         print(f"  {one.name:18s} {100 * one.estimate.share:5.1f}  {100 * one.verdict.share:5.1f}")
 
 

@@ -40,18 +40,18 @@ def least_distances(p, ends, triangles):  # type: ignore[no-untyped-def]  # numb
 
     A triangle is passed over where its ball, about its corners' mean, lies clearly beyond what was found.
     """
-    found, balls = np.full(len(ends), np.inf), np.empty((len(triangles), 4))
+    found, spheres = np.full(len(ends), np.inf), np.empty((len(triangles), 4))
     for k in range(len(triangles)):
         t = triangles[k]
-        balls[k, :3] = (t[0] + t[1] + t[2]) / 3.0
+        spheres[k, :3] = (t[0] + t[1] + t[2]) / 3.0
         for corner in range(3):
-            away = _from_to(balls[k], t[corner])
-            balls[k, 3] = max(balls[k, 3] if corner > 0 else 0.0, np.sqrt(_dot(away, away)))
+            away = _from_to(spheres[k], t[corner])
+            spheres[k, 3] = max(spheres[k, 3] if corner > 0 else 0.0, np.sqrt(_dot(away, away)))
     start = (p[0], p[1], p[2])
     for row in range(len(ends)):
         end = (ends[row, 0], ends[row, 1], ends[row, 2])
         for k in range(len(triangles)):
-            if np.sqrt(_from_segment(balls[k], start, end)) - balls[k, 3] <= found[row] + CLEARLY_MM:
+            if np.sqrt(_from_segment(spheres[k], start, end)) - spheres[k, 3] <= found[row] + CLEARLY_MM:
                 found[row] = min(found[row], _one_triangle(start, end, triangles[k]))
     return found
 

@@ -77,14 +77,14 @@ def verdicts_unlike_fcl(
     wrong = asked = 0
     for radius in RADII_MM:
         verdicts = engine.nearer_than(target, directions, scene.length, radius)
-        capsule, judged = fcl.Capsule(radius, scene.length), np.empty(verdicts.shape, bool)
+        capsule, rated = fcl.Capsule(radius, scene.length), np.empty(verdicts.shape, bool)
         for row, outward in enumerate(directions):
             needle = fcl.CollisionObject(capsule, pose(target, outward, scene.length))
             for column, tree in enumerate(objects):
-                judged[row, column] = fcl.collide(needle, tree, fcl.CollisionRequest(), fcl.CollisionResult()) > 0
+                rated[row, column] = fcl.collide(needle, tree, fcl.CollisionRequest(), fcl.CollisionResult()) > 0
         far = np.abs(exact - radius) >= NEAR_THRESHOLD_MM
-        wrong += int(np.sum((judged != verdicts) | (far & (judged != (exact < radius)))))
-        asked += judged.size
+        wrong += int(np.sum((rated != verdicts) | (far & (rated != (exact < radius)))))
+        asked += rated.size
     return asked, wrong
 
 

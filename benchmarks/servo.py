@@ -20,10 +20,10 @@ import numpy as np
 
 from benchmarks.optimum_trial import OptimumTrial, optimum_trial
 from puncture_twin.meshes import folder
-from puncture_twin.twin.guidance.stereo.detection import Sight, picture_sight, pixel_sight
+from puncture_twin.twin.guidance.stereo.detection import Detector, picture_detector, pixel_detector
 from puncture_twin.twin.guidance.stereo.experiment import Statistics, run_trials, statistics, varied
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
-from puncture_twin.twin.guidance.stereo.session import Eyes
+from puncture_twin.twin.guidance.stereo.session import DetectorOf
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell
 
 PIXEL_PX = 0.02
@@ -96,12 +96,12 @@ def sensitivity(case: ServoCase, seeds: int, jobs: int) -> None:
         study(name, varied(case, **changed), seeds, jobs)
 
 
-def pixels_alone(room: StereoWorkcell, rng: np.random.Generator) -> Sight:
+def pixels_alone(room: StereoWorkcell, rng: np.random.Generator) -> Detector:
     """True pixels with normal errors of ``PIXEL_PX``."""
-    return pixel_sight(room, PIXEL_PX, rng)
+    return pixel_detector(room, PIXEL_PX, rng)
 
 
-def optimum(case: ServoCase, seeds: int, jobs: int, eyes: Eyes = picture_sight) -> None:
+def optimum(case: ServoCase, seeds: int, jobs: int, detector_of: DetectorOf = picture_detector) -> None:
     """Chain and joint estimate against the Cramer-Rao bound, the servo closed over each."""
     for frames in (1, 4):
         print(f"optimum, {frames} frame{'s' if frames > 1 else ''} a look: {seeds} seeds; rms, mm; ratio to the bound")
@@ -110,7 +110,7 @@ def optimum(case: ServoCase, seeds: int, jobs: int, eyes: Eyes = picture_sight) 
             variant = varied(case, servo={"estimate": estimate, "frames": frames})
             context = multiprocessing.get_context("spawn")
             with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-                trials = list(pool.map(partial(optimum_trial, variant, eyes=eyes), range(seeds)))
+                trials = list(pool.map(partial(optimum_trial, variant, detector_of=detector_of), range(seeds)))
             print(f"  {estimate:8s} " + " ".join(ratio(trials, name) for name in ("ball", "target", "offset", "after")))
 
 
@@ -127,7 +127,7 @@ PARTS = {
     "figures": figures,
     "sensitivity": sensitivity,
     "optimum": optimum,
-    "optimum-pixels": partial(optimum, eyes=pixels_alone),
+    "optimum-pixels": partial(optimum, detector_of=pixels_alone),
 }
 """What can be asked for; the last leaves the pictures out: errors of the pixels as the bound assumes them."""
 

@@ -75,14 +75,14 @@ def with_needle_turns(truth, A, seen, turns):
     return turned
 
 
-def cured(truth, recording, seen, cure):
+def cured(truth, recording, seen, suggestion):
     """The proposed poses as the two arms would really record them: the needle brought into the image by the truth."""
-    rows = [recording.names.index(pose.reference) for pose in cure.poses]
-    A = np.array([pose.A for pose in cure.poses])
+    rows = [recording.names.index(pose.reference) for pose in suggestion.poses]
+    A = np.array([pose.A for pose in suggestion.poses])
     wished = ImagePose(
-        seen.tip_mm[rows] + np.array([pose.tip_shift_mm for pose in cure.poses]),
-        seen.insertion[rows] + np.array([pose.insertion_change for pose in cure.poses]),
-        seen.roll[rows] + np.array([pose.needle_roll for pose in cure.poses]),
+        seen.tip_mm[rows] + np.array([pose.tip_shift_mm for pose in suggestion.poses]),
+        seen.insertion[rows] + np.array([pose.insertion_change for pose in suggestion.poses]),
+        seen.roll[rows] + np.array([pose.needle_roll for pose in suggestion.poses]),
         np.zeros(len(rows)),
     )
     return exact_recording(truth, A, wished)

@@ -12,17 +12,17 @@ from puncture_twin.twin.guidance.stereo.joint_model import LENS, Guess, Observed
 from puncture_twin.twin.guidance.stereo.poses import configurations, rod_orientation
 from puncture_twin.twin.guidance.stereo.robot_calibration import grid_points
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
-from puncture_twin.twin.guidance.stereo.servo_law import Held, ball_base
+from puncture_twin.twin.guidance.stereo.servo_law import HeldRod, ball_base
 from puncture_twin.twin.guidance.stereo.stereo_room import (
     arm_errors,
     calibration_frame,
-    draw_room,
+    draw_workcell,
     head_pose,
     planned_cameras,
 )
 
 CASE = load_servo_case(folder() / "head")
-HELD = Held(ur_model("ur3"), CASE.file.tool.rod_mm, rod_orientation(np.radians(CASE.file.tool.tilt_deg)))
+HELD = HeldRod(ur_model("ur3"), CASE.file.tool.rod_mm, rod_orientation(np.radians(CASE.file.tool.tilt_deg)))
 PIXEL_PX, MEASURING_MM, IMAGE_MM = 0.03, 0.01, 0.3
 
 
@@ -60,16 +60,16 @@ def start_configurations():
 def simulate(seed, stays=2):
     """A session up to the marker pictures and a few stays at targets, everything with normal errors."""
     rng = np.random.default_rng(seed)
-    room = draw_room(CASE, rng)
+    room = draw_workcell(CASE, rng)
     lens = rng.normal(size=(2, 4))
     cameras = [replace(c, distortion=np.array(LENS) * u) for c, u in zip(room.cameras, lens, strict=True)]
     q = start_configurations()[: 12 + stays]
     spread = np.sqrt(room.arm.repeatability_rad**2 + room.arm.backlash_rad**2 / 12)
-    balls = room.ball_c(q + rng.normal(0.0, spread, q.shape))
-    pixels, markers = ([c.project(p) for c in cameras] for p in (balls, room.markers_c))
+    spheres = room.ball_c(q + rng.normal(0.0, spread, q.shape))
+    pixels, markers = ([c.project(p) for c in cameras] for p in (spheres, room.markers_c))
     pixels, markers = (np.array(p) + rng.normal(0.0, PIXEL_PX, np.shape(p)) for p in (pixels, markers))
     round_errors = [np.broadcast_to(PIXEL_PX**2 * np.eye(2), (*p.shape, 2)) for p in (pixels, markers)]
-    measured = balls[:12] + rng.normal(0.0, MEASURING_MM, (12, 3))
+    measured = spheres[:12] + rng.normal(0.0, MEASURING_MM, (12, 3))
     image = CASE.markers.points + rng.normal(0.0, IMAGE_MM, CASE.markers.points.shape)
     T_c_base = fit_rigid(ball_base(HELD, q[:12]), measured)
     T_c_m = np.linalg.inv(calibration_frame(CASE)) @ head_pose(CASE)
@@ -78,5 +78,5 @@ def simulate(seed, stays=2):
         planned_cameras(CASE), HELD, arm_errors(CASE), q, pixels, round_errors[0], measured, MEASURING_MM, markers,
         round_errors[1], image, IMAGE_MM,
     )  # fmt: skip
-    truth = Unknowns(np.zeros((2, 13)), np.zeros(6), np.zeros(23), np.zeros(6), CASE.markers.points.copy(), balls)
-    return Simulated(observed, guess, balls, room.targets_c, room, truth)
+    truth = Unknowns(np.zeros((2, 13)), np.zeros(6), np.zeros(23), np.zeros(6), CASE.markers.points.copy(), spheres)
+    return Simulated(observed, guess, spheres, room.targets_c, room, truth)

@@ -79,7 +79,7 @@ def insertion_paths(model: UrModel, target_base: Floats, outward_base: Floats, d
         Shape (8, m, 6), rad, without jumps of whole turns; NaN from where a branch first does not exist.
     """
     line = needle_lines(np.atleast_2d(target_base), np.atleast_2d(outward_base))[0]
-    return every_way(model, line, np.ascontiguousarray(distance_mm, dtype=np.float64))
+    return every_branch(model, line, np.ascontiguousarray(distance_mm, dtype=np.float64))
 
 
 def away_from_singularities(model: UrModel, q: Floats, at_least: float = MIN_SINGULARITY) -> NDArray[np.bool_]:
@@ -161,14 +161,14 @@ def flange_at(line: NeedleLine, distance_mm: float) -> Floats:
     return T
 
 
-def every_way(model: UrModel, line: NeedleLine, distance_mm: Floats) -> Floats:
+def every_branch(model: UrModel, line: NeedleLine, distance_mm: Floats) -> Floats:
     """Every branch's way along a line, see :func:`insertion_paths`; ``distance_mm`` of shape (m,)."""
     q = np.empty((N_BRANCHES, len(distance_mm), 6))
     kernels.ways(model.lengths, *line, distance_mm, q)
     return q
 
 
-def branch_way(model: UrModel, line: NeedleLine, distance_mm: Floats, branch: int, turn: Floats) -> Floats:
+def branch_path(model: UrModel, line: NeedleLine, distance_mm: Floats, branch: int, turn: Floats) -> Floats:
     """The way of one branch along the needle.
 
     Args:

@@ -131,5 +131,5 @@ def search_one(path: Path, out: Path, arm: bool | None) -> dict[str, Any]:
         return row | {"exit_code": 1, "said": "no safe candidate"}
     best = int(found.ranked[0])
     angles = {"best_theta_deg": np.degrees(found.theta[best]), "best_beta_deg": np.degrees(found.beta[best])}
-    said = "done" if found.arm_checked else f"done for the organs; arm {found.arm}"
+    said = "done" if found.arm_checked else f"done for the organs; arm {found.arm_note}"
     return row | {"exit_code": 0, "said": said} | {key: float(value) for key, value in angles.items()}

@@ -73,7 +73,7 @@ def certify(
     if not SMALLEST_SIZE <= size <= np.pi:
         allowed = f"{np.degrees(SMALLEST_SIZE):g} to 180 degrees"
         raise InputError(f"size {np.degrees(size):g} degrees", where="certify", allowed=allowed)
-    judge = _Judge(question, anatomy, case.needle)
+    judge = _Evaluator(question, anatomy, case.needle)
     record = _Record()
     cells, state = question.cap(), judge.start()
     while len(cells):
@@ -137,7 +137,7 @@ class _Verdicts:
         self.bound[rows] = np.broadcast_to(bound, len(where))[rows]
 
 
-class _Judge:
+class _Evaluator:
     """Judges the cells of one question, level by level."""
 
     def __init__(self, question: Question, anatomy: Anatomy, needle: Needle) -> None:
@@ -174,8 +174,8 @@ class _Judge:
         verdicts.triangle[organs.rejected] = organs.witness[organs.rejected]
         if cones.radius.max() <= SKIN_BELOW:
             open_rows = np.flatnonzero((verdicts.letter == UNDECIDED) & ~verdicts.state.view_good)
-            self._judge_view(verdicts, cones, open_rows, any_flange(self._needle, self._question))
-            self._judge_skin(verdicts, cells, cones)
+            self._check_view(verdicts, cones, open_rows, any_flange(self._needle, self._question))
+            self._check_skin(verdicts, cells, cones)
         clear = organs.near.start[1:] == organs.near.start[:-1]
         good_skin = verdicts.state.skin_good & verdicts.state.view_good
         verdicts.letter[clear & good_skin & (verdicts.letter == UNDECIDED)] = SAFE
@@ -198,13 +198,13 @@ class _Judge:
         verdicts.reject(everywhere, Reason.UNKNOWN_REGION)
         return verdicts
 
-    def _judge_view(self, verdicts: _Verdicts, cones: Cones, rows: Ints, flange: FlangeBounds) -> None:
+    def _check_view(self, verdicts: _Verdicts, cones: Cones, rows: Ints, flange: FlangeBounds) -> None:
         target_ct, n = self._question.target_ct, len(cones.radius)
         view = view_bounds(self._view, target_ct, cones.centres[rows], cones.radius[rows], flange)
         verdicts.state.view_good[rows] |= view.kept
         verdicts.reject(_spread(view.left, rows, n), Reason.UNKNOWN_REGION, _spread(view.depth, rows, n))
 
-    def _judge_skin(self, verdicts: _Verdicts, cells: Cells, cones: Cones) -> None:
+    def _check_skin(self, verdicts: _Verdicts, cells: Cells, cones: Cones) -> None:
         question, state = self._question, verdicts.state
         rows = np.flatnonzero((verdicts.letter == UNDECIDED) & ~(state.skin_good & state.view_good))
         if not len(rows):
@@ -233,7 +233,7 @@ class _Judge:
         verdicts.reject(_spread(found.count > 1, rows, n), Reason.REENTERS_SKIN)
         angle = np.degrees(found.least_angle)
         verdicts.reject(_spread(steep, rows, n), Reason.SKIN_ANGLE, _spread(angle, rows, n))
-        self._judge_view(verdicts, cones, rows, flange_bounds(self._needle, question, found))
+        self._check_view(verdicts, cones, rows, flange_bounds(self._needle, question, found))
 
 
 def _organs(meshes: list[TriangleMesh], question: Question) -> Organs:
@@ -275,7 +275,7 @@ class _Record:
         columns = cells.theta, cells.beta, letters, verdicts.reason, verdicts.triangle, verdicts.bound
         self.leaves.append(tuple(column[leaf] for column in columns))
 
-    def certificate(self, question: Question, size: float, judge: _Judge) -> Certificate:
+    def certificate(self, question: Question, size: float, judge: _Evaluator) -> Certificate:
         """All levels together."""
         theta, beta, verdict, code, triangle, bound = (
             np.concatenate(column) for column in zip(*self.leaves, strict=True)

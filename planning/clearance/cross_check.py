@@ -54,12 +54,12 @@ def cross_check(
         CrossCheckError: A distance differs by more than rounding.
     """
     rows = rng.choice(len(outward_ct), min(count, len(outward_ct)), replace=False)
-    judged = FclEngine(meshes).measure(target_ct, outward_ct[rows], length)
-    difference = np.abs(judged.distance - found.distance[rows])
+    rated = FclEngine(meshes).measure(target_ct, outward_ct[rows], length)
+    difference = np.abs(rated.distance - found.distance[rows])
     if difference.size and difference.max() > AGREE_MM:
         row, column = np.unravel_index(int(difference.argmax()), difference.shape)
         raise CrossCheckError(
             f"direction {rows[row]}, structure {column}: the engine says {found.distance[rows[row], column]:.9f} mm,"
-            f" FCL {judged.distance[row, column]:.9f} mm"
+            f" FCL {rated.distance[row, column]:.9f} mm"
         )
     return CrossChecked(len(rows), difference.size, float(difference.max(initial=0.0)))

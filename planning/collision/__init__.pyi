@@ -1,5 +1,5 @@
 from .bodies import Body as Body, Shape as Shape, arm_bodies as arm_bodies
-from .bounding_spheres import ball_tree as ball_tree, prism as prism
+from .bounding_spheres import prism as prism, sphere_tree as sphere_tree
 from .checker import (
     DISTANCE_PAIRS as DISTANCE_PAIRS,
     CellChecker as CellChecker,

@@ -87,7 +87,7 @@ def settings() -> dict[str, float]:
     }
 
 
-def enclosing_ball(points: Floats) -> BoundingSphere:
+def enclosing_sphere(points: Floats) -> BoundingSphere:
     """A small ball about points (n, 3): steps toward the farthest point, ever shorter (Badoiu and Clarkson 2003)."""
     centre = np.empty(3)
     radius = _walk_to_centre(np.ascontiguousarray(points), CENTRE_STEPS, centre)
@@ -160,27 +160,27 @@ def halves(corners: Floats) -> tuple[Floats, Floats]:
     return np.concatenate([corners[below], crossings]), np.concatenate([corners[~below], crossings])
 
 
-def ball_tree(pieces: Sequence[Floats], leaf_radius_mm: float = LEAF_RADIUS_MM) -> BallTree:
+def sphere_tree(pieces: Sequence[Floats], leaf_radius_mm: float = LEAF_RADIUS_MM) -> BallTree:
     """Balls that enclose the union of convex pieces, each given by its corners (n, 3), mm."""
-    balls: list[BoundingSphere] = []
+    spheres: list[BoundingSphere] = []
     children: list[tuple[int, int]] = []
 
     def add(parts: Sequence[Floats]) -> int:
-        row = len(balls)
-        balls.append(enclosing_ball(np.concatenate(parts)))
+        row = len(spheres)
+        spheres.append(enclosing_sphere(np.concatenate(parts)))
         children.append((-1, -1))
         if len(parts) > 1:
             half = len(parts) // 2
             children[row] = (add(parts[:half]), add(parts[half:]))
-        elif balls[row].radius > leaf_radius_mm:
+        elif spheres[row].radius > leaf_radius_mm:
             below, above = halves(parts[0])
             children[row] = (add([below]), add([above]))
         return row
 
     add(pieces)
     return BallTree(
-        np.array([ball.centre for ball in balls]),
-        np.array([ball.radius for ball in balls]),
+        np.array([ball.centre for ball in spheres]),
+        np.array([ball.radius for ball in spheres]),
         np.array(children, dtype=np.int64),
     )
 

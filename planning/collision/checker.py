@@ -30,7 +30,7 @@ from puncture_twin.planning.collision.state_checker import (
     PATIENT,
     Contact,
     Distances,
-    Met,
+    FirstContact,
     Nearest,
     StateChecker,
 )
@@ -48,7 +48,7 @@ __all__ = [
     "Check",
     "Contact",
     "Distances",
-    "Met",
+    "FirstContact",
     "Nearest",
     "StateChecker",
     "Tool",
@@ -132,7 +132,7 @@ class CellChecker:
                 return check.contact
         return None
 
-    def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> Met | None:
+    def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
         """The first state of a path with a contact, and the contact; None when all are clear.
 
         Args:
@@ -145,7 +145,7 @@ class CellChecker:
         for index, q in enumerate(q_path):
             contact = self.contact(q, needle_may_touch_patient=needle_may_touch_patient)
             if contact is not None:
-                return Met(index, contact)
+                return FirstContact(index, contact)
         return None
 
     def nearest(self, q: Floats, pair: str, body: str | None = None) -> Nearest:

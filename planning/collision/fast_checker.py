@@ -11,10 +11,16 @@ from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.collision.checker import NEEDLE_IN_PATIENT, CellChecker, Contact, Met, require_finite
+from puncture_twin.planning.collision.checker import (
+    NEEDLE_IN_PATIENT,
+    CellChecker,
+    Contact,
+    FirstContact,
+    require_finite,
+)
 from puncture_twin.planning.collision.never_touching import without_neighbours
 from puncture_twin.planning.collision.proofs import Motion, Proofs, ask_fcl
-from puncture_twin.planning.collision.segments import SegmentJudge
+from puncture_twin.planning.collision.segments import SegmentChecker
 from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.collision.sweep import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -64,32 +70,32 @@ class FastChecker(CellChecker):
         met = self.first_contact(np.asarray(q)[None], needle_may_touch_patient=needle_may_touch_patient)
         return None if met is None else met.contact
 
-    def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> Met | None:
+    def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
         """See :meth:`CellChecker.first_contact`."""
         path = np.asarray(q_path, dtype=np.float64)
         require_finite(path)
-        return self._first_met(self.motion(path), self._masks[needle_may_touch_patient])
+        return self._first_contact(self.motion(path), self._masks[needle_may_touch_patient])
 
-    def _first_met(self, motion: Motion, mask: Bools) -> Met | None:
+    def _first_contact(self, motion: Motion, mask: Bools) -> FirstContact | None:
         open_at = self._proofs.first_unproven(motion, 0, mask)
         while open_at >= 0:
             index, check = divmod(open_at, len(self._asked))
             if ask_fcl(self._asked[check], motion.frames[index]):
-                return Met(index, self._asked[check].contact)
+                return FirstContact(index, self._asked[check].contact)
             open_at = self._proofs.first_unproven(motion, open_at + 1, mask)
         return None
 
     def segment_contact(self, start: Floats, end: Floats) -> Contact | None:
-        """A contact on the straight joint segment between states (6,), rad; None if free. See :class:`SegmentJudge`.
+        """A contact on the straight joint segment between states (6,), rad; None if free. See :class:`SegmentChecker`.
 
         Raises:
             InputError: If a state is not finite.
         """
-        return self.segment_judge()(start, end)
+        return self.segment_checker()(start, end)
 
-    def segment_judge(self) -> SegmentJudge:
+    def segment_checker(self) -> SegmentChecker:
         """A judge of many segments, which remembers what touched last."""
-        return SegmentJudge(self.model, self._asked, self._proofs)
+        return SegmentChecker(self.model, self._asked, self._proofs)
 
     def open_checks(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact]:
         """The questions at ``q`` (6,) that are left to FCL."""

@@ -18,11 +18,11 @@ from puncture_twin.planning.collision import bounding_spheres as enclosures
 from puncture_twin.planning.collision.bodies import Body
 from puncture_twin.planning.collision.bounding_spheres import (
     BallTree,
-    ball_tree,
     coarse_hull,
-    enclosing_ball,
+    enclosing_sphere,
     inscribed_prism,
     neighbours,
+    sphere_tree,
 )
 from puncture_twin.planning.collision.checker import Check
 from puncture_twin.planning.collision.kernels import proofs as proof_kernels
@@ -35,7 +35,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 _Axes = tuple[Floats, Floats, Floats]
 
-ROOM_FRAME = 0
+WORKCELL_FRAME = 0
 """The frame of what does not move: the base's."""
 
 NO_BOX = -1.0
@@ -85,20 +85,20 @@ class Proofs:
         self, model: UrModel, checks: Sequence[Check], boxes: Sequence[Box], patient: TriangleMesh | None, cache: Cache
     ) -> None:
         hulls, rows = _Hulls(boxes), []
-        roots, balls = _trees([check.second_body for check in checks if check.hulls is None], cache)
+        roots, spheres = _trees([check.second_body for check in checks if check.hulls is None], cache)
         for check in checks:
             frame = check.second_body.frame
             if check.hulls is None:
-                row = (proof_kernels.SKIN, -1, roots[check.second_body.name], ROOM_FRAME, frame)
+                row = (proof_kernels.SKIN, -1, roots[check.second_body.name], WORKCELL_FRAME, frame)
             elif check.first_body is None:
                 second = hulls.add(check.hulls[1], check.second_body)
-                row = (proof_kernels.BOX, hulls.box(check.contact.other), second, ROOM_FRAME, frame)
+                row = (proof_kernels.BOX, hulls.box(check.contact.other), second, WORKCELL_FRAME, frame)
             else:
                 assert check.hulls[0] is not None  # only a box has none, and it belongs to no body
                 pair = (hulls.add(check.hulls[0], check.first_body), hulls.add(check.hulls[1], check.second_body))
                 row = (proof_kernels.PAIR, *pair, check.first_body.frame, frame)
             rows.append(row)
-        self.scene = ProofScene(np.array(rows, dtype=np.int64), _skin(patient), balls, *hulls.packed(cache))
+        self.scene = ProofScene(np.array(rows, dtype=np.int64), _skin(patient), spheres, *hulls.packed(cache))
         self._levers = np.array([_levers(model, check) for check in checks])
         self.movers = _moving(checks)
         self._work = scratch(len(rows), len(self.scene.hulls.radii))
@@ -174,7 +174,7 @@ def _levers(model: UrModel, check: Check) -> Floats:
 def _moving(checks: Sequence[Check]) -> Movers:
     """The piece that each check is about, or all of a body for the skin."""
     rows: dict[int, int] = {}
-    frames, balls, mover = [], [], []
+    frames, spheres, mover = [], [], []
     for check in checks:
         body = check.second_body
         key = id(body) if check.hulls is None else id(check.hulls[1])
@@ -182,9 +182,9 @@ def _moving(checks: Sequence[Check]) -> Movers:
             rows[key] = len(rows)
             corners = np.concatenate(body.full.hulls) if check.hulls is None else check.hulls[1]
             frames.append(body.frame)
-            balls.append(enclosing_ball(_in_frame(corners, body)))
+            spheres.append(enclosing_sphere(_in_frame(corners, body)))
         mover.append(rows[key])
-    centres, radii = np.array([ball.centre for ball in balls]), np.array([ball.radius for ball in balls])
+    centres, radii = np.array([ball.centre for ball in spheres]), np.array([ball.radius for ball in spheres])
     return Movers(np.array(mover, dtype=np.int64), np.array(frames, dtype=np.int64), centres, radii)
 
 
@@ -202,7 +202,7 @@ class _Hulls:
         self._names = {box.name: row for row, box in enumerate(boxes)}
         self._corners = [box.corners for box in boxes]
         self._rounded = [False] * len(boxes)
-        self._frames = [ROOM_FRAME] * len(boxes)
+        self._frames = [WORKCELL_FRAME] * len(boxes)
 
     def box(self, name: str) -> int:
         """Row of the box of that name."""
@@ -240,12 +240,12 @@ class _Hulls:
 
 def _enclosed(hulls: Sequence[Floats]) -> Arrays:
     """Of each convex hull a ball about it and a coarse hull: their numbers, one array each."""
-    balls, coarse = [enclosing_ball(corners) for corners in hulls], [coarse_hull(corners) for corners in hulls]
+    spheres, coarse = [enclosing_sphere(corners) for corners in hulls], [coarse_hull(corners) for corners in hulls]
     edges, first = [neighbours(corners) for corners in hulls], _starts([len(corners) for corners in hulls])
     rows = [hull.rows + start for hull, start in zip(edges, first[:-1], strict=True)]
     return {
-        "centres": np.array([ball.centre for ball in balls]).reshape(-1, 3),
-        "radii": np.array([ball.radius for ball in balls]),
+        "centres": np.array([ball.centre for ball in spheres]).reshape(-1, 3),
+        "radii": np.array([ball.radius for ball in spheres]),
         "slack": np.array([hull.slack_mm for hull in coarse]),
         "sizes": np.array([len(hull.corners) for hull in coarse], dtype=np.int64),
         "few": np.concatenate([np.empty((0, 3)), *(hull.corners for hull in coarse)]),
@@ -288,7 +288,7 @@ def _skin(patient: TriangleMesh | None) -> SkinTree:
 
 
 def _tree_arrays(pieces: Sequence[Floats]) -> Arrays:
-    return dict(vars(ball_tree(pieces)))
+    return dict(vars(sphere_tree(pieces)))
 
 
 def _trees(bodies: Sequence[Body], cache: Cache) -> tuple[dict[str, int], tuple[Floats, Floats, Ints]]:

@@ -27,7 +27,7 @@ QUESTIONS = 256
 """Room for what one segment leaves to FCL, at first."""
 
 
-class SegmentJudge:
+class SegmentChecker:
     """Says of straight joint segments whether they are free. Not for several threads.
 
     What touched last is asked first. That decides which contact is named where there are several, and never whether a
@@ -58,7 +58,7 @@ class SegmentJudge:
         start, end = np.array(start, dtype=np.float64), np.array(end, dtype=np.float64)
         shares, begin = looks(math.ceil(_length(end - start) / LOOK_FIRST_RAD)), 0
         while True:
-            segment_kernels.judge_segment(*self._packed, start, end, shares, begin, FINE_MM, self._order, self._answer)
+            segment_kernels.check_segment(*self._packed, start, end, shares, begin, FINE_MM, self._order, self._answer)
             status, check, begin, asked = self._answer.status.tolist()
             if status == NOT_FINITE:
                 require_finite(np.stack([start, end]))

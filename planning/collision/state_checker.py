@@ -25,7 +25,7 @@ NEEDLE_IN_PATIENT = Contact("needle", PATIENT)
 """What may happen while the needle goes in."""
 
 
-class Met(NamedTuple):
+class FirstContact(NamedTuple):
     """The first contact along a path: at which of its states, and of what."""
 
     at: int
@@ -72,7 +72,7 @@ class StateChecker(Protocol):
     def contact(self, q: Floats, *, needle_may_touch_patient: bool) -> Contact | None:
         """The first contact found at ``q``, shape (6,), rad; None when the arm is clear."""
 
-    def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> Met | None:
+    def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
         """The first state of ``q_path`` (m, 6), rad, with a contact, and the contact; None when all are clear."""
 
     def nearest(self, q: Floats, pair: str, body: str | None = None) -> Nearest:

@@ -26,7 +26,7 @@ LARGEST_BLEND_MM = 5.0
 SMALLEST_BLEND_MM = 1.0
 """Radii are halved down to this; then the arm stops at the waypoint."""
 
-LARGEST_SHARE = 0.45
+LARGEST_FRACTION = 0.45
 """Of each segment, so that two blends never meet: the controller skips a waypoint whose blend overlaps the next."""
 
 SAMPLES = 400
@@ -53,8 +53,8 @@ def _radius_mm(checker: StateChecker, waypoints: Floats, largest_mm: float) -> f
     before, corner, after = waypoints
     radius = largest_mm
     while radius >= SMALLEST_BLEND_MM:
-        starts, ends = (_share_within(checker, corner, other, radius) for other in (before, after))
-        if max(starts, ends) <= LARGEST_SHARE and _free(
+        starts, ends = (_fraction_within(checker, corner, other, radius) for other in (before, after))
+        if max(starts, ends) <= LARGEST_FRACTION and _free(
             checker, corner, starts * (before - corner), ends * (after - corner)
         ):
             return radius
@@ -62,7 +62,7 @@ def _radius_mm(checker: StateChecker, waypoints: Floats, largest_mm: float) -> f
     return 0.0
 
 
-def _share_within(checker: StateChecker, corner: Floats, other: Floats, radius_mm: float) -> float:
+def _fraction_within(checker: StateChecker, corner: Floats, other: Floats, radius_mm: float) -> float:
     """The last share of the way from a corner at which the tip is still within a radius of it, or the next sample.
 
     1 where the tip is so near the other end, so that half of the distance between two tips bounds both radii.
@@ -71,7 +71,7 @@ def _share_within(checker: StateChecker, corner: Floats, other: Floats, radius_m
     poses = flange_pose(checker.model, corner + shares[:, None] * (other - corner))
     tips = poses[:, :3, 3] + checker.tool.needle_length_mm * poses[:, :3, 2]
     far = np.linalg.norm(tips - tips[0], axis=1)
-    if radius_mm > LARGEST_SHARE * far[-1]:
+    if radius_mm > LARGEST_FRACTION * far[-1]:
         return 1.0
     return float(shares[min(SAMPLES, int(np.flatnonzero(far <= radius_mm)[-1]) + 1)])
 

@@ -1,6 +1,6 @@
 """From home to a standoff pose: RRT-Connect to several goals, shortened, corners rounded, timed, and checked by FCL.
 
-A fast checker proves whole segments (:class:`SegmentJudge`). With FCL alone a segment is judged at
+A fast checker proves whole segments (:class:`SegmentChecker`). With FCL alone a segment is judged at
 samples, which can miss something thin; the check of the finished motion is closer, and plans anew what it refuses.
 """
 
@@ -70,7 +70,7 @@ ATTEMPTS = 6
 APPROACH_SPEED = 0.5
 """Share of the joints' speed limits on the way to the patient."""
 
-CUT_SHARE = 0.5
+CUT_FRACTION = 0.5
 """A corner is rounded from the middle of its shorter segment on: the farther, the faster."""
 
 HALVINGS = 5
@@ -168,7 +168,7 @@ def plan_approach(
 def _judge(checker: StateChecker, resolution_rad: float) -> SegmentContact:
     """Who judges segments: the fast checker's proof, or FCL at samples."""
     if isinstance(checker, FastChecker):
-        return checker.segment_judge()
+        return checker.segment_checker()
 
     def sampled(start: Floats, end: Floats) -> Contact | None:
         shares = halving_order(max(1, math.ceil(float(np.linalg.norm(end - start)) / resolution_rad)))
@@ -216,7 +216,7 @@ def _cuts(judge: SegmentContact, waypoints: Floats) -> Floats:
     directions, cuts = steps / lengths[:, None], np.zeros(len(waypoints) - 2)
     share = np.linspace(0.0, 1.0, CURVE_PIECES + 1)
     for at in range(len(cuts)):
-        cut = CUT_SHARE * float(lengths[at : at + 2].min())
+        cut = CUT_FRACTION * float(lengths[at : at + 2].min())
         for _ in range(HALVINGS):
             curve = rounded(waypoints[at + 1], directions[at], directions[at + 1], cut, share)
             if all(judge(start, end) is None for start, end in pairwise(curve)):

@@ -6,4 +6,4 @@ from .document import (
     write_placements as write_placements,
 )
 from .mounts import Region as Region
-from .search import Judged as Judged, PlaceSearch as PlaceSearch, search_placements as search_placements
+from .search import PlaceSearch as PlaceSearch, RatedPlacement as RatedPlacement, search_placements as search_placements

@@ -18,7 +18,7 @@ from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.collision.bounding_spheres import ball_tree, prism
+from puncture_twin.planning.collision.bounding_spheres import prism, sphere_tree
 from puncture_twin.planning.place.obstacle_field import CELL_MM, Boxes, SkinField
 
 BALL_MM = 30.0
@@ -29,7 +29,7 @@ FLANGE = 6
 
 
 @dataclass(frozen=True, eq=False)
-class ArmBalls:
+class ArmSpheres:
     """Balls that enclose the links and the needle's holder, in bodies; not the needle.
 
     Attributes:
@@ -45,7 +45,7 @@ class ArmBalls:
     frames: NDArray[np.int64]
 
     @classmethod
-    def of(cls, model: UrModel, tool: Tool) -> ArmBalls:
+    def of(cls, model: UrModel, tool: Tool) -> ArmSpheres:
         """The balls of an arm with its tool.
 
         Raises:
@@ -54,7 +54,7 @@ class ArmBalls:
         bodies = [[piece.vertices for piece in link.pieces] for link in collision_links(model)]
         start, end = tool.holder_span_mm
         bodies.append([prism(tool.holder_diameter_mm / 2, end - start) + [0.0, 0.0, (start + end) / 2]])
-        trees = [ball_tree(pieces, BALL_MM) for pieces in bodies]
+        trees = [sphere_tree(pieces, BALL_MM) for pieces in bodies]
         rows = [np.insert(tree.leaves, 0, 0) for tree in trees]  # row 0 is the root
         return cls(
             np.concatenate([tree.centres[kept] for tree, kept in zip(trees, rows, strict=True)]),
@@ -81,11 +81,11 @@ class Surroundings:
     padding_mm: float
 
 
-def clear_ways(balls: ArmBalls, room: Surroundings, T_ct_base: Floats, frames: Floats) -> NDArray[np.bool_]:
+def clear_branches(spheres: ArmSpheres, room: Surroundings, T_ct_base: Floats, frames: Floats) -> NDArray[np.bool_]:
     """Which motions keep clear of the room at each of their states; the base is not asked about.
 
     Args:
-        balls: The arm.
+        spheres: The arm.
         room: What it must not meet.
         T_ct_base: Shape (4, 4), mm.
         frames: Shape (k, m, 7, 4, 4), mm, base frame: ``link_poses`` of k motions of m states.
@@ -93,15 +93,15 @@ def clear_ways(balls: ArmBalls, room: Surroundings, T_ct_base: Floats, frames: F
     Returns:
         Shape (k,).
     """
-    arm = (balls.centres, balls.radii + room.padding_mm, balls.starts[1:], balls.frames[1:])
+    arm = (spheres.centres, spheres.radii + room.padding_mm, spheres.starts[1:], spheres.frames[1:])
     clear = np.empty(len(frames), np.bool_)
     _clear(arm, _compiled(room), np.ascontiguousarray(T_ct_base), frames, clear)
     return clear
 
 
-def base_is_clear(balls: ArmBalls, room: Surroundings, T_ct_base: Floats) -> bool:
+def base_is_clear(spheres: ArmSpheres, room: Surroundings, T_ct_base: Floats) -> bool:
     """Whether the base itself stands free of the patient and of what stands with him. A True is proven for boxes."""
-    base = (balls.centres, balls.radii + room.padding_mm, balls.starts[:2], balls.frames[:1])
+    base = (spheres.centres, spheres.radii + room.padding_mm, spheres.starts[:2], spheres.frames[:1])
     alone = Surroundings(room.skin, room.fixed, Boxes.of([]), room.padding_mm)  # it is bolted to what it carries
     clear = np.empty(1, np.bool_)
     _clear(base, _compiled(alone), np.ascontiguousarray(T_ct_base), np.tile(np.eye(4), (1, 1, 7, 1, 1)), clear)

@@ -12,7 +12,7 @@ import numpy as np
 
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.place.mount_lines import mount_lines
-from puncture_twin.planning.place.search import Judged, PlaceSearch
+from puncture_twin.planning.place.search import PlaceSearch, RatedPlacement
 
 PLACE_VERSION = 1
 """Version of ``place.json``'s layout."""
@@ -26,11 +26,11 @@ COLUMNS = (
 
 def placement_rows(found: PlaceSearch) -> list[dict[str, Any]]:
     """One row a judged placement, best first, rank 1; the case's own comes last, without a rank."""
-    rows = [_row(rank, one) for rank, one in enumerate(found.judged, start=1)]
+    rows = [_row(rank, one) for rank, one in enumerate(found.rated, start=1)]
     return rows if found.own is None else [*rows, _row(None, found.own)]
 
 
-def _row(rank: int | None, one: Judged) -> dict[str, Any]:
+def _row(rank: int | None, one: RatedPlacement) -> dict[str, Any]:
     along, across, height = (None, None, None) if one.site is None else one.site.position
     values = (rank, one.name, along, across, height, one.verdict.share, one.verdict.held, one.verdict.asked)
     rest = (one.verdict.margin, one.verdict.home_contact, *one.mount.position_mm)
@@ -40,16 +40,16 @@ def _row(rank: int | None, one: Judged) -> dict[str, Any]:
 def place_document(found: PlaceSearch, provenance: Mapping[str, Any]) -> dict[str, Any]:
     """Everything as plain values: mm; shares and margins 0..1."""
     rows = placement_rows(found)
-    for row, one in zip(rows, (*found.judged, *((found.own,) if found.own else ())), strict=True):
+    for row, one in zip(rows, (*found.rated, *((found.own,) if found.own else ())), strict=True):
         row["mount"] = {key: list(value) for key, value in one.mount.model_dump().items()}
         row["reasons"] = dict(one.verdict.reasons)
         row["estimate"] = None if one.estimate is None else one.estimate._asdict()
-    best = found.judged[0] if found.judged else None
+    best = found.rated[0] if found.rated else None
     return {
         "version": PLACE_VERSION,
         **provenance,
         "T_ct_bed": np.asarray(found.T_ct_bed).tolist(),
-        "sites": {"coarse": len(found.coarse), "refined": found.refined, "judged": len(found.judged)},
+        "sites": {"coarse": len(found.coarse), "refined": found.refined, "judged": len(found.rated)},
         "possible_share": found.possible,
         "placements": rows,
         "mount_lines": None if best is None else mount_lines(best.mount),

@@ -15,7 +15,7 @@ from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.place.arm_spheres import ArmBalls, Surroundings, base_is_clear, clear_ways
+from puncture_twin.planning.place.arm_spheres import ArmSpheres, Surroundings, base_is_clear, clear_branches
 from puncture_twin.planning.place.directions import WantedDirections
 from puncture_twin.planning.place.mounts import Site
 
@@ -23,7 +23,7 @@ STATES = 3
 """Of an insertion, from standoff to target: enough to see most of what ends it."""
 
 
-class Ways(NamedTuple):
+class Branches(NamedTuple):
     """The straight insertions along n directions on every branch, looked at in m states each."""
 
     q: Floats
@@ -48,9 +48,9 @@ class ReachEstimate(NamedTuple):
 NOTHING = ReachEstimate(0.0, 0.0, 0.0, 0.0)
 
 
-def insertion_ways(
+def insertion_branches(
     model: UrModel, target_base: Floats, outward_base: Floats, distances_mm: Floats, at_least: float = MIN_SINGULARITY
-) -> Ways:
+) -> Branches:
     """Every branch of many insertions, by kinematics alone; joint limits are not asked for.
 
     Args:
@@ -64,7 +64,7 @@ def insertion_ways(
     poses = flange_poses(target_base, np.repeat(outward_base, states, axis=0), distances_mm.reshape(-1))
     q = inverse(model, poses).reshape(count, states, N_BRANCHES, 6)
     least = singularity(model, q).least().min(axis=1)  # NaN where a state does not exist
-    return Ways(np.moveaxis(q, 2, 1), np.where(least > at_least, least, 0.0))
+    return Branches(np.moveaxis(q, 2, 1), np.where(least > at_least, least, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,35 +89,35 @@ class Estimator:
 
     def estimate(self, site: Site) -> ReachEstimate:
         """The shares at one site; ``NOTHING`` where the base would stand in something."""
-        model, balls = ur_model(self.model), _balls(self.model, self.tool)
+        model, spheres = ur_model(self.model), _spheres(self.model, self.tool)
         T_ct_base = self.T_ct_bed @ site.T_bed_base()
-        if not base_is_clear(balls, self.room, T_ct_base):
+        if not base_is_clear(spheres, self.room, T_ct_base):
             return NOTHING
         T_base_ct = np.linalg.inv(T_ct_base)
         target = T_base_ct[:3, :3] @ self.T_ct_bed[:3, 3] + T_base_ct[:3, 3]
         depths = np.linspace(0.0, 1.0, STATES)
         distances = self.tool.needle_length_mm + self.wanted.standoff_mm[:, None] * (1.0 - depths)
-        found = insertion_ways(model, target, self.wanted.outward_ct @ T_base_ct[:3, :3].T, distances)
+        found = insertion_branches(model, target, self.wanted.outward_ct @ T_base_ct[:3, :3].T, distances)
         open_margin = self._open_margins(found, T_ct_base)
         best = self._clear_of_itself(found.q, open_margin) if self.itself else open_margin.max(axis=1)
         share = self._share(best)
         margin = float(best @ self.wanted.weight) / share if share > 0.0 else 0.0
         return ReachEstimate(self._share(found.margin.max(axis=1)), self._share(open_margin.max(axis=1)), share, margin)
 
-    def _open_margins(self, ways: Ways, T_ct_base: Floats) -> Floats:
+    def _open_margins(self, ways: Branches, T_ct_base: Floats) -> Floats:
         """The margins of the ways that keep clear of the room, shape (n, 8); 0 for the others.
 
         Of each direction the branches are asked about in the order of their margins. Where the arm itself does not
         count, those after the first clear one are left at 0: no answer depends on them.
         """
-        model, balls = ur_model(self.model), _balls(self.model, self.tool)
+        model, spheres = ur_model(self.model), _spheres(self.model, self.tool)
         open_margin = np.zeros_like(ways.margin)
         order = np.argsort(-ways.margin, axis=1, kind="stable")
         rows = np.arange(len(order))
         for place in range(N_BRANCHES):
             rows = rows[ways.margin[rows, order[rows, place]] > 0.0]
             branches = order[rows, place]
-            clear = clear_ways(balls, self.room, T_ct_base, link_poses(model, ways.q[rows, branches]))
+            clear = clear_branches(spheres, self.room, T_ct_base, link_poses(model, ways.q[rows, branches]))
             open_margin[rows[clear], branches[clear]] = ways.margin[rows[clear], branches[clear]]
             if not self.itself:
                 rows = rows[~clear]
@@ -141,8 +141,8 @@ class Estimator:
 
 
 @cache
-def _balls(model: str, tool: Tool) -> ArmBalls:
-    return ArmBalls.of(ur_model(model), tool)
+def _spheres(model: str, tool: Tool) -> ArmSpheres:
+    return ArmSpheres.of(ur_model(model), tool)
 
 
 @cache

@@ -51,12 +51,12 @@ HALVINGS = 3
 FINALISTS = 6
 """Sites that are judged exactly; each mount's best is among them."""
 
-SHARE_DIGITS = 3
+FRACTION_DIGITS = 3
 """Shares that agree to so many digits are equal; then the margin decides."""
 
 
 @dataclass(frozen=True)
-class Judged:
+class RatedPlacement:
     """A placement and its worth.
 
     Attributes:
@@ -94,8 +94,8 @@ class PlaceSearch:
     coarse: tuple[tuple[Site, ReachEstimate], ...]
     refined: int
     possible: float
-    judged: tuple[Judged, ...]
-    own: Judged | None
+    rated: tuple[RatedPlacement, ...]
+    own: RatedPlacement | None
 
 
 def search_placements(
@@ -146,8 +146,8 @@ def search_placements(
     seeds = [site for site, _ in _best_apart(first, 1.5 * case.place.step_mm, SEEDS)]
     refiner = _Refiner(fine, partial(progress, "refining"))
     finalists = _best_apart(refiner.refine(seeds, case.place.step_mm), case.place.step_mm / 2, FINALISTS)
-    judged, own = _judged(case, judge, T_ct_bed, finalists, placement, jobs, partial(progress, "judged"))
-    return PlaceSearch(T_ct_bed, first, refiner.asked, float(startable.weight.sum()), judged, own)
+    rated, own = _judged(case, judge, T_ct_bed, finalists, placement, jobs, partial(progress, "judged"))
+    return PlaceSearch(T_ct_bed, first, refiner.asked, float(startable.weight.sum()), rated, own)
 
 
 def _judged(
@@ -158,7 +158,7 @@ def _judged(
     placement: Placement | None,
     jobs: int,
     progress: Callable[[int, int], None],
-) -> tuple[tuple[Judged, ...], Judged | None]:
+) -> tuple[tuple[RatedPlacement, ...], RatedPlacement | None]:
     """The finalists as they would be written, best first, and the case's own placement."""
     mounts = [mount_section(T_ct_bed @ site.T_bed_base(), case.space) for site, _ in finalists]
     poses = [mount_pose(mount, case.space, case.path) for mount in mounts]
@@ -168,10 +168,10 @@ def _judged(
     own = None
     if placement is not None:
         T_ct_base = np.asarray(np.linalg.inv(placement.T_base_ct), dtype=np.float64)
-        own = Judged(None, mount_section(T_ct_base, case.space), None, verdicts.pop(0))
-    judged = [Judged(site, m, e, v) for (site, e), m, v in zip(finalists, mounts, verdicts, strict=True)]
-    judged.sort(key=lambda one: (-round(one.verdict.share, SHARE_DIGITS), -one.verdict.margin))
-    return tuple(judged), own
+        own = RatedPlacement(None, mount_section(T_ct_base, case.space), None, verdicts.pop(0))
+    rated = [RatedPlacement(site, m, e, v) for (site, e), m, v in zip(finalists, mounts, verdicts, strict=True)]
+    rated.sort(key=lambda one: (-round(one.verdict.share, FRACTION_DIGITS), -one.verdict.margin))
+    return tuple(rated), own
 
 
 def _judge(case: Case, anatomy: Anatomy, found: Candidates) -> Judge:
@@ -240,7 +240,7 @@ def _neighbours(site: Site, step_mm: float) -> list[Site]:
 
 def _score(estimate: ReachEstimate) -> tuple[float, float]:
     """More is better."""
-    return round(estimate.share, SHARE_DIGITS), estimate.margin
+    return round(estimate.share, FRACTION_DIGITS), estimate.margin
 
 
 def _order(estimate: ReachEstimate) -> tuple[float, float]:

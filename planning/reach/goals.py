@@ -12,7 +12,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.checker import StateChecker
 from puncture_twin.planning.reach.reach import ReachAnswer, ReachRequest, every_reach
 
-MARGIN_SHARE = 0.5
+MARGIN_FRACTION = 0.5
 """A pose whose margin is below this share of the best one's is no goal: a shorter way is not worth a cramped arm."""
 
 NEAREST = 4
@@ -34,7 +34,7 @@ def approach_goals(checker: StateChecker, request: ReachRequest, q_home: Floats)
         InputError: See :func:`every_reach`.
     """
     held = every_reach(checker, request)
-    least = MARGIN_SHARE * max((answer.margin for answer in held), default=0.0)
+    least = MARGIN_FRACTION * max((answer.margin for answer in held), default=0.0)
     every = [turned for answer in held for turned in _turned(checker, answer) if turned.margin >= least]
     every.sort(key=lambda answer: float(np.linalg.norm(answer.insertion_q[0] - q_home)))
     kept: dict[int, list[ReachAnswer]] = {}

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.insertion import (
     NeedleLine,
     away_from_singularities,
-    branch_way,
-    every_way,
+    branch_path,
+    every_branch,
     first_stop,
     flange_at,
     needle_lines,
@@ -69,7 +69,7 @@ class _Drive(NamedTuple):
 
     def along(self, model: UrModel, request: ReachRequest, depths_mm: Floats) -> Floats:
         """The motion at some depths, shape (m, 6), rad."""
-        return branch_way(model, self.line, _distances(request, depths_mm), self.branch, self.turn)
+        return branch_path(model, self.line, _distances(request, depths_mm), self.branch, self.turn)
 
 
 class _Blocked(NamedTuple):
@@ -211,7 +211,7 @@ def _why_none(
     if (stop_at < 0).any():
         return _refusal(Reason.UNREACHABLE, None, "every roll and branch leaves the joint limits")
     distances = _distances(request, depths)
-    paths = every_way(model, line, distances)
+    paths = every_branch(model, line, distances)
     holds = away_from_singularities(model, paths[:, 0])
     if not holds.any():
         why = why_unreachable(model, flange_at(line, distances[0]))

@@ -40,7 +40,7 @@ class Explanation:
 
     @property
     def verdict(self) -> str:
-        """``safe`` or ``rejected``; for the organs alone where ``candidates.arm`` says that the arm was not checked."""
+        """``safe`` or ``rejected``; for the organs alone where ``candidates.arm_note`` says that the arm was not checked."""
         return "safe" if self.safe else "rejected"
 
     @property
@@ -62,7 +62,7 @@ class Explanation:
             "theta_deg": float(np.degrees(row.theta[0])),
             "beta_deg": float(np.degrees(row.beta[0])),
             "verdict": self.verdict,
-            "arm": row.arm,
+            "arm": row.arm_note,
             "reason": str(row.verdict.reason[0]),
             "reason_structure": str(row.verdict.structure[0]),
             "reason_depth_mm": finite(row.verdict.depth[0]),
@@ -167,7 +167,7 @@ class Explanation:
     def _arm(self) -> str:
         row = self.candidates
         if not row.arm_checked:
-            return f"arm {row.arm}"
+            return f"arm {row.arm_note}"
         no_need = "not computed, the organs reject the direction"
         reached = {-1: no_need, 0: "no", 1: f"yes, margin {row.arm.margin[0]:.2f}"}
         return f"arm reaches it: {reached[int(row.arm.reachable[0])]}"

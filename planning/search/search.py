@@ -140,9 +140,9 @@ def with_reach(case: Case, found: Candidates, reach: ArmReach, progress: Progres
     return replace(found, verdict=Verdict(**verdict), arm=ArmColumns(reachable, margin), arm_note=ARM_CHECKED)
 
 
-def reach_depth(case: Case, found: Candidates, row: int, driven_mm: float) -> float:
+def reach_depth(case: Case, found: Candidates, row: int, inserted_mm: float) -> float:
     """Where the tip stands, from the target along the needle, after so many mm of insertion; mm."""
-    return float(standoffs(case.needle, found.path.length[row], found.path.skin_angle[row])) - driven_mm
+    return float(standoffs(case.needle, found.path.length[row], found.path.skin_angle[row])) - inserted_mm
 
 
 def ranked(case: Case, found: Candidates) -> Candidates:

@@ -99,7 +99,7 @@ def leaves_while_waiting(tilt):
     return 60.0 / np.sin(tilt) < LENGTH + 80.0 / np.cos(tilt) + gap(tilt)
 
 
-def judged(context, theta, beta):
+def rated(context, theta, beta):
     """The search's verdicts on directions, rad."""
     theta, beta = np.atleast_1d(theta), np.broadcast_to(beta, np.shape(np.atleast_1d(theta)))
     directions = Directions(theta, beta, outward(theta, beta) @ context.case.T_ct_entry[:3, :3].T)
@@ -118,7 +118,7 @@ def test_an_inserted_flange_inside_and_a_waiting_one_outside_is_unknown(cut):
 def test_each_directions_own_standoff_decides(cut):
     """Safe and unknown part where the own flange leaves, not where the flange of the longest path would."""
     tilt = np.arange(4.0, 30.0, 0.01) * DEG
-    found = judged(cut, tilt, 0.0)
+    found = rated(cut, tilt, 0.0)
     np.testing.assert_array_equal(found.safe, ~leaves_while_waiting(tilt))
     assert (found.verdict.reason[~found.safe] == Reason.UNKNOWN_REGION).all()
     longest = LENGTH + 150.0 + gap(60 * DEG)
@@ -129,7 +129,7 @@ def test_a_stated_standoff_decides(tmp_path):
     """With standoff_mm the flange waits as far out along every path: the image must reach to 330 mm."""
     context = cut_case(tmp_path, "standoff_mm = 120.0")
     tilt = np.arange(4.0, 30.0, 0.01) * DEG
-    np.testing.assert_array_equal(judged(context, tilt, 0.0).safe, 60.0 / np.sin(tilt) >= LENGTH + 120.0)
+    np.testing.assert_array_equal(rated(context, tilt, 0.0).safe, 60.0 / np.sin(tilt) >= LENGTH + 120.0)
 
 
 def test_a_path_without_a_standoff_keeps_its_reason(cut):
@@ -141,7 +141,7 @@ def test_a_path_without_a_standoff_keeps_its_reason(cut):
 def test_the_certificate_agrees_with_the_search(cut, certified, rng):
     """Random directions of the cap: none of a safe cell is refused, none of a rejected one safe; few are undecided."""
     theta, beta = rng.uniform(*CAP["theta"], 4000), rng.uniform(*CAP["beta"], 4000)
-    found = judged(cut, theta, beta)
+    found = rated(cut, theta, beta)
     letters = certified.at(theta, beta)
     assert found.safe[letters == "S"].all()
     assert not found.safe[letters == "R"].any()

@@ -23,7 +23,7 @@ from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.twin.report.scene.scene_parts import room
 from puncture_twin.twin.world.execution import execute
-from puncture_twin.twin.world.workcell import open_room
+from puncture_twin.twin.world.workcell import open_workcell
 
 TILT = trimesh.transformations.rotation_matrix(0.35, [1.0, 0.2, 0.0])
 TILT[:3, 3] = (420.0, 30.0, 80.0)
@@ -181,7 +181,7 @@ def test_the_physics_feels_the_gantry(in_gantry):
     assert checker.contact(home, needle_may_touch_patient=False).other.startswith("gantry_")
     commands = away + (home - away) * np.linspace(0.0, 1.0, 480)[:, None]
     down = -bed_frame(case)[:3, 2]
-    with open_room(model, case_tool(case), patient, T_base_ct, case_boxes(case, T_base_ct), down_ct=down) as room:
+    with open_workcell(model, case_tool(case), patient, T_base_ct, case_boxes(case, T_base_ct), down_ct=down) as room:
         done = execute(room, commands, np.zeros(6))
     assert done.touches and {touch.body.split("_")[0] for touch in done.touches} == {"gantry"}
     assert np.abs(done.q[-1] - home).max() > np.radians(2.0)

@@ -7,8 +7,8 @@ import pytest
 
 from puncture_twin.planning.arm.insertion import (
     FULL_MARGIN_RAD,
-    branch_way,
-    every_way,
+    branch_path,
+    every_branch,
     first_stop,
     flange_at,
     flange_poses,
@@ -41,7 +41,7 @@ def test_a_way_holds_every_flange_pose_along_the_line(name: str) -> None:
     model = ur_model(name)
     drawn = 0
     for line in lines(15, seed=1):
-        q = every_way(model, line, DISTANCES)
+        q = every_branch(model, line, DISTANCES)
         poses = flange_poses(line.target, line.outward, DISTANCES)
         plain = np.swapaxes(inverse(model, poses), 0, 1)
         exists = ~np.isnan(q[..., 0])
@@ -60,10 +60,10 @@ def test_one_branch_alone_and_all_eight_agree() -> None:
     """The same way to 1e-12 rad, the turn added to every row; NaN in the same rows."""
     model, turn = ur_model("ur3"), np.array([0.0, 2 * np.pi, 0.0, -2 * np.pi, 0.0, 0.7])
     for line in lines(10, seed=2):
-        every = every_way(model, line, DISTANCES)
+        every = every_branch(model, line, DISTANCES)
         assert np.array_equal(every, insertion_paths(model, line.target, line.outward, DISTANCES), equal_nan=True)
         for branch in range(8):
-            alone = branch_way(model, line, DISTANCES, branch, turn)
+            alone = branch_path(model, line, DISTANCES, branch, turn)
             assert np.allclose(alone, every[branch] + turn, rtol=0.0, atol=1e-12, equal_nan=True)
 
 
@@ -79,7 +79,7 @@ def test_the_survey_is_what_its_parts_say() -> None:
     found = survey(model, many, [DISTANCES] * 60, [DEPTHS] * 60, ROLLS)
     allowed = 0
     for line, stop_at, margins, turns in zip(many, *found, strict=True):
-        ways = every_way(model, line, DISTANCES)
+        ways = every_branch(model, line, DISTANCES)
         for branch in range(8):
             stop = first_stop(model, ways[branch], DEPTHS)
             assert (stop is None) == (stop_at[branch] < 0)

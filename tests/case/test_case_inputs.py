@@ -148,7 +148,9 @@ def folder(tmp_path: Path) -> Path:
     ball(here / "organ.stl", 20)
     ball(here / "rib.stl", 5, (40, 0, 40))
     place = np.indices((100, 100, 100)) * 2.0 - 99.0
-    detached(np.where(np.linalg.norm(place, axis=0) < 90, 40, -1000).astype(np.int16), here / "ct.nhdr")
+    hounsfield = np.where(np.linalg.norm(place, axis=0) < 90, 40, -1000).astype(np.int16)
+    hounsfield[4:96, 96:98] = 100  # what the body lies on: without it nothing beyond the image's faces is known
+    detached(hounsfield, here / "ct.nhdr")
     detached(vessel((80, 50, 50)), here / "vessels" / "labels.nhdr")
     sitk.WriteImage(image_of(3 * vessel((50, 80, 50))), str(here / "bowel.nii"))
     (here / "bowel.nii.gz").write_bytes(gzip.compress((here / "bowel.nii").read_bytes(), mtime=0))

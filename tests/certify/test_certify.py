@@ -265,9 +265,9 @@ def test_random_directions_never_contradict(certified, rng):
     theta = np.concatenate([theta, np.arccos(rng.uniform(0, 1, 1000))])
     beta = np.concatenate([beta, rng.uniform(0, 2 * np.pi, 1000)])
     letters = found.at(theta, beta)
-    judged = _judged(context, context.anatomy, _directions(case, theta, beta))
-    assert judged.safe[letters == "S"].all()
-    assert not judged.safe[letters == "R"].any()
+    rated = _judged(context, context.anatomy, _directions(case, theta, beta))
+    assert rated.safe[letters == "S"].all()
+    assert not rated.safe[letters == "R"].any()
     assert min((letters == "S").sum(), (letters == "R").sum()) > 300
 
 
@@ -294,8 +294,8 @@ def test_the_safe_cone_is_safe(certified, rng):
     )
     theta, beta = angles(around @ R)
     assert (found.at(theta, beta) == "S").all()
-    judged = _judged(context, context.anatomy, _directions(context.case, theta, beta))
-    assert judged.safe.all()
+    rated = _judged(context, context.anatomy, _directions(context.case, theta, beta))
+    assert rated.safe.all()
 
 
 def test_there_is_no_safe_cone_where_nothing_is_proven(certified):
@@ -479,9 +479,9 @@ def test_a_cap_without_area_is_certified_too(carton, theta, beta):
     assert found.areas["S"] == 0
     centres = found.leaves.centres() @ context.case.T_ct_entry[:3, :3].T
     middle = Directions(found.leaves.theta.mean(axis=1), found.leaves.beta.mean(axis=1), centres)
-    judged = _judged(context, context.anatomy, middle)
-    assert judged.safe[found.verdict == "S"].all()
-    assert not judged.safe[found.verdict == "R"].any()
+    rated = _judged(context, context.anatomy, middle)
+    assert rated.safe[found.verdict == "S"].all()
+    assert not rated.safe[found.verdict == "R"].any()
     assert len(found.leaves) == 1 or (found.verdict != "U").any()  # a pole may run through a vertex
     verify(found, context.case, context.anatomy)
 
@@ -492,10 +492,10 @@ def test_the_whole_sphere_is_certified(carton, rng):
     found = certify(context.case, context.anatomy, size=np.radians(4), theta=(0, np.pi))
     assert sum(found.areas.values()) == pytest.approx(41252.96, rel=1e-6)
     theta, beta = _thrown_into(found.leaves, rng.integers(0, len(found.leaves), 600), rng)
-    judged = _judged(context, context.anatomy, _directions(context.case, theta, beta))
+    rated = _judged(context, context.anatomy, _directions(context.case, theta, beta))
     letters = found.at(theta, beta)
-    assert judged.safe[letters == "S"].all()
-    assert not judged.safe[letters == "R"].any()
+    assert rated.safe[letters == "S"].all()
+    assert not rated.safe[letters == "R"].any()
 
 
 @pytest.mark.parametrize(
@@ -581,10 +581,10 @@ def test_an_open_skin_is_only_certified_where_it_stands(carton, rng):
     anatomy = replace(context.anatomy, skin=skin)
     found = certify(context.case, anatomy, size=np.radians(2))
     theta, beta = np.arccos(rng.uniform(0, 1, 3000)), rng.uniform(0, 2 * np.pi, 3000)
-    judged = _judged(context, anatomy, _directions(context.case, theta, beta))
+    rated = _judged(context, anatomy, _directions(context.case, theta, beta))
     letters = found.at(theta, beta)
-    assert judged.safe[letters == "S"].all()
-    assert not judged.safe[letters == "R"].any()
+    assert rated.safe[letters == "S"].all()
+    assert not rated.safe[letters == "R"].any()
 
 
 def test_the_frame_of_the_map_may_be_any(carton, rng):
@@ -614,10 +614,10 @@ def test_the_real_ct_never_contradicts(rng, tmp_path):
     cap = {"theta": (np.radians(20), np.radians(60)), "beta": (np.radians(40), np.radians(140))}
     found = certify(case, context.anatomy, size=np.radians(2), **cap)
     theta, beta = _thrown_into(found.leaves, rng.integers(0, len(found.leaves), 500), rng)
-    judged = _judged(context, context.anatomy, _directions(case, theta, beta))
+    rated = _judged(context, context.anatomy, _directions(case, theta, beta))
     letters = found.at(theta, beta)
-    assert judged.safe[letters == "S"].all()
-    assert not judged.safe[letters == "R"].any()
+    assert rated.safe[letters == "S"].all()
+    assert not rated.safe[letters == "R"].any()
 
 
 def test_a_ray_through_an_edge_does_not_turn_the_skin_inside_out():

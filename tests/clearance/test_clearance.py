@@ -128,8 +128,8 @@ def test_the_verdict_is_fcls_own_near_the_threshold(rng, ball):
             for sign in (-1, 1):
                 margin = exact[row] + sign * offset
                 found = clearances(mesh, target, directions[row : row + 1], margin=margin)
-                judged = engine.collides(0, target, directions[row], LENGTH, radius + margin)
-                assert bool(found.violated[0, 0]) == (judged or sign > 0)
+                rated = engine.collides(0, target, directions[row], LENGTH, radius + margin)
+                assert bool(found.violated[0, 0]) == (rated or sign > 0)
                 decided += 1
     assert decided >= 50
 
@@ -155,8 +155,8 @@ def test_far_from_the_threshold_distance_and_collision_agree(rng, ball, box):
     for column, mesh in enumerate(meshes):
         for radius in (0.5, 3.0, 5.5):
             found = clearances(mesh, [0, 0, 0], directions, radius=radius)
-            judged = [engine.collides(column, np.zeros(3), u, LENGTH, radius) for u in directions]
-            np.testing.assert_array_equal(found.violated[:, 0], judged)
+            rated = [engine.collides(column, np.zeros(3), u, LENGTH, radius) for u in directions]
+            np.testing.assert_array_equal(found.violated[:, 0], rated)
 
 
 def test_roles_without_a_margin_are_never_violated(ball):

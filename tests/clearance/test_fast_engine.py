@@ -122,9 +122,9 @@ def test_targets_anywhere(rng, ball, place):
     """The target on a vertex, an edge, in a face, in a face's plane, inside, outside and far away."""
     mesh = ball(30, (5, 5, 5), 1)
     a, b, c = mesh.triangles[7]
-    spots = {"vertex": a, "edge": 0.3 * a + 0.7 * b, "face": (a + b + c) / 3, "inside": np.array([6.0, 1, 9])}
-    spots |= {"outside": np.array([80.0, 3, 4]), "far": np.array([4000.0, 300, 40]), "plane": 4 * a - 2 * b - c}
-    found = agrees(mesh, spots[place], units(rng, 25), 150.0 if place != "far" else 4000.0)
+    detections = {"vertex": a, "edge": 0.3 * a + 0.7 * b, "face": (a + b + c) / 3, "inside": np.array([6.0, 1, 9])}
+    detections |= {"outside": np.array([80.0, 3, 4]), "far": np.array([4000.0, 300, 40]), "plane": 4 * a - 2 * b - c}
+    found = agrees(mesh, detections[place], units(rng, 25), 150.0 if place != "far" else 4000.0)
     if place in ("vertex", "edge", "face"):
         np.testing.assert_allclose(found.distance, 0, atol=TIGHT_MM)
 

@@ -51,8 +51,8 @@ def equal_fcl(surfaces, target, directions, radii=RADII_MM):
     for radius in radii:
         verdicts = engine.nearer_than(target, directions, LENGTH, radius)
         for column in range(len(surfaces)):
-            judged = [judge.collides(column, target, u, LENGTH, radius) for u in directions]
-            np.testing.assert_array_equal(verdicts[:, column], judged)
+            rated = [judge.collides(column, target, u, LENGTH, radius) for u in directions]
+            np.testing.assert_array_equal(verdicts[:, column], rated)
     expected = judge.measure(target, directions, LENGTH)
     np.testing.assert_allclose(found.distance, expected.distance, atol=1e-6)
     return found
@@ -61,9 +61,9 @@ def equal_fcl(surfaces, target, directions, radii=RADII_MM):
 @pytest.mark.parametrize("place", ["lesion", "inside", "vertex", "outside"])
 def test_verdicts_on_the_abdomen_are_fcls(rng, abdomen, place):
     """In the lesion, inside another organ, on a vertex and outside the body: no verdict differs."""
-    spots = {"lesion": np.array([-90.0, -10, 60]), "inside": abdomen[4].bounds.mean(axis=0)}
-    spots |= {"vertex": abdomen[0].vertices[1234], "outside": np.array([-230.0, -150, 80])}
-    found = equal_fcl(abdomen, spots[place], units(rng, 40))
+    detections = {"lesion": np.array([-90.0, -10, 60]), "inside": abdomen[4].bounds.mean(axis=0)}
+    detections |= {"vertex": abdomen[0].vertices[1234], "outside": np.array([-230.0, -150, 80])}
+    found = equal_fcl(abdomen, detections[place], units(rng, 40))
     if place == "vertex":
         np.testing.assert_array_equal(found.distance[:, 0], 0)
 
@@ -148,9 +148,9 @@ def test_verdicts_and_distances_hold_for_any_small_surface_and_target(seed, clos
     mesh = small_surface(rng, closed)
     a, b, c = mesh.triangles[rng.integers(len(mesh.faces))]
     share, middle = rng.uniform(0, 1), mesh.vertices.mean(axis=0)
-    spots = {"vertex": a, "edge": share * a + (1 - share) * b, "face": (a + b + c) / 3, "plane": 4 * a - 2 * b - c}
-    spots |= {"amid": middle, "outside": middle + [90.0, 20, 0], "far": middle - [0, 700.0, 300]}
-    target, directions = np.array(spots[place]), units(rng, 16)
+    detections = {"vertex": a, "edge": share * a + (1 - share) * b, "face": (a + b + c) / 3, "plane": 4 * a - 2 * b - c}
+    detections |= {"amid": middle, "outside": middle + [90.0, 20, 0], "far": middle - [0, 700.0, 300]}
+    target, directions = np.array(detections[place]), units(rng, 16)
     toward = middle - target + rng.normal(0, 20, (8, 3))
     directions[:8] = toward / np.linalg.norm(toward, axis=1, keepdims=True)
     engine, judge = FastEngine([mesh]), FclEngine([mesh])
@@ -159,5 +159,5 @@ def test_verdicts_and_distances_hold_for_any_small_surface_and_target(seed, clos
     np.testing.assert_allclose(exact, expected, atol=1e-9, rtol=0)
     capped = engine.measure_capped(target, directions, length, 20.0).distance[:, 0]
     np.testing.assert_allclose(capped, np.minimum(exact, 20.0), atol=1e-9, rtol=0)
-    judged = [judge.collides(0, target, u, length, radius) for u in directions]
-    assert engine.nearer_than(target, directions, length, radius)[:, 0].tolist() == judged
+    rated = [judge.collides(0, target, u, length, radius) for u in directions]
+    assert engine.nearer_than(target, directions, length, radius)[:, 0].tolist() == rated

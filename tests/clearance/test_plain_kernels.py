@@ -195,8 +195,8 @@ def test_the_nearest_triangle_of_a_packed_surface(rng, place):
     """Of some hundreds of triangles, in blocks under a tree: the least distance of all, and the row of who has it."""
     corners = rng.normal(0, 30, (300, 1, 3)) + rng.normal(0, 4, (300, 3, 3))
     mesh = TriangleMesh(corners.reshape(-1, 3), np.arange(900).reshape(-1, 3))
-    spots = {"amid": [1.0, 2, 3], "aside": [70.0, -20, 9], "far": [900.0, 0, -400], "on a corner": corners[17, 1]}
-    target, blocks = np.array(spots[place]), pack(mesh)
+    detections = {"amid": [1.0, 2, 3], "aside": [70.0, -20, 9], "far": [900.0, 0, -400], "on a corner": corners[17, 1]}
+    target, blocks = np.array(detections[place]), pack(mesh)
     placed = _placed(blocks, target)
     each = [segment_triangle_distance(target, target, t.reshape(3, 3)) for t in blocks.triangles]
     assert placed.distance == pytest.approx(min(each), abs=TIGHT_MM)

@@ -17,7 +17,13 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies import arm_bodies
-from puncture_twin.planning.collision.bounding_spheres import ball_tree, coarse_hull, inscribed_prism, neighbours, prism
+from puncture_twin.planning.collision.bounding_spheres import (
+    coarse_hull,
+    inscribed_prism,
+    neighbours,
+    prism,
+    sphere_tree,
+)
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING, hull_gap
@@ -52,9 +58,9 @@ def scene(kind: type[CellChecker], padding_mm: float = 5.0) -> CellChecker:
     T = np.eye(4)
     T[:3, :3] = trimesh.transformations.rotation_matrix(0.3, [0.2, 0.1, 1.0])[:3, :3]
     T[:3, 3] = (400.0, 30.0, -140.0)
-    lamp = np.eye(4)
-    lamp[:3, 3] = (150.0, 250.0, 420.0)
-    boxes = [Box("table", T, (600.0, 900.0, 60.0)), Box("lamp", lamp, (120.0, 80.0, 60.0))]
+    light = np.eye(4)
+    light[:3, 3] = (150.0, 250.0, 420.0)
+    boxes = [Box("table", T, (600.0, 900.0, 60.0)), Box("lamp", light, (120.0, 80.0, 60.0))]
     return kind(UR3, TOOL, boxes, patient, padding_mm=padding_mm)
 
 
@@ -63,7 +69,7 @@ def test_leaf_balls_cover_every_body(name: str, padding: float) -> None:
     """Every corner and many points inside every padded piece lie in a leaf's ball, and in the root's."""
     rng = np.random.default_rng(0)
     for body in arm_bodies(ur_model(name), TOOL, padding):
-        tree = ball_tree(body.full.hulls)
+        tree = sphere_tree(body.full.hulls)
         for corners in body.full.hulls:
             points = np.concatenate([corners, points_within(corners, 500, rng)])
             distances = np.linalg.norm(points[:, None] - tree.centres, axis=2) - tree.radii
@@ -75,7 +81,7 @@ def test_every_ball_encloses_the_balls_parts_below_it() -> None:
     """A parent may answer for its children: what of the body only its own leaves cover lies in its ball too."""
     rng = np.random.default_rng(1)
     body = arm_bodies(UR3, TOOL, 5.0)[2]
-    tree = ball_tree(body.full.hulls)
+    tree = sphere_tree(body.full.hulls)
     points = np.concatenate([points_within(corners, 3000, rng) for corners in body.full.hulls])
     inside = np.linalg.norm(points[:, None] - tree.centres, axis=2) <= tree.radii
     below: dict[int, set[int]] = {}
@@ -372,7 +378,7 @@ def test_what_a_judge_remembers_changes_no_verdict() -> None:
     fast, slow = scene(FastChecker), scene(CellChecker)
     assert isinstance(fast, FastChecker)
     asked = segments(np.random.default_rng(11), 150)
-    seasoned = fast.segment_judge()
+    seasoned = fast.segment_checker()
     fresh = [fast.segment_contact(*ends) for ends in asked]
     assert [seasoned(*ends) is None for ends in asked] == [contact is None for contact in fresh]
     again = [seasoned(*ends) for ends in reversed(asked)][::-1]

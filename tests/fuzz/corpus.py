@@ -91,9 +91,9 @@ def digest_of(name):
 
 def make_meshes(folder):
     """Two balls as one surface, in every format."""
-    balls = [trimesh.creation.icosphere(subdivisions=1, radius=radius) for radius in (20.0, 9.0)]
-    balls[1].apply_translation([60.0, 0.0, 0.0])
-    mesh = trimesh.util.concatenate(balls)
+    spheres = [trimesh.creation.icosphere(subdivisions=1, radius=radius) for radius in (20.0, 9.0)]
+    spheres[1].apply_translation([60.0, 0.0, 0.0])
+    mesh = trimesh.util.concatenate(spheres)
     mesh.export(folder / "a.stl")
     mesh.export(folder / "ascii.stl", file_type="stl_ascii")
     mesh.export(folder / "a.obj", include_normals=False, include_texture=False)

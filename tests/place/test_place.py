@@ -22,10 +22,16 @@ from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.case.case import load_case, mount_pose
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.place.arm_spheres import ArmBalls, Surroundings, base_is_clear, clear_ways, skin_distance
+from puncture_twin.planning.place.arm_spheres import (
+    ArmSpheres,
+    Surroundings,
+    base_is_clear,
+    clear_branches,
+    skin_distance,
+)
 from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.place.directions import WantedDirections, ring_weights
-from puncture_twin.planning.place.estimate import Estimator, insertion_ways
+from puncture_twin.planning.place.estimate import Estimator, insertion_branches
 from puncture_twin.planning.place.evaluate import Judge
 from puncture_twin.planning.place.mount_lines import mount_lines, mount_section
 from puncture_twin.planning.place.mounts import Region, Site, regions
@@ -200,28 +206,28 @@ def test_balls_never_call_clear_what_meets_a_box():
     box = Box(
         "box", np.diag([1.0, 1.0, 1.0, 1.0]) + np.array([[0, 0, 0, 250.0]] + [[0.0] * 4] * 3), (200.0, 400.0, 500.0)
     )
-    balls, checker = ArmBalls.of(UR3, TOOL), CellChecker(UR3, Tool(200.0, 150.0, 0.1, 30.0), [box], padding_mm=1.0)
+    spheres, checker = ArmSpheres.of(UR3, TOOL), CellChecker(UR3, Tool(200.0, 150.0, 0.1, 30.0), [box], padding_mm=1.0)
     room = Surroundings(far_skin, Boxes.of([box]), Boxes.of([]), 2.0)
     q = np.random.default_rng(4).uniform(-np.pi, np.pi, (600, 6))
-    clear = clear_ways(balls, room, np.eye(4), link_poses(UR3, q)[:, None])
+    clear = clear_branches(spheres, room, np.eye(4), link_poses(UR3, q)[:, None])
     met = [checker.contact(row, needle_may_touch_patient=False) for row in q]
     in_room = np.array([m is not None and m.other == "box" and m.body != "needle" for m in met])
     assert not (clear & in_room).any()
     assert 50 < clear.sum() < 550 and (clear == ~in_room).mean() > 0.9
-    carried = clear_ways(
-        balls, Surroundings(far_skin, Boxes.of([]), Boxes.of([box]), 2.0), np.eye(4), link_poses(UR3, q)[:, None]
+    carried = clear_branches(
+        spheres, Surroundings(far_skin, Boxes.of([]), Boxes.of([box]), 2.0), np.eye(4), link_poses(UR3, q)[:, None]
     )
     np.testing.assert_array_equal(carried, clear)
 
 
 def test_a_base_in_the_patient_or_in_a_box_is_seen(ball):
     """And one that stands beside them is not."""
-    balls, nothing = ArmBalls.of(UR3, TOOL), Boxes.of([])
+    spheres, nothing = ArmSpheres.of(UR3, TOOL), Boxes.of([])
     room = Surroundings(SkinField.of(ball(150.0)), Boxes.of([Box("b", np.eye(4), (200.0, 200.0, 900.0))]), nothing, 5.0)
     at = np.eye(4)
     for x, clear in ((0.0, False), (200.0, False), (240.0, True)):
         at[0, 3] = x
-        assert base_is_clear(balls, room, at) is clear
+        assert base_is_clear(spheres, room, at) is clear
 
 
 def test_directions_spread_and_keep_their_weight():
@@ -283,7 +289,7 @@ def test_answers_come_in_order_from_however_many_processes():
 def test_asking_the_best_branch_first_changes_no_estimate():
     """The share and the margin are those of asking about every branch of every direction."""
     body, rng = trimesh.creation.icosphere(subdivisions=3, radius=90.0), np.random.default_rng(6)
-    balls, outward = ArmBalls.of(UR3, TOOL), rng.normal(size=(24, 3))
+    spheres, outward = ArmSpheres.of(UR3, TOOL), rng.normal(size=(24, 3))
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     wanted = WantedDirections(outward, np.full(24, 110.0), np.full(24, 1.0 / 24.0))
     skin, nothing = SkinField.of(TriangleMesh(body.vertices, body.faces)), Boxes.of([])
@@ -296,13 +302,13 @@ def test_asking_the_best_branch_first_changes_no_estimate():
         site = Site(region, tuple(position))
         T = np.linalg.inv(site.T_bed_base())
         distances = 200.0 + 110.0 * np.array([[1.0, 0.5, 0.0]] * 24)
-        ways = insertion_ways(UR3, T[:3, 3], outward @ T[:3, :3].T, distances)
+        ways = insertion_branches(UR3, T[:3, 3], outward @ T[:3, :3].T, distances)
         T_ct_base = site.T_bed_base()
         best = np.zeros(24)
         for row, branch in np.argwhere(ways.margin):
-            if clear_ways(balls, room, T_ct_base, link_poses(UR3, ways.q[row, branch][None]))[0]:
+            if clear_branches(spheres, room, T_ct_base, link_poses(UR3, ways.q[row, branch][None]))[0]:
                 best[row] = max(best[row], ways.margin[row, branch])
-        if not base_is_clear(balls, room, T_ct_base):
+        if not base_is_clear(spheres, room, T_ct_base):
             best[:] = 0.0
         said = quick.estimate(site)
         assert said.share == pytest.approx((best > 0).mean())

@@ -231,8 +231,8 @@ def test_a_plate_across_the_needles_way_blocks_at_its_depth() -> None:
 def test_an_obstacle_at_the_flange_is_a_collision_at_standoff() -> None:
     """A box about the standoff flange stops every branch and roll; link and box are named."""
     asked, _ = reached(CellChecker(UR3, TOOL), 1, seed=7)[0]
-    lamp = Box("lamp", flange_poses(TARGET, asked.outward_base, 320.0)[0], (40.0, 40.0, 40.0))
-    answer = assess_reach(CellChecker(UR3, TOOL, [lamp]), asked)
+    light = Box("lamp", flange_poses(TARGET, asked.outward_base, 320.0)[0], (40.0, 40.0, 40.0))
+    answer = assess_reach(CellChecker(UR3, TOOL, [light]), asked)
     assert answer.reason is Reason.ARM_COLLISION and answer.depth_mm is None and not answer.reachable
     assert "touches lamp at standoff" in answer.detail
     assert answer.insertion_q.shape == (0, 6) and answer.branch == -1 and answer.margin == 0.0

@@ -25,8 +25,8 @@ def verdict(skin, structures=(), direction=UP, needle=NEEDLE, target=(0, 0, 0), 
     structures = tuple(structures)
     engine = FclEngine([s.mesh for s in structures])
     found = measure(engine, structures, target, direction, length=needle.length_mm, radius=needle.radius_mm)
-    judged = judge(paths, found, structures, needle=needle, max_skin_angle=np.radians(max_angle))
-    return str(judged.reason[0]), str(judged.structure[0]), judged.depth[0], judged.amount[0]
+    rated = judge(paths, found, structures, needle=needle, max_skin_angle=np.radians(max_angle))
+    return str(rated.reason[0]), str(rated.structure[0]), rated.depth[0], rated.amount[0]
 
 
 def both(*meshes):

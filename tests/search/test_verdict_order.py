@@ -37,7 +37,7 @@ def nothing(count):
     return Clearances(empty, empty, empty.astype(bool))
 
 
-def judged(skin_rows, clearances=None, structures=(), needle=NEEDLE, **settings):
+def rated(skin_rows, clearances=None, structures=(), needle=NEEDLE, **settings):
     """Verdicts as rows of (reason, structure, depth, amount)."""
     skin = paths(skin_rows)
     clearances = nothing(len(skin_rows)) if clearances is None else clearances
@@ -63,7 +63,7 @@ def test_each_reason_of_the_skin_and_its_numbers():
         (100, 61, NAN, NAN),
     ]
     same(
-        judged(rows),
+        rated(rows),
         [
             ("", "", NAN, NAN),
             (Reason.UNKNOWN_REGION, "skin", 70, NAN),
@@ -73,7 +73,7 @@ def test_each_reason_of_the_skin_and_its_numbers():
             (Reason.SKIN_ANGLE, "skin", 100, 61),
         ],
     )
-    assert judged([(151, 10, NAN, NAN)], skin="carton_wall")[0][1] == "carton_wall"
+    assert rated([(151, 10, NAN, NAN)], skin="carton_wall")[0][1] == "carton_wall"
 
 
 def test_the_first_broken_constraint_gives_the_reason():
@@ -87,7 +87,7 @@ def test_the_first_broken_constraint_gives_the_reason():
         (100, 70, NAN, NAN),
         (100, 10, NAN, NAN),
     ]
-    reasons = [row[0] for row in judged(rows, near, [structure("vessel")])]
+    reasons = [row[0] for row in rated(rows, near, [structure("vessel")])]
     assert reasons == [
         Reason.UNKNOWN_REGION, Reason.NO_SKIN_ENTRY, Reason.REENTERS_SKIN, Reason.TOO_LONG, Reason.SKIN_ANGLE,
         Reason.TOO_CLOSE,
@@ -109,16 +109,16 @@ def test_a_waiting_flange_beyond_the_image_is_unknown():
         (151, 10, NAN, NAN, 250.0),
     ]
     unknown, close = (Reason.UNKNOWN_REGION, "skin"), (Reason.TOO_CLOSE, "vessel")
-    found = judged(rows, near, [structure("vessel")])
+    found = rated(rows, near, [structure("vessel")])
     assert [row[:2] for row in found] == [unknown, close, unknown, close, (Reason.TOO_LONG, "skin")]
     same(found[:1], [(*unknown, 309.9, NAN)])
-    stated = judged([(100, 10, NAN, NAN, 369.9), (100, 10, NAN, NAN, 370.0)], needle=replace(NEEDLE, standoff_mm=170.0))
+    stated = rated([(100, 10, NAN, NAN, 369.9), (100, 10, NAN, NAN, 370.0)], needle=replace(NEEDLE, standoff_mm=170.0))
     assert [row[0] for row in stated] == [Reason.UNKNOWN_REGION, ""]
 
 
 def test_limits_themselves_are_kept():
     """A path of exactly the shaft, an angle of exactly the largest."""
-    assert [row[0] for row in judged([(150, 10, NAN, NAN), (100, 60, NAN, NAN)])] == ["", ""]
+    assert [row[0] for row in rated([(150, 10, NAN, NAN), (100, 60, NAN, NAN)])] == ["", ""]
 
 
 @pytest.mark.parametrize(("standoff", "longest"), [(None, 150), (100.0, 90), (170.0, 150), (160.0, 150), (159.0, 149)])
@@ -140,7 +140,7 @@ def test_the_structure_that_lacks_most_is_named_with_its_depth_and_clearance():
     structures = [structure("a", 2.0), structure("b", 7.0), structure("c", 1.0)]
     rows = [(100, 10, NAN, NAN)] * 4
     same(
-        judged(rows, scene(), structures),
+        rated(rows, scene(), structures),
         [
             (Reason.TOO_CLOSE, "b", 20, 4),
             (Reason.TOO_CLOSE, "a", 30, 1),
@@ -165,6 +165,6 @@ def test_the_worst_structure_decides_between_unknown_and_too_close():
     clearances = Clearances(np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([[30.0, 20], [30, 20]]), np.ones((2, 2), bool))
     structures = [structure("fog", 2.0, Role.UNKNOWN), structure("vessel", 2.0)]
     same(
-        judged([(100, 10, NAN, NAN)] * 2, clearances, structures),
+        rated([(100, 10, NAN, NAN)] * 2, clearances, structures),
         [(Reason.UNKNOWN_REGION, "fog", 30, 0), (Reason.TOO_CLOSE, "vessel", 20, 0)],
     )

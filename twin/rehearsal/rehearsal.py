@@ -26,7 +26,7 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.twin.plant.truth import Truth
 from puncture_twin.twin.world.client import TIME_STEP_S
 from puncture_twin.twin.world.execution import Execution, execute
-from puncture_twin.twin.world.workcell import open_room
+from puncture_twin.twin.world.workcell import open_workcell
 
 SETTLE_S = 0.5
 """Pause between approach and insertion: ten times the time in which a motor's lag dies out."""
@@ -130,7 +130,7 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
     T_base_ct = truth.T_base_ct_true
     model, tool, boxes = ur_model(plan.model), case_tool(case), case_boxes(case, T_base_ct)
     down_ct = -bed_frame(case)[:3, 2]
-    with open_room(model, tool, anatomy.skin.mesh, T_base_ct, boxes, down_ct=down_ct) as room:
+    with open_workcell(model, tool, anatomy.skin.mesh, T_base_ct, boxes, down_ct=down_ct) as room:
         done = execute(room, commands.q, truth.joint_offsets)
     times, phase = commands.times_s[done.steps], commands.phase[done.steps]
     T_ct_flange = np.linalg.inv(T_base_ct) @ done.T_base_flange

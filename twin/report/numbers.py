@@ -89,7 +89,7 @@ def percent(share: float) -> str:
 def arm_words(candidates: Candidates) -> str:
     """Whether "safe" includes the arm."""
     if not candidates.arm_checked:
-        return f"arm {candidates.arm}; “safe” speaks of the needle and the organs alone"
+        return f"arm {candidates.arm_note}; “safe” speaks of the needle and the organs alone"
     return "“safe” includes that the arm can reach the direction and insert the needle"
 
 

@@ -14,7 +14,7 @@ FIELD_OF_VIEW_DEG = 45.0
 NEAR_M = 0.05
 FAR_M = 10.0
 
-LAMP_UP = 1.5
+LIGHT_UP = 1.5
 """The lamp hangs above the camera: its direction is the camera's plus this much of up."""
 
 
@@ -44,8 +44,8 @@ def picture(client: int, camera: SimulatedCamera) -> NDArray[np.uint8]:
     )
     projection = pybullet.computeProjectionMatrixFOV(FIELD_OF_VIEW_DEG, camera.width / camera.height, NEAR_M, FAR_M)
     away = camera.eye_mm - camera.look_at_mm
-    lamp = away / np.linalg.norm(away) + LAMP_UP * camera.up / np.linalg.norm(camera.up)
-    return _drawn(client, (camera.width, camera.height), view, projection, lamp)
+    light = away / np.linalg.norm(away) + LIGHT_UP * camera.up / np.linalg.norm(camera.up)
+    return _drawn(client, (camera.width, camera.height), view, projection, light)
 
 
 def pinhole_picture(
@@ -68,12 +68,12 @@ def pinhole_picture(
     projection = pybullet.computeProjectionMatrix(*edges, NEAR_M, FAR_M)
     view = np.diag([1.0, -1.0, -1.0, 1.0]) @ T_camera_world
     view[:3, 3] = to_m(view[:3, 3])
-    lamp = -T_camera_world[2, :3] + LAMP_UP * -T_camera_world[1, :3]
-    return _drawn(client, size, view.T.ravel().tolist(), projection, lamp)
+    light = -T_camera_world[2, :3] + LIGHT_UP * -T_camera_world[1, :3]
+    return _drawn(client, size, view.T.ravel().tolist(), projection, light)
 
 
 def _drawn(
-    client: int, size: tuple[int, int], view: list[float], projection: list[float], lamp: NDArray[np.float64]
+    client: int, size: tuple[int, int], view: list[float], projection: list[float], light: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
     """A picture by PyBullet's software renderer; the lamp shines from a direction (3,)."""
     width, height = size
@@ -82,7 +82,7 @@ def _drawn(
         height,
         view,
         projection,
-        lightDirection=lamp.tolist(),
+        lightDirection=light.tolist(),
         shadow=1,
         renderer=pybullet.ER_TINY_RENDERER,
         physicsClientId=client,

@@ -38,7 +38,7 @@ class SimulatedWorkcell:
 
 
 @contextmanager
-def open_room(
+def open_workcell(
     model: UrModel,
     tool: Tool,
     skin: TriangleMesh,

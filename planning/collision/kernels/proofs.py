@@ -51,7 +51,7 @@ class ProofScene(NamedTuple):
     """Shape (k, 5): kind, first, second, and the frames of both. For ``SKIN`` the second is the row of the body's root
     among the balls, else both are rows of hulls."""
     skin: SkinTree
-    balls: tuple[Floats, Floats, Ints]
+    spheres: tuple[Floats, Floats, Ints]
     """Centres, radii and children of all bodies' trees of balls, each in the frame of its body."""
     hulls: Hulls
     T_box_base: Floats
@@ -76,7 +76,7 @@ class ProofScratch(NamedTuple):
     """Shape (k, 3): the last direction of each check; zero to begin anew."""
     corners: Ints
     """Shape (k, 2): the last corners."""
-    balls: Floats
+    spheres: Floats
     """Shape (h, 3), mm: where the centres of the hulls' balls stand."""
     stack: Ints
     inner_stack: Ints
@@ -87,33 +87,33 @@ class ProofScratch(NamedTuple):
 @nb.njit(cache=True)
 def scratch(checks, hulls):
     """Room to work in for so many checks and hulls."""
-    axes, corners, balls = np.zeros((checks, 3)), np.zeros((checks, 2), np.int64), np.empty((hulls, 3))
+    axes, corners, spheres = np.zeros((checks, 3)), np.zeros((checks, 2), np.int64), np.empty((hulls, 3))
     stacks = np.empty(STACK, np.int64), np.empty(STACK, np.int64)
-    return ProofScratch(axes, corners, balls, stacks[0], stacks[1], np.empty((3, 4)), np.empty((4, 3)))
+    return ProofScratch(axes, corners, spheres, stacks[0], stacks[1], np.empty((3, 4)), np.empty((4, 3)))
 
 
 @nb.njit(cache=True)
-def stand_balls(hulls, frames, balls):
-    """Fill ``balls`` (h, 3) with the centres of the hulls' balls, the arm standing at ``frames`` (7, 4, 4)."""
-    for hull in range(len(balls)):
+def place_spheres(hulls, frames, spheres):
+    """Fill ``spheres`` (h, 3) with the centres of the hulls' balls, the arm standing at ``frames`` (7, 4, 4)."""
+    for hull in range(len(spheres)):
         frame = hulls.frames[hull]
         x, y, z = hulls.centres[hull, 0], hulls.centres[hull, 1], hulls.centres[hull, 2]
         for i in range(3):
             along = frames[frame, i, 0] * x + frames[frame, i, 1] * y + frames[frame, i, 2] * z
-            balls[hull, i] = along + frames[frame, i, 3]
+            spheres[hull, i] = along + frames[frame, i, 3]
 
 
 @nb.njit(cache=True)
-def ball_gap(is_box, first, second, balls, radii, T_box_base, halves):
+def sphere_gap(is_box, first, second, spheres, radii, T_box_base, halves):
     """Lower bound on the distance of two hulls: of their balls, or of a box and a ball."""
-    x, y, z = balls[second, 0], balls[second, 1], balls[second, 2]
+    x, y, z = spheres[second, 0], spheres[second, 1], spheres[second, 2]
     squared = 0.0
     if is_box:
         for i in range(3):
             along = T_box_base[first, i, 0] * x + T_box_base[first, i, 1] * y + T_box_base[first, i, 2] * z
             squared += max(0.0, abs(along + T_box_base[first, i, 3]) - halves[first, i]) ** 2
         return math.sqrt(squared) - radii[second]
-    squared = (x - balls[first, 0]) ** 2 + (y - balls[first, 1]) ** 2 + (z - balls[first, 2]) ** 2
+    squared = (x - spheres[first, 0]) ** 2 + (y - spheres[first, 1]) ** 2 + (z - spheres[first, 2]) ** 2
     return math.sqrt(squared) - radii[first] - radii[second]
 
 
@@ -136,7 +136,7 @@ def near_gap(scene, work, at, frames, enough, far, needed):
     kind, second, frame_a, frame_b = scene.checks[at, 0], scene.checks[at, 2], scene.checks[at, 3], scene.checks[at, 4]
     if kind == SKIN:
         stacks = work.stack, work.inner_stack
-        gap = skin_gap(scene.skin, scene.balls, second, frames[frame_b], enough, far, needed, stacks[0], stacks[1])
+        gap = skin_gap(scene.skin, scene.spheres, second, frames[frame_b], enough, far, needed, stacks[0], stacks[1])
         return gap if gap > needed else 0.0
     _between(frames[frame_a], frames[frame_b], work.M)
     return hull_gap(scene.hulls, scene.checks[at, 1], second, work.M, work.axes[at], work.corners[at], needed, work.S)
@@ -181,10 +181,10 @@ def first_unproven(scene, levers, motion, work, proven, state, check, asked, cle
                 continue
             if stood < row:
                 stood = row
-                stand_balls(scene.hulls, frames[row], work.balls)
+                place_spheres(scene.hulls, frames[row], work.spheres)
             gap = -math.inf
             if kind != SKIN:
-                gap = ball_gap(kind == BOX, first, second, work.balls, radii, T_box_base, halves)
+                gap = sphere_gap(kind == BOX, first, second, work.spheres, radii, T_box_base, halves)
             if gap <= enough:
                 gap = near_gap(scene, work, at, frames[row], enough, far, clear_mm)
             if gap <= clear_mm:
@@ -195,7 +195,7 @@ def first_unproven(scene, levers, motion, work, proven, state, check, asked, cle
 
 
 @nb.njit(cache=True)
-def ways_about(frames, body_frame, centre, radius, turns, share, ways):
+def paths_about(frames, body_frame, centre, radius, turns, share, ways):
     """How far a body may move while each joint turns by no more than a share of ``turns`` (6,), rad, either way.
 
     Fills ``ways`` (7,), mm: entry j bounds the motion against the frame before joint j, the arm standing at ``frames``
@@ -231,7 +231,7 @@ def clear_about(scene, movers, frames, turns, work, gaps, unproven):
             if unproven[row, at]:
                 mover = movers.of_check[at]
                 ball = movers.centres[mover], movers.radii[mover]
-                ways_about(frames[row], movers.frames[mover], ball[0], ball[1], turns, 1.0, ways)
+                paths_about(frames[row], movers.frames[mover], ball[0], ball[1], turns, 1.0, ways)
                 way = ways[scene.checks[at, 3]] + MIN_GAP_MM
                 gaps[row, at] = near_gap(scene, work, at, frames[row], way, way + MIN_GAP_MM, way)
                 unproven[row, at] = gaps[row, at] <= way

@@ -21,11 +21,11 @@ from puncture_twin.planning.collision.kernels.proofs import (
     BOX,
     MIN_GAP_MM,
     SKIN,
-    ball_gap,
     near_gap,
+    paths_about,
+    place_spheres,
     scratch,
-    stand_balls,
-    ways_about,
+    sphere_gap,
 )
 
 CLEAR, CONTACT, ASK, NOT_FINITE = 0, 1, 2, 3
@@ -40,7 +40,7 @@ PARTS = 256
 
 
 class Answer(NamedTuple):
-    """What a segment came to, filled by :func:`judge_segment`."""
+    """What a segment came to, filled by :func:`check_segment`."""
 
     status: Ints
     """Shape (4,)."""
@@ -76,7 +76,7 @@ def _stand(way, share):
 def _not_far(scene, movers, frames, turns, order, work, near):
     """Fills ``near`` with the checks, in order, that the balls in the middle of a segment do not clear all over it."""
     checks, hulls, T_box_base, halves = scene.checks, scene.hulls, scene.T_box_base, scene.halves
-    stand_balls(hulls, frames, work.balls)
+    place_spheres(hulls, frames, work.spheres)
     ways, known = np.empty((len(movers.frames), 7)), np.zeros(len(movers.frames), np.bool_)
     count = 0
     for at in order:
@@ -84,13 +84,13 @@ def _not_far(scene, movers, frames, turns, order, work, near):
         if not known[mover]:
             known[mover] = True
             ball = movers.centres[mover], movers.radii[mover]
-            ways_about(frames, movers.frames[mover], ball[0], ball[1], turns, 0.5, ways[mover])
+            paths_about(frames, movers.frames[mover], ball[0], ball[1], turns, 0.5, ways[mover])
         way = ways[mover, checks[at, 3]] + MIN_GAP_MM
         if checks[at, 0] == SKIN:
             gap = near_gap(scene, work, at, frames, way, way + MIN_GAP_MM, way)
         else:
             is_box = checks[at, 0] == BOX
-            gap = ball_gap(is_box, checks[at, 1], checks[at, 2], work.balls, hulls.radii, T_box_base, halves)
+            gap = sphere_gap(is_box, checks[at, 1], checks[at, 2], work.spheres, hulls.radii, T_box_base, halves)
         if gap <= way:
             near[count] = at
             count += 1
@@ -106,11 +106,11 @@ def _look(scene, way, shares, near, begin, work, answer):
         look, row = divmod(position, len(near))
         if row == 0 or position == begin:
             _stand(way, shares[look])
-            stand_balls(hulls, frames, work.balls)
+            place_spheres(hulls, frames, work.spheres)
         at, gap = near[row], 0.0
         if checks[at, 0] != SKIN:
             is_box = checks[at, 0] == BOX
-            gap = ball_gap(is_box, checks[at, 1], checks[at, 2], work.balls, hulls.radii, T_box_base, halves)
+            gap = sphere_gap(is_box, checks[at, 1], checks[at, 2], work.spheres, hulls.radii, T_box_base, halves)
         if gap <= MIN_GAP_MM:
             gap = near_gap(scene, work, at, frames, MIN_GAP_MM, 2.0 * MIN_GAP_MM, MIN_GAP_MM)
         if gap <= MIN_GAP_MM:
@@ -137,7 +137,7 @@ def _prove(scene, movers, way, at, fine_mm, work, parts, answer):
         middle, half = (low + high) / 2.0, (high - low) / 2.0
         _stand(way, middle)
         ball = movers.centres[mover], movers.radii[mover]
-        ways_about(frames, movers.frames[mover], ball[0], ball[1], way.turns, half, ways)
+        paths_about(frames, movers.frames[mover], ball[0], ball[1], way.turns, half, ways)
         needed = ways[frame_a] + MIN_GAP_MM
         gap = near_gap(scene, work, at, frames, needed, needed + MIN_GAP_MM, needed)
         if gap > needed:
@@ -159,7 +159,7 @@ def _prove(scene, movers, way, at, fine_mm, work, parts, answer):
 
 
 @nb.njit(cache=True)
-def judge_segment(scene, movers, lengths, start, end, shares, begin, fine_mm, order, answer):
+def check_segment(scene, movers, lengths, start, end, shares, begin, fine_mm, order, answer):
     """Judge a straight joint segment: fills ``answer``.
 
     Args:

@@ -144,7 +144,7 @@ def _field_distance(tree, field, origin, x, y, z, stack):
 
 
 @nb.njit(cache=True)
-def skin_gap(skin, balls, root, T, enough, far, needed, stack, inner_stack):
+def skin_gap(skin, spheres, root, T, enough, far, needed, stack, inner_stack):
     """Lower bound on the distance of a body's balls to the skin, the body's frame standing at ``T`` (4, 4).
 
     The field is asked first: a ball's centre is no farther from the middle of its cell than half of its diagonal. A
@@ -153,7 +153,7 @@ def skin_gap(skin, balls, root, T, enough, far, needed, stack, inner_stack):
     scratch.
     """
     tree, field, origin = skin
-    centres, radii, children = balls
+    centres, radii, children = spheres
     best = far
     stack[0], top = root, 1
     while top > 0 and best > needed:

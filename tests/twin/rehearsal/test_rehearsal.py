@@ -51,9 +51,9 @@ def ball(radius: float, *centre: float) -> TriangleMesh:
     return TriangleMesh(mesh.vertices + np.array(centre), mesh.faces)
 
 
-def anatomy(**balls: TriangleMesh) -> Anatomy:
+def anatomy(**spheres: TriangleMesh) -> Anatomy:
     """A round patient with a lesion about the target, and more structures on request."""
-    meshes = {"lesion": ball(8.0, *TARGET)} | balls
+    meshes = {"lesion": ball(8.0, *TARGET)} | spheres
     structures = tuple(
         Structure(name, Role.TARGET if name == "lesion" else Role.AVOID, 0.0, mesh, "made here")
         for name, mesh in meshes.items()

@@ -11,7 +11,7 @@ from puncture_twin.twin.report.map.map_raster import map_raster, row_colours
 from puncture_twin.twin.report.map_view import MapCells, map_view, rows_at
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.line_of_sight import blocked
-from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, picture, put_moving, veils_of
+from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, picture, put_moving, translucents_of
 from puncture_twin.twin.report.raster.shading import corner_normals
 
 SIZE = 90, 120
@@ -77,7 +77,7 @@ def test_no_sample_falls_between_triangles(ball):
 def test_shells_are_all_hits_in_order(rng):
     """The shells hold the nearest hits of each sample, sorted, as a plain search over all triangles finds them."""
     mesh, camera = soup(rng, 60), camera_at((0, -400, 30))
-    shells = veils_of(Layer([Surface(mesh, (200, 100, 50), 0.3)]), camera)
+    shells = translucents_of(Layer([Surface(mesh, (200, 100, 50), 0.3)]), camera)
     wanted = np.sort(all_hits(mesh, camera.eye, rays_of(camera).astype(float)), axis=1)[:, : len(shells)]
     near = np.where(np.isfinite(wanted), wanted, 1e6 * np.arange(1, 1 + len(shells)))
     apart = (np.diff(near, axis=1) > 0.05).all(axis=1)  # else two count as one
@@ -91,9 +91,9 @@ def test_shells_behind_something_opaque_are_left_out(ball):
     """What is hidden is not drawn at all."""
     camera = camera_at((0, -400, 0))
     wall = opaque_shot(Layer([Surface(ball(50.0), (9, 9, 9))]), camera)
-    veil = Layer([Surface(ball(40.0), (200, 0, 0), 0.3)])
-    assert len(veils_of(veil, camera)) == 2
-    assert veils_of(veil, camera, wall) == ()
+    translucent = Layer([Surface(ball(40.0), (200, 0, 0), 0.3)])
+    assert len(translucents_of(translucent, camera)) == 2
+    assert translucents_of(translucent, camera, wall) == ()
 
 
 def test_of_two_surfaces_in_one_place_the_first_is_seen():
@@ -105,9 +105,9 @@ def test_of_two_surfaces_in_one_place_the_first_is_seen():
     red, blue = (255, 0, 0), (0, 0, 255)
     for first, second, channel in ((red, blue, 0), (blue, red, 2)):
         shot = opaque_shot(Layer([Surface(one, first), Surface(other, second)]), camera)
-        (veil, *_) = veils_of(Layer([Surface(one, first, 0.5), Surface(other, second, 0.5)]), camera)
+        (translucent, *_) = translucents_of(Layer([Surface(one, first, 0.5), Surface(other, second, 0.5)]), camera)
         inner = np.isfinite(opaque_shot(Layer([Surface(one, red)]), camera).depth)
-        for colour in (shot.colour, veil.colour):
+        for colour in (shot.colour, translucent.colour):
             assert (colour[inner].argmax(axis=1) == channel).all()
 
 

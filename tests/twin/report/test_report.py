@@ -27,8 +27,8 @@ from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import TRIANGLES, lightened
 from puncture_twin.twin.report.palette import REASON_COLOURS, SAFE_HIGH, SAFE_LOW
 from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
-from puncture_twin.twin.report.raster.compositing import RasterShot, compose, empty_veil
-from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, put_moving, veils_of
+from puncture_twin.twin.report.raster.compositing import RasterShot, compose, empty_translucent
+from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, put_moving, translucents_of
 from puncture_twin.twin.report.scene import film, lighter_mesh, scene_picture
 from puncture_twin.twin.report.scene.film import draw_film
 from puncture_twin.twin.report.scene.scene_parts import SceneBody, needle_bodies, patient
@@ -260,7 +260,7 @@ def test_depth_and_outline_of_a_ball(ball):
 def test_a_veil_has_both_shells(ball):
     """A see-through ball is hit twice, in front and behind, at the analytic depths."""
     centre, camera, near, far = sphere_view()
-    shells = veils_of(Layer([Surface(ball(60.0, centre, 5), (200, 40, 40), 0.3)]), camera)
+    shells = translucents_of(Layer([Surface(ball(60.0, centre, 5), (200, 40, 40), 0.3)]), camera)
     assert len(shells) == 2
     inner = np.isfinite(shells[1].depth) & (far - near > 40)
     assert inner.sum() > 1000
@@ -272,13 +272,13 @@ def test_a_veil_behind_something_opaque_is_not_drawn():
     """Blending respects depth, and is Porter and Duff's over."""
     opaque = RasterShot(np.full((2, 2, 3), 100, np.float32), np.full((2, 2), 50, np.float32))
     for depth, wanted in ((40, 0.25 * 200 + 0.75 * 100), (60, 100)):
-        veil = replace(
-            empty_veil((2, 2)),
+        translucent = replace(
+            empty_translucent((2, 2)),
             colour=np.full((2, 2, 3), 200, np.float32),
             alpha=np.full((2, 2), 0.25, np.float32),
             depth=np.full((2, 2), depth, np.float32),
         )
-        assert (compose(opaque, [veil]) == round(wanted)).all()
+        assert (compose(opaque, [translucent]) == round(wanted)).all()
 
 
 def test_a_moved_body_looks_like_a_body_that_stands_there(ball, rng):

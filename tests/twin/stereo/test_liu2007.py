@@ -8,7 +8,7 @@ from servo_world import NoContacts
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.twin.guidance.stereo.detection import pixel_sight
+from puncture_twin.twin.guidance.stereo.detection import pixel_detector
 from puncture_twin.twin.guidance.stereo.experiment import run_trial, statistics, trial, varied
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.stereo.session import run_session
@@ -67,7 +67,7 @@ def test_a_seed_repeats_itself_and_another_does_not():
     """Every number is a function of case and seed."""
     case = load_servo_case(folder() / "head")
     first, again, other = (
-        short(case, seed, ("T1",), eyes=lambda room, rng: pixel_sight(room, 0.03, rng)) for seed in (1, 1, 2)
+        short(case, seed, ("T1",), detector_of=lambda room, rng: pixel_detector(room, 0.03, rng)) for seed in (1, 1, 2)
     )
     assert first == again
     assert first.rows != other.rows

@@ -9,11 +9,11 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.winding import winding_number
 from puncture_twin.planning.registration.registration import apply
 from puncture_twin.twin.guidance.stereo.experiment import varied
-from puncture_twin.twin.guidance.stereo.poses import configurations, way_up
+from puncture_twin.twin.guidance.stereo.poses import configurations, path_upward
 from puncture_twin.twin.guidance.stereo.robot_calibration import grid_points, held_rod
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
-from puncture_twin.twin.guidance.stereo.servo_loop import way_contact
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_room, head_pose, room_checker
+from puncture_twin.twin.guidance.stereo.servo_loop import path_contact
+from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_workcell, head_pose, workcell_checker
 from puncture_twin.twin.phantoms.head import FLOOR_MM, MARKERS_MM, RIM_MM, head_field, head_targets
 
 HEAD = folder() / "head"
@@ -87,34 +87,34 @@ def test_the_head_is_open_and_holds_its_targets(case):
 
 def test_both_cameras_see_every_target_and_marker(case):
     """No line of sight from either camera to a ball there meets the head, and all lie well inside the pictures."""
-    room = draw_room(case, np.random.default_rng(0))
+    room = draw_workcell(case, np.random.default_rng(0))
     for camera in room.cameras:
         for point in np.concatenate([room.targets_c, room.markers_c]):
-            assert room.hidden_share(camera, point, 4.0) == 0.0
+            assert room.hidden_fraction(camera, point, 4.0) == 0.0
             assert camera.sees(camera.project(point), 40.0)
 
 
 def test_a_ball_behind_the_head_is_hidden(case):
     """A ball beyond the far wall, below its rim, is hidden whole; one whose edge it touches in part."""
-    room = draw_room(case, np.random.default_rng(0))
+    room = draw_workcell(case, np.random.default_rng(0))
     behind = apply(room.T_c_m, np.array([0.0, 110.0, -60.0]))
-    assert room.hidden_share(room.cameras[0], behind, 4.0) == 1.0
+    assert room.hidden_fraction(room.cameras[0], behind, 4.0) == 1.0
     heights = np.linspace(-60.0, 40.0, 60)
-    shares = [room.hidden_share(room.cameras[0], apply(room.T_c_m, np.array([0, 110.0, z])), 4.0) for z in heights]
+    shares = [room.hidden_fraction(room.cameras[0], apply(room.T_c_m, np.array([0, 110.0, z])), 4.0) for z in heights]
     assert any(0.0 < share < 1.0 for share in shares)
 
 
 def test_the_arm_reaches_everything_without_a_contact(case):
     """Calibration grid, every target from its hovering pose with the head there; no link before the ball."""
-    room = draw_room(case, np.random.default_rng(0))
+    room = draw_workcell(case, np.random.default_rng(0))
     held, T = held_rod(case, room), head_pose(case)
-    calibrated = configurations(held, grid_points(case), room_checker(case, None)).branch
-    targets, checker = apply(T, case.targets.points), room_checker(case, T)
+    calibrated = configurations(held, grid_points(case), workcell_checker(case, None)).branch
+    targets, checker = apply(T, case.targets.points), workcell_checker(case, T)
     q = configurations(
-        held, np.concatenate([targets, way_up(held, targets, case.file.servo.hover_mm)]), checker, first=calibrated
+        held, np.concatenate([targets, path_upward(held, targets, case.file.servo.hover_mm)]), checker, first=calibrated
     ).q
     for aim, hover in zip(q[:16], q[16:], strict=True):
-        assert way_contact(checker, np.stack([hover, aim])) is None
+        assert path_contact(checker, np.stack([hover, aim])) is None
         assert not arm_hides_ball(room, aim)
 
 

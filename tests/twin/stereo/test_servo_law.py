@@ -7,7 +7,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.twin.guidance.stereo.servo_law import (
     MIN_SIGMA,
-    Held,
+    HeldRod,
     ServoStop,
     StepLimits,
     ball_base,
@@ -24,7 +24,7 @@ GOOD = np.radians([14.0, -73.0, -132.0, -55.0, 88.0, -76.0])
 
 def held_at(q, rod_mm=160.0):
     """A rod held as the arm has it at q."""
-    return Held(MODEL, rod_mm, flange_pose(MODEL, q)[:3, :3])
+    return HeldRod(MODEL, rod_mm, flange_pose(MODEL, q)[:3, :3])
 
 
 def test_jacobian_at_the_ball_is_the_slope_of_its_pose():

@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 from servo_world import CASE, HELD, NoContacts, start_configurations
 
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.collision.state_checker import Contact, Met
+from puncture_twin.planning.collision.state_checker import Contact, FirstContact
 from puncture_twin.twin.guidance.stereo.servo_law import ServoStop, StepLimits, ball_base
-from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen, Task, servo, way_contact
+from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen, Task, path_contact, servo
 from puncture_twin.twin.plant.true_arm import ArmErrors, draw_true_arm
 
 Q_START = start_configurations()[12]
@@ -23,7 +23,7 @@ class Touches(NoContacts):
 
     def first_contact(self, q_path, *, needle_may_touch_patient):
         """The needle touches the table."""
-        return Met(0, Contact("needle", "table"))
+        return FirstContact(0, Contact("needle", "table"))
 
 
 class Twin:
@@ -183,7 +183,7 @@ def test_the_judge_is_asked_about_states_between_the_waypoints():
         def first_contact(self, q_path, *, needle_may_touch_patient):
             asked.append((q_path, needle_may_touch_patient))
 
-    assert way_contact(Records(), np.array([Q_START, Q_START + 0.1])) is None
+    assert path_contact(Records(), np.array([Q_START, Q_START + 0.1])) is None
     (path, may_touch) = asked[0]
     assert not may_touch
     assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() <= 0.005 + 1e-12

@@ -8,7 +8,7 @@ import pytest
 from puncture_twin.run_twin import ANSWER_IS_NO, BAD_INPUT, OK, main
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import read_recording, write_recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import load_selfcal_case
-from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_room
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
 from puncture_twin.twin.guidance.ultrasound.simulate import PoseRanges, simulate_recording
 
 CASE = """
@@ -47,7 +47,7 @@ def test_every_file_is_written(done):
 def test_the_calibration_is_the_truth_within_what_it_claims(case_folder, done):
     """Against the truth drawn anew from the seed: X, Y and the tip to a few of their standard deviations."""
     found = json.loads((done / "calibration.json").read_text())
-    truth = draw_room(load_selfcal_case(case_folder), np.random.default_rng(3))
+    truth = draw_workcell(load_selfcal_case(case_folder), np.random.default_rng(3))
     names, covariance = found["parameters"], np.array(found["covariance"])
     drawn = {"t_X": truth.X[:3, 3], "t_Y": truth.Y[:3, 3], "t_Q": truth.tip_end2}
     ours = {

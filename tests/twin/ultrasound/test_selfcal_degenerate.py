@@ -34,7 +34,7 @@ def test_every_degenerate_set_is_refused_and_named(name, noisy):
     assert isinstance(refused.value, InputError)
     assert [(m.cause, m.dimensions) for m in refused.value.motions] == [DEGENERATE[name]]
     assert refused.value.motions[0].words in str(refused.value)
-    assert refused.value.cure.words in str(refused.value)
+    assert refused.value.suggestion.words in str(refused.value)
 
 
 def test_the_words_are_those_of_a_person():
@@ -57,7 +57,7 @@ def test_the_proposed_poses_cure_it(name, seed):
     noisy = with_noise(rng, recording, SPEC_NOISE)
     with pytest.raises(Degenerate) as refused:
         calibrate(noisy, noise=SPEC_NOISE)
-    more = with_noise(rng, cured(truth, noisy, seen, refused.value.cure), SPEC_NOISE)
+    more = with_noise(rng, cured(truth, noisy, seen, refused.value.suggestion), SPEC_NOISE)
     found = calibrate(noisy.joined(more), noise=SPEC_NOISE)
     assert found.condition >= LEAST_RATIO
     held, _ = simulate_recording(rng, 100, truth, noise=None)

@@ -20,7 +20,7 @@ from puncture_twin.twin.guidance.ultrasound.candidate_poses import (
 )
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, SelfcalFile, load_selfcal_case
-from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_room, jog_into_slice
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell, jog_into_slice
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE
 from puncture_twin.twin.guidance.ultrasound.two_arms import (
     BetweenArms,
@@ -188,7 +188,7 @@ def test_inside_phantom_against_the_winding_number(case):
 def test_the_jog_brings_the_true_needle_into_the_slice(case, candidates):
     """Arms, mounts and needle differ from the drawing; after the jog the true needle stands as wanted."""
     rng = np.random.default_rng(9)
-    truth = draw_room(case, rng)
+    truth = draw_workcell(case, rng)
     for row in range(5):
         before = truth.needle_in_image(candidates.q_probe[row], candidates.q_needle[row])
         assert np.linalg.norm(before.tip_image[:2] - candidates.poses.P[row]) > 0.5
@@ -205,15 +205,15 @@ def test_true_rooms_are_seeded_and_differ_as_asked():
     exact = {"link_mm": 0.0, "twist_deg": 0.0, "joint_deg": 0.0, "repeatability_deg": 0.0}
     none = {"mount_mm": 0.0, "mount_deg": 0.0, "tip_mm": 0.0, "length_mm": 0.0, "needle_deg": 0.0}
     plain = make_case(probe_arm={"errors": exact}, needle_arm={"errors": exact}, truth=none)
-    drawn = draw_room(plain, np.random.default_rng(1))
+    drawn = draw_workcell(plain, np.random.default_rng(1))
     assert np.abs(drawn.X - plain.T_end1_image).max() < 1e-12
     assert np.abs(drawn.Y - plain.T_base1_base2).max() < 1e-12
     assert drawn.tip_end2 == pytest.approx(plain.tip_end2)
     usual = make_case()
-    one, again, other = (draw_room(usual, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    one, again, other = (draw_workcell(usual, np.random.default_rng(seed)) for seed in (1, 1, 2))
     assert np.array_equal(one.X, again.X)
     assert not np.array_equal(one.X, other.X)
-    rooms = [draw_room(usual, np.random.default_rng(seed)) for seed in range(80)]
+    rooms = [draw_workcell(usual, np.random.default_rng(seed)) for seed in range(80)]
     errors = np.array([drawn.Y[:3, 3] - usual.T_base1_base2[:3, 3] for drawn in rooms])
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(usual.content.truth.mount_mm, rel=0.2)
 

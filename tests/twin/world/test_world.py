@@ -25,7 +25,7 @@ from puncture_twin.twin.world.contacts import touches
 from puncture_twin.twin.world.engine import pybullet
 from puncture_twin.twin.world.execution import execute
 from puncture_twin.twin.world.units import pose_to_m, pose_to_mm, to_m, to_mm
-from puncture_twin.twin.world.workcell import open_room
+from puncture_twin.twin.world.workcell import open_workcell
 
 REPO = ROOT
 TOOL = Tool(210.0, 150.0, 1.2, 30.0)
@@ -162,7 +162,7 @@ def test_execution_repeats_itself_exactly():
     commands = HOME + np.array([0.3, 0.2, -0.2, 0.1, 0.2, 0.4]) * t**2 * (3 - 2 * t)
 
     def once() -> np.ndarray:
-        with open_room(ur_model("ur3"), TOOL, sphere(80.0), at(350, 0, 60), down_ct=DOWN) as room:
+        with open_workcell(ur_model("ur3"), TOOL, sphere(80.0), at(350, 0, 60), down_ct=DOWN) as room:
             return execute(room, commands, np.zeros(6)).T_base_flange
 
     np.testing.assert_array_equal(once(), once())
@@ -174,7 +174,7 @@ def test_table_in_the_way_is_felt_and_named():
     down = HOME + np.array([0.0, -0.4, 0.0, 0.4, 0.0, 0.0]) * np.linspace(0, 1, 480)[:, None]
     lowest = flange_pose(model, down[-1])[2, 3]
     box = Box("table", at(400, 0, lowest - 20.0), (600.0, 600.0, 40.0))
-    with open_room(model, Tool(60.0, 20.0, 1.2, 30.0), sphere(20.0), at(-400, 0, 0), [box], down_ct=DOWN) as room:
+    with open_workcell(model, Tool(60.0, 20.0, 1.2, 30.0), sphere(20.0), at(-400, 0, 0), [box], down_ct=DOWN) as room:
         done = execute(room, down, np.zeros(6))
     assert {(t.link, t.body) for t in done.touches} & {("needle", "table"), ("holder", "table")}
     assert done.T_base_flange[-1, 2, 3] > lowest + 10.0
@@ -188,7 +188,7 @@ def test_needle_goes_through_the_skin_but_the_holder_does_not():
     shaft_only, too_deep = (T[:3, 3] + (60.0 + gap + 100.0) * T[:3, 2] for gap in (10.0, -5.0))
     for centre, expected in ((shaft_only, set()), (too_deep, {("holder", "patient")})):
         assert np.linalg.norm(tip - centre) < 90.0  # the tip is well inside the ball
-        with open_room(model, TOOL, sphere(100.0), at(*centre), down_ct=DOWN) as room:
+        with open_workcell(model, TOOL, sphere(100.0), at(*centre), down_ct=DOWN) as room:
             room.arm.place(HOME)
             pybullet.performCollisionDetection(physicsClientId=room.client)
             assert {(t.link, room.bodies[t.body]) for t in touches(room.arm)} == expected
@@ -199,7 +199,7 @@ def test_concave_skin_is_hollow_where_it_is_hollow():
     walls = [trimesh.creation.box((20, 200, 200), at(x, 0, 0)) for x in (-100, 100)]
     mesh = trimesh.util.concatenate(walls)
     T = flange_pose(ur_model("ur3"), HOME)
-    with open_room(
+    with open_workcell(
         ur_model("ur3"), TOOL, TriangleMesh(mesh.vertices, mesh.faces), at(*(T[:3, 3] + 90 * T[:3, 2])), down_ct=DOWN
     ) as room:
         room.arm.place(HOME)
@@ -232,7 +232,7 @@ def test_picture_shows_what_stands_there():
 
 def test_loading_prints_nothing_on_stdout(capfd):
     """Standard output belongs to the caller: a table or a JSON object may be on its way there."""
-    with open_room(ur_model("ur3"), TOOL, sphere(50.0), at(400, 0, 0), down_ct=DOWN) as room:
+    with open_workcell(ur_model("ur3"), TOOL, sphere(50.0), at(400, 0, 0), down_ct=DOWN) as room:
         execute(room, HOME[None].repeat(10, axis=0), np.zeros(6))
     assert capfd.readouterr().out == ""
 

@@ -1,7 +1,7 @@
 """What the guidance gets to see: a ball's centre in each camera, from pictures of the true room.
 
-``picture_sight`` draws a picture with the true camera and measures it with the believed one. ``pixel_sight`` leaves the
-picture out and adds normal errors to the true pixel: for studies of everything behind the picture.
+``picture_detector`` draws a picture with the true camera and measures it with the believed one. ``pixel_detector``
+leaves the picture out and adds normal errors to the true pixel: for studies of everything behind the picture.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ class Search(NamedTuple):
     search_px: float
 
 
-Sight = Callable[[int, LocatedPair, Search], Spot | Lost]
+Detector = Callable[[int, LocatedPair, Search], Spot | Lost]
 """Takes the camera's number, the ball as it truly is, and where to look."""
 
 
-class Spots(NamedTuple):
+class Detections(NamedTuple):
     """One ball in every camera."""
 
     pixels: Floats
@@ -72,13 +72,13 @@ class Spots(NamedTuple):
     """Shape (c, 2, 2), px^2."""
 
 
-def picture_sight(room: StereoWorkcell, rng: np.random.Generator) -> Sight:
+def picture_detector(room: StereoWorkcell, rng: np.random.Generator) -> Detector:
     """Pictures of the true room, each drawn anew with noise; what the head hides is hidden."""
     plan = room.case.file.cameras
 
     def see(number: int, ball: LocatedPair, search: Search) -> Spot | Lost:
         true = room.cameras[number]
-        hidden = room.hidden_share(true, ball.center_c, ball.radius_mm) if ball.head_there else 0.0
+        hidden = room.hidden_fraction(true, ball.center_c, ball.radius_mm) if ball.head_there else 0.0
         away = np.abs(true.project(ball.center_c) - search.camera.project(search.predicted_c)).max()
         radius = true.ball_radius_px(ball.center_c, ball.radius_mm)
         half = int(np.ceil(np.nan_to_num(away, nan=0.0) + search.search_px + 2 * radius)) + WINDOW_MARGIN_PX
@@ -97,7 +97,7 @@ def picture_sight(room: StereoWorkcell, rng: np.random.Generator) -> Sight:
     return see
 
 
-def pixel_sight(room: StereoWorkcell, sigma_px: float, rng: np.random.Generator) -> Sight:
+def pixel_detector(room: StereoWorkcell, sigma_px: float, rng: np.random.Generator) -> Detector:
     """True pixels with normal errors of a standard deviation per axis."""
 
     def see(number: int, ball: LocatedPair, search: Search) -> Spot | Lost:
@@ -117,31 +117,31 @@ def ball_scene(plan: CamerasSection, ball: LocatedPair, hidden: float, rng: np.r
         rod_c=(0.0, -1.0, 0.0) if ball.rod_c is None else ball.rod_c,
         rod=ball.rod_c is not None,
         diffuse=DIFFUSE[plan.light],
-        hidden_share=share,
+        hidden_fraction=share,
         hidden_from=float(rng.uniform(-np.pi, np.pi)),
     )
 
 
-def look_at(sight: Sight, ball: LocatedPair, searches: tuple[Search, ...], frames: int = 1) -> Spots | Lost:
+def look_at(detector: Detector, ball: LocatedPair, searches: tuple[Search, ...], frames: int = 1) -> Detections | Lost:
     """One ball in every camera, several pictures each; all must show it.
 
     Pictures of one camera are averaged by their inverse covariances.
     """
     pixels, covariances = [], []
     for number, search in enumerate(searches):
-        spots = []
+        detections = []
         for _ in range(frames):
-            spot = sight(number, ball, search)
+            spot = detector(number, ball, search)
             if isinstance(spot, Lost):
                 return Lost(f"camera {number + 1}: {spot.reason}")
-            spots.append(spot)
-        weights = np.linalg.inv([spot.covariance for spot in spots])
+            detections.append(spot)
+        weights = np.linalg.inv([spot.covariance for spot in detections])
         covariance = np.linalg.inv(weights.sum(axis=0))
-        pixels.append(covariance @ np.einsum("fij,fj->i", weights, [spot.pixel for spot in spots]))
+        pixels.append(covariance @ np.einsum("fij,fj->i", weights, [spot.pixel for spot in detections]))
         covariances.append(covariance)
-    return Spots(np.array(pixels), np.array(covariances))
+    return Detections(np.array(pixels), np.array(covariances))
 
 
-def in_space(cameras: tuple[Camera, ...], spots: Spots) -> Points:
+def in_space(cameras: tuple[Camera, ...], detections: Detections) -> Points:
     """One ball's place in C from its pixels."""
-    return triangulate(cameras, spots.pixels[:, None], spots.covariances[:, None])
+    return triangulate(cameras, detections.pixels[:, None], detections.covariances[:, None])

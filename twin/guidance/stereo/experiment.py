@@ -17,7 +17,7 @@ from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import ServoStop
 from puncture_twin.twin.guidance.stereo.session import Session, run_session
-from puncture_twin.twin.guidance.stereo.stereo_room import room_checker
+from puncture_twin.twin.guidance.stereo.stereo_room import workcell_checker
 
 SHARE = 5
 """Seeds that a process takes at a time; they share the judge of the empty room."""
@@ -125,7 +125,7 @@ def run_trials(
     tell = done or (lambda at, of: None)
     found: list[ServoTrial] = []
     if jobs == 1:
-        empty = room_checker(case, None)
+        empty = workcell_checker(case, None)
         for seed in seeds:
             found.append(run_trial(case, seed, empty))
             tell(len(found), len(seeds))

@@ -8,11 +8,11 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.registration.registration import apply
-from puncture_twin.twin.guidance.stereo.detection import LocatedPair, Search, Sight, Spots, in_space, look_at
+from puncture_twin.twin.guidance.stereo.detection import Detections, Detector, LocatedPair, Search, in_space, look_at
 from puncture_twin.twin.guidance.stereo.joint_model import Guess, Observed, Unknowns
 from puncture_twin.twin.guidance.stereo.mapping import Mapping
 from puncture_twin.twin.guidance.stereo.optimum import Adjusted, adjust
-from puncture_twin.twin.guidance.stereo.robot_calibration import RobotHeld, held_rod
+from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration, held_rod
 from puncture_twin.twin.guidance.stereo.servo_law import ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, arm_errors, planned_cameras
@@ -23,21 +23,21 @@ class Known(NamedTuple):
 
     room: StereoWorkcell
     """Of which only the pictures are used."""
-    calibration: RobotHeld
+    calibration: RobotCalibration
     mapping: Mapping
-    markers: list[Spots]
+    markers: list[Detections]
     """The markers' pixels."""
     markers_m: Floats
     """Shape (n, 3), mm: the markers as the image has them."""
-    sight: Sight
+    detector: Detector
 
 
 class Guide:
     """The chain: calibrated cameras triangulate the ball; the target is where the mapping put it."""
 
     def __init__(self, known: Known) -> None:
-        room, calibration, mapping, markers, markers_m, sight = known
-        self._room, self._case, self._sight = room, room.case, sight
+        room, calibration, mapping, markers, markers_m, detector = known
+        self._room, self._case, self._detector = room, room.case, detector
         self._calibration, self._mapping = calibration, mapping
         self._markers, self._markers_m = markers, markers_m
         self._held = held_rod(room.case, room)
@@ -64,16 +64,16 @@ class Guide:
         ball = LocatedPair(self._room.ball_c(q_true), tool.ball_diameter_mm / 2, self._room.rod_c(q_true))
         predicted = apply(self._T_c_base, ball_base(self._held, q_command))
         searches = tuple(Search(camera, predicted, limits.search_px) for camera in self._calibration.cameras)
-        spots = look_at(self._sight, ball, searches, limits.frames)
-        if isinstance(spots, Lost):
-            return spots
+        detections = look_at(self._detector, ball, searches, limits.frames)
+        if isinstance(detections, Lost):
+            return detections
         self._q.append(q_command)
-        self._pixels.append(spots.pixels)
-        self._covariances.append(spots.covariances)
-        return self._judge(spots)
+        self._pixels.append(detections.pixels)
+        self._covariances.append(detections.covariances)
+        return self._judge(detections)
 
-    def _judge(self, spots: Spots) -> Seen:
-        points = in_space(self._calibration.cameras, spots)
+    def _judge(self, detections: Detections) -> Seen:
+        points = in_space(self._calibration.cameras, detections)
         return Seen(points.points_c[0], self.target_c, points.covariance[0])
 
     def observed(self) -> Observed:
@@ -100,7 +100,7 @@ class JointGuide(Guide):
 
     def __init__(self, known: Known) -> None:
         super().__init__(known)
-        self._balls = [*known.calibration.measured_c]
+        self._spheres = [*known.calibration.measured_c]
         self._last: Unknowns | None = None
 
     def aim_at(self, target_m: Floats) -> None:
@@ -108,19 +108,19 @@ class JointGuide(Guide):
         self.target_m = target_m
         self.target_c = self._adjusted().offset(0, target_m).target_c
 
-    def _judge(self, spots: Spots) -> Seen:
-        self._balls.append(in_space(self._calibration.cameras, spots).points_c[0])
+    def _judge(self, detections: Detections) -> Seen:
+        self._spheres.append(in_space(self._calibration.cameras, detections).points_c[0])
         found = self._adjusted().offset(-1, self.target_m)
         self.target_c = found.target_c
         return Seen(found.ball_c, found.target_c, found.ball_covariance)
 
     def _adjusted(self) -> Adjusted:
-        guess = Guess(self._T_c_base, self._mapping.T_c_m, np.array(self._balls))
+        guess = Guess(self._T_c_base, self._mapping.T_c_m, np.array(self._spheres))
         start = None if self._last is None else self._with_new_ball(self._last)
         found = adjust(self.observed(), guess, start)
         self._last = found.unknowns
         return found
 
     def _with_new_ball(self, last: Unknowns) -> Unknowns:
-        new = np.array(self._balls[len(last.balls_c) :]).reshape(-1, 3)
+        new = np.array(self._spheres[len(last.balls_c) :]).reshape(-1, 3)
         return last._replace(balls_c=np.concatenate([last.balls_c, new]))

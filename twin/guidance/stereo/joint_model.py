@@ -22,7 +22,7 @@ from puncture_twin.planning.registration.registration import apply
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.lens import coefficient_slope
 from puncture_twin.twin.guidance.stereo.mapping import turn_and_shift_slopes
-from puncture_twin.twin.guidance.stereo.servo_law import Held, ball_jacobian
+from puncture_twin.twin.guidance.stereo.servo_law import HeldRod, ball_jacobian
 from puncture_twin.twin.guidance.stereo.stereo_room import (
     CAMERA_AXIS_PX,
     CAMERA_FOCAL,
@@ -64,7 +64,7 @@ class Observed:
     """
 
     planned: tuple[Camera, ...]
-    held: Held
+    held: HeldRod
     arm: ArmErrors
     q_command: Floats
     pixels: Floats
@@ -250,10 +250,10 @@ class JointModel:
         _diagonal(J, 0, x.span("balls_c").start, np.tile(np.eye(3), (len(balls), 1, 1)))
         J[:, :, x.span("base")] = -_pose_slopes(balls, self._base_center, x.base[:3], x.base[3:])
         J[:, :, x.span("arm")] = -T[:3, :3] @ _arm_slopes(arm, o.arm, o.q_command, o.held.rod_mm)
-        return _whitened(x.balls_c - balls, J, self._stray_roots)
+        return _whitened(x.balls_c - balls, J, self._outlier_roots)
 
     @cached_property
-    def _stray_roots(self) -> Floats:
+    def _outlier_roots(self) -> Floats:
         """Roots of the inverse covariance of where the arm has its ball, (s, 3, 3): play (uniform), repeatability."""
         o, R = self.observed, self.guess.T_c_base[:3, :3]
         joint = o.arm.repeatability_rad**2 + o.arm.backlash_rad**2 / 12

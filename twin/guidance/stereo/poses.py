@@ -10,7 +10,7 @@ from puncture_twin.planning.arm.kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
-from puncture_twin.twin.guidance.stereo.servo_law import Held
+from puncture_twin.twin.guidance.stereo.servo_law import HeldRod
 
 LEAST_SINGULARITY = 0.05
 """A branch that comes nearer to a singularity (of 0..1) at some point is not used."""
@@ -26,7 +26,7 @@ def rod_orientation(tilt_rad: float) -> Floats:
     return np.stack([np.cross(y, z), y, z], axis=1)
 
 
-def flange_poses(held: Held, points_base: Floats) -> Floats:
+def flange_poses(held: HeldRod, points_base: Floats) -> Floats:
     """T_base_flange, shape (n, 4, 4), mm, that put the ball on points (n, 3)."""
     T = np.tile(np.eye(4), (len(points_base), 1, 1))
     T[:, :3, :3] = held.R_base_flange
@@ -44,7 +44,7 @@ class Posture(NamedTuple):
     what was calibrated on one is to be used on it."""
 
 
-def configurations(held: Held, points_base: Floats, checker: StateChecker, *, first: int | None = None) -> Posture:
+def configurations(held: HeldRod, points_base: Floats, checker: StateChecker, *, first: int | None = None) -> Posture:
     """Joint angles that hold the ball on every point, all on one branch, free of contacts.
 
     Of the branches the one that stays farthest from every singularity is taken.
@@ -73,6 +73,6 @@ def configurations(held: Held, points_base: Floats, checker: StateChecker, *, fi
     raise NoAnswerError(why)
 
 
-def way_up(held: Held, points_base: Floats, up_mm: float) -> Floats:
+def path_upward(held: HeldRod, points_base: Floats, up_mm: float) -> Floats:
     """Points (n, 3) farther back along the rod by a distance, mm: where the arm hovers."""
     return np.asarray(points_base - up_mm * held.R_base_flange[:, 2])

@@ -17,11 +17,11 @@ from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.registration.registration import fit_rigid
 from puncture_twin.twin.guidance.stereo.cameras.calibration import CameraCalibration, calibrate
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
-from puncture_twin.twin.guidance.stereo.detection import LocatedPair, Search, Sight, look_at
+from puncture_twin.twin.guidance.stereo.detection import Detector, LocatedPair, Search, look_at
 from puncture_twin.twin.guidance.stereo.poses import configurations, rod_orientation
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
-from puncture_twin.twin.guidance.stereo.servo_law import Held, ball_base
-from puncture_twin.twin.guidance.stereo.servo_loop import Lost, way_contact
+from puncture_twin.twin.guidance.stereo.servo_law import HeldRod, ball_base
+from puncture_twin.twin.guidance.stereo.servo_loop import Lost, path_contact
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, planned_cameras
 
 GRID = (3, 2, 2)
@@ -32,7 +32,7 @@ FIRST_SEARCH_PX = 80.0
 
 
 @dataclass(frozen=True, eq=False)
-class RobotHeld:
+class RobotCalibration:
     """The calibration, k points.
 
     Attributes:
@@ -60,13 +60,13 @@ class RobotHeld:
     branch: int
 
 
-def held_rod(case: ServoCase, room: StereoWorkcell) -> Held:
+def held_rod(case: ServoCase, room: StereoWorkcell) -> HeldRod:
     """The nominal arm with the case's rod, as it is held at the targets."""
     tool = case.file.tool
-    return Held(room.model, tool.rod_mm, rod_orientation(float(np.radians(tool.tilt_deg))))
+    return HeldRod(room.model, tool.rod_mm, rod_orientation(float(np.radians(tool.tilt_deg))))
 
 
-def calibrating_rod(case: ServoCase, room: StereoWorkcell) -> Held:
+def calibrating_rod(case: ServoCase, room: StereoWorkcell) -> HeldRod:
     """The same, as it is held during the calibration."""
     tilt = case.file.calibration.tilt_deg
     held = held_rod(case, room)
@@ -81,13 +81,13 @@ def grid_points(case: ServoCase) -> Floats:
 
 
 def calibrate_by_robot(
-    room: StereoWorkcell, sight: Sight, checker: StateChecker, rng: np.random.Generator
-) -> RobotHeld:
+    room: StereoWorkcell, detector: Detector, checker: StateChecker, rng: np.random.Generator
+) -> RobotCalibration:
     """Drive to the points, look, measure, and fit.
 
     Args:
         room: The true room.
-        sight: Takes the pictures.
+        detector: Takes the pictures.
         checker: Judges contacts; the head is not there yet.
         rng: For the arm's repeatability and the measuring arm.
 
@@ -99,11 +99,11 @@ def calibrate_by_robot(
     points = grid_points(case)
     q_command, branch = configurations(held, points, checker)
     for number, (start, end) in enumerate(pairwise(q_command), start=2):
-        contact = way_contact(checker, np.stack([start, end]))
+        contact = path_contact(checker, np.stack([start, end]))
         if contact is not None:
             raise NoAnswerError(f"calibration: {contact.body} would touch {contact.other} on the way to point {number}")
     sigma, q_true = case.file.calibration.measuring_arm_mm, q_command[0]
-    measured, spots, stood = [], [], []
+    measured, detections, stood = [], [], []
     for number, q in enumerate(q_command, start=1):
         q_true = room.arm.settle(q, q_true, rng)
         stood.append(q_true)
@@ -112,17 +112,17 @@ def calibrate_by_robot(
         )
         measured.append(ball.center_c + rng.normal(0.0, sigma, 3))
         searches = tuple(Search(camera, measured[-1], FIRST_SEARCH_PX) for camera in planned_cameras(case))
-        seen = look_at(sight, ball, searches, case.file.servo.frames)
+        seen = look_at(detector, ball, searches, case.file.servo.frames)
         if isinstance(seen, Lost):
             raise NoAnswerError(f"calibration, point {number}: {seen.reason}")
-        spots.append(seen)
+        detections.append(seen)
     measured_c = np.array(measured)
-    pixels = np.stack([s.pixels for s in spots], axis=1)
-    covariances = np.stack([s.covariances for s in spots], axis=1)
+    pixels = np.stack([s.pixels for s in detections], axis=1)
+    covariances = np.stack([s.covariances for s in detections], axis=1)
     cameras = _cameras(case, measured_c, pixels)
     T_base_c = fit_rigid(measured_c, ball_base(held, q_command))
     residual = np.linalg.norm(measured_c @ T_base_c[:3, :3].T + T_base_c[:3, 3] - ball_base(held, q_command), axis=1)
-    return RobotHeld(
+    return RobotCalibration(
         tuple(found.camera for found in cameras),
         T_base_c,
         q_command,

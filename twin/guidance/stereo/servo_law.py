@@ -67,7 +67,7 @@ class Step(NamedTuple):
     """Whether some piece gave the orientation up."""
 
 
-class Held(NamedTuple):
+class HeldRod(NamedTuple):
     """What the arm carries and how it is to be held."""
 
     model: UrModel
@@ -76,13 +76,13 @@ class Held(NamedTuple):
     """Shape (3, 3): the orientation to keep."""
 
 
-def ball_base(held: Held, q: Floats) -> Floats:
+def ball_base(held: HeldRod, q: Floats) -> Floats:
     """Where the nominal arm has its ball, shape (..., 3), mm, base frame."""
     flange = flange_pose(held.model, q)
     return np.asarray(flange[..., :3, 3] + held.rod_mm * flange[..., :3, 2])
 
 
-def ball_jacobian(held: Held, q: Floats) -> Floats:
+def ball_jacobian(held: HeldRod, q: Floats) -> Floats:
     """The nominal Jacobian at the ball, shape (6, 6): mm and rad per rad, for q of shape (6,)."""
     J = jacobian(held.model, q)
     lever = held.rod_mm * flange_pose(held.model, q)[:3, 2]
@@ -90,7 +90,7 @@ def ball_jacobian(held: Held, q: Floats) -> Floats:
     return J
 
 
-def orientation_error(held: Held, q: Floats) -> Floats:
+def orientation_error(held: HeldRod, q: Floats) -> Floats:
     """The turn (3,), rad, base frame, that brings the flange back to the orientation to keep."""
     R = flange_pose(held.model, q)[:3, :3]
     return np.asarray(Rotation.from_matrix(held.R_base_flange @ R.T).as_rotvec())
@@ -101,7 +101,7 @@ def smallest_sigma(J: Floats) -> float:
     return float(np.linalg.svd(_scaled(J), compute_uv=False)[-1])
 
 
-def servo_step(held: Held, q: Floats, move_base: Floats, limits: StepLimits) -> Step:
+def servo_step(held: HeldRod, q: Floats, move_base: Floats, limits: StepLimits) -> Step:
     """The way that moves the ball by a vector and keeps the needle's orientation.
 
     Args:
@@ -130,7 +130,7 @@ def servo_step(held: Held, q: Floats, move_base: Floats, limits: StepLimits) -> 
     return Step(np.array(path), None, only_position)
 
 
-def _piece(held: Held, q: Floats, move: Floats) -> tuple[Floats, bool]:
+def _piece(held: HeldRod, q: Floats, move: Floats) -> tuple[Floats, bool]:
     """Joint turns (6,) of one piece, and whether the orientation was given up."""
     J = ball_jacobian(held, q)
     goal = np.concatenate([move / CHARACTERISTIC_MM, orientation_error(held, q)])
@@ -151,7 +151,7 @@ def damped(J: Floats, goal: Floats) -> Floats:
     return np.asarray(J.T @ np.linalg.solve(J @ J.T + squared * np.eye(len(J)), goal))
 
 
-def _refusal(held: Held, q: Floats, blind: bool, limits: StepLimits) -> ServoStop | None:
+def _refusal(held: HeldRod, q: Floats, blind: bool, limits: StepLimits) -> ServoStop | None:
     if not held.model.within_limits(q):
         return ServoStop.JOINT_LIMIT
     if blind and np.linalg.norm(orientation_error(held, q)) > limits.drift_rad:

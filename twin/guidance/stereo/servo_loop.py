@@ -16,7 +16,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.state_checker import Contact, StateChecker
 from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, dense_states, first_contact
-from puncture_twin.twin.guidance.stereo.servo_law import Held, ServoStop, StepLimits, servo_step
+from puncture_twin.twin.guidance.stereo.servo_law import HeldRod, ServoStop, StepLimits, servo_step
 
 DIVERGING_RATIO = 1.5
 """A step that leaves this times the error it found makes things worse."""
@@ -66,7 +66,7 @@ class Task:
         checker: Judges contacts, with the head where it is believed to stand.
     """
 
-    held: Held
+    held: HeldRod
     T_base_c: Floats
     tolerance_mm: float
     max_steps: int
@@ -145,14 +145,14 @@ def servo(task: Task, q_command: Floats, q_true: Floats, look: Look, drive: Driv
         blind = blind or step.position_only
         if step.stop is not None:
             return ended(step.stop)
-        contact = way_contact(task.checker, step.q_path)
+        contact = path_contact(task.checker, step.q_path)
         if contact is not None:
             return ended(ServoStop.CONTACT, f"{contact.body} and {contact.other}")
         q_command = step.q_path[-1]
         q_true = drive(q_command)
 
 
-def way_contact(checker: StateChecker, q_path: Floats) -> Contact | None:
+def path_contact(checker: StateChecker, q_path: Floats) -> Contact | None:
     """The first contact on the way through waypoints (m, 6), rad, checked as finely as any motion; None if free."""
     return first_contact(checker, dense_states(checker, q_path, RESOLUTION_RAD / FINER))
 

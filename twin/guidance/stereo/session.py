@@ -13,22 +13,27 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.registration.registration import apply
 from puncture_twin.twin.guidance.stereo.detection import (
+    Detections,
+    Detector,
     LocatedPair,
     Search,
-    Sight,
-    Spots,
     in_space,
     look_at,
-    picture_sight,
+    picture_detector,
 )
 from puncture_twin.twin.guidance.stereo.guide import Guide, JointGuide, Known
 from puncture_twin.twin.guidance.stereo.mapping import Mapping, SeenMarkers, map_head
-from puncture_twin.twin.guidance.stereo.poses import configurations, way_up
-from puncture_twin.twin.guidance.stereo.robot_calibration import RobotHeld, calibrate_by_robot, grid_points, held_rod
+from puncture_twin.twin.guidance.stereo.poses import configurations, path_upward
+from puncture_twin.twin.guidance.stereo.robot_calibration import (
+    RobotCalibration,
+    calibrate_by_robot,
+    grid_points,
+    held_rod,
+)
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import ServoStop, StepLimits
-from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed, Task, servo, way_contact
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_room, room_checker
+from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed, Task, path_contact, servo
+from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_workcell, workcell_checker
 
 POINTED_MM = 3.0
 """How well an operator points at a marker in the pictures, per axis: where the search for it begins."""
@@ -36,7 +41,7 @@ POINTED_MM = 3.0
 TEST_POINTS = 10
 """Points at which the stereo is tried, as in the paper's Table 1."""
 
-Eyes = Callable[[StereoWorkcell, np.random.Generator], Sight]
+DetectorOf = Callable[[StereoWorkcell, np.random.Generator], Detector]
 """Makes a sight of a room."""
 
 
@@ -78,7 +83,7 @@ class Session:
 
     seed: int
     room: StereoWorkcell
-    calibration: RobotHeld
+    calibration: RobotCalibration
     mapping: Mapping
     stereo_mm: Floats
     reached: tuple[Reached, ...]
@@ -100,7 +105,7 @@ def run_session(
     seed: int,
     *,
     targets: tuple[str, ...] | None = None,
-    eyes: Eyes = picture_sight,
+    detector_of: DetectorOf = picture_detector,
     empty: StateChecker | None = None,
 ) -> Session:
     """Everything, in a room drawn from a seed.
@@ -109,7 +114,7 @@ def run_session(
         case: The case.
         seed: Of all that is drawn.
         targets: Only these; all when None.
-        eyes: Who looks; ``pixel_sight`` leaves the pictures out.
+        detector_of: Who looks; ``pixel_detector`` leaves the pictures out.
         empty: Judge of the room without the head, where one is at hand.
 
     Raises:
@@ -117,21 +122,23 @@ def run_session(
         InputError: The case contradicts itself.
     """
     parts = _Parts(*(np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(len(_Parts._fields))))
-    room = draw_room(case, parts.room)
-    sight = eyes(room, parts.pictures)
-    calibration = calibrate_by_robot(room, sight, empty or room_checker(case, None), parts.arm)
-    stereo_mm = _try_stereo(room, calibration, sight, parts.tests)
+    room = draw_workcell(case, parts.room)
+    detector = detector_of(room, parts.pictures)
+    calibration = calibrate_by_robot(room, detector, empty or workcell_checker(case, None), parts.arm)
+    stereo_mm = _try_stereo(room, calibration, detector, parts.tests)
     markers_m = case.markers.points + parts.image.normal(0.0, case.file.head.marker_mm, case.markers.points.shape)
     targets_m = case.targets.points + parts.image.normal(0.0, case.file.head.target_mm, case.targets.points.shape)
-    seen = see_markers(room, calibration, sight, parts.tests)
+    seen = see_markers(room, calibration, detector, parts.tests)
     mapping = _map(case, calibration, seen, markers_m, targets_m)
     joint = case.file.servo.estimate == "joint"
-    guide = (JointGuide if joint else Guide)(Known(room, calibration, mapping, seen, markers_m, sight))
+    guide = (JointGuide if joint else Guide)(Known(room, calibration, mapping, seen, markers_m, detector))
     reached = _reach_all(room, guide, mapping, targets_m, calibration, parts.arm, targets)
     return Session(seed, room, calibration, mapping, stereo_mm, reached, guide)
 
 
-def see_markers(room: StereoWorkcell, calibration: RobotHeld, sight: Sight, rng: np.random.Generator) -> list[Spots]:
+def see_markers(
+    room: StereoWorkcell, calibration: RobotCalibration, detector: Detector, rng: np.random.Generator
+) -> list[Detections]:
     """Every marker in every camera.
 
     Raises:
@@ -141,21 +148,27 @@ def see_markers(room: StereoWorkcell, calibration: RobotHeld, sight: Sight, rng:
     for name, point in zip(room.case.markers.names, room.markers_c, strict=True):
         predicted = point + rng.normal(0.0, POINTED_MM, 3)
         searches = tuple(Search(camera, predicted, servo_plan.search_px) for camera in calibration.cameras)
-        spots = look_at(sight, LocatedPair(point, head.marker_diameter_mm / 2, None), searches, servo_plan.frames)
-        if isinstance(spots, Lost):
-            raise NoAnswerError(f"marker {name}: {spots.reason}")
-        found.append(spots)
+        detections = look_at(
+            detector, LocatedPair(point, head.marker_diameter_mm / 2, None), searches, servo_plan.frames
+        )
+        if isinstance(detections, Lost):
+            raise NoAnswerError(f"marker {name}: {detections.reason}")
+        found.append(detections)
     return found
 
 
-def _map(case: ServoCase, calibration: RobotHeld, seen: list[Spots], markers_m: Floats, targets_m: Floats) -> Mapping:
-    points = [in_space(calibration.cameras, spots) for spots in seen]
+def _map(
+    case: ServoCase, calibration: RobotCalibration, seen: list[Detections], markers_m: Floats, targets_m: Floats
+) -> Mapping:
+    points = [in_space(calibration.cameras, detections) for detections in seen]
     markers = SeenMarkers(np.concatenate([p.points_c for p in points]), np.concatenate([p.covariance for p in points]))
     names = case.markers.names
     return map_head(names, markers, markers_m, case.file.head.marker_mm, targets_m, where=f"{case.path}: mapping")
 
 
-def _try_stereo(room: StereoWorkcell, calibration: RobotHeld, sight: Sight, rng: np.random.Generator) -> Floats:
+def _try_stereo(
+    room: StereoWorkcell, calibration: RobotCalibration, detector: Detector, rng: np.random.Generator
+) -> Floats:
     """Error of the stereo at points anywhere in the calibrated volume, shape (10,), mm."""
     T_c_base = np.asarray(np.linalg.inv(calibration.T_base_c), dtype=np.float64)
     tool = room.case.file.tool
@@ -165,14 +178,14 @@ def _try_stereo(room: StereoWorkcell, calibration: RobotHeld, sight: Sight, rng:
     for point in rng.uniform(grid.min(axis=0), grid.max(axis=0), (TEST_POINTS, 3)):
         ball = LocatedPair(apply(room.T_c_base, point), tool.ball_diameter_mm / 2, rod_c, head_there=False)
         searches = _searches(room.case, calibration, apply(T_c_base, point))
-        spots = look_at(sight, ball, searches, room.case.file.servo.frames)
-        if isinstance(spots, Lost):
-            raise NoAnswerError(f"stereo test: {spots.reason}")
-        errors.append(np.linalg.norm(in_space(calibration.cameras, spots).points_c[0] - ball.center_c))
+        detections = look_at(detector, ball, searches, room.case.file.servo.frames)
+        if isinstance(detections, Lost):
+            raise NoAnswerError(f"stereo test: {detections.reason}")
+        errors.append(np.linalg.norm(in_space(calibration.cameras, detections).points_c[0] - ball.center_c))
     return np.array(errors)
 
 
-def _searches(case: ServoCase, calibration: RobotHeld, predicted_c: Floats) -> tuple[Search, ...]:
+def _searches(case: ServoCase, calibration: RobotCalibration, predicted_c: Floats) -> tuple[Search, ...]:
     return tuple(Search(camera, predicted_c, case.file.servo.search_px) for camera in calibration.cameras)
 
 
@@ -181,16 +194,16 @@ def _reach_all(
     guide: Guide,
     mapping: Mapping,
     targets_m: Floats,
-    calibration: RobotHeld,
+    calibration: RobotCalibration,
     rng: np.random.Generator,
     wanted: tuple[str, ...] | None,
 ) -> tuple[Reached, ...]:
     case, held = room.case, held_rod(room.case, room)
     names = case.targets.names
     chosen = [i for i, name in enumerate(names) if wanted is None or name in wanted]
-    checker = room_checker(case, calibration.T_base_c @ mapping.T_c_m)
+    checker = workcell_checker(case, calibration.T_base_c @ mapping.T_c_m)
     aims_base = apply(calibration.T_base_c, mapping.to_c(targets_m[chosen]))
-    hovers = way_up(held, aims_base, case.file.servo.hover_mm)
+    hovers = path_upward(held, aims_base, case.file.servo.hover_mm)
     q = configurations(held, np.concatenate([aims_base, hovers]), checker, first=calibration.branch).q
     limits = case.file.servo
     steps = StepLimits(
@@ -226,7 +239,7 @@ def _reach(
     rng: np.random.Generator,
 ) -> Reached:
     """From where the arm hovers onto the target by the robot alone, then by the servo."""
-    contact = way_contact(task.checker, np.stack([q_hover, q_aim]))
+    contact = path_contact(task.checker, np.stack([q_hover, q_aim]))
     if contact is None:
         q_true = room.arm.settle(q_aim, q_true, rng)
     before = float(np.linalg.norm(room.ball_c(q_true) - aim.target_c))

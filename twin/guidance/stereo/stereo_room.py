@@ -23,7 +23,7 @@ from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, stereo_pai
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, ToolSection
 from puncture_twin.twin.plant.true_arm import ArmErrors, TrueArm, draw_true_arm
 
-SIGHT_RINGS = ((0.0, 1), (0.55, 6), (0.95, 12))
+LINE_OF_SIGHT_RINGS = ((0.0, 1), (0.55, 6), (0.95, 12))
 """Where on the ball's disc a line of sight ends: share of the radius, and how many around."""
 
 CAMERA_TURN_RAD = 0.004
@@ -82,13 +82,13 @@ class StereoWorkcell:
         """Unit direction from the ball along the rod to the flange, shape (3,), C."""
         return np.asarray(-self.T_c_base[:3, :3] @ self.arm.flange_pose(q_true)[:3, 2])
 
-    def hidden_share(self, camera: Camera, point_c: Floats, radius_mm: float) -> float:
+    def hidden_fraction(self, camera: Camera, point_c: Floats, radius_mm: float) -> float:
         """Share of a ball's disc that the head hides from a camera, 0 to 1, by lines of sight."""
         toward = point_c - camera.center_c
         across = tangent_axes(toward / np.linalg.norm(toward))
-        angles = [(r * radius_mm, 2 * np.pi * k / n) for r, n in SIGHT_RINGS for k in range(n)]
-        spots = np.array([r * (np.cos(a) * across[:, 0] + np.sin(a) * across[:, 1]) for r, a in angles])
-        rays = toward + spots
+        angles = [(r * radius_mm, 2 * np.pi * k / n) for r, n in LINE_OF_SIGHT_RINGS for k in range(n)]
+        detections = np.array([r * (np.cos(a) * across[:, 0] + np.sin(a) * across[:, 1]) for r, a in angles])
+        rays = toward + detections
         lengths = np.linalg.norm(rays, axis=1)
         nearby = self._head_about(camera.center_c, toward / np.linalg.norm(toward), radius_mm)
         if nearby is None:
@@ -114,7 +114,7 @@ class StereoWorkcell:
         return TriangleMesh(self.head_c.vertices, self.head_c.faces[near]) if near.any() else None
 
 
-def draw_room(case: ServoCase, rng: np.random.Generator) -> StereoWorkcell:
+def draw_workcell(case: ServoCase, rng: np.random.Generator) -> StereoWorkcell:
     """A room with its errors drawn from the case's standard deviations.
 
     Raises:
@@ -179,7 +179,7 @@ def rod_tool(tool: ToolSection) -> Tool:
     return Tool(length, length - tool.holder_mm, tool.ball_diameter_mm, tool.holder_diameter_mm)
 
 
-def room_checker(case: ServoCase, T_base_m: Floats | None) -> FastChecker:
+def workcell_checker(case: ServoCase, T_base_m: Floats | None) -> FastChecker:
     """The planner's judge of contacts.
 
     Args:

@@ -12,7 +12,7 @@ from .puncture import (
     punctures as punctures,
 )
 from .selfcal_case import SelfcalCase as SelfcalCase, load_selfcal_case as load_selfcal_case
-from .selfcal_truth import draw_room as draw_room
+from .selfcal_truth import draw_workcell as draw_workcell
 from .simulate import (
     SPEC_NOISE as SPEC_NOISE,
     SimulatedTruth as SimulatedTruth,

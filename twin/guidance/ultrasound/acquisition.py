@@ -19,7 +19,7 @@ from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePose
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, Missed, detect
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage, render
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.selfcal_truth import RoomTruth, jog_into_slice
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth, jog_into_slice
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE
 from puncture_twin.twin.guidance.ultrasound.two_arms import BetweenArms, TwoArms
 
@@ -69,7 +69,7 @@ class Acquisition:
 class _Motion:
     """Both true arms, which remember where their play left them; and whether they touch."""
 
-    def __init__(self, case: SelfcalCase, truth: RoomTruth, rng: np.random.Generator) -> None:
+    def __init__(self, case: SelfcalCase, truth: WorkcellTruth, rng: np.random.Generator) -> None:
         self._truth, self._rng = truth, rng
         self.between = BetweenArms(case, truth.X, truth.Y, 0.0)
         self._before: list[Floats | None] = [None, None]
@@ -87,7 +87,7 @@ def acquire(
     case: SelfcalCase,
     room: TwoArms,
     candidates: CandidatePoses,
-    truth: RoomTruth,
+    truth: WorkcellTruth,
     rng: np.random.Generator,
     count: Callable[[int, int], None] = lambda done, total: None,
 ) -> Acquisition:
@@ -153,7 +153,7 @@ def _shot(
     case: SelfcalCase,
     room: TwoArms,
     candidates: CandidatePoses,
-    truth: RoomTruth,
+    truth: WorkcellTruth,
     motion: _Motion,
     row: int,
     rng: np.random.Generator,

@@ -27,7 +27,7 @@ EDGE_MM = 6.0
 
 LEAST_DEPTH_MM = 12.0
 
-PHANTOM_SHARE = 0.3
+PHANTOM_FRACTION = 0.3
 """The face's middle is drawn within this share of the phantom's width from its middle."""
 
 TIP_OUTSIDE = "tip_outside_phantom"
@@ -81,7 +81,7 @@ def draw_geometry(case: SelfcalCase, n: int, rng: np.random.Generator) -> ImageG
     down = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # u along x, v down, z = u x v
     T = np.tile(np.eye(4), (n, 1, 1))
     T[:, :3, :3] = turn.as_matrix() @ down
-    half = PHANTOM_SHARE * np.array(phantom.size_mm[:2])
+    half = PHANTOM_FRACTION * np.array(phantom.size_mm[:2])
     face = np.column_stack([rng.uniform(-half, half, (n, 2)) + phantom.top_mm[:2], np.zeros(n)])
     width, depth = case.content.image.imager().size_mm
     T[:, :3, 3] = face - 0.5 * width * T[:, :3, 0]

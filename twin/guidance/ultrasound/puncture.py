@@ -13,7 +13,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibrati
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, needle_flange
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import Lesion, NeedleInImage, render
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.selfcal_truth import RoomTruth, nearest_configuration
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth, nearest_configuration
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 
 LESION_MM = 4.0
@@ -66,7 +66,7 @@ def punctures(
     room: TwoArms,
     candidates: CandidatePoses,
     rows: NDArray[np.int_],
-    truth: RoomTruth,
+    truth: WorkcellTruth,
     calibration: Calibration,
     rng: np.random.Generator,
 ) -> tuple[Puncture, ...]:
@@ -90,7 +90,7 @@ def _puncture(
     room: TwoArms,
     candidates: CandidatePoses,
     row: int,
-    truth: RoomTruth,
+    truth: WorkcellTruth,
     calibration: Calibration,
     rng: np.random.Generator,
 ) -> Puncture | None:
@@ -107,7 +107,9 @@ def _puncture(
     return Puncture(row, target, clicked, ended, predicted, case.content.truth.click_mm)
 
 
-def aim(candidates: CandidatePoses, row: int, target_mm: Floats, calibration: Calibration, truth: RoomTruth) -> Floats:
+def aim(
+    candidates: CandidatePoses, row: int, target_mm: Floats, calibration: Calibration, truth: WorkcellTruth
+) -> Floats:
     """What the needle's arm is told: by its nominal kinematics and the calibration; (6,), rad, NaN if out of reach.
 
     Args:
@@ -130,7 +132,7 @@ def aim(candidates: CandidatePoses, row: int, target_mm: Floats, calibration: Ca
 def held_out_errors_mm(
     candidates: CandidatePoses,
     rows: NDArray[np.int_],
-    truth: RoomTruth,
+    truth: WorkcellTruth,
     calibration: Calibration,
     rng: np.random.Generator,
 ) -> Floats:

@@ -19,7 +19,7 @@ JOG_STEPS = 4
 """Of the operator's correction: each leaves about the arms' relative error, 1e-3, of what was left before."""
 
 
-class RoomTruth(NamedTuple):
+class WorkcellTruth(NamedTuple):
     """What nobody knows."""
 
     probe_arm: TrueArm
@@ -44,7 +44,7 @@ class RoomTruth(NamedTuple):
         return NeedleInImage(T[:3, :3] @ self.tip_end2 + T[:3, 3], direction / np.linalg.norm(direction))
 
 
-def draw_room(case: SelfcalCase, rng: np.random.Generator) -> RoomTruth:
+def draw_workcell(case: SelfcalCase, rng: np.random.Generator) -> WorkcellTruth:
     """A room whose differences from the drawing are drawn from the case's standard deviations."""
     content, off = case.content, case.content.truth
     arms = [
@@ -55,7 +55,7 @@ def draw_room(case: SelfcalCase, rng: np.random.Generator) -> RoomTruth:
     V = np.array([0.0, 0.0, 1.0])
     tip = case.tip_end2 + [*rng.normal(0.0, off.tip_mm, 2), rng.normal(0.0, off.length_mm)]
     bent = V + tangent_basis(V) @ rng.normal(0.0, np.radians(off.needle_deg), 2)
-    return RoomTruth(arms[0], arms[1], X, Y, tip, bent / np.linalg.norm(bent))
+    return WorkcellTruth(arms[0], arms[1], X, Y, tip, bent / np.linalg.norm(bent))
 
 
 def _shifted(T: Floats, mm: float, rad: float, rng: np.random.Generator) -> Floats:
@@ -65,7 +65,9 @@ def _shifted(T: Floats, mm: float, rad: float, rng: np.random.Generator) -> Floa
     return moved
 
 
-def jog_into_slice(truth: RoomTruth, q_probe: Floats, q_needle: Floats, wanted: NeedleInImage, roll: float) -> Floats:
+def jog_into_slice(
+    truth: WorkcellTruth, q_probe: Floats, q_needle: Floats, wanted: NeedleInImage, roll: float
+) -> Floats:
     """Move the needle's arm until the *true* needle stands in the *true* image as wanted.
 
     It stands for the operator, or a servo on the picture, that jogs until the needle shows: what is left is in

@@ -10,7 +10,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture
-from puncture_twin.twin.guidance.ultrasound.selfcal_truth import RoomTruth
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class SelfcalTrial:
     """
 
     seed: int
-    truth: RoomTruth
+    truth: WorkcellTruth
     acquisition: Acquisition
     calibration: Calibration
     held_out_mm: Floats

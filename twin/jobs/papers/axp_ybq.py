@@ -56,7 +56,7 @@ OVER_BOUND: Mapping[str, float] = MappingProxyType({"Gauss-Newton": 1.2, "weight
 MOST_STEPS = 10
 """Steps of the refinement from 20 poses on."""
 
-OUTLIER_SHARE, OUTLIER_MM = 0.1, 5.0
+OUTLIER_FRACTION, OUTLIER_MM = 0.1, 5.0
 SCALE_LIMIT_MM = 0.25
 """With the pixel size estimated; the known number is 0.239."""
 
@@ -179,7 +179,7 @@ def _outliers(runs: int) -> list[AxpYbqRow]:
     def one(rng: np.random.Generator) -> list[float]:
         recording, truth = simulate_recording(rng, 30)
         held, _ = simulate_recording(rng, HELD_OUT, truth, noise=None)
-        broken = with_outliers(rng, recording, OUTLIER_SHARE, OUTLIER_MM)
+        broken = with_outliers(rng, recording, OUTLIER_FRACTION, OUTLIER_MM)
         active = active_columns(tip=True, scale=False, direction=False)
         plain = plain_fit(Problem(broken, UNWEIGHTED, active), closed_form(broken))
         unweighted, weighted = (calibrate(broken, noise=noise, direction=False) for noise in (None, SPEC_NOISE))

@@ -60,7 +60,7 @@ def place_case(context: CaseContext, out: Path, *, jobs: int, pictures: bool = T
     except NoAnswerError:
         withdraw(out, "place")
         raise
-    if not any(one.verdict.held for one in run.found.judged):
+    if not any(one.verdict.held for one in run.found.rated):
         raise NoAnswerError(f"no placement holds any of the {run.directions} organ-safe directions")
     return replace(run, files=draft.final(run.files))
 
@@ -87,8 +87,8 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool) -> Place
         with stages.time("pictures"):
             draw_placements(found, case, context.anatomy.skin.mesh, out / "placements.png")
             files.append(out / "placements.png")
-    if pictures and any(one.verdict.held for one in found.judged):
-        T_base_ct = mount_pose(found.judged[0].mount, case.space, case.path)
+    if pictures and any(one.verdict.held for one in found.rated):
+        T_base_ct = mount_pose(found.rated[0].mount, case.space, case.path)
         with stages.time("map"):
             reach = ArmReach(case_checker(case, context.anatomy, T_base_ct), np.asarray(T_base_ct))
             held = ranked(case, with_reach(case, candidates, reach))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from puncture_twin.planning.place.search import Judged
+from puncture_twin.planning.place.search import RatedPlacement
 from puncture_twin.twin.jobs.patient.place_job import PlaceRun
 from puncture_twin.twin.report.mount_text import direction_words, mount_words
 
@@ -13,16 +13,16 @@ HALF_A_DIGIT = 5e-4
 def place_text(run: PlaceRun) -> str:
     """The ranked placements, the case's own, the lines to paste, and the files."""
     case, found = run.context.case, run.found
-    asked = found.judged[0].verdict.asked if found.judged else 0
+    asked = found.rated[0].verdict.asked if found.rated else 0
     x, y, z = (direction_words(found.T_ct_bed[:3, axis], str(case.space)) for axis in range(3))
     lines = [
         f"case {case.name}: {asked} organ-safe directions; {len(found.coarse)} + {found.refined} placements estimated,"
-        f" {len(found.judged)} judged",
+        f" {len(found.rated)} judged",
         f"  from the target, mm: along = toward {x}, across = toward {y}, height = toward {z}",
         *needle_line(found.possible),
         "rank  share %   held  margin  along  across  height  mount",
     ]
-    lines += [_line(f"{rank:4d}", one, run) for rank, one in enumerate(found.judged, start=1)]
+    lines += [_line(f"{rank:4d}", one, run) for rank, one in enumerate(found.rated, start=1)]
     if found.own is not None:
         lines.append(_line("   -", found.own, run))
     best = run.document["mount_lines"]
@@ -42,7 +42,7 @@ def needle_line(possible: float) -> list[str]:
     return [f"  {share}: elsewhere the needle itself would start too near the skin"]
 
 
-def _line(rank: str, one: Judged, run: PlaceRun) -> str:
+def _line(rank: str, one: RatedPlacement, run: PlaceRun) -> str:
     verdict, space = one.verdict, str(run.context.case.space)
     where = "     -       -       -" if one.site is None else "{:6.0f}  {:6.0f}  {:6.0f}".format(*one.site.position)
     name = one.name if one.site is None else mount_words(one.site.region, run.found.T_ct_bed, space)

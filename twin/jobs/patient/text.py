@@ -32,7 +32,7 @@ def _search(run: Run) -> list[str]:
     counts = ((found.safe_text if reason == "safe" else reason, count) for reason, count in found.counts().items())
     lines += [f"  {count:7d}  {reason}" for reason, count in counts]
     lines += needle_warnings(run.context.case, found)
-    lines += [] if found.arm_checked else [f"arm {found.arm}"]
+    lines += [] if found.arm_checked else [f"arm {found.arm_note}"]
     return lines + (_best(run) if found.safe.any() else _nothing_safe(run))
 
 

@@ -11,7 +11,7 @@ from puncture_twin.planning.search.context import Watcher
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import FILE_NAME
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
 from puncture_twin.twin.jobs.selfcal.page import write_page
-from puncture_twin.twin.jobs.selfcal.pictures import detection_sheet, room_picture
+from puncture_twin.twin.jobs.selfcal.pictures import detection_sheet, workcell_picture
 from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun, selfcal_recording, selfcal_twin, write_run
 
 COMMAND = "selfcal"
@@ -63,5 +63,5 @@ def _simulated(case: SelfcalCase, seeds: int, draft: Draft, watcher: Watcher) ->
         trial = run.trials[0]
         sheet = detection_sheet(case, trial, draft.folder / "bmode.png")
         shot = trial.acquisition.shots[0]
-        room = room_picture(case, shot.q_probe, shot.q_needle, draft.folder / "room.png")
+        room = workcell_picture(case, shot.q_probe, shot.q_needle, draft.folder / "room.png")
     return run.with_files(sheet, room, write_page(run, sheet, room, draft.folder / "report.html"))

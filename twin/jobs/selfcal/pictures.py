@@ -28,7 +28,7 @@ from puncture_twin.twin.report.annotate import width_of, write
 from puncture_twin.twin.report.palette import Rgb
 from puncture_twin.twin.report.raster.camera import camera_around
 from puncture_twin.twin.report.raster.compositing import compose
-from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, veils_of
+from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, translucents_of
 from puncture_twin.twin.report.scene.shapes import bar, box
 
 PX_PER_MM = 8
@@ -46,8 +46,8 @@ TARGET_MM = 2.0
 DETECTED: Rgb = (86, 220, 255)
 TRUE: Rgb = (255, 214, 64)
 TARGET: Rgb = (255, 96, 96)
-ROOM_SIZE = (1180, 720)
-VEIL = 0.45
+WORKCELL_SIZE = (1180, 720)
+OPACITY = 0.45
 """Opacity of the phantom, so that the needle shows in it."""
 
 
@@ -179,17 +179,17 @@ def _draw_legend(draw: ImageDraw.ImageDraw, top: int) -> None:
         x += 60 + width_of(words, 15)
 
 
-def room_picture(case: SelfcalCase, q_probe: Floats, q_needle: Floats, path: Path) -> Path:
+def workcell_picture(case: SelfcalCase, q_probe: Floats, q_needle: Floats, path: Path) -> Path:
     """Both arms at one pose, by the drawing."""
-    opaque, veiled = room_surfaces(case, q_probe, q_needle)
+    opaque, veiled = workcell_surfaces(case, q_probe, q_needle)
     points = np.concatenate([s.mesh.vertices for s in opaque[1:]])
     toward, up = np.array([0.25, 1.0, -0.45]), np.array([0.0, 0.0, 1.0])
-    camera = camera_around(points, toward, up, fov=0.5, width=ROOM_SIZE[0], height=ROOM_SIZE[1])
+    camera = camera_around(points, toward, up, fov=0.5, width=WORKCELL_SIZE[0], height=WORKCELL_SIZE[1])
     fine = camera.finer(2)
-    pixels = compose(opaque_shot(Layer(opaque), fine), veils_of(Layer(veiled), fine))
+    pixels = compose(opaque_shot(Layer(opaque), fine), translucents_of(Layer(veiled), fine))
     picture = Image.fromarray(np.ascontiguousarray(pixels))
-    if picture.size != ROOM_SIZE:
-        picture = picture.resize(ROOM_SIZE, Image.Resampling.LANCZOS)
+    if picture.size != WORKCELL_SIZE:
+        picture = picture.resize(WORKCELL_SIZE, Image.Resampling.LANCZOS)
     draw = ImageDraw.Draw(picture)
     anchors = {
         f"probe arm ({case.content.probe_arm.model})": np.array([0.0, 0.0, 0.0]),
@@ -204,7 +204,7 @@ def room_picture(case: SelfcalCase, q_probe: Floats, q_needle: Floats, path: Pat
     return path
 
 
-def room_surfaces(case: SelfcalCase, q_probe: Floats, q_needle: Floats) -> tuple[list[Surface], list[Surface]]:
+def workcell_surfaces(case: SelfcalCase, q_probe: Floats, q_needle: Floats) -> tuple[list[Surface], list[Surface]]:
     """Table, arms, probe and needle; and, see-through, the phantom and the slice. base1, mm."""
     table = table_box(case.content.phantom)
     models = (ur_model(case.content.probe_arm.model), ur_model(case.content.needle_arm.model))
@@ -222,7 +222,7 @@ def room_surfaces(case: SelfcalCase, q_probe: Floats, q_needle: Floats) -> tuple
     T_slice[:3, 3] = [width / 2.0, depth / 2.0, 0.0]
     slab = box(T1[6] @ case.T_end1_image @ T_slice, (width, depth, 0.6))
     return opaque, [
-        Surface(phantom_mesh(case.content.phantom), palette.SKIN, VEIL),
+        Surface(phantom_mesh(case.content.phantom), palette.SKIN, OPACITY),
         Surface(slab, (86, 180, 233), 0.55, 0.0),
     ]
 

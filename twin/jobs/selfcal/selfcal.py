@@ -32,7 +32,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.slips import checked_calibra
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, drawing, find_candidates
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, held_out_errors_mm, punctures
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_room
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
 from puncture_twin.twin.guidance.ultrasound.summaries import (
     calibration_summary,
     choice_summary,
@@ -171,7 +171,7 @@ def _trial(
     case: SelfcalCase, room: TwoArms, candidates: CandidatePoses, seed: int, stages: Stages, watcher: Watcher
 ) -> SelfcalTrial:
     rng = np.random.default_rng(seed)
-    truth = draw_room(case, rng)
+    truth = draw_workcell(case, rng)
     with stages.time("recording"):
         taken = acquire(
             case, room, candidates, truth, rng, lambda done, total: watcher.count(f"seed {seed}: pictures", done, total)

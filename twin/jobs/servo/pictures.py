@@ -23,7 +23,7 @@ from puncture_twin.twin.report.annotate import INK, write
 from puncture_twin.twin.report.palette import Rgb
 from puncture_twin.twin.world.bodies import load_ball
 from puncture_twin.twin.world.cameras import pinhole_picture
-from puncture_twin.twin.world.workcell import open_room
+from puncture_twin.twin.world.workcell import open_workcell
 
 BALL, TARGET, MARKER = (214, 96, 0), (0, 120, 60), (30, 80, 200)
 """Colours of what is drawn over the picture."""
@@ -43,7 +43,7 @@ def draw_cameras(session: Session, path_of: Path) -> list[Path]:
     reached = next((one for one in session.reached if one.servoed.visits), session.reached[0])
     paths = []
     for number, camera in enumerate(session.room.cameras):
-        picture = Image.fromarray(_room_picture(session, reached, camera))
+        picture = Image.fromarray(_workcell_picture(session, reached, camera))
         scale = WIDTH_PX / camera.width
         picture = picture.resize((WIDTH_PX, round(camera.height * scale)), Image.Resampling.LANCZOS)
         _annotate(picture, session, reached, number, scale)
@@ -54,14 +54,14 @@ def draw_cameras(session: Session, path_of: Path) -> list[Path]:
     return paths
 
 
-def _room_picture(session: Session, reached: Reached, camera: Camera) -> NDArray[np.uint8]:
+def _workcell_picture(session: Session, reached: Reached, camera: Camera) -> NDArray[np.uint8]:
     """The true room by PyBullet, through the camera without its lens's distortion."""
     room, file = session.room, session.room.case.file
     T_base_c = np.linalg.inv(room.T_c_base)
     tool = Tool(file.tool.rod_mm, file.tool.rod_mm - file.tool.holder_mm, file.tool.rod_diameter_mm,
                 file.tool.holder_diameter_mm)  # fmt: skip
     boxes = [Box(box.name, _at(box.center_mm), box.size_mm) for box in file.box]
-    with open_room(room.model, tool, room.case.skin, T_base_c @ room.T_c_m, boxes, down_ct=DOWN) as opened:
+    with open_workcell(room.model, tool, room.case.skin, T_base_c @ room.T_c_m, boxes, down_ct=DOWN) as opened:
         opened.arm.place(reached.servoed.q_true)
         flange = opened.arm.flange_pose()
         load_ball(opened.client, flange[:3, 3] + file.tool.rod_mm * flange[:3, 2], file.tool.ball_diameter_mm / 2,

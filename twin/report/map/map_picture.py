@@ -42,7 +42,7 @@ SIDE_BOX = (0.685, 0.05, 0.305, 0.85)
 RIM = 1.26
 """Half the side of the map's axes; the disc has radius 1, labels lie between."""
 
-NAMED_SHARE = 0.006
+NAMED_FRACTION = 0.006
 """Least share of the disc that a rejected region needs to carry its structure's name."""
 
 NAMED_REASONS = (Reason.TOO_CLOSE, Reason.UNKNOWN_REGION)
@@ -148,7 +148,7 @@ def _regions(codes: NDArray[np.int64], names: list[str]) -> list[tuple[NDArray[n
     for code, name in enumerate(names):
         labels, _ = ndimage.label((codes == code) if name else np.zeros(codes.shape, dtype=bool))
         areas = ndimage.sum_labels(np.ones_like(labels), labels, np.arange(1, labels.max() + 1))
-        for part in np.flatnonzero(areas > NAMED_SHARE * codes.size * np.pi / 4) + 1:
+        for part in np.flatnonzero(areas > NAMED_FRACTION * codes.size * np.pi / 4) + 1:
             depth = ndimage.distance_transform_edt(np.pad(labels == part, 1))[1:-1, 1:-1]
             found.append((float(areas[part - 1]), depth, name))
     return [(depth, name) for _, depth, name in sorted(found, key=lambda region: -region[0])]

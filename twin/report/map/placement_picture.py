@@ -25,7 +25,7 @@ from puncture_twin.planning.case.case import mount_pose
 from puncture_twin.planning.collision.workcell import case_boxes
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.mounts import Region
-from puncture_twin.planning.place.search import Judged, PlaceSearch
+from puncture_twin.planning.place.search import PlaceSearch, RatedPlacement
 from puncture_twin.twin.report.mount_text import direction_words, mount_words
 from puncture_twin.twin.report.numbers import needle_words, target_words
 
@@ -67,7 +67,7 @@ def draw_placements(found: PlaceSearch, case: Any, skin: TriangleMesh, path: Pat
     figure = Figure(figsize=(columns * PANEL_INCHES, rows * PANEL_INCHES + 1.0), dpi=DPI, facecolor="white")
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     top = max((e.share for _, e in found.coarse), default=0.0)
-    scale = Normalize(0.0, max(top, max((one.verdict.share for one in found.judged), default=0.0), 0.01))
+    scale = Normalize(0.0, max(top, max((one.verdict.share for one in found.rated), default=0.0), 0.01))
     extent = _extent(found, float(case.place.step_mm))
     for axes, regions in zip(grid, panels, strict=False):
         _panel(axes, regions, found, case, scale)
@@ -138,7 +138,7 @@ def _directions(axes: Axes, found: PlaceSearch, space: str) -> None:
 
 
 def _marks(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any) -> None:
-    for rank, one in enumerate(found.judged, start=1):
+    for rank, one in enumerate(found.rated, start=1):
         if one.site is not None and one.site.region in regions:
             along, across, height = one.site.position
             _mark(axes, across, along, "*" if rank == 1 else "o", f"{rank}: {_worth(one)}, h {height:+.0f}")
@@ -149,7 +149,7 @@ def _marks(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any)
         _mark(axes, float(T[1, 3]), float(T[0, 3]), "D", f"now: {_worth(found.own)}, h {T[2, 3]:+.0f}")
 
 
-def _worth(one: Judged) -> str:
+def _worth(one: RatedPlacement) -> str:
     return f"{100 * one.verdict.share:.0f} %"
 
 

@@ -52,7 +52,7 @@ def map_data(case: Any, candidates: Candidates) -> dict[str, Any]:
         "structures": structures,
         "reasons": [REASON_WORDS[reason_of(r)] for r in reasons],
         "safe": candidates.safe_text,
-        "arm": candidates.arm,
+        "arm": candidates.arm_note,
         "codes": [r or "safe" for r in reasons],
         "details": [DETAIL_UNITS.get(reason_of(r), ("", "")) for r in reasons],
         "theta": _rounded(np.degrees(candidates.theta), 3),

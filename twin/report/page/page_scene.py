@@ -37,7 +37,7 @@ LEAST_TRIANGLES = 300
 """A body is never cut below this."""
 
 LABEL_OUT_MM = 45.0
-LEGEND_SHARE = 0.14
+LEGEND_FRACTION = 0.14
 """Of the width; the legend stands left of the scene."""
 
 EYE_DISTANCE = 1.55
@@ -166,7 +166,7 @@ def _layout(case: Any, bodies: Sequence[SceneBody]) -> dict[str, Any]:
     camera = {k: dict(zip("xyz", (float(x) for x in v), strict=True)) for k, v in vectors.items()}
     return {
         "scene": {
-            "domain": {"x": [LEGEND_SHARE, 1.0]},
+            "domain": {"x": [LEGEND_FRACTION, 1.0]},
             "aspectmode": "data",
             "xaxis": axis,
             "yaxis": axis,

@@ -4,7 +4,7 @@ from .compositing import (
     SAMPLES as SAMPLES,
     PixelBox as PixelBox,
     RasterShot as RasterShot,
-    Veil as Veil,
+    TranslucentLayer as TranslucentLayer,
     compose as compose,
 )
 from .render import (
@@ -14,5 +14,5 @@ from .render import (
     opaque_shot as opaque_shot,
     picture as picture,
     put_moving as put_moving,
-    veils_of as veils_of,
+    translucents_of as translucents_of,
 )

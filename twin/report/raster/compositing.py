@@ -1,4 +1,4 @@
-"""Pictures as sample grids with depth, and how opaque things and veils come together in pixels."""
+"""Pictures as sample grids with depth, and how opaque and translucent things come together in pixels."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class RasterShot:
 
 
 @dataclass(frozen=True, eq=False)
-class Veil:
+class TranslucentLayer:
     """One see-through layer: colour, opacity and depth per sample."""
 
     colour: Floats32
@@ -39,9 +39,9 @@ class Veil:
     depth: Floats32
 
 
-def empty_veil(size: tuple[int, int]) -> Veil:
-    """A veil with nothing in it, of a height and width in samples."""
-    return Veil(
+def empty_translucent(size: tuple[int, int]) -> TranslucentLayer:
+    """A translucent layer with nothing in it, of a height and width in samples."""
+    return TranslucentLayer(
         np.zeros((*size, 3), dtype=np.float32),
         np.zeros(size, dtype=np.float32),
         np.full(size, np.inf, dtype=np.float32),
@@ -76,32 +76,34 @@ class PixelBox(NamedTuple):
 NOWHERE = PixelBox(0, 0, 0, 0)
 
 
-def compose(shot: RasterShot, veils: Sequence[Veil], box: PixelBox | None = None) -> NDArray[np.uint8]:
-    """Blend the veils over the opaque shot and average the samples to pixels, shape (h, w, 3).
+def compose(
+    shot: RasterShot, translucents: Sequence[TranslucentLayer], box: PixelBox | None = None
+) -> NDArray[np.uint8]:
+    """Blend the translucent layers over the opaque shot and average the samples to pixels, shape (h, w, 3).
 
     The "over" operator of Porter and Duff, Compositing Digital Images (SIGGRAPH 1984), from back to front.
 
     Args:
         shot: The opaque part, in the sample grid.
-        veils: The shells of ``veils_of``, nearest first; each is drawn where it lies before the opaque part.
+        translucents: The shells of ``translucents_of``, nearest first; drawn where they lie before the opaque part.
         box: The part to make, in samples, whole pixels; all of it when None.
     """
     height, width = shot.depth.shape
     part = (box or PixelBox(0, 0, width, height)).slices
     colour = shot.colour[part].copy()
-    for veil in reversed(veils):
-        _blend(colour, shot.depth[part], veil.colour[part], veil.alpha[part], veil.depth[part])
+    for translucent in reversed(translucents):
+        _blend(colour, shot.depth[part], translucent.colour[part], translucent.alpha[part], translucent.depth[part])
     return np.asarray(_pixels(colour, SAMPLES))
 
 
 @nb.njit(cache=True, nogil=True)
-def _blend(colour, depth, veil_colour, veil_alpha, veil_depth):  # type: ignore[no-untyped-def]  # numba infers
-    """One veil over what lies behind it, sample by sample, in place."""
+def _blend(colour, depth, translucent_colour, translucent_alpha, translucent_depth):  # type: ignore[no-untyped-def]  # numba infers
+    """One translucent layer over what lies behind it, sample by sample, in place."""
     for i in range(depth.shape[0]):
         for j in range(depth.shape[1]):
-            if veil_depth[i, j] < depth[i, j]:
+            if translucent_depth[i, j] < depth[i, j]:
                 for k in range(3):
-                    colour[i, j, k] += veil_alpha[i, j] * (veil_colour[i, j, k] - colour[i, j, k])
+                    colour[i, j, k] += translucent_alpha[i, j] * (translucent_colour[i, j, k] - colour[i, j, k])
 
 
 @nb.njit(cache=True, nogil=True)

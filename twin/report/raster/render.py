@@ -1,6 +1,6 @@
 """Pictures without a screen: triangles drawn into a sample grid with depth, and shaded, by compiled code.
 
-Opaque surfaces give one hit per sample; veils (skin, corridor) are surfaces that one sees through, with up to
+Opaque surfaces give one hit per sample; translucent surfaces (skin, corridor) are seen through, with up to
 ``MAX_SHELLS`` hits.
 """
 
@@ -25,9 +25,9 @@ from puncture_twin.twin.report.raster.compositing import (
     SAMPLES,
     PixelBox,
     RasterShot,
-    Veil,
+    TranslucentLayer,
     compose,
-    empty_veil,
+    empty_translucent,
 )
 from puncture_twin.twin.report.raster.line_of_sight import blocked
 from puncture_twin.twin.report.raster.raster import depth_before, draw, outlines, sorted_by_band
@@ -37,14 +37,14 @@ Floats32 = NDArray[np.float32]
 T = TypeVar("T")
 
 MAX_SHELLS = 4
-"""Layers of a veil that are drawn: skin in, skin out, twice."""
+"""Layers of a translucent surface that are drawn: skin in, skin out, twice."""
 
-SIGHT_SLACK_MM = 2.0
+LINE_OF_SIGHT_SLACK_MM = 2.0
 """A point this close behind a surface still counts as seen: points on the needle lie inside its bar."""
 
 BACKGROUND = np.array([246.0, 247.0, 249.0], dtype=np.float32)
 
-LAMP = np.array([-0.45, 0.6, -1.0]) / np.linalg.norm([-0.45, 0.6, -1.0])
+LIGHT = np.array([-0.45, 0.6, -1.0]) / np.linalg.norm([-0.45, 0.6, -1.0])
 """Over the viewer's left shoulder: right, up, forward."""
 
 BAND = 120_000
@@ -58,8 +58,8 @@ class Surface:
     Attributes:
         mesh: In the frame of the layer it belongs to, mm.
         colour: RGB, 0..255.
-        alpha: Opacity where one looks straight at it; only veils use it.
-        rim: How much more opaque a veil is where one sees it edge-on.
+        alpha: Opacity where one looks straight at it; only translucent surfaces use it.
+        rim: How much more opaque it is where one sees it edge-on.
     """
 
     mesh: TriangleMesh
@@ -92,7 +92,9 @@ class Layer:
 
     def sees(self, eye: Floats, points: Floats) -> NDArray[np.bool_]:
         """Whether nothing of this layer lies between an eye and each point (n, 3), in the layer's frame."""
-        return np.asarray(~blocked(self.vertices, self.faces, np.asarray(eye), np.asarray(points), SIGHT_SLACK_MM))
+        return np.asarray(
+            ~blocked(self.vertices, self.faces, np.asarray(eye), np.asarray(points), LINE_OF_SIGHT_SLACK_MM)
+        )
 
 
 class _View:
@@ -130,10 +132,10 @@ class _View:
             spans: The triangles that it needs.
         """
         inverse, triangle = self._drawn(1, shot.depth, corner, spans)
-        place = tuple(LAMP), self._grid, corner, inverse[0], triangle[0]
+        place = tuple(LIGHT), self._grid, corner, inverse[0], triangle[0]
         shade_nearest(*self._mesh, *self._look, *place, shot.colour, shot.depth)
 
-    def shells(self, before: Floats32, corner: tuple[int, int], spans: Ints32) -> tuple[Veil, ...]:
+    def shells(self, before: Floats32, corner: tuple[int, int], spans: Ints32) -> tuple[TranslucentLayer, ...]:
         """What is see-through, as far as nothing opaque hides it, nearest first.
 
         Args:
@@ -142,12 +144,12 @@ class _View:
             spans: The triangles that it needs.
         """
         inverse, triangle = self._drawn(MAX_SHELLS, before, corner, spans)
-        veils = tuple(empty_veil(before.shape) for _ in range(MAX_SHELLS))
-        look: Any = (*self._look, self._layer.alphas, self._layer.rims, tuple(LAMP), self._grid, corner)
-        for veil, *drawn in zip(veils, inverse, triangle, strict=True):
-            samples: Any = (*drawn, veil.colour, veil.alpha, veil.depth)
+        translucents = tuple(empty_translucent(before.shape) for _ in range(MAX_SHELLS))
+        look: Any = (*self._look, self._layer.alphas, self._layer.rims, tuple(LIGHT), self._grid, corner)
+        for translucent, *drawn in zip(translucents, inverse, triangle, strict=True):
+            samples: Any = (*drawn, translucent.colour, translucent.alpha, translucent.depth)
             shade_shells(*self._mesh, *look, *samples)
-        return veils
+        return translucents
 
     def _drawn(self, most: int, before: Floats32, corner: tuple[int, int], spans: Ints32) -> tuple[Floats32, Ints32]:
         """1/z and triangle of the nearest surfaces, shape (most, h, w), before what is opaque already."""
@@ -169,7 +171,7 @@ def opaque_shot(layer: Layer, camera: ViewCamera) -> RasterShot:
     return shot
 
 
-def veils_of(layer: Layer, camera: ViewCamera, behind: RasterShot | None = None) -> tuple[Veil, ...]:
+def translucents_of(layer: Layer, camera: ViewCamera, behind: RasterShot | None = None) -> tuple[TranslucentLayer, ...]:
     """The shells of a see-through layer: the nearest hit of every sample first, then the one behind it, and so on.
 
     Args:
@@ -181,23 +183,25 @@ def veils_of(layer: Layer, camera: ViewCamera, behind: RasterShot | None = None)
     depth = np.full(size, np.inf, dtype=np.float32) if behind is None else behind.depth
     view = _View(layer, camera)
     parts = _in_bands(camera, lambda band, rows: view.shells(depth[rows], (rows.start, 0), view.of_band(band)))
-    veils = (
-        Veil(*(np.concatenate([getattr(part[k], name) for part in parts]) for name in ("colour", "alpha", "depth")))
+    translucents = (
+        TranslucentLayer(
+            *(np.concatenate([getattr(part[k], name) for part in parts]) for name in ("colour", "alpha", "depth"))
+        )
         for k in range(MAX_SHELLS)
     )
-    return tuple(veil for veil in veils if np.isfinite(veil.depth).any())
+    return tuple(translucent for translucent in translucents if np.isfinite(translucent.depth).any())
 
 
-def picture(opaque: Layer, veils: Layer, camera: ViewCamera) -> NDArray[np.uint8]:
+def picture(opaque: Layer, translucents: Layer, camera: ViewCamera) -> NDArray[np.uint8]:
     """A scene in the CT frame in pixels, shape (h, w, 3): what is opaque, and what is see-through over it.
 
     Args:
         opaque: The opaque surfaces.
-        veils: The see-through ones.
+        translucents: The see-through ones.
         camera: Its pixels are the picture's; each is the mean of ``SAMPLES`` by ``SAMPLES``.
     """
     fine = camera.finer(SAMPLES)
-    solid, glass = _View(opaque, fine), _View(veils, fine)
+    solid, glass = _View(opaque, fine), _View(translucents, fine)
 
     def draw_band(band: int, rows: slice) -> NDArray[np.uint8]:
         shot = _background(rows.stop - rows.start, fine.width)

@@ -21,8 +21,15 @@ from puncture_twin.planning.base.files import atomic
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.numbers import demanding
 from puncture_twin.twin.report.raster.camera import ViewCamera
-from puncture_twin.twin.report.raster.compositing import NOWHERE, SAMPLES, PixelBox, RasterShot, Veil, compose
-from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, put_moving, veils_of
+from puncture_twin.twin.report.raster.compositing import (
+    NOWHERE,
+    SAMPLES,
+    PixelBox,
+    RasterShot,
+    TranslucentLayer,
+    compose,
+)
+from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, put_moving, translucents_of
 from puncture_twin.twin.report.scene.film_text import FrameWords, draw_words
 from puncture_twin.twin.report.scene.scene_parts import ArmPicture, SceneBody, needle_bodies, patient, room
 from puncture_twin.twin.report.scene.shapes import bar
@@ -151,9 +158,11 @@ class _Stage:
         self.camera = camera
         self._fine = camera.finer(SAMPLES)
         self._still: RasterShot = opaque_shot(Layer([b.surface for b in bodies if b.alpha >= 1]), self._fine)
-        veils = [b.surface for b in bodies if b.alpha < 1]
-        self._veils: tuple[Veil, ...] = veils_of(Layer(veils), self._fine) if veils else ()
-        self._picture = compose(self._still, self._veils)
+        translucents = [b.surface for b in bodies if b.alpha < 1]
+        self._translucents: tuple[TranslucentLayer, ...] = (
+            translucents_of(Layer(translucents), self._fine) if translucents else ()
+        )
+        self._picture = compose(self._still, self._translucents)
 
     def picture(self, moving: list[tuple[Layer, Floats]]) -> NDArray[np.uint8]:
         """The view with bodies at their poses T_ct_body, shape (h, w, 3)."""
@@ -166,7 +175,7 @@ class _Stage:
             x0, y0 = changed.x0 // SAMPLES, changed.y0 // SAMPLES
             x1, y1 = -(-changed.x1 // SAMPLES), -(-changed.y1 // SAMPLES)
             box = PixelBox(x0 * SAMPLES, y0 * SAMPLES, x1 * SAMPLES, y1 * SAMPLES)
-            picture[y0:y1, x0:x1] = compose(shot, self._veils, box)
+            picture[y0:y1, x0:x1] = compose(shot, self._translucents, box)
         return picture
 
 

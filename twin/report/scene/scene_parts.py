@@ -20,20 +20,20 @@ from puncture_twin.twin.report.palette import Rgb
 from puncture_twin.twin.report.raster.render import Layer, Surface
 from puncture_twin.twin.report.scene.shapes import ball, bar, box, corridor_mouth, corridor_walls, ring
 
-ORGAN_VEIL = 0.38
+ORGAN_OPACITY = 0.38
 """Opacity of the organ that holds the target, so that the lesion and its vessels show."""
 
-UNKNOWN_VEIL = 0.30
+UNKNOWN_OPACITY = 0.30
 OUTSIDE_SHOWN_MM = np.array([150.0, 150.0, 0.0])
 """How far beyond the skin's box what is outside of the body is drawn: to the sides, front and back, along the bed."""
-SKIN_VEIL = 0.20
-GANTRY_VEIL = 0.15
+SKIN_OPACITY = 0.20
+GANTRY_OPACITY = 0.15
 """Opacity of the gantry, so that it does not hide the patient in its bore."""
 
-MOUTH_VEIL = 0.88
+MOUTH_OPACITY = 0.88
 """Of where a needle may enter: what lies behind it hardly shows, since seen through green it would look safe to hit."""
 
-WALL_VEIL = 0.10
+WALL_OPACITY = 0.10
 
 TARGET_BALL_MM = 3.0
 """Radius of the ball that marks the target point."""
@@ -85,11 +85,11 @@ def patient(anatomy: Any, case: Any) -> tuple[SceneBody, ...]:
     colours = palette.organ_colours(tuple(s.name for s in structures))
     bodies = [SceneBody(s.name, "organ", s.mesh, colours[s.name], _opacity(s, case)) for s in structures]
     bodies += [
-        SceneBody(s.name, "organ", _near(s.mesh, anatomy.skin.mesh), palette.OUTSIDE, UNKNOWN_VEIL)
+        SceneBody(s.name, "organ", _near(s.mesh, anatomy.skin.mesh), palette.OUTSIDE, UNKNOWN_OPACITY)
         for s in anatomy.surroundings
         if str(s.role) == "unknown"
     ]
-    bodies.append(SceneBody("skin", "skin", anatomy.skin.mesh, palette.SKIN, SKIN_VEIL))
+    bodies.append(SceneBody("skin", "skin", anatomy.skin.mesh, palette.SKIN, SKIN_OPACITY))
     bodies.append(SceneBody("target", "target", ball(case.target_ct, TARGET_BALL_MM), palette.TARGET_POINT))
     return tuple(bodies)
 
@@ -102,12 +102,12 @@ def _near(mesh: TriangleMesh, skin: TriangleMesh) -> TriangleMesh:
 
 def _opacity(structure: Any, case: Any) -> float:
     if str(structure.role) == "unknown":
-        return UNKNOWN_VEIL
+        return UNKNOWN_OPACITY
     if structure.name == case.target_structure:
-        return ORGAN_VEIL
+        return ORGAN_OPACITY
     low, high = structure.mesh.bounds
     near = bool(np.all((low <= case.target_ct) & (case.target_ct <= high)))
-    return ORGAN_VEIL if near and abs(winding_number(structure.mesh, case.target_ct)) > 0.5 else 1.0
+    return ORGAN_OPACITY if near and abs(winding_number(structure.mesh, case.target_ct)) > 0.5 else 1.0
 
 
 def safe_region(candidates: Candidates, case: Any) -> tuple[SceneBody, ...]:
@@ -115,9 +115,9 @@ def safe_region(candidates: Candidates, case: Any) -> tuple[SceneBody, ...]:
     mouth, walls = corridor_mouth(candidates, case), corridor_walls(candidates, case)
     bodies = []
     if mouth is not None:
-        bodies.append(SceneBody("safe entry", "safe", mouth, palette.SAFE, MOUTH_VEIL))
+        bodies.append(SceneBody("safe entry", "safe", mouth, palette.SAFE, MOUTH_OPACITY))
     if walls is not None:
-        bodies.append(SceneBody("safe corridor", "safe", walls, palette.SAFE, WALL_VEIL))
+        bodies.append(SceneBody("safe corridor", "safe", walls, palette.SAFE, WALL_OPACITY))
     return tuple(bodies)
 
 
@@ -199,4 +199,4 @@ def room(case: Any, T_base_ct: Floats | None) -> tuple[SceneBody, ...]:
 def _gantry(gantry: Any) -> SceneBody:
     radius = gantry.bore_diameter_mm / 2
     wall = ring(gantry.T_ct_gantry, radius, radius + gantry.wall_mm, gantry.thickness_mm)
-    return SceneBody("gantry", "room", wall, palette.TABLE, GANTRY_VEIL)
+    return SceneBody("gantry", "room", wall, palette.TABLE, GANTRY_OPACITY)

@@ -96,7 +96,9 @@ def find_edges(grey: Grey, camera: Camera, spokes: Spokes) -> Edges:
     return Edges(points, scales, -height * width * np.sqrt(2 * np.pi), inside & seen.all(axis=1))
 
 
-def visible_share(grey: Grey, camera: Camera, spokes: Spokes, on_circle: NDArray[np.bool_], contrast: float) -> float:
+def visible_fraction(
+    grey: Grey, camera: Camera, spokes: Spokes, on_circle: NDArray[np.bool_], contrast: float
+) -> float:
     """Share of the disc that looks like the ball: as bright as it is next to its edges, within a part of its contrast.
 
     Args:

@@ -66,7 +66,7 @@ class BallScene:
     background_grey: float = 60.0
     texture_grey: float = 0.0
     texture_px: float = 3.0
-    hidden_share: float = 0.0
+    hidden_fraction: float = 0.0
     hidden_from: float = 0.0
     occluder_grey: float = 100.0
     ball: bool = True
@@ -139,7 +139,7 @@ def _paint(grey: Floats, low: NDArray[np.int64], camera: Camera, scene: BallScen
     size = np.array(grey.shape[::-1])
     box_low, box_high = (box - low for box in _bounds(camera, scene, pad))
     box_low, box_high = np.clip(box_low, 0, size), np.clip(box_high, 0, size)
-    if np.any(box_high <= box_low) or not (scene.ball or scene.rod or scene.hidden_share > 0):
+    if np.any(box_high <= box_low) or not (scene.ball or scene.rod or scene.hidden_fraction > 0):
         return
     first = low + box_low - pad
     shape = box_high - box_low + 2 * pad
@@ -154,7 +154,7 @@ def _paint(grey: Floats, low: NDArray[np.int64], camera: Camera, scene: BallScen
 def _bounds(camera: Camera, scene: BallScene, pad: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """A box of pixels that holds all that the bodies cover: spheres around ball, rod's end and occluder."""
     rod = np.asarray(scene.rod_c, dtype=np.float64)
-    reach = scene.radius_mm * (2 * OCCLUDER_SIZE + 1 if scene.hidden_share > 0 else 1.0)
+    reach = scene.radius_mm * (2 * OCCLUDER_SIZE + 1 if scene.hidden_fraction > 0 else 1.0)
     ends = [(scene.center_c, reach)]
     if scene.rod:
         ends.append((scene.center_c + scene.rod_length_mm * rod / np.linalg.norm(rod), scene.rod_radius_mm))
@@ -199,7 +199,7 @@ def _layers(rays: Floats, camera: Camera, scene: BallScene) -> list[_Layer]:
         layers.append(_ball(rays, center, scene, light))
     if scene.rod:
         layers.append(_rod(rays, center, R @ _unit(scene.rod_c), scene, light))
-    if scene.hidden_share > 0:
+    if scene.hidden_fraction > 0:
         layers.append(_occluder(rays, center, camera, scene))
     return layers
 
@@ -240,7 +240,7 @@ def _occluder(rays: Floats, center: Floats, camera: Camera, scene: BallScene) ->
     flat = (rays @ axes) / (rays @ (center / distance))[..., None]
     size = float(np.tan(np.arcsin(scene.radius_mm / distance)))
     from_side = np.array([np.cos(scene.hidden_from), np.sin(scene.hidden_from)])
-    gap = OCCLUDER_SIZE - np.linalg.norm(flat / size - disc_distance(scene.hidden_share) * from_side, axis=-1)
+    gap = OCCLUDER_SIZE - np.linalg.norm(flat / size - disc_distance(scene.hidden_fraction) * from_side, axis=-1)
     return _Layer(_cover(gap), np.zeros_like(gap), np.full_like(gap, scene.occluder_grey))
 
 

@@ -14,7 +14,7 @@ RADIUS_RANGE = (0.7, 1.4)
 """Radii that are looked for, in parts of the predicted one: wider than the gate, so that the gate can say no."""
 VOTES = 8
 """Edge pixels that must agree on a centre: few, since every circle is measured afterwards."""
-EDGE_SHARE = 0.5
+EDGE_FRACTION = 0.5
 """Canny's upper threshold in parts of the strongest slope in the picture."""
 SOBEL_GAIN = 4.0
 """Height of Sobel's answer to a step of one grey level."""
@@ -40,7 +40,7 @@ def find_circles(grey: NDArray[np.uint8], radius_px: float) -> FoundCircle:
     """
     smooth = cv2.GaussianBlur(grey, (5, 5), 1.0)
     contrast = float(np.percentile(smooth, 99.5) - np.percentile(smooth, 0.5))
-    threshold = max(EDGE_SHARE * SOBEL_GAIN * contrast / 2, 4.0)
+    threshold = max(EDGE_FRACTION * SOBEL_GAIN * contrast / 2, 4.0)
     circles = cv2.HoughCircles(
         smooth,
         cv2.HOUGH_GRADIENT,

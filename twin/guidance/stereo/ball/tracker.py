@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.twin.guidance.stereo.ball.ball_edges import Edges, Grey, Spokes, find_edges, grey_part, visible_share
+from puncture_twin.twin.guidance.stereo.ball.ball_edges import (
+    Edges,
+    Grey,
+    Spokes,
+    find_edges,
+    grey_part,
+    visible_fraction,
+)
 from puncture_twin.twin.guidance.stereo.ball.ball_image import Picture
 from puncture_twin.twin.guidance.stereo.ball.hough import FoundCircle, find_circles
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
@@ -56,7 +63,7 @@ class TrackerSettings:
     inlier_px: float = 0.35
     min_inliers: float = 0.5
     min_visible: float = 0.5
-    radius_share: float = 0.05
+    radius_fraction: float = 0.05
     min_contrast: float = 12.0
     noise_factor: float = 5.0
     model_px: float = 0.014
@@ -174,7 +181,7 @@ def _measure(
         fitted = _fit(grey, camera, fitted.spokes._replace(reach_px=settings.last_reach_px), radius, settings)
     if isinstance(fitted, LostBall):
         return fitted
-    if visible_share(grey, camera, fitted.spokes, fitted.on_circle, fitted.contrast) < settings.min_visible:
+    if visible_fraction(grey, camera, fitted.spokes, fitted.on_circle, fitted.contrast) < settings.min_visible:
         return LostBall("few_inliers", fitted.inliers)
     direction = fitted.spokes.direction
     size = fitted.spokes.half_angle * camera.local_scale(direction)
@@ -217,7 +224,7 @@ def _fit(grey: Grey, camera: Camera, spokes: Spokes, radius: float, settings: Tr
     if on_circle.sum() < settings.min_inliers * settings.spokes:
         return LostBall("few_inliers", int(on_circle.sum()))
     axis, half_angle = cone(fit.circle, spokes.direction, tangent_axes(spokes.direction))
-    if abs(half_angle * camera.local_scale(axis) - radius) > settings.radius_share * radius:
+    if abs(half_angle * camera.local_scale(axis) - radius) > settings.radius_fraction * radius:
         return LostBall("wrong_radius", int(on_circle.sum()))
     measured = spokes._replace(direction=axis, half_angle=half_angle)
     return _Fitted(measured, fit.covariance, on_circle, float(np.median(edges.contrast[on_circle])))

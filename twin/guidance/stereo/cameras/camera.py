@@ -206,6 +206,6 @@ def stereo_pair(
         raise InputError(
             f"baseline {baseline_mm:g} mm, distance {distance_mm:g} mm", where="stereo pair", allowed="above 0"
         )
-    eyes = [np.array([side * baseline_mm / 2, 0.0, -distance_mm]) for side in (-1, 1)]
-    left, right = (looking_at(eye, np.zeros(3), (width, height), focal_px, distortion=distortion) for eye in eyes)
+    positions = [np.array([side * baseline_mm / 2, 0.0, -distance_mm]) for side in (-1, 1)]
+    left, right = (looking_at(eye, np.zeros(3), (width, height), focal_px, distortion=distortion) for eye in positions)
     return left, right

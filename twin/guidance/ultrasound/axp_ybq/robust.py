@@ -42,7 +42,7 @@ ROUNDING = 1e-6
 STILL_USED = 0.05
 """Tukey's weight from which on a pose counts as one that agrees."""
 
-ALARM_SHARE = 0.6
+ALARM_FRACTION = 0.6
 """Share of the spread that is believed while outliers may be in it: a false alarm costs time, not accuracy."""
 
 LOOKS = 5
@@ -183,7 +183,7 @@ def _judge(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[Bo
         sign = np.where(used, -1.0, 1.0)[:, None, None]
         S = own + sign * pulled[:, block.rows, block.rows]
         size = _squared(r[:, block.rows], _lifted(S, own))
-        believed = _scale(size[used], block, ALARM_SHARE if alarm else 1.0)
+        believed = _scale(size[used], block, ALARM_FRACTION if alarm else 1.0)
         kept.append(size <= block.limit * believed)
     return kept[0], kept[1] & _facing(problem, fit.estimate) if problem.with_direction else fit.direction_kept
 

@@ -22,7 +22,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Problem
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import needle_in_image
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import RobustFit, fitted, plain_fit, robust_fit, settled
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.spread import found_spreads
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.suggested_poses import Cure, propose
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.suggested_poses import SuggestedPoses, propose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import UNWEIGHTED, Spread
 
 SPREAD_ROUNDS = 2
@@ -40,12 +40,12 @@ class Degenerate(InputError):  # noqa: N818 - the field's word for such poses
         cure: Poses that would mend it.
     """
 
-    def __init__(self, observability: Observability, cure: Cure) -> None:
+    def __init__(self, observability: Observability, suggestion: SuggestedPoses) -> None:
         self.motions: tuple[WeakMotion, ...] = observability.weak
         self.ratio = observability.ratio
-        self.cure = cure
+        self.suggestion = suggestion
         what = "; ".join(motion.words for motion in self.motions) + f" (singular value ratio {self.ratio:.1e})"
-        super().__init__(what, where="recording", allowed=cure.words)
+        super().__init__(what, where="recording", allowed=suggestion.words)
 
 
 class Solution(NamedTuple):

@@ -56,7 +56,7 @@ class PoseChange(NamedTuple):
     """T_base2_end2, shape (4, 4), mm, as far as the refused calibration can say: go slowly, look for the needle."""
 
 
-class Cure(NamedTuple):
+class SuggestedPoses(NamedTuple):
     """Proposed poses."""
 
     poses: tuple[PoseChange, ...]
@@ -65,7 +65,7 @@ class Cure(NamedTuple):
     words: str
 
 
-def propose(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> Cure:
+def propose(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> SuggestedPoses:
     """Poses that would cure a recording.
 
     Args:
@@ -81,7 +81,7 @@ def propose(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) 
         cures.append(_greedy(estimate, recording, active, changes))
         if cures[-1].ratio_after >= ROOM * LEAST_RATIO:
             break
-    return max(cures, key=lambda cure: cure.ratio_after)
+    return max(cures, key=lambda suggestion: suggestion.ratio_after)
 
 
 class _Move(NamedTuple):
@@ -145,7 +145,9 @@ def _as_recording(estimate: Estimate, recording: Recording, changes: list[PoseCh
     return Recording(np.array([c.A for c in changes]), np.array([c.B for c in changes]), np.array(P))
 
 
-def _greedy(estimate: Estimate, recording: Recording, active: NDArray[np.int_], changes: list[PoseChange]) -> Cure:
+def _greedy(
+    estimate: Estimate, recording: Recording, active: NDArray[np.int_], changes: list[PoseChange]
+) -> SuggestedPoses:
     """Add the change that helps the least-known combinations most (D-optimal), until the ratio is reached."""
     J = scaled_jacobian(estimate, recording, active)
     offered = scaled_jacobian(estimate, _as_recording(estimate, recording, changes), active)
@@ -157,7 +159,7 @@ def _greedy(estimate: Estimate, recording: Recording, active: NDArray[np.int_], 
         chosen.append(int(np.argmax(np.linalg.slogdet(H + gains + floor)[1])))
         H = H + gains[chosen[-1]]
     picked = tuple(changes[i] for i in chosen)
-    return Cure(picked, _ratio(H), _words(picked))
+    return SuggestedPoses(picked, _ratio(H), _words(picked))
 
 
 def _ratio(H: Floats) -> float:
