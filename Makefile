@@ -1,4 +1,4 @@
-# make demo: the main job on the embedded abdomen.  make test: everything that must hold.
+# make demo: the main job on the embedded abdomen.  make test: everything that must hold.  make quick: most of it, in under a minute.
 # make mutants: which faults in the plain modules and kernels the tests notice (a quarter of an hour).
 
 PYTHON ?= python3.11
@@ -9,13 +9,22 @@ RUNS ?= 100000
 FIRST ?= 0
 KILLS ?= 10
 
-.PHONY: demo test fuzz kill lint mutants install pictures meshes clean
+.PHONY: demo test quick durations fuzz kill lint mutants install pictures meshes clean
 
 demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
 
 test: install lint
 	$(BIN)/pytest -q -n auto
+
+# While one works: what takes under half a second a test, without real data.
+quick: install
+	$(BIN)/pytest -q -n auto -m "not slow and not real"
+
+# Which tests are slow is measured, not guessed: writes tests/slow_tests.txt again (as long as make test).
+durations: install
+	$(BIN)/pytest -q -n auto --durations=0 --durations-min=0.05 > out/durations.txt
+	$(BIN)/python tests/slow_tests.py out/durations.txt
 
 kill: install
 	KILLS=$(KILLS) $(BIN)/python -m pytest -q -s tests/jobs/test_kill.py

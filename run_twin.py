@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -77,9 +78,21 @@ ArmOption = Annotated[
 ]
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        out.print(f"puncture-twin {version('puncture-twin')}", highlight=False)
+        raise typer.Exit
+
+
+VersionOption = Annotated[
+    bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
+]
+
+
 @app.callback(invoke_without_command=True)
-def _without_command(context: typer.Context) -> None:
+def _without_command(context: typer.Context, version: VersionOption = False) -> None:
     """Plan a needle puncture and rehearse it. Research software, not a medical device."""
+    del version  # its callback has printed it
     if context.invoked_subcommand is None:
         demo()
 

@@ -4,11 +4,22 @@ import numpy as np
 import pytest
 import trimesh
 from hypothesis import settings
+from slow_tests import listed
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 settings.register_profile("shared machine", deadline=None)  # the first call of compiled code takes seconds
 settings.load_profile("shared machine")
+
+
+def pytest_collection_modifyitems(items):
+    """Mark what is slow, as measured, and what skips where real data is absent."""
+    slow = listed()
+    for item in items:
+        if item.nodeid.partition("[")[0] in slow:
+            item.add_marker(pytest.mark.slow)
+        if any("not on this machine" in mark.kwargs.get("reason", "") for mark in item.iter_markers("skipif")):
+            item.add_marker(pytest.mark.real)
 
 
 @pytest.fixture

@@ -40,7 +40,7 @@ class Explanation:
 
     @property
     def verdict(self) -> str:
-        """``safe`` or ``rejected``; for the organs alone where ``candidates.arm_note`` says that the arm was not checked."""
+        """``safe`` or ``rejected``; for the organs alone where ``arm_note`` says that the arm was not checked."""
         return "safe" if self.safe else "rejected"
 
     @property
