@@ -37,7 +37,7 @@ from puncture_twin.planning.batch.batch import run_batch
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.export.exporter import FORMATS
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.twin.jobs.patient import main_job, text as words
+from puncture_twin.twin.jobs.patient import answers, main_job, text as words
 from puncture_twin.twin.jobs.patient.place_text import place_text
 from puncture_twin.twin.jobs.robot.mirror import (
     Mirror,
@@ -135,7 +135,7 @@ def verify(
 ) -> None:
     """Prove every cell of a certificate again, with a plain checker that shares none of the fast code."""
     with progress_display() as progress:
-        report = main_job.verify_certificate(certificate, prepare(case, arm=False, watcher=progress))
+        report = answers.verify_certificate(certificate, prepare(case, arm=False, watcher=progress))
     _print(report, words.certificate_text(report), as_json)
 
 
@@ -149,7 +149,7 @@ def check(
 ) -> None:
     """Explain one candidate in full."""
     with progress_display() as progress:
-        explained = main_job.check_candidate(prepare(case, arm=arm, watcher=progress), theta, beta)
+        explained = answers.check_candidate(prepare(case, arm=arm, watcher=progress), theta, beta)
     _print(explained.summary(), explained.text(), as_json)
     if not explained.safe:
         raise typer.Exit(ANSWER_IS_NO)
@@ -250,7 +250,7 @@ def export(
 @app.command()
 def register(case: CaseArgument, as_json: JsonOption = False) -> None:
     """Register a case's markers; print residuals, FRE, expected TRE and weak points."""
-    report = main_job.registration_report(case)
+    report = answers.registration_report(case)
     _print(report, words.registration_text(report), as_json)
 
 

@@ -5,27 +5,21 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import Draft, writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
-from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.certify.certificate import (
-    MAX_CERTIFICATE_BYTES,
-    Certificate,
-    parse_certificate,
     write_certificate,
 )
-from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.certify.cone_column import with_safe_cone
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.cross_check import CrossChecked
@@ -33,14 +27,12 @@ from puncture_twin.planning.export.exporter import Exported, export_name, export
 from puncture_twin.planning.plan.plan import MAX_PLAN_BYTES, Plan, parse_plan, write_plan
 from puncture_twin.planning.plan.planner import make_plan
 from puncture_twin.planning.plan.recheck import check_plan
-from puncture_twin.planning.registration.marker_check import checked_placement
-from puncture_twin.planning.registration.registration import Registration
-from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.explain import Explanation, finite, needle_warnings
 from puncture_twin.planning.search.table import write_table
+from puncture_twin.twin.jobs.patient.run import Run
+from puncture_twin.twin.jobs.patient.summaries import registration_summary, rehearsal_summary
 from puncture_twin.twin.plant.truth import draw_truth
-from puncture_twin.twin.rehearsal.rehearsal import Rehearsal, rehearse
+from puncture_twin.twin.rehearsal.rehearsal import rehearse
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.page.page import write_page
 from puncture_twin.twin.report.scene.film import draw_film
@@ -48,44 +40,6 @@ from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
 PICTURES = ("map.png", "scene.png", "report.html")
 CERTIFICATE, FILM = "certificate.json", "rehearsal.mp4"
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """What a command has done so far, and the files that it wrote."""
-
-    context: CaseContext
-    candidates: Candidates
-    files: tuple[Path, ...]
-    plan: Plan | None = None
-    refusal: str = ""
-    rehearsal: Rehearsal | None = None
-    checked: CrossChecked | None = None
-    certificate: Certificate | None = None
-    read: tuple[Input, ...] = ()
-
-    @property
-    def inputs(self) -> tuple[Input, ...]:
-        """The files that the command read beside the case's, then the case's."""
-        return (*self.read, *self.context.case.inputs)
-
-    def summary(self) -> dict[str, Any]:
-        """Plain values for JSON: mm and degrees."""
-        found, provenance = self.candidates, self.context.provenance()
-        return {
-            **provenance,
-            "warnings": [*provenance["warnings"], *needle_warnings(self.context.case, found)],
-            "inputs": inputs_document(self.inputs),
-            "directions": len(found),
-            "counts": found.counts(),
-            "best": [candidate_summary(found, int(row)) for row in found.ranked[:10]],
-            "plan": None if self.plan is None else plan_summary(self.plan),
-            "rehearsal": None if self.rehearsal is None else rehearsal_summary(self.rehearsal),
-            "cross_check": None if self.checked is None else asdict(self.checked),
-            "certificate": None if self.certificate is None else self.certificate.summary(),
-            "seconds": {stage: round(seconds, 3) for stage, seconds in self.context.stages.seconds.items()},
-            "files": [str(path) for path in self.files],
-        }
 
 
 def search_case(
@@ -256,118 +210,6 @@ def export(
     with writing(out, f"export {name}", inputs=inputs, names=(name,), made_from=made_from, note=note) as draft:
         done = export_plan(plan, format_name, draft.folder, source=plan_path, checker=checker)
     return replace(done, path=draft.final((done.path,))[0], inputs=inputs)
-
-
-def check_candidate(context: CaseContext, theta_deg: float, beta_deg: float) -> Explanation:
-    """Judge one direction and explain it."""
-    found = context.check(np.radians(theta_deg), np.radians(beta_deg))
-    return Explanation(context.case, context.anatomy, found)
-
-
-def registration_report(path: Path) -> dict[str, Any]:
-    """Everything known about a case's registration, as plain values.
-
-    Raises:
-        InputError: The case has no markers, or they cannot be used.
-    """
-    case = load_case(path)
-    checked = checked_placement(case, user_cache())
-    if checked is None or checked.placement.registration is None:
-        raise InputError("the case has no [registration]", where=case.path, allowed="markers_ct and markers_base")
-    placement, registration = checked.placement, checked.placement.registration
-    report = registration_summary(registration)
-    pose = case.target_ct + case.needle.shaft_mm * case.T_ct_entry[:3, 2]
-    along = np.linspace(case.target_ct, pose, 4)
-    report["case"] = case.name
-    report["inputs"] = inputs_document(case.inputs)
-    report["expected_tre_target_mm"] = placement.target_error_mm
-    report["expected_tre_target_interval_mm"] = list(registration.expected_tre_interval_mm(case.target_ct))
-    report["expected_tre_along_shaft_mm"] = registration.expected_tre_mm(along).tolist()
-    report["warnings"] = [*case.warnings, *checked.findings.warnings]
-    report["notes"] = list(checked.findings.notes)
-    return report
-
-
-def registration_summary(registration: Registration) -> dict[str, Any]:
-    """A registration as plain values: mm."""
-    return {
-        "method": registration.method,
-        "T_base_ct": registration.T_base_ct.tolist(),
-        "residual_mm": dict(zip(registration.markers.names, registration.residual_mm.tolist(), strict=True)),
-        "fre_mm": registration.fre_mm,
-        "mean_error_mm": registration.mean_error_mm,
-        "fle_mm": registration.fle_mm,
-        "fle_source": registration.fle_source,
-        "fle_interval_mm": list(registration.residual_test.fle_interval_mm),
-        "chi_squared": finite(registration.residual_test.chi_squared),
-        "degrees_of_freedom": registration.residual_test.freedom,
-        "noise_scale": registration.residual_test.scale,
-        "spread_ratio": registration.conditioning.spread_ratio,
-        "altitude_mm": registration.conditioning.altitude_mm,
-        "leverage": registration.conditioning.leverage,
-        "flags": list(registration.flags),
-    }
-
-
-def candidate_summary(found: Candidates, row: int) -> dict[str, Any]:
-    """One ranked candidate as plain values: mm and degrees."""
-    return {
-        "rank": int(found.ranking.rank[row]),
-        "theta_deg": float(np.degrees(found.theta[row])),
-        "beta_deg": float(np.degrees(found.beta[row])),
-        "cost": finite(found.ranking.cost[row]),
-        "min_clearance_mm": finite(found.clearance.least[row]),
-        "path_length_mm": finite(found.path.length[row]),
-        "skin_angle_deg": finite(np.degrees(found.path.skin_angle[row])),
-        "tissue_mm": finite(found.path.tissue[row]),
-        "reach_margin": finite(found.arm.margin[row]),
-        "safe_cone_deg": finite(np.degrees(found.safe_cone[row])),
-        "pareto": bool(found.ranking.pareto[row]),
-    }
-
-
-def plan_summary(plan: Plan) -> dict[str, Any]:
-    """A plan's main numbers as plain values."""
-    return {
-        "theta_deg": float(np.degrees(plan.theta)),
-        "beta_deg": float(np.degrees(plan.beta)),
-        "entry_ct_mm": plan.entry_ct.tolist(),
-        "standoff_mm": plan.standoff_mm,
-        "expected_target_error_mm": finite(plan.expected_target_error_mm),
-        "approach_s": float(plan.approach.times_s[-1]),
-        "insertion_s": float(plan.insertion.times_s[-1]),
-        "clearance_mm": {phase: finite(value) for phase, value in plan.clearance_mm.items()},
-    }
-
-
-def rehearsal_summary(rehearsal: Rehearsal) -> dict[str, Any]:
-    """A rehearsal's main numbers as plain values."""
-    return {
-        "seed": rehearsal.seed,
-        "tip_error_mm": rehearsal.tip_error_mm,
-        "lateral_mm": rehearsal.lateral_mm,
-        "depth_mm": rehearsal.depth_mm,
-        "predicted_error_mm": finite(rehearsal.predicted_error_mm),
-        "contacts": [f"{c.link} touches {c.body} at {c.time_s:.2f} s" for c in rehearsal.contacts],
-        "least_clearance_mm": {name: float(np.min(values)) for name, values in rehearsal.clearance_mm.items()},
-        "max_joint_speed_deg_s": np.degrees(rehearsal.max_joint_speed).tolist(),
-        "joint_speed_limit_deg_s": np.degrees(rehearsal.speed_limits).tolist(),
-    }
-
-
-def verify_certificate(path: Path, context: CaseContext) -> dict[str, Any]:
-    """Prove every cell of a certificate again, by the plain checker.
-
-    Raises:
-        InputError: Not a certificate, not of this case, or a cell whose verdict does not follow.
-    """
-    found = read_output(path, max_bytes=MAX_CERTIFICATE_BYTES)
-    stated, certificate = found.input("certificate"), parse_certificate(found.data, path)
-    if found.note:
-        context.watcher.note(f"warning: {found.note}")
-    done = verify(certificate, context.case, context.anatomy, partial(context.watcher.count, "cells"))
-    inputs = inputs_document((stated, *context.case.inputs))
-    return {"certificate": str(path), "inputs": inputs, **certificate.summary(), "verified": asdict(done)}
 
 
 def _certified(run: Run, size_deg: float, out: Path) -> Run:

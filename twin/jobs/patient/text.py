@@ -8,7 +8,8 @@ from typing import Any
 from puncture_twin.planning.export.exporter import Exported
 from puncture_twin.planning.search.explain import needle_warnings, reason_text
 from puncture_twin.planning.search.search import closest_miss
-from puncture_twin.twin.jobs.patient.main_job import Run, plan_summary, rehearsal_summary
+from puncture_twin.twin.jobs.patient.run import Run
+from puncture_twin.twin.jobs.patient.summaries import plan_summary, rehearsal_summary
 
 
 def search_text(run: Run) -> str:

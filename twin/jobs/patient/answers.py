@@ -1,0 +1,67 @@
+"""The commands that answer without writing files: check, register, verify."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.output.manifest import read_output
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.certify.certificate import MAX_CERTIFICATE_BYTES, parse_certificate
+from puncture_twin.planning.certify.checker import verify
+from puncture_twin.planning.registration.marker_check import checked_placement
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.explain import Explanation
+from puncture_twin.twin.jobs.patient.summaries import registration_summary
+
+
+def check_candidate(context: CaseContext, theta_deg: float, beta_deg: float) -> Explanation:
+    """Judge one direction and explain it."""
+    found = context.check(np.radians(theta_deg), np.radians(beta_deg))
+    return Explanation(context.case, context.anatomy, found)
+
+
+def registration_report(path: Path) -> dict[str, Any]:
+    """Everything known about a case's registration, as plain values.
+
+    Raises:
+        InputError: The case has no markers, or they cannot be used.
+    """
+    case = load_case(path)
+    checked = checked_placement(case, user_cache())
+    if checked is None or checked.placement.registration is None:
+        raise InputError("the case has no [registration]", where=case.path, allowed="markers_ct and markers_base")
+    placement, registration = checked.placement, checked.placement.registration
+    report = registration_summary(registration)
+    pose = case.target_ct + case.needle.shaft_mm * case.T_ct_entry[:3, 2]
+    along = np.linspace(case.target_ct, pose, 4)
+    report["case"] = case.name
+    report["inputs"] = inputs_document(case.inputs)
+    report["expected_tre_target_mm"] = placement.target_error_mm
+    report["expected_tre_target_interval_mm"] = list(registration.expected_tre_interval_mm(case.target_ct))
+    report["expected_tre_along_shaft_mm"] = registration.expected_tre_mm(along).tolist()
+    report["warnings"] = [*case.warnings, *checked.findings.warnings]
+    report["notes"] = list(checked.findings.notes)
+    return report
+
+
+def verify_certificate(path: Path, context: CaseContext) -> dict[str, Any]:
+    """Prove every cell of a certificate again, by the plain checker.
+
+    Raises:
+        InputError: Not a certificate, not of this case, or a cell whose verdict does not follow.
+    """
+    found = read_output(path, max_bytes=MAX_CERTIFICATE_BYTES)
+    stated, certificate = found.input("certificate"), parse_certificate(found.data, path)
+    if found.note:
+        context.watcher.note(f"warning: {found.note}")
+    done = verify(certificate, context.case, context.anatomy, partial(context.watcher.count, "cells"))
+    inputs = inputs_document((stated, *context.case.inputs))
+    return {"certificate": str(path), "inputs": inputs, **certificate.summary(), "verified": asdict(done)}

@@ -1,0 +1,55 @@
+"""What a command about a patient has done so far, and the files that it wrote."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.certify.certificate import Certificate
+from puncture_twin.planning.clearance.cross_check import CrossChecked
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.explain import needle_warnings
+from puncture_twin.twin.jobs.patient.summaries import candidate_summary, plan_summary, rehearsal_summary
+from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What a command has done so far, and the files that it wrote."""
+
+    context: CaseContext
+    candidates: Candidates
+    files: tuple[Path, ...]
+    plan: Plan | None = None
+    refusal: str = ""
+    rehearsal: Rehearsal | None = None
+    checked: CrossChecked | None = None
+    certificate: Certificate | None = None
+    read: tuple[Input, ...] = ()
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """The files that the command read beside the case's, then the case's."""
+        return (*self.read, *self.context.case.inputs)
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON: mm and degrees."""
+        found, provenance = self.candidates, self.context.provenance()
+        return {
+            **provenance,
+            "warnings": [*provenance["warnings"], *needle_warnings(self.context.case, found)],
+            "inputs": inputs_document(self.inputs),
+            "directions": len(found),
+            "counts": found.counts(),
+            "best": [candidate_summary(found, int(row)) for row in found.ranked[:10]],
+            "plan": None if self.plan is None else plan_summary(self.plan),
+            "rehearsal": None if self.rehearsal is None else rehearsal_summary(self.rehearsal),
+            "cross_check": None if self.checked is None else asdict(self.checked),
+            "certificate": None if self.certificate is None else self.certificate.summary(),
+            "seconds": {stage: round(seconds, 3) for stage, seconds in self.context.stages.seconds.items()},
+            "files": [str(path) for path in self.files],
+        }

@@ -1,0 +1,80 @@
+"""What a command answers, as plain values for ``--json``, the pages and the text: mm and degrees."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.explain import finite
+from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
+
+
+def registration_summary(registration: Registration) -> dict[str, Any]:
+    """A registration as plain values: mm."""
+    return {
+        "method": registration.method,
+        "T_base_ct": registration.T_base_ct.tolist(),
+        "residual_mm": dict(zip(registration.markers.names, registration.residual_mm.tolist(), strict=True)),
+        "fre_mm": registration.fre_mm,
+        "mean_error_mm": registration.mean_error_mm,
+        "fle_mm": registration.fle_mm,
+        "fle_source": registration.fle_source,
+        "fle_interval_mm": list(registration.residual_test.fle_interval_mm),
+        "chi_squared": finite(registration.residual_test.chi_squared),
+        "degrees_of_freedom": registration.residual_test.freedom,
+        "noise_scale": registration.residual_test.scale,
+        "spread_ratio": registration.conditioning.spread_ratio,
+        "altitude_mm": registration.conditioning.altitude_mm,
+        "leverage": registration.conditioning.leverage,
+        "flags": list(registration.flags),
+    }
+
+
+def candidate_summary(found: Candidates, row: int) -> dict[str, Any]:
+    """One ranked candidate as plain values: mm and degrees."""
+    return {
+        "rank": int(found.ranking.rank[row]),
+        "theta_deg": float(np.degrees(found.theta[row])),
+        "beta_deg": float(np.degrees(found.beta[row])),
+        "cost": finite(found.ranking.cost[row]),
+        "min_clearance_mm": finite(found.clearance.least[row]),
+        "path_length_mm": finite(found.path.length[row]),
+        "skin_angle_deg": finite(np.degrees(found.path.skin_angle[row])),
+        "tissue_mm": finite(found.path.tissue[row]),
+        "reach_margin": finite(found.arm.margin[row]),
+        "safe_cone_deg": finite(np.degrees(found.safe_cone[row])),
+        "pareto": bool(found.ranking.pareto[row]),
+    }
+
+
+def plan_summary(plan: Plan) -> dict[str, Any]:
+    """A plan's main numbers as plain values."""
+    return {
+        "theta_deg": float(np.degrees(plan.theta)),
+        "beta_deg": float(np.degrees(plan.beta)),
+        "entry_ct_mm": plan.entry_ct.tolist(),
+        "standoff_mm": plan.standoff_mm,
+        "expected_target_error_mm": finite(plan.expected_target_error_mm),
+        "approach_s": float(plan.approach.times_s[-1]),
+        "insertion_s": float(plan.insertion.times_s[-1]),
+        "clearance_mm": {phase: finite(value) for phase, value in plan.clearance_mm.items()},
+    }
+
+
+def rehearsal_summary(rehearsal: Rehearsal) -> dict[str, Any]:
+    """A rehearsal's main numbers as plain values."""
+    return {
+        "seed": rehearsal.seed,
+        "tip_error_mm": rehearsal.tip_error_mm,
+        "lateral_mm": rehearsal.lateral_mm,
+        "depth_mm": rehearsal.depth_mm,
+        "predicted_error_mm": finite(rehearsal.predicted_error_mm),
+        "contacts": [f"{c.link} touches {c.body} at {c.time_s:.2f} s" for c in rehearsal.contacts],
+        "least_clearance_mm": {name: float(np.min(values)) for name, values in rehearsal.clearance_mm.items()},
+        "max_joint_speed_deg_s": np.degrees(rehearsal.max_joint_speed).tolist(),
+        "joint_speed_limit_deg_s": np.degrees(rehearsal.speed_limits).tolist(),
+    }
