@@ -1,4 +1,4 @@
-"""How the cost of the exact search grows with triangles and with directions, drawn to docs/search-cost.png.
+"""How the cost of the exact search grows with triangles and with directions, drawn to docs/pictures/search-cost.png.
 
 python benchmarks/curves.py          50k to 3M triangles at 1 degree, 1k to 2M directions, first use
 python benchmarks/curves.py --quick  fewer and smaller points
@@ -160,7 +160,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="fewer and smaller points")
     parser.add_argument("--point", type=int, nargs=2, metavar=("ROWS", "DIRECTIONS"), help="one point, as JSON")
-    parser.add_argument("--out", type=Path, default=REPOSITORY / "docs" / "search-cost.png")
+    parser.add_argument("--out", type=Path, default=REPOSITORY / "docs" / "pictures" / "search-cost.png")
     chosen = parser.parse_args()
     if chosen.point:
         print(json.dumps(point(*chosen.point)))

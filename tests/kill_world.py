@@ -129,7 +129,7 @@ def temporaries(out):
 
 
 def said(command, counts: Counter):
-    """A row of the table in docs/validation.md."""
+    """A row of the table in docs/reference/validation.md."""
     return f"| {command} | {sum(counts.values())} | {counts['old']} | {counts['unfinished']} | {counts['new']} |"
 
 

@@ -193,7 +193,7 @@ def load_case(path: Path | str) -> Case:
     path = find_toml(path, "case.toml")
     files = InputFiles(path.parent)
     stated = files.add(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE))
-    content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/case.md")
+    content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md")
     for one in _named_files(content):
         files.read(one.role, one.name, max_bytes=one.max_bytes, key=one.key, where=path)
         _read_data_beside(files, one, path)

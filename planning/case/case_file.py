@@ -1,4 +1,4 @@
-"""What a case file may hold: the TOML schema, key by key. See docs/case.md for the words."""
+"""What a case file may hold: the TOML schema, key by key. See docs/reference/case.md for the words."""
 
 from __future__ import annotations
 

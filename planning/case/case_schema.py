@@ -20,11 +20,11 @@ COUNT_KEY = "structures = N"
 
 SCHEMA_ONE_NOTE = (
     "schema = 1 does not show whether the case file is whole: schema = 2 states its structures and its region "
-    "(docs/migration.md)"
+    "(docs/how-to/case-schema-2.md)"
 )
 TOP_COUNT_NOTE = (
     "structures = N stands at the top of the case, so that a cut after its last structure would not be seen; "
-    "state it in [end], the file's last table (docs/migration.md)"
+    "state it in [end], the file's last table (docs/how-to/case-schema-2.md)"
 )
 NOT_LAST_NOTE = "[end] is not the last table of the case: what stands after it could be cut off unseen"
 

@@ -1,6 +1,6 @@
 """Where the needles of a cone of directions leave the field of view, and how far every bound keeps from its limit.
 
-A needle matters up to its flange while the tip waits at its standoff; docs/certificate.md, lemmas 5 and 9.
+A needle matters up to its flange while the tip waits at its standoff; docs/concepts/certificate.md, lemmas 5 and 9.
 """
 
 from __future__ import annotations

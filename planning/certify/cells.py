@@ -2,7 +2,7 @@
 
 A cell is [θ0, θ1] x [β0, β1] in the entry frame. Halving tiles it without gap or overlap by construction, also at the
 poles, where a rectangle is a spherical triangle. Its cone is the cone about its middle angles through its farthest
-corner: docs/certificate.md proves that it encloses the cell.
+corner: docs/concepts/certificate.md proves that it encloses the cell.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Does a certificate hold? Plain numpy and FCL, cell by cell; nothing of what made the certificate is used.
 
-What a cell claims is proven from the surfaces by the lemmas of docs/certificate.md. A triangle that is proven clear of
-a cell is clear of its parts too, and what holds of the skin all over a cell holds all over its parts.
+What a cell claims is proven from the surfaces by the lemmas of docs/concepts/certificate.md. A triangle that is proven
+clear of a cell is clear of its parts too, and what is true of the skin all over a cell is true all over its parts.
 """
 
 from __future__ import annotations

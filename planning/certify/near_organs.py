@@ -1,7 +1,7 @@
 """Which cells of directions are clear of the organs, and which come too near, by planes and by convexity.
 
-docs/certificate.md, lemmas 2 to 4. No distance is needed to prove a cell clear: a plane through the target that keeps a
-triangle at the limit from every axis of the cell is proof enough, however it was found.
+docs/concepts/certificate.md, lemmas 2 to 4. No distance is needed to prove a cell clear: a plane through the target
+that keeps a triangle at the limit from every axis of the cell is proof enough, however it was found.
 """
 
 from __future__ import annotations

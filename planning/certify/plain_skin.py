@@ -1,4 +1,4 @@
-"""The skin over a cone of directions, in plain numpy: the lemmas of docs/certificate.md once more, for the checker."""
+"""The skin over a cone of directions, in plain numpy, for the checker: the lemmas of docs/concepts/certificate.md."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 A ball is convex, so it contains the convex hull of any points in it. A convex piece is cut by planes into smaller
 ones; the corners of each part are the piece's corners on that side and the points where its edges cross the plane;
-a ball about those corners contains the part, and the parts together are the piece (docs/arm.md).
+a ball about those corners contains the part, and the parts together are the piece (docs/concepts/arm-collisions.md).
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ class FastChecker(CellChecker):
     """Asks FCL the questions of :class:`CellChecker` that cheap lower bounds on the distances leave open.
 
     The questions come in the same order and their answers are FCL's or proven, so each verdict is the same, down to the
-    contact that is named (docs/arm.md). Distances are FCL's. Not for several threads at once.
+    contact that is named (docs/concepts/arm-collisions.md). Distances are FCL's. Not for several threads at once.
 
     Args:
         model: See :class:`CellChecker`.

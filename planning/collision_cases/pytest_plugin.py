@@ -114,7 +114,7 @@ def read_checks(path: Path) -> ChecksFile:
     Raises:
         InputError: Not TOML, or not this schema.
     """
-    return read_toml(path, ChecksFile, allowed="[[check]] tables", keys="docs/pytest.md")
+    return read_toml(path, ChecksFile, allowed="[[check]] tables", keys="docs/how-to/collision-cases.md")
 
 
 def compare(check: CheckSection, found: Explanation) -> None:

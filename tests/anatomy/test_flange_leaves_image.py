@@ -90,7 +90,7 @@ def certified(cut):
 
 
 def gap(angle):
-    """From the waiting tip to the skin, as docs/search.md states it, mm."""
+    """From the waiting tip to the skin, as docs/concepts/search.md states it, mm."""
     return np.maximum(10.0, 5.0 + (0.6 + 5.0) * np.tan(angle) + 1.0)
 
 

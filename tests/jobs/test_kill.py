@@ -1,6 +1,6 @@
 """SIGKILL at random moments: a folder then holds the old set, the new one, or one that every reader refuses.
 
-``make kill`` runs every command as a whole, with more kills, and prints the table of docs/validation.md.
+``make kill`` runs every command as a whole, with more kills, and prints the table of docs/reference/validation.md.
 """
 
 import os

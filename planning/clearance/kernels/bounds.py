@@ -1,7 +1,7 @@
 """Lower bounds in float32, 16 at a time: how near a needle axis can come to a disc, and to a triangle.
 
 The two that are asked most are written as vectors (`lanes.py`); the loops are written for vectorisation: no calls, no
-branches, no float minimum. The slack of each bound is derived in docs/fast-search.md.
+branches, no float minimum. The slack of each bound is derived in docs/concepts/fast-search.md.
 """
 
 from __future__ import annotations

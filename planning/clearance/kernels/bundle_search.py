@@ -15,7 +15,7 @@ from puncture_twin.planning.clearance.kernels.scratch import PAIRS
 from puncture_twin.planning.clearance.kernels.side_by_side import bring_into_frame, measure_beside, measure_other
 
 ROUNDING = np.float32(4e-6)
-"""Share of its corners' distance from the line by which a float32 distance may err (docs/fast-search.md)."""
+"""Share of its corners' distance from the line by which a float32 distance may err (docs/concepts/fast-search.md)."""
 
 AREA_ROUNDING = np.float32(2e-6)
 """Share of that distance's square by which a float32 edge function may err."""

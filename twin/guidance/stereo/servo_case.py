@@ -1,4 +1,4 @@
-"""What a servo case may hold: the TOML schema, version 1, key by key, and the case read from it. See docs/stereo.md."""
+"""The TOML schema, version 1, of a servo case, and the case read from it. See docs/reference/servo-case.md."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def load_servo_case(path: Path | str) -> ServoCase:
     path = find_toml(path, CASE_NAME)
     files = InputFiles(path.parent)
     stated = files.add(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE))
-    file = parse_toml(stated, path, ServoFile, allowed=ALLOWED_CASE, keys="docs/stereo.md")
+    file = parse_toml(stated, path, ServoFile, allowed=ALLOWED_CASE, keys="docs/reference/servo-case.md")
     ur_model(file.robot.model)
     surface = _read(files, file.head, "mesh", meshes.MAX_FILE_BYTES, path)
     named = {key: _read(files, file.head, key, points.MAX_FILE_BYTES, path) for key in ("markers", "targets")}

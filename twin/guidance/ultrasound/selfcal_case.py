@@ -1,4 +1,4 @@
-"""What a self-calibration case may hold: the TOML schema, version 1, key by key. See docs/ultrasound.md."""
+"""What a self-calibration case may hold: the TOML schema, version 1, key by key. See docs/reference/selfcal-case.md."""
 
 from __future__ import annotations
 
@@ -263,7 +263,7 @@ def load_selfcal_case(path: Path | str) -> SelfcalCase:
     """
     path = find_toml(path, CASE_NAME)
     stated = read_toml_bytes(path, ALLOWED_CASE)
-    content = parse_toml(stated, path, SelfcalFile, allowed=ALLOWED_CASE, keys="docs/ultrasound.md")
+    content = parse_toml(stated, path, SelfcalFile, allowed=ALLOWED_CASE, keys="docs/reference/selfcal-case.md")
     for arm in (content.probe_arm, content.needle_arm):
         ur_model(arm.model)
     return SelfcalCase(path, content, (content_input(CASE_ROLE, path.name, stated),))
