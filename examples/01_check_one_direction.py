@@ -2,7 +2,7 @@
 
     python examples/01_check_one_direction.py [CASE] [THETA_DEG] [BETA_DEG]
 
-CASE is a case file of your own CT (docs/reference/case.md), or the folder that holds it; without one, the embedded abdomen.
+CASE is a case file of your own CT (docs/how-to/your-own-case.md), or its folder; without one, the embedded abdomen.
 """
 
 import sys

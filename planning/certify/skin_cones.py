@@ -1,6 +1,6 @@
 """What every ray of a cone meets of the skin: bounds over all crossings, and their number where it is the same for all.
 
-docs/concepts/certificate.md derives each bound; `puncture_twin.planning.certify.checker` holds the same lemmas in plain form.
+docs/concepts/certificate.md derives each bound; `puncture_twin.planning.certify.checker` has the lemmas in plain form.
 """
 
 from __future__ import annotations
