@@ -9,7 +9,7 @@ RUNS ?= 100000
 FIRST ?= 0
 KILLS ?= 10
 
-.PHONY: demo test quick durations fuzz kill lint mutants install pictures meshes clean
+.PHONY: demo test quick durations fuzz kill lint mutants install docs pictures meshes clean
 
 demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
@@ -48,9 +48,20 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[test]'
 	touch $@
 
+# The pages and the API reference, as a site in out/site.
+docs: install
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	$(BIN)/python docs/command_line.py
+	$(BIN)/mkdocs build --quiet
+
 pictures: demo
+	$(BIN)/python docs/architecture_picture.py
 	$(BIN)/python docs/frames_picture.py
-	$(BIN)/python docs/readme_pictures.py $(OUT)
+	$(BIN)/python run_twin.py place meshes/abdomen --out out/place
+	$(BIN)/python run_twin.py selfcal --seeds 1 --out out/selfcal
+	$(BIN)/python run_twin.py servo meshes/head --out out/servo
+	$(BIN)/python docs/concept_pictures.py $(OUT)/plan.json
+	$(BIN)/python docs/copy_pictures.py $(OUT) out/place out/selfcal out/servo
 
 meshes: install
 	$(BIN)/python -m puncture_twin.twin.phantoms --out meshes

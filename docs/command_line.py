@@ -1,0 +1,39 @@
+"""Write docs/reference/command-line.md from the command line's own help: ``python docs/command_line.py``."""
+
+from pathlib import Path
+
+import typer
+
+from puncture_twin.run_twin import app
+
+HEAD = """# Command line
+
+`run-twin COMMAND` where the package is installed, `python run_twin.py COMMAND` from a checkout; without a command it runs `demo`. Exit codes: 0 done; 1 done, and the
+answer is no; 2 bad input, one line that says what, where and what is allowed; 3 the program failed; 130 interrupted. With `--json` stdout holds one JSON object and
+nothing else; progress goes to stderr. What is written: [outputs.md](outputs.md).
+
+*Written by `python docs/command_line.py` from the help of each command (`run-twin COMMAND --help`).*
+"""
+
+
+def option_row(parameter):
+    """A row of the table: names, what it is, default."""
+    names = parameter.opts + parameter.secondary_opts
+    shown = parameter.metavar if parameter.param_type_name == "argument" else ", ".join(names)
+    silent = parameter.default is None or isinstance(parameter.default, bool)
+    default = "required" if parameter.required else "" if silent else f"`{parameter.default}`"
+    return f"| `{shown}` | {(parameter.help or '').replace('|', ' or ')} | {default} |"
+
+
+def main() -> None:
+    """Write the page."""
+    lines = [HEAD]
+    for name, command in typer.main.get_command(app).commands.items():
+        lines += [f"## `{name}`", command.help, "", "| | | default |", "|---|---|---|"]
+        lines += [*(option_row(one) for one in command.params), ""]
+    path = Path(__file__).parent / "reference" / "command-line.md"
+    path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
