@@ -8,9 +8,10 @@ from puncture_twin.run_twin import app
 
 HEAD = """# Command line
 
-`run-twin COMMAND` where the package is installed, `python run_twin.py COMMAND` from a checkout; without a command it runs `demo`. Exit codes: 0 done; 1 done, and the
-answer is no; 2 bad input, one line that says what, where and what is allowed; 3 the program failed; 130 interrupted. With `--json` stdout holds one JSON object and
-nothing else; progress goes to stderr. What is written: [outputs.md](outputs.md).
+`run-twin COMMAND` where the package is installed, `python run_twin.py COMMAND` from a checkout; without a command it
+runs `demo`, and `--version` prints the version. Exit codes: 0 done; 1 done, and the answer is no; 2 bad input, one line
+that says what, where and what is allowed; 3 the program failed; 130 interrupted. With `--json` stdout holds one JSON
+object and nothing else; progress goes to stderr. What is written: [outputs.md](outputs.md).
 
 *Written by `python docs/command_line.py` from the help of each command (`run-twin COMMAND --help`).*
 """

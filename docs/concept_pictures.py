@@ -19,7 +19,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose, inverse, link_pos
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.case_file import AIR_HU
-from puncture_twin.planning.collision.bounding_spheres import ball_tree
+from puncture_twin.planning.collision.bounding_spheres import sphere_tree
 from puncture_twin.planning.plan.plan import read_plan
 from puncture_twin.planning.reach.standoff import skin_gaps
 from puncture_twin.planning.registration.skin_fit import skin_fit
@@ -90,7 +90,7 @@ def standoff():
 def bounding_spheres():
     """The forearm of a UR3, and the leaves of its tree of spheres."""
     link = next(one for one in collision_links(ur_model("ur3")) if one.name == "forearm")
-    tree = ball_tree([np.asarray(piece.vertices) for piece in link.pieces])
+    tree = sphere_tree([np.asarray(piece.vertices) for piece in link.pieces])
     figure, ax = plt.subplots(figsize=(11, 4.6))
     for row in tree.leaves:
         ax.add_patch(Circle(tree.centres[row, :2], tree.radii[row], facecolor="#fbe5d0", edgecolor=ORANGE, alpha=0.5))
