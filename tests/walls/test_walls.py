@@ -38,7 +38,7 @@ TESTS_ALONE = {
     "planning.formats.points.point_files.write_points",
     "planning.reach.reach.assess_reach",
     "twin.guidance.stereo.cameras.dlt.dlt",
-    "twin.guidance.stereo.detection.pixel_sight",
+    "twin.guidance.stereo.detection.pixel_detector",
     "twin.guidance.stereo.experiment.varied",
     "twin.guidance.ultrasound.axp_ybq.recording.read_recording",
     "twin.guidance.ultrasound.image.needle_detector.search_score",
