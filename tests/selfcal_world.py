@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import exp
 from puncture_twin.twin.guidance.ultrasound.simulate import (
     ImagePose,
     draw_image_poses,
@@ -42,7 +42,7 @@ def degenerate_set(name, seed=3, n=24):
     if name == "probe never turns":
         A[:, :3, :3] = A[0, :3, :3]
     elif name == "probe turns about one axis":
-        A[:, :3, :3] = A[0, :3, :3] @ exp(np.outer(rng.uniform(-0.43, 0.43, n), [0.6, 0.8, 0.0]))
+        A[:, :3, :3] = A[0, :3, :3] @ exp_rotation(np.outer(rng.uniform(-0.43, 0.43, n), [0.6, 0.8, 0.0]))
     elif name.startswith("needle never turns") and not name.endswith("image"):
         A = with_needle_turns(truth, A, seen, np.zeros((n, 3)))
     elif name == "needle turns about one axis":
@@ -69,7 +69,7 @@ def with_needle_turns(truth, A, seen, turns):
     """A such that the needle's flange has these orientations and the needle shows as wished."""
     along = np.column_stack([np.cos(seen.insertion), np.sin(seen.insertion), np.zeros(len(A))])
     M = needle_orientations(along, truth.direction_end2, seen.roll)
-    R_B = truth.Y[:3, :3].T @ A[0, :3, :3] @ truth.X[:3, :3] @ M[0] @ exp(turns)
+    R_B = truth.Y[:3, :3].T @ A[0, :3, :3] @ truth.X[:3, :3] @ M[0] @ exp_rotation(turns)
     turned = np.array(A)
     turned[:, :3, :3] = truth.Y[:3, :3] @ R_B @ M.transpose(0, 2, 1) @ truth.X[:3, :3].T
     return turned

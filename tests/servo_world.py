@@ -7,7 +7,8 @@ import numpy as np
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.registration.registration import apply, fit_rigid
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.registration import fit_rigid
 from puncture_twin.twin.guidance.stereo.joint_model import LENS, Guess, Observed, Unknowns
 from puncture_twin.twin.guidance.stereo.poses import configurations, rod_orientation
 from puncture_twin.twin.guidance.stereo.robot_calibration import grid_points

@@ -21,6 +21,7 @@ from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.creases import split_at_creases
 from puncture_twin.planning.geometry.decimation import decimated
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import pose
 
 HU_RANGE = 500.0
 """Values further from the threshold say no more about where the surface is: bone under the skin is as inside
@@ -201,8 +202,7 @@ def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
         if not in_plane.any():
             raise InputError(f"no flat end at its {name}", where="skin mesh", allowed="a side where the body was cut")
         cut_faces |= in_plane
-    T_ct_box = np.eye(4)
-    T_ct_box[:3, 3] = np.where(sides[:, 0], low, low - OPEN_AIR_MM)
+    T_ct_box = pose(np.eye(3), np.where(sides[:, 0], low, low - OPEN_AIR_MM))
     size = np.where(sides[:, 1], high, high + OPEN_AIR_MM) - T_ct_box[:3, 3]
     view = FieldOfView(T_ct_box, size, sides)
     return Skin(mesh, cut_faces, view, warnings + _cut_warnings(view))
@@ -243,9 +243,8 @@ def _skin(
 
 def _field_of_view(body: NDArray[np.bool_], oriented: Oriented) -> FieldOfView:
     spacing = oriented.spacing_mm
-    T_ct_box = np.eye(4)
-    T_ct_box[:3, :3] = oriented.T_ct_index[:3, :3] / spacing
-    T_ct_box[:3, 3] = oriented.T_ct_index[:3, 3] - 0.5 * oriented.T_ct_index[:3, :3].sum(axis=1)
+    axes, origin = oriented.T_ct_index[:3, :3], oriented.T_ct_index[:3, 3]
+    T_ct_box = pose(axes / spacing, origin - 0.5 * axes.sum(axis=1))
     cut = [[bool(body.take(side, axis=axis).any()) for side in (0, -1)] for axis in range(3)]
     return FieldOfView(T_ct_box, spacing * body.shape, np.array(cut))
 

@@ -13,6 +13,7 @@ from puncture_twin.planning.arm import kernels
 from puncture_twin.planning.arm.kinematics import N_BRANCHES, inverse, missing_reach_mm, singularity
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import pose
 
 MIN_SINGULARITY = 0.05
 """Each term of :class:`planning.arm.kinematics.Singularity` must exceed this over the whole insertion. For the wrist
@@ -155,10 +156,7 @@ def needle_lines(targets_base: Floats, outwards_base: Floats) -> list[NeedleLine
 
 def flange_at(line: NeedleLine, distance_mm: float) -> Floats:
     """T_base_flange (4, 4), mm, at roll 0 and a distance from the target."""
-    T = np.eye(4)
-    T[:3, :3] = line.R_base_flange
-    T[:3, 3] = line.target + distance_mm * line.outward
-    return T
+    return pose(line.R_base_flange, line.target + distance_mm * line.outward)
 
 
 def every_branch(model: UrModel, line: NeedleLine, distance_mm: Floats) -> Floats:

@@ -24,6 +24,7 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import exp_rotation, pose
 
 LINK_NAMES = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 """The URDF's names without their ``_link``; index = frame of ``link_poses``."""
@@ -150,8 +151,7 @@ def urdf_link_poses(model: UrModel, q: Floats) -> Floats:
     poses = [T_BASE_URDFBASE]
     for name, angle in zip(JOINT_NAMES, q, strict=True):
         axis = joints[name].find("axis")
-        turn = np.eye(4)
-        turn[:3, :3] = Rotation.from_rotvec(_floats(axis, "xyz") * angle).as_matrix()
+        turn = pose(exp_rotation(_floats(axis, "xyz") * angle), np.zeros(3))
         poses.append(poses[-1] @ _origin(joints[name]) @ turn)
     return np.stack(poses)
 
@@ -243,12 +243,10 @@ def _crossings(starts: Floats, ends: Floats, axis: int, cut: float) -> Floats:
 
 def _origin(element: ElementTree.Element) -> Floats:
     """The ``origin`` of a URDF joint or collision as a 4x4 in mm; identity where there is none."""
-    T = np.eye(4)
     origin = element.find("origin")
-    if origin is not None:
-        T[:3, :3] = Rotation.from_euler("xyz", _floats(origin, "rpy")).as_matrix()
-        T[:3, 3] = 1000.0 * _floats(origin, "xyz")
-    return T
+    if origin is None:
+        return np.eye(4)
+    return pose(Rotation.from_euler("xyz", _floats(origin, "rpy")).as_matrix(), 1000.0 * _floats(origin, "xyz"))
 
 
 def _floats(element: ElementTree.Element | None, key: str) -> Floats:

@@ -9,6 +9,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.rigid import apply
 
 HOLDER_ROOT_MM = 5.0
 """How far the holder's body reaches back into wrist 3, whose mesh ends up to 1.4 mm before the flange plane: without
@@ -96,7 +97,7 @@ class Box:
     def corners(self) -> Floats:
         """Its eight corners, base frame, shape (8, 3), mm."""
         local = np.array(list(product((-0.5, 0.5), repeat=3))) * self.size_mm
-        return np.asarray(local @ self.T_base_box[:3, :3].T + self.T_base_box[:3, 3])
+        return np.asarray(apply(self.T_base_box, local))
 
     @property
     def bounds(self) -> Floats:

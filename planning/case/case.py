@@ -37,6 +37,7 @@ from puncture_twin.planning.formats.meshes import mesh_files as meshes
 from puncture_twin.planning.formats.points import point_files as points
 from puncture_twin.planning.formats.points.point_files import parse_points
 from puncture_twin.planning.formats.volumes import volume_files as volumes
+from puncture_twin.planning.geometry.rigid import frame_of_axes, pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 ALLOWED_CASE = "a TOML case file with schema = 1 or 2, or a folder with case.toml"
@@ -276,23 +277,16 @@ def mount_pose(mount: MountSection, space: Space, path: Path) -> Floats:
             where=path,
             allowed=f"a right angle, to {AXES_SQUARE_DEG:g} degree",
         )
-    z = z / lengths[1]
-    x = x - z * (x @ z)
-    x = x / np.linalg.norm(x)
-    T_ct_base = np.eye(4)
-    T_ct_base[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    T_ct_base[:3, 3] = to_lps(np.asarray([mount.position_mm]), space)[0]
+    T_ct_base = pose(frame_of_axes(z, x), to_lps(np.asarray([mount.position_mm]), space)[0])
     return _read_only(np.linalg.inv(T_ct_base))
 
 
 def _gantry(gantry: GantrySection, space: Space, path: Path) -> Gantry:
     """The bore's pose: z along the axis, x to the top, and turned so that a positive tilt leans the top against z."""
-    T = np.eye(4)
-    T[:3, :3] = axes_frame(gantry.axis or "head", gantry.up or "anterior", space, path, "gantry: axis and up")
-    T[:3, 3] = to_lps(np.asarray([gantry.center_mm]), space)[0]
+    axes = axes_frame(gantry.axis or "head", gantry.up or "anterior", space, path, "gantry: axis and up")
+    T = pose(axes, to_lps(np.asarray([gantry.center_mm]), space)[0])
     c, s = np.cos(np.radians(gantry.tilt_deg)), np.sin(np.radians(gantry.tilt_deg))
-    tilt = np.eye(4)
-    tilt[:3, :3] = [[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]
+    tilt = pose([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]], np.zeros(3))
     return Gantry(_read_only(T @ tilt), gantry.bore_diameter_mm, gantry.wall_mm, gantry.thickness_mm)
 
 

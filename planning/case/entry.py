@@ -11,6 +11,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case_file import EntryAxes
+from puncture_twin.planning.geometry.rigid import frame_of_axes, pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 ANATOMICAL_LPS = MappingProxyType(
@@ -84,10 +85,7 @@ def entry_frame(frame: str | EntryAxes | None, space: Space, *, where: str | Pat
     lengths = np.linalg.norm(z), np.linalg.norm(x)
     if min(lengths) == 0 or abs(z @ x) > AXES_PARALLEL * lengths[0] * lengths[1]:
         raise InputError("search.frame: its axes are parallel or zero", where=where, allowed="two axes")
-    z = z / lengths[0]
-    x = x - z * (x @ z)
-    x = x / np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
+    return frame_of_axes(z, x)
 
 
 def _axis(axis: str | tuple[float, float, float], space: Space) -> Floats:
@@ -98,9 +96,7 @@ def _axis(axis: str | tuple[float, float, float], space: Space) -> Floats:
 
 def view_frame(R_ct_entry: Floats, target_ct: Floats) -> Floats:
     """T_ct_entry: the entry frame with its origin on the target, shape (4, 4), read-only."""
-    T = np.eye(4)
-    T[:3, :3] = R_ct_entry
-    T[:3, 3] = target_ct
+    T = pose(R_ct_entry, target_ct)
     T.setflags(write=False)
     return T
 

@@ -11,6 +11,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.geometry.crossings import first_crossing
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import frame_about
 
 Progress = Callable[[int, int], None]
 
@@ -65,7 +66,7 @@ class FclEngine:
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
         """FCL collision of a capsule with one structure; see `ClearanceEngine`."""
-        pose = fcl.Transform(_rotation_to(outward_ct), target_ct + outward_ct * (length / 2))
+        pose = fcl.Transform(frame_about(outward_ct), target_ct + outward_ct * (length / 2))
         capsule = fcl.CollisionObject(fcl.Capsule(radius, length), pose)
         hits = fcl.collide(capsule, self._objects[structure], fcl.CollisionRequest(), fcl.CollisionResult())
         return bool(hits > 0)
@@ -77,11 +78,3 @@ def _tree(vertices: Floats, faces: np.ndarray) -> fcl.BVHModel:
     tree.addSubModel(vertices, faces)
     tree.endModel()
     return tree
-
-
-def _rotation_to(z: Floats) -> Floats:
-    """A rotation whose third column is the unit vector z."""
-    helper = np.eye(3)[int(np.argmin(np.abs(z)))]
-    x = np.cross(helper, z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)

@@ -16,6 +16,7 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.bounding_spheres import prism
 from puncture_twin.planning.collision.shapes import convex, padded, surface
+from puncture_twin.planning.geometry.rigid import pose
 
 BODY_NAMES = (*LINK_NAMES, "holder", "needle")
 """The bodies of the arm, from the base on."""
@@ -113,8 +114,7 @@ def _link_shape(link: Link, padding_mm: float) -> Shape:
 
 def _round_body(name: str, diameter_mm: float, span_mm: tuple[float, float], padding_mm: float) -> Body:
     length = span_mm[1] - span_mm[0]
-    T_flange_body = np.eye(4)
-    T_flange_body[2, 3] = (span_mm[0] + span_mm[1]) / 2.0
+    T_flange_body = pose(np.eye(3), [0.0, 0.0, (span_mm[0] + span_mm[1]) / 2.0])
     bare = _cylinder(diameter_mm / 2.0, length)
     full = _cylinder(diameter_mm / 2.0 + padding_mm, length + 2.0 * padding_mm) if padding_mm else bare
     return Body(name, 6, T_flange_body, bare, full, float(np.hypot(diameter_mm, length)) / 2.0)

@@ -32,6 +32,7 @@ from puncture_twin.planning.collision.kernels.surfaces import CELL_MM
 from puncture_twin.planning.collision.shapes import touch
 from puncture_twin.planning.collision.triangle_tree import TriangleTree
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
 
 _Axes = tuple[Floats, Floats, Floats]
 
@@ -164,7 +165,7 @@ def _levers(model: UrModel, check: Check) -> Floats:
     if check.hulls is None or check.first_body is None:
         return levers
     body = check.second_body
-    own = np.linalg.norm(check.hulls[1] @ body.T_frame_body[:3, :3].T + body.T_frame_body[:3, 3], axis=1).max()
+    own = np.linalg.norm(apply(body.T_frame_body, check.hulls[1]), axis=1).max()
     lengths = np.hypot(model.a, model.d)
     for joint in range(check.first_body.frame, body.frame):
         levers[joint] = abs(model.a[joint]) + lengths[joint + 1 : body.frame].sum() + own
@@ -190,7 +191,7 @@ def _moving(checks: Sequence[Check]) -> Movers:
 
 def _in_frame(corners: Floats, body: Body) -> Floats:
     """Corners (n, 3) of a body's shapes in the frame that it moves with."""
-    return np.asarray(corners @ body.T_frame_body[:3, :3].T + body.T_frame_body[:3, 3])
+    return np.asarray(apply(body.T_frame_body, corners))
 
 
 class _Hulls:

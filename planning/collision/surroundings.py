@@ -14,6 +14,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.workcell import case_boxes, gantry_in_ct
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
 
 GANTRY = "gantry"
 NOWHERE = (
@@ -65,4 +66,4 @@ def _structure(name: str, mesh: TriangleMesh) -> Structure:
 
 def _mesh(box: Box, T_ct_base: Floats) -> TriangleMesh:
     T = T_ct_base @ box.T_base_box
-    return TriangleMesh((CORNERS * box.size_mm) @ T[:3, :3].T + T[:3, 3], BOX_FACES)
+    return TriangleMesh(apply(T, CORNERS * box.size_mm), BOX_FACES)

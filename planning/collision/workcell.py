@@ -15,6 +15,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case, Gantry, Obstacle
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply, pose
 
 ARM_PADDING_MM = 5.0
 """The arm keeps this distance from patient and room: more than the registration's error, and enough to prove the way
@@ -55,14 +56,13 @@ def gantry_in_patient_mm(gantry: Gantry, skin: TriangleMesh) -> float:
         skin: CT frame.
     """
     T = np.linalg.inv(gantry.T_ct_gantry)
-    at = skin.vertices @ T[:3, :3].T + T[:3, 3]
+    at = apply(T, skin.vertices)
     beside = np.hypot(at[:, 0], at[:, 1])[np.abs(at[:, 2]) <= gantry.thickness_mm / 2]
     return max(0.0, float(beside.max(initial=0.0)) - gantry.bore_diameter_mm / 2)
 
 
 def _box(obstacle: Obstacle, T_base_ct: Floats) -> Box:
-    T = np.eye(4)
-    T[:3, 3] = obstacle.center_mm
+    T = pose(np.eye(3), obstacle.center_mm)
     T_base_box = T if obstacle.frame == "base" else T_base_ct @ T
     x, y, z = obstacle.size_mm
     return Box(obstacle.name, T_base_box, (float(x), float(y), float(z)))

@@ -12,12 +12,12 @@ import re
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.export.program import STREAM_S, JointMove, Program
 from puncture_twin.planning.export.text import heading
+from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation, pose
 from puncture_twin.planning.plan.plan import Plan
 
 M_PER_MM = 1e-3
@@ -195,11 +195,8 @@ def _floats(text: str) -> Floats:
 
 def _pose_m(T: Floats) -> Floats:
     """A pose as the controller writes it: position in metres, then the rotation vector in rad."""
-    return np.concatenate([T[:3, 3] * M_PER_MM, Rotation.from_matrix(T[:3, :3]).as_rotvec()])
+    return np.concatenate([T[:3, 3] * M_PER_MM, log_rotation(T[:3, :3])])
 
 
 def _pose_mm(pose_m: Floats) -> Floats:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(pose_m[3:]).as_matrix()
-    T[:3, 3] = pose_m[:3] / M_PER_MM
-    return T
+    return pose(exp_rotation(pose_m[3:]), pose_m[:3] / M_PER_MM)

@@ -3,6 +3,24 @@ from .creases import split_at_creases as split_at_creases
 from .crossings import Crossings as Crossings, first_crossing as first_crossing
 from .decimation import decimated as decimated, squared_distance as squared_distance
 from .mesh import TriangleMesh as TriangleMesh
+from .rigid import (
+    apply as apply,
+    exp_rotation as exp_rotation,
+    exp_twist as exp_twist,
+    frame_about as frame_about,
+    frame_along as frame_along,
+    frame_of_axes as frame_of_axes,
+    frame_of_points as frame_of_points,
+    frame_xz as frame_xz,
+    frame_yz as frame_yz,
+    inverse as inverse,
+    left_jacobian as left_jacobian,
+    log_rotation as log_rotation,
+    log_twist as log_twist,
+    pose as pose,
+    skew as skew,
+    turned_about as turned_about,
+)
 from .spaces import Space as Space, Unit as Unit, parse_space as parse_space, parse_unit as parse_unit, to_lps as to_lps
 from .voxelize import voxels_inside as voxels_inside
 from .winding import odd_fraction as odd_fraction, winding_number as winding_number

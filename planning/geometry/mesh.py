@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import apply
 
 Faces = NDArray[np.int32]
 
@@ -79,7 +80,7 @@ class TriangleMesh:
         Args:
             T_b_a: Shape (4, 4), maps coordinates of this mesh's frame a to frame b, mm.
         """
-        return TriangleMesh(self.vertices @ T_b_a[:3, :3].T + T_b_a[:3, 3], self.faces)
+        return TriangleMesh(apply(T_b_a, self.vertices), self.faces)
 
 
 def _first_of_equals(columns: NDArray[np.int64]) -> NDArray[np.bool_]:

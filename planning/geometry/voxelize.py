@@ -7,6 +7,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
 
 OFF_LINE = (0.000137, 0.000211)
 """Voxels by which the lines pass beside the voxels' centres in j and k, so that none runs through an edge or a corner
@@ -25,7 +26,7 @@ def voxels_inside(mesh: TriangleMesh, T_ct_index: Floats, shape: tuple[int, int,
         Shape ``shape``.
     """
     T = np.linalg.inv(T_ct_index)
-    corners = np.ascontiguousarray((mesh.vertices @ T[:3, :3].T + T[:3, 3])[mesh.faces])
+    corners = np.ascontiguousarray((apply(T, mesh.vertices))[mesh.faces])
     if not mesh.closed:
         return _voxels_on(corners, shape)
     flips = np.zeros((shape[0] + 1, *shape[1:]), np.int32)

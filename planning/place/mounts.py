@@ -15,6 +15,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case, Obstacle
 from puncture_twin.planning.case.case_file import MountBounds, MountName
+from puncture_twin.planning.geometry.rigid import frame_xz, pose
 
 Range = tuple[float, float]
 
@@ -101,10 +102,7 @@ class Site:
         if np.linalg.norm(x) < STRAIGHT_UP_MM:
             x = np.eye(3)[0] if abs(z[0]) < 0.5 else np.eye(3)[2]
         x /= np.linalg.norm(x)
-        T = np.eye(4)
-        T[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-        T[:3, 3] = at
-        return T
+        return pose(frame_xz(x, z), at)
 
 
 def regions(case: Case, T_ct_bed: Floats) -> tuple[Region, ...]:

@@ -5,7 +5,6 @@ from .registration import (
     MIN_MARKERS as MIN_MARKERS,
     MarkerPairs as MarkerPairs,
     Registration as Registration,
-    apply as apply,
     fit_affine as fit_affine,
     fit_rigid as fit_rigid,
     fit_triad as fit_triad,

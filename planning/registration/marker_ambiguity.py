@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.registration.registration import MarkerPairs, apply, fit_rigid
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.registration import MarkerPairs, fit_rigid
 
 MAX_NUMBERS = 20_000_000
 """Of one table of beginnings (160 MB): sets that are more alike than that are tested for swaps of two names only."""

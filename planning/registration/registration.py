@@ -11,6 +11,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.points.point_files import NamedPoints
+from puncture_twin.planning.geometry.rigid import apply, frame_of_points, pose
 from puncture_twin.planning.registration.conditioning import Conditioning, conditioning, leverage
 from puncture_twin.planning.registration.residual_test import Interval, ResidualTest
 
@@ -194,16 +195,8 @@ def fit_triad(points_ct: Floats, points_base: Floats) -> Floats:
         points_ct: Shape (3, 3), rows M1, M2, M3, mm.
         points_base: Shape (3, 3), the same markers.
     """
-    R = _triad(points_base) @ _triad(points_ct).T
+    R = frame_of_points(points_base) @ frame_of_points(points_ct).T
     return _rigid(R, np.mean(points_base - points_ct @ R.T, axis=0))
-
-
-def _triad(points: Floats) -> Floats:
-    e1 = points[1] - points[0]
-    e1 = e1 / np.linalg.norm(e1)
-    e3 = np.cross(e1, points[2] - points[0])
-    e3 = e3 / np.linalg.norm(e3)
-    return np.stack([e1, np.cross(e3, e1), e3], axis=1)
 
 
 def fit_rigid(points_ct: Floats, points_base: Floats) -> Floats:
@@ -236,11 +229,6 @@ def fit_affine(points_ct: Floats, points_base: Floats) -> Floats:
     return T
 
 
-def apply(T_b_a: Floats, points_a: Floats) -> Floats:
-    """Points (..., 3) of frame a in frame b."""
-    return points_a @ T_b_a[:3, :3].T + T_b_a[:3, 3]
-
-
 def _rigid_fre(markers: MarkerPairs) -> float:
     """FRE of the least-squares fit, whatever the method: the chi-squared test is about that."""
     fitted = apply(fit_rigid(markers.points_ct, markers.points_base), markers.points_ct)
@@ -248,8 +236,7 @@ def _rigid_fre(markers: MarkerPairs) -> float:
 
 
 def _rigid(R: Floats, t: Floats) -> Floats:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
+    T = pose(R, t)
     T.setflags(write=False)
     return T
 

@@ -10,6 +10,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case, Obstacle
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
 
 CONE = np.radians(60.0)
 """A marker is touched from within this angle of the skin's outward normal."""
@@ -31,7 +32,7 @@ def place_excluded(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
     """
     model = ur_model(case.robot.model)
     T_ct_base = np.linalg.inv(T_base_ct)
-    column = np.stack([np.zeros(3), model.shoulder_base]) @ T_ct_base[:3, :3].T + T_ct_base[:3, 3]
+    column = apply(T_ct_base, np.stack([np.zeros(3), model.shoulder_base]))
     if any(side_of(skin, point) is Side.INSIDE for point in column):
         return "the robot's base would stand in the patient"
     for box in _boxes_ct(case):

@@ -15,6 +15,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.volumes.volume_files import parse_header
 from puncture_twin.planning.formats.volumes.volume_header import VolumeHeader
 from puncture_twin.planning.geometry.decimation import squared_distance
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.winding import odd_fraction, winding_number
 from puncture_twin.planning.registration.marker_check import check_markers
 from puncture_twin.planning.registration.placement import Placement
@@ -149,7 +150,7 @@ def _refuse_short_maps(case: Case, anatomy: Anatomy, headers: Headers) -> None:
     for name in sorted({s.labelmap for s in case.structure if s.labelmap} | {s.labelmap for s in case.structures}):
         header = headers[name]
         T_index_ct = np.linalg.inv(header.T_ct_index)
-        index = points @ T_index_ct[:3, :3].T + T_index_ct[:3, 3]
+        index = apply(T_index_ct, points)
         outside = np.maximum(-0.5 - index, index - (np.array(header.shape) - 0.5)).max()
         if outside > VOXELS_OF_SLACK:
             raise InputError(

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration import marker_ambiguity
 from puncture_twin.planning.registration.marker_ambiguity import HARMLESS_MM, renamings
-from puncture_twin.planning.registration.registration import MarkerPairs, apply, fit_rigid
+from puncture_twin.planning.registration.registration import MarkerPairs, fit_rigid
 
 TARGET = np.array([10.0, -20.0, -90.0])
 NAMES = tuple("ABCDEFGHIJKL")

@@ -9,11 +9,11 @@ import pytest
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.points.point_files import NamedPoints
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.conditioning import leverage
 from puncture_twin.planning.registration.registration import (
     MarkerPairs,
-    apply,
     fit_affine,
     fit_rigid,
     fit_triad,

@@ -14,9 +14,10 @@ from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case import Case, Needle, RobotSettings, SearchSettings, load_case
 from puncture_twin.planning.case.case_file import RankingSection, RegistrationSection, RehearsalSection
 from puncture_twin.planning.case.entry import view_frame
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.planning.registration.registration import apply, fit_rigid, fit_triad, leverage
+from puncture_twin.planning.registration.registration import fit_rigid, fit_triad, leverage
 from puncture_twin.twin.plant.truth import MarkerNoise, draw_truth, registration_error
 
 MESHES = ROOT / "meshes"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.twin.phantoms import torso
 from puncture_twin.twin.phantoms.viscera import LESION_CENTRE_LPS_MM
 
@@ -47,10 +48,8 @@ class Guidance:
 
 def patient_placement() -> Floats:
     """Where the patient truly lies: T_base_ct, CT frame to base frame, shape (4, 4), mm."""
-    T_base_ct = np.eye(4)
-    T_base_ct[:3, :3] = np.array(BASE_AXES_CT)
-    T_base_ct[:3, 3] = np.array(TARGET_IN_BASE_MM) - T_base_ct[:3, :3] @ np.array(LESION_CENTRE_LPS_MM)
-    return T_base_ct
+    R = np.array(BASE_AXES_CT, dtype=np.float64)
+    return pose(R, np.array(TARGET_IN_BASE_MM) - R @ np.array(LESION_CENTRE_LPS_MM))
 
 
 def skin_markers_ct() -> dict[str, Floats]:
@@ -78,7 +77,7 @@ def abdomen_guidance(generator: np.random.Generator) -> Guidance:
     half = np.array([IN_PLANE_MM, IN_PLANE_MM, SLICE_SPACING_MM]) / 2
     read = points_ct + generator.uniform(-half, half, points_ct.shape)
     T_base_ct = patient_placement()
-    truth = points_ct @ T_base_ct[:3, :3].T + T_base_ct[:3, 3]
+    truth = apply(T_base_ct, points_ct)
     touched = truth + generator.normal(0.0, TOUCH_SIGMA_MM, truth.shape)
     return Guidance(
         markers_ct=dict(zip(names, read, strict=True)),

@@ -10,6 +10,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose, inverse, singular
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.geometry.rigid import frame_about, pose
 
 TILTS_DEG = (0.0, 15.0, 30.0, 45.0, 60.0)
 """How far the needle may lean from the wished direction, tried in this order."""
@@ -80,20 +81,11 @@ def touching_configuration(probe: TouchProbe, point_base: Floats) -> Floats:
 
 def _touching_poses(probe: TouchProbe, point_base: Floats, tilt: float) -> list[Floats]:
     """Flange poses with the tip on the point, leaning by ``tilt`` to every side."""
-    frame = _frame(probe.needle_base)
+    frame = frame_about(probe.needle_base)
     sides = np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False) if tilt > 0 else [0.0]
     poses = []
     for side in sides:
         lean = [np.sin(tilt) * np.cos(side), np.sin(tilt) * np.sin(side), np.cos(tilt)]
-        T = np.eye(4)
-        T[:3, :3] = _frame(frame @ np.array(lean))  # any roll will do: it is q6 alone
-        T[:3, 3] = point_base - probe.tcp_mm * T[:3, 2]
-        poses.append(T)
+        R = frame_about(frame @ np.array(lean))  # any roll will do: it is q6 alone
+        poses.append(pose(R, point_base - probe.tcp_mm * R[:, 2]))
     return poses
-
-
-def _frame(z: Floats) -> Floats:
-    """A right-handed frame, columns x, y, z, about a unit vector z."""
-    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
-    x = x / np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)

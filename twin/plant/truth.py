@@ -13,15 +13,9 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import RegistrationSection
 from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.registration import (
-    MIN_MARKERS,
-    MarkerPairs,
-    apply,
-    fit_rigid,
-    fit_triad,
-    match,
-)
+from puncture_twin.planning.registration.registration import MIN_MARKERS, MarkerPairs, fit_rigid, fit_triad, match
 
 COLLINEAR = 0.01
 """s2/s1 of the true points below which they leave a rotation free."""

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import pose
 
 MM_PER_M = 1000.0
 
@@ -45,7 +46,4 @@ def pose_to_m(T_a_b: Floats) -> PoseM:
 
 def pose_to_mm(position_m: Sequence[float], quaternion: Sequence[float]) -> Floats:
     """T_a_b, shape (4, 4), mm, of a position in m and a quaternion x, y, z, w."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
-    T[:3, 3] = to_mm(position_m)
-    return T
+    return pose(Rotation.from_quat(quaternion).as_matrix(), to_mm(position_m))

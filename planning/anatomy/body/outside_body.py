@@ -22,6 +22,7 @@ from puncture_twin.planning.anatomy.body.flat_side import FlatSide
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
 
 SMOOTH_MM = 3.0
 """Means over a cube of this edge are compared with air: noise of a finer image falls below that of 3 mm voxels."""
@@ -139,7 +140,7 @@ def beyond_flat_sides(image: OutsideImage, sides: Sequence[FlatSide]) -> list[Tr
 def _box(low: Floats, high: Floats, image: OutsideImage) -> TriangleMesh:
     """A box between two corners, voxels."""
     index = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    return TriangleMesh(index @ image.T_ct_index[:3, :3].T + image.T_ct_index[:3, 3], BOX_FACES)
+    return TriangleMesh(apply(image.T_ct_index, index), BOX_FACES)
 
 
 def beyond_drawn_sides(image: OutsideImage, sides: Sequence[DrawnSide], *, edges: bool) -> list[TriangleMesh]:
@@ -170,7 +171,7 @@ def _beyond_line(image: OutsideImage, side: DrawnSide, *, edges: bool) -> Triang
     rows = [_row(side, across, values, z) for z in slices for values in (along, np.full(len(along), far + sink))]
     index = np.concatenate(rows)
     T = image.T_ct_index
-    vertices = index @ T[:3, :3].T + T[:3, 3]
+    vertices = apply(T, index)
     return TriangleMesh(vertices, _outward_faces(vertices, len(across)))
 
 
@@ -229,7 +230,7 @@ def _drawn_out(surface: TriangleMesh, image: OutsideImage) -> TriangleMesh:
     last = np.array(image.hu.shape) - 1.0
     away = np.array(BEYOND_MM) / image.spacing_mm
     index = np.where(index < -1e-6, index - away, np.where(index > last + 1e-6, index + away, index))
-    return TriangleMesh(index @ T[:3, :3].T + T[:3, 3], surface.faces)
+    return TriangleMesh(apply(T, index), surface.faces)
 
 
 def _hulls_beyond(mask: Bools, image: OutsideImage) -> list[TriangleMesh]:
@@ -266,4 +267,4 @@ def _prism(section: Floats, axis: int, end: int, image: OutsideImage) -> Triangl
     sides = np.concatenate([np.stack([i, j, i + n], axis=1), np.stack([j, j + n, i + n], axis=1)])
     faces = np.concatenate([fan, fan[:, ::-1] + n, sides])
     T = image.T_ct_index
-    return TriangleMesh(index @ T[:3, :3].T + T[:3, 3], faces)
+    return TriangleMesh(apply(T, index), faces)

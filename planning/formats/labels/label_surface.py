@@ -27,6 +27,7 @@ from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.geometry.decimation import decimated
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
 
 
 def label_mesh(
@@ -77,4 +78,4 @@ def field_surface(field: NDArray[Any], T_ct_index: NDArray[np.float64], *, where
         padded[tuple(border)] = -np.abs(padded[tuple(border)])
     found = marching_cubes(padded, level=0.0, method="lorensen", gradient_direction="ascent")
     index, faces = found[0].astype(np.float64) - 1.0, found[1]
-    return guard_mesh(index @ T_ct_index[:3, :3].T + T_ct_index[:3, 3], faces, where=where)
+    return guard_mesh(apply(T_ct_index, index), faces, where=where)

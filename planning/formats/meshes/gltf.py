@@ -20,6 +20,7 @@ from puncture_twin.planning.formats.guard import MAX_TRIANGLES
 from puncture_twin.planning.formats.meshes.gltf_document import Accessor, Document, Primitive
 from puncture_twin.planning.formats.meshes.gltf_scene import PlacedPrimitive, placed_meshes
 from puncture_twin.planning.formats.raw_mesh import RawMesh, join, refuse
+from puncture_twin.planning.geometry.rigid import apply
 
 _GLB_ALLOWED = "glTF, version 2: its length, then a JSON chunk and at most one BIN chunk, as long as they say"
 _JSON_CHUNK, _BIN_CHUNK = b"JSON", b"BIN\0"
@@ -141,7 +142,7 @@ def _part(document: Document, buffers: list[bytes], placed: PlacedPrimitive, whe
     parts = []
     for number, primitive in enumerate(document.meshes[placed.mesh].primitives):
         raw = _primitive(document, buffers, primitive, f"{where}, mesh {placed.mesh}, primitive {number}")
-        vertices = raw.vertices @ T[:3, :3].T + T[:3, 3]
+        vertices = apply(T, raw.vertices)
         parts.append(RawMesh(vertices, raw.faces[:, ::-1] if mirrored else raw.faces))
     return parts
 

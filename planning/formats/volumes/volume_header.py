@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.rigid import apply
 
 MAX_VOXELS = 1_000_000_000
 """Four times a whole-body CT (512 x 512 x 1000); a header that claims more is wrong or hostile."""
@@ -122,7 +123,7 @@ def corner_deviation_mm(T_a: NDArray[np.float64], T_b: NDArray[np.float64], shap
     """Largest distance between where two affines place a corner of the volume, mm."""
     corners = np.array(list(itertools.product(*((0, n - 1) for n in shape))), dtype=np.float64)
     difference = T_a - T_b
-    return float(np.linalg.norm(corners @ difference[:3, :3].T + difference[:3, 3], axis=1).max())
+    return float(np.linalg.norm(apply(difference, corners), axis=1).max())
 
 
 def check_exact_size(actual: int, promised: int, *, where: Path) -> None:

@@ -8,7 +8,8 @@ import pytest
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.registration.registration import apply, fit_rigid, fit_triad, leverage
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.registration import fit_rigid, fit_triad, leverage
 from puncture_twin.twin.plant.scanner import Scanner, draw_true_positions, read_positions, scan, slice_number
 from puncture_twin.twin.plant.tip_touch import TouchProbe, touch, touching_configuration
 

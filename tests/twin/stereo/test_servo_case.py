@@ -6,8 +6,8 @@ import pytest
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.winding import winding_number
-from puncture_twin.planning.registration.registration import apply
 from puncture_twin.twin.guidance.stereo.experiment import varied
 from puncture_twin.twin.guidance.stereo.poses import configurations, path_upward
 from puncture_twin.twin.guidance.stereo.robot_calibration import grid_points, held_rod

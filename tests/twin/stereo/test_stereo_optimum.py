@@ -5,7 +5,7 @@ import pytest
 from servo_world import CASE, HELD, IMAGE_MM, simulate
 
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.registration.registration import apply
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.guidance.stereo.joint_model import JointModel, first_unknowns
 from puncture_twin.twin.guidance.stereo.optimum import adjust, bound
 from puncture_twin.twin.guidance.stereo.servo_law import ball_base

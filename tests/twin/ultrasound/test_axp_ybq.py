@@ -6,6 +6,7 @@ from scipy.optimize import least_squares
 from selfcal_world import as_estimate
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.rigid import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import closed_form
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import direction_from_plane, mean_direction
@@ -19,7 +20,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
     linearised_tip,
     tip_residuals,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import log
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import UNWEIGHTED, covariances
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, PoseRanges, simulate_recording, with_noise
 
@@ -29,7 +29,7 @@ ALL = active_columns(tip=True, scale=False, direction=False)
 def difference(estimate, truth):
     """Largest error in mm and degrees."""
     t = [estimate.t_X - truth.X[:3, 3], estimate.t_Y - truth.Y[:3, 3], estimate.t_Q - truth.tip_end2]
-    R = [log(estimate.R_X.T @ truth.X[:3, :3]), log(estimate.R_Y.T @ truth.Y[:3, :3])]
+    R = [log_rotation(estimate.R_X.T @ truth.X[:3, :3]), log_rotation(estimate.R_Y.T @ truth.Y[:3, :3])]
     return np.abs(t).max(), np.degrees(np.abs(R).max())
 
 

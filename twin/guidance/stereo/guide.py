@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.registration.registration import apply
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.guidance.stereo.detection import Detections, Detector, LocatedPair, Search, in_space, look_at
 from puncture_twin.twin.guidance.stereo.joint_model import Guess, Observed, Unknowns
 from puncture_twin.twin.guidance.stereo.mapping import Mapping

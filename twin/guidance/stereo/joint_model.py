@@ -14,11 +14,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.registration.registration import apply
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, turned_about
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.lens import coefficient_slope
 from puncture_twin.twin.guidance.stereo.mapping import turn_and_shift_slopes
@@ -145,12 +144,11 @@ def camera_of(planned: Camera, errors: Floats) -> Camera:
     """A planned camera with its errors (13,), in spreads."""
     focal = planned.fx * (1.0 + CAMERA_FOCAL * errors[0])
     cx, cy = np.array([planned.cx, planned.cy]) + CAMERA_AXIS_PX * errors[1:3]
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(CAMERA_TURN_RAD * errors[7:10]).as_matrix()
-    T[:3, 3] = CAMERA_SHIFT_MM * errors[10:13]
+    T = pose(exp_rotation(CAMERA_TURN_RAD * errors[7:10]), CAMERA_SHIFT_MM * errors[10:13])
     lens = np.array(LENS) * errors[3:7]
-    pose = T @ planned.T_camera_c
-    return replace(planned, fx=focal, fy=focal, cx=float(cx), cy=float(cy), distortion=lens, T_camera_c=pose)
+    return replace(
+        planned, fx=focal, fy=focal, cx=float(cx), cy=float(cy), distortion=lens, T_camera_c=T @ planned.T_camera_c
+    )
 
 
 def arm_of(model: UrModel, spreads: ArmErrors, errors: Floats) -> TrueArm:
@@ -166,15 +164,6 @@ def arm_of(model: UrModel, spreads: ArmErrors, errors: Floats) -> TrueArm:
         backlash_rad=spreads.backlash_rad,
         repeatability_rad=spreads.repeatability_rad,
     )
-
-
-def turned(T: Floats, errors: Floats, center: Floats) -> Floats:
-    """A pose turned about a centre (3,) and shifted, errors (6,)."""
-    R = Rotation.from_rotvec(errors[:3]).as_matrix()
-    moved = np.eye(4)
-    moved[:3, :3] = R @ T[:3, :3]
-    moved[:3, 3] = R @ (T[:3, 3] - center) + center + errors[3:]
-    return moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +188,7 @@ class JointModel:
 
     def pose_of_head(self, x: Unknowns) -> Floats:
         """T_c_m, shape (4, 4), mm."""
-        return turned(self.guess.T_c_m, x.head, self._head_center)
+        return turned_about(self.guess.T_c_m, self._head_center, x.head)
 
     def head_slopes(self, x: Unknowns, points_c: Floats) -> Floats:
         """Derivative (n, 3, 6) of points (n, 3) of the head by ``x.head``."""
@@ -242,7 +231,7 @@ class JointModel:
     def _commanded(self, x: Unknowns) -> tuple[Floats, Floats]:
         """Where the arm, with its errors, should have the ball; its play and repeatability let it stray."""
         o = self.observed
-        T = turned(self.guess.T_c_base, x.base, self._base_center)
+        T = turned_about(self.guess.T_c_base, self._base_center, x.base)
         arm = arm_of(o.held.model, o.arm, x.arm)
         flange = arm.flange_pose(o.q_command)
         balls = apply(T, flange[:, :3, 3] + o.held.rod_mm * flange[:, :3, 2])

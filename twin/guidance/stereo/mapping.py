@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import apply, turned_about
 from puncture_twin.planning.registration.conditioning import Conditioning
-from puncture_twin.planning.registration.registration import MarkerPairs, apply, register
+from puncture_twin.planning.registration.registration import MarkerPairs, register
 
 MAX_ITERATIONS = 20
 CONVERGED = 1e-12
@@ -106,7 +106,7 @@ def map_head(
         slope = turn_and_shift_slopes(fitted - center)
         normal = np.einsum("nki,nkl,nlj->ij", slope, weights, slope)
         step = np.linalg.solve(normal, np.einsum("nki,nkl,nl->i", slope, weights, seen.points_c - fitted))
-        T = _moved(T, step, center)
+        T = turned_about(T, center, step)
         if np.abs(step).max() < CONVERGED:
             break
     residuals = apply(T, pairs.points_ct) - seen.points_c
@@ -119,12 +119,3 @@ def turn_and_shift_slopes(offsets: Floats) -> Floats:
     zero = np.zeros_like(x)
     turn = np.stack([np.stack(row, axis=-1) for row in ((zero, z, -y), (-z, zero, x), (y, -x, zero))], axis=1)
     return np.concatenate([turn, np.broadcast_to(np.eye(3), turn.shape)], axis=2)
-
-
-def _moved(T: Floats, step: Floats, center: Floats) -> Floats:
-    """T turned about a centre and shifted."""
-    R = Rotation.from_rotvec(step[:3]).as_matrix()
-    moved = np.eye(4)
-    moved[:3, :3] = R @ T[:3, :3]
-    moved[:3, 3] = R @ (T[:3, 3] - center) + center + step[3:]
-    return moved

@@ -16,7 +16,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.registration.registration import apply
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.guidance.stereo.joint_model import Guess, JointModel, Observed, Unknowns, first_unknowns
 
 MAX_ITERATIONS = 30

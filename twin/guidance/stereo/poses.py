@@ -10,6 +10,7 @@ from puncture_twin.planning.arm.kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.planning.geometry.rigid import frame_yz, pose
 from puncture_twin.twin.guidance.stereo.servo_law import HeldRod
 
 LEAST_SINGULARITY = 0.05
@@ -23,15 +24,12 @@ def rod_orientation(tilt_rad: float) -> Floats:
     """R_base_flange, shape (3, 3): the flange looks down, its rod leaning away from the arm by an angle, rad."""
     z = np.array([np.sin(tilt_rad), 0.0, -np.cos(tilt_rad)])
     y = np.array([0.0, -1.0, 0.0])
-    return np.stack([np.cross(y, z), y, z], axis=1)
+    return frame_yz(y, z)
 
 
 def flange_poses(held: HeldRod, points_base: Floats) -> Floats:
     """T_base_flange, shape (n, 4, 4), mm, that put the ball on points (n, 3)."""
-    T = np.tile(np.eye(4), (len(points_base), 1, 1))
-    T[:, :3, :3] = held.R_base_flange
-    T[:, :3, 3] = points_base - held.rod_mm * held.R_base_flange[:, 2]
-    return T
+    return pose(held.R_base_flange, points_base - held.rod_mm * held.R_base_flange[:, 2])
 
 
 class Posture(NamedTuple):

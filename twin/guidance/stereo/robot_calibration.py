@@ -14,6 +14,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.registration import fit_rigid
 from puncture_twin.twin.guidance.stereo.cameras.calibration import CameraCalibration, calibrate
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
@@ -121,7 +122,7 @@ def calibrate_by_robot(
     covariances = np.stack([s.covariances for s in detections], axis=1)
     cameras = _cameras(case, measured_c, pixels)
     T_base_c = fit_rigid(measured_c, ball_base(held, q_command))
-    residual = np.linalg.norm(measured_c @ T_base_c[:3, :3].T + T_base_c[:3, 3] - ball_base(held, q_command), axis=1)
+    residual = np.linalg.norm(apply(T_base_c, measured_c) - ball_base(held, q_command), axis=1)
     return RobotCalibration(
         tuple(found.camera for found in cameras),
         T_base_c,

@@ -15,11 +15,11 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.kinematics import flange_pose, jacobian
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import log_rotation
 
 CHARACTERISTIC_MM = 300.0
 """Length by which millimetres are made comparable with radians: about half of a UR3's reach."""
@@ -93,7 +93,7 @@ def ball_jacobian(held: HeldRod, q: Floats) -> Floats:
 def orientation_error(held: HeldRod, q: Floats) -> Floats:
     """The turn (3,), rad, base frame, that brings the flange back to the orientation to keep."""
     R = flange_pose(held.model, q)[:3, :3]
-    return np.asarray(Rotation.from_matrix(held.R_base_flange @ R.T).as_rotvec())
+    return log_rotation(held.R_base_flange @ R.T)
 
 
 def smallest_sigma(J: Floats) -> float:

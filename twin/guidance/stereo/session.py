@@ -11,7 +11,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
-from puncture_twin.planning.registration.registration import apply
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.guidance.stereo.detection import (
     Detections,
     Detector,

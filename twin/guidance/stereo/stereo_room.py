@@ -18,7 +18,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.crossings import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.registration.registration import apply
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, frame_yz, pose
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, stereo_pair, tangent_axes
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, ToolSection
 from puncture_twin.twin.plant.true_arm import ArmErrors, TrueArm, draw_true_arm
@@ -136,9 +136,7 @@ def planned_cameras(case: ServoCase) -> tuple[Camera, ...]:
 
 def _misplaced(camera: Camera, rng: np.random.Generator) -> Camera:
     """A camera as it was really put up: turned, shifted, its lens off its focal length and axis."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(rng.normal(0.0, CAMERA_TURN_RAD, 3)).as_matrix()
-    T[:3, 3] = rng.normal(0.0, CAMERA_SHIFT_MM, 3)
+    T = pose(exp_rotation(rng.normal(0.0, CAMERA_TURN_RAD, 3)), rng.normal(0.0, CAMERA_SHIFT_MM, 3))
     cx, cy = np.array([camera.cx, camera.cy]) + rng.normal(0.0, CAMERA_AXIS_PX, 2)
     focal = camera.fx * (1.0 + rng.normal(0.0, CAMERA_FOCAL))
     return replace(camera, fx=focal, fy=focal, cx=float(cx), cy=float(cy), T_camera_c=T @ camera.T_camera_c)
@@ -157,20 +155,14 @@ def calibration_frame(case: ServoCase) -> Floats:
     The cameras stand on the far side of the head, seen from the arm, and look back and down at it.
     """
     down = np.radians(case.file.cameras.elevation_deg)
-    T = np.eye(4)
-    z, y = [-np.cos(down), 0.0, -np.sin(down)], [np.sin(down), 0.0, -np.cos(down)]
-    T[:3, :3] = np.stack([np.cross(y, z), y, z], axis=1)
-    T[:3, 3] = case.file.calibration.center_mm
-    return T
+    z, y = np.array([-np.cos(down), 0.0, -np.sin(down)]), np.array([np.sin(down), 0.0, -np.cos(down)])
+    return pose(frame_yz(y, z), case.file.calibration.center_mm)
 
 
 def head_pose(case: ServoCase) -> Floats:
     """T_base_m, shape (4, 4), mm: the head's z up, its face (-y) along the base's x at yaw 0."""
     head = case.file.head
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("z", 90.0 + head.yaw_deg, degrees=True).as_matrix()
-    T[:3, 3] = head.position_mm
-    return T
+    return pose(Rotation.from_euler("z", 90.0 + head.yaw_deg, degrees=True).as_matrix(), head.position_mm)
 
 
 def rod_tool(tool: ToolSection) -> Tool:
@@ -188,9 +180,7 @@ def workcell_checker(case: ServoCase, T_base_m: Floats | None) -> FastChecker:
     """
     boxes = []
     for box in case.file.box:
-        T = np.eye(4)
-        T[:3, 3] = box.center_mm
-        boxes.append(Box(box.name, T, box.size_mm))
+        boxes.append(Box(box.name, pose(np.eye(3), box.center_mm), box.size_mm))
     skin = None if T_base_m is None else case.skin.transformed(T_base_m)
     model, padding = ur_model(case.file.robot.model), case.file.servo.padding_mm
     return FastChecker(model, rod_tool(case.file.tool), boxes, skin, padding_mm=padding)

@@ -15,6 +15,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, content_input
 from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.case.case_file import Length, Name, Number, Section, Sextuple, Vector
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleEcho
 from puncture_twin.twin.plant.true_arm import ArmErrors
@@ -242,17 +243,12 @@ class SelfcalCase:
 
 def _probe_mount(probe: ProbeSection, width_mm: float) -> Floats:
     c, s = np.cos(np.radians(probe.yaw_deg)), np.sin(np.radians(probe.yaw_deg))
-    T = np.eye(4)
-    T[:3, :3] = np.array([[c, 0.0, s], [s, 0.0, -c], [0.0, 1.0, 0.0]])
-    T[:3, 3] = [0.0, 0.0, probe.length_mm] - 0.5 * width_mm * T[:3, 0]
-    return T
+    R = np.array([[c, 0.0, s], [s, 0.0, -c], [0.0, 1.0, 0.0]])
+    return pose(R, [0.0, 0.0, probe.length_mm] - 0.5 * width_mm * R[:, 0])
 
 
 def _base_mount(arm: NeedleArmSection) -> Floats:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("z", arm.yaw_deg, degrees=True).as_matrix()
-    T[:3, 3] = arm.position_mm
-    return T
+    return pose(Rotation.from_euler("z", arm.yaw_deg, degrees=True).as_matrix(), arm.position_mm)
 
 
 def load_selfcal_case(path: Path | str) -> SelfcalCase:

@@ -9,7 +9,8 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import exp, tangent_basis
+from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import tangent_basis
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import needle_flange
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
@@ -61,7 +62,7 @@ def draw_workcell(case: SelfcalCase, rng: np.random.Generator) -> WorkcellTruth:
 def _shifted(T: Floats, mm: float, rad: float, rng: np.random.Generator) -> Floats:
     moved = np.array(T)
     moved[:3, 3] += rng.normal(0.0, mm, 3)
-    moved[:3, :3] = T[:3, :3] @ exp(rng.normal(0.0, rad, 3))
+    moved[:3, :3] = T[:3, :3] @ exp_rotation(rng.normal(0.0, rad, 3))
     return moved
 
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import exp_rotation, frame_about, frame_yz, pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import exp
 
 SPEC_NOISE = Noise(robot_mm=0.1, robot_rad=np.radians(0.03), image_mm=0.3, direction_rad=np.radians(0.5))
 """The noise of spec 3, section 4; it gives none for the direction: half a degree, ten times its detector's spread."""
@@ -73,12 +73,15 @@ class ImagePose(NamedTuple):
 
 def draw_truth(rng: np.random.Generator) -> SimulatedTruth:
     """A probe, two bases 0.9 m apart and a needle of 140 to 200 mm, each at random about its usual place."""
-    X = _pose(exp(rng.uniform(-0.5, 0.5, 3)), np.array([0.0, 30.0, 80.0]) + rng.uniform(-20, 20, 3))
-    turned = exp(np.array([0.0, 0.0, np.pi])) @ exp(rng.uniform(-0.3, 0.3, 3))
-    Y = _pose(turned, np.array([900.0, 0.0, 0.0]) + rng.uniform(-60, 60, 3))
-    direction = exp(rng.uniform(-0.3, 0.3, 3))[:, 2]
+    X = pose(exp_rotation(rng.uniform(-0.5, 0.5, 3)), np.array([0.0, 30.0, 80.0]) + rng.uniform(-20, 20, 3))
+    turned = exp_rotation(np.array([0.0, 0.0, np.pi])) @ exp_rotation(rng.uniform(-0.3, 0.3, 3))
+    Y = pose(turned, np.array([900.0, 0.0, 0.0]) + rng.uniform(-60, 60, 3))
+    direction = exp_rotation(rng.uniform(-0.3, 0.3, 3))[:, 2]
     tip = rng.uniform(140.0, 200.0) * direction + np.append(rng.uniform(-15, 15, 2), 0.0)
-    A_mean = _pose(exp(np.array([np.pi, 0.0, 0.0])) @ exp(rng.uniform(-0.3, 0.3, 3)), np.array([450.0, 0.0, 300.0]))
+    A_mean = pose(
+        exp_rotation(np.array([np.pi, 0.0, 0.0])) @ exp_rotation(rng.uniform(-0.3, 0.3, 3)),
+        np.array([450.0, 0.0, 300.0]),
+    )
     return SimulatedTruth(X, Y, tip, direction, A_mean)
 
 
@@ -87,10 +90,8 @@ def draw_probe_poses(
 ) -> Floats:
     """A within the ranges, shape (n, 4, 4)."""
     ranges = ranges or PoseRanges()
-    A = np.tile(np.eye(4), (n, 1, 1))
-    A[:, :3, :3] = truth.A_mean[:3, :3] @ exp(ranges.draw(rng, -ranges.tilt, ranges.tilt, (n, 3)))
-    A[:, :3, 3] = truth.A_mean[:3, 3] + ranges.draw(rng, -ranges.shift_mm, ranges.shift_mm, (n, 3))
-    return A
+    R = truth.A_mean[:3, :3] @ exp_rotation(ranges.draw(rng, -ranges.tilt, ranges.tilt, (n, 3)))
+    return pose(R, truth.A_mean[:3, 3] + ranges.draw(rng, -ranges.shift_mm, ranges.shift_mm, (n, 3)))
 
 
 def draw_image_poses(rng: np.random.Generator, n: int, ranges: PoseRanges | None = None) -> ImagePose:
@@ -126,12 +127,9 @@ def needle_orientations(along_image: Floats, direction_end2: Floats, roll: Float
     """M, from end2 to image, that lays V along given unit vectors and turns the needle about itself; (n, 3, 3)."""
     beside = np.cross(along_image, [0.0, 0.0, 1.0])
     beside /= np.linalg.norm(beside, axis=1, keepdims=True)
-    image = np.stack([np.cross(beside, along_image), beside, along_image], axis=2)
-    helper = np.eye(3)[int(np.argmin(np.abs(direction_end2)))]
-    first = np.cross(helper, direction_end2)
-    first /= np.linalg.norm(first)
-    end2 = np.stack([first, np.cross(direction_end2, first), direction_end2], axis=1)
-    turn = exp(np.column_stack([np.zeros((len(roll), 2)), roll]))
+    image = frame_yz(beside, along_image)
+    end2 = frame_about(direction_end2)
+    turn = exp_rotation(np.column_stack([np.zeros((len(roll), 2)), roll]))
     return np.asarray(image @ turn @ end2.T)
 
 
@@ -162,12 +160,6 @@ def simulate_recording(
 
 def _shaken(rng: np.random.Generator, T: Floats, noise: Noise) -> Floats:
     shaken = np.array(T)
-    shaken[:, :3, :3] = T[:, :3, :3] @ exp(rng.normal(0.0, noise.robot_rad, (len(T), 3)))
+    shaken[:, :3, :3] = T[:, :3, :3] @ exp_rotation(rng.normal(0.0, noise.robot_rad, (len(T), 3)))
     shaken[:, :3, 3] += rng.normal(0.0, noise.robot_mm, (len(T), 3))
     return shaken
-
-
-def _pose(R: Floats, t: Floats) -> Floats:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
-    return T

@@ -24,6 +24,7 @@ from puncture_twin.planning.collision.bodies import Body, Shape, arm_bodies
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.shapes import skin_surface, touch
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import PhantomSection, SelfcalCase
 
 TABLE_MM = (1800.0, 1200.0, 40.0)
@@ -175,9 +176,8 @@ def _cuboid(size: Floats) -> Shape:
 
 def table_box(phantom: PhantomSection) -> Box:
     """The table under both arms, base1."""
-    T = np.eye(4)
-    T[:3, 3] = [phantom.top_mm[0], phantom.top_mm[1], -TABLE_GAP_MM - TABLE_MM[2] / 2.0]
-    return Box("table", T, TABLE_MM)
+    center = [phantom.top_mm[0], phantom.top_mm[1], -TABLE_GAP_MM - TABLE_MM[2] / 2.0]
+    return Box("table", pose(np.eye(3), center), TABLE_MM)
 
 
 @cache

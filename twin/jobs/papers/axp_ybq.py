@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import closed_form
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import mean_direction
@@ -25,7 +26,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Problem
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import tip_residuals
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import plain_fit
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import log
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import UNWEIGHTED
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, SimulatedTruth, simulate_recording
 
@@ -132,7 +132,7 @@ def _exact_row() -> AxpYbqRow:
     for n in (16, 20, 50):
         recording, truth = simulate_recording(np.random.default_rng([SEED, n]), n, noise=None)
         found, exact = closed_form(recording), truth_estimate(truth)
-        turns = [log(a.T @ b) for a, b in ((found.R_X, exact.R_X), (found.R_Y, exact.R_Y))]
+        turns = [log_rotation(a.T @ b) for a, b in ((found.R_X, exact.R_X), (found.R_Y, exact.R_Y))]
         moves = [found.t_X - exact.t_X, found.t_Y - exact.t_Y, found.t_Q - exact.t_Q]
         worst = max(worst, float(np.degrees(np.abs(turns).max())), float(np.abs(moves).max()))
     return AxpYbqRow("closed form without noise, 16, 20 and 50 poses: largest error", None, worst, 1e-6, "mm or deg")

@@ -16,6 +16,7 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, ProbeShot
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleInImage
@@ -218,8 +219,7 @@ def workcell_surfaces(case: SelfcalCase, q_probe: Floats, q_needle: Floats) -> t
     opaque.append(Surface(box(T1[6] @ head_pose(case, case.T_end1_image), case.content.probe.head_mm), (90, 110, 150)))
     opaque += _needle_surfaces(T2[6], needle)
     width, depth = case.content.image.imager().size_mm
-    T_slice = np.eye(4)
-    T_slice[:3, 3] = [width / 2.0, depth / 2.0, 0.0]
+    T_slice = pose(np.eye(3), [width / 2.0, depth / 2.0, 0.0])
     slab = box(T1[6] @ case.T_end1_image @ T_slice, (width, depth, 0.6))
     return opaque, [
         Surface(phantom_mesh(case.content.phantom), palette.SKIN, OPACITY),

@@ -15,6 +15,7 @@ from PIL import Image, ImageDraw
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.twin.guidance.stereo.ball.ball_image import render
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.detection import LocatedPair, ball_scene
@@ -60,23 +61,17 @@ def _workcell_picture(session: Session, reached: Reached, camera: Camera) -> NDA
     T_base_c = np.linalg.inv(room.T_c_base)
     tool = Tool(file.tool.rod_mm, file.tool.rod_mm - file.tool.holder_mm, file.tool.rod_diameter_mm,
                 file.tool.holder_diameter_mm)  # fmt: skip
-    boxes = [Box(box.name, _at(box.center_mm), box.size_mm) for box in file.box]
+    boxes = [Box(box.name, pose(np.eye(3), box.center_mm), box.size_mm) for box in file.box]
     with open_workcell(room.model, tool, room.case.skin, T_base_c @ room.T_c_m, boxes, down_ct=DOWN) as opened:
         opened.arm.place(reached.servoed.q_true)
         flange = opened.arm.flange_pose()
         load_ball(opened.client, flange[:3, 3] + file.tool.rod_mm * flange[:3, 2], file.tool.ball_diameter_mm / 2,
                   (0.95, 0.5, 0.1, 1.0))  # fmt: skip
-        for marker in room.markers_c @ T_base_c[:3, :3].T + T_base_c[:3, 3]:
+        for marker in apply(T_base_c, room.markers_c):
             load_ball(opened.client, marker, file.head.marker_diameter_mm / 2, (0.2, 0.4, 0.9, 1.0))
         return pinhole_picture(
             opened.client, (camera.width, camera.height), camera.K, camera.T_camera_c @ room.T_c_base
         )
-
-
-def _at(center_mm: tuple[float, float, float]) -> Floats:
-    T = np.eye(4)
-    T[:3, 3] = center_mm
-    return T
 
 
 def _annotate(picture: Image.Image, session: Session, reached: Reached, number: int, scale: float) -> None:

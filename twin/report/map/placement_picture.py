@@ -24,6 +24,7 @@ from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.case.case import mount_pose
 from puncture_twin.planning.collision.workcell import case_boxes
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.place.mounts import Region
 from puncture_twin.planning.place.search import PlaceSearch, RatedPlacement
 from puncture_twin.twin.report.mount_text import direction_words, mount_words
@@ -172,7 +173,7 @@ def _bed(axes: Axes, found: PlaceSearch, case: Any, skin: TriangleMesh) -> None:
             parts["gantry" if box.name.startswith("gantry_") else box.name].append(box.corners)
     things = [(np.concatenate(corners), {"ls": "--", "lw": 0.9}) for corners in parts.values()]
     for corners, look in [*things, (skin.vertices, {"ls": "-", "lw": 1.6})]:
-        flat = (corners @ T_bed_ct[:3, :3].T + T_bed_ct[:3, 3])[:, SEEN_FROM_ABOVE]
+        flat = (apply(T_bed_ct, corners))[:, SEEN_FROM_ABOVE]
         outline = flat[ConvexHull(flat).vertices]
         axes.add_patch(Polygon(outline, closed=True, fill=False, edgecolor="black", zorder=7, **look))
     axes.plot([0], [0], marker="+", color="red", ms=11, mew=2.0, zorder=8)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import frame_along
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +37,8 @@ class ViewCamera:
         """Rows: right, up, forward; unit vectors, shape (3, 3)."""
         forward = np.asarray(self.look_at, dtype=float) - self.eye
         forward = forward / np.linalg.norm(forward)
-        right = np.cross(forward, self.up)
-        right = right / np.linalg.norm(right)
-        return np.stack([right, np.cross(right, forward), forward])
+        right, down, _ = frame_along(forward, -np.asarray(self.up)).T
+        return np.stack([right, -down, forward])
 
     @property
     def scale(self) -> float:

@@ -12,6 +12,7 @@ from puncture_twin.planning.arm.links import visual_links
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.winding import winding_number
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report import palette
@@ -186,8 +187,7 @@ def room(case: Any, T_base_ct: Floats | None) -> tuple[SceneBody, ...]:
     """The case's gantry and obstacles (table and the like); those given in the base frame need to know where it is."""
     bodies = [] if case.gantry is None else [_gantry(case.gantry)]
     for obstacle in case.obstacles:
-        T = np.eye(4)
-        T[:3, 3] = obstacle.center_mm
+        T = pose(np.eye(3), obstacle.center_mm)
         if obstacle.frame == "base":
             if T_base_ct is None:
                 continue

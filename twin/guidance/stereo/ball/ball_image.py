@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.registration.registration import apply
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
 from puncture_twin.twin.guidance.stereo.cameras.lens import distortion_slope, undistort
 

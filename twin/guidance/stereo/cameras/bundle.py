@@ -19,17 +19,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, left_jacobian, pose, skew
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.lens import coefficient_slope, distort
 
 CAMERA_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "wx", "wy", "wz", "tx", "ty", "tz")
 """Order of a camera's parameters: px, 1, rad, mm; w and t turn and move the camera's frame (T_camera_c)."""
-SMALL_ANGLE = 1e-6
-"""rad: below it the left Jacobian is the identity to 5e-7."""
 TOLERANCE = 1e-12
 """Relative change of cost or parameters that ends the search."""
 
@@ -193,7 +191,7 @@ class _Problem:
             _moved_camera(camera, every[14 * i : 14 * i + 14]) for i, camera in enumerate(self.start.cameras)
         )
         moves = every[self.first_body : self.first_point].reshape(-1, 6)
-        bodies = np.stack([_move(move) @ T for move, T in zip(moves, self.start.T_c_bodies, strict=True)])
+        bodies = pose(exp_rotation(moves[:, :3]), moves[:, 3:]) @ self.start.T_c_bodies
         return _Iterate(cameras, bodies, self.start.points + every[self.first_point :].reshape(-1, 3))
 
     def errors(self, x: Floats) -> Floats:
@@ -234,14 +232,14 @@ class _Problem:
 
 def _project(camera: Camera, points_c: Floats) -> Floats:
     """As ``Camera.project``, but smooth everywhere: a step of the search may pass behind a camera."""
-    points = points_c @ camera.T_camera_c[:3, :3].T + camera.T_camera_c[:3, 3]
+    points = apply(camera.T_camera_c, points_c)
     flat = points[:, :2] / points[:, 2:]
     return np.asarray(distort(flat, camera.distortion) * [camera.fx, camera.fy] + [camera.cx, camera.cy])
 
 
 def _camera_slope(camera: Camera, points_c: Floats, turn: tuple[Floats, Floats]) -> Floats:
     """Derivative of the pixels by the camera's 14 parameters, shape (n, 2, 14)."""
-    points = points_c @ camera.T_camera_c[:3, :3].T + camera.T_camera_c[:3, 3]
+    points = apply(camera.T_camera_c, points_c)
     flat = points[:, :2] / points[:, 2:]
     bent = distort(flat, camera.distortion)
     focal = np.array([camera.fx, camera.fy])
@@ -257,28 +255,7 @@ def _camera_slope(camera: Camera, points_c: Floats, turn: tuple[Floats, Floats])
 
 def _turn_slope(turned: Floats, w: Floats) -> Floats:
     """The slope d Exp(w) p / dw = -[Exp(w) p]x J_l(w), for Exp(w) p of shape (n, 3); shape (n, 3, 3)."""
-    return np.asarray(-_skew(turned) @ _left_jacobian(w))
-
-
-def _skew(v: Floats) -> Floats:
-    none = np.zeros(v.shape[:-1])
-    x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    return np.stack([np.stack([none, -z, y], -1), np.stack([z, none, -x], -1), np.stack([-y, x, none], -1)], -2)
-
-
-def _left_jacobian(w: Floats) -> Floats:
-    """J_l of SO(3) (Solà, Deray, Atchuthan 2018, Eq. 145), shape (3, 3)."""
-    angle = float(np.linalg.norm(w))
-    if angle < SMALL_ANGLE:
-        return np.eye(3) + _skew(w) / 2
-    W = _skew(w)
-    return np.asarray(np.eye(3) + (1 - np.cos(angle)) / angle**2 * W + (angle - np.sin(angle)) / angle**3 * W @ W)
-
-
-def _move(move: Floats) -> Floats:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(move[:3]).as_matrix(), move[3:]
-    return T
+    return np.asarray(-skew(turned) @ left_jacobian(w))
 
 
 def _moved_camera(camera: Camera, change: Floats) -> Camera:
@@ -289,5 +266,5 @@ def _moved_camera(camera: Camera, change: Floats) -> Camera:
         cx=camera.cx + float(change[2]),
         cy=camera.cy + float(change[3]),
         distortion=camera.distortion + change[4:8],
-        T_camera_c=_move(change[8:14]) @ camera.T_camera_c,
+        T_camera_c=pose(exp_rotation(change[8:11]), change[11:14]) @ camera.T_camera_c,
     )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.registration.registration import apply
+from puncture_twin.planning.geometry.rigid import apply, frame_about, frame_along, pose
 from puncture_twin.twin.guidance.stereo.cameras.lens import distort, distortion_slope, fold, undistort
 
 ROTATION_TOLERANCE = 1e-6
@@ -141,10 +141,7 @@ class Camera:
 
 def tangent_axes(direction: Floats) -> Floats:
     """Two unit vectors across a unit direction (3,), as columns, shape (3, 2); the three are right-handed."""
-    least = np.eye(3)[int(np.argmin(np.abs(direction)))]
-    first = np.cross(least, direction)
-    first = first / np.linalg.norm(first)
-    return np.stack([first, np.cross(direction, first)], axis=1)
+    return frame_about(direction)[:, :2]
 
 
 def looking_at(
@@ -168,11 +165,8 @@ def looking_at(
     """
     z = np.asarray(target_c, dtype=np.float64) - eye_c
     z = z / np.linalg.norm(z)
-    x = np.cross(down_c, z)
-    x = x / np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(z, x), z])
-    T[:3, 3] = -T[:3, :3] @ np.asarray(eye_c, dtype=np.float64)
+    R = np.ascontiguousarray(frame_along(z, np.asarray(down_c, dtype=np.float64)).T)
+    T = pose(R, -R @ np.asarray(eye_c, dtype=np.float64))
     width, height = size
     middle = (width - 1) / 2, (height - 1) / 2
     return Camera(width, height, focal_px, focal_px, *middle, np.asarray(distortion, dtype=np.float64), T)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg import rq
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import pose
 
 
 class Decomposition(NamedTuple):
@@ -81,9 +82,7 @@ def decompose(M: Floats) -> Decomposition:
     K, R = rq(M[:, :3])
     signs = np.diag(np.sign(np.diag(K)))
     K, R = K @ signs, signs @ R
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, np.linalg.solve(K, M[:, 3])
-    return Decomposition(K / K[2, 2], T)
+    return Decomposition(K / K[2, 2], pose(R, np.linalg.solve(K, M[:, 3])))
 
 
 def project(M: Floats, points: Floats) -> Floats:

@@ -14,6 +14,5 @@ from .recording import (
 from .refine import Problem as Problem
 from .residuals import tip_residuals as tip_residuals
 from .robust import plain_fit as plain_fit
-from .rotations import exp as exp, log as log, tangent_basis as tangent_basis
 from .slips import checked_calibration as checked_calibration
 from .weighting import UNWEIGHTED as UNWEIGHTED

@@ -10,10 +10,10 @@ from scipy.stats import chi2, f
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, PARAMETERS, T_Q, Estimate
+from puncture_twin.planning.geometry.rigid import log_rotation, pose
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, PARAMETERS, T_Q, Estimate, tangent_basis
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip, tip_residuals
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import log, tangent_basis
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.solve import Solution, solve
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import Spread
 
@@ -128,9 +128,9 @@ class Calibration:
         """Truth minus estimate in the order of ``parameters``, shape (p,): the step that leads to the truth."""
         own = self.estimate
         parts = [
-            log(own.R_X.T @ truth.R_X),
+            log_rotation(own.R_X.T @ truth.R_X),
             truth.t_X - own.t_X,
-            log(own.R_Y.T @ truth.R_Y),
+            log_rotation(own.R_Y.T @ truth.R_Y),
             truth.t_Y - own.t_Y,
             truth.t_Q - own.t_Q,
             truth.scale - own.scale,
@@ -230,9 +230,7 @@ def _with_length(solution: Solution, bias: float) -> Floats:
 
 
 def _pose(R: Floats, t: Floats) -> Floats:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
-    return _frozen(T)
+    return _frozen(pose(R, t))
 
 
 def _frozen(array: ArrayLike) -> Floats:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import exp, tangent_basis
+from puncture_twin.planning.geometry.rigid import exp_rotation, skew
 
 PARAMETERS = (
     *(f"w_X_{axis}_rad" for axis in "xyz"),
@@ -48,12 +48,12 @@ class Estimate(NamedTuple):
     """Shape (3,), unit: the needle's direction in end2."""
 
     def moved(self, step: Floats) -> Estimate:
-        """After a step (19,) in the order of ``PARAMETERS``: R exp([w]x), sums of the rest, V on the sphere."""
+        """After a step (19,) in the order of ``PARAMETERS``: R Exp(w), sums of the rest, V on the sphere."""
         V = self.V + tangent_basis(self.V) @ step[DIRECTION]
         return Estimate(
-            self.R_X @ exp(step[W_X]),
+            self.R_X @ exp_rotation(step[W_X]),
             self.t_X + step[T_X],
-            self.R_Y @ exp(step[W_Y]),
+            self.R_Y @ exp_rotation(step[W_Y]),
             self.t_Y + step[T_Y],
             self.t_Q + step[T_Q],
             self.scale + step[SCALE],
@@ -66,3 +66,11 @@ def active_columns(*, tip: bool, scale: bool, direction: bool) -> NDArray[np.int
     wanted = np.ones(N_PARAMETERS, dtype=bool)
     wanted[T_Q], wanted[SCALE], wanted[DIRECTION] = tip, scale, direction
     return np.flatnonzero(wanted)
+
+
+def tangent_basis(direction: Floats) -> Floats:
+    """Two unit vectors across a direction (3,) and each other, as columns, shape (3, 2)."""
+    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    first = skew(direction) @ helper
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, skew(direction) @ first])

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import LENGTH_MM, nearest_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import T_Q, T_X, T_Y, W_X, Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import parameter_units
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip, needle_in_image
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import skew
 
 LEAST_RATIO = 3e-3
 """Below it the calibration is refused (spec 3, section 3): constant insertion angle 4e-17, 45 +- 1 deg 1.2e-3, usual

@@ -22,6 +22,7 @@ from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
 from puncture_twin.planning.formats.raw_mesh import decode_text
+from puncture_twin.planning.geometry.rigid import pose
 
 FILE_NAME = "recording.csv"
 """What a folder is searched for."""
@@ -184,10 +185,7 @@ def _numbers(row: list[str], header: tuple[str, ...], where: str) -> list[float]
 
 
 def _matrices(values: Floats) -> Floats:
-    T = np.tile(np.eye(4), (len(values), 1, 1))
-    T[:, :3, :3] = values[:, :9].reshape(-1, 3, 3)
-    T[:, :3, 3] = values[:, 9:]
-    return T
+    return pose(values[:, :9].reshape(-1, 3, 3), values[:, 9:])
 
 
 def _row_major(T: Floats) -> Floats:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
     DIRECTION,
     N_PARAMETERS,
@@ -26,9 +27,9 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
     W_X,
     W_Y,
     Estimate,
+    tangent_basis,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import skew, tangent_basis
 
 
 class Linearised(NamedTuple):

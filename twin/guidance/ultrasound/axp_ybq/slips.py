@@ -15,6 +15,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.rigid import inverse
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
@@ -89,13 +90,6 @@ def _read(recording: Recording, A: Floats, B: Floats, P: Floats) -> Recording:
     return Recording(A, B, P, None, recording.names, recording.pixels)
 
 
-def _inverse(T: Floats) -> Floats:
-    found = np.tile(np.eye(4), (len(T), 1, 1))
-    found[:, :3, :3] = T[:, :3, :3].transpose(0, 2, 1)
-    found[:, :3, 3] = -(found[:, :3, :3] @ T[:, :3, 3:])[:, :, 0]
-    return found
-
-
 def _transposed(T: Floats) -> Floats:
     found = np.array(T)
     found[:, :3, :3] = T[:, :3, :3].transpose(0, 2, 1)
@@ -110,11 +104,11 @@ def _longer(T: Floats, factor: float) -> Floats:
 
 SLIPS: Mapping[str, Reading] = MappingProxyType(
     {
-        "A and B are inverse (base in flange)": lambda r: _read(r, _inverse(r.A), _inverse(r.B), r.P),
-        "A is inverse (base in flange)": lambda r: _read(r, _inverse(r.A), r.B, r.P),
-        "B is inverse (base in flange)": lambda r: _read(r, r.A, _inverse(r.B), r.P),
+        "A and B are inverse (base in flange)": lambda r: _read(r, inverse(r.A), inverse(r.B), r.P),
+        "A is inverse (base in flange)": lambda r: _read(r, inverse(r.A), r.B, r.P),
+        "B is inverse (base in flange)": lambda r: _read(r, r.A, inverse(r.B), r.P),
         "the arms A and B are swapped": lambda r: _read(r, r.B, r.A, r.P),
-        "the arms are swapped and inverse": lambda r: _read(r, _inverse(r.B), _inverse(r.A), r.P),
+        "the arms are swapped and inverse": lambda r: _read(r, inverse(r.B), inverse(r.A), r.P),
         "the rotations of A and B are written by columns": lambda r: _read(r, _transposed(r.A), _transposed(r.B), r.P),
         "the rotations of A are written by columns": lambda r: _read(r, _transposed(r.A), r.B, r.P),
         "the rotations of B are written by columns": lambda r: _read(r, r.A, _transposed(r.B), r.P),

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import LEAST_RATIO, scaled_jacobian
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import needle_in_image
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import exp, log
 
 TURN_RAD = float(np.radians(25.0))
 """How far the probe is turned, and the insertion angle changed."""
@@ -115,7 +115,7 @@ def _all_moves() -> list[_Move]:
 
 def _central(recording: Recording) -> int:
     """The pose whose tip lies nearest to the middle of all, among those whose probe is turned about as usual."""
-    turns = log(recording.A[0, :3, :3].T @ recording.A[:, :3, :3])
+    turns = log_rotation(recording.A[0, :3, :3].T @ recording.A[:, :3, :3])
     sides = [recording.P - np.median(recording.P, axis=0), (turns - np.median(turns, axis=0)) * 100.0]
     return int(np.argmin(np.linalg.norm(np.column_stack(sides), axis=1)))
 
@@ -125,13 +125,13 @@ def _changed(estimate: Estimate, recording: Recording, row: int, move: _Move) ->
     A, p = recording.A[row], np.append(recording.P[row] * estimate.scale, 0.0)
     R_AX, M = A[:3, :3] @ estimate.R_X, needle_in_image(estimate, recording)[row]
     tip_base1 = A[:3, :3] @ (estimate.R_X @ p + estimate.t_X) + A[:3, 3]
-    turned = R_AX @ exp(np.array(move.turn))
+    turned = R_AX @ exp_rotation(np.array(move.turn))
     new_A, new_B = np.eye(4), np.eye(4)
     new_A[:3, :3] = turned @ estimate.R_X.T
     shifted = p + np.append(move.shift, 0.0)
     new_A[:3, 3] = tip_base1 - new_A[:3, :3] @ (estimate.R_X @ p + estimate.t_X)
     new_tip = turned @ shifted + new_A[:3, :3] @ estimate.t_X + new_A[:3, 3]
-    new_M = exp(np.array([0.0, 0.0, move.insertion])) @ M @ exp(move.roll * estimate.V)
+    new_M = exp_rotation(np.array([0.0, 0.0, move.insertion])) @ M @ exp_rotation(move.roll * estimate.V)
     new_B[:3, :3] = estimate.R_Y.T @ turned @ new_M
     new_B[:3, 3] = estimate.R_Y.T @ (new_tip - estimate.t_Y) - new_B[:3, :3] @ estimate.t_Q
     return PoseChange(

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import across, needle_in_image, tip_points
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.rotations import skew
 
 LEAST_WEIGHT = 1e-12
 """A pose that is set aside keeps this weight: its residual's standard deviation is a million times as large."""

@@ -1,0 +1,139 @@
+"""Rigid motions: rotation vectors, twists, poses, and frames from axes or points.
+
+Notation of Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics" (2018). A rotation vector is
+ω (rad), Ω = [ω]× its cross-product matrix, φ = |ω|. A twist is τ = (ρ, ω): the translation (mm) first, then the
+rotation (rad). A pose T_b_a = [R, t; 0, 1] maps coordinates in frame a to frame b. Every function that takes vectors
+(..., 3) or poses (..., 4, 4) takes many at once, unless its shape says otherwise.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from puncture_twin.planning.base.arrays import Floats
+
+SMALL_ANGLE = 1e-6
+"""rad: below it the left Jacobian's terms of second order (φ²/6 < 2e-13) are left out."""
+
+
+def skew(v: Floats) -> Floats:
+    """The matrix [v]× of vectors (..., 3), shape (..., 3, 3): [v]× a = v × a."""
+    matrix = np.zeros((*v.shape, 3))
+    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    matrix[..., 1, 0], matrix[..., 2, 0], matrix[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return matrix
+
+
+def exp_rotation(w: ArrayLike) -> Floats:
+    """Rotations (..., 3, 3) of rotation vectors (..., 3), rad."""
+    # Exp(ω) = I + sin φ / φ Ω + (1 - cos φ) / φ² Ω²   (Solà 2018, Eq. 69); scipy computes it by a unit quaternion
+    return np.asarray(Rotation.from_rotvec(w).as_matrix())
+
+
+def log_rotation(R: Floats) -> Floats:
+    """Rotation vectors (..., 3), rad, of rotations (..., 3, 3); their length is at most π."""
+    # Log(R) = φ (R - R^T)^∨ / (2 sin φ)   (Solà 2018, Eq. 74); scipy computes it by a unit quaternion, near π too
+    return np.asarray(Rotation.from_matrix(R).as_rotvec())
+
+
+def left_jacobian(w: Floats) -> Floats:
+    """J_l(ω) with Exp(ω + δ) ≈ Exp(J_l(ω) δ) Exp(ω), shape (3, 3), of one rotation vector (3,), rad."""
+    angle = float(np.linalg.norm(w))
+    W = skew(w)
+    if angle < SMALL_ANGLE:
+        return np.asarray(np.eye(3) + W / 2)
+    # J_l(ω) = I + (1 - cos φ) / φ² Ω + (φ - sin φ) / φ³ Ω²   (Solà 2018, Eq. 145)
+    return np.asarray(np.eye(3) + (1 - np.cos(angle)) / angle**2 * W + (angle - np.sin(angle)) / angle**3 * W @ W)
+
+
+def exp_twist(twist: Floats) -> Floats:
+    """The pose of a twist (6,) = (translation mm, rotation rad), shape (4, 4)."""
+    # Exp(τ) = [Exp(ω), J_l(ω) ρ; 0, 1]   (Solà 2018, Eq. 172)
+    return pose(exp_rotation(twist[3:]), left_jacobian(twist[3:]) @ twist[:3])
+
+
+def log_twist(T: Floats) -> Floats:
+    """The twist (6,) = (translation mm, rotation rad) of a pose (4, 4)."""
+    # Log(T) = (J_l(ω)⁻¹ t, ω)   (Solà 2018, Eq. 173)
+    w = log_rotation(T[:3, :3])
+    return np.concatenate([np.linalg.solve(left_jacobian(w), T[:3, 3]), w])
+
+
+def pose(R: ArrayLike, t: ArrayLike) -> Floats:
+    """T (..., 4, 4) of rotations (..., 3, 3), one or as many, and translations (..., 3), mm."""
+    t = np.asarray(t, dtype=np.float64)
+    T = np.zeros((*t.shape[:-1], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
+    return T
+
+
+def inverse(T_b_a: Floats) -> Floats:
+    """T_a_b of poses (..., 4, 4)."""
+    # T⁻¹ = [R^T, -R^T t; 0, 1]
+    T = pose(np.swapaxes(T_b_a[..., :3, :3], -1, -2), np.zeros(T_b_a.shape[:-2] + (3,)))
+    T[..., :3, 3] = -(T[..., :3, :3] @ T_b_a[..., :3, 3:])[..., 0]
+    return T
+
+
+def apply(T_b_a: NDArray[np.floating[Any]], points_a: NDArray[np.floating[Any]]) -> Floats:
+    """Points (..., 3) of frame a in frame b, by one pose (4, 4), or by any affine map as that of voxels."""
+    # p_b = R p_a + t, for points in rows
+    return np.asarray(points_a @ T_b_a[:3, :3].T + T_b_a[:3, 3])
+
+
+def turned_about(T: Floats, center: Floats, change: Floats) -> Floats:
+    """A pose (4, 4) turned about a point (3,) of the frame that it leads to, then shifted.
+
+    Args:
+        T: Shape (4, 4), mm.
+        center: Shape (3,), mm.
+        change: Shape (6,): rotation vector (rad), then shift (mm).
+    """
+    # p -> Exp(ω) (p - c) + c + s
+    R = exp_rotation(change[:3])
+    return pose(R @ T[:3, :3], R @ (T[:3, 3] - center) + center + change[3:])
+
+
+def frame_xz(x: Floats, z: Floats) -> Floats:
+    """Rotations with columns x, y = z × x, z, shape (..., 3, 3), of unit vectors (..., 3) at a right angle."""
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def frame_yz(y: Floats, z: Floats) -> Floats:
+    """Rotations with columns x = y × z, y, z, shape (..., 3, 3), of unit vectors (..., 3) at a right angle."""
+    return np.stack([np.cross(y, z), y, z], axis=-1)
+
+
+def frame_of_axes(z: Floats, x: Floats) -> Floats:
+    """The rotation whose z axis lies along one vector (3,) and whose x axis is what of another is square to it."""
+    # z = z / |z|,  x = x - z (x · z), made a unit vector: Gram and Schmidt
+    z = z / np.linalg.norm(z)
+    x = x - z * (x @ z)
+    return frame_xz(x / np.linalg.norm(x), z)
+
+
+def frame_along(z: Floats, down: Floats) -> Floats:
+    """The rotation with a unit vector z (3,) as its z axis and x = down × z, made a unit vector; y is nearest to down.
+
+    A camera's frame, where z is its view and ``down`` (3,), not parallel to it, is down in its picture.
+    """
+    x = np.cross(down, z)
+    return frame_xz(x / np.linalg.norm(x), z)
+
+
+def frame_about(z: Floats) -> Floats:
+    """Some rotation with a unit vector z (3,) as its z axis; x is square to the base vector farthest from z."""
+    return frame_along(z, np.eye(3)[int(np.argmin(np.abs(z)))])
+
+
+def frame_of_points(points: Floats) -> Floats:
+    """The rotation of the frame that three points (3, 3) span (Chen 2019, Eq. 1-6), columns e1, e2, e3."""
+    # e1 = (p2 - p1) / |..|,  e3 = e1 × (p3 - p1) / |..|,  e2 = e3 × e1
+    e1 = points[1] - points[0]
+    e1 = e1 / np.linalg.norm(e1)
+    e3 = np.cross(e1, points[2] - points[0])
+    return frame_xz(e1, e3 / np.linalg.norm(e3))

@@ -1,0 +1,152 @@
+"""The laws of rigid motions: closure, inverse, exponential and logarithm, Jacobian, and frames that are frames."""
+
+import numpy as np
+import pytest
+
+from puncture_twin.planning.geometry import rigid
+
+SEED = 20260122
+ANGLES = (0.0, 1e-12, 1e-8, 0.99e-6, 1.01e-6, 1e-4, 0.1, 1.0, 3.0, np.pi - 1e-4, np.pi - 1e-8)
+"""rad: identity, near it, on both sides of the Jacobian's small angle, and near a half turn."""
+
+STEP = 1e-6
+"""Of central differences, rad: their error is about STEP^2 + 1e-16 / STEP."""
+
+
+def rotation_vectors(angle):
+    """Twenty rotation vectors of one length, (20, 3)."""
+    axes = np.random.default_rng(SEED).normal(size=(20, 3))
+    return angle * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+
+
+def poses(n=20):
+    """Random poses (n, 4, 4), mm."""
+    rng = np.random.default_rng(SEED)
+    return rigid.pose(rigid.exp_rotation(rng.normal(size=(n, 3))), rng.normal(0.0, 300.0, (n, 3)))
+
+
+def units(n=20):
+    """Random unit vectors (n, 3), with the axes themselves among them."""
+    v = np.random.default_rng(SEED).normal(size=(n, 3))
+    return np.concatenate([v / np.linalg.norm(v, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
+
+
+def assert_rotation(R):
+    """R^T R = 1 and det R = +1."""
+    np.testing.assert_allclose(np.swapaxes(R, -1, -2) @ R, np.broadcast_to(np.eye(3), R.shape), atol=1e-14)
+    np.testing.assert_allclose(np.linalg.det(R), 1.0, atol=1e-14)
+
+
+def test_skew_is_the_cross_product():
+    """[v]x a = v x a, for many vectors at once."""
+    v, a = np.random.default_rng(SEED).normal(size=(2, 20, 3))
+    np.testing.assert_allclose((rigid.skew(v) @ a[..., None])[..., 0], np.cross(v, a), atol=1e-15)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_exponential_is_a_rotation_about_its_vector(angle):
+    """It keeps its axis, its inverse is the exponential of the opposite, and Rodrigues' formula gives the same."""
+    for w in rotation_vectors(angle):
+        R = rigid.exp_rotation(w)
+        assert_rotation(R)
+        np.testing.assert_allclose(R @ w, w, atol=1e-14)
+        np.testing.assert_allclose(R @ rigid.exp_rotation(-w), np.eye(3), atol=1e-14)
+        W = rigid.skew(w)
+        sine, versine = (np.sin(angle) / angle, 2 * (np.sin(angle / 2) / angle) ** 2) if angle else (1.0, 0.5)
+        np.testing.assert_allclose(R, np.eye(3) + sine * W + versine * W @ W, atol=1e-14)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_logarithm_undoes_the_exponential(angle):
+    """To rounding, near the identity and near a half turn."""
+    w = rotation_vectors(angle)
+    np.testing.assert_allclose(rigid.log_rotation(rigid.exp_rotation(w)), w, rtol=1e-9, atol=1e-14)
+
+
+def test_exponential_undoes_the_logarithm_at_a_half_turn():
+    """There the vector's sign is free, the rotation is not."""
+    R = rigid.exp_rotation(rotation_vectors(np.pi))
+    w = rigid.log_rotation(R)
+    np.testing.assert_allclose(np.linalg.norm(w, axis=1), np.pi, atol=1e-7)
+    np.testing.assert_allclose(rigid.exp_rotation(w), R, atol=1e-7)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_left_jacobian_is_the_slope_of_the_exponential(angle):
+    """Log(Exp(w + h e) Exp(w)^T) / h by central differences."""
+    for w in rotation_vectors(angle):
+        R = rigid.exp_rotation(w)
+        ends = [rigid.log_rotation(rigid.exp_rotation(w + h * np.eye(3)) @ R.T) for h in (STEP, -STEP)]
+        slope = (ends[0] - ends[1]).T / (2 * STEP)
+        np.testing.assert_allclose(rigid.left_jacobian(w), slope, atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_twists_return_from_their_poses(angle):
+    """Log(Exp(t)) = t, and Exp(-t) is the inverse of Exp(t)."""
+    shifts = np.random.default_rng(SEED).normal(0.0, 100.0, (20, 3))
+    for twist in np.concatenate([shifts, rotation_vectors(angle)], axis=1):
+        T = rigid.exp_twist(twist)
+        np.testing.assert_allclose(rigid.log_twist(T), twist, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(rigid.exp_twist(-twist), rigid.inverse(T), atol=1e-9)
+
+
+def test_half_a_twist_twice_is_the_twist():
+    """A screw motion goes along one path."""
+    for T in poses():
+        half = rigid.exp_twist(rigid.log_twist(T) / 2)
+        np.testing.assert_allclose(half @ half, T, atol=1e-10)
+
+
+def test_poses_form_a_group():
+    """Products and inverses are poses; the inverse undoes; the product applies one after the other."""
+    T, other = poses(), poses()[::-1]
+    points = np.random.default_rng(SEED).normal(0.0, 100.0, (7, 3))
+    assert_rotation((T @ other)[:, :3, :3])
+    np.testing.assert_allclose(rigid.inverse(T) @ T, np.broadcast_to(np.eye(4), T.shape), atol=1e-12)
+    np.testing.assert_allclose(rigid.inverse(T @ other), rigid.inverse(other) @ rigid.inverse(T), atol=1e-11)
+    for one, two in zip(T, other, strict=True):
+        np.testing.assert_array_equal((one @ two)[3], [0.0, 0.0, 0.0, 1.0])
+        twice = rigid.apply(one, rigid.apply(two, points))
+        np.testing.assert_allclose(rigid.apply(one @ two, points), twice, atol=1e-11)
+        np.testing.assert_allclose(rigid.apply(rigid.inverse(one), rigid.apply(one, points)), points, atol=1e-11)
+
+
+def test_a_turn_about_a_point_leaves_it():
+    """And the shift moves it by itself."""
+    center, shift = np.array([10.0, -20.0, 30.0]), np.array([1.0, 2.0, 3.0])
+    for T, w in zip(poses(), rotation_vectors(0.7), strict=True):
+        moved = rigid.turned_about(T, center, np.concatenate([w, shift]))
+        there = rigid.apply(rigid.inverse(T), center)
+        np.testing.assert_allclose(rigid.apply(moved, there), center + shift, atol=1e-11)
+        np.testing.assert_allclose(moved[:3, :3], rigid.exp_rotation(w) @ T[:3, :3], atol=1e-14)
+
+
+def test_frames_from_axes_keep_the_first_and_lean_to_the_second():
+    """Each is a rotation whose z axis is the one that was given."""
+    for z, other in zip(units(), np.roll(units(), 1, axis=0) * 3.0, strict=True):
+        of_axes, along, about = rigid.frame_of_axes(5 * z, other), rigid.frame_along(z, other), rigid.frame_about(z)
+        for R in (of_axes, along, about):
+            assert_rotation(R)
+            np.testing.assert_allclose(R[:, 2], z, atol=1e-15)
+        assert of_axes[:, 0] @ other > 0
+        assert abs(of_axes[:, 1] @ other) < 1e-14
+        assert along[:, 1] @ other > 0
+        assert abs(along[:, 0] @ other) < 1e-14
+        np.testing.assert_allclose(rigid.frame_xz(about[:, 0], z), about, atol=1e-15)
+        np.testing.assert_allclose(rigid.frame_yz(about[:, 1], z), about, atol=1e-15)
+
+
+def test_the_frame_of_three_points_moves_with_them():
+    """Its x axis leads from the first to the second, the third lies on the side of +y in the xy plane."""
+    points = np.random.default_rng(SEED).normal(0.0, 100.0, (3, 3))
+    R = rigid.frame_of_points(points)
+    assert_rotation(R)
+    in_frame = (points - points[0]) @ R
+    np.testing.assert_allclose(in_frame[:, 2], 0.0, atol=1e-12)
+    assert in_frame[1, 0] > 0
+    assert abs(in_frame[1, 1]) < 1e-12
+    assert in_frame[2, 1] > 0
+    for T in poses():
+        moved = rigid.frame_of_points(rigid.apply(T, points))
+        np.testing.assert_allclose(moved, T[:3, :3] @ R, atol=1e-12)
