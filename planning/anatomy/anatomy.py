@@ -26,9 +26,9 @@ from puncture_twin.planning.formats.labels.naming import RuleKind, names_for, se
 from puncture_twin.planning.formats.meshes.mesh_files import mesh_warnings, parse_mesh
 from puncture_twin.planning.formats.volumes.volume_files import NRRD_ENDINGS
 from puncture_twin.planning.geometry.containment import Side, side_of
-from puncture_twin.planning.geometry.decimation import squared_distance
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, parse_space, parse_unit
+from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
 Progress = Callable[[str], None]
 

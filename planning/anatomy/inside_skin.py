@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from puncture_twin.planning.anatomy.skin import FieldOfView, Skin
 from puncture_twin.planning.anatomy.skin_entry import settled_crossings
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.geometry.decimation import squared_distance
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
 SAMPLES = 1000
 """Points on a structure's surface, each for the same area: a fraction is found to 0.1 %."""

@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.collision.kernels.surfaces import farthest_from
+from puncture_twin.planning.geometry.triangle_distance import farthest_from
 
 LEAF_RADIUS_MM = 30.0
 """Parts are cut until their ball is no larger: half of a UR3 wrist's size."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
 REDUCTIONS = (0.9, 0.75, 0.5)
 """Shares of the triangles to take away, tried from the greatest."""
@@ -113,26 +114,3 @@ def _samples(mesh: TriangleMesh, spacing_mm: float) -> _Samples:
 def _longest_edges(mesh: TriangleMesh) -> NDArray[np.float64]:
     corners = mesh.triangles
     return np.asarray(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1))
-
-
-def squared_distance(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Squared distance from points (..., 3) to triangles (..., 3, 3), broadcast against each other.
-
-    Where the foot on the plane lies inside the triangle it counts, else the nearest of the three edges.
-    """
-    corner = triangles[..., 0, :]
-    normal = np.cross(triangles[..., 1, :] - corner, triangles[..., 2, :] - corner)
-    area2 = np.einsum("...i,...i", normal, normal)
-    inside = area2 > 0
-    edge_squares = []
-    for first in range(3):
-        start, end = triangles[..., first, :], triangles[..., (first + 1) % 3, :]
-        edge, offset = end - start, points - start
-        length2 = np.einsum("...i,...i", edge, edge)
-        along = np.einsum("...i,...i", offset, edge) / np.where(length2 > 0, length2, 1.0)
-        gap = offset - np.clip(along, 0.0, 1.0)[..., None] * edge
-        edge_squares.append(np.einsum("...i,...i", gap, gap))
-        inside = inside & (np.einsum("...i,...i", np.cross(edge, offset), normal) >= 0)
-    height = np.einsum("...i,...i", points - corner, normal)
-    plane = height * height / np.where(area2 > 0, area2, 1.0)
-    return np.where(inside, plane, np.minimum.reduce(edge_squares))

@@ -10,7 +10,7 @@ from scipy.special import fdtri
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.containment import Side, side_of
-from puncture_twin.planning.geometry.decimation import squared_distance
+from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
 MARKER_ON_SKIN_MM = 30.0
 """A skin marker's centre lies within its own height of the skin; one farther off stands on a frame, or is misread."""

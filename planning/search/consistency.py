@@ -14,8 +14,8 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.volumes.volume_files import parse_header
 from puncture_twin.planning.formats.volumes.volume_header import VolumeHeader
-from puncture_twin.planning.geometry.decimation import squared_distance
 from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.triangle_distance import squared_distance
 from puncture_twin.planning.geometry.winding import odd_fraction, winding_number
 from puncture_twin.planning.registration.marker_check import check_markers
 from puncture_twin.planning.registration.placement import Placement

@@ -27,12 +27,13 @@ from puncture_twin.planning.collision.bounding_spheres import (
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING, hull_gap
-from puncture_twin.planning.collision.kernels.surfaces import STACK, to_surface, to_triangle
+from puncture_twin.planning.collision.kernels.surfaces import STACK, to_surface
 from puncture_twin.planning.collision.proofs import ask_fcl
 from puncture_twin.planning.collision.shapes import convex
 from puncture_twin.planning.collision.triangle_tree import TriangleTree
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.triangle_distance import to_triangle
 from puncture_twin.planning.reach.reach import ReachAnswer, assess_reach, assess_reach_all
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.search import case_directions, organ_candidates, reach_request
@@ -113,20 +114,6 @@ def test_no_corner_stands_out_of_the_coarse_hull_by_more_than_its_slack(name: st
             beyond = (corners @ u.T).max(axis=0) - (coarse.corners @ u.T).max(axis=0)
             assert beyond.max() <= coarse.slack_mm + 1e-9
             assert len(coarse.corners) <= 60 and coarse.slack_mm < 12.0
-
-
-def test_distance_to_a_triangle_agrees_with_another_closest_point() -> None:
-    """Over random, thin and flat triangles, from near and far, to 1e-9 of the size; without area, the edges count."""
-    rng = np.random.default_rng(4)
-    triangles = rng.normal(size=(4000, 3, 3)) * 20.0
-    triangles[1000:2000, 2] = triangles[1000:2000, 1] + rng.normal(size=(1000, 3)) * 1e-3
-    points = triangles.mean(axis=1) + rng.normal(size=(4000, 3)) * 10.0 ** rng.uniform(-2, 2, (4000, 1))
-    closest = trimesh.triangles.closest_point(triangles, points)
-    ours = np.sqrt([to_triangle(t, *p) for t, p in zip(triangles, points, strict=True)])
-    assert np.abs(ours - np.linalg.norm(points - closest, axis=1)).max() < 1e-6
-    line = np.array([[0.0, 0, 0], [10, 0, 0], [5, 0, 0]])
-    assert np.sqrt(to_triangle(line, 4.0, 3.0, 0.0)) == pytest.approx(3.0)
-    assert np.sqrt(to_triangle(np.full((3, 3), 2.0), 2.0, 2.0, 7.0)) == pytest.approx(5.0)
 
 
 @pytest.mark.parametrize("subdivisions", [0, 1, 4])

@@ -18,8 +18,9 @@ from scipy.spatial import cKDTree
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.label_surface import label_mesh
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap, read_labelmap
-from puncture_twin.planning.geometry.decimation import decimated, squared_distance
+from puncture_twin.planning.geometry.decimation import decimated
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
 REAL = REAL_CT
 needs_real = pytest.mark.skipif(not REAL.is_dir(), reason=f"the real CT is not at {REAL}")
@@ -167,14 +168,6 @@ def test_a_mesh_that_cannot_lose_a_triangle_within_the_bound_stays(
     mesh = ball(20.0)
     assert decimated(mesh, 1e-6) is mesh
     assert len(decimated(mesh, 1.0).faces) < len(mesh.faces)
-
-
-def test_point_to_triangle_distance_in_every_region() -> None:
-    """Above the inside, beside an edge, beyond a corner, and for a triangle without area."""
-    triangle = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]])
-    points = np.array([[1.0, 1, 2], [2, -3, 0], [7, -4, 0], [-3, 0, 4], [4, 4, 0], [1, 1, 0]])
-    assert np.allclose(squared_distance(points, triangle), [4, 9, 25, 25, 8, 0])
-    assert np.allclose(squared_distance(points[:1], triangle[[0, 1, 1]]), [5])
 
 
 def test_labels_are_read_from_integers_and_from_whole_floats(tmp_path: Path) -> None:

@@ -1,0 +1,86 @@
+"""Distance of points from triangles, in float64, triangles without area included.
+
+The engines' searches have kernels of their own, which measure many needles against one triangle; everything else that
+asks how far a point is from a surface asks here.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.numba_kernels import nb
+
+ROUNDS_TO_ZERO = 1e-30
+"""Squared lengths, mm^2, below which a segment has no direction."""
+
+
+def squared_distance(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Squared distance, mm^2, from points (..., 3) to triangles (..., 3, 3), broadcast against each other."""
+    shape = np.broadcast_shapes(points.shape[:-1], triangles.shape[:-2])
+    pairs = int(np.prod(shape))
+    flat_points = np.broadcast_to(points, (*shape, 3)).reshape(pairs, 3)
+    flat_triangles = np.broadcast_to(triangles, (*shape, 3, 3)).reshape(pairs, 3, 3)
+    squares = np.empty(pairs)
+    _each(np.ascontiguousarray(flat_triangles), np.ascontiguousarray(flat_points), squares)
+    return squares.reshape(shape)
+
+
+@nb.njit(cache=True)
+def _each(triangles, points, squares):  # type: ignore[no-untyped-def]  # numba infers
+    """One point from one triangle, row by row."""
+    for row in range(len(points)):
+        squares[row] = to_triangle(triangles[row], points[row, 0], points[row, 1], points[row, 2])
+
+
+@nb.njit(cache=True)
+def to_triangle(t, x, y, z):  # type: ignore[no-untyped-def]  # numba infers
+    """Squared distance of a point to a triangle (3, 3): its edges', or its plane's where the foot lies inside.
+
+    The edges always count, so that a triangle without area, whose normal means nothing, is not lost.
+    """
+    ax, ay, az = t[0, 0] - x, t[0, 1] - y, t[0, 2] - z
+    bx, by, bz = t[1, 0] - x, t[1, 1] - y, t[1, 2] - z
+    cx, cy, cz = t[2, 0] - x, t[2, 1] - y, t[2, 2] - z
+    squared = min(
+        _to_segment(ax, ay, az, bx, by, bz), _to_segment(bx, by, bz, cx, cy, cz), _to_segment(cx, cy, cz, ax, ay, az)
+    )
+    # b x c, c x a, a x b seen from the point; their sum is the normal, and each part's sign along it the side.
+    px, py, pz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+    qx, qy, qz = cy * az - cz * ay, cz * ax - cx * az, cx * ay - cy * ax
+    rx, ry, rz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    nx, ny, nz = px + qx + rx, py + qy + ry, pz + qz + rz
+    area = nx * nx + ny * ny + nz * nz
+    inside = (
+        px * nx + py * ny + pz * nz >= 0.0 and qx * nx + qy * ny + qz * nz >= 0.0 and rx * nx + ry * ny + rz * nz >= 0.0
+    )
+    if inside and area > ROUNDS_TO_ZERO:
+        height = ax * nx + ay * ny + az * nz
+        squared = min(squared, height * height / area)
+    return squared
+
+
+@nb.njit(cache=True)
+def _to_segment(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]  # numba infers
+    """Squared distance of the origin to the segment a b."""
+    ux, uy, uz = bx - ax, by - ay, bz - az
+    squared = ux * ux + uy * uy + uz * uz
+    share = 0.0
+    if squared > ROUNDS_TO_ZERO:
+        share = min(1.0, max(0.0, -(ax * ux + ay * uy + az * uz) / squared))
+    x, y, z = ax + share * ux, ay + share * uy, az + share * uz
+    return x * x + y * y + z * z
+
+
+@nb.njit(cache=True)
+def farthest_from(triangles, points):  # type: ignore[no-untyped-def]  # numba infers
+    """The largest distance of points (n, 3) to triangles (m, 3, 3); 0 without points."""
+    farthest = 0.0
+    for i in range(len(points)):
+        nearest = math.inf
+        for k in range(len(triangles)):
+            nearest = min(nearest, to_triangle(triangles[k], points[i, 0], points[i, 1], points[i, 2]))
+        farthest = max(farthest, nearest)
+    return math.sqrt(farthest)
