@@ -12,7 +12,9 @@ from .files import (
     is_folder as is_folder,
     is_plain_file as is_plain_file,
 )
+from .html import Facts as Facts, card as card, escape as escape, never_raises as never_raises
 from .input_file import read_input as read_input
+from .polar_map import Sectors as Sectors, polar_map as polar_map
 from .processes import worker_count as worker_count
 from .provenance import (
     CASE_ROLE as CASE_ROLE,
@@ -23,7 +25,14 @@ from .provenance import (
     inputs_document as inputs_document,
     read_inputs as read_inputs,
 )
-from .reasons import Reason as Reason
+from .reasons import (
+    REASON_COLOURS as REASON_COLOURS,
+    REASON_WORDS as REASON_WORDS,
+    SAFE as SAFE,
+    Reason as Reason,
+    Rgb as Rgb,
+    css as css,
+)
 from .stages import Stages as Stages
 from .text_names import MAX_NAME as MAX_NAME, check_name as check_name, unprintable_texts as unprintable_texts
 from .toml_file import (

@@ -1,8 +1,14 @@
-"""Why a candidate is rejected: the reason codes of the candidates table."""
+"""Why a candidate is rejected: the reason codes of the candidates table, and how a person sees them.
+
+The colours follow Okabe and Ito's palette for colour-blind readers ("Color Universal Design", 2008), filled up with
+three dark tones of Paul Tol's ("Colour Schemes", SRON technical note, 2021); none of them is near the greens that mean
+safe.
+"""
 
 from __future__ import annotations
 
 from enum import StrEnum
+from types import MappingProxyType
 
 
 class Reason(StrEnum):
@@ -19,3 +25,45 @@ class Reason(StrEnum):
     ARM_COLLISION = "arm_collision"
     INSERTION_BLOCKED = "insertion_blocked"
     APPROACH_NOT_FOUND = "approach_not_found"
+
+
+Rgb = tuple[int, int, int]
+
+SAFE: Rgb = (0, 158, 115)
+"""Safe, where no shade is meant: legends, the corridor in 3D."""
+
+REASON_COLOURS = MappingProxyType(
+    {
+        Reason.NO_SKIN_ENTRY: (221, 221, 221),
+        Reason.REENTERS_SKIN: (240, 228, 66),
+        Reason.TOO_LONG: (86, 180, 233),
+        Reason.SKIN_ANGLE: (230, 159, 0),
+        Reason.TOO_CLOSE: (213, 94, 0),
+        Reason.UNKNOWN_REGION: (110, 110, 110),
+        Reason.UNREACHABLE: (0, 90, 178),
+        Reason.ARM_COLLISION: (204, 121, 167),
+        Reason.INSERTION_BLOCKED: (136, 34, 85),
+        Reason.APPROACH_NOT_FOUND: (51, 34, 136),
+    }
+)
+
+REASON_WORDS = MappingProxyType(
+    {
+        Reason.NONE: "safe",
+        Reason.NO_SKIN_ENTRY: "no skin entry",
+        Reason.REENTERS_SKIN: "leaves and re-enters the skin",
+        Reason.TOO_LONG: "path longer than the needle's shaft",
+        Reason.SKIN_ANGLE: "too oblique at the skin",
+        Reason.TOO_CLOSE: "hits a structure or its margin",
+        Reason.UNKNOWN_REGION: "unknown region (image ends, or not named)",
+        Reason.UNREACHABLE: "arm cannot reach the pose",
+        Reason.ARM_COLLISION: "arm would collide",
+        Reason.INSERTION_BLOCKED: "straight insertion not drivable",
+        Reason.APPROACH_NOT_FOUND: "no approach found",
+    }
+)
+
+
+def css(colour: Rgb) -> str:
+    """The colour as ``#rrggbb``."""
+    return "#{:02x}{:02x}{:02x}".format(*colour)

@@ -31,6 +31,7 @@ from puncture_twin.planning.case.case_file import (
     StructuresSection,
 )
 from puncture_twin.planning.case.entry import entry_frame, view_frame
+from puncture_twin.planning.case.html import case_html
 from puncture_twin.planning.case.whole_case import wholeness_warnings
 from puncture_twin.planning.formats.labels import naming
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
@@ -169,6 +170,10 @@ class Case:
     stated_structures: int | None = None
     region: str | None = None
     warnings: tuple[str, ...] = ()
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        return case_html(self)
 
     @property
     def folder(self) -> Path:

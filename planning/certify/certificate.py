@@ -19,6 +19,7 @@ from puncture_twin.planning.base.provenance import inputs_document, read_inputs
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, nearest_cell, split
+from puncture_twin.planning.certify.html import certificate_html
 from puncture_twin.planning.certify.question import Question
 
 CERTIFICATE_VERSION = 4
@@ -83,6 +84,10 @@ class Certificate:
     triangle: Ints
     bound: Floats
     queries: int
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        return certificate_html(self)
 
     @cached_property
     def areas(self) -> dict[str, float]:

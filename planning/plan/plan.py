@@ -24,6 +24,7 @@ from puncture_twin.planning.case.entry import needle_pose
 from puncture_twin.planning.formats.guard import guard_transform
 from puncture_twin.planning.motion.follow import MAX_JERK
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Peaks, Trajectory
+from puncture_twin.planning.plan.html import plan_html
 
 Value = TypeVar("Value")
 
@@ -127,6 +128,10 @@ class Plan:
     approach: Trajectory
     insertion: Trajectory
     clearance_mm: Mapping[str, float]
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        return plan_html(self)
 
 
 def write_plan(plan: Plan, path: Path) -> None:

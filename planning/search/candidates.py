@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Ints32, Texts
 from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.search.html import candidates_html
 
 ARM_CHECKED = "checked"
 """What ``Candidates.arm_note`` says where a safe candidate is one that the arm can reach and insert along."""
@@ -148,6 +149,10 @@ class Candidates(Columns):
 
     def __len__(self) -> int:
         return len(self.theta)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        return candidates_html(self)
 
     @property
     def safe(self) -> Bools:

@@ -624,3 +624,14 @@ def test_a_ray_through_an_edge_does_not_turn_the_skin_inside_out():
     """From a target on a scan's grid the direction (3, 5, 4) meets an edge of the flat end: it is inside still."""
     corners = np.array([[x, y, z] for x in (-168.0, 258.0) for y in (-138.0, 288.0) for z in (-60.0, 60.0)])
     assert skin_surface(skin_from_mesh(TriangleMesh(corners, BOX_FACES)), np.zeros(3)).odd
+
+
+def test_a_certificate_shows_itself(carton):
+    """As whole HTML with its map: areas, and what it says nothing about; what cannot be shown does not raise."""
+    certificate = carton[1]
+    shown = certificate._repr_html_()
+    assert "Certificate of carton-m" in shown
+    assert "reach of the arm" in shown
+    assert shown.count("<svg") == 1
+    assert "proven safe for the organs" in shown
+    assert replace(certificate, question=None)._repr_html_().startswith("<pre>")

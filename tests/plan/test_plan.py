@@ -36,6 +36,23 @@ def planned(carton):
     return make_plan(carton, carton.search(), seed=1)
 
 
+def test_plan_case_and_candidates_show_themselves(carton, planned):
+    """As whole HTML with what a person asks first; a name cannot become a tag."""
+    candidates = carton.search()
+    shown = {
+        name: one._repr_html_() for name, one in (("plan", planned.plan), ("case", carton.case), ("all", candidates))
+    }
+    assert "Plan of carton-m" in shown["plan"]
+    assert f"θ {np.degrees(planned.plan.theta):g}°" in shown["plan"]
+    assert "bolt_m" in shown["case"]
+    assert f"{len(candidates):,} candidates" in shown["all"]
+    assert "<svg" in shown["all"]
+    hostile = replace(planned.plan, case_name="<script>")._repr_html_()
+    assert "<script>" not in hostile
+    assert "&lt;script&gt;" in hostile
+    assert replace(planned.plan, clearance_mm=None)._repr_html_().startswith("<pre>")
+
+
 @pytest.fixture
 def document(planned, tmp_path):
     """The plan's JSON, and a function that writes it changed and returns the path."""

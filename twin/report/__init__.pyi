@@ -14,10 +14,6 @@ from .numbers import (
 )
 from .palette import (
     PNG_LEVEL as PNG_LEVEL,
-    REASON_COLOURS as REASON_COLOURS,
-    REASON_WORDS as REASON_WORDS,
-    Rgb as Rgb,
-    css as css,
     reason_of as reason_of,
     safe_shades as safe_shades,
 )

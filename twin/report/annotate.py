@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ImageDraw, ImageFont
 
+from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report.map_view import body_directions
-from puncture_twin.twin.report.palette import Rgb
 from puncture_twin.twin.report.raster.camera import ViewCamera
 
 INK: Rgb = (25, 27, 32)

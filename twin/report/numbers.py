@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_WORDS, SAFE, Rgb
 from puncture_twin.planning.place.directions import ring_weights
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import step_of
-from puncture_twin.twin.report.palette import REASON_COLOURS, REASON_WORDS, SAFE, Rgb, reason_of
+from puncture_twin.twin.report.palette import reason_of
 
 
 @dataclass(frozen=True)

@@ -1,20 +1,11 @@
-"""Colours and plain words for what the pictures and the page show.
-
-The reasons' colours follow Okabe and Ito's palette for colour-blind readers ("Color Universal Design", 2008), filled
-up with three dark tones of Paul Tol's ("Colour Schemes", SRON technical note, 2021); none of them is near the greens
-that mean safe.
-"""
+"""Colours for what the pictures and the page show. Those of the verdicts stand beside the reasons."""
 
 from __future__ import annotations
-
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.reasons import Reason
-
-Rgb = tuple[int, int, int]
+from puncture_twin.planning.base.reasons import Reason, Rgb
 
 PNG_LEVEL = 3
 """How hard pictures are packed: a tenth larger than at Pillow's own 6, in half the time."""
@@ -25,9 +16,6 @@ SAFE_LOW: Rgb = (150, 224, 190)
 SAFE_HIGH: Rgb = (0, 104, 74)
 """Safe, with the greatest clearance."""
 
-SAFE: Rgb = (0, 158, 115)
-"""Safe, where no shade is meant: legends, the corridor in 3D."""
-
 CHOSEN: Rgb = (0, 0, 0)
 NEEDLE: Rgb = (20, 20, 24)
 HOLDER: Rgb = (70, 74, 82)
@@ -36,37 +24,6 @@ TABLE: Rgb = (120, 110, 98)
 OUTSIDE: Rgb = (128, 128, 140)
 SKIN: Rgb = (226, 176, 148)
 TARGET_POINT: Rgb = (214, 0, 30)
-
-REASON_COLOURS = MappingProxyType(
-    {
-        Reason.NO_SKIN_ENTRY: (221, 221, 221),
-        Reason.REENTERS_SKIN: (240, 228, 66),
-        Reason.TOO_LONG: (86, 180, 233),
-        Reason.SKIN_ANGLE: (230, 159, 0),
-        Reason.TOO_CLOSE: (213, 94, 0),
-        Reason.UNKNOWN_REGION: (110, 110, 110),
-        Reason.UNREACHABLE: (0, 90, 178),
-        Reason.ARM_COLLISION: (204, 121, 167),
-        Reason.INSERTION_BLOCKED: (136, 34, 85),
-        Reason.APPROACH_NOT_FOUND: (51, 34, 136),
-    }
-)
-
-REASON_WORDS = MappingProxyType(
-    {
-        Reason.NONE: "safe",
-        Reason.NO_SKIN_ENTRY: "no skin entry",
-        Reason.REENTERS_SKIN: "leaves and re-enters the skin",
-        Reason.TOO_LONG: "path longer than the needle's shaft",
-        Reason.SKIN_ANGLE: "too oblique at the skin",
-        Reason.TOO_CLOSE: "hits a structure or its margin",
-        Reason.UNKNOWN_REGION: "unknown region (image ends, or not named)",
-        Reason.UNREACHABLE: "arm cannot reach the pose",
-        Reason.ARM_COLLISION: "arm would collide",
-        Reason.INSERTION_BLOCKED: "straight insertion not drivable",
-        Reason.APPROACH_NOT_FOUND: "no approach found",
-    }
-)
 
 ORGAN_COLOURS: tuple[Rgb, ...] = (
     (166, 86, 70),
@@ -139,8 +96,3 @@ def safe_shades(share: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Greens for a share 0..1 of the clearance range, shape (n,) to (n, 3)."""
     share = np.clip(np.nan_to_num(share, nan=0.0), 0.0, 1.0)[..., None]
     return np.round(np.array(SAFE_LOW) * (1 - share) + np.array(SAFE_HIGH) * share).astype(np.uint8)
-
-
-def css(colour: Rgb) -> str:
-    """The colour as ``#rrggbb``."""
-    return "#{:02x}{:02x}{:02x}".format(*colour)

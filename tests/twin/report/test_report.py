@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.base.reasons import REASON_COLOURS
 from puncture_twin.planning.case.case_file import EntryAxes
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.place.directions import ring_weights
@@ -25,7 +26,7 @@ from puncture_twin.twin.report.page import page
 from puncture_twin.twin.report.page.page import write_page
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import TRIANGLES, lightened
-from puncture_twin.twin.report.palette import REASON_COLOURS, SAFE_HIGH, SAFE_LOW
+from puncture_twin.twin.report.palette import SAFE_HIGH, SAFE_LOW
 from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
 from puncture_twin.twin.report.raster.compositing import RasterShot, compose, empty_translucent
 from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, put_moving, translucents_of

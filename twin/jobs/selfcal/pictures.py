@@ -15,6 +15,7 @@ from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, ProbeShot
@@ -26,7 +27,6 @@ from puncture_twin.twin.guidance.ultrasound.trial import SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import head_pose, needle_tool, phantom_mesh, probe_tool, table_box
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.annotate import width_of, write
-from puncture_twin.twin.report.palette import Rgb
 from puncture_twin.twin.report.raster.camera import camera_around
 from puncture_twin.twin.report.raster.compositing import compose
 from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, translucents_of

@@ -15,13 +15,13 @@ from PIL import Image, ImageDraw
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.twin.guidance.stereo.ball.ball_image import render
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.detection import LocatedPair, ball_scene
 from puncture_twin.twin.guidance.stereo.session import Reached, Session
 from puncture_twin.twin.report.annotate import INK, write
-from puncture_twin.twin.report.palette import Rgb
 from puncture_twin.twin.world.bodies import load_ball
 from puncture_twin.twin.world.cameras import pinhole_picture
 from puncture_twin.twin.world.workcell import open_workcell

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.reasons import REASON_COLOURS
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import MapCells, MapView
-from puncture_twin.twin.report.palette import REASON_COLOURS, reason_of, safe_shades
+from puncture_twin.twin.report.palette import reason_of, safe_shades
 
 OVERSAMPLING = 2
 """Samples per pixel side at the cells' borders, which they smooth."""

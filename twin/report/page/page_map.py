@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.base.reasons import REASON_WORDS, Reason
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map.map_raster import map_raster
 from puncture_twin.twin.report.map_view import map_view
-from puncture_twin.twin.report.palette import PNG_LEVEL, REASON_WORDS, reason_of
+from puncture_twin.twin.report.palette import PNG_LEVEL, reason_of
 
 PIXELS = 560
 """Side of the map on the page, CSS pixels; the picture is twice as fine for sharp screens."""

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
+from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import body_directions
-from puncture_twin.twin.report.palette import css
 from puncture_twin.twin.report.raster.render import Layer
 from puncture_twin.twin.report.scene.lighter_mesh import lighter_mesh
 from puncture_twin.twin.report.scene.scene_parts import (

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.base.provenance import Input
+from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.numbers import arm_words, nearest_structure, number, percent, reason_counts
-from puncture_twin.twin.report.palette import css
 
 PARTS = ("puncture-twin", "numpy", "python-fcl", "embreex", "ompl", "pybullet", "trimesh", "plotly")
 """The packages whose version a result depends on."""

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints32
+from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.twin.report.palette import Rgb
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.compositing import (
     NOWHERE,

@@ -18,7 +18,7 @@ from PIL import Image
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
-from puncture_twin.twin.report import palette
+from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report.numbers import demanding
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.compositing import (
@@ -54,7 +54,7 @@ LONGEST_S = 11.0
 STILL_S = 2.0
 SPEEDS = (0.5, 1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 30, 40, 60, 100, 200, 500)
 INSET_RADIUS_MM = 30.0
-PLANNED: palette.Rgb = (0, 158, 115)
+PLANNED: Rgb = (0, 158, 115)
 PLANNED_RADIUS_MM = 0.7
 
 

@@ -11,13 +11,13 @@ from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import visual_links
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.reasons import SAFE, Rgb
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.winding import winding_number
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.numbers import chosen_row
-from puncture_twin.twin.report.palette import Rgb
 from puncture_twin.twin.report.raster.render import Layer, Surface
 from puncture_twin.twin.report.scene.shapes import ball, bar, box, corridor_mouth, corridor_walls, ring
 
@@ -116,9 +116,9 @@ def safe_region(candidates: Candidates, case: Any) -> tuple[SceneBody, ...]:
     mouth, walls = corridor_mouth(candidates, case), corridor_walls(candidates, case)
     bodies = []
     if mouth is not None:
-        bodies.append(SceneBody("safe entry", "safe", mouth, palette.SAFE, MOUTH_OPACITY))
+        bodies.append(SceneBody("safe entry", "safe", mouth, SAFE, MOUTH_OPACITY))
     if walls is not None:
-        bodies.append(SceneBody("safe corridor", "safe", walls, palette.SAFE, WALL_OPACITY))
+        bodies.append(SceneBody("safe corridor", "safe", walls, SAFE, WALL_OPACITY))
     return tuple(bodies)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.reasons import SAFE, Rgb
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report import annotate, palette
 from puncture_twin.twin.report.numbers import chosen_row, nearest_structure, number, target_words
@@ -182,7 +183,7 @@ def _words(
     annotate.write(draw, (18, 50), words, size=18, bold=row is None and plan is None, colour=colour)
     items = [("target", palette.TARGET_POINT), (needle_words(case.needle), palette.NEEDLE)]
     if candidates.safe.any():
-        items.append((f"{candidates.safe_text}: where a needle may enter, and its corridor (overview)", palette.SAFE))
+        items.append((f"{candidates.safe_text}: where a needle may enter, and its corridor (overview)", SAFE))
     items.append(("skin (see-through)", palette.SKIN))
     if arm:
         items += [
@@ -215,7 +216,7 @@ def _path_words(candidates: Candidates, plan: Any | None, row: int | None) -> st
     return words + ("" if plan is not None else "  (no plan: the arm is not shown)")
 
 
-def families(names: list[tuple[str, palette.Rgb]], most: int = 26) -> list[tuple[str, palette.Rgb]]:
+def families(names: list[tuple[str, Rgb]], most: int = 26) -> list[tuple[str, Rgb]]:
     """Legend entries, with numbered families (ribs, vertebrae) folded into one when there are many.
 
     Args:
@@ -224,7 +225,7 @@ def families(names: list[tuple[str, palette.Rgb]], most: int = 26) -> list[tuple
     """
     if len(names) <= most:
         return names
-    folded: dict[tuple[str, palette.Rgb], int] = {}
+    folded: dict[tuple[str, Rgb], int] = {}
     for name, colour in names:
         key = name.split("_")[0], colour
         folded[key] = folded.get(key, 0) + 1
