@@ -1,6 +1,8 @@
 """The pages name what is there: links, files, modules, classes, commands and code."""
 
 import ast
+import doctest
+import importlib
 import re
 from functools import cache
 
@@ -149,3 +151,14 @@ def test_every_page_is_in_the_index_and_in_the_menu():
     index, menu = ((ROOT / name).read_text(encoding="utf-8") for name in ("docs/index.md", "mkdocs.yml"))
     pages = [path.relative_to(ROOT / "docs").as_posix() for path in PAGES if ROOT / "docs" in path.parents]
     assert [page for page in pages if page != "index.md" and (f"({page})" not in index or page not in menu)] == []
+
+
+WITH_DOCTESTS = sorted(name for name, path in modules().items() if "\n    >>> " in path.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("name", WITH_DOCTESTS)
+def test_what_docstrings_show_is_what_happens(name):
+    """Every ``>>>`` of the product."""
+    found = doctest.testmod(importlib.import_module(name))
+    assert found.attempted > 0
+    assert found.failed == 0
