@@ -16,6 +16,7 @@ from typing import NamedTuple
 import fcl
 import numpy as np
 
+from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.tool import Box, Tool
@@ -80,7 +81,8 @@ class CellChecker:
         tool: What the flange carries.
         boxes: Solids of the room, base frame. The base link is not tested against them: it is bolted to one.
         patient: The skin, base frame, mm; None for an empty room.
-        skin: The skin alone, where ``patient`` holds more: the base may touch the rest (a table), not the skin.
+        skin: The skin alone, where ``patient`` holds more: the base may touch the rest (a table), not the skin, and
+            contacts with the rest are named ``outside_body``.
         padding_mm: How much fuller the arm is for contacts with patient and boxes (not for distances, nor with itself):
             room for what robot and registration get wrong. With 1 mm or more, free states between which no body moves
             more than 2 mm prove that the way between them meets neither patient nor box.
@@ -109,6 +111,7 @@ class CellChecker:
         self._boxes = _boxes(boxes)
         self._bounds = {box.name: box.bounds for box in boxes}
         self._patient = None if patient is None else skin_surface(patient, PATIENT)
+        self._skin = None if skin is None else skin_surface(skin, PATIENT)
         self.patient_closed = patient is not None and patient.closed
         if patient is not None:
             self._bounds[PATIENT] = patient.bounds
@@ -129,7 +132,7 @@ class CellChecker:
         for check in self._checks:
             allowed = needle_may_touch_patient and check.contact == NEEDLE_IN_PATIENT
             if not allowed and touch(check.first, check.second):
-                return check.contact
+                return self._named(check)
         return None
 
     def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
@@ -194,6 +197,12 @@ class CellChecker:
         """The same for each moving body by name; the tool counts with wrist 3 as one."""
         bounds = self._swept.bounds_mm(q_path)
         return {body.name: bounds[:, body.frame - 1] for body in self._bodies[1:]}
+
+    def _named(self, check: Check) -> Contact:
+        """The contact of a check whose shapes are placed and touch: ``outside_body`` where the skin is not touched."""
+        if check.contact.other != PATIENT or self._skin is None or touch(self._skin, check.second):
+            return check.contact
+        return check.contact._replace(other=OUTSIDE_BODY)
 
     def _room_checks(self) -> Iterator[Check]:
         """Every moving body against the patient, then the boxes."""

@@ -81,7 +81,7 @@ class FastChecker(CellChecker):
         while open_at >= 0:
             index, check = divmod(open_at, len(self._asked))
             if ask_fcl(self._asked[check], motion.frames[index]):
-                return FirstContact(index, self._asked[check].contact)
+                return FirstContact(index, self._named(self._asked[check]))
             open_at = self._proofs.first_unproven(motion, open_at + 1, mask)
         return None
 

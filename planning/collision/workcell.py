@@ -97,7 +97,8 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats) -> FastChecker
         InputError: The robot's base stands in the patient, or the gantry's wall does.
     """
     check_gantry(case, anatomy.skin.mesh)
-    patient, skin = (mesh.transformed(T_base_ct) for mesh in (patient_surface(anatomy), anatomy.skin.mesh))
+    surface, alone = patient_surface(anatomy), anatomy.skin.mesh
+    patient, skin = surface.transformed(T_base_ct), None if surface is alone else alone.transformed(T_base_ct)
     boxes = case_boxes(case, T_base_ct)
     model, tool = ur_model(case.robot.model), case_tool(case)
     return FastChecker(model, tool, boxes, patient, skin=skin, padding_mm=ARM_PADDING_MM, cache=user_cache())

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from puncture_twin.planning.anatomy.body.outside_body import joined
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.links import LINK_NAMES, collision_links, visual_links
 from puncture_twin.planning.arm.tool import HOLDER_ROOT_MM
@@ -16,6 +17,7 @@ from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies import NEVER_TESTED
 from puncture_twin.planning.collision.checker import Box, CellChecker, Contact, Tool
+from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.shapes import convex, surface, touch
 from puncture_twin.planning.collision.sweep import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -151,6 +153,18 @@ def test_the_needle_may_go_in_and_the_holder_may_not() -> None:
         assert (allowed is None) == (names == {"needle"})
         distances = checker.distances(BENT)
         assert (distances.needle.mm == 0.0) == (names == {"needle"})
+
+
+@pytest.mark.parametrize("engine", [CellChecker, FastChecker])
+def test_what_is_outside_of_the_body_is_named_so(engine: type[CellChecker]) -> None:
+    """A table, or the side of the image, was named "patient" in the arm's reasons, which sent people looking at the skin."""
+    T = flange_pose(UR3, BENT)
+    at = T[:3, 3] + 60.0 * T[:3, 2]
+    there, elsewhere = cuboid(at - 15.0, at + 15.0), cuboid(at - 15.0 + 3000.0, at + 15.0 + 3000.0)
+    both = joined([there, elsewhere])
+    for skin, other in ((there, "patient"), (elsewhere, "outside_body"), (None, "patient")):
+        checker = engine(UR3, TOOL, patient=both, skin=skin)
+        assert checker.contact(BENT, needle_may_touch_patient=True) == Contact("holder", other)
 
 
 def test_an_arm_that_ends_inside_the_patient_is_found_at_its_surface() -> None:
