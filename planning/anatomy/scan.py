@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from puncture_twin.planning.anatomy.body.attached_limbs import attached_limbs
-from puncture_twin.planning.anatomy.body.body_mask import BodyMask, body_mask, unscanned_voxels
+from puncture_twin.planning.anatomy.body.body_mask import BodyMask, body_mask
 from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
 from puncture_twin.planning.anatomy.body.flat_side import FlatSide
 from puncture_twin.planning.anatomy.body.outside_body import (
@@ -28,6 +28,7 @@ from puncture_twin.planning.anatomy.body.outside_body import (
     outside_surface,
 )
 from puncture_twin.planning.anatomy.body.support import FACES, find_support
+from puncture_twin.planning.anatomy.body.unscanned import measured_hu, unscanned_voxels
 from puncture_twin.planning.anatomy.second_witness import BodyImage, Named, Unnamed, unnamed_surfaces
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces, kept_mesh
@@ -155,7 +156,7 @@ class Scan:
 
     @cached_property
     def _hu(self) -> NDArray[np.float32]:
-        return self._ct.values.astype(np.float32)
+        return measured_hu(self._ct.values.astype(np.float32))
 
     @cached_property
     def _body(self) -> Bools:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, body_mask, filled_slices
+from puncture_twin.planning.anatomy.body.unscanned import measured_hu
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.label_surface import field_surface
@@ -144,7 +145,7 @@ def skin_from_ct(volume: Volume, *, max_deviation_mm: float | None = None) -> Sk
         InputError: If no body is found, or no air around it.
     """
     oriented = canonical(volume.values, volume.T_ct_index)
-    hu = oriented.values.astype(np.float32)
+    hu = measured_hu(oriented.values.astype(np.float32))
     found = body_mask(hu, oriented.spacing_mm, where=volume.path)
     above = hu - BODY_HU
     inside = np.clip(np.where(above > 0, above, HU_RANGE), HU_LEAST, HU_RANGE)

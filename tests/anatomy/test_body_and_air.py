@@ -5,7 +5,7 @@ import pytest
 import SimpleITK as sitk  # noqa: N813
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
-from puncture_twin.planning.anatomy.body.body_mask import unscanned_voxels
+from puncture_twin.planning.anatomy.body.unscanned import BLANK_HU, measured_hu, unscanned_voxels
 from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
@@ -15,7 +15,7 @@ from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.twin.phantoms import supine
-from puncture_twin.twin.phantoms.ct_image import ScannedPart, rendered
+from puncture_twin.twin.phantoms.ct_image import Grid, ScannedPart, rendered
 from puncture_twin.twin.phantoms.implicit import capsule, ellipsoid
 
 STEP_DEG = 6.0
@@ -60,8 +60,11 @@ HUMERI = "".join(
 )
 
 
-def write_scene(folder, parts, grid, seed=3):
-    """``ct.nii.gz`` of the scene, and ``labels.nii.gz`` of lesion (1), spine (2), humeri (3, 4) and kidney (5)."""
+def write_scene(folder, parts, grid, seed=3, fill=None):
+    """``ct.nii.gz`` of the scene, and ``labels.nii.gz`` of lesion (1), spine (2), humeri (3, 4) and kidney (5).
+
+    ``fill``: the voxels that were not scanned, and the value that is written there.
+    """
     hu = rendered(parts, grid, noise_hu=15.0, rng=np.random.default_rng(seed))
     labels = np.zeros(grid.shape, np.uint8)
     fields = {part.name: part.field for part in parts}
@@ -69,6 +72,8 @@ def write_scene(folder, parts, grid, seed=3):
         if name in fields:
             labels[(fields[name](grid.centres()) < 0).reshape(grid.shape)] = label
     labels[(KIDNEY_FIELD(grid.centres()) < 0).reshape(grid.shape)] = 5
+    if fill is not None:
+        labels[fill[0]], hu[fill[0]] = 0, fill[1]
     for name, values in (("ct", hu.astype(np.int16)), ("labels", labels)):
         image = sitk.GetImageFromArray(values.transpose(2, 1, 0))
         image.SetSpacing(grid.spacing_mm)
@@ -121,12 +126,15 @@ def scene(tmp_path_factory):
     return make
 
 
-def hit_parts(context, found, parts, names):
-    """Rows of safe needles whose axis enters a part's truth between skin and flange at standoff, by the part's name."""
+def hit_parts(context, found, parts, names, beyond_mm=1.0):
+    """Rows of safe needles whose axis enters a part's truth between skin and flange at standoff, by the part's name.
+
+    From ``beyond_mm`` behind the skin on.
+    """
     case, hit = context.case, {}
     for row in np.flatnonzero(found.safe):
         standoff = float(standoffs(case.needle, found.path.length[row], found.path.skin_angle[row]))
-        depths = np.arange(found.path.length[row] + 1.0, standoff + case.needle.length_mm, 0.5)
+        depths = np.arange(found.path.length[row] + beyond_mm, standoff + case.needle.length_mm, 0.5)
         points = case.target_ct + depths[:, None] * found.outward_ct[row]
         for part in parts:
             if part.name in names and part.field(points).min() < 0.0:
@@ -420,9 +428,44 @@ def disc(radius, size=80):
 def test_what_is_padded_around_a_circle_was_not_scanned():
     """One least value outside of the circle of reconstruction, be it that of air, is no air."""
     hu = np.random.default_rng(1).normal(-1000.0, 15.0, (80, 80, 12)).clip(-1024)
-    for padding in (-3024.0, -1024.0):
+    for padding in (-3024.0, -1024.0, -1000.0, 0.0):
         padded = np.where(disc(39.0)[:, :, None], hu, padding)
         assert np.array_equal(unscanned_voxels(padded), np.broadcast_to(~disc(39.0)[:, :, None], hu.shape))
+
+
+def beyond_slab(grid):
+    """What a tilted gantry leaves when its slices are made straight."""
+    _, y, z = np.moveaxis(grid.centres().reshape(*grid.shape, 3), -1, 0)
+    return np.abs(z * np.cos(0.26) - y * np.sin(0.26)) > 60.0
+
+
+def beyond_ends(grid):
+    """Slices that fill a volume up."""
+    return np.abs(grid.centres()[:, 2].reshape(grid.shape)) > 80.0
+
+
+@pytest.mark.parametrize("value", [-1024.0, 0.0])
+@pytest.mark.parametrize("padded", [beyond_slab, beyond_ends])
+def test_where_a_volume_is_filled_up_there_is_neither_skin_nor_air(tmp_path, padded, value):
+    """Padded with air's value, half of the "safe" needles left the body through a cut, some of them past the spine."""
+    parts = [*supine.trunk_parts(), *supine.bed_parts()]
+    grid = Grid((-296.0, -190.0, -117.0), (8.0, 4.0, 6.0), (75, 95, 40))
+    write_scene(tmp_path, parts, grid, fill=(padded(grid), value))
+    context = prepare(write_case(tmp_path), arm=False)
+    found = context.search()
+    assert any("filled up with one value" in warning for warning in context.anatomy.warnings)
+    assert found.safe.sum() > 40
+    assert hit_parts(context, found, parts, {"trunk", "table", "spine"}, beyond_mm=12.0) == {}
+
+
+@pytest.mark.parametrize("value", [-1024.0, 0.0])
+def test_a_slice_of_one_value_was_not_scanned(value):
+    """A lost slice in the middle of a volume would be skin to both sides; air with noise is kept as it is."""
+    hu = np.random.default_rng(1).normal(-1000.0, 15.0, (40, 40, 12))
+    assert measured_hu(hu) is hu
+    hu[:, :, 5] = value
+    assert np.array_equal(unscanned_voxels(hu), np.broadcast_to(np.arange(12) == 5, hu.shape))
+    assert (measured_hu(hu)[:, :, 5] == (BLANK_HU if value == 0.0 else value)).all()
 
 
 def test_constant_air_about_a_body_was_scanned():
@@ -433,6 +476,8 @@ def test_constant_air_about_a_body_was_scanned():
     assert not unscanned_voxels(still).any()
     assert not unscanned_voxels(ball).any()
     assert not unscanned_voxels(clipped).any()
+    blanked = np.where(disc(30.0)[:, :, None], np.random.default_rng(1).normal(40.0, 15.0, (80, 80, 12)), -1024.0)
+    assert not unscanned_voxels(blanked).any()
 
 
 def test_an_arm_that_is_pressed_against_the_trunk_is_no_way_in(tmp_path):

@@ -157,7 +157,7 @@ def test_the_needle_may_go_in_and_the_holder_may_not() -> None:
 
 @pytest.mark.parametrize("engine", [CellChecker, FastChecker])
 def test_what_is_outside_of_the_body_is_named_so(engine: type[CellChecker]) -> None:
-    """A table, or the side of the image, was named "patient" in the arm's reasons, which sent people looking at the skin."""
+    """A table, or the side of the image, was named "patient" in the arm's reasons: people looked at the skin."""
     T = flange_pose(UR3, BENT)
     at = T[:3, 3] + 60.0 * T[:3, 2]
     there, elsewhere = cuboid(at - 15.0, at + 15.0), cuboid(at - 15.0 + 3000.0, at + 15.0 + 3000.0)

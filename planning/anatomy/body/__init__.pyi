@@ -1,9 +1,4 @@
-from .body_mask import (
-    BODY_HU as BODY_HU,
-    BodyMask as BodyMask,
-    filled_slices as filled_slices,
-    unscanned_voxels as unscanned_voxels,
-)
+from .body_mask import BODY_HU as BODY_HU, BodyMask as BodyMask, filled_slices as filled_slices
 from .drawn_side import DrawnSide as DrawnSide
 from .flat_side import FlatSide as FlatSide
 from .outside_body import (
@@ -19,3 +14,4 @@ from .outside_body import (
     outside_surface as outside_surface,
 )
 from .support import FACES as FACES, find_support as find_support, support_warnings as support_warnings
+from .unscanned import measured_hu as measured_hu, unscanned_voxels as unscanned_voxels

@@ -18,21 +18,12 @@ from puncture_twin.planning.anatomy.body.detached_parts import (
 )
 from puncture_twin.planning.anatomy.body.drawn_side import LEAST_LENGTH_MM, TOO_SHORT, DrawnSide, drawn_sides
 from puncture_twin.planning.anatomy.body.flat_side import FlatSide, flat_sides
+from puncture_twin.planning.anatomy.body.unscanned import find_unscanned
 from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.errors import InputError
 
 BODY_HU = -500.0
 """Half way between air (-1000) and water (0): where a voxel is half skin, half air."""
-UNSCANNED_HU = -1500.0
-"""Nothing real is less dense than air at -1000; scanners write -2000 or -3024 where they did not look."""
-CIRCLE_PIXELS = 2.0
-"""A circle of reconstruction is drawn to the pixel; the room's air never ends in one."""
-NEARLY_AIR_HU = -900.0
-"""Below this a voxel is air, with its noise."""
-STILL_AIR = 0.9
-"""Where so much of the air has one value, the image has no noise: that of a phantom, not of a scanner."""
-CIRCLE_FILLS = 0.9
-"""Of the image's width and height at least; a smaller disc in constant air may be a round phantom without noise."""
 OUTSIDE_AIR_HU = -940.0
 """Room air has -1000, inflated lung rarely less than -920: an air region that the border cuts is the room only
 if its median is below this."""
@@ -40,6 +31,10 @@ MIN_OUTSIDE_ML = 50.0
 """A smaller air region at the border may be bowel gas that the field of view cuts."""
 MIN_BODY_ML = 100.0
 """Less than a tenth of a newborn's head: something else was found."""
+PADDED = (
+    "where nothing was scanned the image is filled up with one value, and that cuts the body; no skin is known there, "
+    "and what is filled up is unknown_region (outside_body)"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +64,7 @@ def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where
     room's. Filling too much is the safe side: it turns "air" at the border into "unknown".
 
     Args:
-        hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient.
+        hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient; of `measured_hu`.
         spacing_mm: Shape (3,).
         where: For messages.
 
@@ -93,8 +88,11 @@ def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where
     body = _with_cut_lungs(filled, hu, voxel_ml, warnings)
     if body.all():
         raise InputError("no air around the body", where=where, allowed="a CT that shows the skin somewhere")
-    unscanned = unscanned_voxels(hu)
-    if (ndimage.binary_dilation(body) & unscanned & ~body).any():
+    unscanned, padded = find_unscanned(hu)
+    ends = ndimage.binary_dilation(body) & unscanned & ~body
+    if (ends & padded).any():
+        warnings.append(PADDED)
+    if (ends & ~padded).any():
         warnings.append("the scanner's field of view (a circle in the image) cuts the body; no skin is known there")
     flat = flat_sides(hu - BODY_HU, body, spacing_mm)
     drawn = drawn_sides(hu - BODY_HU, trunk, spacing_mm)
@@ -109,42 +107,6 @@ def _table_warnings(flat: Sequence[FlatSide], drawn: Sequence[DrawnSide], length
     yield from (side.warning for side in drawn if side.whole and (side.axis, side.end) not in named)
     if length_mm < LEAST_LENGTH_MM:
         yield TOO_SHORT.format(length=length_mm)
-
-
-def unscanned_voxels(hu: NDArray[np.float32]) -> Bools:
-    """Voxels that the scanner did not measure: far below air, or one least value that fills what is outside a circle.
-
-    Many scanners write the value of air, -1024, outside of their circle of reconstruction: what is there is no air. In
-    an image without noise the air inside has the same value, and nothing tells the two apart: then it is air.
-
-    Args:
-        hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient.
-    """
-    unscanned = hu < UNSCANNED_HU
-    measured = hu[~unscanned]
-    if len(measured) == 0:
-        return np.asarray(unscanned)
-    least = measured.min()
-    padding = np.all((hu == least) | unscanned, axis=2)
-    air = hu[(hu < NEARLY_AIR_HU) & ~padding[:, :, None]]
-    noisy = len(air) == 0 or np.mean(air == least) < STILL_AIR
-    if noisy and _outside_a_circle(padding):
-        unscanned = unscanned | padding[:, :, None]
-    return np.asarray(unscanned)
-
-
-def _outside_a_circle(padding: Bools) -> bool:
-    """Whether pixels (nx, ny) are just those outside of a circle that fills the image."""
-    inside = np.argwhere(~padding)
-    if not padding.any() or len(inside) == 0:
-        return False
-    low, high = inside.min(axis=0), inside.max(axis=0)
-    if np.any(high - low + 1 < CIRCLE_FILLS * np.array(padding.shape)):
-        return False
-    middle = (low + high) / 2.0
-    farthest = np.linalg.norm(inside - middle, axis=1).max()
-    nearest = np.linalg.norm(np.argwhere(padding) - middle, axis=1).min()
-    return bool(farthest - nearest < CIRCLE_PIXELS)
 
 
 def filled_slices(mask: Bools) -> Bools:

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
-from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, unscanned_voxels
+from puncture_twin.planning.anatomy.body.body_mask import BODY_HU
 from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
 from puncture_twin.planning.anatomy.body.flat_side import FlatSide
+from puncture_twin.planning.anatomy.body.unscanned import Unscanned, find_unscanned
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -80,14 +81,14 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
         air_hu: Voxels whose surroundings are denser than this are not air.
     """
     hu, body = image.hu, image.body
-    scanned = ~unscanned_voxels(hu)
+    unscanned = find_unscanned(hu)
     size = np.maximum(1, np.round(SMOOTH_MM / image.spacing_mm)).astype(int)
     mean = ndimage.uniform_filter(np.maximum(hu, -1024.0), size=tuple(size), mode="nearest")
     dense = (mean > air_hu) | (hu > max(DENSE_HU, air_hu))
     dense &= ~ndimage.maximum_filter(body, size=tuple(2 * (size // 2 + 1) + 1))
-    dense = (dense | (hu > BODY_HU)) & scanned & ~body
+    dense = (dense | (hu > BODY_HU)) & ~unscanned.voxels & ~body
     dense = _without_specks(dense, MIN_PIECE_MM3 / float(np.prod(image.spacing_mm)))
-    return dense | _unscanned_beside(dense | body, ~scanned & ~body, image.spacing_mm)
+    return dense | (_unscanned_beside(dense | body, body, unscanned, image.spacing_mm) & ~body)
 
 
 def outside_surface(image: OutsideImage, mask: Bools, *, where: str | Path) -> TriangleMesh | None:
@@ -105,7 +106,7 @@ def outside_surface(image: OutsideImage, mask: Bools, *, where: str | Path) -> T
         return None
     surface = field_surface(mask.astype(np.float32) - 0.5, image.T_ct_index, where=where)
     drawn = _drawn_out(surface, image)
-    return joined([drawn, *_hulls_beyond(mask, image)])
+    return joined([drawn, *_hulls_beyond(mask & ~find_unscanned(image.hu).padded, image)])
 
 
 def beyond_body(image: OutsideImage) -> list[TriangleMesh]:
@@ -215,12 +216,17 @@ def _without_specks(mask: Bools, least_voxels: float) -> Bools:
     return np.asarray((sizes >= least_voxels)[labels])
 
 
-def _unscanned_beside(dense: Bools, unscanned: Bools, spacing_mm: Floats) -> Bools:
-    """Voxels that were not scanned, near to where something dense ends at them."""
-    ends = ndimage.binary_dilation(dense, FULL) & unscanned
+def _unscanned_beside(dense: Bools, body: Bools, unscanned: Unscanned, spacing_mm: Floats) -> Bools:
+    """Voxels that were not scanned, near to where something dense ends at them.
+
+    A padding that cuts the body is not free anywhere, as what is beyond a face of the image that cuts it.
+    """
+    ends = ndimage.binary_dilation(dense, FULL) & unscanned.voxels & ~body
     if not ends.any():
         return np.zeros_like(dense)
-    return np.asarray((ndimage.distance_transform_edt(~ends, sampling=spacing_mm) <= RIM_MM) & unscanned)
+    beside = (ndimage.distance_transform_edt(~ends, sampling=spacing_mm) <= RIM_MM) & unscanned.voxels
+    cut = unscanned.padded & ndimage.binary_dilation(body, FULL)
+    return np.asarray(beside | unscanned.padded if cut.any() else beside)
 
 
 def _drawn_out(surface: TriangleMesh, image: OutsideImage) -> TriangleMesh:

@@ -1,0 +1,147 @@
+"""Voxels of a CT that the scanner did not measure: what is there is neither body nor air.
+
+Scanners and programs write one value where they did not look: beyond the circle of reconstruction, beyond the slab of a
+tilted gantry that was resampled to a straight image, in slices that fill a volume up. Some write -3024, some the value
+of air, some 0. Air that was measured has noise, and never one value over a whole corner of an image.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from puncture_twin.planning.base.arrays import Bools
+
+UNSCANNED_HU = -1500.0
+"""Nothing real is less dense than air at -1000; scanners write -2000 or -3024 where they did not look."""
+BLANK_HU = -2000.0
+"""Written in the place of paddings that are denser than air, such as 0."""
+CIRCLE_PIXELS = 2.0
+"""A circle of reconstruction is drawn to the pixel; the room's air never ends in one."""
+NEARLY_AIR_HU = -900.0
+"""Below this a voxel is air, with its noise."""
+STILL_AIR = 0.9
+"""Where so much of the air has one value, the image has no noise: that of a phantom, not of a scanner."""
+CIRCLE_FILLS = 0.9
+"""Of the image's width and height at least; a smaller disc in constant air may be a round phantom without noise."""
+BLOCK_VOXELS = 3
+"""A cube of so many voxels along each edge that have one value is no noise, also where a scanner clips at -1024."""
+MEASURED_AIR = 0.02
+"""Of what is padded or nearly air, so much at least is measured air, or the image has no noise to tell by: of a
+background that a program has blanked only the seam of the skin is left."""
+ALIKE_PAIRS = 0.5
+"""Of the neighbours in measured air that have one value: noise of 2 HU leaves less than a fifth."""
+
+
+class Unscanned(NamedTuple):
+    """What was not measured.
+
+    Attributes:
+        voxels: Shape (nx, ny, nz), all of it.
+        padded: Same shape, the part of it that is no circle's outside: there the image ends as it does at its faces.
+    """
+
+    voxels: Bools
+    padded: Bools
+
+
+def measured_hu(hu: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The image with ``BLANK_HU`` where a padding is denser than air, so that no padding counts as body.
+
+    Args:
+        hu: Shape (nx, ny, nz), Hounsfield units.
+
+    Returns:
+        The image itself where there is none.
+    """
+    dense = find_unscanned(hu).voxels & (hu >= NEARLY_AIR_HU)
+    return np.where(dense, np.float32(BLANK_HU), hu) if dense.any() else hu
+
+
+def unscanned_voxels(hu: NDArray[np.float32]) -> Bools:
+    """Voxels that the scanner did not measure; see `find_unscanned`."""
+    return find_unscanned(hu).voxels
+
+
+def find_unscanned(hu: NDArray[np.float32]) -> Unscanned:
+    """Find what the scanner did not measure.
+
+    It is far below air; or it has one value that fills what is outside a circle, or a corner or a slice of the image.
+    In an image without noise nothing tells such a value from that of air: then it is air.
+
+    Args:
+        hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient.
+    """
+    below = np.asarray(hu < UNSCANNED_HU)
+    circle = _outside_circle(hu, below)
+    padded = _padded(hu, circle)
+    return Unscanned(below | circle | padded, padded)
+
+
+def _outside_circle(hu: NDArray[np.float32], below: Bools) -> Bools:
+    """Voxels outside a circle of reconstruction; where there is none, nothing."""
+    none = np.zeros(hu.shape, bool)
+    measured = hu[~below]
+    if len(measured) == 0:
+        return none
+    for value in np.unique([measured.min(), *hu[_corners(hu)].ravel()]):
+        padding = np.all((hu == value) | below, axis=2)
+        if _is_outside_a_circle(padding):
+            air = hu[(hu < NEARLY_AIR_HU) & ~padding[:, :, None]]
+            if len(air) == 0 or np.mean(air == value) < STILL_AIR:
+                return none | padding[:, :, None]
+    return none
+
+
+def _is_outside_a_circle(padding: Bools) -> bool:
+    """Whether pixels (nx, ny) are just those outside of a circle that fills the image."""
+    inside = np.argwhere(~padding)
+    if not padding.any() or len(inside) == 0:
+        return False
+    low, high = inside.min(axis=0), inside.max(axis=0)
+    if np.any(high - low + 1 < CIRCLE_FILLS * np.array(padding.shape)):
+        return False
+    middle = (low + high) / 2.0
+    farthest = np.linalg.norm(inside - middle, axis=1).max()
+    nearest = np.linalg.norm(np.argwhere(padding) - middle, axis=1).min()
+    return bool(farthest - nearest < CIRCLE_PIXELS)
+
+
+def _padded(hu: NDArray[np.float32], circle: Bools) -> Bools:
+    """Slices of one value, and what holds together with a corner of the image by cubes of its value.
+
+    Nothing of what is known to lie outside a circle, and nothing in an image without noise.
+    """
+    padded = np.zeros(hu.shape, bool)
+    padded[:, :, (hu == hu[:1, :1]).all(axis=(0, 1))] = True
+    for value in np.unique(hu[_corners(hu)]):
+        labels, _ = ndimage.label(_block((hu == value) & ~circle))
+        held = np.unique(labels[_corners(hu)])
+        padded |= np.isin(labels, held[held > 0])
+    for value in np.unique(hu[padded]):
+        if not _measured_air_has_noise(hu, value):
+            padded &= hu != value
+    return padded & ~circle
+
+
+def _corners(image: NDArray[Any]) -> tuple[slice, ...]:
+    """The voxels at the corners of an image."""
+    return tuple(slice(None, None, max(1, n - 1)) for n in image.shape)
+
+
+def _block(same: Bools) -> Bools:
+    """Voxels of a mask that lie in a cube of it, or beside one; beyond the image's faces the mask goes on."""
+    eroded = ndimage.minimum_filter(same.view(np.uint8), BLOCK_VOXELS, mode="nearest")
+    return np.asarray(ndimage.maximum_filter(eroded, 2 * BLOCK_VOXELS - 1, mode="nearest").view(bool) & same)
+
+
+def _measured_air_has_noise(hu: NDArray[np.float32], value: np.float32) -> bool:
+    """Whether the image shows air of other values than one, and neighbours in it differ."""
+    air = (hu < NEARLY_AIR_HU) & (hu > UNSCANNED_HU) & (hu != value)
+    if np.count_nonzero(air) < MEASURED_AIR * np.count_nonzero(air | (hu == value)):
+        return False
+    pairs = air[1:] & air[:-1]
+    return bool(np.mean((hu[1:] == hu[:-1])[pairs]) < ALIKE_PAIRS) if pairs.any() else False
