@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from puncture_twin.planning.anatomy.body.body_mask import BodyMask, body_mask
 from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
 from puncture_twin.planning.anatomy.body.flat_side import FlatSide
 from puncture_twin.planning.anatomy.body.outside_body import (
-    BEYOND_MM,
+    BEYOND_LONG_MM,
     OutsideImage,
     beyond_body,
     beyond_drawn_sides,
@@ -27,6 +27,7 @@ from puncture_twin.planning.anatomy.body.outside_body import (
     outside_mask,
     outside_surface,
 )
+from puncture_twin.planning.anatomy.body.room_air import room_fraction
 from puncture_twin.planning.anatomy.body.support import FACES, find_support
 from puncture_twin.planning.anatomy.body.unscanned import measured_hu, unscanned_voxels
 from puncture_twin.planning.anatomy.second_witness import BodyImage, Named, Unnamed, unnamed_surfaces
@@ -34,6 +35,7 @@ from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces, kept_mesh
 from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.cache.array_cache import Arrays
+from puncture_twin.planning.formats.guard import fits
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.volumes.orientation import Oriented, canonical
 from puncture_twin.planning.formats.volumes.volume_files import parse_header
@@ -81,19 +83,27 @@ class Scan:
             ct = self._ct
             image = OutsideImage(self._hu, self._body, ct.T_ct_index, ct.spacing_mm)
             mask = outside_mask(image, air_hu)
-            flat, drawn = self._tables
-            support = find_support(mask & ~unscanned_voxels(self._hu), self._body, ct.spacing_mm, [*flat, *drawn])
-            solids = [outside_surface(image, mask, where=self.source.path)]
-            solids += [] if self.skin is None else beyond_body(image)
-            supports = beyond_flat_sides(image, flat) + beyond_drawn_sides(image, drawn, edges=True)
-            supports += beyond_drawn_sides(image, support.drawn, edges=False)
-            near = support.open_faces
-            faces = [beyond_face(image, *face, wider_mm=BEYOND_MM[0]) if face in near else None for face in FACES]
-            return [_joined(solids), _joined(supports), *faces]
+            meshes = self._outside_meshes(image, mask)
+            if all(mesh is None or fits(mesh) for mesh in meshes):
+                return meshes
+            return self._outside_meshes(replace(image, beyond_mm=BEYOND_LONG_MM), mask)
 
         solids, supports, *faces = self._kept({"what": "outside", "air_hu": air_hu}, make)
         open_faces = tuple(face for face, box in zip(FACES, faces, strict=True) if box is not None)
         return Outside(_joined([solids, supports, *faces]), supports is not None, open_faces)
+
+    def _outside_meshes(self, image: OutsideImage, mask: Bools) -> list[TriangleMesh | None]:
+        """What is outside of the body, what lies beyond tables, and what beyond each open face."""
+        flat, drawn = self._tables
+        support = find_support(mask & ~unscanned_voxels(image.hu), image.body, image.spacing_mm, [*flat, *drawn])
+        solids = [outside_surface(image, mask, where=self.source.path)]
+        solids += [] if self.skin is None else beyond_body(image)
+        supports = beyond_flat_sides(image, flat) + beyond_drawn_sides(image, drawn, edges=True)
+        supports += beyond_drawn_sides(image, support.drawn, edges=False)
+        near = support.open_faces
+        wider = image.beyond_mm[0]
+        faces = [beyond_face(image, *face, wider_mm=wider) if face in near else None for face in FACES]
+        return [_joined(solids), _joined(supports), *faces]
 
     @property
     def _tables(self) -> tuple[tuple[FlatSide, ...], tuple[DrawnSide, ...]]:
@@ -129,6 +139,17 @@ class Scan:
 
         named = {"structures": [f"{one.name} {_digest(one.mesh)}" for one in structures]}
         return Unnamed(*self._kept({"what": "unnamed", "dense_hu": dense_hu, **named}, lambda: list(make())))
+
+    def room_in_skin(self) -> float:
+        """How much of a body, whose skin comes from elsewhere, is the room's air in this CT; 0..1."""
+        if self.skin is None:
+            return 0.0
+
+        def make() -> Arrays:
+            return {"fraction": np.array(room_fraction(self._hu, self._body, self._ct.spacing_mm, self._tolerance_mm))}
+
+        made_from = {"what": "room in skin", "skin": _digest(self.skin.mesh)}
+        return float(self.source.kept(made_from, make, by=__name__, check=_fraction)["fraction"])
 
     def holds(self, point_ct: NDArray[np.float64]) -> bool:
         """Whether a point (3,), LPS mm, lies in the image; only the header is read."""
@@ -194,6 +215,11 @@ def _joined(meshes: Sequence[TriangleMesh | None]) -> TriangleMesh | None:
 
 def _digest(mesh: TriangleMesh) -> str:
     return hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).hexdigest()
+
+
+def _fraction(stored: Arrays) -> None:
+    if not 0.0 <= float(stored["fraction"]) <= 1.0:
+        raise ValueError("a fraction")
 
 
 def _of_meshes(meshes: list[TriangleMesh | None]) -> Arrays:

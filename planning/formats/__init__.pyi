@@ -2,6 +2,7 @@ from .guard import (
     MAX_COORDINATE_MM as MAX_COORDINATE_MM,
     MAX_TRIANGLES as MAX_TRIANGLES,
     ROTATION_TOLERANCE as ROTATION_TOLERANCE,
+    fits as fits,
     guard_mesh as guard_mesh,
     guard_points as guard_points,
     guard_transform as guard_transform,

@@ -66,6 +66,11 @@ def guard_mesh(vertices: ArrayLike, faces: ArrayLike, *, where: str | Path) -> T
     return TriangleMesh(surface.points, surface.indices)
 
 
+def fits(mesh: TriangleMesh) -> bool:
+    """Whether a mesh, mm, is no larger than one that `guard_mesh` accepts."""
+    return _diagonal(mesh.vertices) <= MAX_DIAGONAL_MM
+
+
 def guard_transform(T: ArrayLike, *, where: str | Path) -> NDArray[np.float64]:
     """A rigid motion that may be trusted, or an error.
 

@@ -401,6 +401,31 @@ def test_beyond_a_ct_that_ends_in_the_body_nothing_is_free(scene):
     assert prepare(narrow, arm=False).search().safe.sum() == 0
 
 
+def test_a_ct_that_is_shifted_against_the_skin_is_named(scene):
+    """Its air was blamed on gas that nobody labelled. In its place, the same CT is not blamed."""
+    folder, parts = scene("bed")
+    write_trunk(folder, parts, supine.grid())
+    for name, shift in (("ct", 0.0), ("moved", 25.0)):
+        if shift:
+            crop(folder, np.s_[:, :, :], (shift, 0.0, 0.0))
+        file = '[ct]\nfile = "ct.nii.gz"' if not shift else '[ct]\nfile = "crop.nii.gz"'
+        context = prepare(write_case(folder, skin=TRUNK_SKIN, more=file, name=name), arm=False)
+        blamed = [warning for warning in context.anatomy.warnings if "likely shifted against the skin" in warning]
+        assert len(blamed) == (1 if shift else 0)
+
+
+def test_a_table_beside_a_long_image_is_drawn_as_far_as_is_plausible(tmp_path):
+    """A CT from head to knee was refused: table and image together were larger than any surface that is read."""
+    table = supine.slab((-250, supine.BACK_MM + 10, -2000), (250, supine.BACK_MM + 50, 2000))
+    trunk = capsule((0.0, 0.0, -2000.0), (0.0, 0.0, 2000.0), 95.0, 115.0)
+    parts = [ScannedPart("trunk", trunk, 20.0), *supine.trunk_parts()[2:], ScannedPart("table", table, 60.0)]
+    grid = Grid((-296.0, -190.0, -700.0), (8.0, 8.0, 8.0), (75, 48, 175))
+    write_scene(tmp_path, parts, grid)
+    context = prepare(write_case(tmp_path), arm=False)
+    outside = next(one for one in context.anatomy.surroundings if one.name == "outside_body")
+    assert np.ptp(outside.mesh.vertices[:, 2]) > 1400.0 + 2 * 900.0
+
+
 def test_a_ct_of_another_place_is_refused(scene):
     """A ``[ct] file`` that does not hold the target says nothing about it: another patient's, or a slip of space."""
     folder, parts = scene("alone")

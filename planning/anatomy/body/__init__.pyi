@@ -2,6 +2,7 @@ from .body_mask import BODY_HU as BODY_HU, BodyMask as BodyMask, filled_slices a
 from .drawn_side import DrawnSide as DrawnSide
 from .flat_side import FlatSide as FlatSide
 from .outside_body import (
+    BEYOND_LONG_MM as BEYOND_LONG_MM,
     BEYOND_MM as BEYOND_MM,
     BOX_FACES as BOX_FACES,
     OutsideImage as OutsideImage,

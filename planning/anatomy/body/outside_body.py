@@ -39,6 +39,8 @@ BEYOND_MM = (100.0, 100.0, 2000.0)
 most 550 mm wide and an image at least 350; along the bed table and mattress go on farther than a needle reaches."""
 EDGE_MM = 40.0
 """The edge of a table or cradle is no thicker."""
+BEYOND_LONG_MM = (*BEYOND_MM[:2], 1000.0)
+"""The same where an image is so long that the surface would be larger than any that is plausible."""
 RIM_MM = 50.0
 """Where what is dense ends at voxels that were not scanned, they count as dense so far from it."""
 
@@ -62,12 +64,14 @@ class OutsideImage:
         body: Same shape, the body.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
         spacing_mm: Shape (3,).
+        beyond_mm: How far what the border cuts is taken to go on.
     """
 
     hu: NDArray[np.float32]
     body: Bools
     T_ct_index: Floats
     spacing_mm: Floats
+    beyond_mm: tuple[float, float, float] = BEYOND_MM
 
 
 def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
@@ -94,7 +98,7 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
 def outside_surface(image: OutsideImage, mask: Bools, *, where: str | Path) -> TriangleMesh | None:
     """The closed surface of what is dense outside of the body, LPS mm; None where there is only air.
 
-    Where the border of the image cuts it, it goes on beyond: every cut section is drawn out by ``BEYOND_MM``, and of
+    Where the border of the image cuts it, it goes on beyond: every cut section is drawn out by ``beyond_mm``, and of
     bulky pieces also the convex hull of all cut sections at one side.
 
     Args:
@@ -121,7 +125,7 @@ def beyond_body(image: OutsideImage) -> list[TriangleMesh]:
 def beyond_face(image: OutsideImage, axis: int, end: int, *, wider_mm: float = 0.0) -> TriangleMesh:
     """A box beyond a whole face of the image, at the low (0) or high (-1) end of an axis, and so much wider."""
     low, high = np.full(3, -0.5) - wider_mm / image.spacing_mm, image.hu.shape + wider_mm / image.spacing_mm - 0.5
-    away = BEYOND_MM[axis] / image.spacing_mm[axis]
+    away = image.beyond_mm[axis] / image.spacing_mm[axis]
     near = -0.5 if end == 0 else image.hu.shape[axis] - 0.5
     low[axis], high[axis] = (near - away, near) if end == 0 else (near, near + away)
     return _box(low, high, image)
@@ -129,10 +133,10 @@ def beyond_face(image: OutsideImage, axis: int, end: int, *, wider_mm: float = 0
 
 def beyond_flat_sides(image: OutsideImage, sides: Sequence[FlatSide]) -> list[TriangleMesh]:
     """Boxes beyond the planes in which a body ends that lies on something: to both sides and along the bed too."""
-    shape = np.array(image.hu.shape)
+    shape, away = np.array(image.hu.shape), np.array(image.beyond_mm) / image.spacing_mm
     boxes = []
     for side in sides:
-        low, high = -np.array(BEYOND_MM) / image.spacing_mm, shape - 1.0 + np.array(BEYOND_MM) / image.spacing_mm
+        low, high = -away, shape - 1.0 + away
         (high if side.end == 0 else low)[side.axis] = side.plane
         boxes.append(_box(low, high, image))
     return boxes
@@ -159,14 +163,14 @@ def beyond_drawn_sides(image: OutsideImage, sides: Sequence[DrawnSide], *, edges
 def _beyond_line(image: OutsideImage, side: DrawnSide, *, edges: bool) -> TriangleMesh:
     along_mm, across_mm, step_mm = (float(image.spacing_mm[axis]) for axis in (side.axis, 1 - side.axis, 2))
     outward = 1.0 if side.end else -1.0
-    away, edge = (BEYOND_MM[1 - side.axis] / across_mm, outward * EDGE_MM / along_mm) if edges else (1.0, 0.0)
+    away, edge = (image.beyond_mm[1 - side.axis] / across_mm, outward * EDGE_MM / along_mm) if edges else (1.0, 0.0)
     last = image.hu.shape[1 - side.axis] - 1.0 if edges else 0.0
     before = [min(0.0 if edges else np.inf, side.across[0]) - away, side.across[0] - 0.5]
     after = [side.across[-1] + 0.5, max(last, side.across[-1]) + away]
     across = np.concatenate([before, side.across, after])
     along = np.concatenate([np.full(2, side.along[0] - edge), side.along, np.full(2, side.along[-1] - edge)])
-    far = (image.hu.shape[side.axis] - 1.0 if side.end else 0.0) + outward * BEYOND_MM[side.axis] / along_mm
-    reach = BEYOND_MM[2] / step_mm
+    far = (image.hu.shape[side.axis] - 1.0 if side.end else 0.0) + outward * image.beyond_mm[side.axis] / along_mm
+    reach = image.beyond_mm[2] / step_mm
     slices = np.array([-reach, image.hu.shape[2] - 1.0 + reach])
     sink = outward * abs(side.slope[1]) * float(np.abs(slices).max())
     rows = [_row(side, across, values, z) for z in slices for values in (along, np.full(len(along), far + sink))]
@@ -234,7 +238,7 @@ def _drawn_out(surface: TriangleMesh, image: OutsideImage) -> TriangleMesh:
     T = image.T_ct_index
     index = np.linalg.solve(T[:3, :3], (surface.vertices - T[:3, 3]).T).T
     last = np.array(image.hu.shape) - 1.0
-    away = np.array(BEYOND_MM) / image.spacing_mm
+    away = np.array(image.beyond_mm) / image.spacing_mm
     index = np.where(index < -1e-6, index - away, np.where(index > last + 1e-6, index + away, index))
     return TriangleMesh(apply(T, index), surface.faces)
 
@@ -263,7 +267,7 @@ def _prism(section: Floats, axis: int, end: int, image: OutsideImage) -> Triangl
         rim = section[ConvexHull(section).vertices]
     except QhullError:  # cannot be: whole voxels have an area
         return None
-    away = BEYOND_MM[axis] / image.spacing_mm[axis]
+    away = image.beyond_mm[axis] / image.spacing_mm[axis]
     near = -0.5 if end == 0 else image.hu.shape[axis] - 0.5
     far = near - away if end == 0 else near + away
     n = len(rim)

@@ -1,0 +1,33 @@
+"""The room's air inside a skin that comes from elsewhere: the CT beside it is shifted, or of another position."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from puncture_twin.planning.anatomy.body.body_mask import BODY_HU
+from puncture_twin.planning.base.arrays import Bools, Floats
+
+WIDE_MM = 5.0
+"""Air into which a ball of this radius fits and that goes on outside is the room's; a nose's is narrower."""
+
+
+def room_fraction(hu: NDArray[np.float32], body: Bools, spacing_mm: Floats, tolerance_mm: float) -> float:
+    """How much of a body is air that holds together with the room's, 0..1.
+
+    Args:
+        hu: Shape (nx, ny, nz), Hounsfield units.
+        body: Same shape, what a skin from elsewhere encloses, widened by twice the tolerance at most.
+        spacing_mm: Shape (3,).
+        tolerance_mm: How far the skin may be off.
+    """
+    air = hu < BODY_HU
+    wide = ndimage.distance_transform_edt(np.pad(air, 1, mode="edge"), sampling=spacing_mm)[1:-1, 1:-1, 1:-1] > WIDE_MM
+    labels, _ = ndimage.label(wide)
+    outside = np.unique(labels[~body])
+    room = np.isin(labels, outside[outside > 0])
+    near_room = ndimage.distance_transform_edt(~room, sampling=spacing_mm) <= WIDE_MM if room.any() else room
+    deep = ndimage.distance_transform_edt(np.pad(body, 1, mode="edge"), sampling=spacing_mm)[1:-1, 1:-1, 1:-1]
+    inside = deep > 2.0 * tolerance_mm
+    return float((air & near_room)[inside].mean()) if inside.any() else 0.0
