@@ -1,15 +1,14 @@
 """Long bones beside the trunk: found where an arm is pressed against it, and nowhere in a patient without one."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
+from places import REAL_CT
 
 from puncture_twin.planning.anatomy.body.body_mask import body_mask
 from puncture_twin.planning.anatomy.body.limb_bones import limb_bones
 
-CT = Path(__file__).parents[2] / "shared" / "data" / "totalseg_abdomen_3mm" / "ct.nii.gz"
+CT = REAL_CT / "ct.nii.gz"
 SPACING = np.array([4.0, 4.0, 5.0])
 X, Y, Z = np.indices((90, 60, 24)) * SPACING.reshape(3, 1, 1, 1)
 TRUNK = np.hypot((X - 200.0) / 140.0, (Y - 120.0) / 90.0) < 1.0

@@ -7,6 +7,7 @@ of air, some 0. Air that was measured has noise, and never one value over a whol
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -118,7 +119,10 @@ def _padded(hu: NDArray[np.float32], circle: Bools) -> Bools:
     padded = np.zeros(hu.shape, bool)
     padded[:, :, (hu == hu[:1, :1]).all(axis=(0, 1))] = True
     for value in np.unique(hu[_corners(hu)]):
-        labels, _ = ndimage.label(_block((hu == value) & ~circle))
+        same = (hu == value) & ~circle
+        if not _fills_a_corner(same):
+            continue
+        labels, _ = ndimage.label(_block(same))
         held = np.unique(labels[_corners(hu)])
         padded |= np.isin(labels, held[held > 0])
     for value in np.unique(hu[padded]):
@@ -130,6 +134,11 @@ def _padded(hu: NDArray[np.float32], circle: Bools) -> Bools:
 def _corners(image: NDArray[Any]) -> tuple[slice, ...]:
     """The voxels at the corners of an image."""
     return tuple(slice(None, None, max(1, n - 1)) for n in image.shape)
+
+
+def _fills_a_corner(same: Bools) -> bool:
+    """Whether a mask holds all of a cube at a corner; of measured air none does, and most images end here."""
+    return any(same[cube].all() for cube in itertools.product((slice(0, 2), slice(-2, None)), repeat=3))
 
 
 def _block(same: Bools) -> Bools:
