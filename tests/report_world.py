@@ -122,7 +122,7 @@ def make_plan(case, candidates):
         expected_target_error_mm=1.25,
         theta=candidates.theta[row],
         beta=candidates.beta[row],
-        entry_ct=candidates.entry_ct[row],
+        entry_ct=candidates.path.entry_ct[row],
         target_ct=case.target_ct,
         outward_ct=outward,
         roll=0.0,

@@ -22,7 +22,6 @@ from puncture_twin.twin.report.map.map_picture import FIGURE_INCHES, MAP_BOX, RI
 from puncture_twin.twin.report.map.map_raster import map_raster
 from puncture_twin.twin.report.map_view import map_view, rows_at, step_of
 from puncture_twin.twin.report.numbers import reason_counts
-from puncture_twin.twin.report.page import page
 from puncture_twin.twin.report.page.page import write_page
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import TRIANGLES, lightened
@@ -566,11 +565,6 @@ def test_names_from_files_cannot_become_markup(case, candidates, tmp_path):
     )
     write_page(case, anatomy, named, None, None, {"method": evil, "flags": [evil]}, tmp_path / "page.html", film=evil)
     assert evil not in (tmp_path / "page.html").read_text(encoding="utf-8")
-
-
-def test_template_parts_are_not_searched_again():
-    """What is put in may itself contain the template's braces."""
-    assert page.fill("a {{x}} b {{y}}", {"x": "{{y}}", "y": "1"}) == "a {{y}} b 1"
 
 
 def test_the_page_s_map_knows_its_rows(case, candidates):

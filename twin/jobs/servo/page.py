@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 
-from puncture_twin.planning.base.files import atomic
+from markupsafe import Markup
+
 from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, Statistics, TargetRow
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.jobs.servo.liu2007 import TABLE_2, PaperMean, paper_servo_only_at_least
 from puncture_twin.twin.report.numbers import number, percent
-from puncture_twin.twin.report.page.page import fill
-from puncture_twin.twin.report.page.page_tables import escape, inputs_table, pairs, table
+from puncture_twin.twin.report.page.page_tables import faint, inputs_table, pairs, table, two
+from puncture_twin.twin.report.page.template import Card, data_address, write_html
 
 ROW_HEAD = ("target", "mapping", "expected", "before", "after", "servo-only", "corrections", "ended")
 
@@ -39,25 +38,21 @@ def write_servo_page(
         paper: The paper's columns, where it is compared.
     """
     first = trials[0]
-    text = fill(
-        (files("puncture_twin.twin.report") / "servo.html").read_text(encoding="utf-8"),
-        {
-            "title": escape(f"{case.name}: visual servoing onto {len(first.rows)} targets"),
-            "setup": escape(_setup(case)),
-            "style": (files("puncture_twin.twin.report") / "page.css").read_text(encoding="utf-8"),
-            "cards": _cards(case, ours),
-            "paper": _paper(paper, ours, trials) if paper else "",
-            "seed": str(first.seed),
-            "targets": table(ROW_HEAD, [_cells(row) for row in first.rows], kind="numbers"),
-            "convergence": _embedded(convergence),
-            "cameras": "".join(f'<figure><img alt="{escape(p.stem)}" src="{_embedded(p)}"></figure>' for p in pictures),
-            "statistics": _statistics(ours),
-            "calibration": _calibration(case, first),
-            "inputs": inputs_table(case.inputs),
-        },
+    write_html(
+        "servo.html",
+        path,
+        title=f"{case.name}: visual servoing onto {len(first.rows)} targets",
+        setup=_setup(case),
+        cards=_cards(case, ours),
+        paper=_paper(paper, ours, trials) if paper else "",
+        seed=first.seed,
+        targets=table(ROW_HEAD, [_cells(row) for row in first.rows], kind="numbers"),
+        convergence=data_address(convergence),
+        cameras=[(picture.stem, data_address(picture)) for picture in pictures],
+        statistics=_statistics(ours),
+        calibration=_calibration(case, first),
+        inputs=inputs_table(case.inputs),
     )
-    with atomic(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def _setup(case: ServoCase) -> str:
@@ -71,32 +66,28 @@ def _setup(case: ServoCase) -> str:
     )
 
 
-def _cards(case: ServoCase, ours: Statistics) -> str:
-    tolerance = case.file.servo.tolerance_mm
-    cards = [
-        ("before the servo", number(ours.before_mean, 2, "mm"), "mean, true ball to true target"),
-        ("after the servo", number(ours.after_mean, 2, "mm"), f"{ours.after_over_mapping:.3f} times the mapping's"),
-        ("servo-only", number(ours.servo_only_mean, 3, "mm"), f"mean; at most {ours.servo_only_max:.3f} mm"),
-        ("not confirmed", percent(ours.not_confirmed), f"within {tolerance:g} mm; median {ours.median_steps:g} steps"),
+def _cards(case: ServoCase, ours: Statistics) -> list[Card]:
+    tolerance, steps = case.file.servo.tolerance_mm, f"{ours.median_steps:g}"
+    return [
+        Card("before the servo", number(ours.before_mean, 2, "mm"), "mean, true ball to true target"),
+        Card("after the servo", number(ours.after_mean, 2, "mm"), f"{ours.after_over_mapping:.3f} times the mapping's"),
+        Card("servo-only", number(ours.servo_only_mean, 3, "mm"), f"mean; at most {ours.servo_only_max:.3f} mm"),
+        Card("not confirmed", percent(ours.not_confirmed), f"within {tolerance:g} mm; median {steps} steps"),
     ]
-    return "".join(
-        f'<div class="card"><h3>{title}</h3><p class="big">{value}</p><p class="faint">{escape(detail)}</p></div>'
-        for title, value, detail in cards
-    )
 
 
 def _cells(row: TargetRow) -> tuple[str, ...]:
     lengths = (row.mapping_mm, row.expected_tre_mm, row.before_mm, row.after_mm)
     return (
-        escape(row.target),
+        row.target,
         *(number(mm, 2) for mm in lengths),
         number(row.servo_only_mm, 3),
         str(row.steps),
-        escape(row.stop.replace("_", " ")),
+        row.stop.replace("_", " "),
     )
 
 
-def _statistics(ours: Statistics) -> str:
+def _statistics(ours: Statistics) -> Markup:
     refused = f"; {ours.refused} could not be held" if ours.refused else ""
     return pairs(
         [
@@ -115,12 +106,12 @@ def _statistics(ours: Statistics) -> str:
                 f"{number(ours.servo_only_mean, 3)} and {number(ours.servo_only_max, 3, 'mm')}",
             ),
             ("corrections, median", number(ours.median_steps, 1)),
-            ("not confirmed", escape(percent(ours.not_confirmed))),
+            ("not confirmed", percent(ours.not_confirmed)),
         ]
     )
 
 
-def _calibration(case: ServoCase, first: ServoTrial) -> str:
+def _calibration(case: ServoCase, first: ServoTrial) -> Markup:
     residuals = " and ".join(number(px, 3) for px in first.rms_px)
     cal = case.file.calibration
     return pairs(
@@ -134,7 +125,7 @@ def _calibration(case: ServoCase, first: ServoTrial) -> str:
     )
 
 
-def _paper(paper: Sequence[PaperMean], ours: Statistics, trials: Sequence[ServoTrial]) -> str:
+def _paper(paper: Sequence[PaperMean], ours: Statistics, trials: Sequence[ServoTrial]) -> Markup:
     """The paper's tables beside ours."""
     rows = [row for one in trials for row in one.rows]
     most = {
@@ -147,7 +138,7 @@ def _paper(paper: Sequence[PaperMean], ours: Statistics, trials: Sequence[ServoT
         note = "" if column.holds else " (not what the rows give)"
         printed = f"{column.printed_mean:.2f} / {column.printed_max:.2f}{note}"
         by_rows, own = f"{column.mean:.3f} / {column.max:.2f}", f"{our_mean:.2f} / {our_most:.2f}"
-        lines.append((escape(column.name), escape(printed), by_rows, own))
+        lines.append((column.name, printed, by_rows, own))
     lines.append(("servo-only", "not measured", "–", f"{ours.servo_only_mean:.3f} / {most['servo_only']:.2f}"))
     means = table(("mean / maximum, mm", "paper, printed", "paper, by its rows", "ours"), lines, kind="numbers")
     body = [
@@ -158,15 +149,9 @@ def _paper(paper: Sequence[PaperMean], ours: Statistics, trials: Sequence[ServoT
     ]
     head = ("target", "mapping", "before", "after", "servo-only", "ours: mapping", "before", "after", "servo-only",
             "corrections")  # fmt: skip
-    return (
-        "<h2>Liu et al. 2007, and ours</h2>"
-        '<p class="faint">The paper\'s head, robot and targets are not ours: compare means, not rows. It did not '
-        "measure what the servo alone leaves; by the triangle's inequality it is at least |after − mapping|. "
-        f"Rows of the twin: seed {trials[0].seed}.</p>"
-        f'<div class="two"><div>{means}</div><div>{table(head, body, kind="numbers")}</div></div>'
+    words = (
+        "The paper's head, robot and targets are not ours: compare means, not rows. It did not measure what the servo "
+        "alone leaves; by the triangle's inequality it is at least |after − mapping|. "
+        f"Rows of the twin: seed {trials[0].seed}."
     )
-
-
-def _embedded(path: Path) -> str:
-    """A PNG as a data address."""
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+    return Markup("<h2>Liu et al. 2007, and ours</h2>") + faint(words) + two(means, table(head, body, kind="numbers"))

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plotly.offline import get_plotlyjs
 
 from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.numbers import (
     chosen_row,
@@ -26,6 +22,7 @@ from puncture_twin.twin.report.page import page_tables as tables
 from puncture_twin.twin.report.page.page_charts import rehearsal_charts
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import scene_figure
+from puncture_twin.twin.report.page.template import Card, plotly_script, script_json, write_html
 
 
 def write_page(
@@ -59,63 +56,41 @@ def write_page(
         "probe_mm": float(case.needle.length_mm),
     }
     seed = case.rehearsal.seed if plan is None else plan.seed
-    parts = {
-        "title": tables.escape(f"{case.name}: puncture of {target_words(case)}"),
-        "needle": tables.escape(needle_words(case)),
-        "verdict": _verdict(candidates, plan, rehearsal),
-        "counts": tables.counts_table(candidates),
-        "best": tables.best_table(candidates),
-        "plan": tables.plan_section(plan),
-        "registration": tables.registration_section(registration, plan),
-        "rehearsal": tables.rehearsal_section(rehearsal, demanding(anatomy), film),
-        "warnings": tables.warnings_section(anatomy.warnings),
-        "inputs": tables.inputs_table(case.inputs),
-        "origin": tables.origin_section(seed),
-        "style": _part("page.css"),
-        "data": _json(data),
-        "script": _part("page.js"),
-        "plotly": get_plotlyjs(),
-    }
-    text = fill(_part("page.html"), parts)
-    with atomic(Path(path)) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_html(
+        "report.html",
+        path,
+        title=f"{case.name}: puncture of {target_words(case)}",
+        needle=needle_words(case),
+        refused=_refused(candidates),
+        cards=_cards(candidates, plan, rehearsal),
+        counts=tables.counts_table(candidates),
+        best=tables.best_table(candidates),
+        plan=tables.plan_section(plan),
+        registration=tables.registration_section(registration, plan),
+        rehearsal=tables.rehearsal_section(rehearsal, demanding(anatomy), film),
+        warnings=tables.warnings_section(anatomy.warnings),
+        inputs=tables.inputs_table(case.inputs),
+        origin=tables.origin_section(seed),
+        data=script_json(data),
+        plotly=plotly_script(),
+    )
 
 
-def fill(template: str, parts: Mapping[str, str]) -> str:
-    """Put parts where the template says ``{{name}}``, in one pass: what is put in is never searched again.
-
-    Raises:
-        KeyError: The template names a part that is not given.
-    """
-    pieces = template.split("{{")
-    filled = [pieces[0]]
-    for piece in pieces[1:]:
-        name, _, rest = piece.partition("}}")
-        filled += [parts[name], rest]
-    return "".join(filled)
+def _refused(candidates: Candidates) -> str:
+    """What stands in place of the cards where nothing is safe; "" where something is."""
+    if candidates.safe.any():
+        return ""
+    counts = ", ".join(f"{k.replace('_', ' ')}: {v:,}" for k, v in candidates.counts().items())
+    return f"All {len(candidates):,} directions are refused ({counts})."
 
 
-def _part(name: str) -> str:
-    return (files("puncture_twin.twin.report") / name).read_text(encoding="utf-8")
-
-
-def _json(data: Any) -> str:
-    """JSON that may stand inside a script element: no tag can end it early."""
-    text = json.dumps(data, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
-
-
-def _verdict(candidates: Candidates, plan: Any | None, rehearsal: Any | None) -> str:
+def _cards(candidates: Candidates, plan: Any | None, rehearsal: Any | None) -> list[Card]:
     row = chosen_row(candidates)
     safe = int(candidates.safe.sum())
     if safe == 0:
-        counts = ", ".join(f"{tables.escape(k.replace('_', ' '))}: {v:,}" for k, v in candidates.counts().items())
-        return (
-            '<div class="card bad"><h2>Nothing is safe</h2>'
-            f"<p>All {len(candidates):,} directions are refused ({counts}).</p></div>"
-        )
+        return []
     cards = [
-        (
+        Card(
             "safe directions" if candidates.arm_checked else f"directions {candidates.safe_text}",
             f"{safe:,} of {len(candidates):,}",
             f"{100 * safe / len(candidates):.1f} % of the grid",
@@ -126,18 +101,15 @@ def _verdict(candidates: Candidates, plan: Any | None, rehearsal: Any | None) ->
         where = f"θ {np.degrees(candidates.theta[row]):g}°, β {np.degrees(candidates.beta[row]):g}°"
         detail = f"{number(float(candidates.path.length[row]), 1, 'mm')} in the body"
         if name:
-            detail += f"; nearest {tables.escape(name.replace('_', ' '))}, {number(clearance, 1, 'mm')}"
-        cards.append(("best direction", where, detail))
+            detail += f"; nearest {name.replace('_', ' ')}, {number(clearance, 1, 'mm')}"
+        cards.append(Card("best direction", where, detail))
     if not candidates.arm_checked:
-        cards.append(("arm", "not checked", tables.escape(candidates.arm_note.removeprefix("not checked: "))))
+        cards.append(Card("arm", "not checked", candidates.arm_note.removeprefix("not checked: ")))
     if plan is None:
-        cards.append(("plan", "none", "the arm's motion was not planned or not found"))
+        cards.append(Card("plan", "none", "the arm's motion was not planned or not found"))
     if rehearsal is not None:
         touched = len(rehearsal.contacts)
         detail = f"{touched} contact{'s' if touched != 1 else ''}" if touched else "no contact"
         expected = f"expected (rms) {number(rehearsal.predicted_error_mm, 2, 'mm')}; {detail}"
-        cards.append(("rehearsed tip error", number(rehearsal.tip_error_mm, 2, "mm"), expected))
-    return "".join(
-        f'<div class="card"><h3>{title}</h3><p class="big">{value}</p><p class="faint">{detail}</p></div>'
-        for title, value, detail in cards
-    )
+        cards.append(Card("rehearsed tip error", number(rehearsal.tip_error_mm, 2, "mm"), expected))
+    return cards

@@ -1,8 +1,7 @@
-"""The page's tables, as HTML. Every word that comes from a file is escaped."""
+"""The page's tables, as `Markup`: text is escaped where it meets HTML, HTML is not."""
 
 from __future__ import annotations
 
-import html
 import math
 import platform
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.base.reasons import css
@@ -34,29 +34,45 @@ BEST_COLUMNS = (
 )
 
 
-def escape(value: object) -> str:
-    """Text made safe for HTML."""
-    return html.escape(str(value), quote=True)
+def joined(template: str, items: Iterable[Sequence[str]]) -> Markup:
+    """A piece of HTML, with ``{}`` for each part, written for every item; parts that are not `Markup` are escaped."""
+    return Markup("").join(Markup(template).format(*item) for item in items)
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, kind: str = "") -> str:
-    """A table; the cells are HTML already."""
-    top = "".join(f"<th>{cell}</th>" for cell in head)
-    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
-    return f'<div class="wide"><table class="{kind}"><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, kind: str = "") -> Markup:
+    """A table; cells are text or `Markup`."""
+    top = joined("<th>{}</th>", zip(head, strict=True))
+    body = joined("<tr>{}</tr>", ((joined("<td>{}</td>", zip(row, strict=True)),) for row in rows))
+    form = '<div class="wide"><table class="{}"><thead><tr>{}</tr></thead><tbody>{}</tbody></table></div>'
+    return Markup(form).format(kind, top, body)
 
 
-def pairs(rows: Iterable[tuple[str, str]]) -> str:
-    """A table of names and values; the values are HTML already."""
-    body = "".join(f"<tr><th>{escape(name)}</th><td>{value}</td></tr>" for name, value in rows)
-    return f'<div class="wide"><table class="pairs"><tbody>{body}</tbody></table></div>'
+def pairs(rows: Iterable[tuple[str, str]]) -> Markup:
+    """A table of names and values; each is text or `Markup`."""
+    body = joined("<tr><th>{}</th><td>{}</td></tr>", rows)
+    return Markup('<div class="wide"><table class="pairs"><tbody>{}</tbody></table></div>').format(body)
 
 
-def best_table(candidates: Candidates) -> str:
+def faint(text: str) -> Markup:
+    """A line in small print."""
+    return Markup('<p class="faint">{}</p>').format(text)
+
+
+def listed(lines: Iterable[str]) -> Markup:
+    """Lines that warn, as a list."""
+    return Markup("<ul>{}</ul>").format(joined('<li class="bad">{}</li>', ((line,) for line in lines)))
+
+
+def two(left: str, right: str) -> Markup:
+    """Two pieces side by side."""
+    return Markup('<div class="two"><div>{}</div><div>{}</div></div>').format(left, right)
+
+
+def best_table(candidates: Candidates) -> Markup:
     """The ten best candidates."""
     rows = candidates.ranked[:10]
     if len(rows) == 0:
-        return "<p>No direction is safe, so there is nothing to rank.</p>"
+        return Markup("<p>No direction is safe, so there is nothing to rank.</p>")
     lines = []
     for row in rows:
         name, clearance = nearest_structure(candidates, int(row))
@@ -67,7 +83,7 @@ def best_table(candidates: Candidates) -> str:
                 f"{np.degrees(candidates.beta[row]):g}",
                 number(float(candidates.ranking.cost[row]), 3),
                 number(clearance, 1),
-                escape(name.replace("_", " ") or "–"),
+                name.replace("_", " ") or "–",
                 number(float(candidates.path.length[row]), 1),
                 number(float(np.degrees(candidates.path.skin_angle[row])), 1),
                 number(float(candidates.path.tissue[row]), 1),
@@ -78,26 +94,26 @@ def best_table(candidates: Candidates) -> str:
     return table(BEST_COLUMNS, lines, kind="numbers")
 
 
-def counts_table(candidates: Candidates) -> str:
+def counts_table(candidates: Candidates) -> Markup:
     """How many directions fell to which reason; also the map's legend."""
     rows = [
         (
-            f'<span class="patch" style="background:{css(line.colour)}"></span>{escape(line.words)}',
-            f"<code>{escape(line.code)}</code>",
+            Markup('<span class="patch" style="background:{}"></span>{}').format(css(line.colour), line.words),
+            Markup("<code>{}</code>").format(line.code),
             f"{line.count:,}",
-            escape(percent(line.share)),
-            escape(percent(line.solid_angle)),
+            percent(line.share),
+            percent(line.solid_angle),
         )
         for line in reason_counts(candidates)
     ]
-    words = f'<p class="faint">{escape(arm_words(candidates))}.</p>'
+    words = faint(f"{arm_words(candidates)}.")
     return table(("verdict", "code", "directions", "of grid", "of solid angle"), rows, kind="numbers") + words
 
 
-def registration_section(registration: Mapping[str, Any] | None, plan: Any | None) -> str:
+def registration_section(registration: Mapping[str, Any] | None, plan: Any | None) -> Markup:
     """The registration's numbers from a mapping of plain values; absent ones are left out."""
     if not registration:
-        return "<p>The case has no markers: where the patient lies was stated, or is not known.</p>"
+        return Markup("<p>The case has no markers: where the patient lies was stated, or is not known.</p>")
     names = (
         ("method", "method", "", 0),
         ("fre_mm", "FRE (rms residual; not the accuracy at the target)", "mm", 3),
@@ -108,7 +124,9 @@ def registration_section(registration: Mapping[str, Any] | None, plan: Any | Non
         ("altitude_mm", "least altitude of the triangle", "mm", 1),
         ("leverage", "TRE(target)/FLE", "", 2),
     )
-    rows = [("expected error (TRE, rms) at the target", f"<b>{number(_tre(registration, plan), 2, 'mm')}</b>")]
+    rows: list[tuple[str, str]] = [
+        ("expected error (TRE, rms) at the target", _bold(number(_tre(registration, plan), 2, "mm")))
+    ]
     for key, words, unit, digits in names:
         if registration.get(key) is not None:
             rows.append((words, _value(registration[key], unit, digits)))
@@ -116,13 +134,14 @@ def registration_section(registration: Mapping[str, Any] | None, plan: Any | Non
     if low < high:
         rows.append(("95 % interval of the FLE", f"{number(low, 2)} to {number(high, 2, 'mm')}"))
     flags = list(registration.get("flags") or ())
-    warned = "".join(f'<li class="bad">{escape(flag)}</li>' for flag in flags)
-    rows.append(("weak points", f"<ul>{warned}</ul>" if flags else "no flag raised"))
+    rows.append(("weak points", listed(map(str, flags)) if flags else "no flag raised"))
     residuals = registration.get("residual_mm") or {}
-    shown = table(
-        ("marker", "residual mm"), [(escape(n), number(float(v), 3)) for n, v in residuals.items()], kind="numbers"
-    )
-    return f'<div class="two"><div>{pairs(rows)}</div><div>{shown if residuals else ""}</div></div>'
+    shown = table(("marker", "residual mm"), [(n, number(float(v), 3)) for n, v in residuals.items()], kind="numbers")
+    return two(pairs(rows), shown if residuals else "")
+
+
+def _bold(text: str) -> Markup:
+    return Markup("<b>{}</b>").format(text)
 
 
 def _tre(registration: Mapping[str, Any], plan: Any | None) -> float:
@@ -135,17 +154,17 @@ def _tre(registration: Mapping[str, Any], plan: Any | None) -> float:
 
 def _value(value: Any, unit: str, digits: int) -> str:
     if isinstance(value, int | float):
-        return escape(number(float(value), digits, unit))
-    return escape(value)
+        return number(float(value), digits, unit)
+    return str(value)
 
 
-def plan_section(plan: Any | None) -> str:
+def plan_section(plan: Any | None) -> Markup:
     """The plan's numbers."""
     if plan is None:
-        return "<p>No plan was made.</p>"
+        return Markup("<p>No plan was made.</p>")
     rows = [
         ("direction", f"θ {np.degrees(plan.theta):g}°, β {np.degrees(plan.beta):g}°"),
-        ("arm", escape(plan.model)),
+        ("arm", str(plan.model)),
         ("roll about the needle", f"{np.degrees(plan.roll):.1f}°"),
         ("standoff (tip to target)", number(plan.standoff_mm, 1, "mm")),
         ("entry point, CT frame", _point(plan.entry_ct)),
@@ -159,29 +178,29 @@ def plan_section(plan: Any | None) -> str:
     return pairs(rows)
 
 
-def rehearsal_section(rehearsal: Any | None, keep_away: frozenset[str], film: str | None = None) -> str:
+def rehearsal_section(rehearsal: Any | None, keep_away: frozenset[str], film: str | None = None) -> Markup:
     """The rehearsal's numbers; clearances of the structures that the needle must keep away from; a link to the film."""
     if rehearsal is None:
-        return "<p>Not rehearsed.</p>"
+        return Markup("<p>Not rehearsed.</p>")
     depth = f"{number(abs(rehearsal.depth_mm), 2, 'mm')} too {'deep' if rehearsal.depth_mm >= 0 else 'shallow'}"
-    touched = "".join(
-        f'<li class="bad">{escape(c.link)} touches {escape(c.body)} at {c.time_s:.2f} s'
-        f"{f' ({c.depth_mm:.2f} mm deep)' if math.isfinite(c.depth_mm) else ''}</li>"
+    touched = [
+        f"{c.link} touches {c.body} at {c.time_s:.2f} s"
+        f"{f' ({c.depth_mm:.2f} mm deep)' if math.isfinite(c.depth_mm) else ''}"
         for c in rehearsal.contacts
-    )
+    ]
     share = np.max(rehearsal.max_joint_speed / rehearsal.speed_limits)
     rows = [
-        ("tip error at the end", f"<b>{number(rehearsal.tip_error_mm, 2, 'mm')}</b>"),
+        ("tip error at the end", _bold(number(rehearsal.tip_error_mm, 2, "mm"))),
         ("its lateral part", number(rehearsal.lateral_mm, 2, "mm")),
         ("its depth part", depth),
         ("expected beforehand (rms)", number(rehearsal.predicted_error_mm, 2, "mm")),
-        ("contacts", f"<ul>{touched}</ul>" if touched else "none"),
+        ("contacts", listed(touched) if touched else "none"),
         ("fastest joint", f"{100 * share:.0f} % of its limit{'' if share <= 1 else ' (too fast)'}"),
         ("joint speeds, °/s", ", ".join(f"{v:.0f}" for v in np.degrees(rehearsal.max_joint_speed))),
         ("their limits, °/s", ", ".join(f"{v:.0f}" for v in np.degrees(rehearsal.speed_limits))),
-        ("truth", escape(getattr(rehearsal, "truth_source", "–"))),
+        ("truth", str(getattr(rehearsal, "truth_source", "–"))),
         ("seed", str(rehearsal.seed)),
-        *([("film", f'<a href="{escape(film)}">{escape(film)}</a>')] if film else ()),
+        *([("film", Markup('<a href="{}">{}</a>').format(film, film))] if film else ()),
     ]
     least = sorted(
         ((name, float(np.min(mm))) for name, mm in rehearsal.clearance_mm.items() if name in keep_away and len(mm)),
@@ -189,36 +208,34 @@ def rehearsal_section(rehearsal: Any | None, keep_away: frozenset[str], film: st
     )
     nearest = table(
         ("structure", "least clearance mm"),
-        [(escape(n.replace("_", " ")), number(v, 1)) for n, v in least[:12]],
+        [(n.replace("_", " "), number(v, 1)) for n, v in least[:12]],
         kind="numbers",
     )
-    more = (
-        f'<p class="faint">The 12 nearest of {len(least)} structures to keep away from.</p>' if len(least) > 12 else ""
-    )
-    return f'<div class="two"><div>{pairs(rows)}</div><div>{nearest}{more}</div></div>'
+    more = faint(f"The 12 nearest of {len(least)} structures to keep away from.") if len(least) > 12 else ""
+    return two(pairs(rows), nearest + more)
 
 
-def warnings_section(warnings: Sequence[str]) -> str:
+def warnings_section(warnings: Sequence[str]) -> Markup:
     """What could not be known."""
-    if not warnings:
-        return "<p>None.</p>"
-    return "<ul>" + "".join(f'<li class="bad">{escape(warning)}</li>' for warning in warnings) + "</ul>"
+    return listed(warnings) if warnings else Markup("<p>None.</p>")
 
 
-def inputs_table(inputs: Iterable[Input]) -> str:
+def inputs_table(inputs: Iterable[Input]) -> Markup:
     """Every input with its role and hash."""
-    rows = [(escape(one.role), escape(one.path), f"<code>{escape(one.sha256)}</code>") for one in inputs]
+    rows = [(one.role, one.path, Markup("<code>{}</code>").format(one.sha256)) for one in inputs]
     return table(("role", "file", "SHA-256"), rows)
 
 
-TIMES = '<p class="faint">When it ran, and how long each stage took: <a href="timings.json">timings.json</a>.</p>'
+TIMES = Markup(
+    '<p class="faint">When it ran, and how long each stage took: <a href="timings.json">timings.json</a>.</p>'
+)
 
 
-def origin_section(seed: int) -> str:
+def origin_section(seed: int) -> Markup:
     """Versions and seed, and where the times are: they differ from run to run, and the page does not."""
-    versions = [(name, escape(_version(name))) for name in PARTS]
-    rows = [("seed", str(seed)), ("Python", escape(platform.python_version())), *versions]
-    return f"{pairs(rows)}{TIMES}"
+    versions = [(name, _version(name)) for name in PARTS]
+    rows = [("seed", str(seed)), ("Python", platform.python_version()), *versions]
+    return pairs(rows) + TIMES
 
 
 def _version(name: str) -> str:

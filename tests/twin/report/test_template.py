@@ -1,0 +1,60 @@
+"""The pages' shell: texts are escaped, a missing part is an error, data cannot end its element."""
+
+from importlib.resources import files
+
+import jinja2
+import pytest
+from markupsafe import Markup
+
+from puncture_twin.twin.report.page.page_tables import listed, pairs, table
+from puncture_twin.twin.report.page.template import Card, script_json, write_html
+
+EVIL = "</script><script>alert('1')</script>{{ title }}"
+SERVO = ("setup", "paper", "targets", "convergence", "statistics", "calibration", "inputs")
+
+
+def servo_parts(text):
+    """What the servo's page is given, every text the same."""
+    parts = dict.fromkeys(SERVO, text)
+    return parts | {"title": text, "seed": 1, "cards": [Card(text, text, text)], "cameras": [(text, "data:,")]}
+
+
+@pytest.mark.parametrize(
+    "name", sorted(path.name for path in (files("puncture_twin.twin.report") / "templates").iterdir())
+)
+def test_every_template_is_in_the_package_and_is_read(name):
+    """By name, as text."""
+    assert (files("puncture_twin.twin.report") / "templates" / name).read_text(encoding="utf-8")
+
+
+def test_texts_are_escaped_wherever_they_stand(tmp_path):
+    """Title, cards, figures, and every part that is not marked as HTML."""
+    write_html("servo.html", tmp_path / "page.html", **servo_parts(EVIL))
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "<script" not in text
+    assert text.count("&lt;script&gt;") == len(SERVO) + 2 + 3 + 1  # the title stands twice
+    assert "{{ title }}" in text  # what is put in is not searched again
+
+
+def test_a_part_that_is_missing_is_an_error_and_no_page(tmp_path):
+    """Half a page must not look like a whole one."""
+    parts = servo_parts("words")
+    del parts["targets"]
+    with pytest.raises(jinja2.UndefinedError, match="targets"):
+        write_html("servo.html", tmp_path / "page.html", **parts)
+    assert not list(tmp_path.iterdir())
+
+
+def test_tables_escape_text_and_keep_markup():
+    """In heads, cells and lists alike."""
+    shown = table((EVIL,), [(EVIL, Markup("<b>1</b>"))]) + pairs([(EVIL, EVIL)]) + listed([EVIL])
+    assert "<script" not in shown
+    assert shown.count("&lt;script&gt;") == 5
+    assert "<td><b>1</b></td>" in shown
+
+
+def test_data_cannot_end_its_script_element():
+    """No "<" is left; what is not a number is refused."""
+    assert script_json({"a": EVIL}).count("<") == 0
+    with pytest.raises(ValueError, match="Out of range"):
+        script_json(float("nan"))

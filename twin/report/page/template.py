@@ -1,0 +1,75 @@
+"""The pages' one shell: jinja2 templates that escape every text which is not marked as HTML.
+
+``base.html`` holds the head, the cards, the inputs and the scripts; each page extends it. What a page is given by name
+is text, escaped, or `Markup`, HTML already. A template that names what it is not given is an error.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jinja2 import Environment, FunctionLoader, StrictUndefined
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from puncture_twin.planning.base.files import atomic
+
+
+class Card(NamedTuple):
+    """One of the boxes below a page's title: plain texts."""
+
+    name: str
+    value: str
+    detail: str
+
+
+def write_html(template: str, path: Path, **parts: object) -> None:
+    """Fill a template and write the page, whole or not at all.
+
+    Args:
+        template: Its file name.
+        path: The HTML to write.
+        parts: What the template names: plain text, or `Markup`.
+
+    Raises:
+        jinja2.UndefinedError: The template names a part that is not given.
+    """
+    text = _environment().get_template(template).render(parts)
+    with atomic(Path(path)) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FunctionLoader(_asset), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.globals["asset"] = lambda name: Markup(_asset(name))  # our own style and script
+    return environment
+
+
+def _asset(name: str) -> str:
+    """A file of ``twin/report/templates``."""
+    return (files("puncture_twin.twin.report") / "templates" / name).read_text(encoding="utf-8")
+
+
+def plotly_script() -> Markup:
+    """Plotly, to stand inside a script element."""
+    return Markup(get_plotlyjs())  # the package's own file
+
+
+def script_json(data: Any, encoder: type[json.JSONEncoder] | None = None) -> Markup:
+    """JSON that may stand inside a script element: no tag can end it early."""
+    text = json.dumps(data, allow_nan=False, separators=(",", ":"), cls=encoder)
+    safe = text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+    return Markup(safe)  # nothing in it opens a tag
+
+
+def data_address(picture: Path) -> str:
+    """A PNG as an address that carries it."""
+    return "data:image/png;base64," + base64.b64encode(picture.read_bytes()).decode("ascii")
