@@ -128,17 +128,18 @@ def _sector(inner: float, outer: float, first: float, last: float) -> str:
 
 
 def _rings(rim: float) -> list[str]:
-    """Circles of equal θ with their labels."""
+    """Circles of equal θ with their labels, and the rim."""
     degrees = np.degrees(rim)
     step = next((wide for wide in (5.0, 10.0, 15.0, 30.0, 45.0) if degrees / wide <= 5.0), 60.0)
     parts = []
-    for theta in (*np.arange(step, degrees - 0.3 * step, step), degrees):
+    labelled = np.arange(step, degrees + 1e-6, step)
+    for theta in (*labelled, degrees):
         radius = RADIUS * theta / degrees
         parts.append(
             f'<circle cx="{SIZE / 2:g}" cy="{SIZE / 2:g}" r="{radius:.1f}" fill="none" stroke="#1b1e23" '
             f'stroke-opacity="0.45" stroke-width="0.6"/>'
         )
-        parts.append(_text(f"{theta:.3g}°", radius, np.radians(52.0), "start"))
+    parts += [_text(f"{theta:g}°", RADIUS * theta / degrees, np.radians(52.0), "start") for theta in labelled]
     return parts
 
 

@@ -14,6 +14,9 @@ from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_WORDS, SA
 SAME_ANGLE = 1e-7
 """rad: two angles nearer than this are one line of the grid."""
 
+ALONE = np.radians(2.0)
+"""rad: how wide a direction is drawn where no other has another angle."""
+
 MOST_ROWS = 200_000
 """Directions that are painted; the table says all that there is to say about more."""
 
@@ -46,13 +49,15 @@ def _map(candidates: Any) -> str:
     legend = [Entry(candidates.safe_text, SAFE), *(Entry(REASON_WORDS[r], REASON_COLOURS[r]) for r in reasons[1:])]
     number = {reason.value: row for row, reason in enumerate(reasons)}
     code = np.array([number[str(reason)] for reason in candidates.verdict.reason])
-    step = min(_step(candidates.theta), _step(np.mod(candidates.beta, 2 * np.pi)))
-    theta = np.clip(candidates.theta[:, None] + np.array([-0.5, 0.5]) * step, 0.0, np.pi)
-    beta = np.mod(candidates.beta, 2 * np.pi)[:, None] + np.array([-0.5, 0.5]) * step
-    return polar_map(Sectors(theta, beta, code), legend, step / 2)  # the cells' edges lie at halves of a step
+    azimuth, half = np.mod(candidates.beta, 2 * np.pi), np.array([-0.5, 0.5])
+    steps = _step(candidates.theta), _step(azimuth)
+    theta = np.clip(candidates.theta[:, None] + half * steps[0], 0.0, np.pi)
+    cells = Sectors(theta, azimuth[:, None] + half * steps[1], code)
+    return polar_map(cells, legend, min(steps) / 2)  # the cells' edges lie at halves of a step
 
 
 def _step(values: Floats) -> float:
-    """The grid's step: the least gap between two of its angles, rad; 2 degrees for a grid of one."""
+    """The grid's step: the least gap between two of its angles, rad."""
     gaps = np.diff(np.unique(values))
-    return float(gaps[gaps > SAME_ANGLE].min(initial=np.radians(2.0)))
+    gaps = gaps[gaps > SAME_ANGLE]
+    return float(gaps.min()) if len(gaps) else ALONE
