@@ -38,8 +38,8 @@ MEASURED = {
     "without rod": {"rod": False},
     "lamp 40 %": {"diffuse": 0.6},
     "noise 6": {"noise": 6.0},
-    "15 % hidden": {"hidden_share": 0.15},
-    "30 % hidden": {"hidden_share": 0.30},
+    "15 % hidden": {"hidden_fraction": 0.15},
+    "30 % hidden": {"hidden_fraction": 0.30},
     "background +-15": {"texture_grey": 15.0},
 }
 REFUSED = {
@@ -47,8 +47,8 @@ REFUSED = {
     "no ball, background +-25": {"ball": False, "texture_grey": 25.0},
     "as its background": {"ball_grey": 66.0, "diffuse": 1.0},
     "as its background +-15": {"ball_grey": 66.0, "diffuse": 1.0, "texture_grey": 15.0},
-    "60 % hidden": {"hidden_share": 0.60},
-    "70 % hidden": {"hidden_share": 0.70},
+    "60 % hidden": {"hidden_fraction": 0.60},
+    "70 % hidden": {"hidden_fraction": 0.70},
     "radius +15 %": {"radius_mm": 4.6},
 }
 

@@ -103,7 +103,7 @@ def test_an_occluder_hides_the_share_asked_for(rng):
     """Counted on the disc, with ball and occluder of known greys."""
     for share in (0.15, 0.5):
         plain = scene(rng, rod=False, diffuse=1.0, background_grey=0.0, occluder_grey=0.0)
-        hidden = BallScene(**(vars(plain) | {"hidden_share": share}))
+        hidden = BallScene(**(vars(plain) | {"hidden_fraction": share}))
         whole, part = (
             render(CAMERA, one, rng=rng, noise=0.0, half_px=30).grey.astype(float).sum() for one in (plain, hidden)
         )
@@ -171,7 +171,7 @@ def test_the_radius_is_the_predicted_one(rng):
             {"ball_grey": 66.0, "diffuse": 1.0, "texture_grey": 15.0},
             {"no_circle", "few_inliers", "wrong_radius", "low_contrast"},
         ),
-        ({"hidden_share": 0.65}, {"no_circle", "few_inliers", "wrong_radius", "low_contrast"}),
+        ({"hidden_fraction": 0.65}, {"no_circle", "few_inliers", "wrong_radius", "low_contrast"}),
         ({"radius_mm": 4.6}, {"wrong_radius"}),
     ],
     ids=[

@@ -47,7 +47,7 @@ class BallScene:
         background_grey: What is behind.
         texture_grey: Standard deviation of the background's pattern.
         texture_px: Size of the pattern's spots (standard deviation of the smoothing).
-        hidden_share: Share of the ball's disc that an occluder covers, 0 to 1.
+        hidden_fraction: Share of the ball's disc that an occluder covers, 0 to 1.
         hidden_from: Angle in the tangent plane from which it comes, rad.
         occluder_grey: The occluder's.
         ball: False takes the ball away.
