@@ -21,7 +21,7 @@ COLORS = {"planning": ("#dbe9f6", "#1f4e8c"), "twin": ("#fbe5d0", "#a65e12"), ""
 WIDTH, STEP = 2.3, 1.5
 """Distance of two columns, and of two levels."""
 COLUMNS = {
-    "run_twin": 0.0, "twin/jobs": -1.2, "planning/base": 1.4, "planning/geometry": 1.4,
+    "run_twin": 0.0, "api": 1.4, "twin/jobs": -1.2, "planning/base": 1.4, "planning/geometry": 1.4,
     "meshes": -4.7, "twin/phantoms": -3.7, "twin/guidance/ultrasound": -2.7, "twin/guidance/stereo": -1.7,
     "twin/rehearsal": -0.7, "twin/report": 0.3, "planning/export": 2.0,
     "twin/plant": -1.7, "twin/world": -0.5, "planning/place": 0.6, "planning/plan": 1.6, "planning/certify": 2.6,
