@@ -25,7 +25,7 @@ from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool
-from puncture_twin.planning.reach.reach import assess_reach, assess_reach_all
+from puncture_twin.planning.reach.reach import assess_reach_all
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.search import case_directions, organ_candidates, reach_request
 
@@ -120,7 +120,7 @@ def reach(name: str, case_file: Path, step_deg: float, n_states: int) -> None:
     begin = process_time()
     answers = assess_reach_all(fast, requests)
     middle = process_time()
-    plain = [assess_reach(slow, asked) for asked in requests]
+    plain = [assess_reach_all(slow, [asked])[0] for asked in requests]
     ours_s, theirs_s = middle - begin, process_time() - middle
     keys = ("reachable", "reason", "depth_mm", "contact", "branch", "margin", "detail")
     differ = sum(any(getattr(a, k) != getattr(b, k) for k in keys) for a, b in zip(answers, plain, strict=True))

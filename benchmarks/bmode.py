@@ -21,11 +21,13 @@ from puncture_twin.twin.guidance.ultrasound.image.needle_detector import (
     DetectorSettings,
     Missed,
     detect,
-    search_score,
 )
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleEcho, NeedleInImage, render
 
 IMAGER = Imager()
+
+UNGATED = DetectorSettings(least_score_mm=0.0, least_length_mm=0.0, least_step=-np.inf, sure_step=-np.inf, edge_mm=-1e9)
+"""The brightest segment is taken for a needle, whatever it is."""
 
 
 class Scene(NamedTuple):
@@ -137,7 +139,8 @@ def plainer(picture: np.ndarray, rng: np.random.Generator, gate_grey: float = 26
 def gate(count: int) -> None:
     """The search's score where there is no needle, against the gate."""
     rng = np.random.default_rng(99)
-    scores = np.array([search_score(render(IMAGER, None, rng), IMAGER) for _ in range(count)])
+    found = (detect(render(IMAGER, None, rng), IMAGER, UNGATED) for _ in range(count))
+    scores = np.array([one.score_mm for one in found if isinstance(one, Detection)])
     scale = scores.std() * np.sqrt(6.0) / np.pi
     place = scores.mean() - 0.5772 * scale
     limit = DetectorSettings().least_score_mm

@@ -19,9 +19,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.optimum_trial import OptimumTrial, optimum_trial
+from benchmarks.servo_variants import pixel_detector, varied
 from puncture_twin.meshes import folder
-from puncture_twin.twin.guidance.stereo.detection import Detector, picture_detector, pixel_detector
-from puncture_twin.twin.guidance.stereo.experiment import Statistics, run_trials, statistics, varied
+from puncture_twin.twin.guidance.stereo.detection import Detector, picture_detector
+from puncture_twin.twin.guidance.stereo.experiment import Statistics, run_trials, statistics
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.session import DetectorOf
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell

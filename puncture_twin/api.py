@@ -19,11 +19,15 @@ if TYPE_CHECKING:
     from puncture_twin.planning.case.case import Case
     from puncture_twin.planning.certify.certificate import Certificate
     from puncture_twin.planning.certify.checker import Verification
+    from puncture_twin.planning.formats.volumes.volume_files import Volume
+    from puncture_twin.planning.geometry.mesh import TriangleMesh
     from puncture_twin.planning.plan.plan import Plan
     from puncture_twin.planning.registration.registration import Registration
     from puncture_twin.planning.search.candidates import Candidates
     from puncture_twin.planning.search.context import CaseContext
     from puncture_twin.planning.search.explain import Explanation
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
     from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
 
 Points = NamedPoints | Mapping[str, ArrayLike]
@@ -116,7 +120,7 @@ def register(
     """
     from puncture_twin.planning.registration import registration
 
-    pairs = registration.match(_named(markers_ct), _named(markers_base), use=None)
+    pairs = registration.match(_named(markers_ct, "register"), _named(markers_base, "register"), use=None)
     target = np.asarray(target_ct, dtype=np.float64)
     return registration.register(pairs, method=method, target_ct=target, fle_mm=fle_mm)
 
@@ -167,7 +171,7 @@ def read_plan(path: Path | str, context: CaseContext) -> Plan:
     Raises:
         InputError: It cannot be read, or it does not hold any more.
     """
-    from puncture_twin.planning.plan.plan import read_plan
+    from puncture_twin.planning.plan.plan_document import read_plan
     from puncture_twin.planning.plan.recheck import check_plan
 
     plan = read_plan(Path(path))
@@ -197,9 +201,90 @@ def read_points(path: Path | str) -> NamedPoints:
     return read_points(Path(path))
 
 
+def write_points(points: Points, path: Path | str) -> None:
+    """Write named points as CSV in mm, whole or not at all; the space is not written, a CSV speaks in its case's.
+
+    Raises:
+        InputError: A point that is not three finite numbers, or a place that cannot be written to.
+    """
+    from puncture_twin.planning.formats.points.point_files import write_points
+
+    write_points(Path(path), _named(points, "write_points"))
+
+
+def read_mesh(path: Path | str, *, unit: str = "mm", space: str = "LPS") -> TriangleMesh:
+    """One surface from STL, OBJ, PLY, GLB or VTP, in mm and LPS (or its own frame), checked against its own promises.
+
+    Args:
+        path: The file; nothing about unit or space is taken from it.
+        unit: ``mm``, ``cm`` or ``m``: of its coordinates.
+        space: ``LPS``, ``RAS`` or ``local``: of its coordinates.
+
+    Raises:
+        InputError: It is cut, contradicts itself, is empty, or has coordinates that are no finite numbers.
+    """
+    from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
+    from puncture_twin.planning.geometry.spaces import Space, Unit
+
+    try:
+        known = Unit(unit), Space(space)
+    except ValueError as error:
+        allowed = "mm, cm or m; LPS, RAS or local"
+        raise InputError(f"unit {unit!r}, space {space!r}", where=str(path), allowed=allowed) from error
+    return read_mesh(Path(path), unit=known[0], space=known[1])
+
+
+def read_volume(path: Path | str) -> Volume:
+    """A CT or label map from NIfTI or NRRD: its voxels, and where they lie in LPS mm.
+
+    Raises:
+        InputError: It is cut, contradicts itself, or holds a voxel that is no finite number.
+    """
+    from puncture_twin.planning.formats.volumes.volume_files import read_volume
+
+    return read_volume(Path(path))
+
+
+def read_recording(path: Path | str) -> Recording:
+    """What two arms and a probe's image said, pose by pose, from ``recording.csv`` or its folder; see `calibrate`.
+
+    Raises:
+        InputError: It cannot be read, or a row is no pair of rigid motions with a point.
+    """
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import read_recording
+
+    return read_recording(Path(path))
+
+
+def calibrate(recording: Recording, *, needle_length_mm: float | None = None) -> Calibration:
+    """Probe, needle and both arms to each other (A X P = Y B Q), from a recording of the needle in the image.
+
+    Args:
+        recording: At least 16 poses, from `read_recording`.
+        needle_length_mm: Flange to tip along the shaft, which holds what the image cannot show; None leaves it open.
+
+    Raises:
+        InputError: Too few poses, poses that cannot show every unknown, or more than half of them disagree.
+    """
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
+
+    return calibrate(recording, needle_length_mm=needle_length_mm)
+
+
+def check_folder(folder: Path | str) -> tuple[str, ...]:
+    """What keeps an output folder from being one whole set, a sentence each; empty if nothing does.
+
+    Raises:
+        InputError: Its ``manifest.json`` cannot be read, or is another program's.
+    """
+    from puncture_twin.planning.base.output.manifest import problems
+
+    return problems(Path(folder))
+
+
 def write_plan(plan: Plan, path: Path | str) -> None:
     """Write a plan as JSON, whole or not at all."""
-    from puncture_twin.planning.plan.plan import write_plan
+    from puncture_twin.planning.plan.plan_document import write_plan
 
     write_plan(plan, Path(path))
 
@@ -219,7 +304,7 @@ def rehearse(context: CaseContext, plan: Plan, *, seed: int | None = None) -> Re
     return rehearse(plan, context.case, context.anatomy, truth)
 
 
-def _named(points: Points) -> NamedPoints:
+def _named(points: Points, where: str) -> NamedPoints:
     """Named points, from whichever form.
 
     Raises:
@@ -233,7 +318,7 @@ def _named(points: Points) -> NamedPoints:
     try:
         values = np.array([np.asarray(point, dtype=np.float64) for point in points.values()])
     except (TypeError, ValueError) as error:
-        raise InputError(f"a point is no three numbers ({error})", where="register", allowed=allowed) from error
+        raise InputError(f"a point is no three numbers ({error})", where=where, allowed=allowed) from error
     if values.ndim != 2 or values.shape[1] != 3:
-        raise InputError(f"points of shape {values.shape}", where="register", allowed=allowed)
-    return NamedPoints(tuple(points), guard_points(values, tuple(points), where="register"), None)
+        raise InputError(f"points of shape {values.shape}", where=where, allowed=allowed)
+    return NamedPoints(tuple(points), guard_points(values, tuple(points), where=where), None)

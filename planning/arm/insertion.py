@@ -67,22 +67,6 @@ def flange_poses(
     return T
 
 
-def insertion_paths(model: UrModel, target_base: Floats, outward_base: Floats, distance_mm: Floats) -> Floats:
-    """Every branch's way along the needle at roll 0. A roll adds to q6 and to nothing else.
-
-    Args:
-        model: The arm.
-        target_base: Shape (3,), mm.
-        outward_base: Shape (3,), unit.
-        distance_mm: Shape (m,): target to flange along the way.
-
-    Returns:
-        Shape (8, m, 6), rad, without jumps of whole turns; NaN from where a branch first does not exist.
-    """
-    line = needle_lines(np.atleast_2d(target_base), np.atleast_2d(outward_base))[0]
-    return every_branch(model, line, np.ascontiguousarray(distance_mm, dtype=np.float64))
-
-
 def away_from_singularities(model: UrModel, q: Floats, at_least: float = MIN_SINGULARITY) -> NDArray[np.bool_]:
     """Whether configurations (..., 6) keep their distance from every singularity; NaN does not. Shape (...)."""
     return np.asarray(singularity(model, q).least() > at_least)
@@ -93,7 +77,7 @@ def first_stop(model: UrModel, path: Floats, depths_mm: Floats) -> InsertionStop
 
     Args:
         model: The arm.
-        path: Shape (m, 6), rad, one branch of :func:`insertion_paths`.
+        path: Shape (m, 6), rad, one branch of :func:`every_branch`.
         depths_mm: Shape (m,), rising, mm.
     """
     at = kernels.first_stop_at(model.lengths, path, depths_mm, MIN_SINGULARITY, MAX_JOINT_STEP_RAD_PER_MM)
@@ -160,7 +144,16 @@ def flange_at(line: NeedleLine, distance_mm: float) -> Floats:
 
 
 def every_branch(model: UrModel, line: NeedleLine, distance_mm: Floats) -> Floats:
-    """Every branch's way along a line, see :func:`insertion_paths`; ``distance_mm`` of shape (m,)."""
+    """Every branch's way along the needle at roll 0. A roll adds to q6 and to nothing else.
+
+    Args:
+        model: The arm.
+        line: The needle's line.
+        distance_mm: Shape (m,): target to flange along the way.
+
+    Returns:
+        Shape (8, m, 6), rad, without jumps of whole turns; NaN from where a branch first does not exist.
+    """
     q = np.empty((N_BRANCHES, len(distance_mm), 6))
     kernels.ways(model.lengths, *line, distance_mm, q)
     return q

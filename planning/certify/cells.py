@@ -174,12 +174,6 @@ def _part(ranges: Floats, which: NDArray[np.int64]) -> Floats:
     return np.stack([low, np.where(which == 0, middle, ranges[:, 1])], axis=1)
 
 
-def angle_between(a: Floats, b: Floats) -> Floats:
-    """Angle between unit vectors (..., 3), exact to rounding also where it is small."""
-    chord = np.linalg.norm(a - b, axis=-1)
-    return np.asarray(2 * np.arcsin(np.minimum(0.5 * chord, 1.0)))
-
-
 def nearest_cell(theta: Floats, beta: Floats, cells: Cells) -> Floats:
     """Angle from each direction to the nearest of the cells, shape (n,), rad.
 

@@ -35,7 +35,6 @@ __all__ = [
     "MAX_SWEEP_MM",
     "ReachAnswer",
     "ReachRequest",
-    "assess_reach",
     "assess_reach_all",
     "every_reach",
 ]
@@ -90,38 +89,22 @@ class _Tried(NamedTuple):
     block: _Blocked | None
 
 
-def assess_reach(
-    checker: StateChecker, request: ReachRequest, *, n_rolls: int = 8, step_mm: float = MAX_SWEEP_MM
-) -> ReachAnswer:
-    """Find a roll and a branch on which the arm holds the standoff pose and drives straight to the target, untouched.
-
-    All (roll, branch) pairs are ordered by margin; the first that is clear is the answer, so it is the best of them.
-
-    Args:
-        checker: Judges contacts, in the base frame.
-        request: The direction.
-        n_rolls: How many rolls, evenly over the turn.
-        step_mm: Spacing of the insertion's samples; finer where a body would move farther than ``MAX_SWEEP_MM``.
-
-    Raises:
-        InputError: If the request's needle is not the checker's, or a number makes no sense.
-    """
-    return _answers(checker, [request], n_rolls, step_mm)[0]
-
-
 def every_reach(
     checker: StateChecker, request: ReachRequest, *, n_rolls: int = 8, step_mm: float = MAX_SWEEP_MM
 ) -> list[ReachAnswer]:
-    """All rolls and branches on which :func:`assess_reach` would say yes, the best margin first; empty if none.
+    """Every roll and branch that holds the standoff pose and drives straight in, untouched; the best margin first.
 
     Args:
         checker: Judges contacts, in the base frame.
         request: The direction.
-        n_rolls: See :func:`assess_reach`.
-        step_mm: The same.
+        n_rolls: See :func:`assess_reach_all`.
+        step_mm: See :func:`assess_reach_all`.
+
+    Returns:
+        Empty where there is none.
 
     Raises:
-        InputError: The same.
+        InputError: See :func:`assess_reach_all`.
     """
     surveyed = next(_surveyed(checker, [request], n_rolls, step_mm))
     tries = ((drive, _try(checker, request, drive, surveyed.depths)) for drive in surveyed.drives())
@@ -136,17 +119,20 @@ def assess_reach_all(
     n_rolls: int = 8,
     step_mm: float = MAX_SWEEP_MM,
 ) -> list[ReachAnswer]:
-    """The answers of :func:`assess_reach` to many requests: kinematics for all of them, then contacts one by one.
+    """Find, for each direction, a roll and a branch that hold the standoff pose and drive straight in, untouched.
+
+    All (roll, branch) pairs are ordered by margin; the first that is clear is the answer, so it is the best of them.
+    Kinematics comes first, for all requests; then contacts, one by one.
 
     Args:
         checker: Judges contacts, in the base frame.
         requests: The directions.
         progress: Called with (answered, to answer).
-        n_rolls: See :func:`assess_reach`.
-        step_mm: The same.
+        n_rolls: How many rolls, evenly over the turn.
+        step_mm: Spacing of the insertion's samples; finer where a body would move farther than ``MAX_SWEEP_MM``.
 
     Raises:
-        InputError: The same.
+        InputError: If a request's needle is not the checker's, or a number makes no sense.
     """
     answers: list[ReachAnswer] = []
     for start in range(0, len(requests), CHUNK):

@@ -12,7 +12,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.arm.insertion import insertion_paths
+from puncture_twin.planning.arm.insertion import every_branch, needle_lines
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, jacobian, nearest_within_limits
 from puncture_twin.planning.arm.links import JOINT_NAMES
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
@@ -55,7 +55,8 @@ def plan_to(waypoints, *, speed_scale=0.5, tip_mm_s=10.0, model=UR3):
     tip = tip_poses(model, BENT, TOOL.needle_length_mm)
     outward, target = -tip[:3, 2], tip[:3, 3] + STANDOFF_MM * tip[:3, 2]
     depths = np.linspace(0.0, STANDOFF_MM, 61)
-    ways = insertion_paths(model, target, outward, TOOL.needle_length_mm + STANDOFF_MM - depths)
+    line = needle_lines(target[None], outward[None])[0]
+    ways = every_branch(model, line, TOOL.needle_length_mm + STANDOFF_MM - depths)
     way = ways[np.nanargmin(np.abs(ways[:, 0, :5] - BENT[:5]).max(axis=1))]
     way = way + (BENT - way[0]) * [0, 0, 0, 0, 0, 1]
     T_base_ct = np.eye(4)

@@ -17,7 +17,8 @@ from scipy.spatial import cKDTree
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.label_surface import label_mesh
-from puncture_twin.planning.formats.labels.labelmaps import LabelMap, read_labelmap
+from puncture_twin.planning.formats.labels.labelmaps import LabelMap, labelmap_of
+from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.geometry.decimation import decimated
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
@@ -175,7 +176,7 @@ def test_labels_are_read_from_integers_and_from_whole_floats(tmp_path: Path) -> 
     values = np.zeros((4, 5, 6), dtype=np.float32)
     values[1, 2, 3] = 12
     for dtype in (np.float32, np.float64, np.uint8, np.int16, np.uint32, np.int64):
-        labelmap = read_labelmap(write(tmp_path, values.astype(dtype)))
+        labelmap = labelmap_of(read_volume(write(tmp_path, values.astype(dtype))))
         assert labelmap.labels_present() == (12,)
         assert labelmap.labels[1, 2, 3] == 12
         assert not labelmap.labels.flags.writeable
@@ -190,7 +191,7 @@ def test_values_that_are_no_labels_are_refused(tmp_path: Path, value: float, mat
     values = np.zeros((4, 5, 6), dtype=np.float32)
     values[1, 2, 3] = value
     with pytest.raises(InputError, match=match):
-        read_labelmap(write(tmp_path, values))
+        labelmap_of(read_volume(write(tmp_path, values)))
 
 
 def segmentation(folder: Path, remarks: str) -> Path:
@@ -212,7 +213,7 @@ def test_names_come_out_of_a_slicer_segmentation(tmp_path: Path) -> None:
         "Segment0_Name:=left kidney\nSegment0_LabelValue:=2\nSegment1_LabelValue:=1\nSegment1_Name:=liver: all\n"
         "Segmentation_MasterRepresentation:=Binary labelmap\n"
     )
-    labelmap = read_labelmap(segmentation(tmp_path, remarks))
+    labelmap = labelmap_of(read_volume(segmentation(tmp_path, remarks)))
     assert labelmap.names == {2: "left kidney", 1: "liver: all"}
     with pytest.raises(InputError, match="1 liver: all, 2 left kidney"):
         label_mesh(labelmap, 3, where="case.toml")
@@ -229,7 +230,7 @@ def test_names_come_out_of_a_slicer_segmentation(tmp_path: Path) -> None:
 def test_segments_that_contradict_each_other_are_refused(tmp_path: Path, remarks: str, match: str) -> None:
     """A segment without a sound label, or two with one label."""
     with pytest.raises(InputError, match=match):
-        read_labelmap(segmentation(tmp_path, remarks))
+        labelmap_of(read_volume(segmentation(tmp_path, remarks)))
 
 
 @needs_real
@@ -240,7 +241,7 @@ def test_every_label_of_the_real_patient_is_closed_and_keeps_its_volume(name: st
     From 50 voxels (1.4 ml) on the surface lies, on average, less than a tenth of a voxel inside the voxels' faces,
     whose corners it cuts off.
     """
-    labelmap = read_labelmap(REAL / f"{name}.nii.gz")
+    labelmap = labelmap_of(read_volume(REAL / f"{name}.nii.gz"))
     named = json.loads((REAL / f"{name}.json").read_text())
     assert labelmap.labels_present() == tuple(sorted(map(int, named)))
     shares = []

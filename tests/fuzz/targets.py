@@ -11,7 +11,7 @@ from puncture_twin.planning.case.case_schema import SCHEMA_ONE_NOTE
 from puncture_twin.planning.certify.certificate import read_certificate
 from puncture_twin.planning.collision_cases.pytest_plugin import read_checks
 from puncture_twin.planning.export.csv_times import read_csv
-from puncture_twin.planning.formats.labels.labelmaps import read_labelmap
+from puncture_twin.planning.formats.labels.labelmaps import labelmap_of
 from puncture_twin.planning.formats.labels.naming import names_for
 from puncture_twin.planning.formats.meshes.mesh_files import mesh_warnings, read_mesh
 from puncture_twin.planning.formats.points.point_files import read_points
@@ -185,7 +185,7 @@ CASES = ("full.toml", "stated.toml", "case.toml", "mount.toml")
 TARGETS = [
     Target("mesh", MESHES, read_own_mesh, whole_mesh),
     Target("volume", {"ct.nii.gz": "gzip", "ct.nrrd": "headed", **LABELS}, read_volume, whole_volume),
-    Target("label map", LABELS, read_labelmap, whole_labelmap),
+    Target("label map", LABELS, lambda path: labelmap_of(read_volume(path)), whole_labelmap),
     Target(
         "points",
         {"markers_ct.csv": "table", "kinds.csv": "table", "a.mrk.json": "tree", "a.fcsv": "table"},

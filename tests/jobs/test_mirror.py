@@ -19,7 +19,7 @@ from puncture_twin.planning.base.files import sha256
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import case_tool
-from puncture_twin.planning.reach.reach import ReachRequest, assess_reach
+from puncture_twin.planning.reach.reach import ReachRequest, assess_reach_all
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.jobs.robot import mirror
 
@@ -65,7 +65,7 @@ def drive():
     checker = CellChecker(model, case_tool(case))
     for tilt in np.linspace(-0.6, 0.6, 13):
         u = T[:3, :3] @ [-np.sin(abs(tilt)), -np.cos(tilt), 0.0]
-        answer = assess_reach(checker, ReachRequest(target, u / np.linalg.norm(u), 210.0, 120.0))
+        answer = assess_reach_all(checker, [ReachRequest(target, u / np.linalg.norm(u), 210.0, 120.0)])[0]
         if answer.reachable:
             return answer
     raise AssertionError("the arm must hold some of these")

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from benchmarks.chen2019_reach import SHARES, WINDOWS, PublishedShare, cap, runs
-from puncture_twin.planning.arm.insertion import MIN_SINGULARITY, flange_poses, insertion_paths, reach_margin
+from puncture_twin.planning.arm.insertion import MIN_SINGULARITY, every_branch, flange_poses, needle_lines, reach_margin
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, singularity
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.ur import ur_model
@@ -15,7 +15,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.reach.reach import MAX_SWEEP_MM, ReachRequest, assess_reach
+from puncture_twin.planning.reach.reach import MAX_SWEEP_MM, ReachRequest, assess_reach_all
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=200.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
@@ -68,7 +68,7 @@ def reached(checker: CellChecker, count: int, seed: int) -> list:
     """Some reachable answers with their requests."""
     found = []
     for u in directions(60, seed):
-        answer = assess_reach(checker, request(u))
+        answer = assess_reach_all(checker, [request(u)])[0]
         if answer.reachable:
             found.append((request(u), answer))
         if len(found) == count:
@@ -123,7 +123,7 @@ def test_the_worked_example_of_the_paper_is_out_of_reach() -> None:
     assert T[:3, 3] == pytest.approx([623.69, -313.01, 76.70], abs=0.006)
     assert np.linalg.norm(T[:3, 3] - UR3.shoulder_base) == pytest.approx(701.9, abs=0.05)
     checker = CellChecker(UR3, Tool(401.0, 150.0, 1.2, 30.0))
-    answer = assess_reach(checker, ReachRequest(target, u, 401.0, 150.0))
+    answer = assess_reach_all(checker, [ReachRequest(target, u, 401.0, 150.0)])[0]
     assert not answer.reachable and answer.reason is Reason.UNREACHABLE and answer.depth_mm is None
     assert "701.9 mm from the shoulder" in answer.detail and "out of the arm's reach" in answer.detail
     assert not np.isnan(inverse(ur_model("ur5"), T)).any()
@@ -159,11 +159,11 @@ def test_in_an_empty_room_the_best_margin_wins() -> None:
     checker = CellChecker(UR3, Tool(200.0, 199.0, 0.1, 0.1))
     tried = 0
     for u in directions(12, seed=2):
-        answer = assess_reach(checker, request(u))
+        answer = assess_reach_all(checker, [request(u)])[0]
         if not answer.reachable:
             continue
         tried += 1
-        paths = insertion_paths(UR3, TARGET, u, 320.0 - np.linspace(0.0, STANDOFF_MM, 61))
+        paths = every_branch(UR3, needle_lines(TARGET[None], u[None])[0], 320.0 - np.linspace(0.0, STANDOFF_MM, 61))
         for path in paths[(singularity(UR3, paths).least() > MIN_SINGULARITY).all(axis=1)]:
             if reach_margin(UR3, path) > answer.margin + 0.01:
                 assert any(checker.contact(row, needle_may_touch_patient=True) for row in path)
@@ -179,7 +179,7 @@ def test_a_drive_that_leaves_the_arms_reach_is_blocked_at_its_depth() -> None:
     stuck = u[begins & ~ik_exists(UR3, near_base, u, **lengths)]
     assert len(stuck) >= 10
     for direction in stuck:
-        answer = assess_reach(checker, ReachRequest(near_base, direction, **lengths))
+        answer = assess_reach_all(checker, [ReachRequest(near_base, direction, **lengths)])[0]
         assert answer.reason is Reason.INSERTION_BLOCKED and 0.0 <= answer.depth_mm <= STANDOFF_MM
         assert any(word in answer.detail for word in ("does not reach", "singularity", "jump"))
         assert ik_exists(UR3, near_base, direction, depths_mm=(0.0, max(0.0, answer.depth_mm - 2.0)), **lengths).all()
@@ -192,7 +192,7 @@ def test_what_kinematics_rejects_is_never_reached() -> None:
     might = ik_exists(UR3, TARGET, u, needle_length_mm=TOOL.needle_length_mm, standoff_mm=STANDOFF_MM)
     assert 20 < might.sum() < 100
     for direction in u[~might]:
-        answer = assess_reach(checker, request(direction))
+        answer = assess_reach_all(checker, [request(direction)])[0]
         assert answer.reason in (Reason.UNREACHABLE, Reason.INSERTION_BLOCKED)
         assert "touches" not in answer.detail
 
@@ -207,11 +207,11 @@ def test_the_holder_stops_at_the_skin_where_geometry_says() -> None:
     empty = CellChecker(UR3, TOOL)
     height, standoff = 170.0, 180.0  # the tip starts 10 mm outside the skin
     for u in directions(60, 5):
-        if assess_reach(empty, request(u, standoff)).reachable:
+        if assess_reach_all(empty, [request(u, standoff)])[0].reachable:
             break
     plate = trimesh.creation.box(extents=(60.0, 60.0, 4.0), transform=slab(u, height - 4.0, 4.0))
     skin = TriangleMesh(np.asarray(plate.vertices), np.asarray(plate.faces))
-    answer = assess_reach(CellChecker(UR3, TOOL, patient=skin), request(u, standoff))
+    answer = assess_reach_all(CellChecker(UR3, TOOL, patient=skin), [request(u, standoff)])[0]
     assert answer.reason is Reason.INSERTION_BLOCKED and answer.detail.startswith("holder touches patient")
     exact = standoff + TOOL.shaft_mm - height
     assert exact - 1e-6 <= answer.depth_mm <= exact + MAX_SWEEP_MM
@@ -222,7 +222,7 @@ def test_a_plate_across_the_needles_way_blocks_at_its_depth() -> None:
     empty = CellChecker(UR3, TOOL)
     asked, _ = reached(empty, 1, seed=6)[0]
     plate = Box("plate", slab(asked.outward_base, 40.0, 5.0), (20.0, 20.0, 5.0))
-    answer = assess_reach(CellChecker(UR3, TOOL, [plate]), asked)
+    answer = assess_reach_all(CellChecker(UR3, TOOL, [plate]), [asked])[0]
     assert answer.reason is Reason.INSERTION_BLOCKED and answer.detail.startswith("needle touches plate")
     exact = STANDOFF_MM - 45.0
     assert exact - 1e-6 <= answer.depth_mm <= exact + MAX_SWEEP_MM
@@ -231,8 +231,8 @@ def test_a_plate_across_the_needles_way_blocks_at_its_depth() -> None:
 def test_an_obstacle_at_the_flange_is_a_collision_at_standoff() -> None:
     """A box about the standoff flange stops every branch and roll; link and box are named."""
     asked, _ = reached(CellChecker(UR3, TOOL), 1, seed=7)[0]
-    light = Box("lamp", flange_poses(TARGET, asked.outward_base, 320.0)[0], (40.0, 40.0, 40.0))
-    answer = assess_reach(CellChecker(UR3, TOOL, [light]), asked)
+    lamp = Box("lamp", flange_poses(TARGET, asked.outward_base, 320.0)[0], (40.0, 40.0, 40.0))
+    answer = assess_reach_all(CellChecker(UR3, TOOL, [lamp]), [asked])[0]
     assert answer.reason is Reason.ARM_COLLISION and answer.depth_mm is None and not answer.reachable
     assert "touches lamp at standoff" in answer.detail
     assert answer.insertion_q.shape == (0, 6) and answer.branch == -1 and answer.margin == 0.0
@@ -247,9 +247,9 @@ def test_another_roll_is_taken_where_one_meets_something() -> None:
     T_flange_knob[:3, 3] = rim[np.argmin(rim[:, 1])]
     at_target = flange_poses(TARGET, asked.outward_base, TOOL.needle_length_mm)[0]
     knob = Box("knob", at_target @ T_flange_knob, (1.0, 1.0, 1.0))
-    only_roll = assess_reach(CellChecker(UR3, TOOL, [knob]), asked, n_rolls=1)
+    only_roll = assess_reach_all(CellChecker(UR3, TOOL, [knob]), [asked], n_rolls=1)[0]
     assert only_roll.reason is Reason.INSERTION_BLOCKED and only_roll.detail.startswith("wrist_3 touches knob")
-    answer = assess_reach(CellChecker(UR3, TOOL, [knob]), asked)
+    answer = assess_reach_all(CellChecker(UR3, TOOL, [knob]), [asked])[0]
     assert answer.reachable and answer.roll != 0.0
     distance = TOOL.needle_length_mm + STANDOFF_MM - answer.insertion_depth_mm
     expected = flange_poses(TARGET, asked.outward_base, distance, answer.roll)
@@ -261,7 +261,7 @@ def test_a_standoff_that_starts_inside_the_skin_is_a_collision() -> None:
     asked, _ = reached(CellChecker(UR3, TOOL), 1, seed=8)[0]
     ball = trimesh.creation.icosphere(subdivisions=3, radius=STANDOFF_MM + 5.0)
     skin = TriangleMesh(np.asarray(ball.vertices) + TARGET, np.asarray(ball.faces))
-    answer = assess_reach(CellChecker(UR3, TOOL, patient=skin), asked)
+    answer = assess_reach_all(CellChecker(UR3, TOOL, patient=skin), [asked])[0]
     assert answer.reason is Reason.ARM_COLLISION and "patient at standoff" in answer.detail
 
 
@@ -281,7 +281,7 @@ def test_requests_that_make_no_sense_are_refused() -> None:
     """Wrong needle, a direction that is no unit vector, NaN, nothing to drive."""
     checker, u = CellChecker(UR3, TOOL), np.array([0.0, 0.0, 1.0])
     with pytest.raises(InputError, match=r"the tool's 200\.0"):
-        assess_reach(checker, ReachRequest(TARGET, u, 210.0, 100.0))
+        assess_reach_all(checker, [ReachRequest(TARGET, u, 210.0, 100.0)])[0]
     with pytest.raises(InputError, match="a unit vector"):
         request(1.1 * u)
     with pytest.raises(InputError, match="target_base"):
@@ -289,4 +289,4 @@ def test_requests_that_make_no_sense_are_refused() -> None:
     with pytest.raises(InputError, match="standoff_mm"):
         request(u, 0.0)
     with pytest.raises(InputError, match="n_rolls"):
-        assess_reach(checker, request(u), n_rolls=0)
+        assess_reach_all(checker, [request(u)], n_rolls=0)[0]

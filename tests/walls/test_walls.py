@@ -27,27 +27,7 @@ WITHOUT_WORK = {
     "puncture_twin.twin.plant.scanner",
     "puncture_twin.twin.plant.tip_touch",
 }
-"""Devices, and phantoms to scan, that no command uses yet."""
-
-TESTS_ALONE = {
-    "planning.arm.insertion.insertion_paths",
-    "planning.base.output.manifest.problems",
-    "planning.certify.cells.angle_between",
-    "planning.formats.labels.labelmaps.read_labelmap",
-    "planning.formats.meshes.mesh_files.read_mesh",
-    "planning.formats.points.point_files.write_points",
-    "planning.reach.reach.assess_reach",
-    "twin.guidance.stereo.cameras.dlt.dlt",
-    "twin.guidance.stereo.detection.pixel_detector",
-    "twin.guidance.stereo.experiment.varied",
-    "twin.guidance.ultrasound.axp_ybq.recording.read_recording",
-    "twin.guidance.ultrasound.image.needle_detector.search_score",
-    "twin.phantoms.abdomen.lesion_centre_ct",
-    "twin.phantoms.carton.carton_field",
-    "twin.report.map_view.rows_at",
-    "twin.world.bodies.load_capsule",
-}
-"""Functions that only tests and benchmarks use. It only shrinks."""
+"""Devices, and patients in a scanner, that no command uses yet."""
 
 
 def within(module, package):
@@ -194,9 +174,8 @@ def test_every_public_function_is_used():
     """By a command, the public API or an example; never by tests alone."""
     used = set(used_names())
     unused = {f"{module}.{name}" for module, name in public_names() if name not in used}
-    kept = WITHOUT_WORK | {f"{NAME}.planning.{name}" for name in REGISTERED} | {f"{NAME}.run_twin"}
-    found = {name.removeprefix(f"{NAME}.") for name in unused if name.rpartition(".")[0] not in kept}
-    assert found == TESTS_ALONE
+    kept = WITHOUT_WORK | {f"{NAME}.planning.{name}" for name in REGISTERED} | {f"{NAME}.run_twin", f"{NAME}.api"}
+    assert {name for name in unused if name.rpartition(".")[0] not in kept} == set()
 
 
 @pytest.mark.parametrize("heavy", ["pybullet", "matplotlib", "numba", "trimesh", "SimpleITK", "ompl"])

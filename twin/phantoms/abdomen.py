@@ -10,14 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.phantoms import bones, torso, vessels, viscera
 from puncture_twin.twin.phantoms.implicit import Field
 from puncture_twin.twin.phantoms.mesher import SamplingBox, mesh_field
 from puncture_twin.twin.phantoms.viscera import LESION_CENTRE_LPS_MM
 
-__all__ = ["LESION_CENTRE_LPS_MM", "STRUCTURES", "Part", "abdomen_field", "abdomen_mesh", "lesion_centre_ct"]
+__all__ = ["LESION_CENTRE_LPS_MM", "STRUCTURES", "Part", "abdomen_field", "abdomen_mesh"]
 
 _SEARCH_STEP_MM = 10.0
 """Step of the search for a body's extent."""
@@ -95,11 +94,6 @@ def abdomen_mesh(name: str) -> TriangleMesh:
     """The mesh of one structure, LPS mm, closed, triangles outward."""
     field = abdomen_field(name)
     return mesh_field(field, _box(field, STRUCTURES[name].spacing_mm))
-
-
-def lesion_centre_ct() -> Floats:
-    """Middle of the lesion, shape (3,), LPS mm."""
-    return np.array(LESION_CENTRE_LPS_MM)
 
 
 def _box(field: Field, spacing_mm: float) -> SamplingBox:

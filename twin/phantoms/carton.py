@@ -16,9 +16,8 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_2
-from puncture_twin.twin.phantoms.implicit import Field
 
-__all__ = ["LESIONS_CT_MM", "MARKERS_CT_MM", "TOUCHED_BASE_MM", "carton_field", "carton_meshes"]
+__all__ = ["LESIONS_CT_MM", "MARKERS_CT_MM", "TOUCHED_BASE_MM", "carton_meshes"]
 
 LESIONS_CT_MM = MappingProxyType({name: TABLE_1[name] for name in "LMH"})
 """Table 1: the lesions, the middles of the bolts' upper ends."""
@@ -38,36 +37,6 @@ def carton_meshes() -> dict[str, TriangleMesh]:
     """The box as ``skin`` and the bolts, by name; closed, triangles outward, carton frame, mm."""
     bolts = {f"bolt_{name.lower()}": _bolt(np.array(end)) for name, end in LESIONS_CT_MM.items()}
     return {"skin": _box(), **bolts}
-
-
-def carton_field(name: str) -> Field:
-    """Exact signed field of the true (round) structure; takes points_ct (n, 3), mm; negative inside.
-
-    Raises:
-        KeyError: If there is no such structure; the message lists those there are.
-    """
-    bolts = {f"bolt_{letter.lower()}": end for letter, end in LESIONS_CT_MM.items()}
-    if name == "skin":
-        return _box_field
-    if name not in bolts:
-        raise KeyError(f"no structure {name!r} in the carton; there are: skin, {', '.join(bolts)}")
-    x, y, top = bolts[name]
-
-    def field(points: Floats) -> Floats:
-        beside = np.hypot(points[:, 0] - x, points[:, 1] - y) - _BOLT_RADIUS_MM
-        return _corner_distance(np.stack([beside, np.maximum(-points[:, 2], points[:, 2] - top)], axis=1))
-
-    return field
-
-
-def _box_field(points: Floats) -> Floats:
-    low, high = np.array(BOX_LOW_MM), np.array(BOX_HIGH_MM)
-    return _corner_distance(np.maximum(low - points, points - high))
-
-
-def _corner_distance(beyond: Floats) -> Floats:
-    """Signed distance from how far a point is beyond each pair of faces, shape (n, k)."""
-    return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0))
 
 
 def _box() -> TriangleMesh:

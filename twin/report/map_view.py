@@ -127,14 +127,6 @@ def step_of(candidates: Candidates) -> float:
     return float(np.radians(1.0))
 
 
-def rows_at(candidates: Candidates, theta: Floats, beta: Floats) -> NDArray[np.int64]:
-    """The row of the grid cell that holds each direction, -1 outside the grid; same shape as ``theta``.
-
-    A cell reaches half a step to each side in θ and in β. At θ = 0 the cell is the whole circle.
-    """
-    return MapCells.of(candidates).rows(theta, beta)
-
-
 @dataclass(frozen=True, eq=False)
 class MapCells:
     """The grid's cells, ring after ring of equal θ, and in each ring by β in 0..2π.

@@ -86,22 +86,6 @@ def load_ball(client: int, center_mm: Floats, radius_mm: float, rgba: Rgba) -> i
     return int(pybullet.createMultiBody(0.0, -1, visual, to_m(center_mm).tolist(), physicsClientId=client))
 
 
-def load_capsule(client: int, length_mm: float, radius_mm: float, T_world_capsule: Floats) -> int:
-    """All points within a radius of a segment: a needle with its margin, for contacts only. Returns the body id.
-
-    Args:
-        client: Physics client id.
-        length_mm: Of the segment, along z, its middle at the pose's origin.
-        radius_mm: Above 0.
-        T_world_capsule: Shape (4, 4), mm.
-    """
-    position, quaternion = pose_to_m(T_world_capsule)
-    shape = pybullet.createCollisionShape(
-        pybullet.GEOM_CAPSULE, radius=float(to_m(radius_mm)), height=float(to_m(length_mm)), physicsClientId=client
-    )
-    return int(pybullet.createMultiBody(0.0, shape, -1, position, quaternion, physicsClientId=client))
-
-
 def remove(client: int, body: int) -> None:
     """Take a body out of the world."""
     pybullet.removeBody(body, physicsClientId=client)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.volumes.volume_files import Volume, read_volume
+from puncture_twin.planning.formats.volumes.volume_files import Volume
 
 MAX_LABEL = 65_535
 """Label maps are 8 or 16 bit; a larger value means that an image was given instead."""
@@ -53,21 +53,12 @@ class LabelMap:
         return tuple(self.boxes)
 
 
-def read_labelmap(path: Path) -> LabelMap:
-    """A label map from any file that ``read_volume`` takes, in LPS mm.
-
-    Raises:
-        InputError: Whatever ``read_volume`` refuses; values that are negative, not whole or above
-            ``MAX_LABEL``; a map with background only; segment names that contradict each other.
-    """
-    return labelmap_of(read_volume(path))
-
-
 def labelmap_of(volume: Volume) -> LabelMap:
-    """The label map that a volume is.
+    """The label map that a volume is, in LPS mm.
 
     Raises:
-        InputError: As `read_labelmap`, but for reading.
+        InputError: Values that are negative, not whole or above ``MAX_LABEL``; a map with background only; segment
+            names that contradict each other.
     """
     names = segment_names(volume.fields, volume.path)
     return LabelMap(_whole(volume.values, volume.path), volume.T_ct_index, names, volume.path)

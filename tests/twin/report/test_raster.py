@@ -8,7 +8,7 @@ from embreex.rtcore_scene import EmbreeScene
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.report.map.map_raster import map_raster, row_colours
-from puncture_twin.twin.report.map_view import MapCells, map_view, rows_at
+from puncture_twin.twin.report.map_view import MapCells, map_view
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.line_of_sight import blocked
 from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, picture, put_moving, translucents_of
@@ -156,7 +156,9 @@ def test_the_cells_of_a_picture_are_those_of_its_directions(grid):
     rows = MapCells.of(found).picture(view, 101)
     axis = (np.arange(101) + 0.5) / 101 * 2 - 1
     theta, beta = view.angles_at(np.stack(np.meshgrid(axis, -axis), axis=-1))
-    assert (rows == rows_at(found, theta, beta)).mean() > 0.999  # a direction on a border may fall to either side
+    assert (
+        rows == MapCells.of(found).rows(theta, beta)
+    ).mean() > 0.999  # a direction on a border may fall to either side
     turn = np.abs(np.mod(found.beta - beta.ravel()[:, None] + np.pi, 2 * np.pi) - np.pi)
     near = np.abs(found.theta - theta.ravel()[:, None]) <= np.radians(2.5) * (1 + 1e-9)
     near &= (turn <= np.radians(2.5) * (1 + 1e-9)) | (found.theta < 1e-9)

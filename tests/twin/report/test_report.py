@@ -20,7 +20,7 @@ from puncture_twin.planning.place.directions import ring_weights
 from puncture_twin.twin.report import annotate
 from puncture_twin.twin.report.map.map_picture import FIGURE_INCHES, MAP_BOX, RIM, draw_map
 from puncture_twin.twin.report.map.map_raster import map_raster
-from puncture_twin.twin.report.map_view import map_view, rows_at, step_of
+from puncture_twin.twin.report.map_view import MapCells, map_view, step_of
 from puncture_twin.twin.report.numbers import reason_counts
 from puncture_twin.twin.report.page.page import write_page
 from puncture_twin.twin.report.page.page_map import map_data
@@ -138,7 +138,9 @@ def test_every_direction_finds_its_own_cell(case, theta, beta, step):
     off_pole = np.flatnonzero(found.theta > 1e-6)
     half = np.radians(step) / 2
     for dt, db in ((0, 0), (0.9, 0.9), (-0.9, 0.9), (0.9, -0.9), (-0.9, -0.9)):
-        at = rows_at(found, found.theta[off_pole] + dt * half, np.mod(found.beta[off_pole] + db * half, 2 * np.pi))
+        at = MapCells.of(found).rows(
+            found.theta[off_pole] + dt * half, np.mod(found.beta[off_pole] + db * half, 2 * np.pi)
+        )
         assert np.array_equal(at, off_pole)
 
 
@@ -146,7 +148,7 @@ def test_outside_of_the_grid_there_is_no_cell(case):
     """A wedge of directions leaves the rest of the map empty instead of guessing."""
     found = world.make_candidates(case, theta_deg=(30, 60), beta_deg=(90, 180), step_deg=5.0)
     theta, beta = np.radians([[27, 45, 45, 63, 45], [135, 87, 183, 135, 300]])
-    assert rows_at(found, theta, beta).tolist() == [-1] * 5
+    assert MapCells.of(found).rows(theta, beta).tolist() == [-1] * 5
 
 
 @pytest.mark.parametrize("theta_max", [60, 90, 150, 180])

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from servo_world import NoContacts
 
+from benchmarks.servo_variants import pixel_detector, varied
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.twin.guidance.stereo.detection import pixel_detector
-from puncture_twin.twin.guidance.stereo.experiment import run_trial, statistics, trial, varied
+from puncture_twin.twin.guidance.stereo.experiment import run_trial, statistics, trial
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.stereo.session import run_session
 from puncture_twin.twin.jobs.servo.liu2007 import TABLE_1, TABLE_2, paper_case, paper_columns, paper_servo_only_at_least

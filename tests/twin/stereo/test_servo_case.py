@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from benchmarks.servo_variants import varied
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.winding import winding_number
-from puncture_twin.twin.guidance.stereo.experiment import varied
 from puncture_twin.twin.guidance.stereo.poses import configurations, path_upward
 from puncture_twin.twin.guidance.stereo.robot_calibration import grid_points, held_rod
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case

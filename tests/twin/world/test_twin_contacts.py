@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+import pybullet
 import pytest
 from places import TESTS
 
@@ -19,9 +20,10 @@ from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.collision_cases.pytest_plugin import read_checks
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.context import CaseContext, prepare
-from puncture_twin.twin.world.bodies import load_capsule, load_surface, remove
+from puncture_twin.twin.world.bodies import load_surface, remove
 from puncture_twin.twin.world.client import physics_client
 from puncture_twin.twin.world.contacts import gap_mm
+from puncture_twin.twin.world.units import pose_to_m, to_m
 
 CARDS = TESTS / "collision"
 
@@ -106,7 +108,7 @@ def compare(card: Card, shift_mm: dict[str, np.ndarray] | None = None) -> Compar
         for radius in radii(card):
             for row, direction in enumerate(card.directions):
                 T = pose(case.target_ct, direction, case.needle.length_mm)
-                needle = load_capsule(client, case.needle.length_mm, radius, T)
+                needle = _capsule(client, case.needle.length_mm, radius, T)
                 for column, body in enumerate(bodies):
                     touches = judge.collides(column, case.target_ct, direction, case.needle.length_mm, radius)
                     found.pairs += 1
@@ -117,6 +119,13 @@ def compare(card: Card, shift_mm: dict[str, np.ndarray] | None = None) -> Compar
                         found.differ.append(f"{structures[column].name}, needle {row}, radius {radius:g} mm")
                 remove(client, needle)
     return found
+
+
+def _capsule(client, length_mm, radius_mm, T_world_capsule):
+    """All points within a radius of a segment along z, its middle at the pose's origin; the body's id."""
+    sizes = {"radius": float(to_m(radius_mm)), "height": float(to_m(length_mm))}
+    shape = pybullet.createCollisionShape(pybullet.GEOM_CAPSULE, **sizes, physicsClientId=client)
+    return int(pybullet.createMultiBody(0.0, shape, -1, *pose_to_m(T_world_capsule), physicsClientId=client))
 
 
 def _surface(client: int, structure: Structure, shift: np.ndarray) -> int:

@@ -1,7 +1,7 @@
 """What the guidance gets to see: a ball's centre in each camera, from pictures of the true room.
 
-``picture_detector`` draws a picture with the true camera and measures it with the believed one. ``pixel_detector``
-leaves the picture out and adds normal errors to the true pixel: for studies of everything behind the picture.
+``picture_detector`` draws a picture with the true camera and measures it with the believed one. Another `Detector` may leave
+the picture out: for studies of everything behind it.
 """
 
 from __future__ import annotations
@@ -93,17 +93,6 @@ def picture_detector(room: StereoWorkcell, rng: np.random.Generator) -> Detector
             hough_only=plan.centre == "hough",
         )
         return Lost(found.reason) if isinstance(found, LostBall) else Spot(found.pixel, found.covariance)
-
-    return see
-
-
-def pixel_detector(room: StereoWorkcell, sigma_px: float, rng: np.random.Generator) -> Detector:
-    """True pixels with normal errors of a standard deviation per axis."""
-
-    def see(number: int, ball: LocatedPair, search: Search) -> Spot | Lost:
-        del search
-        pixel = room.cameras[number].project(ball.center_c) + rng.normal(0.0, sigma_px, 2)
-        return Spot(pixel, max(sigma_px, 1e-6) ** 2 * np.eye(2))
 
     return see
 

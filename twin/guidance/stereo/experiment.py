@@ -5,9 +5,8 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -169,16 +168,3 @@ def statistics(trials: Sequence[ServoTrial]) -> Statistics:
         float(np.median([row.steps for row in rows])),
         float(np.mean([row.stop != ServoStop.CONVERGED for row in rows])),
     )
-
-
-def varied(case: ServoCase, **sections: dict[str, Any]) -> ServoCase:
-    """The case with some keys of its sections changed, checked as when read.
-
-    Args:
-        case: The case.
-        sections: Such as ``cameras={"noise_grey": 6.0}``.
-    """
-    content = case.file.model_dump(by_alias=True)
-    for section, keys in sections.items():
-        content[section] |= keys
-    return replace(case, file=type(case.file).model_validate(content))

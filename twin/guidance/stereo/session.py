@@ -114,7 +114,7 @@ def run_session(
         case: The case.
         seed: Of all that is drawn.
         targets: Only these; all when None.
-        detector_of: Who looks; ``pixel_detector`` leaves the pictures out.
+        detector_of: Who looks; studies of what is behind the pictures leave them out.
         empty: Judge of the room without the head, where one is at hand.
 
     Raises:

@@ -35,11 +35,6 @@ class LinearFit(NamedTuple):
     """Largest over second smallest singular value: infinite where the points leave M free."""
 
 
-def dlt(points: Floats, pixels: Floats) -> Floats:
-    """The matrix M of points (n, 3) and their pixels (n, 2), shape (3, 4); see ``fit_matrix``."""
-    return fit_matrix(points, pixels).M
-
-
 def fit_matrix(points: Floats, pixels: Floats) -> LinearFit:
     """Fit M by the normalised direct linear transform.
 

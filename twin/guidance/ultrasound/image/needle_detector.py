@@ -158,11 +158,6 @@ def detect(picture: Pixels, imager: Imager, settings: DetectorSettings | None = 
     return Detection(found, line.direction, segment.score, length, contrast)
 
 
-def search_score(picture: Pixels, imager: Imager) -> float:
-    """What the gate is held against: the largest sum along any segment, amplitude over background times mm."""
-    return _segment(over_background(picture, imager), imager, DetectorSettings()).score
-
-
 def over_background(picture: Pixels, imager: Imager) -> Floats:
     """Amplitude over the mean amplitude of the background around, shape (rows, columns)."""
     size = int(BACKGROUND_MM / imager.pixel_mm) // COARSE | 1
