@@ -15,6 +15,7 @@ from typing import Any
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.strict_json import text
 
 CASE_ROLE = "case"
 """The file that names the others; what it is called decides nothing."""
@@ -51,13 +52,7 @@ def read_inputs(document: Any) -> tuple[Input, ...]:
     """
     if not isinstance(document, list):
         raise TypeError("inputs is no list")
-    return tuple(Input(*(_text(one[key]) for key in ("role", "path", "sha256"))) for one in document)
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"{value!r} is no text")
-    return value
+    return tuple(Input(*(text(one[key]) for key in ("role", "path", "sha256"))) for one in document)
 
 
 def differing_input(stated: Sequence[Input], known: Sequence[Input]) -> str | None:

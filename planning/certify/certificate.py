@@ -17,6 +17,18 @@ from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.provenance import inputs_document, read_inputs
 from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.base.strict_json import (
+    array,
+    field,
+    fitting,
+    number,
+    number_or_nan,
+    parse_document,
+    point,
+    text,
+    texts,
+    whole,
+)
 from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, nearest_cell, split
 from puncture_twin.planning.certify.html import certificate_html
@@ -29,10 +41,7 @@ included; a length each structure is checked to. 4: a safe cell keeps the image 
 MAX_CERTIFICATE_BYTES = 500_000_000
 """A certificate has some ten thousand cells; a larger file is something else."""
 
-MAX_NUMBER = 1e6
-"""Of millimetres and radians: products of larger ones overflow."""
-
-CERTIFICATE_ALLOWED = "a file that search --certify wrote"
+CERTIFICATE_ALLOWED = f"a certificate of version {CERTIFICATE_VERSION}, as search --certify writes it"
 
 CONE_ROUNDING_RAD = 1e-7
 """Taken from a safe cone: arccos near 1 rounds to 1e-8."""
@@ -238,12 +247,9 @@ def parse_certificate(data: bytes, path: Path) -> Certificate:
     Raises:
         InputError: Not a certificate, another version, missing or contradicting parts.
     """
-    document = _document(data, path)
-    try:
+    document = parse_document(data, CERTIFICATE_VERSION, where=path, allowed=CERTIFICATE_ALLOWED)
+    with fitting(path, CERTIFICATE_ALLOWED):
         certificate = _certificate(document, path)
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        what = f"not a certificate: {type(error).__name__} {error}"
-        raise InputError(what, where=path, allowed=CERTIFICATE_ALLOWED) from error
     stated, counted = document.get("summary"), json.loads(json.dumps(certificate.summary()))
     if stated != counted:
         wrong = [key for key in counted if not isinstance(stated, dict) or stated.get(key) != counted[key]]
@@ -252,39 +258,9 @@ def parse_certificate(data: bytes, path: Path) -> Certificate:
     return certificate
 
 
-def _document(data: bytes, path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(data.decode("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"no JSON ({error})", where=path, allowed=CERTIFICATE_ALLOWED) from error
-    if not isinstance(document, dict) or document.get("version") != CERTIFICATE_VERSION:
-        version = document.get("version") if isinstance(document, dict) else None
-        raise InputError(f"certificate version {version}", where=path, allowed=f"version {CERTIFICATE_VERSION}")
-    return document
-
-
 def _certificate(document: dict[str, Any], path: Path) -> Certificate:
-    question = Question(
-        case_name=str(document["case"]),
-        inputs=read_inputs(document["inputs"]),
-        target_ct=_numbers(document["target_ct_mm"], (3,)),
-        R_ct_entry=_numbers(document["R_ct_entry"], (3, 3)),
-        theta=_range(document["theta_rad"]),
-        beta=_range(document["beta_rad"]),
-        length=_number(document["length_mm"]),
-        standoff=None if document["standoff_mm"] is None else _number(document["standoff_mm"]),
-        skin_gap=_number(document["skin_gap_mm"]),
-        farthest=_number(document["farthest_flange_mm"]),
-        radius=_number(document["radius_mm"]),
-        longest=_number(document["longest_path_mm"]),
-        max_skin_angle=_number(document["max_skin_angle_rad"]),
-        structures=tuple(map(str, document["margins_mm"])),
-        margins=_numbers(list(document["margins_mm"].values()), (len(document["margins_mm"]),)),
-        lengths=_numbers(
-            [document["lengths_mm"][name] for name in document["margins_mm"]], (len(document["margins_mm"]),)
-        ),
-    )
-    tree = tuple(str(level) for level in document["tree"])
+    question = _question(document)
+    tree = field(document, "tree", texts)
     leaves = leaves_of(question.cap(), tree, path)
     rows = document["witness"]
     if len(rows) != len(leaves):
@@ -292,36 +268,41 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
     reasons, structures, triangles, bounds = zip(*rows, strict=True)
     return Certificate(
         question=question,
-        size=_number(document["size_rad"]),
+        size=field(document, "size_rad", number),
         tree=tree,
         leaves=leaves,
         verdict=np.array([letter for level in tree for letter in level if letter in "SRU"], dtype="U1"),
         reason=np.array([Reason(reason).value for reason in reasons], dtype=np.str_),
-        structure=np.array([str(name) for name in structures], dtype=np.str_),
-        triangle=np.array([int(triangle) for triangle in triangles], dtype=np.int64),
-        bound=_numbers_or_nan(bounds),
-        queries=int(document["queries"]),
+        structure=np.array([text(name) for name in structures], dtype=np.str_),
+        triangle=np.array([whole(triangle) for triangle in triangles], dtype=np.int64),
+        bound=np.array([number_or_nan(bound) for bound in bounds]),
+        queries=field(document, "queries", whole),
     )
 
 
-def _number(value: Any) -> float:
-    number = float(value)
-    if not abs(number) <= MAX_NUMBER:
-        raise ValueError(f"{value} is not a finite number within {MAX_NUMBER:g}")
-    return number
-
-
-def _numbers_or_nan(values: tuple[Any, ...]) -> Floats:
-    return np.array([np.nan if value is None else _number(value) for value in values])
-
-
-def _numbers(values: Any, shape: tuple[int, ...]) -> Floats:
-    array = np.array(values, dtype=np.float64)
-    if array.shape != shape or not np.all(np.abs(array) <= MAX_NUMBER):
-        raise ValueError(f"{shape} finite numbers within {MAX_NUMBER:g} expected")
-    return array
+def _question(document: dict[str, Any]) -> Question:
+    names, standoff = tuple(document["margins_mm"]), document["standoff_mm"]
+    margins, lengths = ([document[key][name] for name in names] for key in ("margins_mm", "lengths_mm"))
+    return Question(
+        case_name=field(document, "case", text),
+        inputs=field(document, "inputs", read_inputs),
+        target_ct=field(document, "target_ct_mm", point),
+        R_ct_entry=array(document["R_ct_entry"], (3, 3)),
+        theta=field(document, "theta_rad", _range),
+        beta=field(document, "beta_rad", _range),
+        length=field(document, "length_mm", number),
+        standoff=None if standoff is None else number(standoff),
+        skin_gap=field(document, "skin_gap_mm", number),
+        farthest=field(document, "farthest_flange_mm", number),
+        radius=field(document, "radius_mm", number),
+        longest=field(document, "longest_path_mm", number),
+        max_skin_angle=field(document, "max_skin_angle_rad", number),
+        structures=names,
+        margins=array(margins, (len(names),)),
+        lengths=array(lengths, (len(names),)),
+    )
 
 
 def _range(values: Any) -> tuple[float, float]:
-    low, high = map(_number, values)
+    low, high = map(number, values)
     return low, high

@@ -22,7 +22,8 @@ from puncture_twin.planning.export.program import program_of, waypoint_rows
 from puncture_twin.planning.export.program_check import check_program
 from puncture_twin.planning.export.ros2 import TIME_RESOLUTION_S, read_ros2, ros2_text
 from puncture_twin.planning.export.urscript import read_urscript, urscript_text
-from puncture_twin.planning.plan.plan import Plan, check_geometry
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.plan.plan_check import check_geometry
 
 
 @dataclass(frozen=True, eq=False)

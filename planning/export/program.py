@@ -22,7 +22,8 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.export.corners import STRAIGHT_RAD, corner_rows, rests_at
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
-from puncture_twin.planning.plan.plan import POSE_TOLERANCE_MM, Plan
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.plan.plan_check import POSE_TOLERANCE_MM
 
 STREAM_S = SAMPLE_S
 """Period of a streamed approach: that of a CB3 controller, and four of an e-Series one."""

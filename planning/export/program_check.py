@@ -23,7 +23,8 @@ from puncture_twin.planning.export.program import (
     waypoint_rows,
 )
 from puncture_twin.planning.motion.trajectory import Trajectory
-from puncture_twin.planning.plan.plan import POSE_TOLERANCE_MM, STRAIGHT_TOLERANCE_MM, Plan
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.plan.plan_check import POSE_TOLERANCE_MM, STRAIGHT_TOLERANCE_MM
 
 SAME_BRANCH_RAD = 0.01
 """How far the joints of the straight move may end from the plan's: a hundredth of the way to another branch."""

@@ -6,7 +6,8 @@ import string
 from collections.abc import Iterable
 from importlib.metadata import version
 
-from puncture_twin.planning.plan.plan import PLAN_VERSION, Plan
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.plan.plan_document import PLAN_VERSION
 
 PLAIN = frozenset(string.ascii_letters + string.digits + " ._-+:/()")
 """What may stand in a comment or a string of any of the formats: nothing that ends, escapes or nests one."""

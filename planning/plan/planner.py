@@ -13,7 +13,8 @@ from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.motion.approach import plan_approach
 from puncture_twin.planning.motion.follow import drive_smoothly
 from puncture_twin.planning.plan.motion import motion_contact, phase_clearances
-from puncture_twin.planning.plan.plan import INSERTION_MM_S, Plan
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.plan.plan_check import INSERTION_MM_S
 from puncture_twin.planning.reach.goals import approach_goals
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext

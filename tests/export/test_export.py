@@ -32,7 +32,8 @@ from puncture_twin.planning.export.text import PLAIN
 from puncture_twin.planning.export.urscript import read_urscript, urscript_text
 from puncture_twin.planning.motion.follow import drive_smoothly, follow
 from puncture_twin.planning.motion.trajectory import Trajectory
-from puncture_twin.planning.plan.plan import Plan, read_plan, write_plan
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.plan.plan_document import read_plan, write_plan
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)

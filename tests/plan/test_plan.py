@@ -12,7 +12,7 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.plan.motion import motion_contact
-from puncture_twin.planning.plan.plan import read_plan, write_plan
+from puncture_twin.planning.plan.plan_document import read_plan, write_plan
 from puncture_twin.planning.plan.planner import make_plan
 from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.candidates import Ranking
@@ -218,14 +218,16 @@ def test_a_plan_that_contradicts_itself_is_refused(name, document):
     ("data", "message"),
     [
         (b"", "file of 0 bytes"),
-        (b'{"version": 3', "is not JSON"),
+        (b'{"version": 3', "JSON cannot be read"),
         (b'{"version": 3}', "is missing"),
         (b'{"version": 2}', "version 2; allowed: .* plan again"),
         (b'{"version": 1}', "version 1"),
         (b"[1, 2]", "version None"),
-        (b'{"version": 3, "x": NaN}', "NaN is no number"),
-        (b"\xff\xfe\x00", "is not JSON"),
-        (b"[" * 100_000, "is not JSON"),
+        (b'{"version": 3, "x": NaN}', "NaN is not a finite number"),
+        (b'{"version": 3, "x": 1e999}', "1e999 is not a finite number"),
+        (b'{"version": 3, "seed": 1, "seed": 2}', "key 'seed' stands twice"),
+        (b"\xff\xfe\x00", "JSON cannot be read"),
+        (b"[" * 100_000, "JSON cannot be read"),
     ],
 )
 def test_what_is_no_plan_is_refused(data, message, tmp_path):

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
+from puncture_twin.planning.base.strict_json import field, fitting, read_json, text, texts
 
 MANIFEST_NAME = "manifest.json"
 TIMINGS_NAME = "timings.json"
@@ -171,10 +172,8 @@ def read_manifest(folder: Path) -> Manifest | None:
     document = _document(path)
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise InputError("is not that of an output folder", where=path, allowed=ANOTHER_FOLDER)
-    try:
+    with fitting(path, ANOTHER_FOLDER):
         return _manifest(document)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"is damaged ({error})", where=path, allowed=ANOTHER_FOLDER) from error
 
 
 def file_digest(path: Path) -> str:
@@ -194,17 +193,13 @@ def _set_of(folder: Path) -> Manifest | None:
 
 
 def _document(path: Path) -> Any:
-    data = read_input(path, max_bytes=MAX_MANIFEST_BYTES, where=str(path))
-    try:
-        return json.loads(data.decode("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"is damaged ({error})", where=path, allowed=ANOTHER_FOLDER) from error
+    return read_json(path, max_bytes=MAX_MANIFEST_BYTES, allowed=ANOTHER_FOLDER)
 
 
 def _manifest(document: dict[str, Any]) -> Manifest:
     if document["layout"] != LAYOUT:
         raise ValueError(f"layout {document['layout']}")
-    entries = {str(name): _entry(entry) for name, entry in document["entries"].items()}
+    entries = {name: _entry(entry) for name, entry in document["entries"].items()}
     unfinished = tuple(map(_name, document["unfinished"]))
     _refuse_twice([name for entry in entries.values() for name in entry.files] + list(unfinished))
     return Manifest(MappingProxyType(entries), unfinished)
@@ -218,9 +213,9 @@ def _refuse_twice(names: list[str]) -> None:
 
 
 def _entry(document: dict[str, Any]) -> ManifestEntry:
-    files = {_name(name): str(digest) for name, digest in document["files"].items()}
-    depends_on = tuple(str(name) for name in document["depends_on"])
-    return ManifestEntry(str(document["version"]), read_inputs(document["inputs"]), depends_on, MappingProxyType(files))
+    files = {_name(name): text(digest) for name, digest in document["files"].items()}
+    version, depends_on = field(document, "version", text), field(document, "depends_on", texts)
+    return ManifestEntry(version, read_inputs(document["inputs"]), depends_on, MappingProxyType(files))
 
 
 def _name(name: Any) -> str:

@@ -8,7 +8,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.output.manifest import MAX_MANIFEST_BYTES, TIMINGS_NAME
+from puncture_twin.planning.base.strict_json import read_json
 
 
 def with_timings(
@@ -35,9 +37,7 @@ def with_timings(
 def _read(path: Path) -> dict[str, Any]:
     """What is there; nothing where it cannot be read: no result depends on it."""
     try:
-        if path.stat().st_size > MAX_MANIFEST_BYTES:
-            return {}
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        document = read_json(path, max_bytes=MAX_MANIFEST_BYTES, allowed="timings")
+    except InputError:
         return {}
     return document if isinstance(document, dict) else {}

@@ -6,10 +6,10 @@ Source: Slicer documentation, "Markups" module, file formats; in older files the
 from __future__ import annotations
 
 import csv
-import json
 from typing import Any
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.formats.points.raw_points import RawPoints, parse_coordinate
 from puncture_twin.planning.formats.raw_mesh import decode_text, refuse
 from puncture_twin.planning.geometry.spaces import Space, Unit, parse_unit
@@ -31,10 +31,7 @@ def read_markups_points(data: bytes, where: str) -> RawPoints:
     Raises:
         InputError: If it is no such file, states no known space, or a point has no label or defined position.
     """
-    try:
-        tree: Any = json.loads(decode_text(data, where), object_pairs_hook=_unique_keys)
-    except (ValueError, RecursionError) as error:  # no JSON, a key twice, nesting without end
-        raise InputError(f"JSON cannot be read ({error})", where=where, allowed=_MARKUPS_ALLOWED) from error
+    tree = parse_json(data, where=where, allowed=_MARKUPS_ALLOWED)
     markups = tree.get("markups") if isinstance(tree, dict) else None
     if not isinstance(markups, list) or len(markups) != 1 or not isinstance(markups[0], dict):
         refuse("not exactly one entry in 'markups'", where, _MARKUPS_ALLOWED)
@@ -80,13 +77,6 @@ def read_fcsv_points(data: bytes, where: str) -> RawPoints:
         x, y, z = (parse_coordinate(fields[columns.index(axis)], place) for axis in "xyz")
         points.append((x, y, z))
     return RawPoints(names, points, Unit.MM, _space(system, where))
-
-
-def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    keys = [key for key, _ in pairs]
-    if len(set(keys)) != len(keys):
-        raise ValueError(f"a key stands twice among {keys[:20]}")
-    return dict(pairs)
 
 
 def _space(value: object, where: str) -> Space:

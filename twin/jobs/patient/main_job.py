@@ -24,7 +24,8 @@ from puncture_twin.planning.certify.cone_column import with_safe_cone
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.cross_check import CrossChecked
 from puncture_twin.planning.export.exporter import Exported, export_name, export_plan
-from puncture_twin.planning.plan.plan import MAX_PLAN_BYTES, Plan, parse_plan, write_plan
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan, write_plan
 from puncture_twin.planning.plan.planner import make_plan
 from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.context import CaseContext

@@ -1,0 +1,215 @@
+"""JSON that decides something, read strictly: what the standard library lets pass is refused here.
+
+A key that stands twice has two meanings, of which a reader sees one; NaN and infinity are no JSON; 1e999 is infinite.
+The readers of single values raise what `fitting` turns into one line about the file.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.input_file import read_input
+
+Value = TypeVar("Value")
+
+MAX_NUMBER = 1e6
+"""Of millimetres, degrees, radians and seconds: products of larger ones overflow."""
+
+SHOWN = 60
+"""Characters of a damaged value that an error shows."""
+
+
+def read_json(path: Path, *, max_bytes: int, allowed: str) -> Any:
+    """A JSON file, see `parse_json`.
+
+    Raises:
+        InputError: It cannot be read, is larger than ``max_bytes``, or see `parse_json`.
+    """
+    return parse_json(read_input(path, max_bytes=max_bytes, where=str(path)), where=path, allowed=allowed)
+
+
+def parse_json(data: bytes, *, where: str | Path, allowed: str) -> Any:
+    """The tree that some bytes hold: UTF-8 (a byte order mark is passed over), every key once, every number finite.
+
+    Args:
+        data: The whole file.
+        where: Its name, for the error.
+        allowed: What is wanted there, for the error.
+
+    Raises:
+        InputError: Not such JSON, or nested without end.
+    """
+    try:
+        text = data.decode("utf-8-sig")
+        return json.loads(text, parse_constant=_refused, parse_float=_finite, object_pairs_hook=_unique_keys)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"JSON cannot be read ({error})", where=where, allowed=allowed) from error
+
+
+def parse_document(data: bytes, version: int, *, where: str | Path, allowed: str) -> dict[str, Any]:
+    """A JSON object whose ``version`` is this one.
+
+    Args:
+        data: The whole file.
+        version: Of its layout.
+        where: Its name, for the error.
+        allowed: What is wanted there, for the error.
+
+    Raises:
+        InputError: Another version, no object, or see `parse_json`.
+    """
+    document = parse_json(data, where=where, allowed=allowed)
+    stated = document.get("version") if isinstance(document, dict) else None
+    if isinstance(stated, bool) or stated != version:
+        raise InputError(f"version {_shown(stated)}", where=where, allowed=allowed)
+    return dict(document)
+
+
+@contextmanager
+def fitting(where: str | Path, allowed: str) -> Iterator[None]:
+    """Whatever a value of the wrong kind raises within, as one line about its file.
+
+    Args:
+        where: The file.
+        allowed: What is wanted there.
+
+    Raises:
+        InputError: A key that is missing, or a value of another type, shape or size.
+    """
+    try:
+        yield
+    except KeyError as error:
+        raise InputError(f"key {error} is missing", where=where, allowed=allowed) from error
+    except (TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+        raise InputError(f"does not fit: {error}", where=where, allowed=allowed) from error
+
+
+def field(document: dict[str, Any], name: str, read: Callable[[Any], Value]) -> Value:
+    """A value by its key, which errors name.
+
+    Raises:
+        KeyError, ValueError: It is missing, or ``read`` refuses it.
+    """
+    value = document[name]
+    try:
+        return read(value)
+    except InputError as error:
+        raise ValueError(f"{name}: {error.what}, not {error.allowed}") from error
+    except KeyError as error:
+        raise KeyError(f"{name}.{error.args[0]}") from error
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise ValueError(f"{name}: {error}") from error
+
+
+def text(value: Any) -> str:
+    """A text, and nothing that only prints as one.
+
+    Raises:
+        TypeError: Something else.
+    """
+    if not isinstance(value, str):
+        raise TypeError(f"{_shown(value)} is no text")
+    return value
+
+
+def whole(value: Any) -> int:
+    """A whole number, written as one.
+
+    Raises:
+        TypeError: Something else.
+    """
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError(f"{_shown(value)} is no whole number")
+    return value
+
+
+def number(value: Any) -> float:
+    """A number within ±`MAX_NUMBER`.
+
+    Raises:
+        TypeError, ValueError: Something else, or a larger one.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{_shown(value)} is no number")
+    if not abs(value) <= MAX_NUMBER:
+        raise ValueError(f"{_shown(value)} is beyond {MAX_NUMBER:g}")
+    return float(value)
+
+
+def number_or_nan(value: Any) -> float:
+    """A number as `number` takes it, or NaN for null."""
+    return float("nan") if value is None else number(value)
+
+
+def array(value: Any, shape: tuple[int, ...]) -> Floats:
+    """Numbers within ±`MAX_NUMBER` of a known shape; read-only.
+
+    Raises:
+        ValueError: Another shape, a larger number, or something else than numbers.
+    """
+    if not _numbers_only(value):
+        raise ValueError("an array of something else than numbers")
+    try:
+        found = np.array(value, dtype=np.float64)
+    except OverflowError as error:
+        raise ValueError(f"a number beyond {MAX_NUMBER:g}") from error
+    if found.shape != shape or not np.all(np.abs(found) <= MAX_NUMBER):
+        raise ValueError(f"an array of shape {found.shape} where {shape} numbers within {MAX_NUMBER:g} belong")
+    found.setflags(write=False)
+    return found
+
+
+def point(value: Any) -> Floats:
+    """Three numbers, as `array` takes them."""
+    return array(value, (3,))
+
+
+def texts(value: Any) -> tuple[str, ...]:
+    """A list of texts.
+
+    Raises:
+        TypeError: Something else.
+    """
+    if not isinstance(value, list):
+        raise TypeError(f"{_shown(value)} is no list")
+    return tuple(map(text, value))
+
+
+def or_null(value: float) -> float | None:
+    """A number as JSON has it: null where it is not finite."""
+    return float(value) if np.isfinite(value) else None
+
+
+def _refused(name: str) -> float:
+    raise ValueError(f"{name} is not a finite number")
+
+
+def _finite(written: str) -> float:
+    value = float(written)
+    return value if abs(value) < float("inf") else _refused(written[:SHOWN])
+
+
+def _unique_keys(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"key {_shown(next(key for key in keys if keys.count(key) > 1))} stands twice")
+    return found
+
+
+def _numbers_only(value: Any) -> bool:
+    if isinstance(value, list):
+        return all(map(_numbers_only, value))
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _shown(value: Any) -> str:
+    return ascii(value)[:SHOWN]

@@ -1,0 +1,167 @@
+"""Whether a plan does what it says, and is still its case's: what must hold of its numbers alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from puncture_twin.planning.arm.insertion import flange_at, needle_lines
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.provenance import differing_input
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.entry import needle_pose
+from puncture_twin.planning.plan.plan import Plan
+
+POSE_TOLERANCE_MM = 0.01
+"""How far the tip of the stored joint angles may be from the stored pose: well above rounding, far below any error."""
+
+JOIN_TOLERANCE_RAD = 1e-9
+"""How far the insertion may start from where the approach ends: rounding of the time laws."""
+
+STRAIGHT_TOLERANCE_MM = 0.1
+"""How far the tip may leave the straight path during the insertion: what a UR3 repeats."""
+
+BETWEEN_RAD = 0.002
+"""Joint step at which an insertion is looked at between its rows: up to 1.3 mm at the tip, bent by far less."""
+
+MOST_STATES = 100_000
+"""Joints that turn through more steps than this (200 rad) during one insertion do something else."""
+
+ROLL_TOLERANCE_RAD = 1e-4
+"""How far the stated roll may be from that of the joint angles: what the pose's tolerance lets the flange turn."""
+
+ANGLE_ROUNDING = 1e-12
+"""Share of a turn by which degrees and radians round."""
+
+INSERTION_MM_S = 10.0
+"""Tip speed of the insertion: a needle is driven slowly, and an operator must be able to stop it."""
+
+SPEED_ROUNDING = 1e-3
+"""A time law that just keeps a speed may exceed it by its sampling."""
+
+AGREE = "T_base_ct, target_ct_mm, outward_ct, needle_length_mm, standoff_mm and joint angles must agree"
+
+
+def check_inputs(plan: Plan, case: Case, path: Path) -> None:
+    """Refuse a plan whose case has changed since.
+
+    Raises:
+        InputError: Names the first input that differs.
+    """
+    name = differing_input(plan.inputs, case.inputs)
+    if name is not None:
+        raise InputError(f"input '{name}' is not the one that the plan was made from", where=path, allowed="plan again")
+
+
+def check_geometry(plan: Plan, path: Path) -> None:
+    """Refuse a plan whose motion does not do what it says: join, start at standoff, end on the target.
+
+    Raises:
+        InputError: Says which end is off, and by how much.
+    """
+    if not np.allclose(plan.approach.q[-1], plan.insertion.q[0], rtol=0, atol=JOIN_TOLERANCE_RAD):
+        raise InputError("the insertion does not start where the approach ends", where=path, allowed="joined phases")
+    _check_straight(plan, path)
+    _check_speeds(plan, path)
+    model = ur_model(plan.model)
+    for name, q, standoff in (
+        ("standoff", plan.insertion.q[0], plan.standoff_mm),
+        ("target", plan.insertion.q[-1], 0.0),
+    ):
+        pose = needle_pose(plan.target_ct, plan.outward_ct, standoff=standoff, length=plan.needle_length_mm)
+        T_base_flange = flange_pose(model, q)
+        tip = T_base_flange[:3, 3] + plan.needle_length_mm * T_base_flange[:3, 2]
+        for what, point, wanted in (("tip", tip, pose.tip_ct), ("flange", T_base_flange[:3, 3], pose.top_ct)):
+            error = float(np.linalg.norm(point - plan.T_base_ct[:3, :3] @ wanted - plan.T_base_ct[:3, 3]))
+            if not error <= POSE_TOLERANCE_MM:
+                raise InputError(
+                    f"the {what} at {name} is {error:.3g} mm off the stored pose",
+                    where=path,
+                    allowed=f"at most {POSE_TOLERANCE_MM} mm: {AGREE}",
+                )
+
+
+def check_angles(plan: Plan, path: Path) -> None:
+    """Refuse a roll that is not that of the joint angles at standoff, and angles beyond their turn.
+
+    Raises:
+        InputError: Names the angle.
+    """
+    for name, angle, turn in (("theta_deg", plan.theta, np.pi), ("beta_deg", plan.beta, 2 * np.pi)):
+        if not 0.0 <= angle <= turn * (1 + ANGLE_ROUNDING):
+            raise InputError(f"{name} = {np.degrees(angle):g}", where=path, allowed=f"0 to {np.degrees(turn):g}")
+    R, t = plan.T_base_ct[:3, :3], plan.T_base_ct[:3, 3]
+    line = needle_lines((R @ plan.target_ct + t)[None], (R @ plan.outward_ct)[None])[0]
+    unrolled = flange_at(line, plan.needle_length_mm + plan.standoff_mm)[:3, :3]
+    x_axis = unrolled.T @ flange_pose(ur_model(plan.model), plan.insertion.q[0])[:3, 0]
+    roll = float(np.arctan2(x_axis[1], x_axis[0])) % (2 * np.pi)
+    off = abs((plan.roll - roll + np.pi) % (2 * np.pi) - np.pi)
+    if off > ROLL_TOLERANCE_RAD or not 0.0 <= plan.roll < 2 * np.pi:
+        what = f"roll_deg is {np.degrees(plan.roll):g}, the joint angles at standoff give {np.degrees(roll):.4g}"
+        raise InputError(what, where=path, allowed="plan again")
+
+
+def _check_straight(plan: Plan, path: Path) -> None:
+    """Refuse an insertion that leaves the straight line, tilts the needle, goes too deep or turns back.
+
+    Between two stored rows the joints turn evenly, so the motion is looked at there too.
+    """
+    model = ur_model(plan.model)
+    poses = flange_pose(model, _between(plan.insertion.q, path))
+    forward = poses[:, :3, 2]
+    tips = poses[:, :3, 3] + plan.needle_length_mm * forward
+    R, t = plan.T_base_ct[:3, :3], plan.T_base_ct[:3, 3]
+    outward, from_target = R @ plan.outward_ct, tips - (R @ plan.target_ct + t)
+    along = from_target @ outward
+    aside = np.linalg.norm(from_target - along[:, None] * outward, axis=1).max()
+    swing = plan.needle_length_mm * np.linalg.norm(forward + outward, axis=1).max()
+    back = np.max(along - np.minimum.accumulate(along))
+    deep = max(-along.min(), along.max() - plan.standoff_mm)
+    for what, amount in (
+        ("tip leaves the straight path", aside),
+        ("flange end of the needle swings out", swing),
+        ("insertion turns back", back),
+        ("insertion goes beyond standoff and target", deep),
+    ):
+        if not amount <= STRAIGHT_TOLERANCE_MM:
+            allowed = f"at most {STRAIGHT_TOLERANCE_MM} mm: {AGREE}"
+            raise InputError(f"the {what} by {amount:.3g} mm", where=f"{path}: insertion", allowed=allowed)
+
+
+def _between(q: Floats, path: Path) -> Floats:
+    """The rows of a joint path and points between them, no more than `BETWEEN_RAD` apart in any joint."""
+    counts = np.ceil(np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0) / BETWEEN_RAD).clip(min=1)
+    if counts.sum() > MOST_STATES:
+        raise InputError("the insertion turns its joints over and over", where=path, allowed="a straight insertion")
+    segment = np.repeat(np.arange(len(counts)), counts.astype(np.int64))
+    starts = np.cumsum(counts) - counts
+    share = (np.arange(len(segment)) - starts[segment]) / counts[segment]
+    return np.concatenate([q[segment] + share[:, None] * (q[segment + 1] - q[segment]), q[-1:]])
+
+
+def _check_speeds(plan: Plan, path: Path) -> None:
+    """Refuse joint limits, joint speeds or a tip speed beyond what a plan may have."""
+    model = ur_model(plan.model)
+    for phase, part in (("approach", plan.approach), ("insertion", plan.insertion)):
+        if not model.within_limits(part.q).all():
+            raise InputError(
+                f"the {phase} leaves the joint limits", where=path, allowed="angles within the arm's limits"
+            )
+        fastest = float((part.max_speeds() / model.max_speeds).max())
+        if not fastest <= 1 + SPEED_ROUNDING:
+            raise InputError(
+                f"the {phase} is {fastest:.3g} times as fast as a joint can turn",
+                where=path,
+                allowed="the arm's speeds",
+            )
+    poses = flange_pose(model, plan.insertion.q)
+    tips = poses[:, :3, 3] + plan.needle_length_mm * poses[:, :3, 2]
+    speed = float((np.linalg.norm(np.diff(tips, axis=0), axis=1) / np.diff(plan.insertion.times_s)).max(initial=0.0))
+    if not speed <= INSERTION_MM_S * (1 + SPEED_ROUNDING):
+        raise InputError(
+            f"the insertion drives the tip at {speed:.3g} mm/s", where=path, allowed=f"at most {INSERTION_MM_S:g} mm/s"
+        )

@@ -1,0 +1,204 @@
+"""A plan as a versioned file, which is checked again by whoever loads it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.output.manifest import read_output
+from puncture_twin.planning.base.provenance import inputs_document, read_inputs
+from puncture_twin.planning.base.strict_json import (
+    array,
+    field,
+    fitting,
+    number,
+    number_or_nan,
+    or_null,
+    parse_document,
+    point,
+    text,
+    whole,
+)
+from puncture_twin.planning.formats.guard import guard_transform
+from puncture_twin.planning.motion.follow import MAX_JERK
+from puncture_twin.planning.motion.trajectory import SAMPLE_S, Peaks, Trajectory
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.plan.plan_check import check_geometry
+
+PLAN_VERSION = 3
+"""Version of the file's layout. 2: states the peaks of both phases beside the limits; the approach is smooth. 3: lists
+its inputs with their roles, files that a file names included."""
+
+PLAN_ALLOWED = f"a plan.json of version {PLAN_VERSION}; plan again"
+
+NAMES = (
+    *("version", "case", "inputs", "seed", "robot", "T_base_ct", "expected_target_error_mm", "theta_deg", "beta_deg"),
+    *("entry_ct_mm", "target_ct_mm", "outward_ct", "roll_deg", "standoff_mm", "needle_length_mm", "limits"),
+    *("approach", "insertion", "clearance_mm"),
+)
+PHASE_NAMES = ("times_s", "q_rad", "peaks")
+CLEARANCE_NAMES = ("approach", "insertion", "needle")
+INPUT_NAMES = ("role", "path", "sha256")
+"""The keys of a plan and of its parts."""
+
+SAME_TIME_S = 1e-9
+"""Rounding of the samples' times."""
+
+SAME_PEAK = 1e-6
+"""Share by which a stated peak may differ from the samples' own: rounding."""
+
+MAX_PLAN_BYTES = 50_000_000
+"""A plan is some thousand waypoints; a larger file is something else."""
+
+
+def write_plan(plan: Plan, path: Path) -> None:
+    """Write a plan as JSON, whole or not at all; lengths in mm, joints in rad, times in s."""
+    document = {
+        "version": PLAN_VERSION,
+        "case": plan.case_name,
+        "inputs": inputs_document(plan.inputs),
+        "seed": plan.seed,
+        "robot": plan.model,
+        "T_base_ct": plan.T_base_ct.tolist(),
+        "expected_target_error_mm": or_null(plan.expected_target_error_mm),
+        "theta_deg": float(np.degrees(plan.theta)),
+        "beta_deg": float(np.degrees(plan.beta)),
+        "entry_ct_mm": plan.entry_ct.tolist(),
+        "target_ct_mm": plan.target_ct.tolist(),
+        "outward_ct": plan.outward_ct.tolist(),
+        "roll_deg": float(np.degrees(plan.roll)),
+        "standoff_mm": plan.standoff_mm,
+        "needle_length_mm": plan.needle_length_mm,
+        "limits": _rates_document(_limits(plan.model)),
+        "approach": _trajectory_document(plan.approach),
+        "insertion": _trajectory_document(plan.insertion),
+        "clearance_mm": {phase: or_null(value) for phase, value in plan.clearance_mm.items()},
+    }
+    with atomic(path) as temporary:
+        temporary.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_plan(path: Path) -> Plan:
+    """Read a plan, from a whole output set or from outside of any, and check it as `parse_plan` does.
+
+    Raises:
+        InputError: It cannot be read, its folder's manifest lists other bytes, or see `parse_plan`.
+    """
+    return parse_plan(read_output(path, max_bytes=MAX_PLAN_BYTES).data, path)
+
+
+def parse_plan(data: bytes, path: Path) -> Plan:
+    """Check that a plan's bytes are whole and agree with themselves.
+
+    Args:
+        data: The file's bytes.
+        path: The file, for errors.
+
+    Raises:
+        InputError: Not a plan, another version, missing keys, numbers that do not fit, or a pose that the stored
+            joint angles do not reach.
+    """
+    document = parse_document(data, PLAN_VERSION, where=path, allowed=PLAN_ALLOWED)
+    with fitting(path, PLAN_ALLOWED):
+        plan = _plan(document, path)
+    check_geometry(plan, path)
+    _check_stated(document, plan, path)
+    _check_names(document, path)
+    return plan
+
+
+def _check_stated(document: dict[str, Any], plan: Plan, path: Path) -> None:
+    """Refuse limits and peaks that are not the arm's and the samples' own: people read them."""
+    stated: tuple[tuple[str, Any, dict[str, list[float]]], ...] = (
+        ("limits", document.get("limits"), _rates_document(_limits(plan.model))),
+        ("peaks of the approach", document["approach"].get("peaks"), _rates_document(plan.approach.peaks())),
+        ("peaks of the insertion", document["insertion"].get("peaks"), _rates_document(plan.insertion.peaks())),
+    )
+    for name, said, known in stated:
+        if not _same_rates(said, known):
+            raise InputError(f"the {name} are not those of its numbers", where=path, allowed="plan again")
+    for phase, part in (("approach", plan.approach), ("insertion", plan.insertion)):
+        even = SAMPLE_S * np.arange(len(part.times_s))
+        if not np.allclose(part.times_s, even, rtol=0, atol=SAME_TIME_S):
+            raise InputError(f"the times of the {phase} are not even", where=path, allowed=f"a row every {SAMPLE_S} s")
+
+
+def _same_rates(said: Any, known: dict[str, list[float]]) -> bool:
+    try:
+        return set(said) == set(known) and all(
+            np.allclose(array(said[rate], (6,)), known[rate], rtol=SAME_PEAK, atol=SAME_PEAK) for rate in known
+        )
+    except (TypeError, ValueError):
+        return False
+
+
+def _check_names(document: dict[str, Any], path: Path) -> None:
+    """Refuse keys that no plan has: nothing says whether what they state is so."""
+    for where, part, known in (
+        ("", document, NAMES),
+        ("approach.", document["approach"], PHASE_NAMES),
+        ("insertion.", document["insertion"], PHASE_NAMES),
+        ("clearance_mm.", document["clearance_mm"], CLEARANCE_NAMES),
+        *((f"inputs.{at}.", one, INPUT_NAMES) for at, one in enumerate(document["inputs"])),
+    ):
+        # a phase whose clearance is not stated is for whoever has the case to miss
+        for name in sorted(set(part) - set(known) if part is document["clearance_mm"] else set(part) ^ set(known)):
+            what = "is not known" if name in part else "is missing"
+            raise InputError(f"key '{where}{name}' {what}", where=path, allowed=", ".join(known))
+
+
+def _limits(model_name: str) -> Peaks:
+    model = ur_model(model_name)
+    return Peaks(model.max_speeds, np.full(6, model.max_acceleration), np.full(6, MAX_JERK))
+
+
+def _rates_document(rates: Peaks) -> dict[str, list[float]]:
+    units = ("speed_rad_s", "acceleration_rad_s2", "jerk_rad_s3")
+    return {unit: rate.tolist() for unit, rate in zip(units, rates, strict=True)}
+
+
+def _plan(document: dict[str, Any], path: Path) -> Plan:
+    return Plan(
+        case_name=field(document, "case", text),
+        inputs=field(document, "inputs", read_inputs),
+        seed=field(document, "seed", whole),
+        model=field(document, "robot", text),
+        T_base_ct=guard_transform(document["T_base_ct"], where=f"{path}: T_base_ct"),
+        expected_target_error_mm=field(document, "expected_target_error_mm", number_or_nan),
+        theta=float(np.radians(field(document, "theta_deg", number))),
+        beta=float(np.radians(field(document, "beta_deg", number))),
+        entry_ct=field(document, "entry_ct_mm", point),
+        target_ct=field(document, "target_ct_mm", point),
+        outward_ct=field(document, "outward_ct", point),
+        roll=float(np.radians(field(document, "roll_deg", number))),
+        standoff_mm=field(document, "standoff_mm", number),
+        needle_length_mm=field(document, "needle_length_mm", number),
+        approach=field(document, "approach", _trajectory),
+        insertion=field(document, "insertion", _trajectory),
+        clearance_mm=field(document, "clearance_mm", _clearances),
+    )
+
+
+def _clearances(value: Any) -> Mapping[str, float]:
+    return MappingProxyType({phase: number_or_nan(one) for phase, one in value.items()})
+
+
+def _trajectory(document: Any) -> Trajectory:
+    count = len(document["times_s"])
+    return Trajectory(array(document["times_s"], (count,)), array(document["q_rad"], (count, 6)))
+
+
+def _trajectory_document(trajectory: Trajectory) -> dict[str, Any]:
+    return {
+        "times_s": trajectory.times_s.tolist(),
+        "q_rad": trajectory.q.tolist(),
+        "peaks": _rates_document(trajectory.peaks()),
+    }
