@@ -21,7 +21,8 @@ from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import case_tool
 from puncture_twin.planning.export.csv_times import csv_text
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
-from puncture_twin.planning.plan.plan import Plan, write_plan
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.plan.plan_document import write_plan
 from puncture_twin.planning.reach.reach import ReachRequest, assess_reach
 from puncture_twin.planning.registration.placement import load_placement
 
@@ -100,17 +101,15 @@ def make_meshes(folder):
     mesh.export(folder / "a.ply", encoding="binary", vertex_normal=False)
     mesh.export(folder / "ascii.ply", encoding="ascii", vertex_normal=False)
     vertices, faces = mesh.vertices.astype("<f4"), mesh.faces.astype("<u4")
-    glb(folder, gltf(vertices, faces, {}), vertices.tobytes() + faces.tobytes())
+    glb(folder, gltf(vertices, faces), vertices.tobytes() + faces.tobytes())
     (folder / "rib.glb").rename(folder / "a.glb")
-    data = "data:application/octet-stream;base64," + base64.b64encode(vertices.tobytes() + faces.tobytes()).decode()
-    (folder / "a.gltf").write_text(json.dumps(gltf(vertices, faces, {"uri": data})))
     (folder / "ascii.vtp").write_text(
         vtp(mesh, lambda array: ("ascii", " ".join(map(str, array.reshape(-1).tolist()))))
     )
     (folder / "base64.vtp").write_text(vtp(mesh, lambda array: ("binary", packed(array))))
 
 
-def gltf(vertices, faces, buffer):
+def gltf(vertices, faces):
     """A glTF document of one mesh, placed twice."""
     return {
         "asset": {"version": "2.0"},
@@ -129,7 +128,7 @@ def gltf(vertices, faces, buffer):
             {"buffer": 0, "byteLength": vertices.nbytes},
             {"buffer": 0, "byteLength": faces.nbytes, "byteOffset": vertices.nbytes},
         ],
-        "buffers": [{"byteLength": vertices.nbytes + faces.nbytes, **buffer}],
+        "buffers": [{"byteLength": vertices.nbytes + faces.nbytes}],
     }
 
 

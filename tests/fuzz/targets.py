@@ -17,7 +17,7 @@ from puncture_twin.planning.formats.meshes.mesh_files import mesh_warnings, read
 from puncture_twin.planning.formats.points.point_files import read_points
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.geometry.spaces import Space, Unit
-from puncture_twin.planning.plan.plan import read_plan
+from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import read_recording
@@ -169,7 +169,6 @@ MESHES = {
     "a.ply": "headed",
     "ascii.ply": "text",
     "a.glb": "glb",
-    "a.gltf": "tree",
     "ascii.vtp": "text",
     "base64.vtp": "text",
 }

@@ -19,7 +19,7 @@ from puncture_twin.planning.certify.certificate import read_certificate
 from puncture_twin.planning.collision_cases.pytest_plugin import read_checks
 from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
 from puncture_twin.planning.geometry.spaces import Space, Unit
-from puncture_twin.planning.plan.plan import read_plan
+from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.run_twin import main
 
 READERS = {

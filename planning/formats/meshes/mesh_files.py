@@ -1,4 +1,4 @@
-"""Mesh files of other programs, as guarded meshes in mm: STL, OBJ, PLY, GLB, glTF and VTP.
+"""Mesh files of other programs, as guarded meshes in mm: STL, OBJ, PLY, GLB and VTP.
 
 Each format has its own strict reader beside this file, because a lost triangle makes a path "free": a file must hold
 what it promises to the byte. General loaders are made to show something. trimesh 5.2, measured on a box of 12
@@ -18,7 +18,7 @@ import numpy as np
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.formats.guard import guard_mesh, twice_areas
-from puncture_twin.planning.formats.meshes.gltf import read_glb, read_gltf
+from puncture_twin.planning.formats.meshes.glb import read_glb
 from puncture_twin.planning.formats.meshes.obj import read_obj
 from puncture_twin.planning.formats.meshes.ply import read_ply
 from puncture_twin.planning.formats.meshes.stl import read_stl
@@ -31,7 +31,7 @@ MAX_FILE_BYTES = 2_000_000_000
 """Twenty million triangles of binary STL are 1 GB; a file beyond twice that is refused before it is read."""
 
 _READERS: Mapping[str, Callable[[bytes, str], RawMesh]] = MappingProxyType(
-    {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".glb": read_glb, ".gltf": read_gltf, ".vtp": read_vtp}
+    {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".glb": read_glb, ".vtp": read_vtp}
 )
 MESH_SUFFIXES: tuple[str, ...] = tuple(_READERS)
 """The file name endings that ``read_mesh`` takes, in lower case; upper case is the same."""
@@ -40,12 +40,12 @@ MESH_SUFFIXES: tuple[str, ...] = tuple(_READERS)
 def read_mesh(path: Path, *, unit: Unit, space: Space, where: str | None = None) -> TriangleMesh:
     """One mesh file, checked against its own promises, in mm and LPS (or its own local frame).
 
-    Nothing about unit or space is taken from the file: the caller declares both, also for glTF, whose standard says
+    Nothing about unit or space is taken from the file: the caller declares both, also for GLB, whose standard says
     metres. All parts of a file become one surface, placed by their node transforms, in the file's order; nothing is
-    welded and no triangle dropped. The axes stay as in the file: glTF is y-up by its standard and is not turned.
+    welded and no triangle dropped. The axes stay as in the file: GLB is y-up by its standard and is not turned.
 
     Args:
-        path: An STL, OBJ, PLY, GLB, glTF or VTP file.
+        path: An STL, OBJ, PLY, GLB or VTP file.
         unit: The unit of its coordinates.
         space: Their space.
         where: How errors name the file; its path by default.

@@ -1,0 +1,204 @@
+"""GLB, which is glTF 2.0 in one file: the triangles of its scene, placed by its nodes.
+
+Sizes and indices are checked in three steps before any array is made: chunks against the file, buffer views against the
+buffer (`glb_document`), accessors against views. Only geometry is read; materials, images and lights are never opened.
+Source: Khronos glTF 2.0 specification, sections 3.5 (nodes), 3.6 (binary data) and 3.7 (meshes).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.formats.guard import MAX_TRIANGLES
+from puncture_twin.planning.formats.meshes.glb_document import (
+    TRIANGLES,
+    Accessor,
+    Document,
+    Mesh,
+    Node,
+    Primitive,
+    read_document,
+)
+from puncture_twin.planning.formats.raw_mesh import MAX_VERTICES, RawMesh, join, refuse
+
+_TREE_ALLOWED = "nodes that form trees below one scene"
+_FLOAT = 5126
+_INDEX_TYPES: dict[int, np.dtype[Any]] = {5121: np.dtype("<u1"), 5123: np.dtype("<u2"), 5125: np.dtype("<u4")}
+MAX_PARTS = 10_000
+"""Primitives in all places: each one is built by itself."""
+
+MAX_REPEATED_VERTICES = 3_000_000
+"""Beyond what the file's own data hold: what it may place again. They take 70 MB."""
+
+_VERTEX_BYTES, _TRIANGLE_BYTES = 12, 3
+"""Least size of a vertex, and of a triangle by indices of one byte."""
+
+
+def read_glb(data: bytes, where: str) -> RawMesh:
+    """The triangles of a GLB file's scene, in the unit of the file and its axes (y up by the standard).
+
+    Args:
+        data: The whole file.
+        where: Its name, for the error.
+
+    Raises:
+        InputError: If it is cut, contradicts itself, or uses what is not supported.
+    """
+    glb = _Glb(*read_document(data, where), where)
+    placed = glb.placed()
+    glb.check_total(placed)
+    return join([part for mesh, T_scene_mesh in placed for part in glb.parts(mesh, T_scene_mesh)])
+
+
+class _Size(NamedTuple):
+    parts: int
+    vertices: int
+    triangles: int
+
+
+@dataclass(frozen=True)
+class _Glb:
+    """A checked document with the bytes of its buffer, and its name for errors."""
+
+    document: Document
+    binary: bytes
+    where: str
+
+    def placed(self) -> list[tuple[int, Floats]]:
+        """Every mesh with its place T_scene_mesh, shape (4, 4), affine, in the order of the nodes."""
+        T_scene_node, meshes = self._walk(), self.document.meshes
+        placed = []
+        for index, node in enumerate(self.document.nodes):
+            if node.mesh is None:
+                continue
+            if node.mesh >= len(meshes):
+                refuse(f"node {index} uses mesh {node.mesh}", self.where, f"one of the {len(meshes)} meshes")
+            if index not in T_scene_node:
+                refuse(f"node {index} holds a mesh but is not in the scene", self.where, "every mesh in the one scene")
+            placed.append((node.mesh, T_scene_node[index]))
+        lost = set(range(len(meshes))) - {mesh for mesh, _ in placed}
+        if lost or not placed:
+            what = f"mesh {min(lost)} is placed by no node" if lost else "no mesh"
+            refuse(what, self.where, "at least one mesh, each placed by a node of the scene")
+        return placed
+
+    def _walk(self) -> dict[int, Floats]:
+        """The transform of every node that is below the scene's top."""
+        scenes, nodes = self.document.scenes, self.document.nodes
+        if self.document.scene is None and len(scenes) != 1:
+            refuse(f"{len(scenes)} scenes and none of them chosen", self.where, _TREE_ALLOWED)
+        number = self.document.scene or 0
+        if number >= len(scenes):
+            refuse(f"scene {number} of {len(scenes)}", self.where, _TREE_ALLOWED)
+        found: dict[int, Floats] = {}
+        waiting = [(index, np.eye(4)) for index in scenes[number].nodes]
+        while waiting:
+            index, T_scene_parent = waiting.pop()
+            if index >= len(nodes) or index in found:
+                refuse(f"node {index} is missing, or reached twice", self.where, _TREE_ALLOWED)
+            found[index] = T_scene_parent @ _local(nodes[index], f"{self.where}, node {index}")
+            waiting.extend((child, found[index]) for child in nodes[index].children)
+        return found
+
+    def check_total(self, placed: list[tuple[int, Floats]]) -> None:
+        """Count before building: a small file may place one large mesh many times, or name one array in many parts."""
+        sizes = [self._size(mesh) for mesh in self.document.meshes]
+        total = _Size(*(sum(sizes[mesh][kind] for mesh, _ in placed) for kind in range(3)))
+        if total.parts > MAX_PARTS:
+            refuse(f"{total.parts} parts in all places", self.where, f"at most {MAX_PARTS}")
+        held = len(self.binary)
+        vertices = min(MAX_VERTICES, held // _VERTEX_BYTES + MAX_REPEATED_VERTICES)
+        triangles = min(MAX_TRIANGLES, held // _TRIANGLE_BYTES + MAX_REPEATED_VERTICES // 3)
+        if total.triangles > triangles or total.vertices > vertices:
+            what = f"{total.triangles} triangles and {total.vertices} vertices in all places"
+            refuse(what, self.where, f"at most {triangles} and {vertices} from {held} bytes of data")
+
+    def _size(self, mesh: Mesh) -> _Size:
+        corners = [self._count(primitive.attributes.get("POSITION")) for primitive in mesh.primitives]
+        indices = [
+            None if primitive.indices is None else self._count(primitive.indices) for primitive in mesh.primitives
+        ]
+        used = (own if own is not None else other for own, other in zip(indices, corners, strict=True))
+        return _Size(len(corners), sum(corners), sum(count // 3 for count in used))
+
+    def _count(self, accessor: int | None) -> int:
+        if accessor is None or accessor >= len(self.document.accessors):
+            return 0  # the reader refuses it by name
+        return self.document.accessors[accessor].count
+
+    def parts(self, mesh: int, T_scene_mesh: Floats) -> list[RawMesh]:
+        """The primitives of a mesh at one place."""
+        mirrored = np.linalg.det(T_scene_mesh[:3, :3]) < 0.0  # section 3.7.4: then the winding turns
+        parts = []
+        for number, primitive in enumerate(self.document.meshes[mesh].primitives):
+            raw = self._primitive(primitive, f"{self.where}, mesh {mesh}, primitive {number}")
+            vertices = raw.vertices @ T_scene_mesh[:3, :3].T + T_scene_mesh[:3, 3]
+            parts.append(RawMesh(vertices, raw.faces[:, ::-1] if mirrored else raw.faces))
+        return parts
+
+    def _primitive(self, primitive: Primitive, where: str) -> RawMesh:
+        position = primitive.attributes.get("POSITION")
+        if primitive.mode != TRIANGLES:
+            refuse(f"primitive mode {primitive.mode}", where, f"{TRIANGLES} (separate triangles)")
+        if position is None or primitive.targets:
+            refuse("no POSITION, or morph targets", where, "a rigid mesh with POSITION")
+        accessor = self._accessor(position, where)
+        if (accessor.component_type, accessor.type) != (_FLOAT, "VEC3"):
+            refuse(f"POSITION of type {accessor.component_type} {accessor.type}", where, f"{_FLOAT} VEC3")
+        vertices = self._array(position, np.dtype("<f4"), 3, where).astype(np.float64)
+        indices = np.arange(len(vertices)) if primitive.indices is None else self._indices(primitive.indices, where)
+        if len(indices) % 3 or len(indices) > 3 * MAX_TRIANGLES:
+            refuse(f"{len(indices)} indices", where, f"three per triangle, at most {MAX_TRIANGLES} triangles")
+        if indices.max() >= len(vertices):
+            refuse(f"index {indices.max()} out of range", where, f"0 to {len(vertices) - 1}")
+        return RawMesh(vertices, indices.reshape(-1, 3))
+
+    def _indices(self, index: int, where: str) -> Ints:
+        kind = self._accessor(index, where)
+        if kind.component_type not in _INDEX_TYPES or kind.type != "SCALAR":
+            refuse(f"indices of type {kind.component_type} {kind.type}", where, f"SCALAR of {list(_INDEX_TYPES)}")
+        return self._array(index, _INDEX_TYPES[kind.component_type], 1, where).reshape(-1).astype(np.int64)
+
+    def _accessor(self, index: int, where: str) -> Accessor:
+        if index >= len(self.document.accessors):
+            refuse(f"accessor {index} of {len(self.document.accessors)}", where, "an accessor of the file")
+        return self.document.accessors[index]
+
+    def _array(self, index: int, dtype: np.dtype[Any], width: int, where: str) -> NDArray[Any]:
+        """The numbers of an accessor, shape (count, width)."""
+        accessor, views = self._accessor(index, where), self.document.buffer_views
+        if accessor.buffer_view is None or accessor.sparse is not None or accessor.normalized:
+            refuse(f"accessor {index} is sparse, normalized or without data", where, "plain data in a buffer view")
+        if accessor.buffer_view >= len(views):
+            refuse(f"accessor {index} uses bufferView {accessor.buffer_view}", where, "a view of the file")
+        view, row = views[accessor.buffer_view], dtype.itemsize * width
+        stride = view.byte_stride or row
+        needed = accessor.byte_offset + (accessor.count - 1) * stride + row
+        if needed > view.byte_length or stride < row:
+            what = f"accessor {index} takes {needed} bytes of a view of {view.byte_length}, {stride} per row"
+            refuse(what, where, "accessors inside their view")
+        start, strides = view.byte_offset + accessor.byte_offset, (stride, dtype.itemsize)
+        return np.ndarray((accessor.count, width), dtype, self.binary, offset=start, strides=strides)
+
+
+def _local(node: Node, where: str) -> Floats:
+    """T_parent_node, from its matrix (by columns) or as translation times rotation times scale."""
+    allowed = "an invertible affine transform with last row 0 0 0 1"
+    if node.matrix is not None:
+        T = np.array(node.matrix, dtype=np.float64).reshape(4, 4).T
+    else:
+        if np.linalg.norm(node.rotation) == 0.0:
+            refuse("rotation quaternion of length 0", where, allowed)
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_quat(node.rotation).as_matrix() * np.array(node.scale)
+        T[:3, 3] = node.translation
+    determinant = np.linalg.det(T[:3, :3])
+    if not np.isfinite(determinant) or determinant == 0.0 or T[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+        refuse(f"transform with determinant {determinant:.4g}, last row {T[3].tolist()}", where, allowed)
+    return T
