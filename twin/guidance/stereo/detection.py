@@ -1,7 +1,7 @@
 """What the guidance gets to see: a ball's centre in each camera, from pictures of the true room.
 
-``picture_detector`` draws a picture with the true camera and measures it with the believed one. Another `Detector` may leave
-the picture out: for studies of everything behind it.
+``picture_detector`` draws a picture with the true camera and measures it with the believed one. Another `Detector` may
+leave the picture out: for studies of everything behind it.
 """
 
 from __future__ import annotations
