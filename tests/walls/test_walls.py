@@ -4,8 +4,10 @@ import ast
 import importlib
 import subprocess
 import sys
+import tomllib
 import types
 from collections import Counter, defaultdict
+from importlib.metadata import packages_distributions
 
 import pytest
 from walls.house import NAME, ROOT, arrows, cycle, imported, is_package, modules, room_arrows, room_of, tree
@@ -183,3 +185,16 @@ def test_importing_the_planner_loads_nothing_heavy(heavy):
     """A command pays only for what it uses."""
     code = f"import sys, {NAME}, {NAME}.planning\nassert {heavy!r} not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+def test_every_runtime_part_is_imported_by_the_product():
+    """What only tests use is in the extra ``test``: nobody installs it to plan."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    tops = {name.split(".")[0] for path in modules().values() for name in imported(path)}
+    known = packages_distributions()
+    used = {part.lower().replace("_", "-") for top in tops for part in (top, *known.get(top, ()))}
+    assert {part for part in project["dependencies"] if part not in used} == DATA_ALONE
+
+
+DATA_ALONE = {"example-robot-data"}
+"""Its files are read (the arms' shapes), its code is not."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import platform
+import re
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, requires, version
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,7 @@ from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.numbers import arm_words, nearest_structure, number, percent, reason_counts
 
-PARTS = ("puncture-twin", "numpy", "python-fcl", "embreex", "ompl", "pybullet", "trimesh", "plotly")
-"""The packages whose version a result depends on."""
+PROJECT = "puncture-twin"
 
 BEST_COLUMNS = (
     "rank",
@@ -233,9 +233,18 @@ TIMES = Markup(
 
 def origin_section(seed: int) -> Markup:
     """Versions and seed, and where the times are: they differ from run to run, and the page does not."""
-    versions = [(name, _version(name)) for name in PARTS]
+    versions = [(name, _version(name)) for name in parts()]
     rows = [("seed", str(seed)), ("Python", platform.python_version()), *versions]
     return pairs(rows) + TIMES
+
+
+def parts() -> list[str]:
+    """The packages that stand behind a result: this one and what its metadata requires, extras apart."""
+    try:
+        stated = requires(PROJECT) or []
+    except PackageNotFoundError:  # run from a checkout that nobody installed
+        stated = []
+    return [PROJECT, *sorted(re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in stated if "extra ==" not in line)]
 
 
 def _version(name: str) -> str:
