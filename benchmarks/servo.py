@@ -8,11 +8,9 @@ Each row is a whole study: so many rooms drawn, calibrated from rendered picture
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import os
 import platform
 import time
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -21,6 +19,7 @@ import numpy as np
 from benchmarks.optimum_trial import OptimumTrial, optimum_trial
 from benchmarks.servo_variants import pixel_detector, varied
 from puncture_twin.meshes import folder
+from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.twin.guidance.stereo.detection import Detector, picture_detector
 from puncture_twin.twin.guidance.stereo.experiment import Statistics, run_trials, statistics
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
@@ -109,8 +108,7 @@ def optimum(case: ServoCase, seeds: int, jobs: int, detector_of: DetectorOf = pi
         print(f"  {'estimate':8s} {'ball':>14s} {'target':>14s} {'target - ball':>14s} {'after, servo':>14s}")
         for estimate in ("chain", "joint"):
             variant = varied(case, servo={"estimate": estimate, "frames": frames})
-            context = multiprocessing.get_context("spawn")
-            with ProcessPoolExecutor(jobs, mp_context=context) as pool:
+            with process_pool(jobs, seeds) as pool:
                 trials = list(pool.map(partial(optimum_trial, variant, detector_of=detector_of), range(seeds)))
             print(f"  {estimate:8s} " + " ".join(ratio(trials, name) for name in ("ball", "target", "offset", "after")))
 

@@ -1,8 +1,22 @@
-"""How many processes of this machine a piece of work may have."""
+"""Work on processes of this machine, each of which starts anew: libraries with threads do not survive a fork."""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from functools import partial
+from typing import TypeVar
+
+from puncture_twin.planning.base.progress import Count
+
+Thing = TypeVar("Thing")
+Answer = TypeVar("Answer")
+
+BATCH = 48
+"""At most so many things at a time go to a process."""
 
 
 def worker_count(wanted: int, pieces: int) -> int:
@@ -17,3 +31,54 @@ def worker_count(wanted: int, pieces: int) -> int:
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(wanted, cores, pieces))
+
+
+@contextmanager
+def process_pool(jobs: int, pieces: int) -> Iterator[ProcessPoolExecutor]:
+    """A pool of `worker_count` spawned processes; where the block ends early, as by Ctrl-C, nothing more begins.
+
+    Args:
+        jobs: What the caller asks for; any number.
+        pieces: Of the work.
+    """
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(worker_count(jobs, pieces), mp_context=context)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def ask_all(
+    ask: Callable[[Thing], Answer],
+    things: Sequence[Thing],
+    *,
+    jobs: int,
+    progress: Count,
+) -> list[Answer]:
+    """The answers in the order of the things.
+
+    Args:
+        ask: The question; with several jobs it and its answers must be such as can be pickled.
+        things: What is asked about.
+        jobs: Processes, at most one a core; 1 asks in this one.
+        progress: Called with (answered, to answer).
+    """
+    jobs = worker_count(jobs, len(things))
+    size = max(1, min(BATCH, len(things) // (4 * jobs)))
+    batches = [things[start : start + size] for start in range(0, len(things), size)]
+    answers: list[Answer] = []
+    if jobs == 1 or len(batches) < 2:
+        for batch in batches:
+            answers += _batch(ask, batch)
+            progress(len(answers), len(things))
+        return answers
+    with process_pool(jobs, len(batches)) as pool:
+        for some in pool.map(partial(_batch, ask), batches):
+            answers += some
+            progress(len(answers), len(things))
+    return answers
+
+
+def _batch(ask: Callable[[Thing], Answer], things: Sequence[Thing]) -> list[Answer]:
+    return [ask(thing) for thing in things]

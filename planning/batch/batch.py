@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
-import multiprocessing
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,10 @@ import numpy as np
 from puncture_twin.planning.base.errors import InputError, PlanningError, one_line
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.output_set import writing
-from puncture_twin.planning.base.processes import worker_count
+from puncture_twin.planning.base.processes import process_pool
+from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import inputs_document, read_inputs
-from puncture_twin.planning.search.context import Watcher, prepare
+from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.table import write_table
 
 COLUMNS = (
@@ -78,9 +78,7 @@ def _searched(
 ) -> Iterator[tuple[int, dict[str, Any]]]:
     """Each case's number and row, as they are done."""
     folders = [out / folder_name(number) for number in range(1, len(cases) + 1)]
-    context = multiprocessing.get_context("spawn")  # compiled libraries with threads do not survive a fork
-    pool = ProcessPoolExecutor(max_workers=worker_count(jobs, len(cases)), mp_context=context)
-    try:
+    with process_pool(jobs, len(cases)) as pool:
         numbers = {
             pool.submit(search_one, case, folder, arm): number
             for number, (case, folder) in enumerate(zip(cases, folders, strict=True))
@@ -89,8 +87,6 @@ def _searched(
             number, failed = numbers[future], future.exception()
             yield number, future.result() if failed is None else _failed(cases[number], folders[number].name, failed)
             watcher.count("cases", done, len(cases))
-    finally:
-        pool.shutdown(cancel_futures=True)  # after Ctrl-C nothing more begins
 
 
 def _write_rows(rows: Sequence[dict[str, Any]], path: Path) -> None:

@@ -6,7 +6,6 @@ clear of a cell is clear of its parts too, and what is true of the skin all over
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import fcl
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.provenance import differing_input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.certify.certificate import Certificate
@@ -23,8 +23,6 @@ from puncture_twin.planning.certify.plain_skin import PlainSkin, SkinFacts, leav
 from puncture_twin.planning.certify.question import question_of
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.reach.standoff import waiting_flange
-
-Progress = Callable[[int, int], None]
 
 CLEARANCE_PAD_MM = 1e-4
 """Within this of a margin the search leaves the verdict to FCL's capsule; the certifier keeps twice as much."""
@@ -94,7 +92,7 @@ class _Known:
     leaves: bool | None = None
 
 
-def verify(certificate: Certificate, case: Case, anatomy: Anatomy, progress: Progress | None = None) -> Verification:
+def verify(certificate: Certificate, case: Case, anatomy: Anatomy, progress: Count | None = None) -> Verification:
     """Prove every cell of a certificate again.
 
     Args:
@@ -141,7 +139,7 @@ class _Checker:
         self._length = np.repeat(self._question.lengths, np.diff(self._first))
         self._inside = [side_of(mesh, case.target_ct) is Side.INSIDE for mesh in meshes]
 
-    def run(self, progress: Progress | None) -> Verification:
+    def run(self, progress: Count | None) -> Verification:
         """Walk the tree, level by level; the leaves come in the certificate's order."""
         question = self._question
         nothing = _Known(np.arange(len(self._skin.corners)), np.arange(len(self._organs)))

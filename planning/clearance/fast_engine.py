@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.direction_tiles import Tiles, bundle
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
@@ -19,8 +20,6 @@ from puncture_twin.planning.clearance.kernels.nearest_triangle import nearest_tr
 from puncture_twin.planning.clearance.kernels.scratch import Found, scratch_for
 from puncture_twin.planning.clearance.kernels.tile_search import COUNTED, search_tiles
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-Progress = Callable[[int, int], None]
 
 COORDINATE_SLACK = 1e-6
 """Share of a coordinate by which float32 arithmetic of a few terms may err: 8 times its rounding."""
@@ -56,7 +55,7 @@ class FastEngine:
         counts: Shape (7,), what all searches so far went through, see `tile_search.COUNTED`.
     """
 
-    def __init__(self, meshes: Sequence[TriangleMesh], progress: Progress | None = None) -> None:
+    def __init__(self, meshes: Sequence[TriangleMesh], progress: Count | None = None) -> None:
         self._meshes = tuple(meshes)
         self._blocks = tuple(pack(mesh) for mesh in self._meshes)
         self._judges: dict[int, FclEngine] = {}

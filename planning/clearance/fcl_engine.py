@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import fcl
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.geometry.crossings import first_crossing
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import frame_about
-
-Progress = Callable[[int, int], None]
 
 _SEGMENT_FACE = np.array([[0, 1, 1]])
 """A triangle with two corners at the needle's top is the axis itself: FCL's triangle distance is exact for it."""
@@ -30,7 +29,7 @@ class FclEngine:
         progress: Called with (directions done, directions in all).
     """
 
-    def __init__(self, meshes: Sequence[TriangleMesh], progress: Progress | None = None) -> None:
+    def __init__(self, meshes: Sequence[TriangleMesh], progress: Count | None = None) -> None:
         self._meshes = tuple(meshes)
         self._objects = tuple(fcl.CollisionObject(_tree(mesh.vertices, mesh.faces)) for mesh in self._meshes)
         self._progress = progress

@@ -11,6 +11,8 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.base.processes import ask_all
+from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import Case, mount_pose
 from puncture_twin.planning.case.case_file import MountSection
 from puncture_twin.planning.collision.workcell import (
@@ -30,7 +32,6 @@ from puncture_twin.planning.place.mount_lines import mount_section
 from puncture_twin.planning.place.mounts import Site, regions
 from puncture_twin.planning.place.needle_start import needle_can_start
 from puncture_twin.planning.place.obstacle_field import Boxes, SkinField
-from puncture_twin.planning.place.workers import ask_all
 from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.candidates import Candidates
 
@@ -157,7 +158,7 @@ def _judged(
     finalists: Sequence[tuple[Site, ReachEstimate]],
     placement: Placement | None,
     jobs: int,
-    progress: Callable[[int, int], None],
+    progress: Count,
 ) -> tuple[tuple[RatedPlacement, ...], RatedPlacement | None]:
     """The finalists as they would be written, best first, and the case's own placement."""
     mounts = [mount_section(T_ct_bed @ site.T_bed_base(), case.space) for site, _ in finalists]
@@ -199,7 +200,7 @@ class _Refiner:
     until the one that leads has been asked.
     """
 
-    def __init__(self, estimator: Estimator, progress: Callable[[int, int], None]) -> None:
+    def __init__(self, estimator: Estimator, progress: Count) -> None:
         self._quick = replace(estimator, itself=False)
         self._full = replace(estimator, itself=True)
         self._progress = progress

@@ -6,7 +6,7 @@ Retraction is the same motion backwards, so what may be driven in may be driven 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +27,7 @@ from puncture_twin.planning.arm.insertion import (
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.checker import Contact, StateChecker
 from puncture_twin.planning.reach.answer import ReachAnswer, ReachRequest
@@ -114,7 +115,7 @@ def every_reach(
 def assess_reach_all(
     checker: StateChecker,
     requests: Sequence[ReachRequest],
-    progress: Callable[[int, int], None] | None = None,
+    progress: Count | None = None,
     *,
     n_rolls: int = 8,
     step_mm: float = MAX_SWEEP_MM,

@@ -1,6 +1,6 @@
 from .candidates import ARM_CHECKED as ARM_CHECKED, Candidates as Candidates
 from .constraints import longest_path as longest_path
-from .context import CaseContext as CaseContext, Watcher as Watcher, prepare as prepare
+from .context import CaseContext as CaseContext, prepare as prepare
 from .explain import (
     Explanation as Explanation,
     finite as finite,

@@ -8,13 +8,14 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, load_anatomy
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.progress import Silent, Watcher
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.base.stages import Stages
 from puncture_twin.planning.case.case import Case, load_case
@@ -35,35 +36,6 @@ ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast"
 
 NO_BASE = "the case does not say where the robot's base is"
 ALLOWED_BASE = "[registration] with markers_ct and markers_base, or [robot.mount]; or a check without the arm"
-
-
-class Watcher(Protocol):
-    """Whoever shows progress."""
-
-    def step(self, stage: str, what: str) -> None:
-        """A stage has come to a named thing."""
-        ...
-
-    def count(self, stage: str, done: int, total: int) -> None:
-        """A stage has done so many of so many."""
-        ...
-
-    def note(self, line: str) -> None:
-        """Something happened that whoever watches should know."""
-        ...
-
-
-class Silent:
-    """Shows nothing."""
-
-    def step(self, stage: str, what: str) -> None:
-        """Nothing."""
-
-    def count(self, stage: str, done: int, total: int) -> None:
-        """Nothing."""
-
-    def note(self, line: str) -> None:
-        """Nothing."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -11,6 +10,7 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import Directions, direction, grid
@@ -31,8 +31,6 @@ from puncture_twin.planning.search.candidates import (
 from puncture_twin.planning.search.constraints import judge
 from puncture_twin.planning.search.ranking import rank
 from puncture_twin.planning.search.tissue import tissue_crossed
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +59,7 @@ def search(
     directions: Directions,
     *,
     reach: ArmReach | None = None,
-    progress: Progress | None = None,
+    progress: Count | None = None,
 ) -> Candidates:
     """Judge every direction against the organs, those that pass against the arm, and rank what is left.
 
@@ -122,7 +120,7 @@ def reach_request(case: Case, candidates: Candidates, row: int, T_base_ct: Float
     )
 
 
-def with_reach(case: Case, found: Candidates, reach: ArmReach, progress: Progress | None = None) -> Candidates:
+def with_reach(case: Case, found: Candidates, reach: ArmReach, progress: Count | None = None) -> Candidates:
     """Ask the arm for every candidate that the organs allow."""
     rows = np.flatnonzero(found.safe)
     requests = [reach_request(case, found, int(row), reach.T_base_ct) for row in rows]

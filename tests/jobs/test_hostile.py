@@ -12,8 +12,7 @@ from hostile.makers import MAKERS
 from places import TESTS
 
 from puncture_twin.planning.base.output.manifest import problems
-from puncture_twin.planning.base.processes import worker_count
-from puncture_twin.planning.place.workers import ask_all
+from puncture_twin.planning.base.processes import ask_all, worker_count
 
 HERE = TESTS
 CASES = tomllib.loads((HERE / "hostile" / "cases.toml").read_text())["case"]

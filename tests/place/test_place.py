@@ -18,6 +18,7 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.processes import ask_all
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.case.case import load_case, mount_pose
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
@@ -38,7 +39,6 @@ from puncture_twin.planning.place.mounts import Region, Site, regions
 from puncture_twin.planning.place.needle_start import needle_can_start
 from puncture_twin.planning.place.obstacle_field import Boxes, SkinField
 from puncture_twin.planning.place.search import search_placements
-from puncture_twin.planning.place.workers import ask_all
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.search import ArmReach, case_directions, organ_candidates, with_reach

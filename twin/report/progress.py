@@ -21,7 +21,7 @@ def progress_display(stream: TextIO | None = None) -> BarDisplay | LineDisplay:
 
 
 class LineDisplay:
-    """A `puncture_twin.planning.search.context.Watcher` that writes a line every few seconds."""
+    """A `puncture_twin.planning.base.progress.Watcher` that writes a line every few seconds."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -59,7 +59,7 @@ class LineDisplay:
 
 
 class BarDisplay:
-    """A `planning.search.context.Watcher` that draws bars with rate and remaining time; they vanish at the end."""
+    """A `puncture_twin.planning.base.progress.Watcher` that draws bars with rate and remaining time."""
 
     def __init__(self, stream: TextIO) -> None:
         self._bars = Progress(

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.base.processes import worker_count
+from puncture_twin.planning.base.processes import process_pool
+from puncture_twin.planning.base.progress import Count, uncounted
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import ServoStop
@@ -110,9 +109,7 @@ def run_trial(case: ServoCase, seed: int, empty: StateChecker | None = None) -> 
         return ServoTrial(seed, (), (), float("nan"), float("nan"), (), str(error))
 
 
-def run_trials(
-    case: ServoCase, seeds: Sequence[int], *, jobs: int = 1, done: Callable[[int, int], None] | None = None
-) -> list[ServoTrial]:
+def run_trials(case: ServoCase, seeds: Sequence[int], *, jobs: int = 1, done: Count | None = None) -> list[ServoTrial]:
     """Every seed, in the order given.
 
     Args:
@@ -121,7 +118,7 @@ def run_trials(
         jobs: Processes, at most one a core.
         done: Told how many of how many are done.
     """
-    tell = done or (lambda at, of: None)
+    tell = done or uncounted
     found: list[ServoTrial] = []
     if jobs == 1:
         empty = workcell_checker(case, None)
@@ -130,8 +127,7 @@ def run_trials(
             tell(len(found), len(seeds))
         return found
     shares = [seeds[i : i + SHARE] for i in range(0, len(seeds), SHARE)]
-    context = multiprocessing.get_context("spawn")  # compiled libraries with threads do not survive a fork
-    with ProcessPoolExecutor(max_workers=worker_count(jobs, len(shares)), mp_context=context) as pool:
+    with process_pool(jobs, len(shares)) as pool:
         for share in pool.map(partial(run_trials, case), shares):
             found += share
             tell(len(found), len(seeds))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.base.progress import Count, uncounted
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.pose_choice import choose_poses
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, drawing
@@ -89,7 +89,7 @@ def acquire(
     candidates: CandidatePoses,
     truth: WorkcellTruth,
     rng: np.random.Generator,
-    count: Callable[[int, int], None] = lambda done, total: None,
+    count: Count = uncounted,
 ) -> Acquisition:
     """Record as many poses as the case asks for, choosing others for those in which the needle is not found.
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from puncture_twin.planning.base.errors import PlanningError
 from puncture_twin.planning.base.output.output_set import Draft, withdraw, writing
-from puncture_twin.planning.search.context import Watcher
+from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import FILE_NAME
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
 from puncture_twin.twin.jobs.selfcal.page import write_page

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.base.progress import Count
 from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, Statistics
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.session import Session
@@ -33,7 +34,7 @@ def run_servo(
     path: Path,
     out_dir: Path,
     seeds: int,
-    done: Callable[[int, int], None] | None = None,
+    done: Count | None = None,
     note: Callable[[str], None] | None = None,
 ) -> ServoJob:
     """Hold the sessions of a case and write pictures, plot and page.

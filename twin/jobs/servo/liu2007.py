@@ -9,13 +9,14 @@ triangle's inequality no target of the table can have less than |after - mapping
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from puncture_twin.meshes import folder
+from puncture_twin.planning.base.progress import Count
 from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, Statistics, run_trials, statistics, trial
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.session import Session, run_session
@@ -120,7 +121,7 @@ def paper_case() -> ServoCase:
     return load_servo_case(folder() / "head" / CASE)
 
 
-def reproduce(seeds: int | None = None, done: Callable[[int, int], None] | None = None) -> Liu2007Tables:
+def reproduce(seeds: int | None = None, done: Count | None = None) -> Liu2007Tables:
     """Hold the paper's sessions in the twin.
 
     Args:
@@ -130,7 +131,7 @@ def reproduce(seeds: int | None = None, done: Callable[[int, int], None] | None 
     return held_sessions(paper_case(), seeds or DEFAULT_SEEDS, done)
 
 
-def held_sessions(case: ServoCase, seeds: int, done: Callable[[int, int], None] | None = None) -> Liu2007Tables:
+def held_sessions(case: ServoCase, seeds: int, done: Count | None = None) -> Liu2007Tables:
     """The sessions of a case beside the paper's numbers."""
     first = run_session(case, case.file.seed)
     tell = done or (lambda at, of: None)

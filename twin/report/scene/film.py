@@ -6,7 +6,7 @@ where the arm is, and blends only what changed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from PIL import Image
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report.numbers import demanding
 from puncture_twin.twin.report.raster.camera import ViewCamera
@@ -91,7 +92,7 @@ def draw_film(
     case: Any,
     anatomy: Any,
     path: Path,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Count | None = None,
 ) -> Path:
     """Write the film; a GIF beside it when no H.264 encoder can be started.
 
@@ -124,7 +125,7 @@ def _frames(
     case: Any,
     anatomy: Any,
     times: FilmTimes,
-    progress: Callable[[int, int], None] | None,
+    progress: Count | None,
 ) -> Iterator[NDArray[np.uint8]]:
     T_base_ct = rehearsal.T_base_ct_true
     arm = ArmPicture(plan.model, T_base_ct)
