@@ -23,7 +23,7 @@ from puncture_twin.planning.export.csv_times import csv_text
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import write_plan
-from puncture_twin.planning.reach.reach import ReachRequest, assess_reach
+from puncture_twin.planning.reach.reach import ReachRequest, assess_reach_all
 from puncture_twin.planning.registration.placement import load_placement
 
 MARKERS = "name,x_mm,y_mm,z_mm\nA,0,0,80\nB,50,0,75\nC,0,60,70\nD,-40,-30,72\n"
@@ -212,7 +212,9 @@ def straight_plan():
     for tilt in np.linspace(-0.6, 0.6, 13):
         outward_ct = np.array([-np.sin(abs(tilt)), -np.cos(tilt), 0.0])
         outward_ct /= np.linalg.norm(outward_ct)
-        answer = assess_reach(checker, ReachRequest(target, T[:3, :3] @ outward_ct, case.needle.length_mm, STANDOFF_MM))
+        answer = assess_reach_all(
+            checker, [ReachRequest(target, T[:3, :3] @ outward_ct, case.needle.length_mm, STANDOFF_MM)]
+        )[0]
         if answer.reachable:
             break
     q, depth = answer.insertion_q, np.asarray(answer.insertion_depth_mm)
