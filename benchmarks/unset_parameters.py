@@ -65,7 +65,7 @@ def main() -> None:
     for path, tree in trees():
         classes = {id(one): node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef) for one in node.body}
         for node in ast.walk(tree):
-            if not isinstance(node, ast.FunctionDef) or node.decorator_list and path.name == "run_twin.py":
+            if not isinstance(node, ast.FunctionDef) or (node.decorator_list and path.name == "run_twin.py"):
                 continue
             name = classes.get(id(node), node.name) if node.name == "__init__" else node.name
             for place, parameter in defaults(node):

@@ -153,13 +153,12 @@ def skin_from_ct(volume: Volume, *, max_deviation_mm: float | None = None) -> Sk
     return _skin(np.where(found.body, inside, outside), found, oriented, volume.path, max_deviation_mm)
 
 
-def skin_from_label(labelmap: LabelMap, label: int, *, max_deviation_mm: float | None = None) -> Skin:
+def skin_from_label(labelmap: LabelMap, label: int) -> Skin:
     """The outer surface of one label, holes filled in each axial slice (a label may be a shell of skin only).
 
     Args:
         labelmap: The map.
         label: Its body or skin label.
-        max_deviation_mm: As in ``skin_from_ct``.
 
     Raises:
         InputError: If no voxel has this label, or every voxel is inside.
@@ -173,7 +172,7 @@ def skin_from_label(labelmap: LabelMap, label: int, *, max_deviation_mm: float |
     if body.all():
         raise InputError("no air around the body", where=where, allowed="a label with a border inside the image")
     found = BodyMask(body, np.zeros_like(body), ())
-    return _skin(np.where(body, 0.5, -0.5), found, oriented, where, max_deviation_mm)
+    return _skin(np.where(body, 0.5, -0.5), found, oriented, where, None)
 
 
 def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:

@@ -67,9 +67,9 @@ def flange_poses(
     return T
 
 
-def away_from_singularities(model: UrModel, q: Floats, at_least: float = MIN_SINGULARITY) -> NDArray[np.bool_]:
+def away_from_singularities(model: UrModel, q: Floats) -> NDArray[np.bool_]:
     """Whether configurations (..., 6) keep their distance from every singularity; NaN does not. Shape (...)."""
-    return np.asarray(singularity(model, q).least() > at_least)
+    return np.asarray(singularity(model, q).least() > MIN_SINGULARITY)
 
 
 def first_stop(model: UrModel, path: Floats, depths_mm: Floats) -> InsertionStop | None:

@@ -33,25 +33,24 @@ SAMPLES = 400
 """Along a segment, to find where the tip comes within the radius."""
 
 
-def blend_radii_mm(checker: StateChecker, waypoints: Floats, largest_mm: float = LARGEST_BLEND_MM) -> Floats:
+def blend_radii_mm(checker: StateChecker, waypoints: Floats) -> Floats:
     """A radius for each waypoint between the ends; 0 where no corner may be cut.
 
     Args:
         checker: Judges contacts in the plan's own scene; its tool has the needle whose tip is the TCP.
         waypoints: Shape (k, 6), rad.
-        largest_mm: The first radius tried.
 
     Returns:
         Shape (k - 2,), mm.
     """
     corners = range(1, len(waypoints) - 1)
-    return np.array([_radius_mm(checker, waypoints[at - 1 : at + 2], largest_mm) for at in corners])
+    return np.array([_radius_mm(checker, waypoints[at - 1 : at + 2]) for at in corners])
 
 
-def _radius_mm(checker: StateChecker, waypoints: Floats, largest_mm: float) -> float:
+def _radius_mm(checker: StateChecker, waypoints: Floats) -> float:
     """The largest radius tried that is free, of the corner between three waypoints (3, 6)."""
     before, corner, after = waypoints
-    radius = largest_mm
+    radius = LARGEST_BLEND_MM
     while radius >= SMALLEST_BLEND_MM:
         starts, ends = (_fraction_within(checker, corner, other, radius) for other in (before, after))
         if max(starts, ends) <= LARGEST_FRACTION and _free(

@@ -126,7 +126,6 @@ def plan_approach(
     *,
     seed: int,
     max_samples: int = MAX_SAMPLES,
-    speed_scale: float = APPROACH_SPEED,
 ) -> Approach:
     """Plan from home to the goal that the shortest way found leads to.
 
@@ -136,7 +135,6 @@ def plan_approach(
         q_goals: Shape (6,) or (g, 6), rad, within the joint limits.
         seed: Of OMPL's generator. Same seed, same motion.
         max_samples: Of the planner, in each of its runs.
-        speed_scale: Share of the joints' speed limits to use.
 
     Raises:
         InputError: If home or a goal is not six finite angles within the limits, or the scale makes no sense.
@@ -154,7 +152,7 @@ def plan_approach(
             raise NoAnswerError(_why_none(way, len(goals), len(open_goals), seed) + refused)
         cuts = _cuts(judge, way.waypoints)
         for rounding in (cuts, np.zeros_like(cuts)) if cuts.any() else (cuts,):
-            trajectory = follow(checker.model, way.waypoints, rounding, speed_scale=speed_scale)
+            trajectory = follow(checker.model, way.waypoints, rounding, speed_scale=APPROACH_SPEED)
             checked = dense_states(checker, trajectory.q, RESOLUTION_RAD / FINER)
             contact = first_contact(checker, checked)
             if contact is None:

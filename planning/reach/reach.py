@@ -51,6 +51,9 @@ SAME_LENGTH_MM = 1e-6
 MARGIN_DIGITS = 9
 """Margins that agree to this many digits are equal, so that rounding does not choose between mirrored branches."""
 
+ROLLS = 8
+"""Rolls about the needle that are tried, evenly over the turn."""
+
 CHUNK = 64
 """Requests between two reports of progress."""
 
@@ -90,16 +93,12 @@ class _Tried(NamedTuple):
     block: _Blocked | None
 
 
-def every_reach(
-    checker: StateChecker, request: ReachRequest, *, n_rolls: int = 8, step_mm: float = MAX_SWEEP_MM
-) -> list[ReachAnswer]:
+def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswer]:
     """Every roll and branch that holds the standoff pose and drives straight in, untouched; the best margin first.
 
     Args:
         checker: Judges contacts, in the base frame.
         request: The direction.
-        n_rolls: See :func:`assess_reach_all`.
-        step_mm: See :func:`assess_reach_all`.
 
     Returns:
         Empty where there is none.
@@ -107,7 +106,7 @@ def every_reach(
     Raises:
         InputError: See :func:`assess_reach_all`.
     """
-    surveyed = next(_surveyed(checker, [request], n_rolls, step_mm))
+    surveyed = next(_surveyed(checker, [request], ROLLS))
     tries = ((drive, _try(checker, request, drive, surveyed.depths)) for drive in surveyed.drives())
     return [_success(checker.model, drive, tried) for drive, tried in tries if tried.block is None]
 
@@ -117,8 +116,7 @@ def assess_reach_all(
     requests: Sequence[ReachRequest],
     progress: Count | None = None,
     *,
-    n_rolls: int = 8,
-    step_mm: float = MAX_SWEEP_MM,
+    n_rolls: int = ROLLS,
 ) -> list[ReachAnswer]:
     """Find, for each direction, a roll and a branch that hold the standoff pose and drive straight in, untouched.
 
@@ -130,14 +128,13 @@ def assess_reach_all(
         requests: The directions.
         progress: Called with (answered, to answer).
         n_rolls: How many rolls, evenly over the turn.
-        step_mm: Spacing of the insertion's samples; finer where a body would move farther than ``MAX_SWEEP_MM``.
 
     Raises:
         InputError: If a request's needle is not the checker's, or a number makes no sense.
     """
     answers: list[ReachAnswer] = []
     for start in range(0, len(requests), CHUNK):
-        answers += _answers(checker, requests[start : start + CHUNK], n_rolls, step_mm)
+        answers += _answers(checker, requests[start : start + CHUNK], n_rolls)
         if progress is not None:
             progress(len(answers), len(requests))
     return answers
@@ -159,16 +156,14 @@ class _Surveyed(NamedTuple):
         return _drives(self.line, self.margins, self.turns, self.rolls)
 
 
-def _surveyed(
-    checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int, step_mm: float
-) -> Iterator[_Surveyed]:
+def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> Iterator[_Surveyed]:
     for request in requests:
         if abs(request.needle_length_mm - checker.tool.needle_length_mm) > SAME_LENGTH_MM:
             allowed = f"the tool's {checker.tool.needle_length_mm}"
             raise InputError(f"needle_length_mm = {request.needle_length_mm}", where="reach request", allowed=allowed)
-    if n_rolls < 1 or not step_mm > 0.0:
-        raise InputError(f"n_rolls = {n_rolls}, step_mm = {step_mm}", where="reach", allowed="both above 0")
-    depths = [_depths(request, step_mm) for request in requests]
+    if n_rolls < 1:
+        raise InputError(f"n_rolls = {n_rolls}", where="reach", allowed="above 0")
+    depths = [_depths(request) for request in requests]
     rolls = 2.0 * math.pi * np.arange(n_rolls) / n_rolls
     targets = np.array([request.target_base for request in requests])
     outwards = np.array([request.outward_base for request in requests])
@@ -179,11 +174,9 @@ def _surveyed(
         yield _Surveyed(request, line, depth, rolls, stop_at, margins, turns)
 
 
-def _answers(
-    checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int, step_mm: float
-) -> list[ReachAnswer]:
+def _answers(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[ReachAnswer]:
     answers = []
-    for found in _surveyed(checker, requests, n_rolls, step_mm):
+    for found in _surveyed(checker, requests, n_rolls):
         if not np.isnan(found.margins).all():
             answers.append(_first_clear(checker, found.request, found.depths, found.drives()))
         else:
@@ -208,8 +201,8 @@ def _why_none(
     return _refusal(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail)
 
 
-def _depths(request: ReachRequest, step_mm: float) -> Floats:
-    return np.linspace(0.0, request.standoff_mm, math.ceil(request.standoff_mm / step_mm) + 1)
+def _depths(request: ReachRequest) -> Floats:
+    return np.linspace(0.0, request.standoff_mm, math.ceil(request.standoff_mm / MAX_SWEEP_MM) + 1)
 
 
 def _distances(request: ReachRequest, depths_mm: Floats) -> Floats:

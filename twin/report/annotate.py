@@ -50,9 +50,9 @@ def write(
     draw.text(at, words, fill=colour, font=font(size, bold), anchor=anchor, stroke_width=halo, stroke_fill=WHITE)
 
 
-def width_of(words: str, size: int, bold: bool = False) -> float:
+def width_of(words: str, size: int) -> float:
     """Width of a line of text in pixels."""
-    return float(font(size, bold).getlength(words))
+    return float(font(size).getlength(words))
 
 
 def body_axes(

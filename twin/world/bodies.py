@@ -69,11 +69,11 @@ def load_surface(
     return int(body)
 
 
-def load_box(client: int, size_mm: Floats, T_world_box: Floats, rgba: Rgba = BOX_RGBA) -> int:
+def load_box(client: int, size_mm: Floats, T_world_box: Floats) -> int:
     """A box that does not move; size (3,) along its axes, its pose at its centre. Returns the body id."""
     half = to_m(size_mm / 2).tolist()
     collision = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=client)
-    visual = pybullet.createVisualShape(pybullet.GEOM_BOX, halfExtents=half, rgbaColor=rgba, physicsClientId=client)
+    visual = pybullet.createVisualShape(pybullet.GEOM_BOX, halfExtents=half, rgbaColor=BOX_RGBA, physicsClientId=client)
     position, quaternion = pose_to_m(T_world_box)
     return int(pybullet.createMultiBody(0.0, collision, visual, position, quaternion, physicsClientId=client))
 

@@ -21,14 +21,13 @@ STANDARD_GRAVITY_MM_S2 = 9806.65
 
 
 @contextmanager
-def physics_client(down: NDArray[np.float64] | None = None, time_step_s: float = TIME_STEP_S) -> Iterator[int]:
+def physics_client(down: NDArray[np.float64] | None = None) -> Iterator[int]:
     """Open a DIRECT client (no window), yield its id, and disconnect it whatever happens.
 
     Bodies, contacts and solver run in a fixed order, so the same calls give the same numbers.
 
     Args:
         down: Shape (3,), unit vector of gravity in the world frame; None for -z.
-        time_step_s: Length of one physics step.
 
     Raises:
         ConnectionError: PyBullet has no client left.
@@ -38,7 +37,7 @@ def physics_client(down: NDArray[np.float64] | None = None, time_step_s: float =
         raise ConnectionError("PyBullet gave no client: all of its connections are in use")
     try:
         pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=time_step_s,
+            fixedTimeStep=TIME_STEP_S,
             numSolverIterations=SOLVER_ITERATIONS,
             deterministicOverlappingPairs=1,
             enableFileCaching=0,

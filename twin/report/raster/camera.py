@@ -68,9 +68,11 @@ class ViewCamera:
         return np.asarray(rays / np.sqrt(1 + x * x + y * y)[:, None], dtype=np.float32)
 
 
-def camera_around(
-    points_ct: Floats, toward: Floats, up: Floats, *, fov: float, width: int, height: int, spare: float = 1.05
-) -> ViewCamera:
+SPARE = 1.05
+"""How much wider than what must be seen a picture is."""
+
+
+def camera_around(points_ct: Floats, toward: Floats, up: Floats, *, fov: float, width: int, height: int) -> ViewCamera:
     """A camera that looks along ``toward`` and has every point in the picture.
 
     Args:
@@ -80,7 +82,6 @@ def camera_around(
         fov: Vertical opening, rad.
         width: Pixels.
         height: Pixels.
-        spare: How much wider than the points the picture is.
     """
     points = np.asarray(points_ct, dtype=float)
     toward = np.asarray(toward, dtype=float) / np.linalg.norm(toward)
@@ -88,7 +89,7 @@ def camera_around(
     axes = ViewCamera(centre - toward, centre, up, fov, width, height).axes
     for _ in range(3):  # centring shifts the perspective a little; three rounds leave less than a pixel
         local = (points - centre) @ axes.T
-        slope = np.tan(fov / 2) / spare * np.array([width / height, 1.0])
+        slope = np.tan(fov / 2) / SPARE * np.array([width / height, 1.0])
         distance = float(np.max(np.abs(local[:, :2]) / slope - local[:, 2:]))
         seen = local[:, :2] / (local[:, 2:] + distance)
         middle = (seen.min(axis=0) + seen.max(axis=0)) / 2 * distance

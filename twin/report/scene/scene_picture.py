@@ -216,14 +216,17 @@ def _path_words(candidates: Candidates, plan: Any | None, row: int | None) -> st
     return words + ("" if plan is not None else "  (no plan: the arm is not shown)")
 
 
-def families(names: list[tuple[str, Rgb]], most: int = 26) -> list[tuple[str, Rgb]]:
+MOST_ENTRIES = 26
+"""Up to so many entries of the legend nothing is folded."""
+
+
+def families(names: list[tuple[str, Rgb]]) -> list[tuple[str, Rgb]]:
     """Legend entries, with numbered families (ribs, vertebrae) folded into one when there are many.
 
     Args:
         names: Name and colour of each structure.
-        most: Up to so many entries nothing is folded.
     """
-    if len(names) <= most:
+    if len(names) <= MOST_ENTRIES:
         return names
     folded: dict[tuple[str, Rgb], int] = {}
     for name, colour in names:

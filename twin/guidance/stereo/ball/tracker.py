@@ -102,7 +102,6 @@ def find_ball(
     radius_mm: float,
     *,
     search_px: float,
-    settings: TrackerSettings = DEFAULT,
     hough_only: bool = False,
 ) -> DetectedBall | LostBall:
     """Find and measure the ball.
@@ -113,7 +112,6 @@ def find_ball(
         predicted_c: Shape (3,), mm: the ball's centre by the robot's kinematics. Its depth predicts the radius.
         radius_mm: The ball's.
         search_px: How far from the prediction the centre may be.
-        settings: What to believe.
         hough_only: The paper's way: the centre of the best circle that Hough finds, neither measured nor gated.
     """
     picture = image if isinstance(image, Picture) else Picture(image)
@@ -125,7 +123,7 @@ def find_ball(
     if min(part.grey.shape) < 2 * radius:
         return LostBall("not_in_view")
     grey = grey_part(part.grey, np.array(part.offset, dtype=np.float64))
-    if _contrast(part.grey) < _threshold(grey, settings):
+    if _contrast(part.grey) < _threshold(grey, DEFAULT):
         return LostBall("low_contrast")
     found = find_circles(part.grey, radius)
     centers = found.centers + part.offset
@@ -135,7 +133,7 @@ def find_ball(
     if hough_only:
         best = int(np.flatnonzero(near)[0])
         return DetectedBall(centers[best], HOUGH_SIGMA_PX**2 * np.eye(2), float(found.radii[best]), 0, 0)
-    return _best(grey, camera, FoundCircle(centers[near], found.radii[near]), radius, settings)
+    return _best(grey, camera, FoundCircle(centers[near], found.radii[near]), radius, DEFAULT)
 
 
 def _cut(picture: Picture, center: Floats, half: float) -> Picture:

@@ -144,13 +144,16 @@ def tangent_axes(direction: Floats) -> Floats:
     return frame_about(direction)[:, :2]
 
 
+DOWN_C = (0.0, 1.0, 0.0)
+"""What is down in a picture: y of C."""
+
+
 def looking_at(
     eye_c: Floats,
     target_c: Floats,
     size: tuple[int, int],
     focal_px: float,
     *,
-    down_c: Floats | Sequence[float] = (0.0, 1.0, 0.0),
     distortion: Floats | Sequence[float] = (0.0, 0.0, 0.0, 0.0),
 ) -> Camera:
     """A camera at a place in C that has a point in the middle of its picture.
@@ -160,12 +163,11 @@ def looking_at(
         target_c: Shape (3,), mm.
         size: Width and height, px.
         focal_px: Focal length, px.
-        down_c: Shape (3,): what is down in the picture.
         distortion: k1, k2, p1, p2.
     """
     z = np.asarray(target_c, dtype=np.float64) - eye_c
     z = z / np.linalg.norm(z)
-    R = np.ascontiguousarray(frame_along(z, np.asarray(down_c, dtype=np.float64)).T)
+    R = np.ascontiguousarray(frame_along(z, np.array(DOWN_C)).T)
     T = pose(R, -R @ np.asarray(eye_c, dtype=np.float64))
     width, height = size
     middle = (width - 1) / 2, (height - 1) / 2
