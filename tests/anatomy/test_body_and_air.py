@@ -1,5 +1,7 @@
 """What counts as body and as air: patients on a table, with arms, mattress, sheet and line, whose truth is known."""
 
+from collections import Counter
+
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
@@ -12,6 +14,7 @@ from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.certify.subdivision import certify
+from puncture_twin.planning.formats.volumes import voxels
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.twin.phantoms import supine
@@ -161,6 +164,27 @@ def test_no_safe_needle_passes_what_the_scan_shows_outside_of_the_trunk(scene, n
 
     assert hit_parts(context, found, parts, OUTER) == {}
     assert found.safe.sum() > 40
+
+
+def test_a_search_inflates_each_file_once(scene, monkeypatch, tmp_path):
+    """The CT gives the skin, what lies around it and what no label names; the map gives many labels: each one reading.
+
+    The second search finds all surfaces kept: it inflates a file only where it needs voxels, and at most once.
+    """
+    monkeypatch.setenv("PUNCTURE_TWIN_CACHE", str(tmp_path))
+    read, inflated = Counter(), voxels.inflated
+
+    def counted(content, promised, *, where):
+        read[where.name] += 1
+        return inflated(content, promised, where=where)
+
+    monkeypatch.setattr(voxels, "inflated", counted)
+    folder, _ = scene("arms")
+    for most in ({"ct.nii.gz": 1, "labels.nii.gz": 1}, {"ct.nii.gz": 1}):
+        read.clear()
+        prepare(write_case(folder, structures=SPINE + HUMERI, name="counted"), arm=False).search()
+        assert read <= Counter(most)
+    assert "labels.nii.gz" not in read
 
 
 def test_a_detached_arm_is_body(scene):

@@ -190,7 +190,7 @@ BROKEN: list[tuple[str, str, str | bytes, str]] = [
     ("markups-no-position", ".mrk.json", one_point(position=None), r"control point 1: position 'None'"),
     ("markups-two-numbers", ".mrk.json", one_point(position=[1, 2]), r"position '\[1, 2\]'"),
     ("markups-text-numbers", ".mrk.json", one_point(position=["1", 2, 3]), r"allowed: three numbers"),
-    ("markups-nan", ".mrk.json", one_point(position=[float("nan"), 2, 3]), r"control point 1: 'nan' is not finite"),
+    ("markups-nan", ".mrk.json", one_point(position=[float("nan"), 2, 3]), r"NaN is not a finite number"),
     ("markups-point-no-object", ".mrk.json", markups(points=[3]), r"control point 1: label"),  # type: ignore[list-item]  # the fault
     ("fcsv-no-space", ".fcsv", FCSV.replace("# CoordinateSystem = LPS\n", ""), r"coordinate system 'None'"),
     ("fcsv-unknown-space", ".fcsv", FCSV.replace("LPS", "2"), r"coordinate system '2'"),

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from carton_truth import carton_field
 from hypothesis import given, settings, strategies as st
 
 from puncture_twin.meshes import folder
@@ -23,6 +22,7 @@ from puncture_twin.planning.search.ranking import pareto_front, rank
 from puncture_twin.planning.search.search import closest_miss, organ_candidates, ranked
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.planning.search.tissue import inside_length
+from tests.carton_truth import carton_field
 
 
 @pytest.fixture(scope="module")

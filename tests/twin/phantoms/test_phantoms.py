@@ -8,7 +8,6 @@ from itertools import combinations
 import numpy as np
 import pytest
 import trimesh
-from carton_truth import carton_field
 
 from puncture_twin import meshes
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -28,6 +27,7 @@ from puncture_twin.twin.phantoms.implicit import capsule, ellipsoid, smooth_max
 from puncture_twin.twin.phantoms.manifest import ply_bytes
 from puncture_twin.twin.phantoms.mesher import SamplingBox, mesh_field
 from puncture_twin.twin.phantoms.sweep import tube
+from tests.carton_truth import carton_field
 
 FOLDER = meshes.folder()
 INSIDE_THE_LIVER = ("lesion", "portal_vein", "hepatic_veins")
