@@ -16,7 +16,7 @@ from .html import Facts as Facts, card as card, escape as escape, never_raises a
 from .input_file import read_input as read_input
 from .polar_map import Sectors as Sectors, polar_map as polar_map
 from .processes import ask_all as ask_all, process_pool as process_pool, worker_count as worker_count
-from .progress import Count as Count, Silent as Silent, Watcher as Watcher, uncounted as uncounted
+from .progress import Count as Count, Silent as Silent, Stages as Stages, Watcher as Watcher, uncounted as uncounted
 from .provenance import (
     CASE_ROLE as CASE_ROLE,
     Input as Input,
@@ -34,7 +34,6 @@ from .reasons import (
     Rgb as Rgb,
     css as css,
 )
-from .stages import Stages as Stages
 from .text_names import MAX_NAME as MAX_NAME, check_name as check_name, unprintable_texts as unprintable_texts
 from .toml_file import (
     SchemaOne as SchemaOne,

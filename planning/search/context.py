@@ -15,9 +15,8 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy, load_anatomy
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.progress import Silent, Watcher
+from puncture_twin.planning.base.progress import Silent, Stages, Watcher
 from puncture_twin.planning.base.provenance import inputs_document
-from puncture_twin.planning.base.stages import Stages
 from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.clearance.cross_check import CrossChecked, cross_check
 from puncture_twin.planning.clearance.engine import ClearanceEngine

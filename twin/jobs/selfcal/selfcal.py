@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.input_file import read_input
-from puncture_twin.planning.base.progress import Watcher
+from puncture_twin.planning.base.progress import Stages, Watcher
 from puncture_twin.planning.base.provenance import Input, content_input, inputs_document
-from puncture_twin.planning.base.stages import Stages
 from puncture_twin.planning.base.whole_lines import unfinished_warnings
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, acquire, choice_noise
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, calibrate

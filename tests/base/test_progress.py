@@ -2,7 +2,7 @@
 
 import pytest
 
-from puncture_twin.planning.base.stages import Stages
+from puncture_twin.planning.base.progress import Stages
 
 
 def test_stages_are_announced_when_they_begin_and_added_up():
