@@ -21,6 +21,9 @@ from pathlib import Path
 TIMES = ("timings.json",)
 """Files that hold wall times."""
 
+REFUSED = (b"exit code 2", b"exit code 3")
+"""A command that neither side carries out compares nothing."""
+
 EMBEDDED = ("abdomen", "carton", "head", "selfcal")
 REAL = Path(__file__).parents[1] / "tests" / "real"
 
@@ -36,15 +39,16 @@ class Command:
 
 def commands(cases: Path) -> Iterator[Command]:
     """What both checkouts run, in the folder where the outputs of each one lie."""
-    for case in ("abdomen", "carton"):
-        yield Command(f"{case}-search", ("search", str(cases / case), "--out", f"{case}-search", "--certify"))
-        yield Command(f"{case}-no-arm", ("search", str(cases / case), "--no-arm", "--out", f"{case}-no-arm"))
-        yield Command(f"{case}-register", ("register", str(cases / case), "--json"))
-        yield Command(f"{case}-plan", ("plan", str(cases / case), "--out", f"{case}-plan"))
+    for case, file in (("abdomen", "abdomen/case.toml"), ("carton", "carton/case_m.toml")):
+        path = str(cases / file)
+        yield Command(f"{case}-search", ("search", path, "--out", f"{case}-search", "--certify"))
+        yield Command(f"{case}-no-arm", ("search", path, "--no-arm", "--out", f"{case}-no-arm"))
+        yield Command(f"{case}-register", ("register", path, "--json"))
+        yield Command(f"{case}-plan", ("plan", path, "--out", f"{case}-plan"))
         for form in ("urscript", "ros2", "csv"):
-            words = ("export", f"{case}-plan/plan.json", "--format", form, "--case", str(cases / case))
+            words = ("export", f"{case}-plan/plan.json", "--format", form, "--case", path)
             yield Command(f"{case}-{form}", (*words, "--out", f"{case}-{form}"))
-        yield Command(f"{case}-rehearse", ("rehearse", str(cases / case), "--out", f"{case}-rehearse"), slow=True)
+        yield Command(f"{case}-rehearse", ("rehearse", path, "--out", f"{case}-rehearse"), slow=True)
     check = ("check", str(cases / "abdomen"), "--theta", "30", "--beta", "100", "--json")
     yield Command("abdomen-check", check)
     yield Command("place", ("place", str(cases / "abdomen"), "--out", "place"), slow=True)
@@ -103,7 +107,8 @@ def run(command: Command, checkout: Path, folder: Path) -> None:
 def differences(out: Path, name: str) -> list[str]:
     """The files of one command that differ, or that one side lacks."""
     before, after = (written(out / side, name) for side in ("before", "after"))
-    lacking = [f"{file}: on one side only" for file in sorted(set(before) ^ set(after))]
+    refused = [f"{name}.stdout: refused or failed" for file in before.values() if file.startswith(REFUSED)]
+    lacking = refused + [f"{file}: on one side only" for file in sorted(set(before) ^ set(after))]
     return lacking + [f"{file}: differs" for file in sorted(set(before) & set(after)) if before[file] != after[file]]
 
 
