@@ -34,7 +34,10 @@ SIZE_VARIABLE = "PUNCTURE_TWIN_CACHE_MB"
 MOST_BYTES = 2_000_000_000
 """Where it says nothing: the surfaces of some twenty whole bodies."""
 
-LIBRARIES = ("puncture-twin", "numpy", "scipy", "scikit-image", "numba", "python-fcl", "trimesh", "fast-simplification")
+LIBRARIES = (
+    *("puncture-twin", "numpy", "scipy", "scikit-image", "numba", "python-fcl", "trimesh", "fast-simplification"),
+    "pydantic",
+)
 """Whose versions decide what is made."""
 
 
