@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.arrays import Floats
 
@@ -31,12 +30,16 @@ def skew(v: Floats) -> Floats:
 def exp_rotation(w: ArrayLike) -> Floats:
     """Rotations (..., 3, 3) of rotation vectors (..., 3), rad."""
     # Exp(ω) = I + sin φ / φ Ω + (1 - cos φ) / φ² Ω²   (Solà 2018, Eq. 69); scipy computes it by a unit quaternion
+    from scipy.spatial.transform import Rotation  # here: who only moves points does not wait for scipy
+
     return np.asarray(Rotation.from_rotvec(w).as_matrix())
 
 
 def log_rotation(R: Floats) -> Floats:
     """Rotation vectors (..., 3), rad, of rotations (..., 3, 3); their length is at most π."""
     # Log(R) = φ (R - R^T)^∨ / (2 sin φ)   (Solà 2018, Eq. 74); scipy computes it by a unit quaternion, near π too
+    from scipy.spatial.transform import Rotation
+
     return np.asarray(Rotation.from_matrix(R).as_rotvec())
 
 
