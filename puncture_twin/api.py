@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.points.point_files import NamedPoints
 
 if TYPE_CHECKING:
     from puncture_twin.planning.case.case import Case
     from puncture_twin.planning.certify.certificate import Certificate
     from puncture_twin.planning.certify.checker import Verification
+    from puncture_twin.planning.formats.points.point_files import NamedPoints
     from puncture_twin.planning.formats.volumes.volume_files import Volume
     from puncture_twin.planning.geometry.mesh import TriangleMesh
     from puncture_twin.planning.plan.plan import Plan
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
     from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
 
-Points = NamedPoints | Mapping[str, ArrayLike]
-"""Named points: read from a file, or name to (x, y, z) in mm."""
+    Points = NamedPoints | Mapping[str, ArrayLike]
+    """Named points: read from a file, or name to (x, y, z) in mm."""
 
 
 def load_case(path: Path | str) -> Case:
@@ -311,6 +311,7 @@ def _named(points: Points, where: str) -> NamedPoints:
         InputError: A point that is not three finite numbers.
     """
     from puncture_twin.planning.formats.guard import guard_points
+    from puncture_twin.planning.formats.points.point_files import NamedPoints
 
     if isinstance(points, NamedPoints):
         return points
