@@ -76,9 +76,15 @@ def check(context: CaseContext, theta_deg: float, beta_deg: float) -> Explanatio
         context: From `prepare`.
         theta_deg: Puncture angle θ, 0..180.
         beta_deg: Azimuth β, 0..360.
+
+    Raises:
+        InputError: An angle outside of its range.
     """
     from puncture_twin.planning.search.explain import Explanation
 
+    if not (0.0 <= theta_deg <= 180.0 and 0.0 <= beta_deg <= 360.0):
+        what = f"theta {theta_deg}, beta {beta_deg}"
+        raise InputError(what, where="check", allowed="theta_deg 0 to 180, beta_deg 0 to 360")
     found = context.check(float(np.radians(theta_deg)), float(np.radians(beta_deg)))
     return Explanation(context.case, context.anatomy, found)
 
@@ -121,7 +127,7 @@ def register(
     from puncture_twin.planning.registration import registration
 
     pairs = registration.match(_named(markers_ct, "register"), _named(markers_base, "register"), use=None)
-    target = np.asarray(target_ct, dtype=np.float64)
+    target = _named({"target": target_ct}, "register: target_ct").points[0]
     return registration.register(pairs, method=method, target_ct=target, fle_mm=fle_mm)
 
 

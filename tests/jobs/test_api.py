@@ -101,3 +101,18 @@ def test_files_are_read_and_written_under_the_one_name(tmp_path):
     with pytest.raises(pt.InputError, match="register_mesh|is not there|no such file"):
         pt.read_mesh(tmp_path / "none.stl")
     assert pt.check_folder(tmp_path) == ("manifest.json is missing",)
+
+
+@pytest.mark.parametrize("angles", [(400.0, 10.0), (-1.0, 0.0), (10.0, 361.0), (float("nan"), 10.0)])
+def test_check_refuses_an_angle_outside_of_its_range(context, angles):
+    """400 degrees would be explained as 40: the command line refuses it, and so does the library."""
+    with pytest.raises(pt.InputError, match="allowed: theta_deg 0 to 180, beta_deg 0 to 360"):
+        pt.check(context, *angles)
+
+
+@pytest.mark.parametrize("target", [(0, 0), (0, 0, float("nan")), "abc"])
+def test_register_refuses_a_target_that_is_no_point(target):
+    """One line that names the target, not NumPy's complaint."""
+    markers = {"a": (0, 0, 0), "b": (100, 0, 0), "c": (0, 80, 0)}
+    with pytest.raises(pt.InputError, match="target"):
+        pt.register(markers, markers, target_ct=target, fle_mm=0.5)
