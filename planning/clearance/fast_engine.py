@@ -27,9 +27,6 @@ COORDINATE_SLACK = 1e-6
 LONGEST_MM = 1e9
 """A needle that could reach the nodes that only fill a level up would be measured from them."""
 
-NEAR_THRESHOLD_MM = 1e-4
-"""Within this of a threshold FCL's capsule collision decides: its own tolerance is 1e-6 mm."""
-
 
 @dataclass(frozen=True, eq=False)
 class _Placed:
@@ -64,47 +61,20 @@ class FastEngine:
 
     def measure(self, target_ct: Floats, outward_ct: Floats, length: Floats | float) -> AxisDistances:
         """Exact distances of n axes from all k structures; see `ClearanceEngine`."""
-        return self._search(target_ct, outward_ct, length, cap=np.inf, enough=-1.0)
-
-    def measure_capped(
-        self, target_ct: Floats, outward_ct: Floats, length: float, cap: Floats | float
-    ) -> AxisDistances:
-        """Distances that are exact below a cap and given as the cap elsewhere.
-
-        Args:
-            target_ct: Shape (3,).
-            outward_ct: Shape (n, 3), unit vectors.
-            length: Of the axes, mm.
-            cap: One number or shape (k,), mm, 0 or less where a structure does not matter; a depth at the cap is void.
-        """
-        return self._search(target_ct, outward_ct, length, cap=cap, enough=-1.0)
-
-    def nearer_than(
-        self, target_ct: Floats, outward_ct: Floats, length: float, threshold: Floats | float
-    ) -> NDArray[np.bool_]:
-        """Whether axes come nearer to structures than a threshold: the verdicts alone, shape (n, k).
-
-        Within 1e-4 mm of the threshold FCL's capsule of that radius decides. Surfaces only, as everywhere here.
-
-        Args:
-            target_ct: Shape (3,).
-            outward_ct: Shape (n, 3), unit vectors.
-            length: Of the axes, mm.
-            threshold: One number or shape (k,), mm: needle radius plus margin; -inf asks nothing of a structure.
-        """
-        thresholds = np.broadcast_to(np.asarray(threshold, dtype=np.float64), len(self._meshes))
-        if np.isnan(thresholds).any():
-            raise InputError("a threshold is not a number", where="clearance", allowed="mm, or -inf to ask nothing")
-        cap, enough = thresholds + 2 * NEAR_THRESHOLD_MM, thresholds - NEAR_THRESHOLD_MM
-        distance = self._search(target_ct, outward_ct, length, cap=cap, enough=enough).distance
-        verdicts = distance < thresholds
-        for column in range(len(self._meshes)):
-            near = np.abs(distance[:, column] - thresholds[column]) < NEAR_THRESHOLD_MM
-            for row in np.flatnonzero(near):
-                verdicts[row, column] = self.collides(
-                    column, target_ct, outward_ct[row], length, float(thresholds[column])
-                )
-        return verdicts
+        target = np.ascontiguousarray(target_ct, dtype=np.float64)
+        outward = np.ascontiguousarray(outward_ct, dtype=np.float64).reshape(-1, 3)
+        shape = (len(self._meshes), len(outward))
+        lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), shape[:1])
+        sound = np.isfinite(target).all() and np.isfinite(outward).all()
+        if not (sound and np.all((lengths >= 0.0) & (lengths <= LONGEST_MM))):
+            raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
+        distance, depth = np.empty(shape), np.empty(shape)
+        tiles = bundle(outward)
+        for row, blocks in enumerate(self._blocks):
+            _one_structure(blocks, tiles, target, lengths[row], distance[row], depth[row], self.counts)
+            if self._progress is not None:
+                self._progress((row + 1) * len(outward), len(self._blocks) * len(outward))
+        return AxisDistances(distance.T, depth.T)
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
         """FCL collision of a capsule with one structure; see `ClearanceEngine`."""
@@ -112,53 +82,27 @@ class FastEngine:
             self._judges[structure] = FclEngine([self._meshes[structure]])
         return self._judges[structure].collides(0, target_ct, outward_ct, length, radius)
 
-    def _search(
-        self, target: Floats, outward: Floats, length: Floats | float, *, cap: Floats | float, enough: Floats | float
-    ) -> AxisDistances:
-        target = np.ascontiguousarray(target, dtype=np.float64)
-        outward = np.ascontiguousarray(outward, dtype=np.float64).reshape(-1, 3)
-        shape = (len(self._meshes), len(outward))
-        values = (length, cap, enough)
-        lengths, caps, enoughs = (np.broadcast_to(np.asarray(x, dtype=np.float64), shape[:1]) for x in values)
-        sound = np.isfinite(target).all() and np.isfinite(outward).all()
-        if not (sound and np.all((lengths >= 0.0) & (lengths <= LONGEST_MM))):
-            raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
-        distance, depth = np.empty(shape), np.empty(shape)
-        tiles = bundle(outward)
-        for row, blocks in enumerate(self._blocks):
-            _one_structure(
-                blocks, tiles, target, lengths[row], caps[row], enoughs[row], distance[row], depth[row], self.counts
-            )
-            if self._progress is not None:
-                self._progress((row + 1) * len(outward), len(self._blocks) * len(outward))
-        return AxisDistances(distance.T, depth.T)
-
 
 def _one_structure(
     blocks: Blocks,
     tiles: Tiles,
     target: Floats,
     length: float,
-    cap: float,
-    enough: float,
     distance: Floats,
     depth: Floats,
     counts: NDArray[np.int64],
 ) -> None:
     """Fill one structure's distances and depths, in the caller's order."""
-    if not cap > 0.0:
-        distance[:] = depth[:] = 0.0
-        return
     placed = _placed(blocks, target)
-    if placed.distance == 0.0 or placed.distance < enough:
-        distance[:], depth[:] = min(placed.distance, cap), 0.0
+    if placed.distance == 0.0:
+        distance[:] = depth[:] = 0.0
         return
     found = Found(np.empty(len(distance)), np.empty(len(distance)), counts)
     surface = (blocks.triangles, blocks.local, blocks.base)
     bundles = (tiles.outward, tiles.starts, tiles.middle, tiles.chord)
     search_tiles(
         surface, placed.nodes, placed.slack, target, float(length), placed.distance, placed.nearest,
-        float(cap), float(enough), bundles, scratch_for(len(placed.nodes)), found, LANES,
+        bundles, scratch_for(len(placed.nodes)), found, LANES,
     )  # fmt: skip
     distance[tiles.order], depth[tiles.order] = np.sqrt(found.square), found.depth
 

@@ -66,10 +66,36 @@ def measure(
             distance[:, column] = depth[:, column] = 0.0
         if structure.demands_margin:
             limit = radius + structure.margin_mm
-            violated[:, column] = distance[:, column] < limit
-            for row in np.flatnonzero(np.abs(distance[:, column] - limit) < NEAR_THRESHOLD_MM):
-                violated[row, column] = distance[row, column] < limit - ROUNDING_MM or engine.collides(
-                    column, target_ct, outward_ct[row], float(lengths[column]), limit
-                )
+            violated[:, column] = too_near(
+                engine, column, target_ct, outward_ct, float(lengths[column]), distance[:, column], limit
+            )
     distance -= radius
     return Clearances(distance, depth, violated)
+
+
+def too_near(
+    engine: ClearanceEngine,
+    structure: int,
+    target_ct: Floats,
+    outward_ct: Floats,
+    length: float,
+    distance: Floats,
+    limit: float,
+) -> NDArray[np.bool_]:
+    """Whether axes come nearer to a structure's surface than a limit, shape (n,); FCL decides what is a tie.
+
+    Args:
+        engine: Which measured the distances.
+        structure: Its place in the engine.
+        target_ct: Shape (3,).
+        outward_ct: Shape (n, 3), unit vectors.
+        length: Of the axes, mm.
+        distance: Shape (n,), of the axes from the surface, mm.
+        limit: Needle radius plus margin, mm.
+    """
+    nearer = distance < limit
+    for row in np.flatnonzero(np.abs(distance - limit) < NEAR_THRESHOLD_MM):
+        nearer[row] = distance[row] < limit - ROUNDING_MM or engine.collides(
+            structure, target_ct, outward_ct[row], length, limit
+        )
+    return nearer

@@ -1,4 +1,4 @@
-"""The fast engine against brute force and FCL: hostile meshes, targets and directions, and its three modes."""
+"""The fast engine against brute force and FCL: hostile meshes, targets and directions."""
 
 import numpy as np
 import pytest
@@ -186,25 +186,6 @@ def test_a_million_triangles(rng):
     fcl = FclEngine([TriangleMesh(vertices, faces)]).measure(np.zeros(3), directions, 60.0)
     assert len(faces) > 990_000
     np.testing.assert_allclose(found.distance, fcl.distance, atol=TIGHT_MM)
-
-
-def test_capped_is_exact_below_the_cap_and_the_cap_elsewhere(rng, ball):
-    """A cap changes no distance below it and hides those above; caps may differ by structure."""
-    engine, directions = FastEngine([ball(20, (60, 0, 0)), ball(10, (0, 40, 0))]), units(rng, 400)
-    exact = engine.measure(np.zeros(3), directions, LENGTH).distance
-    caps = np.array([12.0, 25.0])
-    capped = engine.measure_capped(np.zeros(3), directions, LENGTH, caps).distance
-    np.testing.assert_allclose(capped, np.minimum(exact, caps), atol=1e-12)
-    assert (exact < caps).any(axis=0).all() and (exact > caps).any(axis=0).all()
-
-
-def test_verdicts_are_those_of_the_distances(rng, ball):
-    """Verdicts alone equal the comparison of the distances; a threshold of -inf asks nothing."""
-    engine, directions = FastEngine([ball(20, (60, 0, 0)), ball(10, (0, 40, 0))]), units(rng, 400)
-    exact = engine.measure(np.zeros(3), directions, LENGTH).distance
-    for thresholds in ([5.0, 0.5], [-np.inf, 31.5], [45.0, 12.0]):
-        verdicts = engine.nearer_than(np.zeros(3), directions, LENGTH, np.array(thresholds))
-        np.testing.assert_array_equal(verdicts, exact < thresholds)
 
 
 def test_a_kd_order_is_a_permutation_of_compact_runs(rng):

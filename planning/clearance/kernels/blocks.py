@@ -17,7 +17,7 @@ PARALLEL = 1e-6
 """Share of its triangles' area below which a block's mean normal says nothing."""
 
 FAR_MM = 1e15
-"""Where the nodes lie that only fill a level up to whole groups: farther than any cap."""
+"""Where the nodes lie that only fill a level up to whole groups: farther than any needle is long."""
 
 
 @dataclass(frozen=True, eq=False)

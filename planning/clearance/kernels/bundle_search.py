@@ -80,9 +80,6 @@ def _most_promising(needle, groups, low, high, room, answer):  # type: ignore[no
     """Bound all found blocks for all axes; pair each axis with the block of the least bound. How many pairs."""
     waiting = 0
     for m in range(high - low):
-        if room.upper[m] < needle.enough:
-            answer.square[low + m] = room.upper[m] * room.upper[m]
-            continue
         u, best, least = direction(room.frames32, m), 0, HUGE
         for group in range(groups):
             row = m * groups + group
@@ -102,8 +99,6 @@ def _most_promising(needle, groups, low, high, room, answer):  # type: ignore[no
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _others(needle, groups, m, group, low, waiting, room, answer):  # type: ignore[no-untyped-def]  # numba infers
     """Pair an axis with the blocks of a group that may be nearer, or be met before, than what was found."""
-    if room.upper[m] < needle.enough:
-        return waiting
     bits = at_most(room.bounds, m * groups + group, room.upper[m])
     while bits != 0:
         lane = lowest(bits)

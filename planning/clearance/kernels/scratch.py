@@ -71,14 +71,12 @@ class NeedleAxes(NamedTuple):
         length: Mm.
         short: The length as float32.
         slack: Rounding of a node's coordinate, mm.
-        enough: An axis nearer than this need not be measured further, mm.
     """
 
     target: Any
     length: Any
     short: Any
     slack: Any
-    enough: Any
 
 
 def scratch_for(groups: int) -> Scratch:

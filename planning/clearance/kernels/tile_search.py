@@ -20,7 +20,7 @@ COUNTED = ("bundles", "nodes", "blocks found", "axes", "filters", "block tests",
 
 @nb.njit(cache=True, error_model="numpy")
 def search_tiles(  # type: ignore[no-untyped-def]  # numba infers
-    surface, all_nodes, slack, origin, length, at_target, nearest, cap, enough, tiles, scratch, found, lanes
+    surface, all_nodes, slack, origin, length, at_target, nearest, tiles, scratch, found, lanes
 ):
     """Distance and depth of every axis; a structure's whole search.
 
@@ -32,8 +32,6 @@ def search_tiles(  # type: ignore[no-untyped-def]  # numba infers
         length: Of the axes, mm.
         at_target: Distance of the target itself from the surface, mm; bounds every answer from above.
         nearest: Row of the triangle that is nearest to the target.
-        cap: Distances at or beyond need not be found: they are given as ``cap``, mm.
-        enough: An axis nearer than this need not be measured further, mm; negative to measure all.
         tiles: `Tiles.outward`, ``starts``, ``middle`` and ``chord``.
         scratch: `Scratch`, for this structure's groups.
         found: `Found`, written in the tiles' order; the counts are raised.
@@ -42,11 +40,11 @@ def search_tiles(  # type: ignore[no-untyped-def]  # numba infers
     triangles, local, base = bare(surface[0]), bare(surface[1]), bare(surface[2])
     outward, starts, middle, chords = bare(tiles[0]), bare(tiles[1]), bare(tiles[2]), bare(tiles[3])
     nodes, room, answer = bare(all_nodes), _bare_scratch(scratch), _bare_found(found)
-    target, seed, start = (origin[0], origin[1], origin[2]), nearest, min(at_target, cap)
-    needle = NeedleAxes(target, length, np.float32(length), np.float32(slack), np.float32(enough))
+    target, seed = (origin[0], origin[1], origin[2]), nearest
+    needle = NeedleAxes(target, length, np.float32(length), np.float32(slack))
     for tile in range(len(middle)):
         low, high = starts[tile], starts[tile + 1]
-        _begin(outward, low, high, start, lanes, room, answer)
+        _begin(outward, low, high, at_target, lanes, room, answer)
         if seed != nearest:
             corners = _corners(triangles, seed, target)
             lower_upper_bounds(room.frames32, lanes, corners, needle.short, FOUR * needle.slack, room.upper)
