@@ -18,6 +18,7 @@ import numpy as np
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, turned_about
+from puncture_twin.twin.guidance.gauss_newton import System
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.lens import coefficient_slope
 from puncture_twin.twin.guidance.stereo.mapping import turn_and_shift_slopes
@@ -120,20 +121,6 @@ class Unknowns(NamedTuple):
         return slice(sum(sizes[:at]), sum(sizes[: at + 1]))
 
 
-class System(NamedTuple):
-    """The linearised problem."""
-
-    residuals: Floats
-    """Shape (m,), in standard deviations."""
-    slopes: Floats
-    """Shape (m, N): their derivative by the unknowns."""
-
-    @property
-    def information(self) -> Floats:
-        """Fisher's information, shape (N, N)."""
-        return np.asarray(self.slopes.T @ self.slopes)
-
-
 def first_unknowns(observed: Observed, guess: Guess) -> Unknowns:
     """All errors 0."""
     cameras = np.zeros((len(observed.planned), PER_CAMERA))
@@ -194,7 +181,7 @@ class JointModel:
         """Derivative (n, 3, 6) of points (n, 3) of the head by ``x.head``."""
         return _pose_slopes(points_c, self._head_center, x.head[:3], x.head[3:])
 
-    def linearised(self, x: Unknowns) -> System:
+    def linearised(self, x: Unknowns) -> System[Unknowns]:
         """Residuals and slopes at x."""
         rows = [*self._seen(x), self._measured(x), self._commanded(x), self._imaged(x), self._drawn(x)]
         return System(np.concatenate([r for r, _ in rows]), np.concatenate([J for _, J in rows]))

@@ -17,6 +17,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import apply, turned_about
 from puncture_twin.planning.registration.conditioning import Conditioning
 from puncture_twin.planning.registration.registration import MarkerPairs, register
+from puncture_twin.twin.guidance.gauss_newton import System, gauss_newton
 
 MAX_ITERATIONS = 20
 CONVERGED = 1e-12
@@ -99,18 +100,25 @@ def map_head(
     """
     pairs = MarkerPairs(names, np.asarray(markers_m, dtype=np.float64), seen.points_c)
     plain = register(pairs, method="rigid", target_ct=np.mean(targets_m, axis=0), where=where)
-    weights = np.linalg.inv(seen.covariances + max(image_mm, 1e-9) ** 2 * np.eye(3))
-    T, center = plain.T_base_ct, seen.points_c.mean(axis=0)
-    for _ in range(MAX_ITERATIONS):
+    covariances, center = seen.covariances + max(image_mm, 1e-9) ** 2 * np.eye(3), seen.points_c.mean(axis=0)
+    roots = np.linalg.inv(np.linalg.cholesky(covariances))
+
+    def linearised(T: Floats) -> System[Floats]:
         fitted = apply(T, pairs.points_ct)
-        slope = turn_and_shift_slopes(fitted - center)
-        normal = np.einsum("nki,nkl,nlj->ij", slope, weights, slope)
-        step = np.linalg.solve(normal, np.einsum("nki,nkl,nl->i", slope, weights, seen.points_c - fitted))
-        T = turned_about(T, center, step)
-        if np.abs(step).max() < CONVERGED:
-            break
-    residuals = apply(T, pairs.points_ct) - seen.points_c
-    return Mapping(T, np.linalg.inv(normal), center, residuals, plain.conditioning)
+        slopes = roots @ turn_and_shift_slopes(fitted - center)
+        return System((roots @ (fitted - seen.points_c)[:, :, None]).ravel(), slopes.reshape(-1, 6))
+
+    def moved(T: Floats, step: Floats) -> Floats:
+        return turned_about(T, center, step)
+
+    fit = gauss_newton(plain.T_base_ct, linearised, moved, _arrived, MAX_ITERATIONS)
+    residuals = apply(fit.estimate, pairs.points_ct) - seen.points_c
+    covariance = np.asarray(np.linalg.inv(fit.system.information), dtype=np.float64)
+    return Mapping(fit.estimate, covariance, center, residuals, plain.conditioning)
+
+
+def _arrived(_: System[Floats], step: Floats) -> bool:
+    return bool(np.abs(step).max() < CONVERGED)
 
 
 def turn_and_shift_slopes(offsets: Floats) -> Floats:

@@ -12,16 +12,18 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.twin.guidance.gauss_newton import System, gauss_newton
 from puncture_twin.twin.guidance.stereo.joint_model import Guess, JointModel, Observed, Unknowns, first_unknowns
 
 MAX_ITERATIONS = 30
 ARRIVED = 1e-4
 """A step of the adjustment whose every residual changes by less than this standard deviation has arrived."""
+
+UNSETTLED = "the joint adjustment does not settle: a measurement is far off, or the cameras see too little"
 
 
 class Offset(NamedTuple):
@@ -97,18 +99,19 @@ def adjust(observed: Observed, guess: Guess, start: Unknowns | None = None) -> A
     """
     model = JointModel(observed, guess)
     x = first_unknowns(observed, guess) if start is None else start
-    for iteration in range(1, MAX_ITERATIONS + 1):
-        try:
-            system = model.linearised(x)
-            step = cho_solve(cho_factor(system.information), -system.slopes.T @ system.residuals)
-        except (InputError, np.linalg.LinAlgError, ValueError):  # a camera that cannot be, or what no number describes
-            break
-        x = x.moved(step)
-        if np.abs(system.slopes @ step).max() < ARRIVED:
-            covariance = np.asarray(np.linalg.inv(system.information), dtype=np.float64)
-            chi2 = float(np.sum((system.residuals + system.slopes @ step) ** 2))
-            return Adjusted(model, x, covariance, chi2, iteration)
-    raise NoAnswerError("the joint adjustment does not settle: a measurement is far off, or the cameras see too little")
+    try:
+        fit = gauss_newton(x, model.linearised, Unknowns.moved, _arrived, MAX_ITERATIONS)
+    except (InputError, np.linalg.LinAlgError, ValueError) as error:  # a camera that cannot be, or what is no number
+        raise NoAnswerError(UNSETTLED) from error
+    if not (fit.settled and fit.determined):
+        raise NoAnswerError(UNSETTLED)
+    covariance = np.asarray(np.linalg.inv(fit.system.information), dtype=np.float64)
+    chi2 = float(np.sum((fit.system.residuals + fit.system.slopes @ fit.step) ** 2))
+    return Adjusted(model, fit.estimate, covariance, chi2, fit.iterations)
+
+
+def _arrived(system: System[Unknowns], step: Floats) -> bool:
+    return bool(np.abs(system.slopes @ step).max() < ARRIVED)
 
 
 def bound(observed: Observed, guess: Guess, truth: Unknowns) -> Adjusted:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.twin.guidance.gauss_newton import System, gauss_newton
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import LENGTH_MM
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
     DIRECTION,
@@ -36,12 +37,6 @@ MAX_STEPS = 50
 
 SMALL_STEP = 1e-7
 """A step whose largest part (rad, 100 mm) is smaller ends the refinement: it is off by less than 1e-5 mm."""
-
-SMALL_GAIN = 1e-10
-"""So does a step that would lower the cost by a smaller share."""
-
-NO_PIVOT = 1e-15
-"""An eigenvalue of the normal equations below this share of the largest is rounding: no step is made along it."""
 
 
 class Problem(NamedTuple):
@@ -108,39 +103,25 @@ def refine(problem: Problem, start: Estimate, weights: Floats, *, max_steps: int
         weights: One per residual, shape (n, k).
         max_steps: The most steps taken.
     """
-    estimate, damping = start, 0.0
-    for steps in range(1, max_steps + 1):
+
+    def linearised(estimate: Estimate) -> System[Estimate]:
         W = whitener(problem_covariances(problem, estimate), weights)
         r, J = linearise(problem, estimate)
-        white, slopes = (W @ r[:, :, None]).ravel(), (W @ J).reshape(-1, J.shape[2])
-        step, moved, damping = _descend(problem, estimate, W, white, slopes, damping)
-        if step is None:
-            return Refined(estimate, steps)
-        estimate = moved
-        if np.abs(step).max() < SMALL_STEP:
-            return Refined(estimate, steps)
-    return Refined(estimate, max_steps)
+        units = parameter_units(problem.active, estimate.scale)
 
+        def cost(near: Estimate) -> float:
+            return float(np.sum((W @ _residuals(problem, near)[:, :, None]) ** 2))
 
-def _descend(
-    problem: Problem, estimate: Estimate, W: Floats, white: Floats, slopes: Floats, damping: float
-) -> tuple[Floats | None, Estimate, float]:
-    """A step that lowers the cost under fixed weights, in the parameters' units; None where there is none left."""
-    units = parameter_units(problem.active, estimate.scale)
-    values, axes = np.linalg.eigh((slopes * units).T @ (slopes * units))
-    pull = axes.T @ (units * (slopes.T @ white))
-    cost, known = white @ white, values > NO_PIVOT * values[-1]
-    if np.sum(pull[known] ** 2 / values[known]) <= SMALL_GAIN * cost:
-        return None, estimate, damping
-    for _ in range(30):
-        inverse = np.where(known, 1.0 / np.where(known, values + damping * values[-1], 1.0), 0.0)
-        step = -axes @ (inverse * pull)
-        moved = estimate.moved(_full(problem.active, units * step))
-        after = W @ _residuals(problem, moved)[:, :, None]
-        if np.sum(after**2) <= cost * (1 + 1e-12):
-            return step, moved, damping / 10 if damping > 1e-9 else 0.0
-        damping = max(10 * damping, 1e-6)
-    return None, estimate, damping
+        return System((W @ r[:, :, None]).ravel(), (W @ J).reshape(-1, J.shape[2]) * units, cost)
+
+    def moved(estimate: Estimate, step: Floats) -> Estimate:
+        return estimate.moved(_full(problem.active, parameter_units(problem.active, estimate.scale) * step))
+
+    def arrived(_: System[Estimate], step: Floats) -> bool:
+        return bool(np.abs(step).max() < SMALL_STEP)
+
+    fit = gauss_newton(start, linearised, moved, arrived, max_steps)
+    return Refined(fit.estimate, fit.iterations)
 
 
 def _residuals(problem: Problem, estimate: Estimate) -> Floats:

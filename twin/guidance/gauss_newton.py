@@ -1,0 +1,141 @@
+"""Gauss-Newton, damped where a step fails: the least-squares fits of stereo and of ultrasound.
+
+At an estimate x the residuals r, each in its standard deviation, have the slopes J. A step s solves
+
+    (J^T J + d l I) s = -J^T r
+
+along the axes (eigenvectors) of J^T J that are more than rounding; l is its largest eigenvalue, and the damping d is 0
+until a step raises the cost |r|^2 (Levenberg-Marquardt). The estimate may be of any kind that can be moved, and the
+weights may follow it. Where it is a vector and the weights are fixed, scipy serves (`stereo/cameras/bundle.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+
+X = TypeVar("X")
+"""What is estimated."""
+
+NO_PIVOT = 1e-15
+"""An eigenvalue of the normal equations below this share of the largest is rounding: no step is made along it."""
+
+SMALL_GAIN = 1e-10
+"""A step that would lower the cost by a smaller share is not made: the fit has settled."""
+
+NOT_HIGHER = 1 + 1e-12
+"""A cost that rises by no more than rounding has not risen."""
+
+MOST_DAMPINGS = 30
+"""Of one step; from 1e-6 by tens, far beyond any step that moves the estimate."""
+
+
+class System(NamedTuple, Generic[X]):
+    """A problem, linearised at an estimate."""
+
+    residuals: Floats
+    """Shape (m,), in standard deviations."""
+    slopes: Floats
+    """Shape (m, p): their derivative by the unknowns."""
+    cost: Callable[[X], float] | None = None
+    """Sum of the squared residuals near the estimate, under its weights: a step that raises it is damped.
+
+    None: each step is made as it is, so a start that is far off does not settle.
+    """
+
+    @property
+    def information(self) -> Floats:
+        """Fisher's information J^T J, shape (p, p)."""
+        return np.asarray(self.slopes.T @ self.slopes)
+
+
+class Fit(NamedTuple, Generic[X]):
+    """Where Gauss-Newton ended."""
+
+    estimate: X
+    system: System[X]
+    """Linearised where the last step began."""
+    step: Floats
+    """Shape (p,): the last step, in the unknowns' units; 0 where none was left to make."""
+    iterations: int
+    settled: bool
+    """Whether it arrived within the steps it was given."""
+    determined: bool
+    """Whether no unknown was left alone by the last step."""
+
+
+def gauss_newton(
+    start: X,
+    linearised: Callable[[X], System[X]],
+    moved: Callable[[X, Floats], X],
+    arrived: Callable[[System[X], Floats], bool],
+    most_steps: int,
+) -> Fit[X]:
+    """The estimate of least squares near a start.
+
+    Args:
+        start: Where to begin.
+        linearised: The problem at an estimate.
+        moved: An estimate with a step (p,) added.
+        arrived: Whether a step (p,) of a system is so small that the next would not matter.
+        most_steps: The most steps taken.
+
+    Raises:
+        numpy.linalg.LinAlgError: The system holds what is no number.
+    """
+    estimate, damping = start, 0.0
+    for iteration in range(1, most_steps + 1):
+        system = linearised(estimate)
+        normal = _Normal.of(system)
+        step, estimate, damping = _descend(normal, system, estimate, moved, damping)
+        if not step.any() or arrived(system, step):
+            return Fit(estimate, system, step, iteration, True, bool(normal.known.all()))
+    return Fit(estimate, system, step, most_steps, False, bool(normal.known.all()))
+
+
+class _Normal(NamedTuple):
+    """The normal equations, along their own axes."""
+
+    values: Floats
+    axes: Floats
+    pull: Floats
+    known: np.ndarray[tuple[int], np.dtype[np.bool_]]
+
+    @classmethod
+    def of(cls, system: System[X]) -> _Normal:
+        information = system.information
+        if not np.isfinite(information).all():
+            raise np.linalg.LinAlgError("the normal equations are not finite")
+        values, axes = np.linalg.eigh(information)
+        return cls(values, axes, axes.T @ (system.slopes.T @ system.residuals), values > NO_PIVOT * values[-1])
+
+    def step(self, damping: float) -> Floats:
+        """The step under a damping, shape (p,)."""
+        damped = np.where(self.known, self.values + damping * self.values[-1], 1.0)
+        return np.asarray(-self.axes @ (np.where(self.known, 1.0 / damped, 0.0) * self.pull))
+
+    def gain(self) -> float:
+        """By how much the undamped step would lower the cost, were the problem linear."""
+        return float(np.sum(self.pull[self.known] ** 2 / self.values[self.known]))
+
+
+def _descend(
+    normal: _Normal, system: System[X], estimate: X, moved: Callable[[X, Floats], X], damping: float
+) -> tuple[Floats, X, float]:
+    """A step that lowers the cost, the estimate after it, and the damping for the next; a step of 0 where none does."""
+    if system.cost is None:
+        step = normal.step(damping)
+        return step, moved(estimate, step), damping
+    before = float(system.residuals @ system.residuals)
+    if normal.gain() > SMALL_GAIN * before:
+        for _ in range(MOST_DAMPINGS):
+            step = normal.step(damping)
+            after = moved(estimate, step)
+            if system.cost(after) <= before * NOT_HIGHER:
+                return step, after, damping / 10 if damping > 1e-9 else 0.0
+            damping = max(10 * damping, 1e-6)
+    return np.zeros(len(normal.values)), estimate, damping
