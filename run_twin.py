@@ -280,13 +280,14 @@ def selfcal(
     as_json: JsonOption = False,
 ) -> None:
     """Let two arms calibrate themselves by ultrasound, AXP = YBQ, and send the needle to targets in the image."""
+    from puncture_twin.twin.jobs.selfcal.facts import selfcal_facts
     from puncture_twin.twin.jobs.selfcal.job import run_selfcal
     from puncture_twin.twin.jobs.selfcal.text import selfcal_text
 
     case = meshes_folder() / "selfcal" if case is None and recording is None else case
     with progress_display() as progress:
-        run = run_selfcal(case, recording, seeds, out_dir, progress)
-    _print(run.summary(), selfcal_text(run), as_json)
+        facts = selfcal_facts(run_selfcal(case, recording, seeds, out_dir, progress))
+    _print(facts, selfcal_text(facts), as_json)
 
 
 @app.command()

@@ -12,8 +12,9 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.twin.guidance.stereo.experiment import run_trial, statistics, trial
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.stereo.session import run_session
+from puncture_twin.twin.jobs.servo.facts import servo_facts
 from puncture_twin.twin.jobs.servo.liu2007 import TABLE_1, TABLE_2, paper_case, paper_columns, paper_servo_only_at_least
-from puncture_twin.twin.jobs.servo.text import servo_summary, statistics_lines
+from puncture_twin.twin.jobs.servo.text import statistics_lines
 
 SEED = 5
 
@@ -51,8 +52,9 @@ def test_a_room_like_the_papers_shows_its_finding():
     assert ours.targets == 3
     assert ours.servo_only_max < 0.4 + 3 * ours.stereo_max
     assert ours.after_mean < ours.before_mean
-    assert json.loads(json.dumps(servo_summary(case, trials, ours), allow_nan=False))["case"] == "liu2007"
-    assert any("after/mapping" in line for line in statistics_lines(ours))
+    facts = servo_facts(case, trials, ours)
+    assert json.loads(json.dumps(facts, allow_nan=False))["case"] == "liu2007"
+    assert any("after/mapping" in line for line in statistics_lines(facts["statistics"]))
 
 
 def test_in_a_good_room_the_servo_ends_within_what_it_may():

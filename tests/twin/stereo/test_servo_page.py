@@ -9,9 +9,9 @@ from servo_world import CASE
 
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, TargetRow, statistics
-from puncture_twin.twin.jobs.servo.liu2007 import paper_columns
+from puncture_twin.twin.jobs.servo.facts import paper_facts, servo_facts
 from puncture_twin.twin.jobs.servo.page import write_servo_page
-from puncture_twin.twin.jobs.servo.text import servo_summary, servo_text
+from puncture_twin.twin.jobs.servo.text import servo_text
 
 
 def trials():
@@ -46,13 +46,13 @@ def test_statistics_are_those_of_the_rows():
 
 def test_the_words_say_what_was_not_reached():
     """A target that was not confirmed and a session that was not held are both said."""
-    text = servo_text(CASE, trials(), statistics(trials()), ["out/servo.html"])
+    facts = servo_facts(CASE, trials(), statistics(trials()))
+    text = servo_text({**facts, "files": ["out/servo.html"]})
     assert "tolerance not reached" in text
     assert "1 sessions could not be held" in text
     assert "not confirmed 25.0 %" in text
-    summary = servo_summary(CASE, trials(), statistics(trials()))
-    assert summary["sessions"][2]["refused"].endswith("few_inliers")
-    assert summary["stops"] == {"converged": 3, "tolerance_not_reached": 1}
+    assert facts["sessions"][2]["refused"].endswith("few_inliers")
+    assert facts["stops"] == {"converged": 3, "tolerance_not_reached": 1}
 
 
 def test_the_page_needs_no_network_and_shows_every_number(tmp_path):
@@ -60,8 +60,8 @@ def test_the_page_needs_no_network_and_shows_every_number(tmp_path):
     picture = tmp_path / "one.png"
     Image.new("RGB", (4, 4)).save(picture)
     page = tmp_path / "servo.html"
-    ours = statistics(trials())
-    write_servo_page(CASE, trials(), ours, [picture, picture], picture, page, paper_columns())
+    facts = servo_facts(CASE, trials(), statistics(trials()))
+    write_servo_page(CASE, {**facts, **paper_facts()}, [picture, picture], picture, page)
     text = page.read_text(encoding="utf-8")
     assert "http" not in re.sub(r"http-equiv", "", text)
     assert text.count("data:image/png;base64,") == 3
@@ -71,5 +71,5 @@ def test_the_page_needs_no_network_and_shows_every_number(tmp_path):
     assert "1.47 / 2.41 (not what the rows give)" in text
     assert "1.479 / 2.41" in text
     without = tmp_path / "plain.html"
-    write_servo_page(CASE, trials(), ours, [picture], picture, without)
+    write_servo_page(CASE, facts, [picture], picture, without)
     assert "Liu et al." not in without.read_text(encoding="utf-8")

@@ -9,15 +9,11 @@ import numpy as np
 from markupsafe import Markup
 from plotly.utils import PlotlyJSONEncoder
 
-from puncture_twin.twin.guidance.ultrasound.summaries import (
-    noise_summary,
-    predicted_tre,
-    puncture_summary,
-    trial_summary,
-)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
+from puncture_twin.twin.jobs.selfcal.facts import Facts, selfcal_facts
 from puncture_twin.twin.jobs.selfcal.page_charts import puncture_chart, residual_charts
 from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun
-from puncture_twin.twin.jobs.selfcal.text import NOISE_WORDS, REASON_WORDS, deviations
+from puncture_twin.twin.jobs.selfcal.text import NOISE_WORDS, REASON_WORDS, missed_text
 from puncture_twin.twin.report.numbers import number
 from puncture_twin.twin.report.page.page_tables import TIMES, faint, inputs_table, origin_section, pairs, table
 from puncture_twin.twin.report.page.template import Card, data_address, plotly_script, script_json, write_html
@@ -32,18 +28,18 @@ def write_page(run: SelfcalRun, sheet: Path | None, room: Path | None, path: Pat
         room: The picture of the room; None for a recording.
         path: The HTML to write; it appears whole or not at all.
     """
-    charts = residual_charts(run.calibration, run.recording)
+    facts, charts = selfcal_facts(run), residual_charts(run.calibration, run.recording)
     twin = None
     if sheet is not None and room is not None and run.trials:
         charts["targets"] = puncture_chart(run.punctures)
-        twin = _twin_section(run, sheet, room)
+        twin = _twin_section(facts, sheet, room)
     write_html(
         "selfcal.html",
         path,
         title=f"{run.name}: ultrasound self-calibration",
-        cards=_cards(run),
-        cannot=run.calibration.cannot_show,
-        calibration=_calibration(run),
+        cards=_cards(facts),
+        cannot=facts["cannot_show"],
+        calibration=_calibration(facts, deviations(run.calibration)),
         twin=twin,
         inputs=inputs_table(run.inputs),
         origin=_origin(run),
@@ -60,15 +56,14 @@ def _origin(run: SelfcalRun) -> Markup:
     return pairs([("seed", "none: nothing was drawn")]) + TIMES
 
 
-def _cards(run: SelfcalRun) -> list[Card]:
-    found = run.calibration
-    used, expected = len(run.recording) - len(found.outliers), predicted_tre(found, run.recording)
+def _cards(facts: Facts) -> list[Card]:
+    aside, poses = facts["set_aside"], facts["poses"]
     cards = [
-        Card("expected error of the calibration", number(expected, 2, "mm"), "rms at the tip"),
-        Card("residuals", number(found.rms_mm, 2, "mm"), "rms length of the poses that were used"),
-        Card("poses", f"{used} of {len(run.recording)}", f"set aside: {', '.join(found.outliers) or 'none'}"),
+        Card("expected error of the calibration", number(facts["predicted_tre_mm"], 2, "mm"), "rms at the tip"),
+        Card("residuals", number(facts["residual_rms_mm"], 2, "mm"), "rms length of the poses that were used"),
+        Card("poses", f"{poses - len(aside)} of {poses}", f"set aside: {', '.join(aside) or 'none'}"),
     ]
-    reached = puncture_summary(run.punctures)
+    reached = facts["punctures"]
     if reached is not None:
         detail = (
             f"rms over {reached['targets']} targets, worst {number(reached['error_worst_mm'], 2, 'mm')}; calibration "
@@ -78,41 +73,48 @@ def _cards(run: SelfcalRun) -> list[Card]:
     return cards
 
 
-def _calibration(run: SelfcalRun) -> Markup:
-    found = run.calibration
-    sigma = deviations(found)
+def deviations(found: Calibration) -> dict[str, float]:
+    """Standard deviation of every parameter, by name; rotations in degrees."""
+    sigma = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))
+    pairs = zip(found.parameters, sigma, strict=True)
+    return {
+        name.replace("_rad", "_deg"): float(np.degrees(value) if name.endswith("_rad") else value)
+        for name, value in pairs
+    }
+
+
+def _calibration(facts: Facts, sigma: dict[str, float]) -> Markup:
     rows = [
-        ("T_end1_image (X), mm", _matrix(found.X)),
-        ("T_base1_base2 (Y), mm", _matrix(found.Y)),
-        ("tip in end2, mm", _vector(found.tip_end2, 3)),
-        ("needle direction in end2", _vector(found.needle_direction_end2, 5)),
-        ("iterations", str(found.iterations)),
-        ("condition σ_min/σ_max, lengths in 100 mm", f"{found.condition:.2e}"),
+        ("T_end1_image (X), mm", _matrix(facts["T_end1_image"])),
+        ("T_base1_base2 (Y), mm", _matrix(facts["T_base1_base2"])),
+        ("tip in end2, mm", _vector(facts["tip_end2_mm"], 3)),
+        ("needle direction in end2", _vector(facts["needle_direction_end2"], 5)),
+        ("iterations", str(facts["iterations"])),
+        ("condition σ_min/σ_max, lengths in 100 mm", f"{facts['condition']:.2e}"),
     ]
-    rows += [(NOISE_WORDS[key], f"{value:.3f}") for key, value in noise_summary(found).items()]
+    rows += [(NOISE_WORDS[key], f"{value:.3f}") for key, value in facts["noise"].items()]
     known = [(name, f"{value:.4f}") for name, value in sigma.items()]
     shown = table(("parameter", "standard deviation"), known, kind="numbers")
     note = faint("w: a small turn, R exp([w]×); t: a shift; V: the needle’s direction.")
     return pairs(rows) + Markup("<h3>How well each number is known</h3>") + shown + note
 
 
-def _twin_section(run: SelfcalRun, sheet: Path, room: Path) -> dict[str, str]:
-    assert run.candidates is not None  # there are no trials without
-    assert run.choice is not None
-    counts = [(REASON_WORDS[key], f"{value:,}") for key, value in run.candidates.counts.items()]
-    choice = run.choice
-    asked = len(run.recording)
+def _twin_section(facts: Facts, sheet: Path, room: Path) -> dict[str, str]:
+    counts = [(REASON_WORDS[key], f"{value:,}") for key, value in facts["candidates"].items()]
+    choice, asked, trials = facts["choice"], facts["poses"], facts["trials"]
     bounds = [
-        (f"expected error with the {asked} recorded poses", number(choice.chosen_mm, 3, "mm")),
-        (f"{asked} at random, median of {len(choice.random_mm)} choices", number(choice.median_random_mm, 3, "mm")),
-        ("at random, the best of them", number(min(choice.random_mm), 3, "mm")),
+        (f"expected error with the {asked} recorded poses", number(choice["chosen_bound_mm"], 3, "mm")),
+        (
+            f"{asked} at random, median of {choice['random_sets']} choices",
+            number(choice["random_bound_median_mm"], 3, "mm"),
+        ),
+        ("at random, the best of them", number(choice["random_bound_best_mm"], 3, "mm")),
     ]
-    seeds = f"{len(run.trials)} seed{'s' if len(run.trials) != 1 else ''}, each a room of its own"
     return {
-        "seeds": seeds,
-        "punctures": _punctures(run),
-        "trials": _trials(run),
-        "seed": str(run.trials[0].seed),
+        "seeds": f"{len(trials)} seed{'s' if len(trials) != 1 else ''}, each a room of its own",
+        "punctures": _punctures(facts),
+        "trials": _trials(facts),
+        "seed": str(trials[0]["seed"]),
         "sheet": data_address(sheet),
         "room": data_address(room),
         "counts": table(("what became of a draw", "draws"), counts, kind="numbers"),
@@ -120,8 +122,8 @@ def _twin_section(run: SelfcalRun, sheet: Path, room: Path) -> dict[str, str]:
     }
 
 
-def _punctures(run: SelfcalRun) -> Markup:
-    reached = puncture_summary(run.punctures)
+def _punctures(facts: Facts) -> Markup:
+    reached = facts["punctures"]
     if reached is None:
         return Markup("<p>No target could be reached without touching.</p>")
     rows = [
@@ -138,7 +140,7 @@ def _punctures(run: SelfcalRun) -> Markup:
     return pairs(rows) + faint("The arms’ own errors come on top of what is expected.")
 
 
-def _trials(run: SelfcalRun) -> Markup:
+def _trials(facts: Facts) -> Markup:
     head = (
         "seed",
         "residual rms mm",
@@ -152,18 +154,17 @@ def _trials(run: SelfcalRun) -> Markup:
         "tip to target rms mm",
     )
     rows = []
-    for trial in run.trials:
-        values: dict[str, Any] = trial_summary(trial)
+    for values in facts["trials"]:
         along, reached = values["detected_tip_along_mm"], values["punctures"]
         rows.append(
             (
-                str(trial.seed),
+                str(values["seed"]),
                 number(values["residual_rms_mm"], 3),
                 number(values["predicted_tre_mm"], 3),
                 number(values["held_out_error_rms_mm"], 3),
                 f"{number(along[0], 2)}, {number(along[1], 2)}",
                 number(values["detected_angle_deg"][1], 2),
-                "; ".join(f"{count} {reason}" for reason, count in values["missed"].items()) or "none",
+                missed_text(values),
                 ", ".join(values["set_aside"]) or "none",
                 str(values["true_contacts"]),
                 "–" if reached is None else number(reached["error_rms_mm"], 2),

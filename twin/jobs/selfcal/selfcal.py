@@ -32,12 +32,7 @@ from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePose
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, held_out_errors_mm, punctures
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
-from puncture_twin.twin.guidance.ultrasound.summaries import (
-    calibration_summary,
-    choice_summary,
-    puncture_summary,
-    trial_summary,
-)
+from puncture_twin.twin.guidance.ultrasound.summaries import calibration_summary
 from puncture_twin.twin.guidance.ultrasound.trial import Choice, SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 
@@ -88,21 +83,6 @@ class SelfcalRun:
     def punctures(self) -> tuple[Puncture, ...]:
         """Of all seeds."""
         return tuple(one for trial in self.trials for one in trial.punctures)
-
-    def summary(self) -> dict[str, Any]:
-        """Plain values for JSON: mm and degrees."""
-        return {
-            **calibration_summary(self.calibration, self.recording),
-            "name": self.name,
-            "inputs": inputs_document(self.inputs),
-            "candidates": None if self.candidates is None else self.candidates.counts,
-            "choice": None if self.choice is None else choice_summary(self.choice),
-            "trials": [trial_summary(trial) for trial in self.trials],
-            "punctures": puncture_summary(self.punctures),
-            "seconds": {stage: round(seconds, 3) for stage, seconds in self.stages.seconds.items()},
-            "files": [str(path) for path in self.files],
-            "warnings": list(self.warnings),
-        }
 
     def with_files(self, *files: Path) -> SelfcalRun:
         """The same, with files written."""

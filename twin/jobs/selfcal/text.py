@@ -4,16 +4,7 @@ from __future__ import annotations
 
 from types import MappingProxyType
 
-import numpy as np
-
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
-from puncture_twin.twin.guidance.ultrasound.summaries import (
-    noise_summary,
-    predicted_tre,
-    puncture_summary,
-    trial_summary,
-)
-from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun
+from puncture_twin.twin.jobs.selfcal.facts import Facts
 
 REASON_WORDS = MappingProxyType(
     {
@@ -40,74 +31,63 @@ NOISE_WORDS = MappingProxyType(
 )
 
 
-def deviations(found: Calibration) -> dict[str, float]:
-    """Standard deviation of every parameter, by name; rotations in degrees."""
-    sigma = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))
-    pairs = zip(found.parameters, sigma, strict=True)
-    return {
-        name.replace("_rad", "_deg"): float(np.degrees(value) if name.endswith("_rad") else value)
-        for name, value in pairs
-    }
-
-
-def selfcal_text(run: SelfcalRun) -> str:
+def selfcal_text(facts: Facts) -> str:
     """Poses, calibration, what it cannot show, punctures; then the files."""
-    lines = [*_poses(run), *_calibration(run), *_trials(run), *_punctures(run)]
-    lines += [f"warning: {warning}" for warning in run.warnings]
-    stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in run.stages.seconds.items())
-    return "\n".join([*lines, f"seconds: {stages}", "look at:", *(f"  {path}" for path in run.files)])
+    lines = [*_poses(facts), *_calibration(facts), *map(_trial, facts["trials"]), *_punctures(facts)]
+    lines += [f"warning: {warning}" for warning in facts["warnings"]]
+    stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in facts["seconds"].items())
+    return "\n".join([*lines, f"seconds: {stages}", "look at:", *(f"  {path}" for path in facts["files"])])
 
 
-def _poses(run: SelfcalRun) -> list[str]:
-    if run.candidates is None or run.choice is None:
-        return [f"recording {run.name}: {len(run.recording)} poses"]
-    counts = run.candidates.counts
-    lines = [f"case {run.name}: {sum(counts.values())} poses drawn in the common workspace"]
+def _poses(facts: Facts) -> list[str]:
+    counts, choice = facts["candidates"], facts["choice"]
+    if counts is None or choice is None:
+        return [f"recording {facts['name']}: {facts['poses']} poses"]
+    lines = [f"case {facts['name']}: {sum(counts.values())} poses drawn in the common workspace"]
     lines += [f"  {count:5d}  {REASON_WORDS[reason]}" for reason, count in counts.items() if count]
-    choice = run.choice
     lines.append(
-        f"{len(run.recording)} recorded; expected error (Cramer-Rao, with the usual noise) {choice.chosen_mm:.3f} mm; "
-        f"random choices of as many: median {choice.median_random_mm:.3f}, best {min(choice.random_mm):.3f} mm"
+        f"{facts['poses']} recorded; expected error (Cramer-Rao, with the usual noise) "
+        "{chosen_bound_mm:.3f} mm; random choices of as many: median {random_bound_median_mm:.3f}, best "
+        "{random_bound_best_mm:.3f} mm".format(**choice)
     )
     return lines
 
 
-def _calibration(run: SelfcalRun) -> list[str]:
-    found = run.calibration
-    noise = ", ".join(f"{NOISE_WORDS[key]} {value:.3f}" for key, value in noise_summary(found).items())
+def _calibration(facts: Facts) -> list[str]:
+    noise = ", ".join(f"{NOISE_WORDS[key]} {value:.3f}" for key, value in facts["noise"].items())
     lines = [
-        f"calibration: residuals {found.rms_mm:.3f} mm rms, {found.iterations} iterations, "
-        f"condition {found.condition:.1e}",
+        "calibration: residuals {residual_rms_mm:.3f} mm rms, {iterations} iterations, "
+        "condition {condition:.1e}".format(**facts),
         f"  {noise}",
-        f"  expected error at the tip (rms, calibration alone) {predicted_tre(found, run.recording):.3f} mm",
-        f"  tip in the flange's frame ({', '.join(f'{x:.2f}' for x in found.tip_end2)}) mm",
+        f"  expected error at the tip (rms, calibration alone) {facts['predicted_tre_mm']:.3f} mm",
+        f"  tip in the flange's frame ({', '.join(f'{x:.2f}' for x in facts['tip_end2_mm'])}) mm",
     ]
-    if found.outliers:
-        lines.append(f"  set aside: {', '.join(found.outliers)}")
-    return lines + [f"  cannot be shown: {line}" for line in found.cannot_show]
+    if facts["set_aside"]:
+        lines.append(f"  set aside: {', '.join(facts['set_aside'])}")
+    return lines + [f"  cannot be shown: {line}" for line in facts["cannot_show"]]
 
 
-def _trials(run: SelfcalRun) -> list[str]:
-    lines = []
-    for trial in run.trials:
-        values = trial_summary(trial)
-        missed = "; ".join(f"{count} {reason}" for reason, count in values["missed"].items()) or "none"
-        along = values["detected_tip_along_mm"]
-        lines.append(
-            f"seed {trial.seed}: residuals {values['residual_rms_mm']:.3f} mm, held-out tip error "
-            f"{values['held_out_error_rms_mm']:.3f} mm rms (expected {values['predicted_tre_mm']:.3f} + arms); "
-            f"detected tip {along[0]:+.2f} mm along the shaft, sd {along[1]:.2f}; not used: {missed}; "
-            f"true contacts of the arms: {values['true_contacts']}"
-        )
-    return lines
+def missed_text(trial: Facts) -> str:
+    """How many poses of a trial were not used, by reason."""
+    return "; ".join(f"{count} {reason}" for reason, count in trial["missed"].items()) or "none"
 
 
-def _punctures(run: SelfcalRun) -> list[str]:
-    reached = puncture_summary(run.punctures)
+def _trial(trial: Facts) -> str:
+    along, spread = trial["detected_tip_along_mm"]
+    return (
+        "seed {seed}: residuals {residual_rms_mm:.3f} mm, held-out tip error {held_out_error_rms_mm:.3f} mm rms "
+        "(expected {predicted_tre_mm:.3f} + arms); ".format(**trial)
+        + f"detected tip {along:+.2f} mm along the shaft, sd {spread:.2f}; not used: {missed_text(trial)}; "
+        f"true contacts of the arms: {trial['true_contacts']}"
+    )
+
+
+def _punctures(facts: Facts) -> list[str]:
+    reached = facts["punctures"]
     if reached is None:
-        return ["no target could be reached without touching"] if run.trials else []
+        return ["no target could be reached without touching"] if facts["trials"] else []
     return [
-        f"punctures: {reached['targets']} targets over {len(run.trials)} seeds: the true tip ended "
+        f"punctures: {reached['targets']} targets over {len(facts['trials'])} seeds: the true tip ended "
         f"{reached['error_rms_mm']:.2f} mm (rms) from the true target, worst {reached['error_worst_mm']:.2f} mm",
         f"  lateral {reached['lateral_rms_mm']:.2f} mm rms; depth {reached['depth_mean_mm']:+.2f} mm on average "
         f"(+ is too deep), {reached['depth_rms_mm']:.2f} mm rms",

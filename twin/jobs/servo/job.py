@@ -8,13 +8,14 @@ from typing import Any, NamedTuple
 
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Count
-from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, Statistics
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.session import Session
-from puncture_twin.twin.jobs.servo import liu2007, text as servo_words
-from puncture_twin.twin.jobs.servo.liu2007 import Liu2007Tables, held_sessions
+from puncture_twin.twin.jobs.servo import liu2007
+from puncture_twin.twin.jobs.servo.facts import Facts, reproduction_facts, servo_facts
+from puncture_twin.twin.jobs.servo.liu2007 import held_sessions
 from puncture_twin.twin.jobs.servo.page import write_servo_page
 from puncture_twin.twin.jobs.servo.pictures import draw_cameras, draw_convergence
+from puncture_twin.twin.jobs.servo.text import reproduction_text, servo_text
 
 NAMES = ("servo.html", "convergence.png", "camera_1.png", "camera_2.png")
 
@@ -53,11 +54,10 @@ def run_servo(
     case = load_servo_case(path)
     with writing(out_dir, "servo", inputs=case.inputs, names=NAMES, note=note) as draft:
         result = held_sessions(case, seeds, done)
-        written = _files(case, result.first, result.trials, result.ours, draft.folder)
-    files = [str(path) for path in draft.final(written)]
-    summary = {**servo_words.servo_summary(case, result.trials, result.ours), "files": files}
-    text = servo_words.servo_text(case, result.trials, result.ours, files)
-    return ServoJob(result.ours.not_confirmed == 0.0 and result.ours.refused == 0, summary, text)
+        facts = servo_facts(case, result.trials, result.ours)
+        written = _files(case, result.first, facts, draft.folder)
+    facts["files"] = [str(path) for path in draft.final(written)]
+    return ServoJob(result.ours.not_confirmed == 0.0 and result.ours.refused == 0, facts, servo_text(facts))
 
 
 def reproduce_paper(out_dir: Path, seeds: int | None) -> ServoJob:
@@ -65,23 +65,16 @@ def reproduce_paper(out_dir: Path, seeds: int | None) -> ServoJob:
     with writing(out_dir, "reproduce", names=NAMES) as draft:
         result = liu2007.reproduce(seeds)
         draft.inputs = result.case.inputs
-        written = _files(result.case, result.first, result.trials, result.ours, draft.folder, result)
-    files = [str(path) for path in draft.final(written)]
-    summary = {**servo_words.reproduction_summary(result), "files": files}
-    return ServoJob(result.holds, summary, servo_words.reproduction_text(result, files))
+        facts = reproduction_facts(result)
+        written = _files(result.case, result.first, facts, draft.folder)
+    facts["files"] = [str(path) for path in draft.final(written)]
+    return ServoJob(result.holds, facts, reproduction_text(facts))
 
 
-def _files(
-    case: ServoCase,
-    first: Session,
-    trials: tuple[ServoTrial, ...],
-    ours: Statistics,
-    out_dir: Path,
-    paper: Liu2007Tables | None = None,
-) -> list[Path]:
+def _files(case: ServoCase, first: Session, facts: Facts, out_dir: Path) -> list[Path]:
     """Write everything; returns the paths."""
     pictures = draw_cameras(first, out_dir)
     convergence, page = out_dir / "convergence.png", out_dir / "servo.html"
     draw_convergence(first, convergence)
-    write_servo_page(case, trials, ours, pictures, convergence, page, () if paper is None else paper.columns)
+    write_servo_page(case, facts, pictures, convergence, page)
     return [page, convergence, *pictures]

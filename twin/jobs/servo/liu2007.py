@@ -79,14 +79,12 @@ class Liu2007Tables:
 
     Attributes:
         case: The room like the paper's.
-        columns: The paper's columns, recomputed.
         first: The session of the first seed, in full.
         trials: Every seed.
         ours: Over all seeds.
     """
 
     case: ServoCase
-    columns: tuple[PaperMean, ...]
     first: Session
     trials: tuple[ServoTrial, ...]
     ours: Statistics
@@ -140,4 +138,4 @@ def held_sessions(case: ServoCase, seeds: int, done: Count | None = None) -> Liu
         case, range(case.file.seed + 1, case.file.seed + seeds), done=lambda at, of: tell(at + 1, seeds)
     )
     trials = (trial(first), *others)
-    return Liu2007Tables(case, paper_columns(), first, trials, statistics(trials))
+    return Liu2007Tables(case, first, trials, statistics(trials))

@@ -1,0 +1,80 @@
+"""What a servo command found, as one table of plain values: ``--json``, the text and the page read nothing else."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, Statistics
+from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
+from puncture_twin.twin.jobs.servo.liu2007 import (
+    TABLE_1,
+    TABLE_2,
+    Liu2007Tables,
+    paper_columns,
+    paper_servo_only_at_least,
+)
+
+Facts = Mapping[str, Any]
+"""What `servo_facts` or `reproduction_facts` returns: mm, shares 0..1."""
+
+
+def servo_facts(case: ServoCase, trials: Sequence[ServoTrial], ours: Statistics) -> dict[str, Any]:
+    """A case's sessions, each seed and all together."""
+    stops = Counter(row.stop for one in trials for row in one.rows)
+    return {
+        "case": case.name,
+        "inputs": inputs_document(case.inputs),
+        "tolerance_mm": case.file.servo.tolerance_mm,
+        "estimate": case.file.servo.estimate,
+        "stops": dict(stops),
+        "statistics": {**ours._asdict(), "after_over_mapping": ours.after_over_mapping},
+        "sessions": [_session(one) for one in trials],
+    }
+
+
+def reproduction_facts(result: Liu2007Tables) -> dict[str, Any]:
+    """The paper's tables, and our sessions in a room like the paper's."""
+    ours = servo_facts(result.case, result.trials, result.ours)
+    return {"holds": result.holds, **paper_facts(), **ours}
+
+
+def paper_facts() -> dict[str, Any]:
+    """The paper's tables, as printed and by their rows."""
+    return {
+        "paper": [{**column._asdict(), "holds": column.holds} for column in paper_columns()],
+        "paper_table_1_mm": list(TABLE_1),
+        "paper_table_2_mm": [list(row) for row in TABLE_2],
+        "paper_servo_only_at_least_mm": list(paper_servo_only_at_least()),
+    }
+
+
+def _session(one: ServoTrial) -> dict[str, Any]:
+    held = not one.refused
+    return {
+        "seed": one.seed,
+        "refused": one.refused or None,
+        "stereo_mm": list(one.stereo_mm),
+        "calibration_rms_px": list(one.rms_px),
+        "fre_mm": one.fre_mm if held else None,
+        "robot_residual_mm": one.robot_residual_mm if held else None,
+        "targets": [row._asdict() for row in one.rows],
+    }
+
+
+class MeanAndMost(NamedTuple):
+    """Of an error, mm."""
+
+    mean: float
+    most: float
+
+
+def our_errors(facts: Facts) -> dict[str, MeanAndMost]:
+    """Mean and maximum over all targets of all seeds, by the names of the paper's columns and ``servo_only``."""
+    ours, rows = facts["statistics"], [row for one in facts["sessions"] for row in one["targets"]]
+    errors = {"stereo": MeanAndMost(ours["stereo_mean"], ours["stereo_max"])}
+    for name in ("mapping", "before", "after", "servo_only"):
+        errors[name] = MeanAndMost(ours[f"{name}_mean"], max(row[f"{name}_mm"] for row in rows))
+    return errors
