@@ -17,8 +17,8 @@ import numpy as np
 
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.gauss_newton import System
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, turned_about
-from puncture_twin.twin.guidance.gauss_newton import System
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.lens import coefficient_slope
 from puncture_twin.twin.guidance.stereo.mapping import turn_and_shift_slopes

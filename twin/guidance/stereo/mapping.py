@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
 from puncture_twin.planning.geometry.rigid import apply, turned_about
 from puncture_twin.planning.registration.conditioning import Conditioning
 from puncture_twin.planning.registration.registration import MarkerPairs, register
-from puncture_twin.twin.guidance.gauss_newton import System, gauss_newton
 
 MAX_ITERATIONS = 20
 CONVERGED = 1e-12

@@ -15,8 +15,8 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.twin.guidance.gauss_newton import System, gauss_newton
 from puncture_twin.twin.guidance.stereo.joint_model import Guess, JointModel, Observed, Unknowns, first_unknowns
 
 MAX_ITERATIONS = 30
@@ -63,13 +63,12 @@ class Adjusted:
     chi2: float
     iterations: int
 
-    def offset(self, stay: int, target_m: Floats, target_mm: float = 0.0) -> Offset:
+    def offset(self, stay: int, target_m: Floats) -> Offset:
         """Ball at one stay and a target of the image, with their covariances.
 
         Args:
             stay: Which of the stays; -1 is the last.
             target_m: Shape (3,), mm.
-            target_mm: Standard deviation per axis with which the image has the target.
         """
         x = self.unknowns
         stay = stay % len(x.balls_c)
@@ -79,11 +78,10 @@ class Adjusted:
         ball_rows[:, start : start + 3] = np.eye(3)
         target_rows = np.zeros_like(ball_rows)
         target_rows[:, x.span("head")] = self.model.head_slopes(x, target[None])[0]
-        own = target_mm**2 * np.eye(3)
         ball, aim, both = (
             rows @ self.covariance @ rows.T for rows in (ball_rows, target_rows, target_rows - ball_rows)
         )
-        return Offset(x.balls_c[stay], target, ball, aim + own, both + own)
+        return Offset(x.balls_c[stay], target, ball, aim, both)
 
 
 def adjust(observed: Observed, guess: Guess, start: Unknowns | None = None) -> Adjusted:

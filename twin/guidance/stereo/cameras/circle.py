@@ -37,8 +37,6 @@ class Refit(NamedTuple):
     circle: Circle
     covariance: Floats
     """Shape (3, 3), of center and radius, for independent edges of the spread found, rad^2."""
-    spread_px: float
-    """Robust standard deviation of an edge around the circle."""
 
 
 def consensus(points: Floats, valid: NDArray[np.bool_], scales: Floats, tolerance_px: float) -> Circle | None:
@@ -107,7 +105,7 @@ def refit(points: Floats, scales: Floats, start: Circle, tolerance_px: float) ->
         near = np.abs(miss) < 3 * tolerance_px
         spread = float(np.clip(1.4826 * np.median(np.abs(miss[near])) if near.any() else floor, floor, tolerance_px))
     weighted = J * root_weight[:, None]
-    return Refit(Circle(center, float(radius)), spread**2 * np.linalg.pinv(weighted.T @ weighted), spread)
+    return Refit(Circle(center, float(radius)), spread**2 * np.linalg.pinv(weighted.T @ weighted))
 
 
 def cone(circle: Circle, direction: Floats, axes: Floats) -> tuple[Floats, float]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.twin.guidance.gauss_newton import System, gauss_newton
+from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import LENGTH_MM
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
     DIRECTION,

@@ -1,4 +1,4 @@
-"""Gauss-Newton, damped where a step fails: the least-squares fits of stereo and of ultrasound.
+"""Gauss-Newton, damped where a step fails: least squares for whichever value is estimated.
 
 At an estimate x the residuals r, each in its standard deviation, have the slopes J. A step s solves
 
@@ -6,7 +6,7 @@ At an estimate x the residuals r, each in its standard deviation, have the slope
 
 along the axes (eigenvectors) of J^T J that are more than rounding; l is its largest eigenvalue, and the damping d is 0
 until a step raises the cost |r|^2 (Levenberg-Marquardt). The estimate may be of any kind that can be moved, and the
-weights may follow it. Where it is a vector and the weights are fixed, scipy serves (`stereo/cameras/bundle.py`).
+weights may follow it. Where it is a vector and the weights are fixed, `scipy.optimize.least_squares` serves.
 """
 
 from __future__ import annotations
