@@ -23,6 +23,9 @@ RED: Rgb = (190, 0, 20)
 SHORT_AXIS = 0.45
 """Axes that appear shorter than this share of their length point at the viewer; their labels would collide."""
 
+LEGEND_SIZE = 15
+"""Pixels: a legend's letters and patches."""
+
 SCALE_BARS_MM = (5, 10, 20, 50, 100, 200, 500)
 
 Anchor = Literal["lm", "rm", "mm", "la", "ra", "ma", "lb"]
@@ -139,18 +142,16 @@ def scale_bar(
     write(draw, (left, bottom - 22), f"{mm} mm{note}", size=14, halo=2)
 
 
-def legend(
-    draw: ImageDraw.ImageDraw, items: list[tuple[str, Rgb]], left: float, top: float, right: float, size: int = 15
-) -> float:
+def legend(draw: ImageDraw.ImageDraw, items: list[tuple[str, Rgb]], left: float, top: float, right: float) -> float:
     """Colour patches with names, line after line; returns the row below the last line."""
-    x, y, patch = left, top, size
+    x, y, size = left, top, LEGEND_SIZE
     for name, colour in items:
         words = name.replace("_", " ")
-        need = patch + 8 + width_of(words, size) + 22
+        need = size + 8 + width_of(words, size) + 22
         if x + need > right and x > left:
             x, y = left, y + size + 11
-        draw.rectangle([x, y, x + patch, y + patch], fill=colour, outline=INK)
-        write(draw, (x + patch + 8, y + patch / 2 + 1), words, size=size, anchor="lm")
+        draw.rectangle([x, y, x + size, y + size], fill=colour, outline=INK)
+        write(draw, (x + size + 8, y + size / 2 + 1), words, size=size, anchor="lm")
         x += need
     return y + size + 11
 

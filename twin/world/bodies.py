@@ -32,7 +32,6 @@ def load_surface(
     T_world_mesh: Floats,
     *,
     solid: bool,
-    rgba: Rgba = SKIN_RGBA,
     max_faces: int = MAX_PHYSICS_FACES,
 ) -> int:
     """A surface that does not move: triangle by triangle, hollows included.
@@ -42,7 +41,6 @@ def load_surface(
         mesh: The surface, mm; thinned to ``max_faces``.
         T_world_mesh: Its pose, shape (4, 4), mm.
         solid: Whether bodies collide with it, or it is only seen.
-        rgba: Colour, each 0..1.
         max_faces: How many triangles physics and pictures bear.
 
     Returns:
@@ -61,7 +59,7 @@ def load_surface(
                 physicsClientId=client,
             )
         visual = pybullet.createVisualShape(
-            pybullet.GEOM_MESH, fileName=str(path), rgbaColor=rgba, physicsClientId=client
+            pybullet.GEOM_MESH, fileName=str(path), rgbaColor=SKIN_RGBA, physicsClientId=client
         )
         body = pybullet.createMultiBody(0.0, collision, visual, position, quaternion, physicsClientId=client)
     if solid:

@@ -25,14 +25,11 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.volumes.orientation import canonical
-from puncture_twin.planning.geometry.decimation import decimated
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 
 
-def label_mesh(
-    labelmap: LabelMap, label: int, *, max_deviation_mm: float | None = None, where: str | Path
-) -> TriangleMesh:
+def label_mesh(labelmap: LabelMap, label: int, *, where: str | Path) -> TriangleMesh:
     """The surface of one label, closed, normals outward, in LPS mm.
 
     A label that touches the border of the volume is closed there, on the outer face of its border voxels. The
@@ -41,7 +38,6 @@ def label_mesh(
     Args:
         labelmap: The map.
         label: Which label.
-        max_deviation_mm: If given, triangles are merged as long as the two surfaces stay this close (mm).
         where: The file or case entry, for messages.
 
     Raises:
@@ -56,8 +52,7 @@ def label_mesh(
     T_ct_box = labelmap.T_ct_index.copy()
     T_ct_box[:3, 3] += labelmap.T_ct_index[:3, :3] @ [axis.start for axis in box]
     oriented = canonical(mask, T_ct_box)
-    mesh = field_surface(oriented.values.astype(np.float32) - 0.5, oriented.T_ct_index, where=where)
-    return mesh if max_deviation_mm is None else decimated(mesh, max_deviation_mm)
+    return field_surface(oriented.values.astype(np.float32) - 0.5, oriented.T_ct_index, where=where)
 
 
 def field_surface(field: NDArray[Any], T_ct_index: NDArray[np.float64], *, where: str | Path) -> TriangleMesh:

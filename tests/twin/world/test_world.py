@@ -217,16 +217,17 @@ def test_large_surfaces_are_thinned_and_stay_in_place():
 
 
 def test_picture_shows_what_stands_there():
-    """A red ball in the middle makes the middle red; the array is rows, columns, RGB."""
+    """A ball of the skin's colour in the middle makes the middle reddish; the array is rows, columns, RGB."""
     camera = SimulatedCamera(np.array([500.0, 0, 0]), np.zeros(3), np.array([0.0, 0, 1]), 120, 80)
     with physics_client() as client:
         empty = picture(client, camera)
-        load_surface(client, sphere(60.0), np.eye(4), solid=False, rgba=(0.9, 0.1, 0.1, 1.0))
+        load_surface(client, sphere(60.0), np.eye(4), solid=False)
         seen = picture(client, camera)
     assert seen.shape == (80, 120, 3)
     assert seen.dtype == np.uint8
-    red, green, _ = seen[40, 60].astype(int)
-    assert red > green + 50
+    red, green, blue = seen[40, 60].astype(int)
+    assert red > green > blue
+    assert (seen[40, 60] != empty[40, 60]).any()
     np.testing.assert_array_equal(seen[0, 0], empty[0, 0])
 
 

@@ -26,8 +26,6 @@ class Puncture(NamedTuple):
     candidate: int
     target_image: Floats
     """True target in the true image, shape (3,), mm; it lies in the plane, for it is seen."""
-    clicked_image: Floats
-    """Where the operator read it, shape (2,), mm."""
     needle: NeedleInImage
     """Where the needle truly ended, in the true image."""
     predicted_mm: float
@@ -104,7 +102,7 @@ def _puncture(
     rest_needle = truth.needle_arm.settle(q_needle, q_needle, rng)
     predicted = float(calibration.predicted_tre_mm(clicked[None], candidates.poses.A[row])[0])
     ended = truth.needle_in_image(rest_probe, rest_needle)
-    return Puncture(row, target, clicked, ended, predicted, case.content.truth.click_mm)
+    return Puncture(row, target, ended, predicted, case.content.truth.click_mm)
 
 
 def aim(

@@ -171,17 +171,14 @@ def opaque_shot(layer: Layer, camera: ViewCamera) -> RasterShot:
     return shot
 
 
-def translucents_of(layer: Layer, camera: ViewCamera, behind: RasterShot | None = None) -> tuple[TranslucentLayer, ...]:
+def translucents_of(layer: Layer, camera: ViewCamera) -> tuple[TranslucentLayer, ...]:
     """The shells of a see-through layer: the nearest hit of every sample first, then the one behind it, and so on.
 
     Args:
         layer: The surfaces, CT frame.
         camera: Its pixels are the samples.
-        behind: What hides shells behind it; nothing when None.
     """
-    size = camera.height, camera.width
-    depth = np.full(size, np.inf, dtype=np.float32) if behind is None else behind.depth
-    view = _View(layer, camera)
+    view, depth = _View(layer, camera), np.full((camera.height, camera.width), np.inf, dtype=np.float32)
     parts = _in_bands(camera, lambda band, rows: view.shells(depth[rows], (rows.start, 0), view.of_band(band)))
     translucents = (
         TranslucentLayer(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import parameter_unit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import covariances, whitener
 
-Criterion = Literal["tre", "D"]
-
 PRIOR_WEIGHT = 1e-6
 """Information that every parameter is taken to have beforehand, as a share of a candidate's; for the first picks."""
 
@@ -28,7 +26,7 @@ MAX_SWEEPS = 20
 """How often all chosen poses are looked at for a better exchange."""
 
 WORTH = 1e-4
-"""An exchange must lower the criterion by this share."""
+"""An exchange must lower the mean squared error by this share."""
 
 
 class _Design(NamedTuple):
@@ -40,7 +38,6 @@ class _Design(NamedTuple):
     """Mean of J^T J over the workspace, shape (p, p): trace(C wanted) is the mean squared error at the tip."""
     base: Floats
     """Information held beforehand, shape (p, p)."""
-    criterion: Criterion
 
     def information(self, index: int) -> Floats:
         """Of one candidate, shape (p, p)."""
@@ -53,18 +50,17 @@ def choose_poses(
     noise: Noise,
     prior: Calibration | Estimate,
     *,
-    criterion: Criterion = "tre",
     recorded: Recording | None = None,
 ) -> NDArray[np.int_]:
     """Choose poses by Fisher information: greedily, then by exchange until no single exchange helps.
+
+    What is minimised is the mean squared error at the tip over all candidates: A-optimal for that error.
 
     Args:
         candidates: Poses that could be recorded, with the tip where it would show.
         n: How many to choose.
         noise: Of both arms and the image.
         prior: A rough calibration, such as the drawing's: 10 deg and 20 mm off will do.
-        criterion: ``tre``, least mean squared error at the tip over all candidates (A-optimal for that error), or
-            ``D``, least volume of the confidence region.
         recorded: Poses that are recorded already and count.
 
     Returns:
@@ -76,7 +72,7 @@ def choose_poses(
     if not 0 < n <= len(candidates):
         raise InputError(f"{n} poses of {len(candidates)} candidates", where="pose choice", allowed="1 to all of them")
     prior = prior.estimate if isinstance(prior, Calibration) else prior
-    design = _design(candidates, noise, prior, recorded, criterion)
+    design = _design(candidates, noise, prior, recorded)
     chosen: list[int] = []
     H = design.base
     for _ in range(n):
@@ -113,22 +109,18 @@ def _wanted(workspace: Recording, prior: Estimate) -> Floats:
     return np.asarray((J.transpose(0, 2, 1) @ J).mean(axis=0))
 
 
-def _design(
-    candidates: Recording, noise: Noise, prior: Estimate, recorded: Recording | None, criterion: Criterion
-) -> _Design:
+def _design(candidates: Recording, noise: Noise, prior: Estimate, recorded: Recording | None) -> _Design:
     rows = _whitened(candidates, noise, prior)
     base = PRIOR_WEIGHT * np.diag((rows**2).sum(axis=1).mean(axis=0))
     if recorded is not None:
         held = _whitened(recorded, noise, prior).reshape(-1, rows.shape[2])
         base = base + held.T @ held
-    return _Design(rows, _wanted(candidates, prior), base, criterion)
+    return _Design(rows, _wanted(candidates, prior), base)
 
 
 def _value(design: _Design, H: Floats) -> float:
-    """Mean squared error at the tip, or the size of the confidence region per parameter; the less, the better."""
-    if design.criterion == "tre":
-        return float(np.trace(np.linalg.solve(H, design.wanted)))
-    return float(np.exp(-np.linalg.slogdet(H)[1] / len(H)))
+    """Mean squared error at the tip, mm^2."""
+    return float(np.trace(np.linalg.solve(H, design.wanted)))
 
 
 def _values_with(design: _Design, H: Floats) -> Floats:
@@ -136,10 +128,8 @@ def _values_with(design: _Design, H: Floats) -> Floats:
     C = np.linalg.inv(H)
     GC = design.rows @ C
     S = np.eye(3) + GC @ design.rows.transpose(0, 2, 1)
-    if design.criterion == "tre":
-        gained = np.linalg.solve(S, GC @ design.wanted @ GC.transpose(0, 2, 1))
-        return np.asarray(_value(design, H) - np.trace(gained, axis1=1, axis2=2))
-    return np.asarray(_value(design, H) * np.exp(-np.linalg.slogdet(S)[1] / len(H)))
+    gained = np.linalg.solve(S, GC @ design.wanted @ GC.transpose(0, 2, 1))
+    return np.asarray(_value(design, H) - np.trace(gained, axis1=1, axis2=2))
 
 
 def _best(design: _Design, H: Floats, without: list[int]) -> int:

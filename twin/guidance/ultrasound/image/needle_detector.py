@@ -116,8 +116,6 @@ class Detection(NamedTuple):
     """Unit, shape (2,): toward the tip."""
     score_mm: float
     """Sum along the visible segment of the amplitude over background, times mm."""
-    visible_mm: float
-    """Length of the segment."""
     contrast_db: float
     """Amplitude of the last piece of shaft over the background."""
 
@@ -155,7 +153,7 @@ def detect(picture: Pixels, imager: Imager, settings: DetectorSettings | None = 
     if np.any(found < settings.edge_mm) or np.any(found > high):
         return Missed.TIP_AT_EDGE
     contrast = 20.0 * float(np.log10(max(1.0 + tip.step, 1e-6)))
-    return Detection(found, line.direction, segment.score, length, contrast)
+    return Detection(found, line.direction, segment.score, contrast)
 
 
 def over_background(picture: Pixels, imager: Imager) -> Floats:
