@@ -1,54 +1,131 @@
-"""A small case on disk: a round body with an organ, a rib and a vessel from a label map."""
+"""The one maker of cases for tests: a case's text from its parts, and the files that it names.
+
+The usual patient is a round body about the origin, whose target is an organ in the middle; in front of it lie a rib
+and, in a label map, a vessel.
+"""
+
+import json
 
 import numpy as np
 import SimpleITK
 import trimesh
 
-CASE = """schema = 1
-name = "small"
-space = "LPS"
+HEAD = """schema = {schema}
+name = "{name}"
+space = "{space}"
 [target]
-position_mm = [0.0, 0.0, 0.0]
-structure = "organ"
+{target}
 [needle]
-length_mm = 210.0
-shaft_mm = 150.0
-diameter_mm = 1.2
+{needle}
 [search]
-theta_deg = [0, 10]
-step_deg = 10.0
-[registration]
-markers_ct = "markers_ct.csv"
-markers_base = "touch.csv"
-[[structure]]
-name = "skin"
-mesh = "skin.stl"
-unit = "mm"
-role = "skin"
-[[structure]]
-name = "organ"
-mesh = "organ.stl"
-unit = "mm"
-role = "target"
-[[structure]]
-name = "rib"
-mesh = "rib.stl"
-unit = "mm"
-role = "avoid"
-margin_mm = 3.0
-[[structure]]
-name = "vessel"
-labelmap = "labels.nrrd"
-label = 3
-role = "avoid"
-margin_mm = 3.0
+{search}
 """
+TARGET = 'position_mm = [0.0, 0.0, 0.0]\nstructure = "organ"'
+NEEDLE = "length_mm = 210.0\nshaft_mm = 150.0\ndiameter_mm = 1.2"
+SEARCH = "theta_deg = [0, 10]\nstep_deg = 10.0"
+
+
+def case_text(*sections, name="small", schema="1", space="LPS", target=TARGET, needle=NEEDLE, search=SEARCH):
+    """A case file: its head with these lines, then its sections."""
+    return HEAD.format(schema=schema, name=name, space=space, target=target, needle=needle, search=search) + "".join(
+        sections
+    )
+
+
+def structure(name, role, source=None, **keys):
+    """A section of one structure.
+
+    Args:
+        name: Its name.
+        role: Its role.
+        source: Where its surface comes from; by default a mesh of its name, an STL in mm.
+        keys: What else is stated.
+    """
+    values = {"name": name, **(source or {"mesh": f"{name}.stl", "unit": "mm"}), "role": role, **keys}
+    return "[[structure]]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in values.items())
+
+
+def registration_section(*more):
+    """The section that names the two lists of markers, with further lines."""
+    return "\n".join(
+        ["[registration]", 'markers_ct = "markers_ct.csv"', 'markers_base = "touch.csv"', *filter(None, more), ""]
+    )
+
+
+SKIN = structure("skin", "skin")
+ORGAN = structure("organ", "target")
+CASE = case_text(
+    registration_section(),
+    SKIN,
+    ORGAN,
+    structure("rib", "avoid", margin_mm=3.0),
+    structure("vessel", "avoid", {"labelmap": "labels.nrrd", "label": 3}, margin_mm=3.0),
+)
+
+BALLS = {"skin": (90.0, (0, 0, 0)), "organ": (20.0, (0, 0, 0)), "rib": (5.0, (40, 0, 40))}
+"""Radius and centre of the usual patient's meshes, mm."""
 
 MARKERS = "name,x_mm,y_mm,z_mm\nA,0,0,80\nB,50,0,75\nC,0,60,70\nD,-40,-30,72\n"
 
 
+def changed(text, *changes):
+    """A text with (old, new) replaced, each once."""
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new, 1)
+    return text
+
+
+def ball(path, radius=10.0, center=(0, 0, 0)):
+    """A closed sphere on disk."""
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+    mesh.apply_translation(center)
+    mesh.export(path)
+
+
+def write_balls(folder, *names, ending="stl"):
+    """The meshes of the usual patient: those that are named, or all."""
+    for name in names or BALLS:
+        ball(folder / f"{name}.{ending}", *BALLS[name])
+
+
+def write_markers(folder, ct=MARKERS, base=MARKERS):
+    """The two lists of markers."""
+    (folder / "markers_ct.csv").write_text(ct)
+    (folder / "touch.csv").write_text(base)
+
+
+def points_file(points, names="ABCDEFGH"):
+    """The text of a file of points."""
+    rows = [",".join([name, *(f"{x:.3f}" for x in point)]) for name, point in zip(names, points, strict=False)]
+    return "\n".join(["name,x_mm,y_mm,z_mm", *rows]) + "\n"
+
+
+def image_of(voxels_zyx, spacing=(2.0, 2.0, 2.0)):
+    """An image about the origin, 200 mm wide, from values with the slices first."""
+    image = SimpleITK.GetImageFromArray(voxels_zyx)
+    image.SetSpacing(spacing)
+    image.SetOrigin([-100 + one / 2 for one in spacing])
+    return image
+
+
+def vessel_voxels(spacing=(2.0, 2.0, 2.0)):
+    """The usual patient's vessel, label 3, in front of the organ: voxels (z, y, x)."""
+    shape = [round(200 / one) for one in spacing[::-1]]
+    z, y, x = (np.arange(n) * s - 100 + s / 2 for n, s in zip(shape, spacing[::-1], strict=True))
+    labels = np.zeros(shape, np.uint8)
+    labels[np.ix_(np.abs(z) < 20, np.abs(y - 36) < 4, np.abs(x - 36) < 4)] = 3
+    return labels
+
+
+def write_labels(path, labels=None, spacing=(2.0, 2.0, 2.0), compressed=True):
+    """A label map about the origin, 200 mm wide; a vessel with label 3 by default."""
+    image = image_of(vessel_voxels(spacing) if labels is None else labels, spacing)
+    SimpleITK.WriteImage(image, path, useCompression=compressed)
+
+
 def write_case(folder, *changes, text=CASE, labels=None, spacing=(2.0, 2.0, 2.0)):
-    """Write the case, with (old, new) changes to its text; returns its file.
+    """Write the usual patient's case, with (old, new) changes to its text; returns its file.
 
     Args:
         folder: Where.
@@ -57,28 +134,8 @@ def write_case(folder, *changes, text=CASE, labels=None, spacing=(2.0, 2.0, 2.0)
         labels: Voxels (z, y, x); a vessel with label 3 by default.
         spacing: Of the label map, mm, along x, y and z.
     """
-    for old, new in changes:
-        assert old in text, old
-        text = text.replace(old, new, 1)
-    for name, radius, centre in (("skin", 90, (0, 0, 0)), ("organ", 20, (0, 0, 0)), ("rib", 5, (40, 0, 40))):
-        mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-        mesh.apply_translation(centre)
-        mesh.export(folder / f"{name}.stl")
-    write_labels(folder / "labels.nrrd", labels, spacing)
-    (folder / "markers_ct.csv").write_text(MARKERS)
-    (folder / "touch.csv").write_text(MARKERS)
-    (folder / "case.toml").write_text(text)
+    write_balls(folder)
+    write_labels(folder / "labels.nrrd", labels, spacing, compressed=False)
+    write_markers(folder)
+    (folder / "case.toml").write_text(changed(text, *changes))
     return folder / "case.toml"
-
-
-def write_labels(path, labels=None, spacing=(2.0, 2.0, 2.0)):
-    """A label map about the origin, 200 mm wide; a vessel with label 3 by default."""
-    if labels is None:
-        shape = [round(200 / one) for one in spacing[::-1]]
-        z, y, x = (np.arange(n) * s - 100 + s / 2 for n, s in zip(shape, spacing[::-1], strict=True))
-        labels = np.zeros(shape, np.uint8)
-        labels[np.ix_(np.abs(z) < 20, np.abs(y - 36) < 4, np.abs(x - 36) < 4)] = 3
-    image = SimpleITK.GetImageFromArray(labels)
-    image.SetSpacing(spacing)
-    image.SetOrigin([-100 + one / 2 for one in spacing])
-    SimpleITK.WriteImage(image, path)

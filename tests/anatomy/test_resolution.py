@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import SimpleITK
+from case_world import write_case, write_labels
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.search.context import prepare
-from tests.case_world import write_case, write_labels
 
 
 def warnings_of(path):

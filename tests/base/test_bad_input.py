@@ -6,61 +6,32 @@ import struct
 
 import numpy as np
 import pytest
-import SimpleITK
 import trimesh
+from case_world import (
+    MARKERS,
+    ORGAN,
+    SKIN,
+    ball,
+    case_text,
+    registration_section,
+    structure,
+    write_balls,
+    write_labels,
+    write_markers,
+)
 
 from puncture_twin.run_twin import BAD_INPUT, main
 
-CASE = """
-schema = 1
-name = "bad"
-space = "LPS"
-[target]
-position_mm = [0.0, 0.0, 0.0]
-structure = "organ"
-[needle]
-length_mm = 210.0
-shaft_mm = 150.0
-diameter_mm = 1.2
-[search]
-theta_deg = [0, 10]
-step_deg = 10.0
-[[structure]]
-name = "skin"
-mesh = "skin.stl"
-unit = "mm"
-role = "skin"
-[[structure]]
-name = "organ"
-mesh = "organ.stl"
-unit = "mm"
-role = "target"
-[[structure]]
-name = "rib"
-mesh = "rib.stl"
-unit = "mm"
-role = "avoid"
-[[structure]]
-name = "vessel"
-labelmap = "labels.nii.gz"
-label = 3
-role = "avoid"
-[registration]
-markers_ct = "markers_ct.csv"
-markers_base = "touch.csv"
-"""
-
-MARKERS = "name,x_mm,y_mm,z_mm\nA,0,0,80\nB,50,0,75\nC,0,60,70\nD,-40,-30,72\n"
-
+CASE = case_text(
+    SKIN,
+    ORGAN,
+    structure("rib", "avoid"),
+    structure("vessel", "avoid", {"labelmap": "labels.nii.gz", "label": 3}),
+    registration_section(),
+    name="bad",
+)
 
 SPREAD_MARKERS = "name,x_mm,y_mm,z_mm\nA,0,0,80\nB,50,0,20\nC,0,60,70\nD,-40,-30,-10\n"
-
-
-def ball(path, radius=10.0, center=(0, 0, 0)):
-    """A closed sphere on disk."""
-    mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-    mesh.apply_translation(center)
-    mesh.export(path)
 
 
 def opened(path, radius, wound_at_random=False, shells=1):
@@ -90,18 +61,12 @@ def folder(tmp_path):
     here = tmp_path / "case"
     here.mkdir()
     (here / "case.toml").write_text(CASE)
-    ball(here / "skin.stl", 90)
-    ball(here / "organ.stl", 20)
-    ball(here / "rib.stl", 5, (40, 0, 40))
+    write_balls(here)
     labels = np.zeros((100, 100, 100), np.uint8)
     labels[42:58, 67:69, 67:69] = 3
-    image = SimpleITK.GetImageFromArray(labels)
-    image.SetSpacing((2.0, 2.0, 2.0))
-    image.SetOrigin((-99.0, -99.0, -99.0))
-    SimpleITK.WriteImage(image, here / "labels.nii.gz")
-    SimpleITK.WriteImage(image, here / "labels.nrrd", useCompression=False)
-    (here / "markers_ct.csv").write_text(MARKERS)
-    (here / "touch.csv").write_text(MARKERS)
+    write_labels(here / "labels.nii.gz", labels)
+    write_labels(here / "labels.nrrd", labels, compressed=False)
+    write_markers(here)
     return here
 
 

@@ -10,54 +10,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
-import trimesh
+from case_world import ORGAN, SKIN, case_text, structure, write_balls, write_labels
 from places import ROOT
 
-CASE = """
-schema = 1
-name = "kept"
-space = "LPS"
-[target]
-position_mm = [0.0, 0.0, 0.0]
-structure = "organ"
-[needle]
-length_mm = 210.0
-shaft_mm = 150.0
-diameter_mm = 1.2
-[search]
-theta_deg = [0, 20]
-step_deg = 10.0
-[[structure]]
-name = "skin"
-mesh = "skin.stl"
-unit = "mm"
-role = "skin"
-[[structure]]
-name = "organ"
-mesh = "organ.stl"
-unit = "mm"
-role = "target"
-[[structure]]
-name = "vessel"
-labelmap = "labels.nii.gz"
-label = 3
-role = "avoid"
-"""
+CASE = case_text(
+    SKIN,
+    ORGAN,
+    structure("vessel", "avoid", {"labelmap": "labels.nii.gz", "label": 3}),
+    name="kept",
+    search="theta_deg = [0, 20]\nstep_deg = 10.0",
+)
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small case beside two empty cache folders."""
     here = tmp_path_factory.mktemp("kept")
-    for name, radius in (("skin", 90), ("organ", 20)):
-        trimesh.creation.icosphere(subdivisions=2, radius=radius).export(here / f"{name}.stl")
+    write_balls(here, "skin", "organ")
     labels = np.zeros((100, 100, 100), np.uint8)
     labels[48:52, 28:32, 48:52] = 3
-    image = sitk.GetImageFromArray(labels)
-    image.SetSpacing((2.0, 2.0, 2.0))
-    image.SetOrigin((-99.0, -99.0, -99.0))
-    sitk.WriteImage(image, str(here / "labels.nii.gz"))
+    write_labels(here / "labels.nii.gz", labels)
     (here / "case.toml").write_text(CASE)
     return here
 

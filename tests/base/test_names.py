@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from case_world import write_case
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import InputError
@@ -17,7 +18,6 @@ from puncture_twin.planning.formats.points.point_files import read_points
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.table import to_table, write_table
-from tests.case_world import write_case
 
 HOSTILE = {
     "an escape sequence": "liver\x1b[2J",

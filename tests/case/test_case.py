@@ -5,36 +5,19 @@ import tomllib
 
 import numpy as np
 import pytest
+from case_world import ORGAN, SKIN, case_text, changed
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.geometry.spaces import Space
 
-GOOD = """
-schema = 1
-name = "one"
-space = "LPS"
-[target]
-position_mm = [1.0, 2.0, 3.0]
-structure = "organ"
-[needle]
-length_mm = 210.0
-shaft_mm = 150.0
-diameter_mm = 1.2
-[search]
-theta_deg = [0, 60]
-step_deg = 5.0
-[[structure]]
-name = "skin"
-mesh = "skin.stl"
-unit = "mm"
-role = "skin"
-[[structure]]
-name = "organ"
-mesh = "organ.stl"
-unit = "mm"
-role = "target"
-"""
+GOOD = case_text(
+    SKIN,
+    ORGAN,
+    name="one",
+    target='position_mm = [1.0, 2.0, 3.0]\nstructure = "organ"',
+    search="theta_deg = [0, 60]\nstep_deg = 5.0",
+)
 
 
 @pytest.fixture
@@ -44,11 +27,8 @@ def write(tmp_path):
         (tmp_path / name).write_bytes(name.encode())
 
     def make(*changes, text=GOOD):
-        for old, new in changes:
-            assert old in text
-            text = text.replace(old, new, 1)
         path = tmp_path / "case.toml"
-        path.write_text(text)
+        path.write_text(changed(text, *changes))
         return path
 
     return make

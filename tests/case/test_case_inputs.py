@@ -12,57 +12,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
-import trimesh
+from case_world import ORGAN, case_text, image_of, registration_section, structure, write_balls, write_markers
 
 from puncture_twin.planning.base.provenance import differing_input, inputs_document
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.search.context import CaseContext, prepare
 
-CASE = """
-schema = 1
-name = "inputs"
-space = "LPS"
-# 1
-[target]
-points = "targets.csv"
-name = "T"
-structure = "organ"
-[needle]
-length_mm = 210.0
-shaft_mm = 150.0
-diameter_mm = 1.2
-[search]
-theta_deg = [0, 10]
-step_deg = 10.0
-[[structure]]
-name = "skin"
-ct = "ct.nhdr"
-role = "skin"
-[[structure]]
-name = "organ"
-mesh = "organ.stl"
-unit = "mm"
-role = "target"
-[[structure]]
-name = "rib"
-mesh = "rib.stl"
-unit = "mm"
-role = "avoid"
-[[structure]]
-name = "bowel"
-labelmap = "bowel.nii.gz"
-label = 3
-role = "avoid"
-[[structures]]
-labelmap = "vessels/labels.nhdr"
-naming = "names.csv"
-avoid = { "v*" = 2.0 }
-[registration]
-markers_ct = "markers_ct.csv"
-markers_base = "touch.csv"
-[rehearsal]
-truth_base = "truth.csv"
-"""
+CASE = case_text(
+    structure("skin", "skin", {"ct": "ct.nhdr"}),
+    ORGAN,
+    structure("rib", "avoid"),
+    structure("bowel", "avoid", {"labelmap": "bowel.nii.gz", "label": 3}),
+    '[[structures]]\nlabelmap = "vessels/labels.nhdr"\nnaming = "names.csv"\navoid = { "v*" = 2.0 }\n',
+    registration_section(),
+    '[rehearsal]\ntruth_base = "truth.csv"\n',
+    name="inputs",
+    target='# 1\npoints = "targets.csv"\nname = "T"\nstructure = "organ"',
+)
 
 MARKERS = "name,x_mm,y_mm,z_mm\nA,0,0,85\nB,50,0,70\nC,0,60,60\nD,-40,-30,72\n"
 
@@ -103,17 +69,14 @@ CHANGES = {
 """One byte of each file that may change without a refusal; None: the last one."""
 
 
-def image_of(values: np.ndarray) -> sitk.Image:
-    """An image of 2 mm voxels about the origin, from values with axis i first."""
-    image = sitk.GetImageFromArray(np.ascontiguousarray(values.transpose(2, 1, 0)))
-    image.SetSpacing((2.0, 2.0, 2.0))
-    image.SetOrigin((-99.0, -99.0, -99.0))
-    return image
+def sliced(values: np.ndarray) -> np.ndarray:
+    """Values with the slices first, from values with axis i first."""
+    return np.ascontiguousarray(values.transpose(2, 1, 0))
 
 
 def detached(values: np.ndarray, header: Path) -> None:
     """A NRRD header with its data beside it."""
-    sitk.WriteImage(image_of(values), str(header), useCompression=False)
+    sitk.WriteImage(image_of(sliced(values)), str(header), useCompression=False)
     text = header.read_bytes()
     header.write_bytes(text.replace(b"\n", b"\n# written for a test\n", 1))
 
@@ -126,11 +89,8 @@ def vessel(place: tuple[int, int, int]) -> np.ndarray:
     return labels
 
 
-def ball(path: Path, radius: float, center: tuple[float, float, float] = (0, 0, 0)) -> None:
-    """A closed sphere as binary STL with an empty header."""
-    mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-    mesh.apply_translation(center)
-    mesh.export(path)
+def without_header(path: Path) -> None:
+    """Empty the header of a binary STL."""
     path.write_bytes(bytes(80) + path.read_bytes()[80:])
 
 
@@ -143,16 +103,16 @@ def folder(tmp_path: Path) -> Path:
     (here / "targets.csv").write_text("name,x_mm,y_mm,z_mm\nT,0,0,0\n")
     (here / "names.csv").write_text("id,name\n1,v1\n")
     (here / "truth.csv").write_text(IN_BASE + "T,0.5,400,0\n")
-    (here / "markers_ct.csv").write_text(MARKERS)
-    (here / "touch.csv").write_text(IN_BASE)
-    ball(here / "organ.stl", 20)
-    ball(here / "rib.stl", 5, (40, 0, 40))
+    write_markers(here, MARKERS, IN_BASE)
+    write_balls(here, "organ", "rib")
+    for name in ("organ", "rib"):
+        without_header(here / f"{name}.stl")
     place = np.indices((100, 100, 100)) * 2.0 - 99.0
     hounsfield = np.where(np.linalg.norm(place, axis=0) < 90, 40, -1000).astype(np.int16)
     hounsfield[4:96, 96:98] = 100  # what the body lies on: without it nothing beyond the image's faces is known
     detached(hounsfield, here / "ct.nhdr")
     detached(vessel((80, 50, 50)), here / "vessels" / "labels.nhdr")
-    sitk.WriteImage(image_of(3 * vessel((50, 80, 50))), str(here / "bowel.nii"))
+    sitk.WriteImage(image_of(sliced(3 * vessel((50, 80, 50)))), str(here / "bowel.nii"))
     (here / "bowel.nii.gz").write_bytes(gzip.compress((here / "bowel.nii").read_bytes(), mtime=0))
     (here / "bowel.nii").unlink()
     return here

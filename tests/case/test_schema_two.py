@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from case_world import CASE, MARKERS, write_case, write_labels
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
@@ -12,7 +13,6 @@ from puncture_twin.planning.case.case_schema import NOT_LAST_NOTE, SCHEMA_ONE_NO
 from puncture_twin.planning.formats.labels.totalsegmentator import V2
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import BAD_INPUT, OK, main
-from tests.case_world import CASE, MARKERS, write_case, write_labels
 
 TWO = CASE.replace("schema = 1", 'schema = 2\nregion = "other"') + "[end]\nstructures = 4\n"
 TOP = CASE.replace("schema = 1", 'schema = 2\nstructures = 4\nregion = "other"')

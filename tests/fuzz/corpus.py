@@ -10,6 +10,7 @@ import zlib
 import numpy as np
 import SimpleITK
 import trimesh
+from case_world import MARKERS, registration_section
 from hostile.makers import CASE, MOUNT, RIB, certificate, glb, recording, sound_case
 
 from puncture_twin.meshes import folder as embedded
@@ -26,8 +27,7 @@ from puncture_twin.planning.plan.plan_document import write_plan
 from puncture_twin.planning.reach.reach import ReachRequest, assess_reach_all
 from puncture_twin.planning.registration.placement import load_placement
 
-MARKERS = "name,x_mm,y_mm,z_mm\nA,0,0,80\nB,50,0,75\nC,0,60,70\nD,-40,-30,72\n"
-REGISTRATION = '[registration]\nmarkers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"\n'
+REGISTRATION = registration_section()
 TABLE = '[[obstacle]]\nname = "table"\nframe = "ct"\ncenter_mm = [0.0, 160.0, 0.0]\nsize_mm = [600.0, 40.0, 2000.0]\n'
 LABELS = (
     '[[structures]]\nlabelmap = "labels.seg.nrrd"\navoid = { "ves*" = 2.0 }\nignore = ["bone"]\n'

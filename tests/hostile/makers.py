@@ -4,7 +4,7 @@ import json
 import struct
 
 import numpy as np
-import trimesh
+from case_world import case_text, structure, write_balls
 
 from puncture_twin.planning.certify.cells import Cells
 from puncture_twin.planning.certify.certificate import Certificate, write_certificate
@@ -13,48 +13,18 @@ from puncture_twin.planning.plan.plan_document import write_plan
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording, write_recording
 from puncture_twin.twin.guidance.ultrasound.simulate import simulate_recording
 
-CASE = """schema = 1
-name = "hostile"
-space = "LPS"
-[target]
-position_mm = [0.0, 0.0, 0.0]
-structure = "organ"
-[needle]
-length_mm = 210.0
-shaft_mm = 150.0
-diameter_mm = 1.2
-[search]
-theta_deg = [0, 10]
-step_deg = 10.0
-[[structure]]
-name = "skin"
-mesh = "skin.ply"
-unit = "mm"
-role = "skin"
-[[structure]]
-name = "organ"
-mesh = "organ.ply"
-unit = "mm"
-role = "target"
-"""
-
-RIB = '[[structure]]\nname = "rib"\nmesh = "rib.ply"\nunit = "mm"\nrole = "avoid"\n'
+SKIN, ORGAN, RIB = (
+    structure(name, role, {"mesh": f"{name}.ply", "unit": "mm"})
+    for name, role in (("skin", "skin"), ("organ", "target"), ("rib", "avoid"))
+)
+CASE = case_text(SKIN, ORGAN, name="hostile")
 MOUNT = "[robot.mount]\nposition_mm = [300.0, 0.0, 0.0]\nx_axis = [1.0, 0.0, 0.0]\nz_axis = [0.0, 0.0, 1.0]\n"
-STRUCTURE = '[[structure]]\nname = "s{0}"\nmesh = "rib.ply"\nunit = "mm"\nrole = "avoid"\n'
-
-
-def ball(path, radius, center=(0, 0, 0)):
-    """A closed sphere."""
-    mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-    mesh.apply_translation(center)
-    mesh.export(path)
+STRUCTURE = RIB.replace('"rib"', '"s{0}"')
 
 
 def sound_case(folder, text=CASE + RIB):
     """A case of three balls, in which everything is right."""
-    ball(folder / "skin.ply", 90)
-    ball(folder / "organ.ply", 20)
-    ball(folder / "rib.ply", 5, (40, 0, 40))
+    write_balls(folder, ending="ply")
     (folder / "case.toml").write_text(text)
 
 

@@ -6,6 +6,16 @@ import shutil
 import numpy as np
 import pytest
 import trimesh
+from case_world import (
+    NEEDLE,
+    ORGAN,
+    case_text,
+    points_file,
+    registration_section,
+    structure,
+    write_balls,
+    write_markers,
+)
 
 from puncture_twin.meshes import folder as meshes_folder
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
@@ -14,46 +24,6 @@ from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import BAD_INPUT, main
 from puncture_twin.twin.jobs.robot.mirror import Mirror
-
-CASE = """
-schema = 2
-region = "other"
-name = "slips"
-space = "{space}"
-[target]
-position_mm = [0.0, 0.0, 0.0]
-structure = "organ"
-[needle]
-length_mm = 210.0
-shaft_mm = 180.0
-diameter_mm = 1.2
-[search]
-theta_deg = [0, 10]
-step_deg = 10.0
-[registration]
-markers_ct = "markers_ct.csv"
-markers_base = "touch.csv"
-{registration}
-[[structure]]
-name = "skin"
-mesh = "skin.stl"
-unit = "mm"
-space = "{skin_space}"
-role = "skin"
-[[structure]]
-name = "organ"
-mesh = "organ.stl"
-unit = "mm"
-role = "target"
-[[structure]]
-name = "rib"
-mesh = "rib.stl"
-unit = "mm"
-role = "avoid"
-{more}
-[end]
-structures = 3
-"""
 
 TABLE = '[[obstacle]]\nname = "table"\nframe = "ct"\ncenter_mm = [0.0, 150.0, 0.0]\nsize_mm = [600.0, 40.0, 1200.0]\n'
 LOPSIDED = np.array([15.0, 30.0, 40.0])
@@ -84,12 +54,6 @@ def touched(points):
     return points @ BASE_AXES.T + IN_FRONT
 
 
-def csv(points):
-    """A file of points named A, B, ..."""
-    rows = [",".join([name, *(f"{x:.3f}" for x in point)]) for name, point in zip("ABCDEF", points, strict=False)]
-    return "\n".join(["name,x_mm,y_mm,z_mm", *rows]) + "\n"
-
-
 @pytest.fixture
 def case(tmp_path):
     """A function: a case with an ellipsoid for a body, and these markers."""
@@ -97,14 +61,22 @@ def case(tmp_path):
     def make(points_ct, points_base, registration="", more="", center=LOPSIDED, space="LPS"):
         here = tmp_path / f"case{len(list(tmp_path.iterdir()))}"
         here.mkdir()
-        texts = {"registration": registration, "more": more, "space": space, "skin_space": "LPS"}
-        (here / "case.toml").write_text(CASE.format(**texts))
+        text = case_text(
+            registration_section(registration),
+            structure("skin", "skin", {"mesh": "skin.stl", "unit": "mm", "space": "LPS"}),
+            ORGAN,
+            structure("rib", "avoid"),
+            f"{more}\n[end]\nstructures = 3\n",
+            name="slips",
+            schema='2\nregion = "other"',
+            space=space,
+            needle=NEEDLE.replace("150", "180"),
+        )
+        (here / "case.toml").write_text(text)
         body = trimesh.creation.icosphere(subdivisions=5)
         trimesh.Trimesh(body.vertices * RADII + center, body.faces).export(here / "skin.stl")
-        for name, radius, at in (("organ", 20.0, (0, 0, 0)), ("rib", 5.0, (40, 0, 40))):
-            trimesh.creation.icosphere(subdivisions=2, radius=radius).apply_translation(at).export(here / f"{name}.stl")
-        (here / "markers_ct.csv").write_text(csv(points_ct))
-        (here / "touch.csv").write_text(csv(points_base))
+        write_balls(here, "organ", "rib")
+        write_markers(here, points_file(points_ct), points_file(points_base))
         return here
 
     return make
@@ -154,7 +126,7 @@ def test_the_abdomens_markers_read_as_ras_are_refused(tmp_path, capfd):
     shutil.copytree(meshes_folder() / "abdomen", here)
     rows = [line.split(",") for line in (here / "markers_ct.csv").read_text().split()[1:]]
     points = np.array([[float(x) for x in row[1:]] for row in rows])
-    text = csv(points * [-1, -1, 1])
+    text = points_file(points * [-1, -1, 1])
     for row, letter in zip(rows, "ABCDEF", strict=True):
         text = text.replace(f"{letter},", f"{row[0]},", 1)
     (here / "markers_ct.csv").write_text(text)
@@ -173,7 +145,7 @@ def test_four_of_the_abdomens_markers_show_the_slip_and_three_leave_it_open(coun
     shutil.copytree(meshes_folder() / "abdomen", here)
     for name, signs in (("markers_ct.csv", [-1, -1, 1]), ("touch.csv", [1, 1, 1])):
         rows = [line.split(",") for line in (here / name).read_text().split()[1:]]
-        (here / name).write_text(csv(np.array([[float(x) for x in row[1:]] for row in rows[:count]]) * signs))
+        (here / name).write_text(points_file(np.array([[float(x) for x in row[1:]] for row in rows[:count]]) * signs))
     assert main(["register", str(here)]) == code
     captured = capfd.readouterr()
     assert "markers_ct with x and y negated" in captured.out or "with x and y negated" in captured.err
