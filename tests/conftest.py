@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from hypothesis import settings
-from slow_tests import listed
+from slow_tests import listed, names_of, plugins
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -12,11 +12,17 @@ settings.register_profile("shared machine", deadline=None)  # the first call of 
 settings.load_profile("shared machine")
 
 
+def pytest_configure(config):
+    """Measure what tests take, where that is wanted."""
+    for plugin in plugins():
+        config.pluginmanager.register(plugin)
+
+
 def pytest_collection_modifyitems(items):
     """Mark what is slow, as measured, and what skips where real data is absent."""
     slow = listed()
     for item in items:
-        if item.nodeid.partition("[")[0] in slow:
+        if not slow.isdisjoint(names_of(item)):
             item.add_marker(pytest.mark.slow)
         if any("not on this machine" in mark.kwargs.get("reason", "") for mark in item.iter_markers("skipif")):
             item.add_marker(pytest.mark.real)
