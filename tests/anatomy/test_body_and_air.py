@@ -571,6 +571,24 @@ def test_a_thin_or_flat_arm_that_is_pressed_against_the_trunk_is_no_way_in(tmp_p
     assert found.safe.sum() > 40
 
 
+@pytest.mark.parametrize("radius_mm", [32.0, 24.0], ids=["thick", "thin"])
+@pytest.mark.parametrize("search", ["", "trust_labels = true"], ids=["", "labels trusted"])
+def test_a_forearm_across_the_belly_is_no_way_in(tmp_path, radius_mm, search):
+    """Nothing narrows between it and the trunk, and its bone runs across the bed: air on many sides of it tells."""
+    line = (-207.0, -10.0, 0.0), (95.0, -104.0, 10.0)
+    arm = ScannedPart("arm", capsule(*line, radius_mm), 20.0)
+    bone = ScannedPart("radius", capsule(*line, 7.0), 700.0)
+    parts = [*supine.trunk_parts(), arm, bone]
+    write_scene(tmp_path, parts, supine.grid())
+    prepared = prepare(write_case(tmp_path, search=search), arm=False)
+    found = prepared.search()
+
+    assert hit_parts_from_target(prepared, found, arm) == 0
+    assert "attached_limb" in found.verdict.structure
+    assert any("pressed against" in warning for warning in prepared.anatomy.warnings)
+    assert found.safe.sum() > 10
+
+
 def hit_parts_from_target(prepared, found, part):
     """Safe needles whose path in the body passes a part's truth by more than a voxel."""
     depths = np.arange(0.0, 210.0, 0.5)

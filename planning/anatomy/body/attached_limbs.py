@@ -2,16 +2,20 @@
 
 Between an arm and the trunk that it touches there is skin, which a CT does not show. What tells them apart is the neck:
 a ball that fits into either does not fit through where they touch. Where there is no neck, because the arm is thin or
-pressed flat, it is known by its bone, and what is as near to it as the arm may be thick belongs to it.
+pressed flat, or lies across the trunk, it is known by its bone, and what is as near to it as the arm may be thick
+belongs to it.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from puncture_twin.planning.anatomy.body.detached_parts import BONE_HU, MIN_BONE_ML
+from puncture_twin.planning.anatomy.body.exposed_bones import Exposed, exposed_bones
 from puncture_twin.planning.anatomy.body.limb_bones import LimbBone, limb_bones
 from puncture_twin.planning.base.arrays import Bools, Floats
 
@@ -43,7 +47,8 @@ def attached_limbs(hu: NDArray[np.float32], body: Bools, spacing_mm: Floats, tar
     stride = np.maximum(1, (SAMPLING_MM / spacing_mm).astype(int))
     coarse = body[:: stride[0], :: stride[1], :: stride[2]]
     at = tuple(np.clip(np.round(target_index / stride).astype(int), 0, np.array(coarse.shape) - 1))
-    owner = _nearest_core(_holding(coarse, at), spacing_mm * stride)
+    trunk = _holding(coarse, at)
+    owner = _nearest_core(trunk, spacing_mm * stride)
     voxel_ml = float(np.prod(spacing_mm)) / 1000.0
     parts = _spread(owner, stride, body.shape) * body
     limbs = np.zeros(body.shape, bool)
@@ -56,7 +61,58 @@ def attached_limbs(hu: NDArray[np.float32], body: Bools, spacing_mm: Floats, tar
     for bone in limb_bones(hu, held, spacing_mm):
         if not _holds_whole(limbs, bone) and not _about(bone, target_index, spacing_mm):
             limbs |= _surroundings(bone, body.shape, spacing_mm) & held
-    return limbs
+    across = _across(_blocks(held & (hu > BONE_HU), stride), trunk, spacing_mm * stride, at)
+    return limbs | ((_spread(across.astype(np.int32), stride, body.shape) > 0) & held)
+
+
+def _across(bone: Bools, held: Bools, spacing_mm: Floats, at: tuple[int, ...]) -> Bools:
+    """Voxels of limbs that lie across the part that holds a voxel, known by air on many sides of their bones."""
+    across = np.zeros(held.shape, bool)
+    for limb in exposed_bones(bone, held, spacing_mm):
+        about = _about_exposed(limb, held.shape, spacing_mm)
+        if not about.own[at]:
+            across |= about.reach
+    return across
+
+
+class _About(NamedTuple):
+    """What lies about the bones of one limb: nearer to them than they to the air, and as far as the limb may reach."""
+
+    own: Bools
+    reach: Bools
+
+
+def _about_exposed(limb: Exposed, shape: tuple[int, ...], spacing_mm: Floats) -> _About:
+    """What may belong to the limb about some bones, also some way beyond their ends."""
+    depth = np.full(shape, -1.0)
+    depth[tuple(limb.voxels.T)] = limb.depth_mm
+    gap, nearest = ndimage.distance_transform_edt(depth < 0.0, sampling=spacing_mm, return_indices=True)
+    radius = depth[tuple(nearest)]
+    reach = gap <= FLAT * radius + SLACK_MM
+    points = limb.voxels * spacing_mm
+    along = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][0] / spacing_mm
+    steps = np.arange(-BEYOND_ENDS_MM, BEYOND_ENDS_MM + 1e-9, 0.5 * float(spacing_mm.min()))
+    beyond = np.zeros(shape, bool)
+    for shift in np.unique(np.rint(steps[:, None] * along).astype(int), axis=0):
+        beyond |= _shifted(reach, shift)
+    return _About(gap < radius, beyond)
+
+
+def _shifted(mask: Bools, by: NDArray[np.int_]) -> Bools:
+    """The mask moved by whole voxels; False comes in."""
+    moved = np.zeros_like(mask)
+    into = tuple(slice(max(0, k), n + min(0, k)) for k, n in zip(by, mask.shape, strict=True))
+    out_of = tuple(slice(max(0, -k), n + min(0, -k)) for k, n in zip(by, mask.shape, strict=True))
+    moved[into] = mask[out_of]
+    return moved
+
+
+def _blocks(mask: Bools, stride: NDArray[np.int_]) -> Bools:
+    """A mask sampled: True where an eighth of a block is, which noise is not."""
+    share = mask.astype(np.float32)
+    for axis, times in enumerate(stride):
+        share = np.add.reduceat(share, np.arange(0, mask.shape[axis], times), axis=axis)
+    return np.asarray(share >= np.prod(stride) / 8.0)
 
 
 def _holds_whole(limbs: Bools, bone: LimbBone) -> bool:
