@@ -127,7 +127,7 @@ def _refuse_open_around_target(case: Case, anatomy: Anatomy) -> None:
     shells in shells, which a ray leaves an even number of times. Neither is the inside, so none is claimed.
     """
     for structure in anatomy.structures:
-        if structure.role is not Role.AVOID or structure.mesh.closed:
+        if not structure.demands_margin or structure.mesh.closed:
             continue
         odd, turns = odd_fraction(structure.mesh, case.target_ct), winding_number(structure.mesh, case.target_ct)
         if max(odd, abs(turns)) > MOST_AROUND:
@@ -141,17 +141,19 @@ def _refuse_open_around_target(case: Case, anatomy: Anatomy) -> None:
 
 
 def _refuse_short_maps(case: Case, anatomy: Anatomy, headers: Headers) -> None:
-    """Beyond a label map's box organs have no label: within the needle's reach the box must hold the body."""
-    reach = case.needle.length_mm
-    low, high = anatomy.skin.mesh.bounds
-    low, high = np.maximum(low, case.target_ct - reach), np.minimum(high, case.target_ct + reach)
-    corners = np.array([[low[0], high[0]], [low[1], high[1]], [low[2], high[2]]])
-    points = np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1).reshape(-1, 3)
+    """Beyond a label map's box organs have no label: within the needle's reach the box must hold the body.
+
+    Both are compared along the map's own axes, in voxels, which may be oblique to the patient's.
+    """
     for name in sorted({s.labelmap for s in case.structure if s.labelmap} | {s.labelmap for s in case.structures}):
         header = headers[name]
         T_index_ct = np.linalg.inv(header.T_ct_index)
-        index = apply(T_index_ct, points)
-        outside = np.maximum(-0.5 - index, index - (np.array(header.shape) - 0.5)).max()
+        skin = apply(T_index_ct, anatomy.skin.mesh.vertices)
+        target = apply(T_index_ct, case.target_ct[None])[0]
+        # |row| is how many voxels an axis advances for a step of 1 mm along its normal
+        reach = case.needle.length_mm * np.linalg.norm(T_index_ct[:3, :3], axis=1)
+        low, high = np.maximum(skin.min(axis=0), target - reach), np.minimum(skin.max(axis=0), target + reach)
+        outside = max((-0.5 - low).max(), (high - (np.array(header.shape) - 0.5)).max())
         if outside > VOXELS_OF_SLACK:
             raise InputError(
                 f"label map {name} ends {outside:.0f} voxels inside the body, within the needle's reach",

@@ -225,6 +225,10 @@ BREAKS = {
         lambda f: opened(f / "rib.stl", 30, wound_at_random=True),
         "whether the target lies inside is not known (98 % of all rays from it cross the mesh an odd number of times",
     ),
+    "an open region of role unknown around the target": (
+        lambda f: (opened(f / "rib.stl", 30), replace("case.toml", '"avoid"', '"unknown"')(f)),
+        "'rib' is an open mesh about the target: whether the target lies inside is not known (98 % of all rays",
+    ),
     "two open shells around the target": (
         lambda f: opened(f / "rib.stl", 30, shells=2),
         "whether the target lies inside is not known (0 % of all rays from it cross the mesh an odd number of times; "
