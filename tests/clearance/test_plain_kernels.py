@@ -279,9 +279,11 @@ def test_a_ray_into_a_triangle_crosses_it_however_near_its_rim(rng, scale):
         for w in range(len(weights)):
             depth = met.get((triangle * len(weights) + w, triangle))
             assert depth == pytest.approx(away[triangle, w], rel=1e-6)
-    beyond = np.einsum("wk,tkx->twx", np.array([[1.02, -0.01, -0.01], [0.51, 0.51, -0.02]]), corners[::3])
+    outside = np.array([[1.02, -0.01, -0.01], [0.51, 0.51, -0.02]])
+    outside = np.concatenate([np.roll(outside, k, axis=1) for k in range(3)])
+    beyond = np.einsum("wk,tkx->twx", outside, corners[::3])
     out = crossings(mesh, np.zeros(3), (beyond / np.linalg.norm(beyond, axis=-1)[..., None]).reshape(-1, 3))
-    assert not any(face == 3 * (ray // 2) for ray, face in zip(out.ray.tolist(), out.face.tolist(), strict=True))
+    assert not any(face == 3 * (ray // 6) for ray, face in zip(out.ray.tolist(), out.face.tolist(), strict=True))
 
 
 def test_triangles_about_the_poles(rng):
@@ -322,6 +324,14 @@ def test_an_edge_is_crossed_whichever_way_the_faces_are_wound(order):
     at = np.concatenate([corners, [[-4, 0, 8.0], [0, 2, 8], [0, -2, 8]]])
     found = crossings(TriangleMesh(corners, [order]), np.zeros(3), at / np.linalg.norm(at, axis=1, keepdims=True))
     assert found.count.tolist() == [1] * 6
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2], [0, 2, 1]])
+def test_a_triangle_whose_weights_add_up_to_one_is_crossed(order):
+    """Half a square millimetre across the ray: the three weights are twice areas, their sum exactly 1."""
+    corners = np.array([[-0.25, -0.25, 5.0], [0.75, -0.25, 5.0], [-0.25, 0.75, 5.0]])
+    found = crossings(TriangleMesh(corners, [order]), np.zeros(3), np.array([[0.0, 0.0, 1.0]]))
+    assert found.depth.tolist() == [5.0]
 
 
 def test_crossings_behind_beyond_and_at_the_length():
