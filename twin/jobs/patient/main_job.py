@@ -14,8 +14,9 @@ import numpy as np
 
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.output.draft import Draft
 from puncture_twin.planning.base.output.manifest import read_output
-from puncture_twin.planning.base.output.output_set import Draft, writing
+from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.certify.certificate import (
     write_certificate,

@@ -6,7 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from puncture_twin.planning.base.errors import PlanningError
-from puncture_twin.planning.base.output.output_set import Draft, withdraw, writing
+from puncture_twin.planning.base.output.draft import Draft
+from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import FILE_NAME
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case

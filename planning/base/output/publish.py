@@ -1,0 +1,153 @@
+"""From a draft to the command's set.
+
+When all files of a draft are there:
+
+1. the manifest is replaced by one without the entries that go, which names every file that may be left over;
+2. the files are moved in;
+3. files of the entries that went are removed;
+4. the manifest is replaced by the one with the new entries.
+
+The entries that go are the command's old one, every one that owns a file of the same name, and whatever depends on
+those. Whoever is killed before 1 leaves the old set, after 4 the new one, and between them files that no manifest
+lists.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import datetime
+from importlib.metadata import version
+from pathlib import Path
+from types import FrameType
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.output.draft import Draft
+from puncture_twin.planning.base.output.manifest import (
+    MANIFEST_NAME,
+    TIMINGS_NAME,
+    Manifest,
+    ManifestEntry,
+    file_digest,
+)
+from puncture_twin.planning.base.output.timings import with_timings
+
+
+def publish(draft: Draft, started: datetime) -> None:
+    """Make the draft's files the command's set."""
+    out, old, state = draft.out, draft.old, draft.folder.parent / "state"
+    new = _entries(draft)
+    files = {name for entry in new.values() for name in entry.files}
+    gone = _gone(old, {draft.command, *new}, files)
+    refuse_foreign(draft, files)
+    kept = {name: entry for name, entry in old.entries.items() if name not in gone}
+    left = files.union(old.unfinished, *(old.entries[name].files for name in gone))
+    (state / "before").write_text(Manifest(kept, tuple(sorted(left))).text(), encoding="utf-8")
+    (state / "after").write_text(Manifest({**kept, **new}).text(), encoding="utf-8")
+    timings = with_timings(out, kept, draft.command, started, draft.seconds)
+    (state / "timings").write_text(timings, encoding="utf-8")
+    with _uninterrupted():
+        (state / "before").replace(out / MANIFEST_NAME)
+        for name in sorted(files):
+            (out / name).parent.mkdir(parents=True, exist_ok=True)
+            (draft.folder / name).replace(out / name)
+        _remove(out, left - files)
+        (state / "timings").replace(out / TIMINGS_NAME)
+        (state / "after").replace(out / MANIFEST_NAME)
+    _tell(draft, gone - {draft.command, *new} - _dependents(old, {draft.command, *new}))
+
+
+def _entries(draft: Draft) -> dict[str, ManifestEntry]:
+    """The new entries, from the files in the draft."""
+    files: dict[str, dict[str, str]] = {draft.command: {}}
+    for path in sorted(draft.folder.rglob("*")):
+        if path.is_file():
+            name = path.relative_to(draft.folder).as_posix()
+            files.setdefault(draft.parts.get(name, draft.command), {})[name] = file_digest(path)
+    own = version("puncture-twin")
+    return {
+        name: ManifestEntry(
+            own, tuple(draft.inputs), draft.depends_on if name == draft.command else (draft.command,), listed
+        )
+        for name, listed in files.items()
+        if listed
+    }
+
+
+def _gone(old: Manifest, new: set[str], files: set[str]) -> set[str]:
+    """The old entries that a new one replaces, robs of a file, or leaves without what they depend on."""
+    gone = {name for name, entry in old.entries.items() if name in new or files & set(entry.files)}
+    return gone | _dependents(old, gone)
+
+
+def _dependents(old: Manifest, names: set[str]) -> set[str]:
+    """The entries that depend on some, directly or through others."""
+    found: set[str] = set()
+    while more := {name for name, entry in old.entries.items() if {*names, *found} & set(entry.depends_on)} - found:
+        found |= more
+    return found
+
+
+def refuse_foreign(draft: Draft, files: Iterable[str]) -> None:
+    """Never overwrite what no run of this program has written.
+
+    Raises:
+        InputError: Names the first such file.
+    """
+    known = {*draft.old.files, *draft.old.unfinished}
+    if (draft.out / MANIFEST_NAME).exists():
+        known.add(TIMINGS_NAME)
+    for name in sorted({*files, TIMINGS_NAME} - known):
+        foreign = _in_the_way(draft.out, name)
+        if foreign is not None:
+            what = f"{name} is to be written, but the file {foreign} there comes from no run of this program"
+            raise InputError(what, where=draft.out, allowed="another folder, or this one without that file")
+
+
+def _in_the_way(out: Path, name: str) -> str | None:
+    """What stands under a name that is to be written, or where a sub-folder of it must be; a link leads elsewhere."""
+    place = out / name
+    for folder in reversed(Path(name).parents[:-1]):
+        if (out / folder).is_symlink() or ((out / folder).exists() and not (out / folder).is_dir()):
+            return folder.as_posix()
+    return name if place.exists() or place.is_symlink() else None
+
+
+def _remove(out: Path, names: Iterable[str]) -> None:
+    """Remove files, and sub-folders that are empty then; nothing outside of the folder."""
+    home = out.resolve()
+    for name in sorted(names):
+        path = out / name
+        if path.parent.resolve().is_relative_to(home) and not path.is_dir():
+            path.unlink(missing_ok=True)
+            with suppress(OSError):
+                for parent in path.relative_to(out).parents[:-1]:
+                    (out / parent).rmdir()
+
+
+def _tell(draft: Draft, others: set[str]) -> None:
+    """Name what went although neither the command's own nor made from it."""
+    if others:
+        named = ", ".join(sorted(others))
+        draft.note(f"{draft.out}: the files of {named} were removed: {draft.command} has replaced a part of them")
+    if draft.legacy:
+        named = ", ".join(draft.legacy)
+        draft.note(f"{draft.out}: files of an older version, without a manifest, were replaced or removed: {named}")
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Put Ctrl-C off until the end of the block: some renames, a millisecond."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[tuple[int, FrameType | None]] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: came.append((number, frame)))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came and callable(before):
+        before(*came[0])
