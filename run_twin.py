@@ -9,9 +9,6 @@ from __future__ import annotations
 
 import json
 import sys
-import traceback
-import warnings
-from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from importlib.metadata import version
@@ -20,23 +17,16 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from typer._click.exceptions import ClickException  # typer carries its own click and re-exports no base class
 
 from puncture_twin.meshes import folder as meshes_folder
-from puncture_twin.planning.base.errors import (
-    MOST_WHAT,
-    CacheWarning,
-    InputError,
-    NoAnswerError,
-    PlanningError,
-    one_line,
-)
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import check_writable
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.batch.batch import run_batch
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.export.exporter import FORMATS
 from puncture_twin.planning.search.context import prepare
+from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, exit_code_of
 from puncture_twin.twin.jobs.patient import answers, main_job, text as words
 from puncture_twin.twin.jobs.patient.place_text import place_text
 from puncture_twin.twin.jobs.robot.mirror import (
@@ -50,8 +40,6 @@ from puncture_twin.twin.report.progress import progress_display
 
 MOST_SEEDS = 10_000
 """Rooms or draws of one command; each takes seconds."""
-
-OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
 
 app = typer.Typer(add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False)
 out = Console(soft_wrap=True)
@@ -344,49 +332,7 @@ def _print(summary: dict[str, Any], text: str, as_json: bool) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
-    with warnings.catch_warnings():
-        warnings.showwarning = _notes(warnings.showwarning)
-        return _run(arguments)
-
-
-def _notes(usual: Callable[..., None]) -> Callable[..., None]:
-    """Says in one line, once, what was made anew; other warnings are Python's."""
-    said: set[str] = set()
-
-    def show(message: Warning | str, category: type[Warning], *rest: Any) -> None:
-        if not issubclass(category, CacheWarning):
-            usual(message, category, *rest)
-        elif str(message) not in said:
-            said.add(str(message))
-            print(f"note: {message}", file=sys.stderr)
-
-    return show
-
-
-def _run(arguments: list[str] | None) -> int:
-    try:
-        result = app(arguments, standalone_mode=False)
-    except InputError as error:
-        return _fail(str(error), BAD_INPUT)
-    except NoAnswerError as error:
-        return _fail(one_line(str(error)), ANSWER_IS_NO)
-    except (KeyboardInterrupt, typer.Abort):
-        result = INTERRUPTED
-    except ClickException as error:
-        return _fail(f"command line: {one_line(error.format_message(), MOST_WHAT)}; allowed: see --help", BAD_INPUT)
-    except PlanningError as error:
-        return _fail(str(error), PROGRAM_FAILED)
-    except Exception:  # the last line of defence: the user gets exit code 3 and the traceback, whatever broke
-        traceback.print_exc()
-        return PROGRAM_FAILED
-    if result == INTERRUPTED:  # typer itself turns Ctrl-C into this, and says nothing
-        return _fail("interrupted", INTERRUPTED)
-    return int(result or OK)
-
-
-def _fail(line: str, code: int) -> int:
-    print(line, file=sys.stderr)
-    return code
+    return exit_code_of(partial(app, arguments, standalone_mode=False), partial(print, file=sys.stderr))
 
 
 if __name__ == "__main__":

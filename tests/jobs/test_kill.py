@@ -28,7 +28,8 @@ from puncture_twin.planning.base.files import sha256
 from puncture_twin.planning.base.output.manifest import problems, read_manifest
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input
-from puncture_twin.run_twin import ANSWER_IS_NO, OK, main
+from puncture_twin.run_twin import main
+from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, OK
 
 KILLS = int(os.environ.get("KILLS", "3"))
 ALL = "KILLS" in os.environ

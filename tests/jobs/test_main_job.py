@@ -11,7 +11,8 @@ import pytest
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.files import sha256
 from puncture_twin.planning.base.output.manifest import problems
-from puncture_twin.run_twin import ANSWER_IS_NO, BAD_INPUT, INTERRUPTED, OK, PROGRAM_FAILED, main
+from puncture_twin.run_twin import main
+from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, INTERRUPTED, OK, PROGRAM_FAILED
 from puncture_twin.twin.report.progress import BarDisplay, LineDisplay, progress_display
 
 

@@ -22,7 +22,8 @@ from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.run_twin import BAD_INPUT, main
+from puncture_twin.run_twin import main
+from puncture_twin.twin.jobs.exit_codes import BAD_INPUT
 from puncture_twin.twin.jobs.robot.mirror import Mirror
 
 TABLE = '[[obstacle]]\nname = "table"\nframe = "ct"\ncenter_mm = [0.0, 150.0, 0.0]\nsize_mm = [600.0, 40.0, 1200.0]\n'
