@@ -12,15 +12,17 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import closed_fo
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import direction_from_plane, mean_direction
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import N_PARAMETERS, SCALE, T_X, W_X, W_Y, active_columns
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Problem, refine
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import refine
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
+    UNWEIGHTED,
+    Problem,
+    covariances,
     direction_residuals,
     directions_image,
     linearised_direction,
     linearised_tip,
     tip_residuals,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import UNWEIGHTED, covariances
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, PoseRanges, simulate_recording, with_noise
 
 ALL = active_columns(tip=True, scale=False, direction=False)

@@ -23,10 +23,8 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import mean_direct
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, active_columns
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.pose_choice import expected_tre_mm
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Problem
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import tip_residuals
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import UNWEIGHTED, Problem, tip_residuals
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import plain_fit
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import UNWEIGHTED
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, SimulatedTruth, simulate_recording
 
 SEED = 20230816

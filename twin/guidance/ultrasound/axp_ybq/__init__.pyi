@@ -11,8 +11,6 @@ from .recording import (
     recording_file as recording_file,
     write_recording as write_recording,
 )
-from .refine import Problem as Problem
-from .residuals import tip_residuals as tip_residuals
+from .residuals import UNWEIGHTED as UNWEIGHTED, Problem as Problem, tip_residuals as tip_residuals
 from .robust import plain_fit as plain_fit
 from .slips import checked_calibration as checked_calibration
-from .weighting import UNWEIGHTED as UNWEIGHTED

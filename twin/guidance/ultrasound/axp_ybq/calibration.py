@@ -13,9 +13,8 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import log_rotation, pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, PARAMETERS, T_Q, Estimate, tangent_basis
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip, tip_residuals
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import Spread, linearised_tip, tip_residuals
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.solve import Solution, solve
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import Spread
 
 SHAFT_BIAS = (
     "a constant error of the detected tip along the shaft moves the tip in the needle's flange frame and leaves every "

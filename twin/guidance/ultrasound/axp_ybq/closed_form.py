@@ -11,11 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import LENGTH_MM, Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-
-LENGTH_MM = 100.0
-"""Lengths are counted in this unit, so that the columns of the system are of one size."""
 
 LEAST_POSES = 16
 """48 unknowns, three rows a pose."""

@@ -11,8 +11,9 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
+    direction_residuals,
+    directions_end2,
     directions_image,
-    linearised_direction,
     needle_in_image,
 )
 
@@ -39,7 +40,7 @@ class SeenDirection(NamedTuple):
     """The same across the image."""
 
 
-def mean_direction(estimate: Estimate, recording: Recording, weights: Floats | None = None) -> Floats:
+def mean_direction(estimate: Estimate, recording: Recording) -> Floats:
     """V = normalise(sum M_i^T v_i), shape (3,), frame end2.
 
     Every M_i is a rotation from end2 to image, so that M_i^T v_i is the direction itself, seen by pose i.
@@ -47,11 +48,12 @@ def mean_direction(estimate: Estimate, recording: Recording, weights: Floats | N
     Args:
         estimate: R_X and R_Y.
         recording: With directions.
-        weights: One per pose; all 1 when absent.
     """
-    back = needle_in_image(estimate, recording).transpose(0, 2, 1)
-    seen = np.einsum("nij,nj->ni", back, directions_image(recording, estimate))
-    total = seen.sum(axis=0) if weights is None else weights @ seen
+    seen = directions_end2(estimate, recording)
+    return _unit(seen.sum(axis=0))
+
+
+def _unit(total: Floats) -> Floats:
     return np.asarray(total / np.linalg.norm(total))
 
 
@@ -63,15 +65,14 @@ def agreed_direction(estimate: Estimate, recording: Recording, kept: NDArray[np.
         recording: With directions.
         kept: Shape (n,): poses whose tip is trusted; only these make the mean.
     """
-    back = needle_in_image(estimate, recording).transpose(0, 2, 1)
-    seen = np.einsum("nij,nj->ni", back, directions_image(recording, estimate))
+    seen = directions_end2(estimate, recording)
     middle = np.median(seen[kept], axis=0)
     angles = np.arccos(np.clip(seen @ middle / np.linalg.norm(middle), -1.0, 1.0))
     limit = max(FAR * float(np.median(angles[kept])) / HALF_NORMAL, LEAST_ANGLE)
     agrees = angles <= limit
-    V = mean_direction(estimate, recording, 1.0 * (agrees & kept))
-    found = linearised_direction(estimate._replace(V=V), recording, directions_image(recording, estimate))
-    inside, across = np.sqrt(np.mean(found.residuals[agrees & kept] ** 2, axis=0))
+    V = _unit((agrees & kept) @ seen)
+    found = direction_residuals(estimate._replace(V=V), recording, directions_image(recording, estimate))
+    inside, across = np.sqrt(np.mean(found[agrees & kept] ** 2, axis=0))
     return SeenDirection(V, agrees, max(float(inside), LEAST_SPREAD), max(float(across), LEAST_SPREAD))
 
 

@@ -29,6 +29,10 @@ W_X, T_X, W_Y, T_Y, T_Q, SCALE, DIRECTION = (
 )  # fmt: skip
 
 
+LENGTH_MM = 100.0
+"""Lengths are counted in this unit, so that the columns of a system are of one size."""
+
+
 class Estimate(NamedTuple):
     """One value of every unknown."""
 
@@ -66,6 +70,15 @@ def active_columns(*, tip: bool, scale: bool, direction: bool) -> NDArray[np.int
     wanted = np.ones(N_PARAMETERS, dtype=bool)
     wanted[T_Q], wanted[SCALE], wanted[DIRECTION] = tip, scale, direction
     return np.flatnonzero(wanted)
+
+
+def parameter_units(active: NDArray[np.int_], scale: Floats) -> Floats:
+    """How large a step of each free parameter is "one": 1 rad, 100 mm, the scale itself."""
+    units = np.ones(N_PARAMETERS)
+    for part in (T_X, T_Y, T_Q):
+        units[part] = LENGTH_MM
+    units[SCALE] = scale
+    return units[active]
 
 
 def tangent_basis(direction: Floats) -> Floats:

@@ -14,10 +14,17 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import skew
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import LENGTH_MM, nearest_rotation
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import T_Q, T_X, T_Y, W_X, Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import nearest_rotation
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
+    LENGTH_MM,
+    T_Q,
+    T_X,
+    T_Y,
+    W_X,
+    Estimate,
+    parameter_units,
+)
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import parameter_units
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip, needle_in_image
 
 LEAST_RATIO = 3e-3

@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, active_columns, parameter_units
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import parameter_units
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import covariances, whitener
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import covariances, linearised_tip, whitener
 
 PRIOR_WEIGHT = 1e-6
 """Information that every parameter is taken to have beforehand, as a share of a candidate's; for the first picks."""

@@ -1,4 +1,4 @@
-"""Residuals of A X P = Y B Q, of the needle's direction, and their Jacobians.
+"""What every pose says of the unknowns of A X P = Y B Q: residuals, their Jacobians and their expected covariance.
 
 Tip:       F = R_Y (R_B t_Q + t_B) + t_Y - R_A (R_X S p + t_X) - t_A (mm, base1), S = diag(scale).
            With R <- R exp([w]x) its derivatives by w_X, t_X, w_Y, t_Y, t_Q, scale are
@@ -14,6 +14,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import skew
@@ -29,7 +30,43 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
     Estimate,
     tangent_basis,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
+
+Weights = Floats | NDArray[np.bool_]
+
+LEAST_WEIGHT = 1e-12
+"""A pose that is set aside keeps this weight: its residual's standard deviation is a million times as large."""
+
+
+class Spread(NamedTuple):
+    """The same spread for every pose; with equal parts inside and across the image this is unweighted least squares."""
+
+    inside_mm: float
+    """Of the tip's residual along each axis of the image."""
+    across_mm: float
+    """Of the tip's residual across the image, where the image itself measures nothing."""
+    direction_rad: float
+    """Of the direction's residual inside the image."""
+
+
+UNWEIGHTED = Spread(1.0, 1.0, 1.0)
+"""Every residual counts the same."""
+
+
+class Problem(NamedTuple):
+    """What is to be estimated, from what."""
+
+    recording: Recording
+    noise: Noise | Spread
+    active: NDArray[np.int_]
+    """Which of the 19 parameters are free."""
+    lean_rad: float = 0.0
+    """How far needles lean out of the slice and still show: all that a direction seen in the image says across it."""
+
+    @property
+    def with_direction(self) -> bool:
+        """Whether the measured directions take part."""
+        return bool(self.active[-1] >= DIRECTION.start)
 
 
 class Linearised(NamedTuple):
@@ -39,6 +76,38 @@ class Linearised(NamedTuple):
     """Shape (n, k)."""
     jacobian: Floats
     """Shape (n, k, 19), by the parameters of ``estimate.PARAMETERS``."""
+
+
+def linearise(problem: Problem, estimate: Estimate) -> Linearised:
+    """All residuals (n, 3 or 5) and their Jacobian by the free parameters (n, 3 or 5, p)."""
+    tip = linearised_tip(estimate, problem.recording)
+    if not problem.with_direction:
+        return Linearised(tip.residuals, tip.jacobian[:, :, problem.active])
+    v_image = directions_image(problem.recording, estimate)
+    turn = linearised_direction(estimate, problem.recording, v_image)
+    jacobian = np.concatenate([tip.jacobian, turn.jacobian], axis=1)[:, :, problem.active]
+    return Linearised(np.concatenate([tip.residuals, turn.residuals], axis=1), jacobian)
+
+
+def problem_covariances(problem: Problem, estimate: Estimate) -> Floats:
+    """The expected covariance of each pose's residuals, shape (n, k, k)."""
+    v_image = directions_image(problem.recording, estimate) if problem.with_direction else None
+    return covariances(estimate, problem.recording, problem.noise, v_image, problem.lean_rad)
+
+
+def residual_weights(problem: Problem, tip_weights: Weights, direction_weights: Weights) -> Floats:
+    """One weight per residual, shape (n, k), from one per pose for tip and direction (a flag counts as 1 or 0)."""
+    columns = [tip_weights] * 3 + [direction_weights] * (2 if problem.with_direction else 0)
+    return np.column_stack(columns).astype(np.float64)
+
+
+def residuals(problem: Problem, estimate: Estimate) -> Floats:
+    """All residuals alone, shape (n, 3 or 5)."""
+    tip = tip_residuals(estimate, problem.recording)
+    if not problem.with_direction:
+        return tip
+    v_image = directions_image(problem.recording, estimate)
+    return np.concatenate([tip, direction_residuals(estimate, problem.recording, v_image)], axis=1)
 
 
 def tip_points(estimate: Estimate, recording: Recording) -> tuple[Floats, Floats]:
@@ -91,6 +160,12 @@ def directions_image(recording: Recording, estimate: Estimate) -> Floats:
     return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True))
 
 
+def directions_end2(estimate: Estimate, recording: Recording) -> Floats:
+    """The measured directions as every pose has them in end2, M^T v: shape (n, 3), unit."""
+    back = needle_in_image(estimate, recording).transpose(0, 2, 1)
+    return np.asarray(np.einsum("nij,nj->ni", back, directions_image(recording, estimate)))
+
+
 def across(v: Floats) -> Floats:
     """e1 (inside the image, across v) and e2 (across the image) of unit vectors (n, 3), as rows: shape (n, 2, 3)."""
     rows = np.zeros((len(v), 2, 3))
@@ -123,3 +198,61 @@ def linearised_direction(estimate: Estimate, recording: Recording, v_image: Floa
     J[:, :, W_Y] = -rows @ R_AXY @ skew(recording.B[:, :3, :3] @ estimate.V)
     J[:, :, DIRECTION] = rows @ M @ tangent_basis(estimate.V)
     return Linearised((rows @ m[:, :, None])[:, :, 0], J)
+
+
+def covariances(
+    estimate: Estimate,
+    recording: Recording,
+    noise: Noise | Spread,
+    v_image: Floats | None = None,
+    lean_rad: float = 0.0,
+) -> Floats:
+    """Covariance of each pose's residuals, shape (n, 3, 3) of the tip, or (n, 5, 5) with the direction's two behind it.
+
+    Args:
+        estimate: Where the residuals are linearised.
+        recording: The poses.
+        noise: Propagated to first order through both arms and the image, or taken as it is.
+        v_image: The measured directions, unit, shape (n, 3), where they are used.
+        lean_rad: How far the needle leans out of the measured direction's plane across the image.
+    """
+    n, size = len(recording), 3 if v_image is None else 5
+    sigma = np.zeros((n, size, size))
+    if isinstance(noise, Spread):
+        in_image = recording.A[:, :3, :3] @ estimate.R_X * [noise.inside_mm, noise.inside_mm, noise.across_mm]
+        sigma[:, :3, :3] = in_image @ in_image.transpose(0, 2, 1)
+    else:
+        sigma += _propagated(estimate, recording, noise, v_image)
+    if v_image is not None:
+        sigma[:, 3, 3] += noise.direction_rad**2
+        sigma[:, 4, 4] += lean_rad**2
+    return sigma
+
+
+def _propagated(estimate: Estimate, recording: Recording, noise: Noise, v_image: Floats | None) -> Floats:
+    """Both flanges' and the tip's noise in the residuals; every source is independent and isotropic."""
+    R_A, R_B = recording.A[:, :3, :3], recording.B[:, :3, :3]
+    in_end1, _ = tip_points(estimate, recording)
+    turn_A, turn_B = R_A @ skew(in_end1), -estimate.R_Y @ R_B @ skew(estimate.t_Q)
+    if v_image is not None:
+        M, rows = needle_in_image(estimate, recording), across(v_image)
+        end1 = (M @ estimate.V) @ estimate.R_X.T
+        turn_A = np.concatenate([turn_A, rows @ estimate.R_X.T @ skew(end1)], axis=1)
+        turn_B = np.concatenate([turn_B, -rows @ M @ skew(estimate.V)], axis=1)
+    sigma = noise.robot_rad**2 * (turn_A @ turn_A.transpose(0, 2, 1) + turn_B @ turn_B.transpose(0, 2, 1))
+    in_image = (R_A @ estimate.R_X)[:, :, :2]
+    sigma[:, :3, :3] += noise.image_mm**2 * in_image @ in_image.transpose(0, 2, 1)
+    sigma[:, :3, :3] += 2 * noise.robot_mm**2 * np.eye(3)
+    return np.asarray(sigma)
+
+
+def whitener(sigma: Floats, weights: Floats) -> Floats:
+    """W with W^T W the inverse covariance, each pose's times its weight; shape (n, k, k).
+
+    Args:
+        sigma: Shape (n, k, k).
+        weights: Shape (n, k): one per residual; 0 sets it aside.
+    """
+    spread = 1.0 / np.sqrt(np.maximum(weights, LEAST_WEIGHT))
+    scaled = sigma * spread[:, :, None] * spread[:, None, :]
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(scaled)))

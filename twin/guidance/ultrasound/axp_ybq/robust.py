@@ -16,15 +16,17 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import HALF_NORMAL
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import refine
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
     Problem,
+    Spread,
+    directions_image,
     linearise,
+    needle_in_image,
     problem_covariances,
-    refine,
     residual_weights,
+    whitener,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import directions_image, needle_in_image
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import Spread, whitener
 
 FALSE_ALARMS = 0.01
 """Chance that a recording without outliers loses a pose."""

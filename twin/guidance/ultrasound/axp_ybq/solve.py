@@ -18,12 +18,10 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import (
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, Estimate, active_columns
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability, WeakMotion, observe
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Problem
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import needle_in_image
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import UNWEIGHTED, Problem, Spread, needle_in_image
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import RobustFit, fitted, plain_fit, robust_fit, settled
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.spread import found_spreads
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.suggested_poses import SuggestedPoses, propose
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import UNWEIGHTED, Spread
 
 SPREAD_ROUNDS = 2
 """How often the residuals' spread is found and the fit repeated with it; it settles to a few percent in two."""

@@ -7,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Problem
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import Problem, Spread
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import LEAST_MM, Fitted, RobustFit, fitted
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.weighting import Spread
 
 LEAST_FREEDOM = 15
 """Residuals minus unknowns below which inside and across are not told apart: their ratio would be chance."""
