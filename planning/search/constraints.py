@@ -18,6 +18,9 @@ from puncture_twin.planning.search.candidates import Verdict
 
 Column = NDArray[Any] | str | float
 
+SKIN = "skin"
+"""Its name in the reasons."""
+
 
 def longest_path(needle: Needle) -> float:
     """The longest path, target to skin, that the needle can drive, mm.
@@ -36,7 +39,6 @@ def judge(
     *,
     needle: Needle,
     max_skin_angle: float,
-    skin: str = "skin",
 ) -> Verdict:
     """Apply every constraint; the reason given is the first that is broken, in the order of the code.
 
@@ -49,7 +51,6 @@ def judge(
         structures: The k structures.
         needle: For the longest path.
         max_skin_angle: rad.
-        skin: Name of the skin in the reasons.
     """
     count = len(paths.path_length)
     reasons, names_of, details = (np.full(count, "", dtype=object) for _ in range(3))
@@ -66,13 +67,13 @@ def judge(
             column[rows] = value[rows] if isinstance(value, np.ndarray) else value
 
     length = paths.path_length
-    give(Reason.UNKNOWN_REGION, ~np.isnan(paths.unknown_depth), skin, paths.unknown_depth)
-    give(Reason.NO_SKIN_ENTRY, np.isnan(length), skin, np.nan)
-    give(Reason.REENTERS_SKIN, ~np.isnan(paths.reentry_depth), skin, paths.reentry_depth)
-    give(Reason.TOO_LONG, length > longest_path(needle), skin, length, length)
-    give(Reason.SKIN_ANGLE, paths.skin_angle > max_skin_angle, skin, length, np.degrees(paths.skin_angle))
+    give(Reason.UNKNOWN_REGION, ~np.isnan(paths.unknown_depth), SKIN, paths.unknown_depth)
+    give(Reason.NO_SKIN_ENTRY, np.isnan(length), SKIN, np.nan)
+    give(Reason.REENTERS_SKIN, ~np.isnan(paths.reentry_depth), SKIN, paths.reentry_depth)
+    give(Reason.TOO_LONG, length > longest_path(needle), SKIN, length, length)
+    give(Reason.SKIN_ANGLE, paths.skin_angle > max_skin_angle, SKIN, length, np.degrees(paths.skin_angle))
     waiting = paths.view_depth < waiting_flange(needle, length, paths.skin_angle)
-    give(Reason.UNKNOWN_REGION, waiting, skin, paths.view_depth)
+    give(Reason.UNKNOWN_REGION, waiting, SKIN, paths.view_depth)
     worst = worst_violation(clearances, structures)
     names = np.array([s.name for s in structures] or [""], dtype=object)[worst]
     unknown = np.array([s.role is Role.UNKNOWN for s in structures] or [False])[worst]

@@ -37,7 +37,7 @@ MESH_SUFFIXES: tuple[str, ...] = tuple(_READERS)
 """The file name endings that ``read_mesh`` takes, in lower case; upper case is the same."""
 
 
-def read_mesh(path: Path, *, unit: Unit, space: Space, where: str | None = None) -> TriangleMesh:
+def read_mesh(path: Path, *, unit: Unit, space: Space) -> TriangleMesh:
     """One mesh file, checked against its own promises, in mm and LPS (or its own local frame).
 
     Nothing about unit or space is taken from the file: the caller declares both, also for GLB, whose standard says
@@ -48,17 +48,15 @@ def read_mesh(path: Path, *, unit: Unit, space: Space, where: str | None = None)
         path: An STL, OBJ, PLY, GLB or VTP file.
         unit: The unit of its coordinates.
         space: Their space.
-        where: How errors name the file; its path by default.
 
     Raises:
         InputError: If it is missing, cut, contradicts itself, is empty, or fails the guard.
     """
-    name = where or str(path)
-    _reader(path, name)  # an unknown ending is refused before anything is read
-    return parse_mesh(read_input(path, max_bytes=MAX_FILE_BYTES, where=name), path, unit=unit, space=space, where=name)
+    _reader(path)  # an unknown ending is refused before anything is read
+    return parse_mesh(read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path)), path, unit=unit, space=space)
 
 
-def parse_mesh(data: bytes, path: Path, *, unit: Unit, space: Space, where: str | None = None) -> TriangleMesh:
+def parse_mesh(data: bytes, path: Path, *, unit: Unit, space: Space) -> TriangleMesh:
     """The same of a file that has been read; it is not opened again.
 
     Args:
@@ -66,13 +64,12 @@ def parse_mesh(data: bytes, path: Path, *, unit: Unit, space: Space, where: str 
         path: Its name, whose ending says the format.
         unit: The unit of its coordinates.
         space: Their space.
-        where: How errors name the file; its path by default.
 
     Raises:
         InputError: As `read_mesh`, but for reading.
     """
-    name = where or str(path)
-    reader = _reader(path, name)
+    name = str(path)
+    reader = _reader(path)
     with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite or NaN here, the guard refuses
         raw = reader(data, name)
         vertices = to_lps(raw.vertices, space) * unit.mm
@@ -108,9 +105,9 @@ def _signed_volume(mesh: TriangleMesh) -> float:
     return float(np.linalg.det(corners).sum() / 6.0)
 
 
-def _reader(path: Path, where: str) -> Callable[[bytes, str], RawMesh]:
+def _reader(path: Path) -> Callable[[bytes, str], RawMesh]:
     suffix = path.suffix.lower()
     if suffix not in _READERS:
         allowed = "a file ending in " + ", ".join(MESH_SUFFIXES)
-        raise InputError(f"unknown mesh format {path.suffix!r}", where=where, allowed=allowed)
+        raise InputError(f"unknown mesh format {path.suffix!r}", where=path, allowed=allowed)
     return _READERS[suffix]
