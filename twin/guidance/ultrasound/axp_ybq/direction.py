@@ -40,6 +40,21 @@ class SeenDirection(NamedTuple):
     """The same across the image."""
 
 
+def needle_direction(estimate: Estimate, recording: Recording, kept: NDArray[np.bool_]) -> SeenDirection:
+    """V, from the directions that agree, or from the image plane alone.
+
+    Args:
+        estimate: R_X, R_Y and t_Q.
+        recording: The poses.
+        kept: Shape (n,): poses whose tip is trusted.
+    """
+    if recording.v is not None:
+        return agreed_direction(estimate, recording, kept)
+    V = direction_from_plane(estimate, recording.subset(kept))
+    V = V if V @ estimate.t_Q > 0 else -V  # the tip lies ahead of the flange
+    return SeenDirection(V, np.ones(len(recording), dtype=bool), 1.0, 1.0)
+
+
 def mean_direction(estimate: Estimate, recording: Recording) -> Floats:
     """V = normalise(sum M_i^T v_i), shape (3,), frame end2.
 

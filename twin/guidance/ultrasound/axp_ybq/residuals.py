@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.geometry.rigid import skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
     DIRECTION,
@@ -32,7 +32,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 
-Weights = Floats | NDArray[np.bool_]
+Weights = Floats | Bools
 
 LEAST_WEIGHT = 1e-12
 """A pose that is set aside keeps this weight: its residual's standard deviation is a million times as large."""
@@ -256,3 +256,28 @@ def whitener(sigma: Floats, weights: Floats) -> Floats:
     spread = 1.0 / np.sqrt(np.maximum(weights, LEAST_WEIGHT))
     scaled = sigma * spread[:, :, None] * spread[:, None, :]
     return np.asarray(np.linalg.inv(np.linalg.cholesky(scaled)))
+
+
+class Fitted(NamedTuple):
+    """A problem linearised at its fit."""
+
+    residuals: Floats
+    """Shape (n, k)."""
+    jacobian: Floats
+    """Shape (n, k, p)."""
+    sigma: Floats
+    """Expected covariance of each pose's residuals, shape (n, k, k)."""
+    white: Floats
+    """The residuals of the poses that were used, over their spread, shape (n, k)."""
+    covariance: Floats
+    """Of the free parameters, shape (p, p): the inverse of J^T W J over the poses that were used."""
+
+
+def fitted(problem: Problem, estimate: Estimate, tip_kept: Bools, direction_kept: Bools) -> Fitted:
+    """Linearise a problem at its fit; the tips and directions that were used are kept, each shape (n,)."""
+    r, J = linearise(problem, estimate)
+    sigma = problem_covariances(problem, estimate)
+    W = whitener(sigma, residual_weights(problem, tip_kept, direction_kept))
+    slopes = (W @ J).reshape(-1, J.shape[2])
+    C = np.linalg.pinv(slopes.T @ slopes, hermitian=True)
+    return Fitted(r, J, sigma, (W @ r[:, :, None])[:, :, 0], np.asarray(C, dtype=np.float64))

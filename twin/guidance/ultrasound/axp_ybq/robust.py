@@ -21,11 +21,11 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
     Problem,
     Spread,
     directions_image,
+    fitted,
     linearise,
     needle_in_image,
     problem_covariances,
     residual_weights,
-    whitener,
 )
 
 FALSE_ALARMS = 0.01
@@ -63,31 +63,6 @@ class RobustFit(NamedTuple):
     direction_kept: Bools
     """Shape (n,): its direction was used."""
     iterations: int
-
-
-class Fitted(NamedTuple):
-    """A problem linearised at its fit."""
-
-    residuals: Floats
-    """Shape (n, k)."""
-    jacobian: Floats
-    """Shape (n, k, p)."""
-    sigma: Floats
-    """Expected covariance of each pose's residuals, shape (n, k, k)."""
-    white: Floats
-    """The residuals of the poses that were used, over their spread, shape (n, k)."""
-    covariance: Floats
-    """Of the free parameters, shape (p, p)."""
-
-
-def fitted(problem: Problem, fit: RobustFit) -> Fitted:
-    """Linearise a problem at its fit; the covariance is the inverse of J^T W J over the poses that were used."""
-    r, J = linearise(problem, fit.estimate)
-    sigma = problem_covariances(problem, fit.estimate)
-    W = whitener(sigma, residual_weights(problem, fit.tip_kept, fit.direction_kept))
-    slopes = (W @ J).reshape(-1, J.shape[2])
-    C = np.linalg.pinv(slopes.T @ slopes, hermitian=True)
-    return Fitted(r, J, sigma, (W @ r[:, :, None])[:, :, 0], np.asarray(C, dtype=np.float64))
 
 
 class _Block(NamedTuple):
@@ -177,7 +152,7 @@ def _judge(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[Bo
         fit: The fit.
         alarm: Only ask whether a closer look is due, after a fit of all poses, whose outliers widen the spread.
     """
-    r, J, sigma, _, C = fitted(problem, fit)
+    r, J, sigma, _, C = fitted(problem, fit.estimate, fit.tip_kept, fit.direction_kept)
     pulled = J @ C @ J.transpose(0, 2, 1)
     kept = []
     for block, used in zip(_blocks(problem), (fit.tip_kept, fit.direction_kept), strict=False):

@@ -10,16 +10,18 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import LEAST_POSES, LEAST_POSES_KNOWN_TIP, closed_form
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import (
-    SeenDirection,
-    agreed_direction,
-    direction_from_plane,
-)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import SeenDirection, needle_direction
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, Estimate, active_columns
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability, WeakMotion, observe
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import UNWEIGHTED, Problem, Spread, needle_in_image
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import RobustFit, fitted, plain_fit, robust_fit, settled
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
+    UNWEIGHTED,
+    Problem,
+    Spread,
+    fitted,
+    needle_in_image,
+)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import RobustFit, plain_fit, robust_fit, settled
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.spread import found_spreads
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.suggested_poses import SuggestedPoses, propose
 
@@ -85,7 +87,7 @@ def solve(
     active = active_columns(tip=known_tip is None, scale=scale, direction=False)
     problem = Problem(recording, noise or UNWEIGHTED, active)
     fit = (robust_fit if robust else plain_fit)(problem, estimate)
-    seen = _needle(problem, fit)
+    seen = needle_direction(fit.estimate, recording, fit.tip_kept)
     fit = fit._replace(estimate=fit.estimate._replace(V=seen.V), direction_kept=seen.agrees)
     observability = _observed(problem, fit)
     if direction and recording.v is not None:
@@ -112,16 +114,6 @@ def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: E
         raise InputError(f"{len(recording)} poses", where="recording", allowed=allowed)
 
 
-def _needle(problem: Problem, fit: RobustFit) -> SeenDirection:
-    """V, from the directions that agree, or from the image plane alone."""
-    recording = problem.recording
-    if recording.v is not None:
-        return agreed_direction(fit.estimate, recording, fit.tip_kept)
-    V = direction_from_plane(fit.estimate, recording.subset(fit.tip_kept))
-    V = V if V @ fit.estimate.t_Q > 0 else -V  # the tip lies ahead of the flange
-    return SeenDirection(V, np.ones(len(recording), dtype=bool), 1.0, 1.0)
-
-
 def _full_fit(problem: Problem, fit: RobustFit, seen: SeenDirection, *, robust: bool) -> tuple[Problem, RobustFit]:
     """Fit again with the directions, and with the spread that the residuals themselves show where no noise is given."""
     told = not isinstance(problem.noise, Spread)
@@ -136,7 +128,7 @@ def _full_fit(problem: Problem, fit: RobustFit, seen: SeenDirection, *, robust: 
 
 
 def _solution(problem: Problem, fit: RobustFit, observability: Observability) -> Solution:
-    at_fit = fitted(problem, fit)
+    at_fit = fitted(problem, fit.estimate, fit.tip_kept, fit.direction_kept)
     count = 3 * int(fit.tip_kept.sum()) + 2 * int(fit.direction_kept.sum()) * problem.with_direction
     freedom = count - len(problem.active)
     return Solution(

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import Problem, Spread
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import LEAST_MM, Fitted, RobustFit, fitted
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import Fitted, Problem, Spread, fitted
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import LEAST_MM, RobustFit
 
 LEAST_FREEDOM = 15
 """Residuals minus unknowns below which inside and across are not told apart: their ratio would be chance."""
@@ -37,7 +37,7 @@ def found_spreads(problem: Problem, fit: RobustFit) -> ResidualSpreads:
         problem: With the directions where they take part, and with the spreads found so far.
         fit: Its fit.
     """
-    at_fit = fitted(problem, fit)
+    at_fit = fitted(problem, fit.estimate, fit.tip_kept, fit.direction_kept)
     turn, lean = 1.0, problem.lean_rad
     if problem.with_direction:
         turn, lean = (_direction_part(at_fit, fit, column) for column in (3, 4))
