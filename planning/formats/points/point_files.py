@@ -60,7 +60,6 @@ def read_points(
     *,
     default_space: Space | None = None,
     default_unit: Unit | None = None,
-    where: str | None = None,
 ) -> NamedPoints:
     """The points of one file, in mm; in LPS where the file or the caller names a patient space.
 
@@ -68,15 +67,13 @@ def read_points(
         path: A .csv, .mrk.json or .fcsv file.
         default_space: The space of a file that states none: the case's, or None for a robot's base.
         default_unit: The unit of a file that states none; None refuses such a file.
-        where: How errors name the file; its path by default.
 
     Raises:
         InputError: If it cannot be read, contradicts the caller, or its points fail the guard.
     """
-    name = where or str(path)
-    _reader(path, name)  # an unknown ending is refused before anything is read
-    data = read_input(path, max_bytes=MAX_FILE_BYTES, where=name)
-    return parse_points(data, path, default_space=default_space, default_unit=default_unit, where=name)
+    _reader(path, str(path))  # an unknown ending is refused before anything is read
+    data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
+    return parse_points(data, path, default_space=default_space, default_unit=default_unit)
 
 
 def parse_points(
@@ -85,7 +82,6 @@ def parse_points(
     *,
     default_space: Space | None = None,
     default_unit: Unit | None = None,
-    where: str | None = None,
 ) -> NamedPoints:
     """The same of a file that has been read; it is not opened again.
 
@@ -94,12 +90,11 @@ def parse_points(
         path: Its name, whose ending says the format.
         default_space: As in `read_points`.
         default_unit: As in `read_points`.
-        where: How errors name the file; its path by default.
 
     Raises:
         InputError: As `read_points`, but for reading.
     """
-    name = where or str(path)
+    name = str(path)
     raw = _reader(path, name)(data, name)
     unit = raw.unit or default_unit
     if unit is None:
