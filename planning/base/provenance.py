@@ -48,11 +48,14 @@ def read_inputs(document: Any) -> tuple[Input, ...]:
     """The list of a result that was read from a file.
 
     Raises:
-        TypeError, KeyError, ValueError: It is no such list.
+        TypeError, KeyError, ValueError: It is no such list, or an input has two hashes in it.
     """
     if not isinstance(document, list):
         raise TypeError("inputs is no list")
-    return tuple(Input(*(text(one[key]) for key in ("role", "path", "sha256"))) for one in document)
+    inputs = tuple(Input(*(text(one[key]) for key in ("role", "path", "sha256"))) for one in document)
+    if len({_place(one) for one in inputs}) != len({(_place(one), one.sha256) for one in inputs}):
+        raise ValueError("an input stands twice, with two hashes")
+    return inputs
 
 
 def differing_input(stated: Sequence[Input], known: Sequence[Input]) -> str | None:

@@ -43,6 +43,13 @@ MAX_CERTIFICATE_BYTES = 500_000_000
 
 CERTIFICATE_ALLOWED = f"a certificate of version {CERTIFICATE_VERSION}, as search --certify writes it"
 
+NAMES = frozenset({
+    *("version", "case", "inputs", "target_ct_mm", "R_ct_entry", "theta_rad", "beta_rad", "length_mm", "standoff_mm"),
+    *("skin_gap_mm", "farthest_flange_mm", "radius_mm", "longest_path_mm", "max_skin_angle_rad", "margins_mm"),
+    *("lengths_mm", "size_rad", "queries", "summary", "tree", "witness"),
+})  # fmt: skip
+"""The keys of a certificate."""
+
 CONE_ROUNDING_RAD = 1e-7
 """Taken from a safe cone: arccos near 1 rounds to 1e-8."""
 
@@ -250,6 +257,8 @@ def parse_certificate(data: bytes, path: Path) -> Certificate:
     document = parse_document(data, CERTIFICATE_VERSION, where=path, allowed=CERTIFICATE_ALLOWED)
     with fitting(path, CERTIFICATE_ALLOWED):
         certificate = _certificate(document, path)
+    for name in sorted(set(document) - NAMES):
+        raise InputError(f"key '{name}' is not known", where=path, allowed=", ".join(sorted(NAMES)))
     stated, counted = document.get("summary"), json.loads(json.dumps(certificate.summary()))
     if stated != counted:
         wrong = [key for key in counted if not isinstance(stated, dict) or stated.get(key) != counted[key]]
@@ -282,6 +291,8 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
 
 def _question(document: dict[str, Any]) -> Question:
     names, standoff = tuple(document["margins_mm"]), document["standoff_mm"]
+    if set(document["lengths_mm"]) != set(names):
+        raise ValueError("lengths_mm and margins_mm name other structures")
     margins, lengths = ([document[key][name] for name in names] for key in ("margins_mm", "lengths_mm"))
     return Question(
         case_name=field(document, "case", text),

@@ -67,6 +67,15 @@ def test_what_is_no_list_of_inputs_is_refused(wrong: object) -> None:
         read_inputs(wrong)
 
 
+def test_an_input_with_two_hashes_is_refused() -> None:
+    """Whichever is compared, a person may read the other; the same twice says the same."""
+    _, liver = LISTED
+    assert read_inputs(inputs_document((liver, liver))) == (liver, liver)
+    other = Input("mesh liver", "./liver.stl", "c" * 64)
+    with pytest.raises(ValueError, match="two hashes"):
+        read_inputs(inputs_document((other, *LISTED)))
+
+
 def test_the_input_that_differs_is_named() -> None:
     """By role and path; another notation of a path, another name of the case file and another order are the same."""
     case, liver = LISTED

@@ -371,6 +371,9 @@ def _swap(document, old, new):
         (lambda d: d.pop("tree"), "tree"),
         (lambda d: d.update(size_rad=float("nan")), "finite"),
         (lambda d: d["witness"].__setitem__(0, ["because", "", None, None]), "because"),
+        (lambda d: d.update(approved=True), "key 'approved' is not known"),
+        (lambda d: d["lengths_mm"].update(heart=1.0), "lengths_mm and margins_mm name other structures"),
+        (lambda d: d["inputs"].insert(0, {**d["inputs"][0], "sha256": "0" * 64}), "two hashes"),
     ],
 )
 def test_a_file_that_contradicts_itself_is_refused(carton, tmp_path, change, says):
