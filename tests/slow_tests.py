@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 LIST = Path(__file__).with_name("slow_tests.txt")
-SLOW_S = 0.35
+SLOW_S = 0.3
 """Of one case, without the fixtures that it shares."""
 
-SLOW_FIXTURE_S = 1.0
+SLOW_FIXTURE_S = 1.5
 """Of a shared fixture, without others below it: whatever uses it is slow, since one test alone pays for all of it."""
 
 
