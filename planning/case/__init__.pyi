@@ -9,23 +9,13 @@ from .case import (
     mount_pose as mount_pose,
 )
 from .case_file import (
-    Coordinate as Coordinate,
-    Degrees180 as Degrees180,
-    Degrees360 as Degrees360,
-    Length as Length,
     MountBounds as MountBounds,
     MountName as MountName,
     MountSection as MountSection,
-    Name as Name,
-    NotNegative as NotNegative,
-    Number as Number,
     RankingSection as RankingSection,
     RegistrationSection as RegistrationSection,
-    Section as Section,
-    Sextuple as Sextuple,
     StructureSection as StructureSection,
     StructuresSection as StructuresSection,
-    Vector as Vector,
 )
 from .case_schema import count_difference as count_difference
 from .entry import (
@@ -37,4 +27,17 @@ from .entry import (
     needle_pose as needle_pose,
     outward as outward,
     view_frame as view_frame,
+)
+from .errors import ArmUncertainty as ArmUncertainty, ErrorModel as ErrorModel
+from .toml_types import (
+    Coordinate as Coordinate,
+    Degrees180 as Degrees180,
+    Degrees360 as Degrees360,
+    Length as Length,
+    Name as Name,
+    NotNegative as NotNegative,
+    Number as Number,
+    Section as Section,
+    Sextuple as Sextuple,
+    Vector as Vector,
 )

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,6 @@ from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_to
 from puncture_twin.planning.case.case_file import (
     AIR_HU,
     DENSE_HU,
-    Anatomical,
     CaseFile,
     EntryAxes,
     GantrySection,
@@ -31,7 +31,10 @@ from puncture_twin.planning.case.case_file import (
     StructuresSection,
 )
 from puncture_twin.planning.case.entry import entry_frame, view_frame
+from puncture_twin.planning.case.errors import Cells, ErrorModel, error_model
+from puncture_twin.planning.case.errors_section import ErrorsSection
 from puncture_twin.planning.case.html import case_html
+from puncture_twin.planning.case.toml_types import Anatomical
 from puncture_twin.planning.case.whole_case import wholeness_warnings
 from puncture_twin.planning.formats.labels import naming
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
@@ -71,12 +74,21 @@ class Needle:
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """The grid of directions and the limit at the skin, all in radians."""
+    """The grid of directions, the limit at the skin and those of the chances; radians.
+
+    Attributes:
+        min_hit: Least chance to hit the target; None sets no limit.
+        max_touch: Greatest chance to touch any one structure; None sets no limit.
+        max_touch_of: The same for single structures, by name, instead.
+    """
 
     theta: tuple[float, float]
     beta: tuple[float, float]
     step: float
     max_skin_angle: float
+    min_hit: float | None = None
+    max_touch: float | None = None
+    max_touch_of: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
 
 @dataclass(frozen=True)
@@ -145,6 +157,9 @@ class Case:
         stated_structures: How many structures the case says that it has, the skin among them; None in schema 1.
         region: Which part of the body it shows; None in schema 1.
         warnings: What the case file itself leaves open, one sentence each.
+        hit_radius_mm: Within which of the target the tip hits; None counts the target's own mesh.
+        errors: What is declared to err, or None.
+        truth_errors: From what a rehearsal's truth is drawn instead, to test a wrong belief; None draws from `errors`.
     """
 
     path: Path
@@ -170,6 +185,9 @@ class Case:
     stated_structures: int | None = None
     region: str | None = None
     warnings: tuple[str, ...] = ()
+    hit_radius_mm: float | None = None
+    errors: ErrorModel | None = None
+    truth_errors: ErrorModel | None = None
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""
@@ -219,6 +237,9 @@ def load_case(path: Path | str) -> Case:
             beta=(np.radians(settings.beta_deg[0]), np.radians(settings.beta_deg[1])),
             step=np.radians(settings.step_deg),
             max_skin_angle=np.radians(settings.max_skin_angle_deg),
+            min_hit=settings.min_hit,
+            max_touch=settings.max_touch,
+            max_touch_of=MappingProxyType(dict(settings.max_touch_of)),
         ),
         ranking=content.ranking,
         T_ct_entry=view_frame(entry_frame(settings.frame, space, where=path), target),
@@ -243,7 +264,36 @@ def load_case(path: Path | str) -> Case:
         stated_structures=content.stated_structures,
         region=content.region,
         warnings=wholeness_warnings(content, files, path),
+        hit_radius_mm=content.target.hit_radius_mm,
+        errors=_errors(content, content.errors, files, path),
+        truth_errors=_errors(content, content.rehearsal.errors, files, path, truth=True),
     )
+
+
+def _errors(
+    content: CaseFile, section: ErrorsSection | None, files: InputFiles, path: Path, *, truth: bool = False
+) -> ErrorModel | None:
+    """The declared errors, or the truth's own, which know no short form and no older names."""
+    if section is None:
+        return None
+    return error_model(
+        section,
+        space=Space(content.space),
+        cells=_ct_cells(content, files, path),
+        fle_mm=None if truth or content.registration is None else content.registration.fle_mm,
+        rehearsal=None if truth else content.rehearsal,
+        where=f"{path}: {'rehearsal.errors' if truth else 'errors'}",
+    )
+
+
+def _ct_cells(content: CaseFile, files: InputFiles, path: Path) -> Cells | None:
+    """Pixel, slice spacing and slice normal of the case's CT; None without one."""
+    names = [one.ct for one in content.structure if one.ct is not None] + [content.ct.file]
+    if names[0] is None:
+        return None
+    header = volumes.parse_header(files.content(names[0]), path.parent / names[0])
+    spacing = header.spacing_mm
+    return Cells(float(spacing[:2].max()), float(spacing[2]), header.T_ct_index[:3, 2] / spacing[2])
 
 
 def _target(content: CaseFile, path: Path, space: Space, files: InputFiles) -> Floats:

@@ -2,43 +2,38 @@
 
 from __future__ import annotations
 
-import difflib
 from collections import Counter
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    AllowInfNan,
-    BaseModel,
-    ConfigDict,
-    Field,
-    Strict,
-    StringConstraints,
-    model_validator,
-)
+from pydantic import Field, Strict, model_validator
 
-from puncture_twin.planning.base.text_names import MAX_NAME, unprintable_texts
+from puncture_twin.planning.base.text_names import unprintable_texts
 from puncture_twin.planning.case.case_schema import CaseSchema, Region, check_statement, count_difference, with_count
-
-Number = Annotated[float, Strict(), AllowInfNan(False)]
-Positive = Annotated[Number, Field(gt=0)]
-NotNegative = Annotated[Number, Field(ge=0)]
-Coordinate = Annotated[Number, Field(ge=-100_000, le=100_000)]
-Length = Annotated[Number, Field(gt=0, le=100_000)]
-Margin = Annotated[Number, Field(ge=0, le=1000)]
-Weight = Annotated[Number, Field(ge=0, le=1000)]
-JointDegrees = Annotated[Number, Field(ge=-360, le=360)]
-Vector = tuple[Coordinate, Coordinate, Coordinate]
-Sextuple = tuple[JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees]
-Text = Annotated[str, StringConstraints(min_length=1, max_length=MAX_NAME)]
-Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=80)]
-Degrees360 = Annotated[Number, Field(ge=0, le=360)]
-Degrees180 = Annotated[Number, Field(ge=0, le=180)]
-Yes = Annotated[bool, Strict()]
-Label = Annotated[int, Strict(), Field(ge=1, le=65535)]
-
+from puncture_twin.planning.case.errors_section import ErrorsSection
+from puncture_twin.planning.case.toml_types import (
+    Anatomical,
+    Coordinate,
+    Degrees180,
+    Degrees360,
+    Label,
+    Length,
+    Margin,
+    Name,
+    NotNegative,
+    Number,
+    Positive,
+    Section,
+    Sextuple,
+    Text,
+    Vector,
+    Weight,
+    Yes,
+)
 
 MAX_STRUCTURES = 1000
 """Structures, or obstacles, of a case: TotalSegmentator knows 117 classes, and each structure costs a tree."""
+
+Chance = Annotated[Number, Field(ge=0, le=1)]
 
 MAX_LABEL_MAPS = 100
 """Tables ``[[structures]]``, each with a label map of its own."""
@@ -53,24 +48,6 @@ MAX_DIRECTIONS = 1_000_000
 """Rows of a search: a hemisphere at 0.2 degrees; 2 GB of table with 60 structures."""
 
 
-class Section(BaseModel):
-    """A table of the file: frozen, and an unknown key is an error that names the nearest valid one."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _refuse_unknown_keys(cls, data: Any) -> Any:
-        if isinstance(data, dict):
-            known = [field.alias or name for name, field in cls.model_fields.items()]
-            for key in data:
-                if key not in known:
-                    near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-                    hint = f"did you mean '{near[0]}'? " if near else ""
-                    raise ValueError(f"unknown key '{key}'; {hint}keys here: {', '.join(known)}")
-        return data
-
-
 class TargetSection(Section):
     """The point to reach: coordinates, or a name in a file of points."""
 
@@ -78,6 +55,7 @@ class TargetSection(Section):
     points: str | None = None
     name: Text = "target"
     structure: Name
+    hit_radius_mm: Annotated[Number, Field(gt=0, le=100)] | None = None
 
     @model_validator(mode="after")
     def _one_position(self) -> Self:
@@ -103,9 +81,6 @@ class NeedleSection(Section):
         return self
 
 
-Anatomical = Literal["left", "right", "anterior", "posterior", "head", "feet"]
-
-
 class EntryAxes(Section):
     """An entry frame of one's own: where its z and x axes point; y = z × x."""
 
@@ -122,6 +97,9 @@ class SearchSection(Section):
     max_skin_angle_deg: Annotated[Number, Field(gt=0, le=90)] = 60.0
     frame: Literal["ct", "bed"] | EntryAxes | None = None
     trust_labels: Annotated[bool, Strict()] = False
+    min_hit: Chance | None = None
+    max_touch: Chance | None = None
+    max_touch_of: Annotated[dict[Text, Chance], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _grid_fits(self) -> Self:
@@ -223,7 +201,7 @@ class CtSection(Section):
 class RegistrationSection(Section):
     """Markers seen in the CT and touched by the robot."""
 
-    method: Literal["triad", "rigid", "affine"] = "rigid"
+    method: Literal["triad", "rigid", "weighted", "affine"] | None = None
     markers_ct: str
     markers_base: str
     use: tuple[Text, ...] | None = None
@@ -320,6 +298,7 @@ class RehearsalSection(Section):
     fle_ct_mm: NotNegative = 0.5
     fle_touch_mm: NotNegative = 0.1
     joint_offset_deg: NotNegative = 0.02
+    errors: ErrorsSection | None = None
 
 
 class EndSection(Section):
@@ -348,6 +327,7 @@ class CaseFile(Section):
     obstacle: Annotated[tuple[ObstacleSection, ...], Field(max_length=MAX_STRUCTURES)] = ()
     gantry: GantrySection | None = None
     place: PlaceSection = PlaceSection()
+    errors: ErrorsSection | None = None
     rehearsal: RehearsalSection = RehearsalSection()
     end: EndSection | None = None
 
@@ -382,6 +362,11 @@ class CaseFile(Section):
     def _no_contradiction(self) -> Self:
         if self.registration is not None and self.robot.mount is not None:
             raise ValueError("[registration] and [robot.mount] both say where the base is; keep one")
+        if self.errors is None and self.rehearsal.errors is not None:
+            raise ValueError("[rehearsal.errors] is a truth that differs from [errors], which is not there")
+        chances = (self.search.min_hit, self.search.max_touch, self.search.max_touch_of or None)
+        if self.errors is None and any(chance is not None for chance in chances):
+            raise ValueError("search.min_hit and max_touch need [errors]: without declared errors there is no chance")
         if self.space == "local" and self.ct.file is not None:
             raise ValueError('ct.file: a CT says its own patient space; space "local" has none')
         if self.space == "local" and any(s.cut for s in self.structure):

@@ -28,7 +28,7 @@ from pydantic import Field
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.base.toml_file import read_toml
-from puncture_twin.planning.case.case_file import Degrees180, Degrees360, NotNegative, Number, Section
+from puncture_twin.planning.case.toml_types import Degrees180, Degrees360, NotNegative, Number, Section
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation
 

@@ -3,12 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
+import numpy as np
+
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.registration import Registration, match, register
+from puncture_twin.planning.registration.reading_noise import ReadingNoise, reading_noise
+from puncture_twin.planning.registration.registration import (
+    MarkerPairs,
+    Registration,
+    check_pairs,
+    fit_rigid,
+    match,
+    register,
+)
+from puncture_twin.planning.registration.touch_poses import touching_configuration
+
+MAX_JOINTS_OFF_MM = 5.0
+"""A controller with its own calibration puts the tip up to some mm from where the data sheet's arm does."""
+
+GUESSED_HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
+"""An arm bent at the elbow, its needle down."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,19 +59,69 @@ def load_placement(case: Case) -> Placement | None:
         mount = case.robot.T_base_ct_mount
         return None if mount is None else Placement(mount, None, float("nan"))
     settings = case.registration
-    markers_ct = _points(case, settings.markers_ct, case.space)
-    markers_base = _points(case, settings.markers_base, Space.LOCAL)
     where = f"{case.path}: registration"
+    markers = match(
+        _points(case, settings.markers_ct, case.space),
+        _points(case, settings.markers_base, Space.LOCAL),
+        use=settings.use,
+        where=where,
+    )
+    errors = case.errors
     registration = register(
-        match(markers_ct, markers_base, use=settings.use, where=where),
-        method=settings.method,
+        markers,
+        method=settings.method or default_method(errors),
         target_ct=case.target_ct,
-        fle_mm=settings.fle_mm,
+        fle_mm=settings.fle_mm if errors is None else None,
+        noise=None if errors is None else marker_noise(case, errors, markers, where=where),
+        noise_found=errors is not None and errors.found,
         accept_residuals=settings.accept_residuals,
         where=where,
     )
     error = float(registration.expected_tre_mm(case.target_ct[None])[0])
     return Placement(registration.T_base_ct, registration, error)
+
+
+def default_method(errors: ErrorModel | None) -> Literal["rigid", "weighted"]:
+    """Weighted where markers are declared to be read better along some axes than along others."""
+    return "weighted" if errors is not None and errors.anisotropic else "rigid"
+
+
+def marker_noise(case: Case, errors: ErrorModel, markers: MarkerPairs, *, where: str | Path) -> ReadingNoise:
+    """The declared noise of a case's markers, with the arm as it stood at the touches, or as it is guessed to have.
+
+    Raises:
+        InputError: Too few markers to fit, or joints that do not put the tip where the file says that it touched.
+    """
+    model, tip = ur_model(case.robot.model), case.needle.length_mm
+    if markers.joints is not None:
+        _check_joints(model, tip, markers, where)
+        return reading_noise(errors, model, tip, markers.joints, known=True)
+    check_pairs(markers, where)
+    needle = -(fit_rigid(markers.points_ct, markers.points_base)[:3, :3] @ case.T_ct_entry[:3, 2])
+    q = [_guessed(model, tip, point, needle) for point in markers.points_base]
+    return reading_noise(errors, model, tip, np.array(q), known=False)
+
+
+def _guessed(model: UrModel, tip_mm: float, point_base: Floats, needle_base: Floats) -> Floats:
+    """How the arm may have stood; its home where it cannot touch the point in any direction tried."""
+    try:
+        return touching_configuration(model, tip_mm, point_base, needle_base)
+    except NoAnswerError:
+        return GUESSED_HOME
+
+
+def _check_joints(model: UrModel, tip_mm: float, markers: MarkerPairs, where: str | Path) -> None:
+    assert markers.joints is not None
+    flanges = flange_pose(model, markers.joints)
+    tips = flanges[:, :3, 3] + tip_mm * flanges[:, :3, 2]
+    away = np.linalg.norm(tips - markers.points_base, axis=1)
+    worst = int(np.argmax(away))
+    if away[worst] > MAX_JOINTS_OFF_MM:
+        raise InputError(
+            f"the joints of marker {markers.names[worst]} put the tip {away[worst]:.1f} mm away from where it touched",
+            where=where,
+            allowed=f"within {MAX_JOINTS_OFF_MM:g} mm: joints in degrees, of this robot, with this needle",
+        )
 
 
 def _points(case: Case, name: str, space: Space) -> NamedPoints:

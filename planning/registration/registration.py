@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,6 +14,9 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.points.point_files import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply, frame_of_points, pose
 from puncture_twin.planning.registration.conditioning import Conditioning, conditioning, leverage
+from puncture_twin.planning.registration.fit_map import fit_weighted
+from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, fit_uncertainty
+from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.registration.residual_test import Interval, ResidualTest
 
 MIN_MARKERS = 3
@@ -27,7 +31,9 @@ UNIT_SLIP = 5.0
 MAX_RESIDUAL_MM = 15.0
 """A marker that misses by more was swapped, moved or typed wrongly: the paper's worst set misses by 7 mm."""
 
-ALLOWED_RESIDUALS = "names and readings checked, the true fle_mm, or registration.accept_residuals = true"
+ALLOWED_RESIDUALS = "names and readings checked, the true errors declared, or registration.accept_residuals = true"
+
+Method = Literal["triad", "rigid", "weighted", "affine"]
 
 MIRROR_GAIN = 2.0
 """A mirrored fit that is better than the proper one by this factor (and 1 mm) says that one side is mirrored."""
@@ -35,11 +41,15 @@ MIRROR_GAIN = 2.0
 
 @dataclass(frozen=True, eq=False)
 class MarkerPairs:
-    """The same markers in both frames, matched by name; shapes (n, 3), mm."""
+    """The same markers in both frames, matched by name; shapes (n, 3), mm.
+
+    Joints: how the arm stood at each touch, shape (n, 6), rad, where the file has them.
+    """
 
     names: tuple[str, ...]
     points_ct: Floats
     points_base: Floats
+    joints: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -56,6 +66,7 @@ class Registration:
         residuals: Shape (n, 3), T_base_ct markers_ct - markers_base, mm.
         residual_test: The residuals of the rigid fit against the noise.
         conditioning: The three flags of a weak set, for the target given.
+        uncertainty: What the declared errors make of it; None where none are declared.
     """
 
     method: str
@@ -64,22 +75,48 @@ class Registration:
     residuals: Floats
     residual_test: ResidualTest
     conditioning: Conditioning
+    uncertainty: FitUncertainty | None = None
 
     @property
     def fle_mm(self) -> float:
         """The fiducial localisation error (rms) that the expectations use."""
-        return self.residual_test.fle_mm
+        return self.residual_test.fle_mm if self.uncertainty is None else self.uncertainty.fle_mm
 
     @property
     def fle_source(self) -> str:
         """Where that number comes from."""
-        return self.residual_test.source
+        if self.uncertainty is None:
+            return self.residual_test.source
+        scaled = (
+            f", scaled by {self.uncertainty.test.scale:.2f} to the residuals" if self.uncertainty.test.scaled else ""
+        )
+        return f"[errors]{scaled}"
+
+    @property
+    def fle_interval_mm(self) -> Interval:
+        """The 95 % interval of that number: one value where it is declared and holds."""
+        if self.uncertainty is None:
+            return self.residual_test.fle_interval_mm
+        test, fle = self.uncertainty.test, self.uncertainty.fle_mm
+        if not test.scaled:
+            return Interval(fle, fle)
+        return Interval(*(fle / test.scale * end for end in test.interval))
 
     @property
     def flags(self) -> tuple[str, ...]:
         """What weakens this registration, in words: the conditioning, and residuals that were accepted."""
-        accepted = () if self.residual_test.explained else (f"{self.residual_test.text()}; accepted by the case",)
-        return (*self.conditioning.flags, *accepted)
+        return (*self.conditioning.flags, *self._doubts())
+
+    def _doubts(self) -> tuple[str, ...]:
+        if self.uncertainty is None:
+            test = self.residual_test
+            return () if test.explained else (f"{test.text()}; accepted by the case",)
+        declared = self.uncertainty.test
+        if declared.holds:
+            return ()
+        return (
+            declared.text() + ("; all errors are scaled to them" if declared.explained else "; accepted by the case"),
+        )
 
     @property
     def residual_mm(self) -> Floats:
@@ -97,13 +134,20 @@ class Registration:
         return float(np.sqrt(np.mean(self.residual_mm**2)))
 
     def expected_tre_mm(self, points_ct: Floats) -> Floats:
-        """Expected (rms) target registration error at points (n, 3) of the CT frame, shape (n,), mm."""
-        return self.fle_mm * leverage(self.markers.points_ct, points_ct)
+        """Expected (rms) target registration error at points (n, 3) of the CT frame, shape (n,), mm.
+
+        By the declared errors of the readings where there are any, else by Fitzpatrick's formula. The arm's own errors,
+        which partly cancel between touch and insertion, are not in it.
+        """
+        if self.uncertainty is None:
+            return self.fle_mm * leverage(self.markers.points_ct, points_ct)
+        points_base = apply(self.T_base_ct, points_ct)
+        return np.sqrt([np.trace(self.uncertainty.cov_at(point)[:3, :3]) for point in points_base])
 
     def expected_tre_interval_mm(self, point_ct: Floats) -> Interval:
         """The same at one point (3,), at both ends of the noise's 95 % interval, mm."""
-        lever = float(leverage(self.markers.points_ct, point_ct[None])[0])
-        return Interval(*(fle * lever for fle in self.residual_test.fle_interval_mm))
+        expected = float(self.expected_tre_mm(point_ct[None])[0])
+        return Interval(*(expected * fle / self.fle_mm for fle in self.fle_interval_mm))
 
 
 def match(
@@ -141,15 +185,18 @@ def match(
         raise InputError(f"names repeat: {', '.join(names)}", where=where, allowed="unique names")
     rows_ct = [markers_ct.names.index(name) for name in names]
     rows_base = [markers_base.names.index(name) for name in names]
-    return MarkerPairs(tuple(names), markers_ct.points[rows_ct], markers_base.points[rows_base])
+    joints = None if markers_base.joints is None else markers_base.joints[rows_base]
+    return MarkerPairs(tuple(names), markers_ct.points[rows_ct], markers_base.points[rows_base], joints)
 
 
 def register(
     markers: MarkerPairs,
     *,
-    method: Literal["triad", "rigid", "affine"],
+    method: Method,
     target_ct: Floats,
     fle_mm: float | None = None,
+    noise: ReadingNoise | None = None,
+    noise_found: bool = False,
     accept_residuals: bool = False,
     where: str | Path = "registration",
 ) -> Registration:
@@ -157,33 +204,65 @@ def register(
 
     Args:
         markers: At least three, matched.
-        method: ``triad`` (Chen 2019, Eq. 1-9, three markers in the order given) or ``rigid`` (least squares).
+        method: ``triad`` (Chen 2019, Eq. 1-9, three markers in the order given), ``rigid`` (least squares) or
+            ``weighted`` (by the declared noise).
         target_ct: Shape (3,), where the error matters.
-        fle_mm: Known localisation error (rms, both sides together); None estimates it from FRE.
+        fle_mm: Known localisation error (rms, both sides together); None estimates it from FRE. Not beside ``noise``.
+        noise: What is declared of each marker, in the order of ``markers``.
+        noise_found: Whether ``noise`` is a shape alone, its size to be found from the residuals.
         accept_residuals: Whether residuals beyond the noise are taken, and the noise is scaled to them.
         where: What errors name.
 
     Raises:
-        InputError: Fewer than three markers, collinear, mirrored, a unit slip, a marker far off, ``affine``, or
-            residuals that the noise does not explain.
+        InputError: Fewer than three markers, collinear, mirrored, a unit slip, a marker far off, ``affine``,
+            ``weighted`` without noise, or residuals that the noise does not explain.
     """
+    _check_method(method, noise, where)
+    check_pairs(markers, where)
+    if method == "triad" and len(markers) != MIN_MARKERS:
+        raise InputError(f"triad takes 3 markers, not {len(markers)}", where=where, allowed="3 names in use")
+    fit = _fit(method, noise)
+    T_base_ct = fit(markers.points_ct, markers.points_base)
+    residuals = apply(T_base_ct, markers.points_ct) - markers.points_base
+    _check_residuals(markers, residuals, where)
+    uncertainty = None
+    if noise is not None:
+        points = markers.points_ct, markers.points_base
+        uncertainty = fit_uncertainty(method, fit, T_base_ct, *points, noise, found=noise_found)
+        fle_mm = None if noise_found else _greatest_fle_mm(noise, T_base_ct)
+    test = ResidualTest(len(markers), _rigid_fre(markers), fle_mm)
+    told = test if uncertainty is None else uncertainty.test
+    if not (told.explained or accept_residuals):
+        raise InputError(told.text(), where=where, allowed=ALLOWED_RESIDUALS)
+    weak = conditioning(markers.points_ct, target_ct)
+    return Registration(method, T_base_ct, markers, residuals, test, weak, uncertainty)
+
+
+def _check_method(method: Method, noise: ReadingNoise | None, where: str | Path) -> None:
     if method == "affine":
         raise InputError(
             "method 'affine' bends the patient",
             where=where,
-            allowed="triad or rigid; affine only reproduces the paper's Table 6",
+            allowed="triad, rigid or weighted; affine only reproduces the paper's Table 6",
         )
-    _check_markers(markers, where)
-    if method == "triad" and len(markers) != MIN_MARKERS:
-        raise InputError(f"triad takes 3 markers, not {len(markers)}", where=where, allowed="3 names in use")
-    fit = fit_triad if method == "triad" else fit_rigid
-    T_base_ct = fit(markers.points_ct, markers.points_base)
-    residuals = apply(T_base_ct, markers.points_ct) - markers.points_base
-    _check_residuals(markers, residuals, where)
-    test = ResidualTest(len(markers), _rigid_fre(markers), fle_mm)
-    if not (test.explained or accept_residuals):
-        raise InputError(test.text(), where=where, allowed=ALLOWED_RESIDUALS)
-    return Registration(method, T_base_ct, markers, residuals, test, conditioning(markers.points_ct, target_ct))
+    if method == "weighted" and noise is None:
+        raise InputError(
+            "method 'weighted' weighs by declared errors", where=where, allowed="[errors], or method rigid"
+        )
+
+
+def _fit(method: Method, noise: ReadingNoise | None) -> Callable[[Floats, Floats], Floats]:
+    if method == "weighted" and noise is not None:
+        return lambda ct, base: fit_weighted(ct, base, noise, fit_rigid(ct, base))
+    return fit_triad if method == "triad" else fit_rigid
+
+
+def _greatest_fle_mm(noise: ReadingNoise, T_base_ct: Floats) -> float:
+    """The noise of the isotropic test that other pairings of the names are held against: the worst axis in all three.
+
+    Residuals that pass the weighted test have |r|^2 <= lambda_max chi-squared: the given names pass this one too.
+    """
+    return float(np.sqrt(3 * np.linalg.eigvalsh(noise.whole(T_base_ct[:3, :3]))[-1]))
 
 
 def fit_triad(points_ct: Floats, points_base: Floats) -> Floats:
@@ -241,7 +320,12 @@ def _rigid(R: Floats, t: Floats) -> Floats:
     return T
 
 
-def _check_markers(markers: MarkerPairs, where: str | Path) -> None:
+def check_pairs(markers: MarkerPairs, where: str | Path) -> None:
+    """Whether markers can be fitted at all.
+
+    Raises:
+        InputError: Fewer than three, not finite, on a line, or of two sizes.
+    """
     if len(markers) < MIN_MARKERS:
         raise InputError(f"{len(markers)} markers", where=where, allowed="3 or more, by the same names")
     both = np.concatenate([markers.points_ct, markers.points_base])

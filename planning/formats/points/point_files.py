@@ -42,17 +42,21 @@ class NamedPoints:
         points: Shape (n, 3), mm, read-only, in ``space``.
         space: LPS for patient data, LOCAL for a frame of its own, None where nobody said (such as a robot's base).
         kinds: Shape (n,), what each point is, where the file says so ("marker", "lesion").
+        joints: Shape (n, 6), rad, read-only: how the robot stood at the touch of each, where the file says so.
     """
 
     names: tuple[str, ...]
     points: NDArray[np.float64]
     space: Space | None
     kinds: tuple[str, ...] | None = None
+    joints: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
-        points = np.array(self.points, dtype=np.float64)
-        points.setflags(write=False)
-        object.__setattr__(self, "points", points)
+        for name in ("points", "joints"):
+            if getattr(self, name) is not None:
+                array = np.array(getattr(self, name), dtype=np.float64)
+                array.setflags(write=False)
+                object.__setattr__(self, name, array)
 
 
 def read_points(
@@ -107,7 +111,8 @@ def parse_points(
     with np.errstate(over="ignore"):  # beyond the range of floats is infinite, which the guard refuses
         points = points * unit.mm if space is None else to_lps(points, space) * unit.mm
     guarded = guard_points(points, raw.names, where=name)
-    return NamedPoints(tuple(raw.names), guarded, Space.LPS if space is Space.RAS else space, raw.kinds)
+    joints = None if raw.joints_deg is None else np.radians(np.array(raw.joints_deg))
+    return NamedPoints(tuple(raw.names), guarded, Space.LPS if space is Space.RAS else space, raw.kinds, joints)
 
 
 def _reader(path: Path, where: str) -> Callable[[bytes, str], RawPoints]:
@@ -118,16 +123,19 @@ def _reader(path: Path, where: str) -> Callable[[bytes, str], RawPoints]:
 
 
 def write_points(path: Path, points: NamedPoints) -> None:
-    """A CSV with ``name,x_mm,y_mm,z_mm`` that reads back to the same numbers; whole, or not at all.
+    """A CSV with ``name,x_mm,y_mm,z_mm``, and joints, that reads back to the same numbers; whole, or not at all.
 
     The space is not written: a CSV speaks in the space of its case.
 
     Raises:
         InputError: If the place cannot be written to.
     """
+    joints = points.joints is not None
     header = ["name", *(["kind"] if points.kinds else []), "x_mm", "y_mm", "z_mm"]
+    header += [f"q{number}_deg" for number in range(1, 7)] if joints else []
     labels = zip(points.names, points.kinds, strict=True) if points.kinds else ((name,) for name in points.names)
-    rows = [[*label, *map(repr, row)] for label, row in zip(labels, points.points.tolist(), strict=True)]
+    numbers = points.points if points.joints is None else np.hstack([points.points, np.degrees(points.joints)])
+    rows = [[*label, *map(repr, row)] for label, row in zip(labels, numbers.tolist(), strict=True)]
     try:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
     except OSError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 from puncture_twin.planning.base.errors import InputError
@@ -13,7 +13,13 @@ from puncture_twin.planning.formats.points.raw_points import RawPoints, parse_co
 from puncture_twin.planning.formats.raw_mesh import decode_text, refuse
 from puncture_twin.planning.geometry.spaces import Unit, parse_unit
 
-_ALLOWED = "a header name,x_mm,y_mm,z_mm (or _cm, _m; kind may be added), then as many fields in every line"
+_ALLOWED = (
+    "a header name,x_mm,y_mm,z_mm (or _cm, _m; kind, and q1_deg to q6_deg, may be added), "
+    "then as many fields in every line"
+)
+_JOINTS = tuple(f"q{number}_deg" for number in range(1, 7))
+MAX_JOINT_DEG = 720.0
+"""No joint of a robot arm turns farther than two whole turns; a larger angle is none in degrees."""
 
 
 class _Row(NamedTuple):
@@ -52,7 +58,16 @@ def read_csv_points(data: bytes, where: str) -> RawPoints:
         unit=unit,
         space=None,
         kinds=tuple(f[columns["kind"]].strip() for _, f in rows[1:]) if "kind" in columns else None,
+        joints_deg=[_joints(row, columns, where) for row in rows[1:]] if "q1" in columns else None,
     )
+
+
+def _joints(row: _Row, columns: Mapping[str, int], where: str) -> tuple[float, ...]:
+    line = f"{where}, line {row.line}"
+    angles = tuple(parse_coordinate(row.fields[columns[f"q{number}"]], line) for number in range(1, 7))
+    if max(map(abs, angles)) > MAX_JOINT_DEG:
+        refuse(f"a joint at {max(angles, key=abs):g} degrees", line, f"-{MAX_JOINT_DEG:g} to {MAX_JOINT_DEG:g}")
+    return angles
 
 
 def _rows(data: bytes, where: str) -> Iterator[_Row]:
@@ -72,11 +87,12 @@ def _unit(header: list[str], where: str) -> Unit | None:
         axis = re.fullmatch(r"([xyz])(?:_(\w+))?", name)
         if axis:
             units[axis[1]] = axis[2] or ""
-        elif name not in ("name", "kind"):
+        elif name not in ("name", "kind", *_JOINTS):
             refuse(f"column {name[:40]!r}", f"{where}, header", _ALLOWED)
     if len(set(header)) != len(header) or sorted(units) != ["x", "y", "z"] or "name" not in header:
         refuse(f"columns {header}", f"{where}, header", _ALLOWED)
-    if len(header) != 4 + ("kind" in header):  # such as x_mm beside x_m
+    joints = sum(name in _JOINTS for name in header)
+    if joints not in (0, 6) or len(header) != 4 + ("kind" in header) + joints:  # such as x_mm beside x_m
         refuse(f"columns {header}", f"{where}, header", _ALLOWED)
     if len(set(units.values())) != 1:
         refuse(f"mixed units {sorted(set(units.values()))}", f"{where}, header", _ALLOWED)

@@ -18,6 +18,7 @@ class RawPoints(NamedTuple):
         unit: None if the file states none.
         space: None if the file states none.
         kinds: One per point, if the file has them.
+        joints_deg: Six joint angles per point, if the file says how the robot stood there.
     """
 
     names: list[str]
@@ -25,6 +26,7 @@ class RawPoints(NamedTuple):
     unit: Unit | None
     space: Space | None
     kinds: tuple[str, ...] | None = None
+    joints_deg: list[tuple[float, ...]] | None = None
 
 
 def parse_coordinate(text: str, where: str) -> float:

@@ -10,8 +10,9 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.registration import fit_rigid, fit_triad, leverage
+from puncture_twin.planning.registration.touch_poses import touching_configuration
 from puncture_twin.twin.plant.scanner import Scanner, draw_true_positions, read_positions, scan, slice_number
-from puncture_twin.twin.plant.tip_touch import TouchProbe, touch, touching_configuration
+from puncture_twin.twin.plant.tip_touch import TouchProbe, touch
 
 MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [90, -10, 20], [20, 150, 147]])
 """A to E of the carton (Chen 2019, Table 1)."""
@@ -46,6 +47,11 @@ def probe(**changes: object) -> TouchProbe:
         "joint_offsets": EXACT_JOINTS,
     }
     return TouchProbe(**(settings | changes))
+
+
+def configuration(one: TouchProbe, point: np.ndarray) -> np.ndarray:
+    """How a probe's arm touches a point."""
+    return touching_configuration(one.model, one.tcp_mm, point, one.needle_base)
 
 
 def test_slices_are_numbered_from_the_inner_wall():
@@ -94,7 +100,7 @@ def test_touch_without_noise_reads_the_truth():
 def test_every_point_of_the_papers_first_placement_can_be_touched_by_a_ur3():
     """The tip is on the point, and the needle leans by 60 degrees at most from the wished direction."""
     for point in SETUP_1:
-        T = flange_pose(ur_model("ur3"), touching_configuration(probe(), point))
+        T = flange_pose(ur_model("ur3"), configuration(probe(), point))
         np.testing.assert_allclose(T[:3, 3] + 401.0 * T[:3, 2], point, atol=1e-6)
         assert T[:3, 2] @ DOWN_IN_THE_BOX >= np.cos(np.radians(60.0)) - 1e-9
 
@@ -114,7 +120,7 @@ def test_joint_offsets_move_the_reading_by_what_the_jacobian_says():
     shifted = probe(noise_mm=0.0, joint_offsets=offsets)
     readings = touch(shifted, SETUP_1, np.random.default_rng(0))
     for point, reading in zip(SETUP_1, readings, strict=True):
-        q = touching_configuration(shifted, point)
+        q = configuration(shifted, point)
         step, tip = 1e-6, np.array([0.0, 0.0, 401.0, 1.0])
         ahead, behind = (flange_pose(ur_model("ur3"), q + s * step * offsets) @ tip for s in (1, -1))
         np.testing.assert_allclose(reading, point - (ahead - behind)[:3] / (2 * step), atol=2e-3)

@@ -14,7 +14,7 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, content_input
 from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
-from puncture_twin.planning.case.case_file import Length, Name, Number, Section, Sextuple, Vector
+from puncture_twin.planning.case.toml_types import Length, Name, Number, Section, Sextuple, Vector
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleEcho

@@ -1,0 +1,242 @@
+"""The one declaration of errors, in the planner's units: belief computes with it, the twin's truth is drawn from it.
+
+Defaults and their reasons: docs/concepts/uncertainty.md. What is not here (breathing, a needle that bends, tissue that
+moves) is not modelled, which is something else than 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case_file import RehearsalSection
+from puncture_twin.planning.case.entry import ANATOMICAL_LPS
+from puncture_twin.planning.case.errors_section import ErrorsSection
+from puncture_twin.planning.geometry.spaces import Space, to_lps
+
+DEFAULT_READING_MM = 0.5
+"""Of a marker in a CT whose pixel and slice spacing nobody stated."""
+
+DEFAULT_TOUCH_MM = 0.35
+"""What the touches of Chen 2019 show without any CT: distances between its markers, measured twice."""
+
+DEFAULT_DRIFT_DEG = 0.02
+"""Of every joint between touch and insertion."""
+
+UNIFORM = 1.0 / np.sqrt(12.0)
+"""Standard deviation of an error that is uniform over one cell, over the cell."""
+
+
+class ArmKind(NamedTuple):
+    """How well the kinematic parameters of an arm are known: standard deviations in mm and degrees."""
+
+    link_mm: float
+    twist_deg: float
+    joint_deg: float
+
+
+ARM_KINDS: Mapping[str, ArmKind] = MappingProxyType(
+    {"calibrated": ArmKind(0.05, 0.005, 0.005), "nominal": ArmKind(0.5, 0.05, 0.1)}
+)
+"""``calibrated``: with the maker's own kinematic calibration. ``nominal``: by data sheet; assumed, nobody states it."""
+
+
+@dataclass(frozen=True)
+class ArmUncertainty:
+    """Standard deviations of an arm and the needle on it; mm and radians.
+
+    Attributes:
+        link_mm: Of every Denavit-Hartenberg length a_i and d_i.
+        twist: Of every twist alpha_i.
+        joint: Of every joint's zero.
+        repeatability: Of every joint, anew at each arrival.
+        drift: Of every joint, since the markers were touched.
+        tip_offset_mm: Of the needle's tip, per axis of the flange.
+        needle_direction: Of the needle's direction, about each of the flange's x and y axes.
+    """
+
+    link_mm: float
+    twist: float
+    joint: float
+    repeatability: float
+    drift: float
+    tip_offset_mm: float
+    needle_direction: float
+
+    def scaled(self, factor: float) -> ArmUncertainty:
+        """Each deviation times a factor."""
+        return ArmUncertainty(**{name: factor * value for name, value in vars(self).items()})
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorModel:
+    """All declared errors of a case.
+
+    Attributes:
+        marker_cov_ct: Shape (3, 3), mm^2: of one marker read in the CT.
+        touch_mm: Of one touch, per axis of the base frame, besides the arm.
+        target_cov_ct: Shape (3, 3), mm^2: of the target read in the CT.
+        arm: Of the arm and its needle.
+        surface_mm: By which a whole structure's surface may lie off, along its normal.
+        found: Whether the markers' residuals give the size of all errors, and the declaration their shape.
+    """
+
+    marker_cov_ct: Floats
+    touch_mm: float
+    target_cov_ct: Floats
+    arm: ArmUncertainty
+    surface_mm: float
+    found: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("marker_cov_ct", "target_cov_ct"):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @property
+    def anisotropic(self) -> bool:
+        """Whether a marker is read better along some axes of the CT than along others."""
+        values = np.linalg.eigvalsh(self.marker_cov_ct)
+        return bool(values[-1] > values[0] * (1 + 1e-9))
+
+    def scaled(self, factor: float) -> ErrorModel:
+        """Each deviation times a factor."""
+        return replace(
+            self,
+            marker_cov_ct=factor**2 * self.marker_cov_ct,
+            touch_mm=factor * self.touch_mm,
+            target_cov_ct=factor**2 * self.target_cov_ct,
+            arm=self.arm.scaled(factor),
+            surface_mm=factor * self.surface_mm,
+        )
+
+
+class Cells(NamedTuple):
+    """Of what a CT is made: pixel and slice spacing in mm, and the unit normal of its slices, shape (3,), LPS."""
+
+    pixel_mm: float
+    spacing_mm: float
+    normal_ct: Floats
+
+
+def error_model(
+    section: ErrorsSection,
+    *,
+    space: Space,
+    cells: Cells | None = None,
+    fle_mm: float | None = None,
+    rehearsal: RehearsalSection | None = None,
+    where: str | Path = "errors",
+) -> ErrorModel:
+    """The declaration in mm and radians, with the defaults filled in.
+
+    Args:
+        section: As the case states it.
+        space: Of the case, in which ``bed_axis`` is meant.
+        cells: Of the case's own CT, which give pixel, spacing and bed axis where the section does not.
+        fle_mm: ``registration.fle_mm``, the short form: rms length of a marker's whole error, touch included.
+        rehearsal: For its older names of three of these keys.
+        where: What errors name.
+
+    Raises:
+        InputError: One error declared twice, or slices that differ from pixels without a bed axis.
+    """
+    section = _with_older_names(section, rehearsal, where)
+    stated = section.model_fields_set
+    if fle_mm is not None:
+        twice = sorted(stated & {"ct_pixel_mm", "ct_spacing_mm", "ct_in_plane_mm", "ct_slice_mm", "touch_mm"})
+        if twice:
+            message = f"registration.fle_mm and errors.{twice[0]} state the same error"
+            raise InputError(message, where=where, allowed="fle_mm alone, or CT and touch in [errors]")
+    reading, touch = _reading_cov(section, space, cells, where), _or(section.touch_mm, DEFAULT_TOUCH_MM)
+    target = reading if section.target_mm is None else section.target_mm**2 * np.eye(3)
+    if fle_mm is not None:
+        reading, touch = fle_mm**2 / 3 * np.eye(3), 0.0
+    found = section.marker_noise == "found"
+    return ErrorModel(reading, touch, target, _arm(section), section.surface_mm, found)
+
+
+def _arm(section: ErrorsSection) -> ArmUncertainty:
+    kind = ARM_KINDS[section.arm]
+    return ArmUncertainty(
+        link_mm=_or(section.link_mm, kind.link_mm),
+        twist=np.radians(_or(section.twist_deg, kind.twist_deg)),
+        joint=np.radians(_or(section.joint_deg, kind.joint_deg)),
+        repeatability=np.radians(section.repeatability_deg),
+        drift=np.radians(_or(section.joint_drift_deg, DEFAULT_DRIFT_DEG)),
+        tip_offset_mm=section.tip_offset_mm,
+        needle_direction=np.radians(section.needle_direction_deg),
+    )
+
+
+def _reading_cov(section: ErrorsSection, space: Space, cells: Cells | None, where: str | Path) -> Floats:
+    """sigma_p^2 (I - b b') + sigma_s^2 b b', with b the axis across the slices."""
+    in_plane = _deviation(section.ct_in_plane_mm, section.ct_pixel_mm, None if cells is None else cells.pixel_mm)
+    across = _deviation(section.ct_slice_mm, section.ct_spacing_mm, None if cells is None else cells.spacing_mm)
+    if in_plane == across:
+        return np.asarray(in_plane**2 * np.eye(3))
+    axis = _bed_axis(section, space, cells, where)
+    return np.asarray(in_plane**2 * np.eye(3) + (across**2 - in_plane**2) * np.outer(axis, axis))
+
+
+def _deviation(stated: float | None, cell: float | None, of_ct: float | None) -> float:
+    if stated is not None:
+        return stated
+    cell = of_ct if cell is None else cell
+    return DEFAULT_READING_MM if cell is None else float(cell * UNIFORM)
+
+
+def _bed_axis(section: ErrorsSection, space: Space, cells: Cells | None, where: str | Path) -> Floats:
+    """The unit vector across the slices, LPS (or the case's local frame)."""
+    axis = section.bed_axis
+    if axis is None and space is Space.LOCAL:
+        allowed = "bed_axis = [x, y, z], the direction across the slices"
+        message = 'ct_slice_mm differs from ct_in_plane_mm, and space "local" has no bed'
+        raise InputError(message, where=where, allowed=allowed)
+    if isinstance(axis, str) and space is Space.LOCAL:
+        raise InputError('bed_axis: space "local" has no head', where=where, allowed="bed_axis = [x, y, z]")
+    if axis is None:
+        return np.array([0.0, 0.0, 1.0]) if cells is None else np.asarray(cells.normal_ct)
+    vector = (
+        np.array(ANATOMICAL_LPS[axis]) if isinstance(axis, str) else to_lps(np.array([axis], dtype=float), space)[0]
+    )
+    length = float(np.linalg.norm(vector))
+    if length == 0:
+        raise InputError("bed_axis is zero", where=where, allowed="a direction")
+    return np.asarray(vector / length)
+
+
+OLDER_NAMES = (
+    ("fle_ct_mm", ("ct_in_plane_mm", "ct_slice_mm")),
+    ("fle_touch_mm", ("touch_mm",)),
+    ("joint_offset_deg", ("joint_drift_deg",)),
+)
+"""Keys of ``[rehearsal]``, and what they are called in ``[errors]``."""
+
+
+def _with_older_names(section: ErrorsSection, rehearsal: RehearsalSection | None, where: str | Path) -> ErrorsSection:
+    """The section with what ``[rehearsal]`` states under its older names."""
+    stated = set() if rehearsal is None else rehearsal.model_fields_set
+    update: dict[str, float] = {}
+    for old, names in OLDER_NAMES:
+        if old not in stated:
+            continue
+        cells = {"ct_pixel_mm", "ct_spacing_mm"} if old == "fle_ct_mm" else set()
+        twice = sorted(section.model_fields_set & ({*names} | cells))
+        if twice:
+            message = f"rehearsal.{old} and errors.{twice[0]} state the same error"
+            raise InputError(message, where=where, allowed=f"errors.{names[0]} alone")
+        update |= dict.fromkeys(names, getattr(rehearsal, old))
+    return section.model_copy(update=update)
+
+
+def _or(value: float | None, default: float) -> float:
+    return default if value is None else value

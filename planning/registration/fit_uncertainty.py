@@ -1,0 +1,81 @@
+"""What a registration's method makes of the declared errors of its markers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.registration.fit_map import carried, design, differenced_map, least_squares_map
+from puncture_twin.planning.registration.noise_test import NoiseTest, noise_test
+from puncture_twin.planning.registration.reading_noise import ReadingNoise
+
+
+@dataclass(frozen=True, eq=False)
+class FitUncertainty:
+    """The declared errors of the markers, and the map from them to the pose; base axes, mm and rad.
+
+    Attributes:
+        noise: Of the markers.
+        R_base_ct: Shape (3, 3), as registered.
+        center_base: Shape (3,), the markers' centroid, about which `fit_map` turns.
+        fit_map: L, shape (6, 3 N), from the stacked reading errors to shift and rotation.
+        test: Whether the residuals agree with the declaration; its scale is not yet in the covariances below.
+    """
+
+    noise: ReadingNoise
+    R_base_ct: Floats
+    center_base: Floats
+    fit_map: Floats
+    test: NoiseTest
+
+    @property
+    def fle_mm(self) -> float:
+        """The rms length of one marker's error, CT and touch together, scaled; the arm's own errors not counted."""
+        omega = self.noise.independent(self.R_base_ct)
+        return self.test.scale * float(np.sqrt(np.trace(omega) / (len(omega) / 3)))
+
+    def map_at(self, point_base: Floats) -> Floats:
+        """X L, shape (6, 3 N): shift at a point (3,) and rotation, per reading error."""
+        return carried(self.center_base, point_base) @ self.fit_map
+
+    def cov_at(self, point_base: Floats) -> Floats:
+        """X L Omega L' X', shape (6, 6): shift (mm) at a point (3,) and rotation, from the readings alone, scaled."""
+        at = self.map_at(point_base)
+        return np.asarray(self.test.scale**2 * at @ self.noise.independent(self.R_base_ct) @ at.T)
+
+
+def fit_uncertainty(
+    method: str,
+    fit: Callable[[Floats, Floats], Floats],
+    T_base_ct: Floats,
+    points_ct: Floats,
+    points_base: Floats,
+    noise: ReadingNoise,
+    *,
+    found: bool,
+) -> FitUncertainty:
+    """The uncertainty of a pose that a method fitted.
+
+    Args:
+        method: ``rigid`` and ``weighted`` have a formula; of others ``fit`` is differenced.
+        fit: From points (N, 3) in both frames to T_base_ct.
+        T_base_ct: Shape (4, 4), what it gave.
+        points_ct: Shape (N, 3), mm.
+        points_base: Shape (N, 3), mm.
+        noise: Of the markers.
+        found: Whether the residuals give the errors' size.
+    """
+    R, center = T_base_ct[:3, :3], points_base.mean(axis=0)
+    fitted = points_ct @ R.T + T_base_ct[:3, 3]
+    A, omega = design(fitted, center), noise.independent(R)
+    if method == "weighted":
+        L = least_squares_map(A, np.asarray(np.linalg.inv(omega), dtype=np.float64))
+    elif method == "rigid":
+        L = least_squares_map(A)
+    else:
+        L = differenced_map(fit, points_ct, fitted)
+    test = noise_test((points_base - fitted).ravel(), omega + noise.shared(), A, found=found)
+    return FitUncertainty(noise, R, center, L, test)

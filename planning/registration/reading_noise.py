@@ -1,0 +1,84 @@
+"""The covariance of markers read in a CT and touched by an arm: y_i = T x_i - J_i eta - Jq_i eps_i + n_i, stacked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from puncture_twin.planning.arm.error_jacobian import N_PARAMETERS, PARAMETERS, error_jacobian
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.errors import ArmUncertainty, ErrorModel
+
+
+def parameter_variances(arm: ArmUncertainty) -> Floats:
+    """The diagonal of Sigma_eta, shape (28,), in the order of `error_jacobian`'s columns; mm^2 and rad^2."""
+    deviations = np.empty(N_PARAMETERS)
+    for kind, value in (
+        ("link", arm.link_mm),
+        ("twist", arm.twist),
+        ("joint", arm.joint),
+        ("tip_offset", arm.tip_offset_mm),
+        ("needle_direction", arm.needle_direction),
+    ):
+        deviations[PARAMETERS[kind]] = value
+    return np.asarray(deviations**2)
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingNoise:
+    """What the readings of N markers may be off by, all normal with mean zero.
+
+    Attributes:
+        cov_ct: Shape (3, 3), mm^2, of each reading in the CT.
+        cov_base: Shape (N, 3, 3), mm^2, of each touch: its own noise, and the arm's repeatability there.
+        arm_jacobian: Shape (3 N, 28), how the arm's parameters move the tip at the touches.
+        eta_variances: Shape (28,), of those parameters.
+        touches_known: Whether the file says how the arm stood at the touches; else they are the planner's guess.
+    """
+
+    cov_ct: Floats
+    cov_base: Floats
+    arm_jacobian: Floats
+    eta_variances: Floats
+    touches_known: bool
+
+    def independent(self, R_base_ct: Floats) -> Floats:
+        """Omega, shape (3 N, 3 N): what errs anew at each marker, CT axes turned by (3, 3)."""
+        blocks = R_base_ct @ self.cov_ct @ R_base_ct.T + self.cov_base
+        omega = np.zeros((3 * len(blocks), 3 * len(blocks)))
+        for row, block in enumerate(blocks):
+            omega[3 * row : 3 * row + 3, 3 * row : 3 * row + 3] = block
+        return omega
+
+    def shared(self) -> Floats:
+        """J Sigma_eta J', shape (3 N, 3 N): what the arm does wrong at all markers together."""
+        return np.asarray((self.arm_jacobian * self.eta_variances) @ self.arm_jacobian.T)
+
+    def whole(self, R_base_ct: Floats) -> Floats:
+        """C, shape (3 N, 3 N): both."""
+        return self.independent(R_base_ct) + self.shared()
+
+    def subset(self, rows: list[int]) -> ReadingNoise:
+        """Of some of the markers."""
+        arm = self.arm_jacobian.reshape(-1, 3, N_PARAMETERS)[rows].reshape(-1, N_PARAMETERS)
+        return ReadingNoise(self.cov_ct, self.cov_base[rows], arm, self.eta_variances, self.touches_known)
+
+
+def reading_noise(errors: ErrorModel, model: UrModel, tip_mm: float, q_touch: Floats, *, known: bool) -> ReadingNoise:
+    """The noise of markers that were touched in given configurations.
+
+    Args:
+        errors: As declared.
+        model: The arm.
+        tip_mm: Flange to tip.
+        q_touch: Shape (N, 6), rad.
+        known: Whether these are the real ones.
+    """
+    J = error_jacobian(model, q_touch, tip_mm)[:, :3]
+    Jq = J[..., PARAMETERS["joint"]]
+    cov_base = errors.touch_mm**2 * np.eye(3) + errors.arm.repeatability**2 * Jq @ np.swapaxes(Jq, -1, -2)
+    return ReadingNoise(
+        errors.marker_cov_ct, cov_base, J.reshape(-1, N_PARAMETERS), parameter_variances(errors.arm), known
+    )
