@@ -134,9 +134,9 @@ def frame_about(z: Floats) -> Floats:
 
 
 def frame_of_points(points: Floats) -> Floats:
-    """The rotation of the frame that three points (3, 3) span (Chen 2019, Eq. 1-6), columns e1, e2, e3."""
+    """Rotations of the frames that three points (..., 3, 3) span (Chen 2019, Eq. 1-6), columns e1, e2, e3."""
     # e1 = (p2 - p1) / |..|,  e3 = e1 × (p3 - p1) / |..|,  e2 = e3 × e1
-    e1 = points[1] - points[0]
-    e1 = e1 / np.linalg.norm(e1)
-    e3 = np.cross(e1, points[2] - points[0])
-    return frame_xz(e1, e3 / np.linalg.norm(e3))
+    e1 = points[..., 1, :] - points[..., 0, :]
+    e1 = e1 / np.sqrt(np.vecdot(e1, e1))[..., None]
+    e3 = np.cross(e1, points[..., 2, :] - points[..., 0, :])
+    return frame_xz(e1, e3 / np.sqrt(np.vecdot(e3, e3))[..., None])

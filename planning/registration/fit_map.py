@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import apply, log_rotation, pose, skew, turned_about
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, log_rotation, pose, skew
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 
 STEPS = 6
@@ -24,10 +24,7 @@ NUDGE_MM = 1e-4
 
 def design(points_base: Floats, center_base: Floats) -> Floats:
     """A, shape (3 N, 6), of points (N, 3) about a centre (3,): how a shift and a rotation (rad) move them."""
-    blocks = np.concatenate(
-        [np.broadcast_to(np.eye(3), (len(points_base), 3, 3)), -skew(points_base - center_base)], axis=2
-    )
-    return blocks.reshape(-1, 6)
+    return _blocks(points_base, center_base).reshape(-1, 6)
 
 
 def least_squares_map(A: Floats, weights: Floats | None = None) -> Floats:
@@ -37,22 +34,37 @@ def least_squares_map(A: Floats, weights: Floats | None = None) -> Floats:
 
 
 def fit_weighted(points_ct: Floats, points_base: Floats, noise: ReadingNoise, T_start: Floats) -> Floats:
-    """T_base_ct, shape (4, 4), that minimises z' Omega^-1 z over rigid motions, z the stacked residuals.
+    """T_base_ct, shape (..., 4, 4), that minimises z' Omega^-1 z over rigid motions, z the stacked residuals.
 
     Args:
-        points_ct: Shape (N, 3), mm.
-        points_base: Shape (N, 3), mm.
+        points_ct: Shape (..., N, 3), mm: one set of markers, or many of one noise.
+        points_base: Shape (..., N, 3), mm.
         noise: Gives Omega, for the rotation found so far.
-        T_start: Shape (4, 4), such as the least-squares fit.
+        T_start: Shape (..., 4, 4), such as the least-squares fit.
     """
-    T, center = T_start, points_base.mean(axis=0)
+    R, t, center = T_start[..., :3, :3], T_start[..., :3, 3], points_base.mean(axis=-2)
     for _ in range(STEPS):
-        fitted = apply(T, points_ct)
-        weights = np.asarray(np.linalg.inv(noise.independent(T[:3, :3])), dtype=np.float64)
-        step = least_squares_map(design(fitted, center), weights) @ (points_base - fitted).ravel()
-        T = turned_about(T, center, np.concatenate([step[3:], step[:3]]))
-    U, _, Vt = np.linalg.svd(T[:3, :3])  # products of rotations drift from one by rounding
-    return pose(U @ Vt, T[:3, 3])
+        fitted = points_ct @ _turned(R) + t[..., None, :]
+        weights = np.linalg.inv(noise.blocks(R))
+        A = _blocks(fitted, center)
+        weighted = np.swapaxes(A, -1, -2) @ weights
+        normal, right = (weighted @ A).sum(axis=-3), weighted @ (points_base - fitted)[..., None]
+        step = np.linalg.solve(normal, right.sum(axis=-3))[..., 0]
+        turn = exp_rotation(step[..., 3:])
+        t = (turn @ (t - center)[..., None])[..., 0] + center + step[..., :3]
+        R = turn @ R
+    U, _, Vt = np.linalg.svd(R)  # products of rotations drift from one by rounding
+    return pose(U @ Vt, t)
+
+
+def _blocks(points: Floats, center: Floats) -> Floats:
+    """A_i = [I, -[p_i - c]x], shape (..., N, 3, 6)."""
+    eye = np.broadcast_to(np.eye(3), (*points.shape, 3))
+    return np.concatenate([eye, -skew(points - center[..., None, :])], axis=-1)
+
+
+def _turned(R: Floats) -> Floats:
+    return np.swapaxes(R, -1, -2)
 
 
 def differenced_map(fit: Callable[[Floats, Floats], Floats], points_ct: Floats, points_base: Floats) -> Floats:

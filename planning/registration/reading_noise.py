@@ -46,11 +46,16 @@ class ReadingNoise:
 
     def independent(self, R_base_ct: Floats) -> Floats:
         """Omega, shape (3 N, 3 N): what errs anew at each marker, CT axes turned by (3, 3)."""
-        blocks = R_base_ct @ self.cov_ct @ R_base_ct.T + self.cov_base
+        blocks = self.blocks(R_base_ct)
         omega = np.zeros((3 * len(blocks), 3 * len(blocks)))
         for row, block in enumerate(blocks):
             omega[3 * row : 3 * row + 3, 3 * row : 3 * row + 3] = block
         return omega
+
+    def blocks(self, R_base_ct: Floats) -> Floats:
+        """Omega's blocks, shape (..., N, 3, 3), one a marker, for rotations (..., 3, 3)."""
+        read = R_base_ct @ self.cov_ct @ np.swapaxes(R_base_ct, -1, -2)
+        return np.asarray(read[..., None, :, :] + self.cov_base)
 
     def shared(self) -> Floats:
         """J Sigma_eta J', shape (3 N, 3 N): what the arm does wrong at all markers together."""
@@ -59,11 +64,6 @@ class ReadingNoise:
     def whole(self, R_base_ct: Floats) -> Floats:
         """C, shape (3 N, 3 N): both."""
         return self.independent(R_base_ct) + self.shared()
-
-    def subset(self, rows: list[int]) -> ReadingNoise:
-        """Of some of the markers."""
-        arm = self.arm_jacobian.reshape(-1, 3, N_PARAMETERS)[rows].reshape(-1, N_PARAMETERS)
-        return ReadingNoise(self.cov_ct, self.cov_base[rows], arm, self.eta_variances, self.touches_known)
 
 
 def reading_noise(errors: ErrorModel, model: UrModel, tip_mm: float, q_touch: Floats, *, known: bool) -> ReadingNoise:

@@ -271,29 +271,32 @@ def fit_triad(points_ct: Floats, points_base: Floats) -> Floats:
     R_base_ct = R_base R_ct^T; the translation is the mean over the three markers.
 
     Args:
-        points_ct: Shape (3, 3), rows M1, M2, M3, mm.
-        points_base: Shape (3, 3), the same markers.
+        points_ct: Shape (..., 3, 3), rows M1, M2, M3, mm; one set, or many.
+        points_base: Shape (..., 3, 3), the same markers.
     """
-    R = frame_of_points(points_base) @ frame_of_points(points_ct).T
-    return _rigid(R, np.mean(points_base - points_ct @ R.T, axis=0))
+    R_ct = np.swapaxes(frame_of_points(points_ct), -1, -2)
+    R = frame_of_points(points_base) @ R_ct
+    return _rigid(R, np.mean(points_base - points_ct @ np.swapaxes(R, -1, -2), axis=-2))
 
 
 def fit_rigid(points_ct: Floats, points_base: Floats) -> Floats:
     """T_base_ct that minimises the squared residuals over rotations (Arun 1987, by SVD; det = +1 after Umeyama 1991).
 
     Args:
-        points_ct: Shape (n, 3), n >= 3, not collinear, mm.
-        points_base: Shape (n, 3), the same markers.
+        points_ct: Shape (..., n, 3), n >= 3, not collinear, mm; one set, or many.
+        points_base: Shape (..., n, 3), the same markers.
     """
     return _least_squares(points_ct, points_base, mirrored=False)
 
 
 def _least_squares(points_ct: Floats, points_base: Floats, *, mirrored: bool) -> Floats:
-    center_ct, center_base = points_ct.mean(axis=0), points_base.mean(axis=0)
-    U, _, Vt = np.linalg.svd((points_base - center_base).T @ (points_ct - center_ct))
+    center_ct, center_base = points_ct.mean(axis=-2), points_base.mean(axis=-2)
+    spread = np.swapaxes(points_base - center_base[..., None, :], -1, -2) @ (points_ct - center_ct[..., None, :])
+    U, _, Vt = np.linalg.svd(spread)
     sign = np.sign(np.linalg.det(U @ Vt)) * (-1.0 if mirrored else 1.0)
-    R = U @ np.diag([1.0, 1.0, sign]) @ Vt
-    return _rigid(R, center_base - R @ center_ct)
+    U = U * np.stack([np.ones_like(sign), np.ones_like(sign), sign], axis=-1)[..., None, :]
+    R = U @ Vt
+    return _rigid(R, center_base - (R @ center_ct[..., None])[..., 0])
 
 
 def fit_affine(points_ct: Floats, points_base: Floats) -> Floats:

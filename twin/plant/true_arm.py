@@ -48,7 +48,7 @@ class TrueArm(NamedTuple):
         poses = np.empty((*q.shape[:-1], 7, 4, 4))
         poses[..., 0, :, :] = np.eye(4)
         for i in range(6):
-            step = _dh_step(q[..., i], self.d[i], self.a[i], self.alpha[i])
+            step = dh_step(q[..., i], self.d[i], self.a[i], self.alpha[i])
             poses[..., i + 1, :, :] = poses[..., i, :, :] @ step
         return poses
 
@@ -90,8 +90,8 @@ def draw_true_arm(nominal: UrModel, errors: ArmErrors, rng: np.random.Generator)
     )
 
 
-def _dh_step(q: Floats, d: float, a: float, alpha: float) -> Floats:
-    """T_{i-1}_{i} = Rz(q) Tz(d) Tx(a) Rx(alpha), shape (..., 4, 4)."""
+def dh_step(q: Floats, d: Floats | float, a: Floats | float, alpha: Floats | float) -> Floats:
+    """T_{i-1}_{i} = Rz(q) Tz(d) Tx(a) Rx(alpha), shape (..., 4, 4), of angles of shape (...); d, a, alpha as many, or one."""
     c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
     T = np.zeros((*np.shape(q), 4, 4))
     T[..., 0, 0], T[..., 0, 1], T[..., 0, 2], T[..., 0, 3] = c, -s * ca, s * sa, a * c

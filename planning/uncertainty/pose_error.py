@@ -1,0 +1,154 @@
+"""The covariance of the needle's pose against the anatomy at the end of an insertion, and where it comes from.
+
+With J_i the arm's error Jacobian at marker i's touch and J_f at the insertion, L the registration's map, X its transport
+to the target, Omega what errs anew at each marker:
+
+    Sigma6 = G Sigma_eta G' + X L Omega L' X' + (rep^2 + drift^2) Jq_f Jq_f',   G = J_f - X L J
+
+The minus sign is the cancellation: what the arm does wrong at the markers it does again at the target. Where nobody
+says how the arm touched them, 2 J_f Sigma_eta J_f' stands for the first term: errors of equal size, independent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from puncture_twin.planning.arm.error_jacobian import PARAMETERS, error_jacobian
+from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
+from puncture_twin.planning.registration.registration import Registration
+
+
+@dataclass(frozen=True, eq=False)
+class PoseError:
+    """Answers how far the needle may be off, for any configuration that puts its tip on the target.
+
+    Attributes:
+        model: The arm.
+        tip_mm: Flange to tip.
+        target_base: Shape (3,), mm.
+        errors: As declared.
+        fit: What the registration makes of them; its test's scale multiplies every covariance given here.
+    """
+
+    model: UrModel
+    tip_mm: float
+    target_base: Floats
+    errors: ErrorModel
+    fit: FitUncertainty
+
+    @property
+    def freedom(self) -> int | None:
+        """Degrees of freedom of the errors' size where the residuals gave it; None where it is declared."""
+        return self.fit.test.freedom if self.fit.test.scaled else None
+
+    def covariance(self, q: Floats) -> Floats:
+        """Sigma6 of configurations (n, 6), rad: shape (n, 6, 6), tip (mm) then rotation (rad), base axes."""
+        return np.asarray(sum(self.parts(q).values()))
+
+    def tip_covariance(self, q: Floats) -> Floats:
+        """Of the tip against the point that was meant, reading of the target included: shape (n, 3, 3), mm^2, base axes."""
+        return self.covariance(q)[:, :3, :3] + self.target_covariance
+
+    @property
+    def target_covariance(self) -> Floats:
+        """Of the target's reading, shape (3, 3), mm^2, base axes, scaled."""
+        R = self.fit.R_base_ct
+        return np.asarray(self.fit.test.scale**2 * R @ self.errors.target_cov_ct @ R.T)
+
+    def parts(self, q: Floats) -> dict[str, Floats]:
+        """Sigma6 by source, each of shape (n, 6, 6); they add up to `covariance`."""
+        J = error_jacobian(self.model, q, self.tip_mm)
+        found = {**self._reading_parts(len(q)), **self._arm_parts(J)}
+        return {source: self.fit.test.scale**2 * cov for source, cov in found.items()}
+
+    def _reading_parts(self, count: int) -> dict[str, Floats]:
+        """Of the markers: in the CT, at the touch, and by the arm's repeatability there; the same for all rows."""
+        at, noise = self.fit.map_at(self.target_base), self.fit.noise
+        marks = at.reshape(6, -1, 3)
+        R, touch = self.fit.R_base_ct, self.errors.touch_mm**2 * np.eye(3)
+        blocks = {
+            "markers_ct": np.broadcast_to(R @ noise.cov_ct @ R.T, noise.cov_base.shape),
+            "touch": np.broadcast_to(touch, noise.cov_base.shape),
+            "repeatability": noise.cov_base - touch,
+        }
+        covs = {source: np.einsum("anb,nbc,dnc->ad", marks, block, marks) for source, block in blocks.items()}
+        return {source: np.broadcast_to(cov, (count, 6, 6)) for source, cov in covs.items()}
+
+    def _arm_parts(self, J: Floats) -> dict[str, Floats]:
+        """Of the arm's parameters, of its drift since the touches, and of one arrival at the target."""
+        known, eta = self.fit.noise.touches_known, self.fit.noise.eta_variances
+        G = J - self.fit.map_at(self.target_base) @ self.fit.noise.arm_jacobian if known else np.sqrt(2.0) * J
+        found = {source: _outer(G[..., part], eta[part]) for source, part in PARAMETERS.items()}
+        Jq, arm = J[..., PARAMETERS["joint"]], self.errors.arm
+        found["drift"] = _outer(Jq, np.full(6, arm.drift**2))
+        found["arrival"] = _outer(Jq, np.full(6, arm.repeatability**2))
+        return found
+
+
+def _outer(J: Floats, variances: Floats) -> Floats:
+    """J diag(v) J', shape (n, 6, 6)."""
+    return np.asarray((J * variances) @ np.swapaxes(J, -1, -2))
+
+
+def pose_error(case: Case, registration: Registration | None) -> PoseError | None:
+    """The pose error of a case; None where it declares no errors, or no markers tie its frames.
+
+    Args:
+        case: The case.
+        registration: Of its markers, with the case's own declaration.
+    """
+    if case.errors is None or registration is None or registration.uncertainty is None:
+        return None
+    target = apply(registration.T_base_ct, case.target_ct)
+    return PoseError(
+        ur_model(case.robot.model), case.needle.length_mm, target, case.errors, registration.uncertainty
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorBudget:
+    """Where the tip's expected error comes from.
+
+    Attributes:
+        rms_mm: Tip to the point that was meant, rms.
+        lateral_mm: Its part across the needle, rms.
+        depth_mm: Its part along the needle, rms.
+        half_axes_mm: Shape (3,), of the 95 % ellipsoid, longest first.
+        share: Source to its part of rms_mm squared; they add up to 1.
+    """
+
+    rms_mm: float
+    lateral_mm: float
+    depth_mm: float
+    half_axes_mm: Floats
+    share: Mapping[str, float]
+
+
+def error_budget(error: PoseError, q: Floats, outward_base: Floats) -> ErrorBudget:
+    """The budget of one configuration.
+
+    Args:
+        error: Of the case.
+        q: Shape (6,), rad, the tip on the target.
+        outward_base: Shape (3,), unit, from the target along the needle.
+    """
+    parts = {source: float(np.trace(cov[0, :3, :3])) for source, cov in error.parts(q[None]).items()}
+    parts["repeatability"] += parts.pop("arrival")
+    parts["target"] = float(np.trace(error.target_covariance))
+    whole = error.tip_covariance(q[None])[0]
+    variance, along = float(np.trace(whole)), float(outward_base @ whole @ outward_base)
+    return ErrorBudget(
+        rms_mm=float(np.sqrt(variance)),
+        lateral_mm=float(np.sqrt(max(variance - along, 0.0))),
+        depth_mm=float(np.sqrt(along)),
+        half_axes_mm=error.fit.test.region_factor * np.sqrt(np.linalg.eigvalsh(whole)[::-1]),
+        share={source: part / variance if variance > 0 else 0.0 for source, part in parts.items()},
+    )

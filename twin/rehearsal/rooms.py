@@ -1,0 +1,128 @@
+"""Many rooms at once, without physics: markers read and touched, registered, and the needle driven to the target.
+
+Every room draws its truth anew from one declaration of errors: what the CT shows of markers and target, the arm's 28
+parameters, its touches, what drifted since, and one arrival. The arm's motion is exact kinematics, not linearised; tissue
+does not move and the needle does not bend.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.arm.kinematics import flange_pose, inverse, wrap_to_pi
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.fit_map import fit_weighted
+from puncture_twin.planning.registration.reading_noise import ReadingNoise, parameter_variances
+from puncture_twin.planning.registration.registration import fit_rigid, fit_triad
+from puncture_twin.twin.plant.true_needle import driven_onto, true_needle
+
+
+@dataclass(frozen=True, eq=False)
+class Puncture:
+    """What every room repeats: the belief, and the commands that follow from it.
+
+    Attributes:
+        model: The arm.
+        tip_mm: Flange to tip.
+        method: Of the registration.
+        noise: Of the markers, as believed: the weights of ``weighted``.
+        points_ct: Shape (N, 3), mm, the markers.
+        q_touch: Shape (N, 6), rad, how the arm touches them.
+        T_base_ct: Shape (4, 4), mm: where the patient lies.
+        target_ct: Shape (3,), mm.
+        outward_ct: Shape (3,), unit, from the target along the needle.
+        q_insertion: Shape (6,), rad, the tip on the target.
+    """
+
+    model: UrModel
+    tip_mm: float
+    method: str
+    noise: ReadingNoise
+    points_ct: Floats
+    q_touch: Floats
+    T_base_ct: Floats
+    target_ct: Floats
+    outward_ct: Floats
+    q_insertion: Floats
+
+
+class Rooms(NamedTuple):
+    """What happened in n rooms; CT frame, mm.
+
+    Attributes:
+        tip_ct: Shape (n, 3), where the tip ended.
+        outward_ct: Shape (n, 3), unit, from there along the needle.
+        target_ct: Shape (n, 3), where the target truly was.
+        T_base_ct: Shape (n, 4, 4), what each room registered.
+        reached: Shape (n,), whether the arm could reach the pose that followed.
+    """
+
+    tip_ct: Floats
+    outward_ct: Floats
+    target_ct: Floats
+    T_base_ct: Floats
+    reached: np.ndarray[tuple[int], np.dtype[np.bool_]]
+
+
+def draw_rooms(puncture: Puncture, errors: ErrorModel, count: int, rng: np.random.Generator) -> Rooms:
+    """Draw rooms from declared errors and rehearse the puncture in each.
+
+    Args:
+        puncture: What every room repeats.
+        errors: What their truth is drawn from.
+        count: Rooms.
+        rng: The source of all draws.
+    """
+    eta = rng.normal(size=(count, 28)) * np.sqrt(parameter_variances(errors.arm))
+    T_base_ct = _registered(puncture, errors, eta, rng)
+    q, reached = _commanded(puncture, T_base_ct)
+    arrival = rng.normal(size=(count, 6)) * np.hypot(errors.arm.repeatability, errors.arm.drift)
+    needle = true_needle(puncture.model, q + arrival, eta, puncture.tip_mm)
+    T_ct_base = np.linalg.inv(puncture.T_base_ct)
+    target_ct = puncture.target_ct + _normal(rng, errors.target_cov_ct, (count,))
+    outward_ct = -needle.R_base_needle[:, :, 2] @ T_ct_base[:3, :3].T
+    return Rooms(apply(T_ct_base, needle.tip_base), outward_ct, target_ct, T_base_ct, reached)
+
+
+def _registered(puncture: Puncture, errors: ErrorModel, eta: Floats, rng: np.random.Generator) -> Floats:
+    """T_base_ct of every room, shape (n, 4, 4), from markers that are read with errors and touched by an arm that errs."""
+    count, markers = len(eta), len(puncture.points_ct)
+    eta_of = np.broadcast_to(eta[:, None], (count, markers, 28))
+    read_ct = puncture.points_ct + _normal(rng, errors.marker_cov_ct, (count, markers))
+    there = np.broadcast_to(apply(puncture.T_base_ct, puncture.points_ct), (count, markers, 3))
+    q_true = driven_onto(puncture.model, there, puncture.q_touch, eta_of, puncture.tip_mm)
+    q_encoder = q_true - rng.normal(size=q_true.shape) * errors.arm.repeatability
+    flange = flange_pose(puncture.model, q_encoder)
+    touched = flange[..., :3, 3] + puncture.tip_mm * flange[..., :3, 2]
+    touched = touched + rng.normal(size=touched.shape) * errors.touch_mm
+    if puncture.method == "triad":
+        return fit_triad(read_ct, touched)
+    fitted = fit_rigid(read_ct, touched)
+    return fit_weighted(read_ct, touched, puncture.noise, fitted) if puncture.method == "weighted" else fitted
+
+
+def _commanded(puncture: Puncture, T_base_ct: Floats) -> tuple[Floats, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
+    """The joints (n, 6) that the controller's own arm takes to the target, in the planned branch and roll, and whether."""
+    planned = flange_pose(puncture.model, puncture.q_insertion)
+    R_ct_flange = puncture.T_base_ct[:3, :3].T @ planned[:3, :3]
+    poses = np.zeros((len(T_base_ct), 4, 4))
+    poses[:, :3, :3] = T_base_ct[:, :3, :3] @ R_ct_flange
+    target_base = T_base_ct[:, :3, :3] @ puncture.target_ct + T_base_ct[:, :3, 3]
+    poses[:, :3, 3], poses[:, 3, 3] = target_base - puncture.tip_mm * poses[:, :3, 2], 1.0
+    turns = wrap_to_pi(inverse(puncture.model, poses) - puncture.q_insertion)
+    far = np.where(np.isnan(turns).any(axis=2), np.inf, np.abs(turns).max(axis=2))
+    branch = far.argmin(axis=1)
+    rows = np.arange(len(poses))
+    return puncture.q_insertion + turns[rows, branch], np.isfinite(far[rows, branch])
+
+
+def _normal(rng: np.random.Generator, cov: Floats, shape: tuple[int, ...]) -> Floats:
+    """Normal vectors (..., 3) of a covariance (3, 3), which may be singular."""
+    values, axes = np.linalg.eigh(cov)
+    return np.asarray(rng.normal(size=(*shape, 3)) * np.sqrt(np.maximum(values, 0.0)) @ axes.T)
