@@ -16,10 +16,13 @@ class AxisDistances:
         distance: Shape (n, k), least distance of axis i from the surface of structure j; 0 where they meet.
         depth: Shape (n, k), distance from the target, along the axis, of the axis point nearest to the structure;
             where they meet, of the first meeting point.
+        normal: Shape (n, k, 3), unit, from the structure's nearest point to that axis point; NaN where they meet; None
+            where it was not asked for.
     """
 
     distance: Floats
     depth: Floats
+    normal: Floats | None = None
 
 
 class ClearanceEngine(Protocol):
@@ -29,10 +32,13 @@ class ClearanceEngine(Protocol):
     decided by the target alone, because every axis starts there (see `puncture_twin.planning.clearance.measure`).
     """
 
-    def measure(self, target_ct: Floats, outward_ct: Floats, length: Floats | float) -> AxisDistances:
+    def measure(
+        self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, normals: bool = False
+    ) -> AxisDistances:
         """Exact distances of the axes from ``target_ct`` (3,) along ``outward_ct`` (n, 3).
 
-        ``length`` is one number or shape (k,), mm: as long is an axis for each structure.
+        ``length`` is one number or shape (k,), mm: as long is an axis for each structure. With ``normals`` each answer
+        says from where it is nearest.
         """
         ...
 

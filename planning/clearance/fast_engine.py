@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.direction_tiles import Tiles, bundle
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.clearance.kernels.axis_normals import axis_normals
 from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
 from puncture_twin.planning.clearance.kernels.lanes import LANES
 from puncture_twin.planning.clearance.kernels.nearest_triangle import nearest_triangle
@@ -59,7 +60,9 @@ class FastEngine:
         self._progress = progress
         self.counts = np.zeros(len(COUNTED), np.int64)
 
-    def measure(self, target_ct: Floats, outward_ct: Floats, length: Floats | float) -> AxisDistances:
+    def measure(
+        self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, normals: bool = False
+    ) -> AxisDistances:
         """Exact distances of n axes from all k structures; see `ClearanceEngine`."""
         target = np.ascontiguousarray(target_ct, dtype=np.float64)
         outward = np.ascontiguousarray(outward_ct, dtype=np.float64).reshape(-1, 3)
@@ -69,12 +72,15 @@ class FastEngine:
         if not (sound and np.all((lengths >= 0.0) & (lengths <= LONGEST_MM))):
             raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
         distance, depth = np.empty(shape), np.empty(shape)
+        normal = np.empty((*shape, 3)) if normals else None
         tiles = bundle(outward)
         for row, blocks in enumerate(self._blocks):
-            _one_structure(blocks, tiles, target, lengths[row], distance[row], depth[row], self.counts)
+            nearest = _one_structure(blocks, tiles, target, lengths[row], distance[row], depth[row], self.counts)
+            if normal is not None:
+                axis_normals(blocks.triangles, nearest, target, outward, distance[row], depth[row], normal[row])
             if self._progress is not None:
                 self._progress((row + 1) * len(outward), len(self._blocks) * len(outward))
-        return AxisDistances(distance.T, depth.T)
+        return AxisDistances(distance.T, depth.T, None if normal is None else normal.transpose(1, 0, 2))
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
         """FCL collision of a capsule with one structure; see `ClearanceEngine`."""
@@ -91,20 +97,22 @@ def _one_structure(
     distance: Floats,
     depth: Floats,
     counts: NDArray[np.int64],
-) -> None:
-    """Fill one structure's distances and depths, in the caller's order."""
+) -> Ints:
+    """Fill one structure's distances and depths, in the caller's order; the rows of the nearest triangles."""
     placed = _placed(blocks, target)
+    nearest = np.empty(len(distance), np.int64)
     if placed.distance == 0.0:
-        distance[:] = depth[:] = 0.0
-        return
-    found = Found(np.empty(len(distance)), np.empty(len(distance)), counts)
+        distance[:], depth[:], nearest[:] = 0.0, 0.0, placed.nearest
+        return nearest
+    found = Found(np.empty(len(distance)), np.empty(len(distance)), np.empty(len(distance), np.int64), counts)
     surface = (blocks.triangles, blocks.local, blocks.base)
     bundles = (tiles.outward, tiles.starts, tiles.middle, tiles.chord)
     search_tiles(
         surface, placed.nodes, placed.slack, target, float(length), placed.distance, placed.nearest,
         bundles, scratch_for(len(placed.nodes)), found, LANES,
     )  # fmt: skip
-    distance[tiles.order], depth[tiles.order] = np.sqrt(found.square), found.depth
+    distance[tiles.order], depth[tiles.order], nearest[tiles.order] = np.sqrt(found.square), found.depth, found.triangle
+    return nearest
 
 
 def _placed(blocks: Blocks, target: Floats) -> _Placed:

@@ -34,13 +34,15 @@ class FclEngine:
         self._objects = tuple(fcl.CollisionObject(_tree(mesh.vertices, mesh.faces)) for mesh in self._meshes)
         self._progress = progress
 
-    def measure(self, target_ct: Floats, outward_ct: Floats, length: Floats | float) -> AxisDistances:
+    def measure(
+        self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, normals: bool = False
+    ) -> AxisDistances:
         """Exact distances of n axes from all k structures; see `ClearanceEngine`."""
         shape = (len(outward_ct), len(self._objects))
-        distance, depth = np.empty(shape), np.empty(shape)
+        distance, depth, normal = np.empty(shape), np.empty(shape), np.empty((*shape, 3))
         lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), shape[1:])
         for row, outward in enumerate(outward_ct):
-            distance[row], depth[row] = self._one_direction(target_ct, outward, lengths)
+            distance[row], depth[row], normal[row] = self._one_direction(target_ct, outward, lengths)
             if self._progress is not None:
                 self._progress(row + 1, len(outward_ct))
         for column, mesh in enumerate(self._meshes):
@@ -48,20 +50,25 @@ class FclEngine:
             distance[met, column] = 0.0
             if met.any():
                 depth[met, column] = first_crossing(mesh, target_ct, outward_ct[met], float(lengths[column]))
-        return AxisDistances(distance, depth)
+                normal[met, column] = np.nan
+        return AxisDistances(distance, depth, normal if normals else None)
 
-    def _one_direction(self, tip: Floats, outward: Floats, lengths: Floats) -> tuple[list[float], list[float]]:
+    def _one_direction(
+        self, tip: Floats, outward: Floats, lengths: Floats
+    ) -> tuple[list[float], list[float], list[Floats]]:
         axes = {
             length: fcl.CollisionObject(_tree(np.stack([tip, tip + length * outward]), _SEGMENT_FACE))
             for length in set(lengths.tolist())
         }
-        distances, depths = [], []
+        distances, depths, normals = [], [], []
         for structure, length in zip(self._objects, lengths.tolist(), strict=True):
             result = fcl.DistanceResult()  # a reused result keeps its old minimum
             request = fcl.DistanceRequest(enable_nearest_points=True)
             distances.append(fcl.distance(axes[length], structure, request, result))
             depths.append(float(np.linalg.norm(result.nearest_points[0] - tip)))
-        return distances, depths
+            away = result.nearest_points[0] - result.nearest_points[1]
+            normals.append(away / max(float(np.linalg.norm(away)), np.finfo(float).tiny))
+        return distances, depths, normals
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
         """FCL collision of a capsule with one structure; see `ClearanceEngine`."""

@@ -75,6 +75,38 @@ def _to_segment(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]  # numb
 
 
 @nb.njit(cache=True)
+def nearest_point(t, x, y, z):  # type: ignore[no-untyped-def]  # numba infers
+    """The point of a triangle (3, 3) that is nearest to another, as three numbers; one without area included."""
+    best, px, py, pz = math.inf, 0.0, 0.0, 0.0
+    for i in range(3):
+        j = (i + 1) % 3
+        ux, uy, uz = t[j, 0] - t[i, 0], t[j, 1] - t[i, 1], t[j, 2] - t[i, 2]
+        ax, ay, az = t[i, 0] - x, t[i, 1] - y, t[i, 2] - z
+        squared, along = ux * ux + uy * uy + uz * uz, 0.0
+        if squared > ROUNDS_TO_ZERO:
+            along = min(1.0, max(0.0, -(ax * ux + ay * uy + az * uz) / squared))
+        qx, qy, qz = ax + along * ux, ay + along * uy, az + along * uz
+        distance = qx * qx + qy * qy + qz * qz
+        if distance < best:
+            best, px, py, pz = distance, x + qx, y + qy, z + qz
+    ax, ay, az = t[0, 0] - x, t[0, 1] - y, t[0, 2] - z
+    bx, by, bz = t[1, 0] - x, t[1, 1] - y, t[1, 2] - z
+    cx, cy, cz = t[2, 0] - x, t[2, 1] - y, t[2, 2] - z
+    # The foot on its plane, where it lies inside: as in `to_triangle`.
+    ux, uy, uz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+    vx, vy, vz = cy * az - cz * ay, cz * ax - cx * az, cx * ay - cy * ax
+    wx, wy, wz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    nx, ny, nz = ux + vx + wx, uy + vy + wy, uz + vz + wz
+    area = nx * nx + ny * ny + nz * nz
+    within = ux * nx + uy * ny + uz * nz, vx * nx + vy * ny + vz * nz, wx * nx + wy * ny + wz * nz
+    if min(within) >= 0.0 and area > ROUNDS_TO_ZERO:
+        height = (ax * nx + ay * ny + az * nz) / area
+        if height * height * area < best:
+            px, py, pz = x + height * nx, y + height * ny, z + height * nz
+    return px, py, pz
+
+
+@nb.njit(cache=True)
 def farthest_from(triangles, points):  # type: ignore[no-untyped-def]  # numba infers
     """The largest distance of points (n, 3) to triangles (m, 3, 3); 0 without points."""
     farthest = 0.0

@@ -189,5 +189,6 @@ def _try_all(triangles, needle, low, count, room, answer, seed):  # type: ignore
         i = low + m
         if square < answer.square[i] or (square == answer.square[i] and depth < answer.depth[i]):
             answer.square[i], answer.depth[i], seed = square, depth, room.tried[k, 1]
+            answer.triangle[i] = seed
             room.upper[m] = min(room.upper[m], np.float32(np.sqrt(square)) * GROWN)
     return seed

@@ -56,10 +56,11 @@ class Scratch(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a structure's search writes: squared distance (mm^2) and depth (mm) of each axis; steps taken, `COUNTED`."""
+    """What a structure's search writes: squared distance (mm^2), depth (mm) and nearest triangle of each axis; `COUNTED`."""
 
     square: NDArray[np.float64]
     depth: NDArray[np.float64]
+    triangle: NDArray[np.int64]
     counts: NDArray[np.int64]
 
 

@@ -44,7 +44,7 @@ def search_tiles(  # type: ignore[no-untyped-def]  # numba infers
     needle = NeedleAxes(target, length, np.float32(length), np.float32(slack))
     for tile in range(len(middle)):
         low, high = starts[tile], starts[tile + 1]
-        _begin(outward, low, high, at_target, lanes, room, answer)
+        _begin(outward, low, high, at_target, nearest, lanes, room, answer)
         if seed != nearest:
             corners = _corners(triangles, seed, target)
             lower_upper_bounds(room.frames32, lanes, corners, needle.short, FOUR * needle.slack, room.upper)
@@ -71,7 +71,7 @@ def _bare_scratch(s):  # type: ignore[no-untyped-def]  # numba infers
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _bare_found(f):  # type: ignore[no-untyped-def]  # numba infers
     """Likewise."""
-    return Found(bare(f.square), bare(f.depth), bare(f.counts))
+    return Found(bare(f.square), bare(f.depth), bare(f.triangle), bare(f.counts))
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
@@ -90,10 +90,10 @@ def _across(u):  # type: ignore[no-untyped-def]  # numba infers
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _begin(outward, low, high, start, lanes, room, answer):  # type: ignore[no-untyped-def]  # numba infers
+def _begin(outward, low, high, start, nearest, lanes, room, answer):  # type: ignore[no-untyped-def]  # numba infers
     """Set up a bundle: its members' frames and the first upper bound; lanes to spare repeat the last member."""
     for i in range(low, high):
-        answer.square[i], answer.depth[i] = start * start, 0.0
+        answer.square[i], answer.depth[i], answer.triangle[i] = start * start, 0.0, nearest
     for k in range(lanes):
         i = min(low + k, high - 1)
         u = (outward[i, 0], outward[i, 1], outward[i, 2])
