@@ -20,6 +20,8 @@ class Reason(StrEnum):
     TOO_LONG = "too_long"
     SKIN_ANGLE = "skin_angle"
     TOO_CLOSE = "too_close"
+    HIT_UNLIKELY = "hit_unlikely"
+    TOUCH_LIKELY = "touch_likely"
     UNKNOWN_REGION = "unknown_region"
     UNREACHABLE = "unreachable"
     ARM_COLLISION = "arm_collision"
@@ -39,6 +41,8 @@ REASON_COLOURS = MappingProxyType(
         Reason.TOO_LONG: (86, 180, 233),
         Reason.SKIN_ANGLE: (230, 159, 0),
         Reason.TOO_CLOSE: (213, 94, 0),
+        Reason.HIT_UNLIKELY: (153, 153, 51),
+        Reason.TOUCH_LIKELY: (204, 51, 17),
         Reason.UNKNOWN_REGION: (110, 110, 110),
         Reason.UNREACHABLE: (0, 90, 178),
         Reason.ARM_COLLISION: (204, 121, 167),
@@ -55,6 +59,8 @@ REASON_WORDS = MappingProxyType(
         Reason.TOO_LONG: "path longer than the needle's shaft",
         Reason.SKIN_ANGLE: "too oblique at the skin",
         Reason.TOO_CLOSE: "hits a structure or its margin",
+        Reason.HIT_UNLIKELY: "too unlikely to hit the target",
+        Reason.TOUCH_LIKELY: "too likely to touch a structure",
         Reason.UNKNOWN_REGION: "unknown region (image ends, or not named)",
         Reason.UNREACHABLE: "arm cannot reach the pose",
         Reason.ARM_COLLISION: "arm would collide",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Ints32, Texts
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.search.html import candidates_html
+from puncture_twin.planning.uncertainty.chances import Chances
 
 ARM_CHECKED = "checked"
 """What ``Candidates.arm_note`` says where a safe candidate is one that the arm can reach and insert along."""
@@ -35,7 +36,7 @@ class Verdict(Columns):
         structure: Shape (n,), the structure (or arm body and what it touches) that the reason names, or "".
         depth: Shape (n,), distance from the target along the needle, mm; NaN where it means nothing.
         amount: Shape (n,), the number that fell short: clearance for ``too_close``, path length for ``too_long``, the
-            skin angle in degrees for ``skin_angle``; NaN otherwise.
+            skin angle in degrees for ``skin_angle``, the chance for ``hit_unlikely``, ``touch_likely``; NaN otherwise.
         detail: Shape (n,), what kept the arm, in one sentence; "" for the organs' reasons.
     """
 
@@ -44,6 +45,12 @@ class Verdict(Columns):
     depth: Floats
     amount: Floats
     detail: Texts
+
+    def rejected(self, rows: Ints, reason: Reason, structure: Texts, amount: Floats) -> Verdict:
+        """The same with some rows rejected: each by a structure, shape (m,), and a number, shape (m,)."""
+        arrays = {field.name: getattr(self, field.name).copy() for field in fields(self)}
+        arrays["reason"][rows], arrays["structure"][rows], arrays["amount"][rows] = reason.value, structure, amount
+        return Verdict(**arrays)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,15 +94,17 @@ class ArmColumns(Columns):
     Attributes:
         reachable: Shape (n,), 1 yes, 0 no, -1 not queried.
         margin: Shape (n,), 0..1 distance from joint limits and singularities; NaN where not queried.
+        q_insertion: Shape (n, 6), the joints that put the tip on the target, rad; NaN where the arm does not reach it.
     """
 
     reachable: NDArray[np.int8]
     margin: Floats
+    q_insertion: Floats
 
     @classmethod
     def unknown(cls, count: int) -> ArmColumns:
         """Of an arm that was not queried."""
-        return cls(np.full(count, -1, np.int8), np.full(count, np.nan))
+        return cls(np.full(count, -1, np.int8), np.full(count, np.nan), np.full((count, 6), np.nan))
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +143,7 @@ class Candidates(Columns):
         safe_cone: Shape (n,), by how much one may be off in any direction and still be safe for the organs, rad; NaN
             without a certificate.
         arm_note: `ARM_CHECKED`, or "not checked: " and why: then a safe candidate is safe for the organs alone.
+        chances: To hit and to touch; None where the case declares no errors.
     """
 
     theta: Floats
@@ -146,6 +156,7 @@ class Candidates(Columns):
     ranking: Ranking
     safe_cone: Floats
     arm_note: str = "not checked"
+    chances: Chances | None = None
 
     def __len__(self) -> int:
         return len(self.theta)

@@ -27,8 +27,10 @@ from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.registration.placement import Placement, load_placement
 from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
+from puncture_twin.planning.search.chance import ChanceModel, chance_model
 from puncture_twin.planning.search.consistency import check_consistency
 from puncture_twin.planning.search.search import ArmReach, case_directions, one_direction, search
+from puncture_twin.planning.uncertainty.pose_error import pose_error
 
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
 """Who measures clearance: the fast exact engine, or FCL alone as the plain reference."""
@@ -44,6 +46,7 @@ class CaseContext:
     Attributes:
         placement: Where the patient lies for the robot, or None when the case does not say.
         reach: Who answers for the arm, or None without a placement.
+        chance: Of the declared errors; None where the case declares none, or the arm is not checked.
         stages: How long reading took; later stages are added as they happen.
     """
 
@@ -52,6 +55,7 @@ class CaseContext:
     placement: Placement | None
     engine: ClearanceEngine
     reach: ArmReach | None
+    chance: ChanceModel | None
     watcher: Watcher
     stages: Stages
 
@@ -71,6 +75,7 @@ class CaseContext:
                 self.engine,
                 case_directions(self.case),
                 reach=self.reach,
+                chance=self.chance,
                 progress=partial(self.watcher.count, "arm"),
             )
         return replace(found, arm_note=self.arm)
@@ -78,7 +83,7 @@ class CaseContext:
     def check(self, theta: float, beta: float) -> Candidates:
         """Judge a single direction (rad)."""
         directions = one_direction(self.case, theta, beta)
-        found = search(self.case, self.anatomy, self.engine, directions, reach=self.reach)
+        found = search(self.case, self.anatomy, self.engine, directions, reach=self.reach, chance=self.chance)
         return replace(found, arm_note=self.arm)
 
     def cross_check(self, count: int) -> CrossChecked:
@@ -143,4 +148,6 @@ def prepare(
         reach = None
         if arm is not False and placement is not None:
             reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct), placement.T_base_ct)
-    return CaseContext(case, anatomy, placement, measurer, reach, watcher, stages)
+        error = None if reach is None or placement is None else pose_error(case, placement.registration)
+        chance = chance_model(case, anatomy, error)
+    return CaseContext(case, anatomy, placement, measurer, reach, chance, watcher, stages)

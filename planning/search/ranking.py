@@ -19,6 +19,9 @@ TIE_DIGITS = 9
 COMFORT_CONE = np.radians(5.0)
 """Safe cone from which on more is no better: a hand-held or robotic needle is aimed within a degree or two."""
 
+NO_RISK = 1e-6
+"""Chance to touch from which down less is no better: what no model of a patient can tell."""
+
 TERMS = ("clearance", "path_length", "skin_angle", "tissue", "reach", "safe_cone")
 """The cost's terms, in the order of the columns."""
 
@@ -51,16 +54,18 @@ def rank(
     shaft: float,
     max_skin_angle: float,
     weights: RankingSection,
+    touch_chance: Floats | None = None,
 ) -> Ranking:
     """Rank candidates; all arrays have shape (n,), mm and rad.
 
-    The terms: 1 - min(clearance, 20 mm)/20 mm to the nearest structure with a margin; path length over usable shaft;
+    The terms: 1 - min(clearance, 20 mm)/20 mm to the nearest structure with a margin, or where chances are known the
+    risk min(1, log10(p/1e-6)/6), at least 0, of touching any; path length over usable shaft;
     skin angle over the largest allowed; length through other structures over usable shaft; 1 - reach margin
     (0 for all where reach was not asked); 1 - min(safe cone, 5 degrees)/5 degrees (0 for all without a certificate).
     """
     terms = np.stack(
         [
-            1 - np.clip(min_clearance, 0, COMFORT_MM) / COMFORT_MM,
+            _risk(min_clearance, touch_chance),
             path_length / shaft,
             skin_angle / max_skin_angle,
             tissue / shaft,
@@ -76,6 +81,15 @@ def rank(
     ranks = np.empty(len(cost), np.int32)
     ranks[order] = np.arange(1, len(cost) + 1)
     return Ranking(terms, cost, ranks, pareto_front(terms))
+
+
+def _risk(min_clearance: Floats, touch_chance: Floats | None) -> Floats:
+    """The first term: by the chance to touch where it is known, else by clearance."""
+    by_clearance = 1 - np.clip(min_clearance, 0, COMFORT_MM) / COMFORT_MM
+    if touch_chance is None:
+        return np.asarray(by_clearance)
+    decades = np.log10(np.maximum(touch_chance, NO_RISK) / NO_RISK) / -np.log10(NO_RISK)
+    return np.where(np.isnan(touch_chance), by_clearance, np.minimum(decades, 1.0))
 
 
 def pareto_front(terms: Floats) -> NDArray[np.bool_]:

@@ -28,6 +28,7 @@ from puncture_twin.planning.search.candidates import (
     Ranking,
     Verdict,
 )
+from puncture_twin.planning.search.chance import ChanceModel, with_chances, with_joint_chances
 from puncture_twin.planning.search.constraints import judge
 from puncture_twin.planning.search.ranking import rank
 from puncture_twin.planning.search.tissue import tissue_crossed
@@ -59,6 +60,7 @@ def search(
     directions: Directions,
     *,
     reach: ArmReach | None = None,
+    chance: ChanceModel | None = None,
     progress: Count | None = None,
 ) -> Candidates:
     """Judge every direction against the organs, those that pass against the arm, and rank what is left.
@@ -69,12 +71,14 @@ def search(
         engine: Prepared for the meshes of ``anatomy.checked``, in that order.
         directions: What to judge.
         reach: Who answers for the arm; None leaves ``reachable`` unasked.
+        chance: Of the case's declared errors; None leaves the chances blank.
         progress: Called with (candidates asked, candidates to ask) while the arm is checked.
     """
     found = organ_candidates(case, anatomy, engine, directions)
     if reach is not None:
         found = with_reach(case, found, reach, progress)
-    return ranked(case, found)
+    found = ranked(case, with_chances(case, anatomy, engine, found, chance))
+    return with_joint_chances(case, anatomy, engine, found, chance)
 
 
 def organ_candidates(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> Candidates:
@@ -126,16 +130,20 @@ def with_reach(case: Case, found: Candidates, reach: ArmReach, progress: Count |
     requests = [reach_request(case, found, int(row), reach.T_base_ct) for row in rows]
     answers = assess_reach_all(reach.checker, requests, progress)
     verdict = {field.name: getattr(found.verdict, field.name).copy() for field in fields(found.verdict)}
-    reachable, margin = found.arm.reachable.copy(), found.arm.margin.copy()
+    reachable, margin, q_insertion = (getattr(found.arm, field.name).copy() for field in fields(found.arm))
     for row, answer in zip(rows, answers, strict=True):
         reachable[row] = int(answer.reachable)
         margin[row] = answer.margin
-        if not answer.reachable:
+        if answer.reachable:
+            q_insertion[row] = answer.insertion_q[-1]
+        else:
             verdict["reason"][row], verdict["detail"][row] = answer.reason.value, answer.detail
             verdict["structure"][row] = "" if answer.contact is None else "/".join(answer.contact)
             depth = answer.depth_mm
             verdict["depth"][row] = np.nan if depth is None else reach_depth(case, found, int(row), depth)
-    return replace(found, verdict=Verdict(**verdict), arm=ArmColumns(reachable, margin), arm_note=ARM_CHECKED)
+    return replace(
+        found, verdict=Verdict(**verdict), arm=ArmColumns(reachable, margin, q_insertion), arm_note=ARM_CHECKED
+    )
 
 
 def reach_depth(case: Case, found: Candidates, row: int, inserted_mm: float) -> float:
@@ -156,6 +164,7 @@ def ranked(case: Case, found: Candidates) -> Candidates:
         shaft=case.needle.shaft_mm,
         max_skin_angle=case.search.max_skin_angle,
         weights=case.ranking,
+        touch_chance=None if found.chances is None else found.chances.touch_any[rows],
     )
     blank = Ranking.none(len(found))
     cost, ranks, pareto = blank.cost.copy(), blank.rank.copy(), blank.pareto.copy()

@@ -11,8 +11,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.uncertainty.chances import Chances
 
 
 def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
@@ -50,8 +52,27 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
         "rank": candidates.ranking.rank,
         "pareto": candidates.ranking.pareto,
     }
+    if candidates.chances is not None:
+        columns |= chance_columns(candidates.chances)
     table = pa.table({name: _array(value) for name, value in columns.items()})
     return table.replace_schema_metadata({"run": json.dumps(dict(provenance), sort_keys=True)})
+
+
+def chance_columns(chances: Chances) -> dict[str, Floats]:
+    """The columns of a case that declares errors, after all others."""
+    wide = {
+        f"p_{kind}_{name}": getattr(chances, kind)[:, column]
+        for kind in ("touch", "margin")
+        for column, name in enumerate(chances.structures)
+    }
+    return {
+        "p_hit": chances.hit,
+        **wide,
+        "p_touch_any": chances.touch_any,
+        "p_touch_joint": chances.touch_joint,
+        "sigma_lateral_mm": chances.lateral_mm,
+        "sigma_depth_mm": chances.depth_mm,
+    }
 
 
 def _array(value: Any) -> pa.Array:

@@ -5,9 +5,9 @@ surface is crossed at distances rho_ij, and with m_i^2 = u_i' Sigma^-1 u_i
 
     P = sum_i m_i^-3 sum_j s_ij F3(rho_ij m_i) / sum_i m_i^-3,   F3 the distribution of the length of three normals
 
-where s_ij is +1 for the last crossing and alternates inwards, which is right for a target outside or on the surface too.
-Where the residuals gave the errors' size, that size is uncertain too: F3 becomes Fisher's F(3, nu), and within a radius the
-chance is averaged over chi-squared.
+where s_ij is +1 for the last crossing and alternates inwards, which is right for a target outside or on the surface
+too. Where the residuals gave the errors' size, that size is uncertain too: F3 becomes Fisher's F(3, nu), and within a
+radius the chance is averaged over chi-squared.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def hit_in_mesh(rays: TargetRays, cov_ct: Floats, freedom: int | None = None) ->
     Returns:
         Shape (n,).
     """
-    inverse = np.linalg.inv(cov_ct + LEAST_VARIANCE * np.eye(3))
+    inverse = np.asarray(np.linalg.inv(cov_ct + LEAST_VARIANCE * np.eye(3)), dtype=np.float64)
     if freedom is None:
         found = np.empty(len(inverse))
         _directional(rays.directions, rays.ray, rays.depth, rays.sign, inverse, found)
@@ -124,7 +124,7 @@ def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Fl
     Returns:
         Shape (n,).
     """
-    values = np.linalg.eigvalsh(cov) + LEAST_VARIANCE
+    values = np.asarray(np.linalg.eigvalsh(cov) + LEAST_VARIANCE, dtype=np.float64)
     if freedom is None:
         return chance_within(values, np.full((len(cov), 1), radius_mm))[:, 0]
     parts = (np.arange(QUANTILES) + 0.5) / QUANTILES

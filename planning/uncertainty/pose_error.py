@@ -1,7 +1,7 @@
 """The covariance of the needle's pose against the anatomy at the end of an insertion, and where it comes from.
 
-With J_i the arm's error Jacobian at marker i's touch and J_f at the insertion, L the registration's map, X its transport
-to the target, Omega what errs anew at each marker:
+With J_i the arm's error Jacobian at marker i's touch and J_f at the insertion, L the registration's map, X its
+transport to the target, Omega what errs anew at each marker:
 
     Sigma6 = G Sigma_eta G' + X L Omega L' X' + (rep^2 + drift^2) Jq_f Jq_f',   G = J_f - X L J
 
@@ -54,8 +54,23 @@ class PoseError:
         return np.asarray(sum(self.parts(q).values()))
 
     def tip_covariance(self, q: Floats) -> Floats:
-        """Of the tip against the point that was meant, reading of the target included: shape (n, 3, 3), mm^2, base axes."""
+        """Of the tip against the point that was meant, its reading included: shape (n, 3, 3), mm^2, base axes."""
         return self.covariance(q)[:, :3, :3] + self.target_covariance
+
+    def covariance_ct(self, q: Floats) -> Floats:
+        """Sigma6 in CT axes, shape (n, 6, 6)."""
+        turn = np.kron(np.eye(2), self.fit.R_base_ct)
+        return np.asarray(turn.T @ self.covariance(q) @ turn)
+
+    def tip_covariance_ct(self, q: Floats) -> Floats:
+        """`tip_covariance` in CT axes, shape (n, 3, 3)."""
+        R = self.fit.R_base_ct
+        return np.asarray(R.T @ self.tip_covariance(q) @ R)
+
+    @property
+    def surface_mm(self) -> float:
+        """By which a structure's surface may lie off as a whole, scaled as all that is declared."""
+        return self.fit.test.scale * self.errors.surface_mm
 
     @property
     def target_covariance(self) -> Floats:
@@ -108,9 +123,7 @@ def pose_error(case: Case, registration: Registration | None) -> PoseError | Non
     if case.errors is None or registration is None or registration.uncertainty is None:
         return None
     target = apply(registration.T_base_ct, case.target_ct)
-    return PoseError(
-        ur_model(case.robot.model), case.needle.length_mm, target, case.errors, registration.uncertainty
-    )
+    return PoseError(ur_model(case.robot.model), case.needle.length_mm, target, case.errors, registration.uncertainty)
 
 
 @dataclass(frozen=True, eq=False)

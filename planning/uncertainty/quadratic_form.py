@@ -1,9 +1,9 @@
 """P(sum lambda_i z_i^2 < x) of three standard normals, by Ruben's series (Ann. Math. Stat. 33, 1962).
 
-With beta = min lambda and gamma_i = 1 - beta / lambda_i, P = sum_k c_k F_{3+2k}(x / beta), F the chi-squared distribution.
-The weights' generating function C(t) = prod_i sqrt(beta / lambda_i) (1 - gamma_i t)^(-1/2) satisfies D C' = -D' C / 2 with
-D = prod_i (1 - gamma_i t), of which one gamma is 0; hence (k+1) c_{k+1} = e1 (k + 1/2) c_k - e2 k c_{k-1}, with e1 and e2 the
-sum and product of the other two gammas.
+With beta = min lambda and gamma_i = 1 - beta / lambda_i, P = sum_k c_k F_{3+2k}(x / beta), F the chi-squared
+distribution. The weights' generating function C(t) = prod_i sqrt(beta / lambda_i) (1 - gamma_i t)^(-1/2) satisfies D
+C' = -D' C / 2 with D = prod_i (1 - gamma_i t), of which one gamma is 0; hence (k+1) c_{k+1} = e1 (k + 1/2) c_k - e2 k
+c_{k-1}, with e1 and e2 the sum and product of the other two gammas.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ def draw_true_arm(nominal: UrModel, errors: ArmErrors, rng: np.random.Generator)
 
 
 def dh_step(q: Floats, d: Floats | float, a: Floats | float, alpha: Floats | float) -> Floats:
-    """T_{i-1}_{i} = Rz(q) Tz(d) Tx(a) Rx(alpha), shape (..., 4, 4), of angles of shape (...); d, a, alpha as many, or one."""
+    """T_{i-1}_{i} = Rz(q) Tz(d) Tx(a) Rx(alpha), shape (..., 4, 4), of angles (...); d, a, alpha: as many, or one."""
     c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
     T = np.zeros((*np.shape(q), 4, 4))
     T[..., 0, 0], T[..., 0, 1], T[..., 0, 2], T[..., 0, 3] = c, -s * ca, s * sa, a * c

@@ -1,8 +1,8 @@
 """Many rooms at once, without physics: markers read and touched, registered, and the needle driven to the target.
 
 Every room draws its truth anew from one declaration of errors: what the CT shows of markers and target, the arm's 28
-parameters, its touches, what drifted since, and one arrival. The arm's motion is exact kinematics, not linearised; tissue
-does not move and the needle does not bend.
+parameters, its touches, what drifted since, and one arrival. The arm's motion is exact kinematics, not linearised;
+tissue does not move and the needle does not bend.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def draw_rooms(puncture: Puncture, errors: ErrorModel, count: int, rng: np.rando
 
 
 def _registered(puncture: Puncture, errors: ErrorModel, eta: Floats, rng: np.random.Generator) -> Floats:
-    """T_base_ct of every room, shape (n, 4, 4), from markers that are read with errors and touched by an arm that errs."""
+    """T_base_ct of every room, shape (n, 4, 4), from markers read with errors and touched by an arm that errs."""
     count, markers = len(eta), len(puncture.points_ct)
     eta_of = np.broadcast_to(eta[:, None], (count, markers, 28))
     read_ct = puncture.points_ct + _normal(rng, errors.marker_cov_ct, (count, markers))
@@ -108,7 +108,7 @@ def _registered(puncture: Puncture, errors: ErrorModel, eta: Floats, rng: np.ran
 
 
 def _commanded(puncture: Puncture, T_base_ct: Floats) -> tuple[Floats, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
-    """The joints (n, 6) that the controller's own arm takes to the target, in the planned branch and roll, and whether."""
+    """The joints (n, 6) that the nominal arm takes to the target, in the planned branch and roll, and whether."""
     planned = flange_pose(puncture.model, puncture.q_insertion)
     R_ct_flange = puncture.T_base_ct[:3, :3].T @ planned[:3, :3]
     poses = np.zeros((len(T_base_ct), 4, 4))

@@ -56,7 +56,7 @@ class Scratch(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a structure's search writes: squared distance (mm^2), depth (mm) and nearest triangle of each axis; `COUNTED`."""
+    """What a search writes: squared distance (mm^2), depth (mm), nearest triangle of each axis; `COUNTED`."""
 
     square: NDArray[np.float64]
     depth: NDArray[np.float64]

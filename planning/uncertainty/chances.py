@@ -1,0 +1,75 @@
+"""The chances of a search's candidates: to hit the target, and to touch each structure or its margin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.uncertainty.hit import TargetRays, hit_in_ball, hit_in_mesh, target_rays
+from puncture_twin.planning.uncertainty.pose_error import PoseError
+
+
+@dataclass(frozen=True, eq=False)
+class Chances:
+    """Of n candidates and k structures that demand a margin; NaN where nothing was computed.
+
+    Attributes:
+        structures: The k names.
+        hit: Shape (n,), that the tip is in the target's mesh, or within its radius.
+        touch: Shape (n, k), that the needle touches each structure.
+        margin: Shape (n, k), that it breaks each structure's margin.
+        touch_any: Shape (n,), min(1, sum of touch): never below the truth of what `touch` says.
+        touch_joint: Shape (n,), that it touches any, all linearised together; of the best candidates alone.
+        lateral_mm: Shape (n,), expected (rms) error of the tip across the needle, target reading included.
+        depth_mm: Shape (n,), along it.
+    """
+
+    structures: tuple[str, ...]
+    hit: Floats
+    touch: Floats
+    margin: Floats
+    touch_any: Floats
+    touch_joint: Floats
+    lateral_mm: Floats
+    depth_mm: Floats
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
+    @classmethod
+    def unknown(cls, structures: tuple[str, ...], count: int) -> Chances:
+        """Of candidates for which nothing was computed."""
+        blank = [np.full(count, np.nan) for _ in range(5)]
+        wide = [np.full((count, len(structures)), np.nan) for _ in range(2)]
+        return cls(structures, blank[0], wide[0], wide[1], *blank[1:])
+
+
+@dataclass(frozen=True, eq=False)
+class HitModel:
+    """When a tip hits: within a radius of the target, or within its mesh.
+
+    Attributes:
+        radius_mm: Where a case gives one.
+        rays: The target's mesh, else.
+    """
+
+    radius_mm: float | None
+    rays: TargetRays | None
+
+    def chance(self, error: PoseError, q: Floats) -> Floats:
+        """The chance of configurations (n, 6), shape (n,)."""
+        if self.rays is None or self.radius_mm is not None:
+            assert self.radius_mm is not None
+            return hit_in_ball(error.tip_covariance(q), self.radius_mm, error.freedom)
+        return hit_in_mesh(self.rays, error.covariance_ct(q)[:, :3, :3], error.freedom)
+
+
+def hit_model(radius_mm: float | None, mesh: TriangleMesh, target_ct: Floats) -> HitModel:
+    """By the radius where there is one, else by the mesh of the target's structure."""
+    return HitModel(radius_mm, None if radius_mm is not None else target_rays(mesh, target_ct))
