@@ -156,15 +156,18 @@ def rehearse(
     source: Annotated[Path, typer.Argument(metavar="CASE_OR_PLAN", help="A case, or a plan.json beside --case.")],
     case: Annotated[Path | None, typer.Option("--case", help="The case of a plan.json.")] = None,
     out_dir: OutOption = Path("out"),
+    seeds: Annotated[
+        int | None, typer.Option("--seeds", min=1, max=1_000_000, help="Rooms, each with a truth of its own.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Execute a plan in the twin, where the truth differs from the belief, and say where the tip ended."""
     if source.suffix == ".json":
         if case is None:
             raise InputError("a plan needs its case", where=source, allowed="rehearse plan.json --case CASE")
-        _rehearse(case, out_dir, as_json, plan_path=source)
+        _rehearse(case, out_dir, as_json, plan_path=source, rooms=seeds)
     else:
-        _rehearse(source, out_dir, as_json)
+        _rehearse(source, out_dir, as_json, rooms=seeds)
 
 
 @app.command()
@@ -313,13 +316,15 @@ def reproduce(
         raise typer.Exit(ANSWER_IS_NO)
 
 
-def _rehearse(case: Path, out_dir: Path, as_json: bool, plan_path: Path | None = None) -> None:
+def _rehearse(
+    case: Path, out_dir: Path, as_json: bool, plan_path: Path | None = None, rooms: int | None = None
+) -> None:
     with progress_display() as progress:
         context = prepare(case, watcher=progress)
         if plan_path is None:
-            run = main_job.rehearse_case(context, out_dir)
+            run = main_job.rehearse_case(context, out_dir, rooms)
         else:
-            run = main_job.rehearse_plan(context, plan_path, out_dir)
+            run = main_job.rehearse_plan(context, plan_path, out_dir, rooms)
     _print(run.summary(), words.rehearsal_text(run), as_json)
 
 

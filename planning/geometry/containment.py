@@ -38,6 +38,23 @@ def side_of(mesh: TriangleMesh, point: NDArray[np.float64]) -> Side:
     return Side.INSIDE if inside else Side.OUTSIDE
 
 
+def inside_each(mesh: TriangleMesh, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which of many points (n, 3) lie inside a closed surface, shape (n,); those on an open one are not told apart.
+
+    Raises:
+        ValueError: The surface is open.
+    """
+    if not mesh.closed:
+        raise ValueError("an open surface has no inside")
+    if not mesh.wound_alike:
+        return np.array([_leaves_oddly(mesh, point) for point in points], dtype=bool)
+    low, high = mesh.bounds
+    inside = np.all((points > low) & (points < high), axis=1)
+    rows = np.flatnonzero(inside)
+    inside[rows] = [round(winding_number(mesh, points[row])) != 0 for row in rows]
+    return inside
+
+
 def _leaves_oddly(mesh: TriangleMesh, point: NDArray[np.float64]) -> bool:
     """Whether most of the rays from a point cross an odd number of the surface's distinct triangles."""
     a, b, c = np.moveaxis(mesh.triangles[mesh.distinct] - point, 1, 0)

@@ -93,13 +93,19 @@ def marker_noise(case: Case, errors: ErrorModel, markers: MarkerPairs, *, where:
         InputError: Too few markers to fit, or joints that do not put the tip where the file says that it touched.
     """
     model, tip = ur_model(case.robot.model), case.needle.length_mm
+    check_pairs(markers, where)
     if markers.joints is not None:
         _check_joints(model, tip, markers, where)
-        return reading_noise(errors, model, tip, markers.joints, known=True)
-    check_pairs(markers, where)
+    return reading_noise(errors, model, tip, touches(case, markers), known=markers.joints is not None)
+
+
+def touches(case: Case, markers: MarkerPairs) -> Floats:
+    """How the arm stood when it touched each marker, shape (N, 6), rad: as the file says, or as it may have stood."""
+    if markers.joints is not None:
+        return markers.joints
+    model, tip = ur_model(case.robot.model), case.needle.length_mm
     needle = -(fit_rigid(markers.points_ct, markers.points_base)[:3, :3] @ case.T_ct_entry[:3, 2])
-    q = [_guessed(model, tip, point, needle) for point in markers.points_base]
-    return reading_noise(errors, model, tip, np.array(q), known=False)
+    return np.array([_guessed(model, tip, point, needle) for point in markers.points_base])
 
 
 def _guessed(model: UrModel, tip_mm: float, point_base: Floats, needle_base: Floats) -> Floats:

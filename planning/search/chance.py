@@ -71,7 +71,8 @@ def with_chances(
     if model is None or not len(rows):
         return replace(found, chances=blank)
     parts = [rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)]
-    arrays = [_chances(case, anatomy, engine, found, model, part) for part in parts]
+    outward, q = found.outward_ct, found.arm.q_insertion
+    arrays = [chances_of(case, anatomy, engine, model, outward[part], q[part]) for part in parts]
     values = {name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]}
     filled = {name: getattr(blank, name).copy() for name in values}
     for name, value in values.items():
@@ -80,27 +81,34 @@ def with_chances(
 
 
 def _near(
-    case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates, model: ChanceModel, rows: Ints
-) -> tuple[Proximity, Floats]:
-    """How the needles of some rows pass what must not be touched, and the covariance of their poses, CT axes."""
-    columns, outward = demanding(anatomy.checked), found.outward_ct[rows]
-    cov_ct = model.error.covariance_ct(found.arm.q_insertion[rows])
-    axes = engine.measure(case.target_ct, outward, axis_lengths(case, anatomy.checked), normals=True)
+    case: Case, anatomy: Anatomy, engine: ClearanceEngine, model: ChanceModel, outward_ct: Floats, cov_ct: Floats
+) -> Proximity:
+    """How some needles pass what must not be touched."""
+    columns = demanding(anatomy.checked)
+    axes = engine.measure(case.target_ct, outward_ct, axis_lengths(case, anatomy.checked), normals=True)
     assert axes.normal is not None
     distance, depth, normal = axes.distance[:, columns], axes.depth[:, columns], axes.normal[:, columns]
-    return proximity(distance, depth, normal, outward, cov_ct, model.error.surface_mm), cov_ct
+    return proximity(distance, depth, normal, outward_ct, cov_ct, model.error.surface_mm)
 
 
-def _chances(
-    case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates, model: ChanceModel, rows: Ints
+def chances_of(
+    case: Case, anatomy: Anatomy, engine: ClearanceEngine, model: ChanceModel, outward_ct: Floats, q: Floats
 ) -> dict[str, Floats]:
-    """The chances of some rows, but for the joint one."""
-    near, _ = _near(case, anatomy, engine, found, model, rows)
-    q, outward = found.arm.q_insertion[rows], found.outward_ct[rows]
+    """The columns of `Chances`, but for the joint one, of any needles that reach the target.
+
+    Args:
+        case: The case.
+        anatomy: Its structures.
+        engine: Prepared for the meshes of ``anatomy.checked``.
+        model: Of the case.
+        outward_ct: Shape (n, 3), unit.
+        q: Shape (n, 6), rad, the tip on the target.
+    """
+    near = _near(case, anatomy, engine, model, outward_ct, model.error.covariance_ct(q))
     margins = np.array([anatomy.checked[column].margin_mm for column in demanding(anatomy.checked)])
     touch = touch_chance(near, case.needle.radius_mm, model.error.freedom)
     tip = model.error.tip_covariance_ct(q)
-    along = np.einsum("na,nab,nb->n", outward, tip, outward)
+    along = np.einsum("na,nab,nb->n", outward_ct, tip, outward_ct)
     return {
         "hit": model.hit.chance(model.error, q),
         "touch": touch,
@@ -144,7 +152,8 @@ def with_joint_chances(
     rows = found.ranked[:BEST]
     if model is None or found.chances is None or not len(rows):
         return found
-    near, cov_ct = _near(case, anatomy, engine, found, model, rows)
+    cov_ct = model.error.covariance_ct(found.arm.q_insertion[rows])
+    near = _near(case, anatomy, engine, model, found.outward_ct[rows], cov_ct)
     joint = found.chances.touch_joint.copy()
     joint[rows] = joint_touch_chance(near, cov_ct, case.needle.radius_mm, model.error.freedom)
     return replace(found, chances=replace(found.chances, touch_joint=joint))

@@ -34,6 +34,7 @@ from puncture_twin.planning.search.table import write_table
 from puncture_twin.twin.jobs.patient.run import Run
 from puncture_twin.twin.jobs.patient.summaries import registration_summary, rehearsal_summary
 from puncture_twin.twin.plant.truth import draw_truth
+from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_rooms
 from puncture_twin.twin.rehearsal.rehearsal import rehearse
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.page.page import write_page
@@ -76,8 +77,8 @@ def plan_case(context: CaseContext, out: Path) -> Run:
     return _answered(_final(run, draft), out)
 
 
-def rehearse_case(context: CaseContext, out: Path) -> Run:
-    """Plan, rehearse the plan, and write everything.
+def rehearse_case(context: CaseContext, out: Path, rooms: int | None = None) -> Run:
+    """Plan, rehearse the plan, in many rooms too where a number is given, and write everything.
 
     Raises:
         InputError: The case does not say where the arm stands.
@@ -88,7 +89,7 @@ def rehearse_case(context: CaseContext, out: Path) -> Run:
     with _writing(out, "plan", context, names) as draft:
         run = _searched_and_planned(context, draft.folder)
         planned = run.files
-        run = run if run.plan is None else _rehearsed(run, draft.folder)
+        run = run if run.plan is None else _rehearsed(run, draft.folder, rooms)
         run = _with_pictures(run, draft.folder)
         if run.rehearsal is not None:  # the page shows it: it goes with it
             shown = {draft.folder / "map.png", draft.folder / "scene.png"}
@@ -145,7 +146,7 @@ def _searched_and_planned(context: CaseContext, out: Path) -> Run:
     return _with_table(_planned(Run(context, context.search(), ()), out), out)
 
 
-def rehearse_plan(context: CaseContext, plan_path: Path, out: Path) -> Run:
+def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: int | None = None) -> Run:
     """Load a plan, check it again, rehearse it; write the rehearsal's files and the scene, but no map of one direction.
 
     The scene is left out where the plan's own stands beside it: it shows the same.
@@ -157,7 +158,7 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path) -> Run:
     with context.stages.time("plan"):
         candidates = check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
     with _writing(out, "rehearse", context, ("rehearsal.json", FILM), source) as draft:
-        run = _rehearsed(Run(context, candidates, (), plan, read=(source,)), draft.folder)
+        run = _rehearsed(Run(context, candidates, (), plan, read=(source,)), draft.folder, rooms)
         if not draft.source_has("scene.png"):
             with context.stages.time("scene"):
                 draw_scene(context.case, context.anatomy, candidates, plan, draft.folder / "scene.png")
@@ -174,14 +175,16 @@ def _read_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Plan]:
     return found.input("plan"), plan
 
 
-def _rehearsed(run: Run, out: Path) -> Run:
-    """Execute the run's plan where the truth differs, write the numbers and the film."""
+def _rehearsed(run: Run, out: Path, rooms: int | None) -> Run:
+    """Execute the run's plan where the truth differs, in many rooms too, write the numbers and the film."""
     assert run.plan is not None
     context = run.context
     with context.stages.time("rehearsal"):
         truth = draw_truth(context.case, run.plan.T_base_ct)
         rehearsal = rehearse(run.plan, context.case, context.anatomy, truth)
-    document = {**rehearsal_summary(rehearsal), "inputs": inputs_document(run.inputs)}
+    run = run if rooms is None else replace(run, distribution=_distribution(run, rooms))
+    shown = {} if run.distribution is None else {"distribution": run.distribution.summary()}
+    document = {**rehearsal_summary(rehearsal), **shown, "inputs": inputs_document(run.inputs)}
     run = _with(replace(run, rehearsal=rehearsal), _write_json(document, out / "rehearsal.json"))
     with context.stages.time("film"):
         film = draw_film(
@@ -193,6 +196,14 @@ def _rehearsed(run: Run, out: Path) -> Run:
             progress=partial(context.watcher.count, "film"),
         )
     return _with(run, film)
+
+
+def _distribution(run: Run, rooms: int) -> Distribution:
+    assert run.plan is not None
+    context = run.context
+    with context.stages.time("rooms"):
+        q = run.plan.insertion.q[-1]
+        return rehearse_rooms(context, run.plan.outward_ct, q, rooms, context.case.rehearsal.seed)
 
 
 def export(

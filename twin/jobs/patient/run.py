@@ -14,6 +14,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import needle_warnings
 from puncture_twin.twin.jobs.patient.summaries import candidate_summary, plan_summary, rehearsal_summary
+from puncture_twin.twin.rehearsal.distribution import Distribution
 from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
 
 
@@ -30,6 +31,7 @@ class Run:
     checked: CrossChecked | None = None
     certificate: Certificate | None = None
     read: tuple[Input, ...] = ()
+    distribution: Distribution | None = None
 
     @property
     def inputs(self) -> tuple[Input, ...]:
@@ -48,6 +50,7 @@ class Run:
             "best": [candidate_summary(found, int(row)) for row in found.ranked[:10]],
             "plan": None if self.plan is None else plan_summary(self.plan),
             "rehearsal": None if self.rehearsal is None else rehearsal_summary(self.rehearsal),
+            **({} if self.distribution is None else {"distribution": self.distribution.summary()}),
             "cross_check": None if self.checked is None else asdict(self.checked),
             "certificate": None if self.certificate is None else self.certificate.summary(),
             "seconds": {stage: round(seconds, 3) for stage, seconds in self.context.stages.seconds.items()},

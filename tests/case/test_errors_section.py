@@ -1,0 +1,89 @@
+"""The table [errors]: defaults, aliases, and what contradicts itself."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case_file import RehearsalSection
+from puncture_twin.planning.case.errors import Cells, error_model
+from puncture_twin.planning.case.errors_section import ErrorsSection
+from puncture_twin.planning.geometry.spaces import Space
+
+
+def model(space=Space.LPS, cells=None, fle_mm=None, rehearsal=None, **keys):
+    """The declaration of some keys."""
+    return error_model(ErrorsSection(**keys), space=space, cells=cells, fle_mm=fle_mm, rehearsal=rehearsal)
+
+
+def test_a_cell_makes_a_uniform_error():
+    """Cell over root 12 in each axis: 1 and 5 mm give .29, .29, 1.44, across the slices along z."""
+    found = model(ct_pixel_mm=1.0, ct_spacing_mm=5.0)
+    np.testing.assert_allclose(np.sqrt(np.diag(found.marker_cov_ct)), [0.2887, 0.2887, 1.4434], atol=1e-4)
+    np.testing.assert_array_equal(found.marker_cov_ct, found.target_cov_ct)
+    assert found.anisotropic
+
+
+def test_the_case_s_own_ct_gives_what_is_not_stated():
+    """Pixel, spacing and the normal of its slices."""
+    found = model(cells=Cells(0.7, 3.0, np.array([0.0, 1.0, 0.0])))
+    np.testing.assert_allclose(np.sqrt(np.diag(found.marker_cov_ct)), np.array([0.7, 3.0, 0.7]) / np.sqrt(12))
+    assert not model().anisotropic
+    np.testing.assert_allclose(model().marker_cov_ct, 0.25 * np.eye(3))
+
+
+def test_a_bed_axis_turns_the_slices_and_ras_is_understood():
+    """By name or by vector, in the case's own space."""
+    for axis, space in (("left", Space.LPS), ((2.0, 0.0, 0.0), Space.LPS), ((-1.0, 0.0, 0.0), Space.RAS)):
+        found = model(space, ct_in_plane_mm=0.3, ct_slice_mm=1.0, bed_axis=axis)
+        np.testing.assert_allclose(np.diag(found.marker_cov_ct), [1.0, 0.09, 0.09])
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"space": Space.LOCAL, "ct_slice_mm": 1.0}, "no bed"),
+        ({"space": Space.LOCAL, "ct_slice_mm": 1.0, "bed_axis": "head"}, "no head"),
+        ({"ct_slice_mm": 1.0, "bed_axis": (0.0, 0.0, 0.0)}, "bed_axis is zero"),
+        ({"fle_mm": 1.0, "touch_mm": 0.1}, "state the same error"),
+        ({"fle_mm": 1.0, "ct_pixel_mm": 0.1}, "state the same error"),
+        ({"rehearsal": RehearsalSection(fle_touch_mm=0.2), "touch_mm": 0.1}, "state the same error"),
+        ({"rehearsal": RehearsalSection(fle_ct_mm=0.2), "ct_spacing_mm": 0.1}, "state the same error"),
+        ({"rehearsal": RehearsalSection(joint_offset_deg=0.2), "joint_drift_deg": 0.1}, "state the same error"),
+    ],
+)
+def test_contradictions_are_refused(settings, told):
+    """One line that names both keys."""
+    with pytest.raises(InputError, match=told):
+        model(**settings)
+
+
+def test_cell_and_deviation_are_one_error():
+    """Not both in the table."""
+    with pytest.raises(ValidationError, match="state the same error"):
+        ErrorsSection(ct_pixel_mm=1.0, ct_in_plane_mm=0.3)
+
+
+def test_the_short_form_and_the_older_names():
+    """fle_mm^2/3 in each axis and no touch; [rehearsal]'s keys mean these."""
+    short = model(fle_mm=0.9)
+    np.testing.assert_allclose(short.marker_cov_ct, 0.27 * np.eye(3))
+    assert short.touch_mm == 0
+    old = model(rehearsal=RehearsalSection(fle_ct_mm=0.4, fle_touch_mm=0.2, joint_offset_deg=0.1))
+    np.testing.assert_allclose(old.marker_cov_ct, 0.16 * np.eye(3))
+    assert (old.touch_mm, old.arm.drift) == (0.2, np.radians(0.1))
+
+
+def test_a_nominal_arm_errs_ten_times_as_much():
+    """And single keys go before the kind."""
+    found = model(arm="nominal", twist_deg=0.01)
+    assert (found.arm.link_mm, found.arm.twist) == (0.5, np.radians(0.01))
+    assert model().arm.link_mm == 0.05
+
+
+def test_scaling_scales_every_deviation():
+    """Twice all errors: covariances by four."""
+    one, two = model(surface_mm=0.3), model(surface_mm=0.3).scaled(2.0)
+    np.testing.assert_allclose(two.marker_cov_ct, 4 * one.marker_cov_ct)
+    np.testing.assert_allclose(two.target_cov_ct, 4 * one.target_cov_ct)
+    assert [two.touch_mm, two.surface_mm, two.arm.drift] == [2 * one.touch_mm, 0.6, 2 * one.arm.drift]

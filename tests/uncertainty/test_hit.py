@@ -1,0 +1,85 @@
+"""The chance to hit: against closed forms, and against a million draws."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.special import chdtr
+
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.uncertainty.hit import hit_in_ball, hit_in_mesh, target_rays
+from puncture_twin.planning.uncertainty.quadratic_form import chance_within
+
+DRAWS = np.random.default_rng(3).normal(size=(1_000_000, 3))
+
+DEVIATIONS = [(1.0, 1.0, 1.0), (1.0, 1.7, 0.5), (1.0, 5.7, 2.0), (1.0, 1.8, 1.0), (1.0, 10.0, 1.0), (10.0, 10.0, 1.0)]
+
+
+def covariance(deviations, seed=0):
+    """A covariance with these standard deviations along random axes, and those axes."""
+    axes = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    return axes @ np.diag(np.square(deviations)) @ axes.T, axes
+
+
+@pytest.mark.parametrize("deviations", DEVIATIONS)
+@pytest.mark.parametrize("radius", [0.3, 1.0, 2.5, 8.0])
+def test_within_a_radius_as_a_million_draws_say(deviations, radius):
+    """Ruben's series to .0015, the draws' own error."""
+    found = hit_in_ball(covariance(deviations)[0][None], radius)[0]
+    assert found == pytest.approx(np.mean(np.sum((DRAWS * deviations) ** 2, axis=1) < radius**2), abs=0.0015)
+
+
+def test_equal_axes_are_a_chi_squared():
+    """P(s |z| < a) to 1e-7; and two equal axes beside one that is nearly none are a Rayleigh distribution."""
+    radii = np.array([[0.1, 0.7, 2.0, 5.0]])
+    np.testing.assert_allclose(chance_within(np.full((1, 3), 4.0), radii)[0], chdtr(3, radii[0] ** 2 / 4), atol=1e-7)
+    flat = chance_within(np.array([[1e-3, 1.0, 1.0]]), radii)[0]
+    np.testing.assert_allclose(flat, 1 - np.exp(-(radii[0] ** 2) / 2), atol=1e-3)
+
+
+def test_the_chance_grows_with_the_radius_and_is_never_above_one():
+    """From 0 to 1, for axis ratios up to 30."""
+    radii = np.linspace(0, 200, 400)[None]
+    for high in (1.0, 5.0, 30.0):
+        found = chance_within(np.array([[1.0, 2.0, high**2]]), radii)[0]
+        assert found[0] == 0
+        assert np.all(np.diff(found) > -1e-7)
+        assert 1 - 1e-6 < found[-1] <= 1
+
+
+@pytest.mark.parametrize("deviations", DEVIATIONS)
+@pytest.mark.parametrize("off", [0.0, 6.0, 8.0, 12.0])
+def test_within_a_ball_of_triangles_from_inside_on_its_face_and_outside(deviations, off):
+    """The rays' sum to .004 of a million draws, wherever the target lies."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=8.0)
+    deviations = 3 * np.array(deviations)
+    cov, axes = covariance(deviations, seed=1)
+    found = hit_in_mesh(target_rays(TriangleMesh(ball.vertices, ball.faces), np.array([off, 0.0, 0.0])), cov[None])[0]
+    tips = (DRAWS * deviations) @ axes.T + [off, 0, 0]
+    assert found == pytest.approx(np.mean(np.sum(tips**2, axis=1) < 64), abs=0.004)
+
+
+def test_a_target_on_a_flat_face_is_hit_half_of_the_time_at_most():
+    """The paper's carton aims at the face of a bolt."""
+    box = trimesh.creation.box(extents=[50.0, 50.0, 50.0])
+    rays = target_rays(TriangleMesh(box.vertices, box.faces), np.array([25.0, 0.0, 0.0]))
+    assert hit_in_mesh(rays, np.eye(3)[None])[0] == pytest.approx(0.5, abs=0.002)
+
+
+def test_an_error_whose_size_was_estimated_follows_fishers_f():
+    """Three markers: far more often off than a known error of that size."""
+    cov, _ = covariance((1.0, 2.0, 0.7))
+    size = np.sqrt(3 / np.random.default_rng(5).chisquare(3, len(DRAWS)))
+    drawn = np.sum((DRAWS * [1.0, 2.0, 0.7] * size[:, None]) ** 2, axis=1) < 4
+    assert hit_in_ball(cov[None], 2.0, 3)[0] == pytest.approx(drawn.mean(), abs=0.002)
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=2.0)
+    rays = target_rays(TriangleMesh(ball.vertices, ball.faces), np.zeros(3))
+    assert hit_in_mesh(rays, cov[None], 3)[0] == pytest.approx(drawn.mean(), abs=0.006)
+
+
+def test_no_error_hits_for_certain_and_outside_never():
+    """Sources of 0: P is 1 inside and 0 outside."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=2.0)
+    mesh = TriangleMesh(ball.vertices, ball.faces)
+    for off, chance in ((0.0, 1.0), (3.0, 0.0)):
+        assert hit_in_mesh(target_rays(mesh, np.array([off, 0, 0])), np.zeros((1, 3, 3)))[0] == pytest.approx(chance)
+    assert hit_in_ball(np.zeros((1, 3, 3)), 0.5)[0] == pytest.approx(1.0)

@@ -1,0 +1,123 @@
+"""The chance to touch, to first order: exact for what is flat, and near the draws for what is round."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.special import ndtr
+
+from puncture_twin.planning.clearance.fast_engine import FastEngine
+from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.planning.uncertainty.touch import joint_touch_chance, proximity, touch_chance
+
+LENGTH, RADIUS = 150.0, 0.6
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def scene(*meshes):
+    """Trimesh bodies as the engine takes them."""
+    return [TriangleMesh(mesh.vertices, mesh.faces) for mesh in meshes]
+
+
+def slab(x):
+    """A wide block whose face is the plane at x."""
+    box = trimesh.creation.box(extents=[40.0, 4000.0, 4000.0])
+    box.apply_translation([x + 20.0, 0, 0])
+    return box
+
+
+def ball(radius, at):
+    """A fine sphere."""
+    mesh = trimesh.creation.icosphere(subdivisions=5, radius=radius)
+    mesh.apply_translation(at)
+    return mesh
+
+
+def near(meshes, cov, surface=0.0):
+    """One needle along z from the origin past some meshes."""
+    axes = FastEngine(meshes).measure(np.zeros(3), UP[None], LENGTH, normals=True)
+    return proximity(axes.distance, axes.depth, axes.normal, UP[None], cov[None], surface)
+
+
+def drawn(meshes, cov, count, threshold, seed=0):
+    """How many of so many displaced needles come nearer than a threshold, per mesh and to any."""
+    rng, engine = np.random.default_rng(seed), FastEngine(meshes)
+    errors = rng.multivariate_normal(np.zeros(6), cov, count, method="eigh")
+    met = np.empty((count, len(meshes)), bool)
+    for row, error in enumerate(errors):
+        outward = exp_rotation(error[3:]) @ UP
+        met[row] = engine.measure(error[:3], outward[None], LENGTH).distance[0] < threshold
+    return met.mean(axis=0), met.any(axis=1).mean()
+
+
+def test_a_half_space_has_a_closed_form():
+    """Sigma of the tip's end, or of the top that leans over it: P = Phi(-(D - r)/sigma), exactly."""
+    cov = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    found = touch_chance(near(scene(slab(3.0)), cov), RADIUS)[0, 0]
+    assert found == pytest.approx(ndtr(-(3.0 - RADIUS)), rel=1e-9)
+    wider = touch_chance(near(scene(slab(3.0)), cov, surface=2.0), RADIUS)[0, 0]
+    assert wider == pytest.approx(ndtr(-(3.0 - RADIUS) / np.sqrt(5.0)), rel=1e-9)
+
+
+def test_a_ball_beside_the_needle_feels_the_lean_by_its_depth():
+    """Sigma^2 = s^2 + (depth phi)^2 in the ball's direction."""
+    s, phi = 0.4, 0.01
+    cov = np.diag([s**2, 9.0, 9.0, phi**2, phi**2, 0.0])
+    found = near(scene(ball(5.0, [8.0, 0.0, 100.0])), cov)
+    assert found.deviation[0, 0] == pytest.approx(np.hypot(s, 100.0 * phi), rel=1e-3)
+    assert found.distance[0, 0] == pytest.approx(3.0, abs=0.01)
+
+
+@pytest.mark.parametrize("distance", [1.5, 3.0])
+def test_a_round_organ_is_near_what_draws_say(distance):
+    """First order errs on the safe side at a convex body, by less than .03 here."""
+    cov = np.diag([1.0, 1.0, 0.5, 0.005**2, 0.005**2, 0.0])
+    meshes = scene(ball(12.0, [12.0 + distance, 0.0, 60.0]))
+    found = touch_chance(near(meshes, cov), RADIUS)[0, 0]
+    realised = drawn(meshes, cov, 4000, RADIUS)[0][0]
+    assert -0.015 < found - realised < 0.03
+
+
+def test_any_is_below_the_sum_and_near_the_draws():
+    """Two slabs on both sides, and one twice: joint chances know what excludes and what repeats."""
+    cov = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    left = slab(2.0)
+    left.apply_transform(np.diag([-1.0, 1, 1, 1]))
+    left.invert()
+    both = near(scene(slab(2.0), left), cov)
+    twice = near(scene(slab(2.0), slab(2.0)), cov)
+    one = ndtr(-(2.0 - RADIUS))
+    assert joint_touch_chance(both, cov[None], RADIUS)[0] == pytest.approx(2 * one, abs=0.02)
+    assert joint_touch_chance(twice, cov[None], RADIUS)[0] == pytest.approx(one, abs=0.02)
+    assert touch_chance(twice, RADIUS).sum() == pytest.approx(2 * one)
+
+
+def test_no_error_touches_for_certain_or_never_and_a_met_structure_has_no_first_order():
+    """P is 0 or 1 without doubt; NaN where the axis meets the structure already."""
+    nothing = np.zeros((6, 6))
+    clear = near(scene(slab(3.0), ball(5.0, [0.0, 0.0, 80.0])), nothing)
+    assert touch_chance(clear, RADIUS)[0, 0] == 0.0
+    assert touch_chance(clear, 4.0)[0, 0] == 1.0
+    assert np.isnan(touch_chance(clear, RADIUS)[0, 1])
+
+
+def test_an_estimated_size_makes_far_organs_likelier():
+    """Student's t with 3 degrees instead of the normal."""
+    cov = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    found = near(scene(slab(4.0)), cov)
+    assert touch_chance(found, RADIUS, 3)[0, 0] > 10 * touch_chance(found, RADIUS)[0, 0]
+
+
+def test_both_engines_say_from_where_an_axis_is_nearest(rng):
+    """The same unit vectors, by two codes; NaN where the axis meets the structure."""
+    meshes = []
+    for _ in range(4):
+        mesh = trimesh.creation.icosphere(subdivisions=2, radius=rng.uniform(5, 30))
+        mesh.vertices = mesh.vertices * rng.normal(1, 0.1, (len(mesh.vertices), 1)) + rng.uniform(-80, 80, 3)
+        meshes += scene(mesh)
+    outward = rng.normal(size=(200, 3))
+    outward /= np.linalg.norm(outward, axis=1)[:, None]
+    fast, fcl = (kind(meshes).measure(np.zeros(3), outward, LENGTH, normals=True) for kind in (FastEngine, FclEngine))
+    np.testing.assert_allclose(fast.normal, fcl.normal, atol=1e-9)
+    assert np.isnan(fast.normal).any(axis=2).sum() == (fast.distance == 0).sum() > 0

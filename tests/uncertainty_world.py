@@ -1,0 +1,106 @@
+"""Punctures for tests: the embedded markers, a UR3 that touches them, and one direction to the target."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from places import ROOT
+
+from puncture_twin.planning.arm.insertion import flange_poses
+from puncture_twin.planning.arm.kinematics import inverse, singularity
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.errors import error_model
+from puncture_twin.planning.case.errors_section import ErrorsSection
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.registration.reading_noise import reading_noise
+from puncture_twin.planning.registration.registration import MarkerPairs, fit_rigid, register
+from puncture_twin.planning.registration.touch_poses import touching_configuration
+from puncture_twin.planning.uncertainty.pose_error import PoseError
+from puncture_twin.twin.rehearsal.rooms import Puncture
+
+NO_ARM = {
+    "link_mm": 0.0,
+    "twist_deg": 0.0,
+    "joint_deg": 0.0,
+    "repeatability_deg": 0.0,
+    "joint_drift_deg": 0.0,
+    "tip_offset_mm": 0.0,
+    "needle_direction_deg": 0.0,
+}
+SLICES = {"ct_pixel_mm": 1.0, "ct_spacing_mm": 5.0, "bed_axis": (1.0, 0.0, 0.0)}
+"""Of the carton (Chen 2019): pixels of 1 mm, slices of 5 mm."""
+
+DIRECTIONS = {"abdomen/case.toml": (62.0, 96.0), "carton/case_m.toml": (18.0, 232.0)}
+"""Of each case, one that a UR3 reaches, degrees."""
+
+
+def declared(**keys):
+    """An error model from keys of ``[errors]``."""
+    return error_model(ErrorsSection(**keys), space=Space.LOCAL)
+
+
+@dataclass(frozen=True)
+class World:
+    """Errors, what is believed of the pose, and what every room repeats."""
+
+    errors: object
+    error: PoseError
+    puncture: Puncture
+
+
+def world(case_file, method, errors, *, touch_like_insertion=False, moved=None):
+    """A puncture of an embedded case, whose patient lies where its markers say.
+
+    Args:
+        case_file: Below the embedded meshes.
+        method: Of the registration.
+        errors: As declared.
+        touch_like_insertion: Whether markers are touched with the insertion's own orientation and branch.
+        moved: T_base_base, by which the patient is moved for the arm.
+    """
+    case = load_case(ROOT / "meshes" / case_file)
+    found = load_placement(case).registration.markers
+    model, tip = ur_model(case.robot.model), case.needle.length_mm
+    T = fit_rigid(found.points_ct, found.points_base)
+    T = T if moved is None else moved @ T
+    outward_ct = _direction(case, *DIRECTIONS[case_file])
+    target, outward = apply(T, case.target_ct), T[:3, :3] @ outward_ct
+    q = _insertion(model, target, outward, tip)
+    there = apply(T, found.points_ct)
+    if touch_like_insertion:
+        q_touch = np.array([_nearest(model, point, outward, tip, q) for point in there])
+    else:
+        down = -(T[:3, :3] @ case.T_ct_entry[:3, 2])
+        q_touch = np.array([touching_configuration(model, tip, point, down) for point in there])
+    noise = reading_noise(errors, model, tip, q_touch, known=True)
+    markers = MarkerPairs(found.names, found.points_ct, there)
+    fitted = register(markers, method=method, target_ct=case.target_ct, noise=noise)
+    error = PoseError(model, tip, target, errors, fitted.uncertainty)
+    puncture = Puncture(
+        model, tip, method, noise, found.points_ct, q_touch, fitted.T_base_ct, case.target_ct, outward_ct, q
+    )
+    return World(errors, error, puncture)
+
+
+def _direction(case, theta_deg, beta_deg):
+    theta, beta = np.radians([theta_deg, beta_deg])
+    local = np.array([np.sin(theta) * np.cos(beta), np.sin(theta) * np.sin(beta), np.cos(theta)])
+    return case.T_ct_entry[:3, :3] @ local
+
+
+def _insertion(model, target, outward, tip):
+    """The configuration farthest from singular over all rolls and branches."""
+    rolls = np.radians(np.arange(0, 360, 30))
+    q = inverse(model, flange_poses(target, outward, tip, rolls)).reshape(-1, 6)
+    return q[np.nanargmax(singularity(model, q).least())]
+
+
+def _nearest(model, point, outward, tip, q_near):
+    """The configuration that touches a point with the needle along a direction, and turns least from another."""
+    rolls = np.radians(np.arange(0, 360, 2))
+    q = inverse(model, flange_poses(point, outward, tip, rolls)).reshape(-1, 6)
+    q = q[~np.isnan(q).any(axis=1)]
+    turns = (q - q_near + np.pi) % (2 * np.pi) - np.pi
+    return q_near + turns[np.abs(turns).max(axis=1).argmin()]

@@ -1,0 +1,201 @@
+"""A puncture rehearsed in many rooms: what was realised, beside what was predicted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtri
+
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.containment import inside_each
+from puncture_twin.planning.reach.standoff import axis_lengths
+from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
+from puncture_twin.planning.registration.noise_test import NoiseTest
+from puncture_twin.planning.registration.placement import touches
+from puncture_twin.planning.registration.reading_noise import reading_noise
+from puncture_twin.planning.search.chance import chance_model, chances_of, demanding
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.explain import finite
+from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE
+from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
+from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
+
+REGION = 0.95
+ALLOWED = "a case with [errors] and markers, which say what a room may differ by"
+
+
+@dataclass(frozen=True, eq=False)
+class Distribution:
+    """n rooms of one puncture in which the arm reached the pose; mm.
+
+    Attributes:
+        seed: Of all draws.
+        unreached: Rooms beside these whose registration put the pose out of the arm's reach.
+        error_ct: Shape (n, 3), true tip minus true target.
+        outward_ct: Shape (3,), the planned direction.
+        cov_ct: Shape (3, 3), predicted of it, mm^2.
+        in_region: Shape (n,), whether it lies in the predicted 95 % ellipsoid.
+        hit: Shape (n,).
+        p_hit: Predicted.
+        structures: The k structures that must not be touched.
+        touched: Shape (n, k).
+        p_touch: Shape (k,), predicted.
+        wrong_belief: Whether the truth was drawn from other errors than the belief declares, on purpose.
+        guessed_touches: Whether nobody says how the arm touched the markers, so that a posture was assumed.
+    """
+
+    seed: int
+    unreached: int
+    error_ct: Floats
+    outward_ct: Floats
+    cov_ct: Floats
+    in_region: Bools
+    hit: Bools
+    p_hit: float
+    structures: tuple[str, ...]
+    touched: Bools
+    p_touch: Floats
+    wrong_belief: bool
+    guessed_touches: bool
+
+    def __len__(self) -> int:
+        return len(self.error_ct)
+
+    @property
+    def tip_error_mm(self) -> Floats:
+        """Shape (n,)."""
+        return np.asarray(np.linalg.norm(self.error_ct, axis=1))
+
+    @property
+    def realised_rms_mm(self) -> float:
+        """Of the tip's error."""
+        return float(np.sqrt(np.mean(self.tip_error_mm**2))) if len(self) else float("nan")
+
+    @property
+    def predicted_rms_mm(self) -> float:
+        """Of the tip's error."""
+        return float(np.sqrt(np.trace(self.cov_ct)))
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "rooms": len(self) + self.unreached,
+            "unreached": self.unreached,
+            "seed": self.seed,
+            "realised_rms_mm": finite(self.realised_rms_mm),
+            "predicted_rms_mm": self.predicted_rms_mm,
+            "median_mm": finite(np.median(self.tip_error_mm) if len(self) else np.nan),
+            "coverage_95": _share(self.in_region),
+            "hit_share": _share(self.hit),
+            "mean_p_hit": self.p_hit,
+            "touch_share": _share(self.touched.any(axis=1)),
+            "mean_p_touch": float(min(1.0, self.p_touch.sum())),
+            "touch_share_by_structure": {
+                name: _share(self.touched[:, column]) for column, name in enumerate(self.structures)
+            },
+            "p_touch_by_structure": dict(zip(self.structures, self.p_touch.tolist(), strict=True)),
+            "wrong_belief": self.wrong_belief,
+            "guessed_touches": self.guessed_touches,
+        }
+
+
+def _share(rooms: Bools) -> float | None:
+    return float(rooms.mean()) if len(rooms) else None
+
+
+def rehearse_rooms(
+    context: CaseContext, outward_ct: Floats, q_insertion: Floats, count: int, seed: int
+) -> Distribution:
+    """Rehearse one direction in many rooms, each with a truth of its own.
+
+    Args:
+        context: Of a case with declared errors and markers.
+        outward_ct: Shape (3,), unit, from the target along the needle.
+        q_insertion: Shape (6,), rad, the tip on the target.
+        count: Rooms, at least 1.
+        seed: Of all draws.
+
+    Raises:
+        InputError: The case declares no errors, or has no markers.
+    """
+    case = context.case
+    registration = None if context.placement is None else context.placement.registration
+    error = pose_error(case, registration)
+    if error is None or registration is None:
+        raise InputError("no rooms can be drawn", where=case.path, allowed=ALLOWED)
+    q_touch = touches(case, registration.markers)
+    believed = _as_rehearsed(error, q_touch)
+    truth = (case.truth_errors or case.errors or error.errors).scaled(error.fit.test.scale)
+    puncture = Puncture(
+        ur_model(case.robot.model), case.needle.length_mm, registration.method, believed.fit.noise,
+        registration.markers.points_ct, q_touch, registration.T_base_ct, case.target_ct, outward_ct, q_insertion,
+    )  # fmt: skip
+    rooms = draw_rooms(puncture, truth, count, np.random.default_rng(seed))
+    return _measured(context, believed, puncture, rooms, seed, registration.markers.joints is None)
+
+
+def _as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
+    """The pose error of rooms: touches as there, and errors of the size that the markers say, taken for declared."""
+    errors, fit = error.errors.scaled(error.fit.test.scale), error.fit
+    noise = reading_noise(errors, error.model, error.tip_mm, q_touch, known=True)
+    holds = NoiseTest(fit.test.count, float(fit.test.freedom))
+    return replace(error, errors=errors, fit=FitUncertainty(noise, fit.R_base_ct, fit.center_base, fit.fit_map, holds))
+
+
+def _measured(
+    context: CaseContext, believed: PoseError, puncture: Puncture, rooms: Rooms, seed: int, guessed: bool
+) -> Distribution:
+    case, q = context.case, puncture.q_insertion[None]
+    unreached = int((~rooms.reached).sum())
+    rooms = Rooms(*(column[rooms.reached] for column in rooms))
+    cov_ct, error_ct = believed.tip_covariance_ct(q)[0], rooms.tip_ct - rooms.target_ct
+    model = chance_model(case, context.anatomy, believed)
+    assert model is not None
+    chances = chances_of(case, context.anatomy, context.engine, model, puncture.outward_ct[None], q)
+    inverse = np.linalg.inv(cov_ct + LEAST_VARIANCE * np.eye(3))
+    square = np.einsum("na,ab,nb->n", error_ct, inverse, error_ct)
+    columns = demanding(context.anatomy.checked)
+    return Distribution(
+        seed=seed,
+        unreached=unreached,
+        error_ct=error_ct,
+        outward_ct=puncture.outward_ct,
+        cov_ct=cov_ct,
+        in_region=square <= chdtri(3, 1 - REGION),
+        hit=_hits(context, rooms),
+        p_hit=float(chances["hit"][0]),
+        structures=tuple(context.anatomy.checked[column].name for column in columns),
+        touched=_touches(context, puncture, rooms),
+        p_touch=chances["touch"][0],
+        wrong_belief=case.truth_errors is not None,
+        guessed_touches=guessed,
+    )
+
+
+def _hits(context: CaseContext, rooms: Rooms) -> Bools:
+    """Within the radius of the true target, or in the mesh, which comes from the target's own scan."""
+    case = context.case
+    if case.hit_radius_mm is not None:
+        return np.asarray(np.linalg.norm(rooms.tip_ct - rooms.target_ct, axis=1) < case.hit_radius_mm)
+    return inside_each(context.anatomy.structure(case.target_structure).mesh, rooms.tip_ct)
+
+
+def _touches(context: CaseContext, puncture: Puncture, rooms: Rooms) -> Bools:
+    """Which structures each room's needle touches, shape (n, k), by FCL's capsule where a bound does not exclude it."""
+    case, checked = context.case, context.anatomy.checked
+    columns, lengths = demanding(checked), axis_lengths(context.case, checked)
+    distance = context.engine.measure(case.target_ct, puncture.outward_ct[None], lengths).distance[0]
+    shift = np.linalg.norm(rooms.tip_ct - case.target_ct, axis=1)
+    turn = np.linalg.norm(rooms.outward_ct - puncture.outward_ct, axis=1)
+    touched = np.zeros((len(rooms.tip_ct), len(columns)), bool)
+    for place, column in enumerate(columns):
+        length, radius = float(lengths[column]), case.needle.radius_mm
+        for row in np.flatnonzero(distance[column] - shift - length * turn <= radius):
+            touched[row, place] = context.engine.collides(
+                int(column), rooms.tip_ct[row], rooms.outward_ct[row], length, radius
+            )
+    return touched
