@@ -42,7 +42,8 @@ class FclEngine:
         distance, depth, normal = np.empty(shape), np.empty(shape), np.empty((*shape, 3))
         lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), shape[1:])
         for row, outward in enumerate(outward_ct):
-            distance[row], depth[row], normal[row] = self._one_direction(target_ct, outward, lengths)
+            distance[row], depth[row], away = self._one_direction(target_ct, outward, lengths)
+            normal[row] = np.reshape(away, shape[1:] + (3,))
             if self._progress is not None:
                 self._progress(row + 1, len(outward_ct))
         for column, mesh in enumerate(self._meshes):

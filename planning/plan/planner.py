@@ -19,6 +19,7 @@ from puncture_twin.planning.reach.goals import approach_goals
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.search import ranked, reach_request
+from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
 
 MAX_TRIES = 20
 """Candidates to which an approach is sought; what none of the best twenty allows is a matter of the room."""
@@ -82,13 +83,18 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
     goals = approach_goals(checker, request, home)
     approach = plan_approach(checker, home, np.array([goal.insertion_q[0] for goal in goals]), seed=seed)
     answer = goals[approach.goal_index]
+    error = (
+        context.placement.target_error_mm
+        if context.chance is None
+        else expected_error_mm(context.chance.error, answer.insertion_q[-1])
+    )
     plan = Plan(
         case_name=case.name,
         inputs=case.inputs,
         seed=seed,
         model=case.robot.model,
         T_base_ct=context.placement.T_base_ct,
-        expected_target_error_mm=context.placement.target_error_mm,
+        expected_target_error_mm=error,
         theta=float(candidates.theta[row]),
         beta=float(candidates.beta[row]),
         entry_ct=candidates.path.entry_ct[row],

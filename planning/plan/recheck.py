@@ -16,6 +16,7 @@ from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
+from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
 
 SAME_DIRECTION = 1e-6
 """Largest difference of two unit vectors that name one direction: degrees in the file are rounded to 1e-15."""
@@ -64,6 +65,8 @@ def _check_labels(plan: Plan, context: CaseContext, candidates: Candidates, path
     """Refuse what a plan says of itself where the case says otherwise: people read these numbers."""
     case, placement = context.case, context.placement
     error = float("nan") if placement is None else placement.target_error_mm
+    if context.chance is not None:
+        error = expected_error_mm(context.chance.error, plan.insertion.q[-1])
     stated: tuple[tuple[str, Any, Any], ...] = (
         ("case", plan.case_name, case.name),
         ("robot", plan.model, case.robot.model),

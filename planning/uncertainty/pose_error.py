@@ -145,6 +145,11 @@ class ErrorBudget:
     share: Mapping[str, float]
 
 
+def expected_error_mm(error: PoseError, q: Floats) -> float:
+    """The tip's expected (rms) error against the point that was meant, of one configuration (6,), rad."""
+    return float(np.sqrt(np.trace(error.tip_covariance(q[None])[0])))
+
+
 def error_budget(error: PoseError, q: Floats, outward_base: Floats) -> ErrorBudget:
     """The budget of one configuration.
 

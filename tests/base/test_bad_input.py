@@ -20,7 +20,8 @@ from case_world import (
     write_markers,
 )
 
-from puncture_twin.run_twin import BAD_INPUT, main
+from puncture_twin.run_twin import main
+from puncture_twin.twin.jobs.exit_codes import BAD_INPUT
 
 CASE = case_text(
     SKIN,

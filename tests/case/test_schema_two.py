@@ -12,7 +12,8 @@ from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.case_schema import NOT_LAST_NOTE, SCHEMA_ONE_NOTE, TOP_COUNT_NOTE
 from puncture_twin.planning.formats.labels.totalsegmentator import V2
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.run_twin import BAD_INPUT, OK, main
+from puncture_twin.run_twin import main
+from puncture_twin.twin.jobs.exit_codes import BAD_INPUT, OK
 
 TWO = CASE.replace("schema = 1", 'schema = 2\nregion = "other"') + "[end]\nstructures = 4\n"
 TOP = CASE.replace("schema = 1", 'schema = 2\nstructures = 4\nregion = "other"')

@@ -34,7 +34,8 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.search import organ_candidates
-from puncture_twin.run_twin import OK, main
+from puncture_twin.run_twin import main
+from puncture_twin.twin.jobs.exit_codes import OK
 
 REAL = TESTS / "real"
 DATA = REAL_CT

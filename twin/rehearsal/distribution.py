@@ -21,7 +21,7 @@ from puncture_twin.planning.search.chance import chance_model, chances_of, deman
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE
-from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
+from puncture_twin.planning.uncertainty.pose_error import ErrorBudget, PoseError, error_budget, pose_error
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
 
 REGION = 0.95
@@ -45,6 +45,7 @@ class Distribution:
         touched: Shape (n, k).
         p_touch: Shape (k,), predicted.
         wrong_belief: Whether the truth was drawn from other errors than the belief declares, on purpose.
+        budget: Where the predicted error comes from.
         guessed_touches: Whether nobody says how the arm touched the markers, so that a posture was assumed.
     """
 
@@ -60,6 +61,7 @@ class Distribution:
     touched: Bools
     p_touch: Floats
     wrong_belief: bool
+    budget: ErrorBudget
     guessed_touches: bool
 
     def __len__(self) -> int:
@@ -92,12 +94,13 @@ class Distribution:
             "coverage_95": _share(self.in_region),
             "hit_share": _share(self.hit),
             "mean_p_hit": self.p_hit,
-            "touch_share": _share(self.touched.any(axis=1)),
+            "touch_share": _share(np.asarray(self.touched.any(axis=1))),
             "mean_p_touch": float(min(1.0, self.p_touch.sum())),
             "touch_share_by_structure": {
                 name: _share(self.touched[:, column]) for column, name in enumerate(self.structures)
             },
             "p_touch_by_structure": dict(zip(self.structures, self.p_touch.tolist(), strict=True)),
+            "predicted_share": dict(self.budget.share),
             "wrong_belief": self.wrong_belief,
             "guessed_touches": self.guessed_touches,
         }
@@ -151,7 +154,7 @@ def _measured(
 ) -> Distribution:
     case, q = context.case, puncture.q_insertion[None]
     unreached = int((~rooms.reached).sum())
-    rooms = Rooms(*(column[rooms.reached] for column in rooms))
+    rooms = rooms.reached_alone()
     cov_ct, error_ct = believed.tip_covariance_ct(q)[0], rooms.tip_ct - rooms.target_ct
     model = chance_model(case, context.anatomy, believed)
     assert model is not None
@@ -172,6 +175,7 @@ def _measured(
         touched=_touches(context, puncture, rooms),
         p_touch=chances["touch"][0],
         wrong_belief=case.truth_errors is not None,
+        budget=error_budget(believed, q[0], puncture.T_base_ct[:3, :3] @ puncture.outward_ct),
         guessed_touches=guessed,
     )
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, wrap_to_pi
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fit_map import fit_weighted
@@ -67,7 +67,14 @@ class Rooms(NamedTuple):
     outward_ct: Floats
     target_ct: Floats
     T_base_ct: Floats
-    reached: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    reached: Bools
+
+    def reached_alone(self) -> Rooms:
+        """Without the rooms in which the arm did not reach the pose."""
+        kept = self.reached
+        return Rooms(
+            self.tip_ct[kept], self.outward_ct[kept], self.target_ct[kept], self.T_base_ct[kept], self.reached[kept]
+        )
 
 
 def draw_rooms(puncture: Puncture, errors: ErrorModel, count: int, rng: np.random.Generator) -> Rooms:
@@ -107,7 +114,7 @@ def _registered(puncture: Puncture, errors: ErrorModel, eta: Floats, rng: np.ran
     return fit_weighted(read_ct, touched, puncture.noise, fitted) if puncture.method == "weighted" else fitted
 
 
-def _commanded(puncture: Puncture, T_base_ct: Floats) -> tuple[Floats, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
+def _commanded(puncture: Puncture, T_base_ct: Floats) -> tuple[Floats, Bools]:
     """The joints (n, 6) that the nominal arm takes to the target, in the planned branch and roll, and whether."""
     planned = flange_pose(puncture.model, puncture.q_insertion)
     R_ct_flange = puncture.T_base_ct[:3, :3].T @ planned[:3, :3]

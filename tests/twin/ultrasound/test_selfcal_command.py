@@ -5,11 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from puncture_twin.run_twin import ANSWER_IS_NO, BAD_INPUT, OK, main
+from puncture_twin.run_twin import main
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import read_recording, write_recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import load_selfcal_case
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
 from puncture_twin.twin.guidance.ultrasound.simulate import PoseRanges, simulate_recording
+from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, OK
 
 CASE = """
 schema = 1

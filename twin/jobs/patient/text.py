@@ -11,6 +11,12 @@ from puncture_twin.planning.search.search import closest_miss
 from puncture_twin.twin.jobs.patient.run import Run
 from puncture_twin.twin.jobs.patient.summaries import plan_summary, rehearsal_summary
 
+LEAST_SOURCE = 0.005
+"""Of the variance: a smaller source is not named to people."""
+
+LEAST_SHOWN = 5e-5
+"""A chance or share below it rounds to nothing in what people read."""
+
 
 def search_text(run: Run) -> str:
     """Counts, the best ten, or what came closest; then the files."""
@@ -24,7 +30,8 @@ def plan_text(run: Run) -> str:
 
 def rehearsal_text(run: Run) -> str:
     """The search and the plan, then where the tip ended; then the files."""
-    return "\n".join([*_search(run), *_plan(run), *_rehearsal(run), *_footer(run)])
+    rooms = [] if run.distribution is None else distribution_lines(run.distribution.summary())
+    return "\n".join([*_search(run), *_plan(run), *_rehearsal(run), *rooms, *_footer(run)])
 
 
 def _search(run: Run) -> list[str]:
@@ -58,6 +65,34 @@ def _rehearsal(run: Run) -> list[str]:
         f"  lateral {done['lateral_mm']:.2f} mm, depth {done['depth_mm']:+.2f} mm (+ is too deep)",
         f"  least clearance of the true needle to what it must avoid: {nearest[1]:.2f} mm, {nearest[0]}",
         f"  arm contacts: {'; '.join(done['contacts']) or 'none'}",
+    ]
+
+
+def distribution_lines(rooms: dict[str, Any]) -> list[str]:
+    """What happened in many rooms, beside what was predicted; share and chance by structure where there is any."""
+    if rooms["realised_rms_mm"] is None:
+        return [f"{rooms['rooms']} rooms: in none did the arm reach the pose that its registration asked for"]
+    wrong = ", drawn from [rehearsal.errors]: the belief is wrong by design" if rooms["wrong_belief"] else ""
+    guessed = ["  nobody says how the arm touched the markers: a posture was assumed (touch.csv, q1_deg to q6_deg)"]
+    missed = [f"  in {rooms['unreached']} of them the arm did not reach the pose; they are not counted"]
+    chances = [
+        f"    {name}: touched in {100 * share:.2f} %, predicted {100 * rooms['p_touch_by_structure'][name]:.2f} %"
+        for name, share in rooms["touch_share_by_structure"].items()
+        if max(share, rooms["p_touch_by_structure"][name]) >= LEAST_SHOWN
+    ]
+    sources = sorted(rooms["predicted_share"].items(), key=lambda source: -source[1])
+    return [
+        f"{rooms['rooms']} rooms, seed {rooms['seed']}{wrong}:                realised   predicted",
+        f"  tip error, rms             {rooms['realised_rms_mm']:12.3f} {rooms['predicted_rms_mm']:11.3f} mm",
+        f"  inside the 95 % ellipsoid  {100 * rooms['coverage_95']:12.1f} {95.0:11.1f} %",
+        f"  hit the target             {100 * rooms['hit_share']:12.2f} {100 * rooms['mean_p_hit']:11.2f} %",
+        f"  touched anything           {100 * rooms['touch_share']:12.2f} {100 * rooms['mean_p_touch']:11.2f} %",
+        *chances,
+        "  of the predicted variance: "
+        + ", ".join(f"{name} {100 * part:.0f} %" for name, part in sources if part >= LEAST_SOURCE),
+        *(missed if rooms["unreached"] else []),
+        *(guessed if rooms["guessed_touches"] else []),
+        "  not modelled: breathing, a needle that bends, tissue that moves",
     ]
 
 
