@@ -14,6 +14,8 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import differing_input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import needle_pose
+from puncture_twin.planning.motion.follow import MAX_JERK
+from puncture_twin.planning.motion.trajectory import Peaks
 from puncture_twin.planning.plan.plan import Plan
 
 POSE_TOLERANCE_MM = 0.01
@@ -44,6 +46,12 @@ SPEED_ROUNDING = 1e-3
 """A time law that just keeps a speed may exceed it by its sampling."""
 
 AGREE = "T_base_ct, target_ct_mm, outward_ct, needle_length_mm, standoff_mm and joint angles must agree"
+
+
+def rate_limits(model_name: str) -> Peaks:
+    """The highest rates of an arm's joints in a plan, rad and s."""
+    model = ur_model(model_name)
+    return Peaks(model.max_speeds, np.full(6, model.max_acceleration), np.full(6, MAX_JERK))
 
 
 def check_inputs(plan: Plan, case: Case, path: Path) -> None:
@@ -144,20 +152,8 @@ def _between(q: Floats, path: Path) -> Floats:
 
 
 def _check_speeds(plan: Plan, path: Path) -> None:
-    """Refuse joint limits, joint speeds or a tip speed beyond what a plan may have."""
+    """Refuse joints beyond their limits, rates beyond the plan's own limits, or a tip that is too fast."""
     model = ur_model(plan.model)
-    for phase, part in (("approach", plan.approach), ("insertion", plan.insertion)):
-        if not model.within_limits(part.q).all():
-            raise InputError(
-                f"the {phase} leaves the joint limits", where=path, allowed="angles within the arm's limits"
-            )
-        fastest = float((part.max_speeds() / model.max_speeds).max())
-        if not fastest <= 1 + SPEED_ROUNDING:
-            raise InputError(
-                f"the {phase} is {fastest:.3g} times as fast as a joint can turn",
-                where=path,
-                allowed="the arm's speeds",
-            )
     poses = flange_pose(model, plan.insertion.q)
     tips = poses[:, :3, 3] + plan.needle_length_mm * poses[:, :3, 2]
     speed = float((np.linalg.norm(np.diff(tips, axis=0), axis=1) / np.diff(plan.insertion.times_s)).max(initial=0.0))
@@ -165,3 +161,14 @@ def _check_speeds(plan: Plan, path: Path) -> None:
         raise InputError(
             f"the insertion drives the tip at {speed:.3g} mm/s", where=path, allowed=f"at most {INSERTION_MM_S:g} mm/s"
         )
+    for phase, part in (("approach", plan.approach), ("insertion", plan.insertion)):
+        if not model.within_limits(part.q).all():
+            raise InputError(
+                f"the {phase} leaves the joint limits", where=path, allowed="angles within the arm's limits"
+            )
+        peaks, limits = part.peaks(), rate_limits(plan.model)
+        for rate in ("speed", "acceleration"):  # a jerk wears the arm, and does not stop it
+            most = float((getattr(peaks, rate) / getattr(limits, rate)).max())
+            if not most <= 1 + SPEED_ROUNDING:
+                what = f"the {phase} has {most:.3g} times the {rate} that a joint may have"
+                raise InputError(what, where=path, allowed="the arm's limits of speed and acceleration")

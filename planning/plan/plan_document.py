@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
@@ -28,10 +27,9 @@ from puncture_twin.planning.base.strict_json import (
     whole,
 )
 from puncture_twin.planning.formats.guard import guard_transform
-from puncture_twin.planning.motion.follow import MAX_JERK
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Peaks, Trajectory
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.plan.plan_check import check_geometry
+from puncture_twin.planning.plan.plan_check import check_geometry, rate_limits
 
 PLAN_VERSION = 3
 """Version of the file's layout. 2: states the peaks of both phases beside the limits; the approach is smooth. 3: lists
@@ -77,7 +75,7 @@ def write_plan(plan: Plan, path: Path) -> None:
         "roll_deg": float(np.degrees(plan.roll)),
         "standoff_mm": plan.standoff_mm,
         "needle_length_mm": plan.needle_length_mm,
-        "limits": _rates_document(_limits(plan.model)),
+        "limits": _rates_document(rate_limits(plan.model)),
         "approach": _trajectory_document(plan.approach),
         "insertion": _trajectory_document(plan.insertion),
         "clearance_mm": {phase: or_null(value) for phase, value in plan.clearance_mm.items()},
@@ -118,7 +116,7 @@ def parse_plan(data: bytes, path: Path) -> Plan:
 def _check_stated(document: dict[str, Any], plan: Plan, path: Path) -> None:
     """Refuse limits and peaks that are not the arm's and the samples' own: people read them."""
     stated: tuple[tuple[str, Any, dict[str, list[float]]], ...] = (
-        ("limits", document.get("limits"), _rates_document(_limits(plan.model))),
+        ("limits", document.get("limits"), _rates_document(rate_limits(plan.model))),
         ("peaks of the approach", document["approach"].get("peaks"), _rates_document(plan.approach.peaks())),
         ("peaks of the insertion", document["insertion"].get("peaks"), _rates_document(plan.insertion.peaks())),
     )
@@ -153,11 +151,6 @@ def _check_names(document: dict[str, Any], path: Path) -> None:
         for name in sorted(set(part) - set(known) if part is document["clearance_mm"] else set(part) ^ set(known)):
             what = "is not known" if name in part else "is missing"
             raise InputError(f"key '{where}{name}' {what}", where=path, allowed=", ".join(known))
-
-
-def _limits(model_name: str) -> Peaks:
-    model = ur_model(model_name)
-    return Peaks(model.max_speeds, np.full(6, model.max_acceleration), np.full(6, MAX_JERK))
 
 
 def _rates_document(rates: Peaks) -> dict[str, list[float]]:

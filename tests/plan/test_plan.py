@@ -182,7 +182,11 @@ BROKEN = {
     "only the two ends of the insertion": (lambda d: _two_rows(d), "leaves the straight path by|swings out"),
     "a thousand times as fast": (
         lambda d: {"approach": {**d["approach"], "times_s": [t / 1000 for t in d["approach"]["times_s"]]}},
-        "times as fast as a joint can turn",
+        "the approach has .* times the speed that a joint may have",
+    ),
+    "a jolt on the way": (
+        lambda d: {"approach": _moved(d["approach"], len(d["approach"]["q_rad"]) // 2, 2, 0.01)},
+        "the approach has .* times the acceleration that a joint may have",
     ),
     "an insertion at ten times the speed": (
         lambda d: {"insertion": {**d["insertion"], "times_s": [t / 10 for t in d["insertion"]["times_s"]]}},
