@@ -5,9 +5,11 @@ import pytest
 from selfcal_world import DEGENERATE, as_estimate, cured, degenerate_set
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.rigid import exp_rotation, pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import active_columns
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import LEAST_RATIO, observe, scaled_jacobian
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import tip_residuals
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.solve import Degenerate
 from puncture_twin.twin.guidance.ultrasound.simulate import (
@@ -88,6 +90,33 @@ def test_usual_poses_are_accepted():
         recording, truth = simulate_recording(np.random.default_rng(seed), 20, noise=None)
         ratios.append(observe(as_estimate(truth), recording, ALL).ratio)
     assert min(ratios) > 2 * LEAST_RATIO
+
+
+@pytest.mark.parametrize("distance_mm", [1350.0, 5000.0])
+def test_where_the_second_base_stands_does_not_matter(distance_mm):
+    """Thirty usual recordings whose base 2 has its origin elsewhere: none is refused, and the ratio is the same."""
+    for seed in range(30):
+        recording, _ = simulate_recording(np.random.default_rng(seed), 20)
+        away = pose(exp_rotation(np.array([0.2, -0.4, 1.0])), [distance_mm, 0.0, 0.0])
+        moved = Recording(recording.A, away @ recording.B, recording.P, recording.v)
+        here, there = calibrate(recording, noise=SPEC_NOISE), calibrate(moved, noise=SPEC_NOISE)
+        assert there.condition == pytest.approx(here.condition, rel=1e-4)
+        np.testing.assert_allclose(there.Y @ away, here.Y, atol=1e-2)
+        np.testing.assert_allclose(there.tip_end2, here.tip_end2, atol=1e-3)
+
+
+def test_a_base_far_away_does_not_hide_a_degenerate_set():
+    """A needle guide's poses are refused by the same name with base 2 at 5 m, and their ratio is the same."""
+    truth, A, seen = degenerate_set("insertion angle 45 +- 1 deg")
+    recording = exact_recording(truth, A, seen)
+    away = pose(np.eye(3), [5000.0, 0.0, 0.0])
+    ratios = []
+    for B in (recording.B, away @ recording.B):
+        with pytest.raises(Degenerate) as refused:
+            calibrate(Recording(recording.A, B, recording.P, recording.v), noise=SPEC_NOISE)
+        ratios.append(refused.value.ratio)
+        assert refused.value.motions[0].cause == "insertion_angle"
+    assert ratios[0] == pytest.approx(ratios[1], rel=1e-5)
 
 
 def test_the_ratio_grows_with_the_range_of_angles():

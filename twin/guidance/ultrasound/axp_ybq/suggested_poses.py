@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import LEAST_RATIO, scaled_jacobian
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import LEAST_RATIO, scaled_jacobian, tips_centre
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import needle_in_image
 
@@ -150,7 +150,8 @@ def _greedy(
 ) -> SuggestedPoses:
     """Add the change that helps the least-known combinations most (D-optimal), until the ratio is reached."""
     J = scaled_jacobian(estimate, recording, active)
-    offered = scaled_jacobian(estimate, _as_recording(estimate, recording, changes), active)
+    centre = tips_centre(estimate, recording)
+    offered = scaled_jacobian(estimate, _as_recording(estimate, recording, changes), active, centre)
     pieces = offered.reshape(len(changes), 3, -1)
     gains = pieces.transpose(0, 2, 1) @ pieces
     H, chosen = J.T @ J, list[int]()
