@@ -24,13 +24,17 @@ COUNTED_LATE = frozenset({"tests/jobs/test_hostile.py::runner"})
 
 
 def slow_names(report):
-    """Tests (file::name) and shared fixtures (file::name) that take longer than their limit."""
-    slow = set(COUNTED_LATE)
+    """Tests (file::name) and shared fixtures (file::name) that take longer than their limit.
+
+    Of many cases the longest is left out: the first one loads the compiled kernels for all.
+    """
+    found = defaultdict(list)
     for line in report.splitlines():
         kind, name, seconds = line.split("\t")
-        if float(seconds) > {"test": SLOW_S, "fixture": SLOW_FIXTURE_S}[kind]:
-            slow.add(name)
-    return sorted(slow)
+        found[kind, name].append(float(seconds))
+    limits = {"test": SLOW_S, "fixture": SLOW_FIXTURE_S}
+    slow = {name for (kind, name), taken in found.items() if sorted(taken)[-2 if len(taken) > 3 else -1] > limits[kind]}
+    return sorted(slow | COUNTED_LATE)
 
 
 def totals(report):

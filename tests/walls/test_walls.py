@@ -9,6 +9,7 @@ import types
 from collections import Counter, defaultdict
 from importlib.metadata import packages_distributions
 
+import pytest
 from walls.house import NAME, ROOT, arrows, cycle, imported, is_package, modules, room_arrows, room_of, tree
 
 MOST_MODULES = 16
@@ -29,6 +30,13 @@ WITHOUT_WORK = {
     "puncture_twin.twin.plant.tip_touch",
 }
 """Devices, and patients in a scanner, that no command uses yet."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def sources():
+    """Read once, for all walls."""
+    for path in modules().values():
+        imported(path)
 
 
 def within(module, package):
