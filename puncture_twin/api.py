@@ -80,13 +80,10 @@ def check(context: CaseContext, theta_deg: float, beta_deg: float) -> Explanatio
     Raises:
         InputError: An angle outside of its range.
     """
-    from puncture_twin.planning.search.explain import Explanation
-
     if not (0.0 <= theta_deg <= 180.0 and 0.0 <= beta_deg <= 360.0):
         what = f"theta {theta_deg}, beta {beta_deg}"
         raise InputError(what, where="check", allowed="theta_deg 0 to 180, beta_deg 0 to 360")
-    found = context.check(float(np.radians(theta_deg)), float(np.radians(beta_deg)))
-    return Explanation(context.case, context.anatomy, found)
+    return context.explain(float(np.radians(theta_deg)), float(np.radians(beta_deg)))
 
 
 def rerank(candidates: Candidates, cost: ArrayLike) -> Candidates:

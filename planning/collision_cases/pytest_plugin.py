@@ -150,9 +150,7 @@ def _judge(config: pytest.Config, path: Path, check: CheckSection) -> Explanatio
     cases, key = config.stash[PREPARED], (path.resolve(), check.arm)
     if key not in cases:
         cases[key] = prepare(path, arm=check.arm)  # True refuses a case that does not say where the base is
-    context = cases[key]
-    found = context.check(np.radians(check.theta_deg), np.radians(check.beta_deg))
-    return Explanation(context.case, context.anatomy, found)
+    return cases[key].explain(float(np.radians(check.theta_deg)), float(np.radians(check.beta_deg)))
 
 
 @pytest.fixture(scope="session")

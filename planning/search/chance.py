@@ -80,7 +80,7 @@ def with_chances(
     return _limited(case, replace(found, chances=Chances(names, **filled, touch_joint=blank.touch_joint)))
 
 
-def _near(
+def passing(
     case: Case, anatomy: Anatomy, engine: ClearanceEngine, model: ChanceModel, outward_ct: Floats, cov_ct: Floats
 ) -> Proximity:
     """How some needles pass what must not be touched."""
@@ -104,7 +104,7 @@ def chances_of(
         outward_ct: Shape (n, 3), unit.
         q: Shape (n, 6), rad, the tip on the target.
     """
-    near = _near(case, anatomy, engine, model, outward_ct, model.error.covariance_ct(q))
+    near = passing(case, anatomy, engine, model, outward_ct, model.error.covariance_ct(q))
     margins = np.array([anatomy.checked[column].margin_mm for column in demanding(anatomy.checked)])
     touch = touch_chance(near, case.needle.radius_mm, model.error.freedom)
     tip = model.error.tip_covariance_ct(q)
@@ -127,7 +127,7 @@ def _limited(case: Case, found: Candidates) -> Candidates:
         rows = np.flatnonzero(found.safe & (chances.hit < least))
         target = np.full(len(rows), case.target_structure, dtype=object)
         found = replace(found, verdict=found.verdict.rejected(rows, Reason.HIT_UNLIKELY, target, chances.hit[rows]))
-    limits = np.array([_limit(case, name) for name in chances.structures])
+    limits = np.array([touch_limit(case, name) for name in chances.structures])
     beyond = np.where(chances.touch > limits, chances.touch - limits, -np.inf)
     rows = np.flatnonzero(found.safe & (beyond > 0).any(axis=1))
     worst = beyond[rows].argmax(axis=1) if len(rows) else rows
@@ -136,7 +136,7 @@ def _limited(case: Case, found: Candidates) -> Candidates:
     return replace(found, verdict=found.verdict.rejected(rows, Reason.TOUCH_LIKELY, names, amounts))
 
 
-def _limit(case: Case, name: str) -> float:
+def touch_limit(case: Case, name: str) -> float:
     """The greatest chance to touch a structure that a case allows."""
     allowed = case.search.max_touch_of.get(name, case.search.max_touch)
     return np.inf if allowed is None else allowed
@@ -153,7 +153,7 @@ def with_joint_chances(
     if model is None or found.chances is None or not len(rows):
         return found
     cov_ct = model.error.covariance_ct(found.arm.q_insertion[rows])
-    near = _near(case, anatomy, engine, model, found.outward_ct[rows], cov_ct)
+    near = passing(case, anatomy, engine, model, found.outward_ct[rows], cov_ct)
     joint = found.chances.touch_joint.copy()
     joint[rows] = joint_touch_chance(near, cov_ct, case.needle.radius_mm, model.error.freedom)
     return replace(found, chances=replace(found.chances, touch_joint=joint))

@@ -27,8 +27,10 @@ from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.registration.placement import Placement, load_placement
 from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
-from puncture_twin.planning.search.chance import ChanceModel, chance_model
+from puncture_twin.planning.search.chance import ChanceModel, chance_model, passing
 from puncture_twin.planning.search.consistency import check_consistency
+from puncture_twin.planning.search.doubt import Doubt, doubt_of
+from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.search import ArmReach, case_directions, one_direction, search
 from puncture_twin.planning.uncertainty.pose_error import pose_error
 
@@ -85,6 +87,18 @@ class CaseContext:
         directions = one_direction(self.case, theta, beta)
         found = search(self.case, self.anatomy, self.engine, directions, reach=self.reach, chance=self.chance)
         return replace(found, arm_note=self.arm)
+
+    def explain(self, theta: float, beta: float) -> Explanation:
+        """Judge a single direction (rad), and say what it was judged against and how sure it is."""
+        found = self.check(theta, beta)
+        return Explanation(self.case, self.anatomy, found, self._doubt(found))
+
+    def _doubt(self, found: Candidates) -> Doubt | None:
+        if self.chance is None or not np.isfinite(found.arm.q_insertion[0]).all():
+            return None
+        cov_ct = self.chance.error.covariance_ct(found.arm.q_insertion)
+        near = passing(self.case, self.anatomy, self.engine, self.chance, found.outward_ct, cov_ct)
+        return doubt_of(self.case, found, self.chance, near)
 
     def cross_check(self, count: int) -> CrossChecked:
         """Measure random directions of the grid again with FCL.

@@ -16,9 +16,20 @@ from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.along_path import Stretch, stretches
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.constraints import longest_path
+from puncture_twin.planning.search.doubt import Doubt
 
 MOST = 0.5
 """Of all directions: a needle that is too short for more of them was likely not meant for this target."""
+
+NO_CHANCES = "no chances to hit and to touch: they need markers, the arm, and a direction that organs and arm allow"
+
+UNITS = {
+    Reason.SKIN_ANGLE.value: "deg",
+    Reason.TOO_LONG.value: "mm of path",
+    Reason.HIT_UNLIKELY.value: "chance to hit",
+    Reason.TOUCH_LIKELY.value: "chance to touch",
+}
+"""Of the number that fell short, by reason; of all others it is a clearance in mm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +38,13 @@ class Explanation:
 
     Attributes:
         candidates: A search's result with this candidate alone.
+        doubt: How sure it is; None where the case declares no errors, or the candidate was rejected before.
     """
 
     case: Case
     anatomy: Anatomy
     candidates: Candidates
+    doubt: Doubt | None = None
 
     @property
     def safe(self) -> bool:
@@ -88,7 +101,14 @@ class Explanation:
                 for part in self.along_path
             ],
             "warnings": list(self.anatomy.warnings),
+            **self._chances(),
         }
+
+    def _chances(self) -> dict[str, Any]:
+        """Only of a case that declares errors, so that others keep their keys."""
+        if self.case.errors is None:
+            return {}
+        return {"chances": None if self.doubt is None else self.doubt.summary()}
 
     @cached_property
     def along_path(self) -> tuple[Stretch, ...]:
@@ -106,6 +126,7 @@ class Explanation:
                 f"case {self.case.name}",
                 head,
                 *self._reason(),
+                *self._doubt(),
                 *self._path(),
                 self._target(),
                 *self._scan(),
@@ -119,6 +140,11 @@ class Explanation:
 
     def _reason(self) -> list[str]:
         return [] if self.safe else ["  because " + reason_text(self.candidates, 0)]
+
+    def _doubt(self) -> list[str]:
+        if self.doubt is not None:
+            return [f"  {line}" for line in self.doubt.lines()]
+        return [] if self.case.errors is None else [f"  {NO_CHANCES}"]
 
     def _path(self) -> list[str]:
         row, needle = self.candidates, self.case.needle
@@ -199,7 +225,7 @@ def reason_text(candidates: Candidates, row: int) -> str:
 
 
 def _unit(reason: str) -> str:
-    return {"skin_angle": "deg", "too_long": "mm of path"}.get(reason, "mm clearance")
+    return UNITS.get(reason, "mm clearance")
 
 
 def finite(value: float) -> float | None:

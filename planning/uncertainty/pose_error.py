@@ -24,6 +24,7 @@ from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
 from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.uncertainty.sources import reading_parts
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +91,10 @@ class PoseError:
         marks = at.reshape(6, -1, 3)
         R, touch = self.fit.R_base_ct, self.errors.touch_mm**2 * np.eye(3)
         blocks = {
-            "markers_ct": np.broadcast_to(R @ noise.cov_ct @ R.T, noise.cov_base.shape),
+            **{
+                source: np.broadcast_to(R @ cov @ R.T, noise.cov_base.shape)
+                for source, cov in reading_parts(noise.cov_ct).items()
+            },
             "touch": np.broadcast_to(touch, noise.cov_base.shape),
             "repeatability": noise.cov_base - touch,
         }

@@ -24,8 +24,7 @@ from puncture_twin.twin.jobs.patient.summaries import registration_summary
 
 def check_candidate(context: CaseContext, theta_deg: float, beta_deg: float) -> Explanation:
     """Judge one direction and explain it."""
-    found = context.check(np.radians(theta_deg), np.radians(beta_deg))
-    return Explanation(context.case, context.anatomy, found)
+    return context.explain(float(np.radians(theta_deg)), float(np.radians(beta_deg)))
 
 
 def registration_report(path: Path) -> dict[str, Any]:

@@ -1,0 +1,315 @@
+"""How sure one candidate is, why not surer, and which single error would have to shrink, and to what.
+
+An error's variance enters every covariance linearly, so that a source of f times its deviation leaves Sigma - (1 - f^2)
+part. The registration's weights are left as they are: with better ones the errors could be a little larger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.chance import ChanceModel, touch_limit
+from puncture_twin.planning.uncertainty.hit import hit_in_ball, hit_in_mesh
+from puncture_twin.planning.uncertainty.pose_error import ErrorBudget, error_budget
+from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES, deviation, reading_parts
+from puncture_twin.planning.uncertainty.touch import Proximity, touch_chance
+
+WISHED_HIT = 0.99
+"""Chance to hit that is asked for where the case demands none."""
+
+HALVINGS = 40
+"""Of the interval in which a source's factor lies: far below any digit that is printed."""
+
+LEAST_SHARE = 0.005
+"""Of the variance: a smaller source is not named to people."""
+
+
+class Remedy(NamedTuple):
+    """One source that alone would do: its declared deviation, and the greatest that suffices, in its key's unit."""
+
+    source: str
+    declared: float
+    needed: float
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What does not hold, and what would mend it.
+
+    Attributes:
+        structure: What is touched too likely; "" where the target is hit too unlikely.
+        limit: The chance that is demanded or allowed.
+        stated: Whether the case states the limit.
+        remedies: The single sources that could mend it, the one that has to shrink least first.
+        all_sources: By which factor all of them together would have to shrink; None where not even 0 is enough.
+    """
+
+    structure: str
+    limit: float
+    stated: bool
+    remedies: tuple[Remedy, ...]
+    all_sources: float | None
+
+    @property
+    def words(self) -> str:
+        """What would hold then."""
+        return f"{self.limit:g} to {f'touch {self.structure}' if self.structure else 'hit'}"
+
+    def text(self) -> str:
+        """What would have to shrink, in one sentence."""
+        if not self.remedies:
+            if self.all_sources is None:
+                return f"{self.words} cannot be had, however small the errors"
+            told = f"all of them together would have to shrink to {100 * self.all_sources:.0f} %"
+            return f"for {self.words} no single error is enough: {told}"
+        source, declared, needed = self.remedies[0]
+        words, key, unit = SOURCES[source]
+        return f"for {self.words} the {words} ({key}) would have to be {needed:.2g} {unit}, not {declared:.2g}"
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON, in the units of the keys of ``[errors]``."""
+        return {
+            "structure": self.structure,
+            "limit": self.limit,
+            "stated": self.stated,
+            "all_sources_times": self.all_sources,
+            "single_sources": [
+                {"source": one.source, "key": SOURCES[one.source].key, "declared": one.declared, "needed": one.needed}
+                for one in self.remedies
+            ],
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Doubt:
+    """How sure one candidate is.
+
+    Attributes:
+        p_hit: Chance to hit.
+        p_touch: Structure to chance to touch it.
+        p_touch_any: Of any, min(1, sum).
+        budget: The tip's expected error and its sources.
+        declaration: Whether the markers' residuals agree with the declared errors, in one sentence.
+        goals: What does not hold: the case's limits, or `WISHED_HIT` where it demands no chance to hit.
+    """
+
+    p_hit: float
+    p_touch: Mapping[str, float]
+    p_touch_any: float
+    budget: ErrorBudget
+    declaration: str
+    goals: tuple[Goal, ...]
+
+    @property
+    def likeliest(self) -> tuple[str, float]:
+        """The structure that is touched most likely, and its chance; ("", 0) without structures."""
+        return max(self.p_touch.items(), key=lambda item: item[1], default=("", 0.0))
+
+    def sources(self) -> list[tuple[str, float]]:
+        """Sources worth naming with their share of the error's variance, the largest first."""
+        shares = sorted(self.budget.share.items(), key=lambda item: -item[1])
+        return [(source, share) for source, share in shares if share >= LEAST_SHARE]
+
+    def sentence(self) -> str:
+        """The whole in one line."""
+        name, chance = self.likeliest
+        parts = [f"{chance_words(self.p_hit)} to hit"]
+        parts += [f"{chance_words(chance)} to touch {name}"] if name else []
+        parts += [
+            f"{100 * share:.0f} % of the doubt is {SOURCES[source].words}" for source, share in self.sources()[:1]
+        ]
+        return "; ".join([*parts, *(goal.text() for goal in self.goals)])
+
+    def lines(self) -> list[str]:
+        """For a person, below the sentence."""
+        budget, axes = self.budget, ", ".join(f"{mm:.2f}" for mm in self.budget.half_axes_mm)
+        shares = ", ".join(f"{SOURCES[source].words} {100 * share:.0f} %" for source, share in self.sources())
+        return [
+            self.sentence(),
+            f"  expected error {budget.rms_mm:8.2f} mm (rms): {budget.lateral_mm:.2f} across the needle, "
+            f"{budget.depth_mm:.2f} along it; half axes of the 95 % ellipsoid {axes} mm",
+            f"  of its variance: {shares}",
+            f"  {self.declaration}",
+            f"  touches anything: {chance_words(self.p_touch_any)} at most, to first order",
+            f"  not modelled: {NOT_MODELLED}",
+        ]
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "p_hit": self.p_hit,
+            "p_touch": dict(self.p_touch),
+            "p_touch_any": self.p_touch_any,
+            **budget_summary(self.budget),
+            "declaration": self.declaration,
+            "for_the_limits": [goal.summary() for goal in self.goals],
+            "not_modelled": NOT_MODELLED,
+        }
+
+
+def budget_summary(budget: ErrorBudget) -> dict[str, Any]:
+    """A budget as plain values, mm."""
+    return {
+        "expected_rms_mm": budget.rms_mm,
+        "expected_lateral_mm": budget.lateral_mm,
+        "expected_depth_mm": budget.depth_mm,
+        "half_axes_95_mm": budget.half_axes_mm.tolist(),
+        "share": dict(budget.share),
+    }
+
+
+def chance_words(chance: float) -> str:
+    """A chance for people: what is not sure never reads as 0 or 1."""
+    if 0 < chance < 5e-5:
+        return "<0.0001"
+    if 1 > chance > 1 - 5e-5:
+        return ">0.9999"
+    digits = 2 if 0.0095 <= chance <= 0.99 or chance in (0.0, 1.0) else 4
+    return f"{chance:.{digits}f}"
+
+
+def doubt_of(case: Case, found: Candidates, model: ChanceModel | None, near: Proximity | None) -> Doubt | None:
+    """The doubt of the only candidate; None where no chances were computed.
+
+    Args:
+        case: The case.
+        found: A search's result with this candidate alone.
+        model: Of the case.
+        near: How the candidate passes what must not be touched.
+    """
+    chances = found.chances
+    if chances is None or model is None or near is None or not np.isfinite(chances.hit[0]):
+        return None
+    q = found.arm.q_insertion[0]
+    outward_base = model.error.fit.R_base_ct @ found.outward_ct[0]
+    touch = dict(zip(chances.structures, map(float, chances.touch[0]), strict=True))
+    needle = shrinkable(case, model, near, chances.structures, q)
+    return Doubt(
+        float(chances.hit[0]),
+        MappingProxyType(touch),
+        float(chances.touch_any[0]),
+        error_budget(model.error, q, outward_base),
+        model.error.fit.test.text(),
+        tuple(goals_of(needle, float(chances.hit[0]), touch)),
+    )
+
+
+class _Part(NamedTuple):
+    """What one source adds: to Sigma6, shape (6, 6), CT axes; to the reading of the target, (3, 3); to surfaces."""
+
+    cov6: Floats
+    target: Floats
+    surface: float
+
+
+def _parts(model: ChanceModel, q: Floats) -> dict[str, _Part]:
+    """All sources of one configuration (6,); a target read in the markers' CT shrinks with them."""
+    error, R = model.error, model.error.fit.R_base_ct
+    turn, scale = np.kron(np.eye(2), R), error.fit.test.scale**2
+    none = np.zeros((3, 3))
+    whole = {source: turn.T @ cov[0] @ turn for source, cov in error.parts(q[None]).items()}
+    whole["repeatability"] = whole["repeatability"] + whole.pop("arrival")
+    parts = {source: _Part(cov, none, 0.0) for source, cov in whole.items()}
+    if np.array_equal(error.errors.target_cov_ct, error.errors.marker_cov_ct):
+        for source, cov in reading_parts(error.errors.target_cov_ct).items():
+            parts[source] = parts[source]._replace(target=scale * cov)
+    else:
+        parts["target"] = _Part(np.zeros((6, 6)), scale * error.errors.target_cov_ct, 0.0)
+    parts["surface"] = _Part(np.zeros((6, 6)), none, error.surface_mm**2)
+    return parts
+
+
+class ShrinkableNeedle(NamedTuple):
+    """One candidate whose sources can be shrunk: `shrinkable` makes one."""
+
+    case: Case
+    model: ChanceModel
+    near: Proximity
+    structures: tuple[str, ...]
+    parts: Mapping[str, _Part]
+
+    def chance(self, structure: str, factors: Mapping[str, float]) -> float:
+        """To touch a structure, or where it is "" to hit, with some deviations times factors."""
+        squares = {source: factors.get(source, 1.0) ** 2 for source in self.parts}
+        cov6 = np.asarray(sum(squares[source] * part.cov6 for source, part in self.parts.items()))
+        if structure:
+            surface = sum(squares[source] * part.surface for source, part in self.parts.items())
+            return self._touch(structure, cov6, surface)
+        target = np.asarray(sum(squares[source] * part.target for source, part in self.parts.items()))
+        return self._hit(cov6[:3, :3], target)
+
+    def _hit(self, cov: Floats, target: Floats) -> float:
+        hit, freedom = self.model.hit, self.model.error.freedom
+        if hit.radius_mm is not None:
+            return float(hit_in_ball((cov + target)[None], hit.radius_mm, freedom)[0])
+        assert hit.rays is not None
+        return float(hit_in_mesh(hit.rays, cov[None], freedom)[0])
+
+    def _touch(self, structure: str, cov6: Floats, surface: float) -> float:
+        at = [self.structures.index(structure)]
+        gradient = self.near.gradient[:, at]
+        variance = np.einsum("nka,ab,nkb->nk", gradient, cov6, gradient) + surface
+        near = Proximity(self.near.distance[:, at], gradient, np.sqrt(np.maximum(variance, 0.0)))
+        return float(touch_chance(near, self.case.needle.radius_mm, self.model.error.freedom)[0, 0])
+
+
+def shrinkable(
+    case: Case, model: ChanceModel, near: Proximity, structures: tuple[str, ...], q: Floats
+) -> ShrinkableNeedle:
+    """One candidate whose sources can be shrunk.
+
+    Args:
+        case: For its needle and its limits.
+        model: Of the case.
+        near: How the candidate passes the k structures.
+        structures: Their names.
+        q: Shape (6,), rad, the tip on the target.
+    """
+    return ShrinkableNeedle(case, model, near, structures, _parts(model, q))
+
+
+def goals_of(needle: ShrinkableNeedle, p_hit: float, p_touch: Mapping[str, float]) -> list[Goal]:
+    """What does not hold, and what would mend it."""
+    case, goals = needle.case, []
+    least = WISHED_HIT if case.search.min_hit is None else case.search.min_hit
+    if p_hit < least:
+        goals.append(_goal(needle, "", least, stated=case.search.min_hit is not None))
+    for name, chance in p_touch.items():
+        if chance > touch_limit(case, name):
+            goals.append(_goal(needle, name, touch_limit(case, name), stated=True))
+    return goals
+
+
+def _goal(needle: ShrinkableNeedle, structure: str, limit: float, *, stated: bool) -> Goal:
+    def holds(factors: Mapping[str, float]) -> bool:
+        chance = needle.chance(structure, factors)
+        return chance <= limit if structure else chance >= limit
+
+    errors, remedies = needle.model.error.errors.scaled(needle.model.error.fit.test.scale), []
+    for source in needle.parts:
+        factor = _greatest(lambda f, source=source: holds({source: f}))  # type: ignore[misc]
+        if factor is not None:
+            declared = deviation(errors, source)
+            remedies.append((factor, Remedy(source, declared, factor * declared)))
+    together = _greatest(lambda f: holds(dict.fromkeys(needle.parts, f)))
+    ordered = tuple(remedy for _, remedy in sorted(remedies, key=lambda one: -one[0]))
+    return Goal(structure, limit, stated, ordered, together)
+
+
+def _greatest(holds: Callable[[float], bool]) -> float | None:
+    """The greatest factor below 1 that mends it, by halving; None where not even 0 does."""
+    if not holds(0.0):
+        return None
+    low, high = 0.0, 1.0
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low

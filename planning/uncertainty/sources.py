@@ -1,0 +1,72 @@
+"""The sources of a needle's pose error: what people call them, and which key of ``[errors]`` states each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.errors import ErrorModel
+
+NOT_MODELLED = "breathing, a needle that bends, tissue that moves"
+"""What no source stands for: it is not known, which is something else than 0."""
+
+ISOTROPIC = 1e-9
+"""Relative difference of variances below which a marker is read equally well along all axes."""
+
+
+class Source(NamedTuple):
+    """What a source is called, the key of ``[errors]`` that states it, and that key's unit."""
+
+    words: str
+    key: str
+    unit: str
+
+
+SOURCES: Mapping[str, Source] = MappingProxyType(
+    {
+        "ct_slice": Source("reading across the CT's slices", "ct_slice_mm", "mm"),
+        "ct_in_plane": Source("reading within the CT's slices", "ct_in_plane_mm", "mm"),
+        "markers_ct": Source("reading in the CT", "ct_in_plane_mm and ct_slice_mm", "mm"),
+        "touch": Source("touch noise", "touch_mm", "mm"),
+        "target": Source("reading of the target", "target_mm", "mm"),
+        "link": Source("the arm's lengths", "link_mm", "mm"),
+        "twist": Source("the arm's twists", "twist_deg", "deg"),
+        "joint": Source("zeros of the joints", "joint_deg", "deg"),
+        "repeatability": Source("repeatability", "repeatability_deg", "deg"),
+        "drift": Source("drift since the touch", "joint_drift_deg", "deg"),
+        "tip_offset": Source("offset of the needle's tip", "tip_offset_mm", "mm"),
+        "needle_direction": Source("direction of the needle", "needle_direction_deg", "deg"),
+        "surface": Source("surfaces of the structures", "surface_mm", "mm"),
+    }
+)
+"""By the names under which `PoseError.parts` and `ErrorBudget.share` give their parts, and the surfaces' own."""
+
+
+def reading_parts(cov_ct: Floats) -> dict[str, Floats]:
+    """A reading's covariance (3, 3), split into across and within the slices where the two differ."""
+    values, axes = np.linalg.eigh(cov_ct)
+    if values[2] - values[0] <= ISOTROPIC * values[2]:
+        return {"markers_ct": cov_ct}
+    across = 0 if values[1] - values[0] > values[2] - values[1] else 2
+    slices = values[across] * np.outer(axes[:, across], axes[:, across])
+    return {"ct_slice": slices, "ct_in_plane": cov_ct - slices}
+
+
+def deviation(errors: ErrorModel, source: str) -> float:
+    """What is declared for a source, in the unit of its key."""
+    if source in ("ct_slice", "ct_in_plane", "markers_ct"):
+        return float(np.sqrt(np.linalg.eigvalsh(reading_parts(errors.marker_cov_ct)[source])[2]))
+    if source == "target":
+        return float(np.sqrt(np.linalg.eigvalsh(errors.target_cov_ct)[2]))
+    held = errors.arm if hasattr(errors.arm, _attribute(source)) else errors
+    value = float(getattr(held, _attribute(source)))
+    return float(np.degrees(value)) if SOURCES[source].unit == "deg" else value
+
+
+def _attribute(source: str) -> str:
+    """Where `ErrorModel` or its arm keeps a source."""
+    return f"{source}_mm" if SOURCES[source].unit == "mm" else source

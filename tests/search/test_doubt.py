@@ -1,0 +1,125 @@
+"""What an explanation says of chances: the numbers of the table, and which error would have to shrink, and to what."""
+
+import numpy as np
+import pytest
+from places import ROOT
+from uncertainty_world import declared, world
+
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.search.chance import ChanceModel
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.doubt import WISHED_HIT, chance_words, goals_of, shrinkable
+from puncture_twin.planning.uncertainty.chances import HitModel
+from puncture_twin.planning.uncertainty.hit import hit_in_ball
+from puncture_twin.planning.uncertainty.sources import SOURCES, deviation, reading_parts
+from puncture_twin.planning.uncertainty.touch import proximity
+
+KEYS = {"ct_in_plane_mm": 0.3, "ct_slice_mm": 1.2, "bed_axis": (1.0, 0.0, 0.0), "touch_mm": 0.5, "tip_offset_mm": 0.2}
+
+
+def asked(radius_mm, **keys):
+    """A puncture of the abdomen with declared errors, and the sources of its needle."""
+    made = world("abdomen/case.toml", "rigid", declared(**keys))
+    case, q = load_case(ROOT / "meshes" / "abdomen"), made.puncture.q_insertion
+    model = ChanceModel(made.error, HitModel(radius_mm, None))
+    outward = made.puncture.outward_ct[None]
+    normal = np.cross(outward, [0.0, 0.0, 1.0])
+    normal /= np.linalg.norm(normal)
+    near = proximity(
+        np.array([[2.0]]), np.array([[30.0]]), normal[:, None], outward, made.error.covariance_ct(q[None]), 0.0
+    )
+    return made, shrinkable(case, model, near, ("rib",), q)
+
+
+def test_parts_add_up_to_the_chance_of_the_table():
+    """With nothing shrunk the chance is that of the whole covariance."""
+    made, needle = asked(1.5, **KEYS)
+    told = hit_in_ball(made.error.tip_covariance(made.puncture.q_insertion[None]), 1.5)[0]
+    assert needle.chance("", {}) == pytest.approx(told, abs=1e-9)
+
+
+def test_a_source_that_shrinks_to_what_is_told_gives_the_wished_chance():
+    """Each remedy, declared anew, gives the chance: the method is rigid, so that the weights stay."""
+    made, needle = asked(2.0, **KEYS)
+    p_hit = needle.chance("", {})
+    (goal,) = goals_of(needle, p_hit, {"rib": 0.0})
+    assert p_hit < WISHED_HIT == goal.limit and not goal.stated
+    assert "ct_slice" in {remedy.source for remedy in goal.remedies}
+    for remedy in goal.remedies:
+        assert remedy.needed < remedy.declared == pytest.approx(deviation(made.errors, remedy.source))
+        again, _ = asked(2.0, **(KEYS | {SOURCES[remedy.source].key: remedy.needed}))
+        told = hit_in_ball(again.error.tip_covariance(made.puncture.q_insertion[None]), 2.0)[0]
+        assert told == pytest.approx(WISHED_HIT, abs=1e-5)
+
+
+def test_where_no_single_source_is_enough_all_together_are():
+    """A radius smaller than every part of the error."""
+    _, needle = asked(0.3, **KEYS)
+    (goal,) = goals_of(needle, needle.chance("", {}), {})
+    assert not goal.remedies and "no single error is enough" in goal.text()
+    factors = dict.fromkeys(needle.parts, goal.all_sources)
+    assert needle.chance("", factors) == pytest.approx(WISHED_HIT, abs=1e-6)
+
+
+def test_a_limit_for_touching_is_mended_too():
+    """The case's limit for touching is reached, to rounding."""
+    _, needle = asked(50.0, **KEYS)
+    touched = needle.chance("rib", {})
+    limit = touched / 3
+    search = needle.case.search.__class__(**{**vars(needle.case.search), "max_touch": limit})
+    needle = needle._replace(case=needle.case.__class__(**{**vars(needle.case), "search": search}))
+    (goal,) = goals_of(needle, 1.0, {"rib": touched})
+    assert goal.stated and goal.remedies and "touch rib" in goal.text()
+    first = goal.remedies[0]
+    assert needle.chance("rib", {first.source: first.needed / first.declared}) == pytest.approx(limit, rel=1e-6)
+
+
+def test_reading_is_split_by_slices():
+    """Across the slices whether they are read better or worse; not at all where all axes are alike."""
+    axis = np.array([0.6, 0.0, 0.8])
+    for across in (0.1, 2.0):
+        cov = 0.25 * np.eye(3) + (across**2 - 0.25) * np.outer(axis, axis)
+        parts = reading_parts(cov)
+        assert np.allclose(parts["ct_slice"], across**2 * np.outer(axis, axis))
+        assert np.allclose(sum(parts.values()), cov)
+    assert list(reading_parts(0.25 * np.eye(3))) == ["markers_ct"]
+
+
+SHOWN = {1.0: "1.00", 0.0: "0.00", 0.93: "0.93", 1e-9: "<0.0001", 1 - 1e-9: ">0.9999", 0.002: "0.0020", 0.996: "0.9960"}
+
+
+@pytest.mark.parametrize(("chance", "words"), SHOWN.items())
+def test_what_is_not_sure_never_reads_as_sure(chance, words):
+    """Neither 0 nor 1 by rounding."""
+    assert chance_words(chance) == words
+
+
+@pytest.fixture(scope="module")
+def carton(tmp_path_factory):
+    """The carton with declared errors and a radius within which its target counts as hit."""
+    folder = tmp_path_factory.mktemp("carton")
+    for path in (ROOT / "meshes/carton").iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    text = (folder / "case_m.toml").read_text().split("\n[errors]")[0].split("\n[end]")[0]
+    text = text.replace('structure = "bolt_m"\n', 'structure = "bolt_m"\nhit_radius_mm = 2.0\n', 1)
+    errors = "\n[errors]\nct_pixel_mm = 1.0\nct_spacing_mm = 5.0\nbed_axis = [1.0, 0.0, 0.0]\n"
+    (folder / "case_m.toml").write_text(f"{text}\n{errors}\n[end]\nstructures = 4\n")
+    return prepare(folder / "case_m.toml")
+
+
+def test_explanation_says_the_chances_of_the_table(carton):
+    """To the last bit, with the sources and the test of the declaration."""
+    found = carton.explain(np.radians(18), np.radians(232))
+    chances = found.summary()["chances"]
+    assert chances["p_hit"] == found.candidates.chances.hit[0]
+    assert chances["p_touch_any"] == found.candidates.chances.touch_any[0]
+    assert sum(chances["share"].values()) == pytest.approx(1)
+    text = found.text()
+    assert f"{chance_words(chances['p_hit'])} to hit; " in text and "not modelled: breathing" in text
+    assert "do not agree with the declared errors" in text
+
+
+def test_explanation_says_where_there_are_no_chances(carton):
+    """Of a direction that was rejected before, it says so."""
+    found = carton.explain(np.radians(90), np.radians(0))
+    assert found.doubt is None and found.summary()["chances"] is None and "no chances to hit" in found.text()
