@@ -18,7 +18,7 @@ demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
 
 test: install lint
-	$(BIN)/pytest -q -n auto
+	$(BIN)/pytest -q -n auto --dist loadfile
 
 # While one works: what takes under 0.3 s a test, without real data.
 quick: install
@@ -28,7 +28,7 @@ quick: install
 durations: install
 	mkdir -p out
 	rm -f out/durations.txt
-	DURATIONS=$(CURDIR)/out/durations.txt $(BIN)/pytest -q -n auto
+	DURATIONS=$(CURDIR)/out/durations.txt $(BIN)/pytest -q -n auto --dist loadfile
 	$(BIN)/python tests/slow_tests.py out/durations.txt
 
 kill: install
