@@ -59,11 +59,14 @@ def test_a_rehearsal_writes_every_file(rehearsed):
 
 
 def test_the_carton_errs_like_the_paper(rehearsed):
-    """The truth is where the robot really touched the lesion: 2-3 mm off, as Chen 2019 measured (Table 3: 2.94 mm)."""
+    """The truth is where the robot really touched the lesion: 2-3 mm off, as Chen 2019 measured (Table 3: 2.94 mm).
+
+    The approach passes the table by 6 mm as believed; the true patient is turned, and the table's corner with them.
+    """
     found = json.loads((rehearsed / "rehearsal.json").read_text())
     assert found["tip_error_mm"] == pytest.approx(2.94, abs=0.2)
     assert found["tip_error_mm"] ** 2 == pytest.approx(found["lateral_mm"] ** 2 + found["depth_mm"] ** 2)
-    assert found["contacts"] == []
+    assert {contact.split(" at ")[0] for contact in found["contacts"]} <= {"wrist_3 touches table"}
     speeds = zip(found["max_joint_speed_deg_s"], found["joint_speed_limit_deg_s"], strict=True)
     assert all(speed <= limit for speed, limit in speeds)
 
@@ -257,11 +260,11 @@ def test_reproduce_holds(capfd):
 
 
 def test_register_reports_residuals_and_expectation(carton, capfd):
-    """Mean error as in Eq. 16, no flag."""
+    """Mean error as in Eq. 16; one flag: the paper's residuals are beyond its pixels and slices."""
     code, found = run(capfd, "register", carton)
     assert code == OK
     assert found["mean_error_mm"] == pytest.approx(1.43, abs=0.005)
-    assert found["flags"] == []
+    assert [flag.split(" (")[0] for flag in found["flags"]] == ["residuals do not agree with the declared errors"]
     assert len(found["expected_tre_along_shaft_mm"]) == 4
 
 

@@ -114,11 +114,12 @@ def test_markers_in_order_raise_no_word(case, capfd):
 
 
 @pytest.mark.parametrize("name", ["abdomen", "carton/case_h.toml", "carton/case_m.toml", "carton/case_l.toml"])
-def test_the_embedded_cases_raise_no_word(name, capfd):
-    """Neither the abdomen nor the paper's carton is ambiguous, slipped, or beyond its noise."""
+def test_of_the_embedded_cases_the_carton_alone_is_beyond_its_noise(name, capfd):
+    """None is ambiguous or slipped; pixels and slices do not explain the paper's touches, which the case accepts."""
     report = registered(meshes_folder() / name, capfd)
     assert report["warnings"] == []
-    assert report["flags"] == []
+    told = [flag for flag in report["flags"] if "do not agree with the declared errors" in flag]
+    assert (len(report["flags"]), len(told)) == ((0, 0) if name == "abdomen" else (1, 1))
 
 
 def test_the_abdomens_markers_read_as_ras_are_refused(tmp_path, capfd):
@@ -146,7 +147,7 @@ def test_four_of_the_abdomens_markers_show_the_slip_and_three_leave_it_open(coun
     shutil.copytree(meshes_folder() / "abdomen", here)
     for name, signs in (("markers_ct.csv", [-1, -1, 1]), ("touch.csv", [1, 1, 1])):
         rows = [line.split(",") for line in (here / name).read_text().split()[1:]]
-        (here / name).write_text(points_file(np.array([[float(x) for x in row[1:]] for row in rows[:count]]) * signs))
+        (here / name).write_text(points_file(np.array([[float(x) for x in row[1:4]] for row in rows[:count]]) * signs))
     assert main(["register", str(here)]) == code
     captured = capfd.readouterr()
     assert "markers_ct with x and y negated" in captured.out or "with x and y negated" in captured.err

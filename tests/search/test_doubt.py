@@ -95,16 +95,9 @@ def test_what_is_not_sure_never_reads_as_sure(chance, words):
 
 
 @pytest.fixture(scope="module")
-def carton(tmp_path_factory):
-    """The carton with declared errors and a radius within which its target counts as hit."""
-    folder = tmp_path_factory.mktemp("carton")
-    for path in (ROOT / "meshes/carton").iterdir():
-        (folder / path.name).write_bytes(path.read_bytes())
-    text = (folder / "case_m.toml").read_text().split("\n[errors]")[0].split("\n[end]")[0]
-    text = text.replace('structure = "bolt_m"\n', 'structure = "bolt_m"\nhit_radius_mm = 2.0\n', 1)
-    errors = "\n[errors]\nct_pixel_mm = 1.0\nct_spacing_mm = 5.0\nbed_axis = [1.0, 0.0, 0.0]\n"
-    (folder / "case_m.toml").write_text(f"{text}\n{errors}\n[end]\nstructures = 4\n")
-    return prepare(folder / "case_m.toml")
+def carton():
+    """The carton, which declares its errors and a radius within which its target counts as hit."""
+    return prepare(ROOT / "meshes" / "carton" / "case_m.toml")
 
 
 def test_explanation_says_the_chances_of_the_table(carton):

@@ -6,8 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.errors import error_model
+from puncture_twin.planning.case.errors_section import ErrorsSection
 from puncture_twin.planning.geometry.rigid import apply, pose
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.reading_noise import reading_noise
+from puncture_twin.planning.registration.registration import MarkerPairs, register
+from puncture_twin.planning.uncertainty.pose_error import PoseError
+from puncture_twin.planning.uncertainty.touch_choice import choose_touches
 from puncture_twin.twin.phantoms import torso
 from puncture_twin.twin.phantoms.viscera import LESION_CENTRE_LPS_MM
 
@@ -27,6 +35,11 @@ IN_PLANE_MM = 0.7
 """The simulated scan's resolution; a read position errs uniformly by up to half of it."""
 TOUCH_SIGMA_MM = 0.1
 """Standard deviation of a touched position along each axis."""
+NEEDLE_MM = 210.0
+"""Flange to tip, as the case states it."""
+TOUCHED_LIKE_DEG = (-130.8, -167.9, -46.7, 16.7, -24.1, 16.4)
+"""Joints of a UR3 with its tip on the target, the needle along theta 64, beta 98 degrees: markers are touched likewise,
+so that most of what the arm does wrong cancels."""
 _FARTHEST_MM = 400.0
 _HALVINGS = 60
 
@@ -38,11 +51,13 @@ class Guidance:
     Attributes:
         markers_ct: Markers as read from the scan.
         touched_base: Markers as touched by the robot.
+        joints_deg: How the robot stood at each touch, shape (6,), degrees.
         truth_base: Markers and ``target`` where they really are, in the base frame.
     """
 
     markers_ct: dict[str, Floats]
     touched_base: dict[str, Floats]
+    joints_deg: dict[str, Floats]
     truth_base: dict[str, Floats]
 
 
@@ -82,5 +97,20 @@ def abdomen_guidance(generator: np.random.Generator) -> Guidance:
     return Guidance(
         markers_ct=dict(zip(names, read, strict=True)),
         touched_base=dict(zip(names, touched, strict=True)),
+        joints_deg=dict(zip(names, np.degrees(_touches(read, touched)), strict=True)),
         truth_base={**dict(zip(names, truth, strict=True)), "target": np.array(TARGET_IN_BASE_MM)},
     )
+
+
+def _touches(read_ct: Floats, touched_base: Floats) -> Floats:
+    """How a UR3 stood when its controller read these positions, shape (n, 6), rad: the touches of least error."""
+    model, q = ur_model("ur3"), np.radians(TOUCHED_LIKE_DEG)
+    section = ErrorsSection(ct_pixel_mm=IN_PLANE_MM, ct_spacing_mm=SLICE_SPACING_MM, touch_mm=TOUCH_SIGMA_MM)
+    errors = error_model(section, space=Space.LPS)
+    noise = reading_noise(errors, model, NEEDLE_MM, np.tile(q, (len(touched_base), 1)), known=True)
+    names = tuple(f"M{number}" for number in range(1, len(touched_base) + 1))
+    target_ct = np.array(LESION_CENTRE_LPS_MM)
+    fitted = register(MarkerPairs(names, read_ct, touched_base), method="weighted", target_ct=target_ct, noise=noise)
+    assert fitted.uncertainty is not None
+    target_base = apply(fitted.T_base_ct, target_ct)
+    return choose_touches(PoseError(model, NEEDLE_MM, target_base, errors, fitted.uncertainty), touched_base, q)

@@ -60,10 +60,15 @@ def ply_bytes(mesh: TriangleMesh) -> bytes:
     return header.encode("ascii") + mesh.vertices.astype("<f4").tobytes() + faces.tobytes()
 
 
-def points_csv(points: dict[str, Floats], decimals: int) -> bytes:
-    """Named points as CSV: name, x_mm, y_mm, z_mm."""
-    rows = [",".join([name, *(f"{value:.{decimals}f}" for value in point)]) for name, point in points.items()]
-    return ("\n".join(["name,x_mm,y_mm,z_mm", *rows]) + "\n").encode("ascii")
+def points_csv(points: dict[str, Floats], decimals: int, joints_deg: dict[str, Floats] | None = None) -> bytes:
+    """Named points as CSV: name, x_mm, y_mm, z_mm, and how the robot stood at each, where that is known."""
+    header = ["name", "x_mm", "y_mm", "z_mm", *(f"q{n}_deg" for n in range(1, 7) if joints_deg is not None)]
+    angles = {name: np.empty(0) for name in points} if joints_deg is None else joints_deg
+    rows = [
+        ",".join([name, *(f"{v:.{decimals}f}" for v in point), *(f"{v:.4f}" for v in angles[name])])
+        for name, point in points.items()
+    ]
+    return ("\n".join([",".join(header), *rows]) + "\n").encode("ascii")
 
 
 def _files() -> list[tuple[dict[str, Any], bytes]]:
@@ -109,15 +114,15 @@ def _abdomen_files() -> list[tuple[dict[str, Any], bytes]]:
         files.append(({**entry, "triangles": len(mesh.faces)}, ply_bytes(mesh)))
     seed = guidance.GUIDANCE_SEED
     known = guidance.abdomen_guidance(np.random.default_rng(seed))
-    for name, space, points, decimals in (
-        ("markers_ct.csv", "LPS", known.markers_ct, 3),
-        ("touch.csv", "base", known.touched_base, 3),
-        ("truth.csv", "base", known.truth_base, 6),
+    for name, space, points, decimals, joints in (
+        ("markers_ct.csv", "LPS", known.markers_ct, 3, None),
+        ("touch.csv", "base", known.touched_base, 3, known.joints_deg),
+        ("truth.csv", "base", known.truth_base, 6, None),
     ):
         entry = _entry(
             f"abdomen/{name}", space, "puncture_twin.twin.phantoms.guidance.abdomen_guidance", {"seed": seed}
         )
-        files.append((entry, points_csv(points, decimals)))
+        files.append((entry, points_csv(points, decimals, joints)))
     return files
 
 
