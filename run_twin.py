@@ -88,7 +88,9 @@ def _without_command(context: typer.Context, version: VersionOption = False) -> 
 @app.command()
 def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> None:
     """The main job on the embedded abdomen: search, plan, rehearse, report."""
-    _rehearse(meshes_folder() / "abdomen", out_dir, as_json)
+    with progress_display() as progress:
+        run = main_job.demo_case(prepare(meshes_folder() / "abdomen", watcher=progress), out_dir)
+    _print(run.summary(), words.rehearsal_text(run), as_json)
 
 
 @app.command()
@@ -159,15 +161,19 @@ def rehearse(
     seeds: Annotated[
         int | None, typer.Option("--seeds", min=1, max=1_000_000, help="Rooms, each with a truth of its own.")
     ] = None,
+    physics: Annotated[int, typer.Option("--physics", min=0, max=MOST_SEEDS, help="Of them in the simulator.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Execute a plan in the twin, where the truth differs from the belief, and say where the tip ended."""
+    if physics and seeds is None:
+        raise InputError("--physics runs some of the rooms", where="--physics", allowed="--seeds N --physics K, K <= N")
+    rooms = None if seeds is None else main_job.RoomCount(seeds, physics)
     if source.suffix == ".json":
         if case is None:
             raise InputError("a plan needs its case", where=source, allowed="rehearse plan.json --case CASE")
-        _rehearse(case, out_dir, as_json, plan_path=source, rooms=seeds)
+        _rehearse(case, out_dir, as_json, plan_path=source, rooms=rooms)
     else:
-        _rehearse(source, out_dir, as_json, rooms=seeds)
+        _rehearse(source, out_dir, as_json, rooms=rooms)
 
 
 @app.command()
@@ -317,7 +323,11 @@ def reproduce(
 
 
 def _rehearse(
-    case: Path, out_dir: Path, as_json: bool, plan_path: Path | None = None, rooms: int | None = None
+    case: Path,
+    out_dir: Path,
+    as_json: bool,
+    plan_path: Path | None = None,
+    rooms: main_job.RoomCount | None = None,
 ) -> None:
     with progress_display() as progress:
         context = prepare(case, watcher=progress)

@@ -300,11 +300,10 @@ def rehearse(context: CaseContext, plan: Plan, *, seed: int | None = None) -> Re
         plan: From `make_plan` or `read_plan`.
         seed: What the ground truth is drawn from; the case's by default.
     """
-    from puncture_twin.twin.plant.truth import draw_truth
+    from puncture_twin.twin.rehearsal.plan_truth import plan_truth
     from puncture_twin.twin.rehearsal.rehearsal import rehearse
 
-    truth = draw_truth(context.case, plan.T_base_ct, seed=seed)
-    return rehearse(plan, context.case, context.anatomy, truth)
+    return rehearse(plan, context.case, context.anatomy, plan_truth(context, plan, seed))
 
 
 def _named(points: Points, where: str) -> NamedPoints:

@@ -79,7 +79,7 @@ def make_candidates(case, *, step_deg=5.0, theta_deg=(0, 90), beta_deg=(0, 360),
             distance=clearance,
             least=clearance.min(axis=1),
         ),
-        arm=ArmColumns(np.where(good, 1, -1).astype(np.int8), np.where(good, 0.5, np.nan)),
+        arm=ArmColumns(np.where(good, 1, -1).astype(np.int8), np.where(good, 0.5, np.nan), np.full((n, 6), np.nan)),
         ranking=Ranking(np.where(good, 0.1 * rank, np.nan), rank, (rank > 0) & (rank < 4)),
         safe_cone=np.full(n, np.nan),
         arm_note="checked",
@@ -181,6 +181,9 @@ def make_rehearsal(plan, *, shift=(0.6, 0.0, 0.8), total_s=2.0):
         lateral_mm=float(np.linalg.norm(error + depth * plan.outward_ct)),
         depth_mm=depth,
         predicted_error_mm=1.25,
+        target_true_ct=plan.target_ct,
+        truth_is_belief=False,
+        standing=None,
     )
 
 

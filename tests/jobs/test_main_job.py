@@ -79,6 +79,25 @@ def test_a_written_plan_is_rehearsed_again_with_the_same_result(carton, rehearse
     assert again["rehearsal"]["tip_error_mm"] == pytest.approx(before["tip_error_mm"], abs=1e-6)
 
 
+def test_of_many_rooms_the_median_is_shown(carton, tmp_path, capfd):
+    """Headline, film and numbers are of the room in the middle, which the simulator confirms."""
+    here = tmp_path / "case"
+    shutil.copytree(carton.parent, here)
+    text = (here / "case_m.toml").read_text().split("\n[errors]")[0].split("\n[end]")[0]
+    errors = "\n[errors]\ntouch_mm = 0.2\nct_in_plane_mm = 0.3\nct_slice_mm = 0.3\n"
+    (here / "case_m.toml").write_text(f"{text}\n{errors}\n[end]\nstructures = 4\n")
+    arguments = ("rehearse", here / "case_m.toml", "--seeds", 201, "--physics", 1, "--out", tmp_path / "out")
+    code, found = run(capfd, *arguments)
+    assert code == OK
+    one, rooms = found["rehearsal"], found["distribution"]
+    assert one["percentile"] == pytest.approx(50, abs=2) and one["percentile_of"] == "rooms"
+    assert one["tip_error_mm"] == pytest.approx(rooms["median_mm"], abs=0.05)
+    assert rooms["physics"]["rooms"] == 1 and rooms["physics"]["largest_apart_mm"] < 0.05
+    page = (tmp_path / "out/report.html").read_text()
+    assert "median of 201 rooms (50th percentile" in page
+    assert main(["rehearse", str(carton), "--physics", "1", "--out", str(tmp_path / "no")]) == BAD_INPUT
+
+
 def test_a_plan_whose_marker_file_changed_is_refused(carton, rehearsed, tmp_path, capfd):
     """One touched marker moved by a hundredth: the plan is stale, and nothing is written."""
     other = tmp_path / "case"

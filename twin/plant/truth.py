@@ -43,15 +43,17 @@ class Truth:
             or was not seen since the markers were touched.
         seed: What the random part was drawn from.
         source: How it was found, in words for the report.
+        target_ct: Shape (3,), mm: where the target truly is in the CT; None where it was read without error.
     """
 
     T_base_ct_true: Floats
     joint_offsets: Floats
     seed: int
     source: str
+    target_ct: Floats | None = None
 
     def __post_init__(self) -> None:
-        for name in ("T_base_ct_true", "joint_offsets"):
+        for name in ("T_base_ct_true", "joint_offsets", *(() if self.target_ct is None else ("target_ct",))):
             array = np.array(getattr(self, name), dtype=np.float64)
             array.setflags(write=False)
             object.__setattr__(self, name, array)

@@ -29,14 +29,36 @@ ALLOWED = "a case with [errors] and markers, which say what a room may differ by
 
 
 @dataclass(frozen=True, eq=False)
+class PhysicsRooms:
+    """What the simulator said of some rooms.
+
+    Attributes:
+        apart_mm: Shape (n,), its tip from that of the kinematics, in the patient.
+        contacts: So many of the rooms had a contact of the arm.
+    """
+
+    apart_mm: Floats
+    contacts: int
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "rooms": len(self.apart_mm),
+            "largest_apart_mm": float(self.apart_mm.max()),
+            "rms_apart_mm": float(np.sqrt(np.mean(self.apart_mm**2))),
+            "rooms_with_contacts": self.contacts,
+        }
+
+
+@dataclass(frozen=True, eq=False)
 class Distribution:
     """n rooms of one puncture in which the arm reached the pose; mm.
 
     Attributes:
         seed: Of all draws.
         unreached: Rooms beside these whose registration put the pose out of the arm's reach.
-        error_ct: Shape (n, 3), true tip minus true target.
-        outward_ct: Shape (3,), the planned direction.
+        puncture: What every room repeats.
+        rooms: The n rooms.
         cov_ct: Shape (3, 3), predicted of it, mm^2.
         in_region: Shape (n,), whether it lies in the predicted 95 % ellipsoid.
         hit: Shape (n,).
@@ -47,12 +69,13 @@ class Distribution:
         wrong_belief: Whether the truth was drawn from other errors than the belief declares, on purpose.
         budget: Where the predicted error comes from.
         guessed_touches: Whether nobody says how the arm touched the markers, so that a posture was assumed.
+        physics: Some of the rooms in the simulator, where that was wanted.
     """
 
     seed: int
     unreached: int
-    error_ct: Floats
-    outward_ct: Floats
+    puncture: Puncture
+    rooms: Rooms
     cov_ct: Floats
     in_region: Bools
     hit: Bools
@@ -63,9 +86,15 @@ class Distribution:
     wrong_belief: bool
     budget: ErrorBudget
     guessed_touches: bool
+    physics: PhysicsRooms | None = None
 
     def __len__(self) -> int:
-        return len(self.error_ct)
+        return len(self.rooms.tip_ct)
+
+    @property
+    def error_ct(self) -> Floats:
+        """Shape (n, 3), true tip minus true target."""
+        return np.asarray(self.rooms.tip_ct - self.rooms.target_ct)
 
     @property
     def tip_error_mm(self) -> Floats:
@@ -103,6 +132,7 @@ class Distribution:
             "predicted_share": dict(self.budget.share),
             "wrong_belief": self.wrong_belief,
             "guessed_touches": self.guessed_touches,
+            **({} if self.physics is None else {"physics": self.physics.summary()}),
         }
 
 
@@ -165,8 +195,8 @@ def _measured(
     return Distribution(
         seed=seed,
         unreached=unreached,
-        error_ct=error_ct,
-        outward_ct=puncture.outward_ct,
+        puncture=puncture,
+        rooms=rooms,
         cov_ct=cov_ct,
         in_region=square <= chdtri(3, 1 - REGION),
         hit=_hits(context, rooms),

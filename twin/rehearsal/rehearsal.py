@@ -24,6 +24,7 @@ from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.twin.plant.truth import Truth
+from puncture_twin.twin.rehearsal.standing import Standing
 from puncture_twin.twin.world.client import TIME_STEP_S
 from puncture_twin.twin.world.execution import Execution, execute
 from puncture_twin.twin.world.workcell import open_workcell
@@ -78,6 +79,9 @@ class Rehearsal:
         lateral_mm: Its part across the needle.
         depth_mm: Its part along the needle, positive when too deep.
         predicted_error_mm: What the plan expected (rms), NaN without markers.
+        target_true_ct: Shape (3,), where the target truly was in the CT.
+        truth_is_belief: Whether the patient lay exactly where it was believed, so that the error says little.
+        standing: Where the error stands among others; None where the case declares no errors.
     """
 
     seed: int
@@ -98,6 +102,9 @@ class Rehearsal:
     lateral_mm: float
     depth_mm: float
     predicted_error_mm: float
+    target_true_ct: Floats
+    truth_is_belief: bool
+    standing: Standing | None = None
 
     def __post_init__(self) -> None:
         for value in (*vars(self).values(), *self.clearance_mm.values()):
@@ -137,7 +144,8 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
     forward_ct = T_ct_flange[:, :3, 2]
     tip_ct = T_ct_flange[:, :3, 3] + plan.needle_length_mm * forward_ct
     samples = _clearance_samples(phase)
-    error = split_error(tip_ct[-1], forward_ct[-1], case.target_ct)
+    target_ct = case.target_ct if truth.target_ct is None else truth.target_ct
+    error = split_error(tip_ct[-1], forward_ct[-1], target_ct)
     return Rehearsal(
         seed=truth.seed,
         truth_source=truth.source,
@@ -157,6 +165,8 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
         lateral_mm=error.lateral_mm,
         depth_mm=error.depth_mm,
         predicted_error_mm=plan.expected_target_error_mm,
+        target_true_ct=target_ct.copy(),
+        truth_is_belief=bool(np.array_equal(T_base_ct, plan.T_base_ct)),
     )
 
 

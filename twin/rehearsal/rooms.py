@@ -61,6 +61,7 @@ class Rooms(NamedTuple):
         target_ct: Shape (n, 3), where the target truly was.
         T_base_ct: Shape (n, 4, 4), what each room registered.
         reached: Shape (n,), whether the arm could reach the pose that followed.
+        R_ct_needle: Shape (n, 3, 3), the needle's axes as columns; z points to the tip.
     """
 
     tip_ct: Floats
@@ -68,12 +69,18 @@ class Rooms(NamedTuple):
     target_ct: Floats
     T_base_ct: Floats
     reached: Bools
+    R_ct_needle: Floats
 
     def reached_alone(self) -> Rooms:
         """Without the rooms in which the arm did not reach the pose."""
         kept = self.reached
         return Rooms(
-            self.tip_ct[kept], self.outward_ct[kept], self.target_ct[kept], self.T_base_ct[kept], self.reached[kept]
+            self.tip_ct[kept],
+            self.outward_ct[kept],
+            self.target_ct[kept],
+            self.T_base_ct[kept],
+            self.reached[kept],
+            self.R_ct_needle[kept],
         )
 
 
@@ -94,7 +101,8 @@ def draw_rooms(puncture: Puncture, errors: ErrorModel, count: int, rng: np.rando
     T_ct_base = np.linalg.inv(puncture.T_base_ct)
     target_ct = puncture.target_ct + _normal(rng, errors.target_cov_ct, (count,))
     outward_ct = -needle.R_base_needle[:, :, 2] @ T_ct_base[:3, :3].T
-    return Rooms(apply(T_ct_base, needle.tip_base), outward_ct, target_ct, T_base_ct, reached)
+    R_ct_needle = T_ct_base[:3, :3] @ needle.R_base_needle
+    return Rooms(apply(T_ct_base, needle.tip_base), outward_ct, target_ct, T_base_ct, reached, R_ct_needle)
 
 
 def _registered(puncture: Puncture, errors: ErrorModel, eta: Floats, rng: np.random.Generator) -> Floats:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
+from uncertainty_world import declared
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
 from puncture_twin.planning.anatomy.skin import skin_from_mesh
@@ -18,14 +20,25 @@ from puncture_twin.planning.case.case import Case, Needle, Obstacle, RobotSettin
 from puncture_twin.planning.case.case_file import RankingSection, RehearsalSection
 from puncture_twin.planning.case.entry import view_frame
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.registration.reading_noise import reading_noise
+from puncture_twin.planning.registration.touch_poses import touching_configuration
 from puncture_twin.twin.plant.truth import Truth
+from puncture_twin.twin.rehearsal.plan_truth import room_truth, spread_rows
 from puncture_twin.twin.rehearsal.rehearsal import rehearse, split_error
+from puncture_twin.twin.rehearsal.rooms import Puncture, draw_rooms
+from puncture_twin.twin.rehearsal.standing import Standing, ordinal
 
 UR3 = ur_model("ur3")
+APART_MM = 0.003
+"""What the motors leave of the asked place."""
+
+MARKERS = np.array([[60.0, 0.0, 70.0], [-50.0, 40.0, 60.0], [0.0, -70.0, 55.0], [-20.0, 0.0, 90.0]])
+
 HOME = np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])
 NEEDLE = Needle(210.0, 150.0, 1.2, 150.0, 10.0, 30.0)
 TARGET = np.array([10.0, -5.0, 3.0])
@@ -323,3 +336,65 @@ def test_down_is_where_the_bed_is(space, axes, down):
     """Local: -z. Supine patient in the bed frame: posterior; prone: anterior; CT axes: supine is taken."""
     there = dataclasses.replace(case(), space=space, T_ct_entry=view_frame(axes.astype(float), TARGET))
     np.testing.assert_allclose(-bed_frame(there)[:3, 2], down, atol=1e-15)
+
+
+@pytest.fixture(scope="module")
+def rooms():
+    """The plan of a ball, and a thousand rooms with errors of every kind, of an uncalibrated arm."""
+    plan, errors = make_plan(), declared(touch_mm=0.5, arm="nominal", tip_offset_mm=0.5)
+    down = -T_BASE_CT[:3, 2]
+    there = apply(T_BASE_CT, MARKERS)
+    q_touch = np.array([touching_configuration(UR3, NEEDLE.length_mm, point, down) for point in there])
+    noise = reading_noise(errors, UR3, NEEDLE.length_mm, q_touch, known=True)
+    puncture = Puncture(
+        UR3,
+        NEEDLE.length_mm,
+        "rigid",
+        noise,
+        MARKERS,
+        q_touch,
+        T_BASE_CT,
+        TARGET,
+        plan.outward_ct,
+        plan.insertion.q[-1],
+    )
+    drawn = draw_rooms(puncture, errors, 1000, np.random.default_rng(3))
+    assert drawn.reached.all()
+    return plan, puncture, drawn
+
+
+def test_the_simulator_ends_where_the_room_did(rooms):
+    """Tip, direction and error against the true target, from the least error to the greatest."""
+    plan, puncture, drawn = rooms
+    error = np.linalg.norm(drawn.tip_ct - drawn.target_ct, axis=1)
+    order = np.argsort(error)
+    for row in order[[0, 500, 999]]:
+        done = rehearse(plan, case(), anatomy(), room_truth(puncture, drawn, int(row), 3, "a room"))
+        assert np.linalg.norm(done.tip_true_ct[-1] - drawn.tip_ct[row]) < APART_MM
+        assert done.tip_error_mm == pytest.approx(error[row], abs=APART_MM)
+        along = -(np.linalg.inv(done.T_base_ct_true) @ done.T_base_flange_true[-1])[:3, 2]
+        assert np.linalg.norm(along - drawn.outward_ct[row]) < 1e-4
+        assert np.allclose(done.target_true_ct, drawn.target_ct[row]) and not done.truth_is_belief
+
+
+def test_a_truth_that_equals_the_belief_is_known(rooms):
+    """A flag for whoever prints it first."""
+    done = rehearse(rooms[0], case(), anatomy(), Truth(T_BASE_CT, np.zeros(6), 0, "exact"))
+    assert done.truth_is_belief and np.array_equal(done.target_true_ct, TARGET)
+
+
+@pytest.mark.parametrize(("count", "wanted"), [(1, [2]), (5, [0, 1, 2, 3, 4]), (2, [0, 3])])
+def test_rows_are_spread_over_the_order_of_the_errors(count, wanted):
+    """One is the median; several are evenly spaced."""
+    error = np.array([0.3, 0.1, 0.5, 0.2, 0.4])
+    rows = spread_rows(SimpleNamespace(tip_error_mm=error), count)
+    assert sorted(np.argsort(np.argsort(error))[rows]) == wanted
+
+
+def test_standing_in_words():
+    """What headline and film say."""
+    assert Standing(50.05, 1000).words == "median of 1,000 rooms (50th percentile of their tip errors)"
+    assert Standing(2.6).words == "3rd percentile of the tip errors that are predicted"
+    assert [ordinal(n) for n in (1, 2, 3, 4, 11, 12, 13, 21, 99)] == (
+        ["1st", "2nd", "3rd", "4th", "11th", "12th", "13th", "21st", "99th"]
+    )

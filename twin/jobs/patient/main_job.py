@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,9 +33,10 @@ from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.twin.jobs.patient.run import Run
 from puncture_twin.twin.jobs.patient.summaries import registration_summary, rehearsal_summary
-from puncture_twin.twin.plant.truth import draw_truth
 from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_rooms
-from puncture_twin.twin.rehearsal.rehearsal import rehearse
+from puncture_twin.twin.rehearsal.physics import physics_rooms
+from puncture_twin.twin.rehearsal.plan_truth import median_truth, plan_truth, standing
+from puncture_twin.twin.rehearsal.rehearsal import Rehearsal, rehearse
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.page.page import write_page
 from puncture_twin.twin.report.scene.film import draw_film
@@ -43,6 +44,16 @@ from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
 PICTURES = ("map.png", "scene.png", "report.html")
 CERTIFICATE, FILM = "certificate.json", "rehearsal.mp4"
+
+DEMO_ROOMS = 1000
+"""What a stranger sees first is a distribution, where the case declares what it may be off by."""
+
+
+class RoomCount(NamedTuple):
+    """How many rooms are rehearsed, and how many of them in the simulator too."""
+
+    rooms: int
+    physics: int = 0
 
 
 def search_case(
@@ -77,7 +88,7 @@ def plan_case(context: CaseContext, out: Path) -> Run:
     return _answered(_final(run, draft), out)
 
 
-def rehearse_case(context: CaseContext, out: Path, rooms: int | None = None) -> Run:
+def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = None) -> Run:
     """Plan, rehearse the plan, in many rooms too where a number is given, and write everything.
 
     Raises:
@@ -95,6 +106,11 @@ def rehearse_case(context: CaseContext, out: Path, rooms: int | None = None) -> 
             shown = {draft.folder / "map.png", draft.folder / "scene.png"}
             draft.split("rehearse", *(path for path in run.files if path not in {*planned, *shown}))
     return _answered(_final(run, draft), out)
+
+
+def demo_case(context: CaseContext, out: Path) -> Run:
+    """`rehearse_case`, in `DEMO_ROOMS` rooms where the case declares errors and has markers."""
+    return rehearse_case(context, out, None if context.chance is None else RoomCount(DEMO_ROOMS))
 
 
 def _refuse_without_arm(context: CaseContext) -> None:
@@ -146,7 +162,7 @@ def _searched_and_planned(context: CaseContext, out: Path) -> Run:
     return _with_table(_planned(Run(context, context.search(), ()), out), out)
 
 
-def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: int | None = None) -> Run:
+def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomCount | None = None) -> Run:
     """Load a plan, check it again, rehearse it; write the rehearsal's files and the scene, but no map of one direction.
 
     The scene is left out where the plan's own stands beside it: it shows the same.
@@ -175,21 +191,19 @@ def _read_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Plan]:
     return found.input("plan"), plan
 
 
-def _rehearsed(run: Run, out: Path, rooms: int | None) -> Run:
-    """Execute the run's plan where the truth differs, in many rooms too, write the numbers and the film."""
+def _rehearsed(run: Run, out: Path, rooms: RoomCount | None) -> Run:
+    """Execute the run's plan where the truth differs, of many rooms the median, write the numbers and the film."""
     assert run.plan is not None
-    context = run.context
-    with context.stages.time("rehearsal"):
-        truth = draw_truth(context.case, run.plan.T_base_ct)
-        rehearsal = rehearse(run.plan, context.case, context.anatomy, truth)
+    context, plan = run.context, run.plan
     run = run if rooms is None else replace(run, distribution=_distribution(run, rooms))
+    rehearsal = _executed(run, plan)
     shown = {} if run.distribution is None else {"distribution": run.distribution.summary()}
     document = {**rehearsal_summary(rehearsal), **shown, "inputs": inputs_document(run.inputs)}
     run = _with(replace(run, rehearsal=rehearsal), _write_json(document, out / "rehearsal.json"))
     with context.stages.time("film"):
         film = draw_film(
             rehearsal,
-            run.plan,
+            plan,
             context.case,
             context.anatomy,
             out / FILM,
@@ -198,12 +212,26 @@ def _rehearsed(run: Run, out: Path, rooms: int | None) -> Run:
     return _with(run, film)
 
 
-def _distribution(run: Run, rooms: int) -> Distribution:
+def _executed(run: Run, plan: Plan) -> Rehearsal:
+    """One rehearsal in the simulator, and where its error stands among those of the rooms, or in the prediction."""
+    context, found = run.context, run.distribution
+    with context.stages.time("rehearsal"):
+        truth = plan_truth(context, plan) if found is None else median_truth(found)
+        done = rehearse(plan, context.case, context.anatomy, truth)
+        return replace(done, standing=standing(context, plan.insertion.q[-1], done.tip_error_mm, found))
+
+
+def _distribution(run: Run, count: RoomCount) -> Distribution:
     assert run.plan is not None
     context = run.context
     with context.stages.time("rooms"):
         q = run.plan.insertion.q[-1]
-        return rehearse_rooms(context, run.plan.outward_ct, q, rooms, context.case.rehearsal.seed)
+        found = rehearse_rooms(context, run.plan.outward_ct, q, count.rooms, context.case.rehearsal.seed)
+    if not (count.physics and len(found)):
+        return found
+    with context.stages.time("physics"):
+        again = partial(context.watcher.count, "rooms in the simulator")
+        return replace(found, physics=physics_rooms(context, run.plan, found, count.physics, again))
 
 
 def export(

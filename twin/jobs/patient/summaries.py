@@ -77,4 +77,5 @@ def rehearsal_summary(rehearsal: Rehearsal) -> dict[str, Any]:
         "least_clearance_mm": {name: float(np.min(values)) for name, values in rehearsal.clearance_mm.items()},
         "max_joint_speed_deg_s": np.degrees(rehearsal.max_joint_speed).tolist(),
         "joint_speed_limit_deg_s": np.degrees(rehearsal.speed_limits).tolist(),
+        **({} if rehearsal.standing is None else rehearsal.standing.summary()),
     }

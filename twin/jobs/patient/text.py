@@ -8,8 +8,10 @@ from typing import Any
 from puncture_twin.planning.export.exporter import Exported
 from puncture_twin.planning.search.explain import needle_warnings, reason_text
 from puncture_twin.planning.search.search import closest_miss
+from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
 from puncture_twin.twin.jobs.patient.run import Run
 from puncture_twin.twin.jobs.patient.summaries import plan_summary, rehearsal_summary
+from puncture_twin.twin.report.page.page import TRUTH_IS_BELIEF
 
 LEAST_SOURCE = 0.005
 """Of the variance: a smaller source is not named to people."""
@@ -31,7 +33,12 @@ def plan_text(run: Run) -> str:
 def rehearsal_text(run: Run) -> str:
     """The search and the plan, then where the tip ended; then the files."""
     rooms = [] if run.distribution is None else distribution_lines(run.distribution.summary())
-    return "\n".join([*_search(run), *_plan(run), *_rehearsal(run), *rooms, *_footer(run)])
+    return "\n".join([*_notice(run), *_search(run), *_plan(run), *_rehearsal(run), *rooms, *_footer(run)])
+
+
+def _notice(run: Run) -> list[str]:
+    """What must be read first."""
+    return [f"NOTE: {TRUTH_IS_BELIEF}"] if run.rehearsal is not None and run.rehearsal.truth_is_belief else []
 
 
 def _search(run: Run) -> list[str]:
@@ -61,7 +68,8 @@ def _rehearsal(run: Run) -> list[str]:
     kept = {s.name: done["least_clearance_mm"][s.name] for s in run.context.anatomy.structures if s.demands_margin}
     nearest = min(kept.items(), key=lambda item: item[1], default=("nothing", float("nan")))
     return [
-        f"rehearsal (seed {done['seed']}): the tip ended {done['tip_error_mm']:.2f} mm from the true target",
+        f"rehearsal (seed {done['seed']}): the tip ended {done['tip_error_mm']:.2f} mm from the true target"
+        + ("" if run.rehearsal.standing is None else f", {run.rehearsal.standing.words}"),
         f"  lateral {done['lateral_mm']:.2f} mm, depth {done['depth_mm']:+.2f} mm (+ is too deep)",
         f"  least clearance of the true needle to what it must avoid: {nearest[1]:.2f} mm, {nearest[0]}",
         f"  arm contacts: {'; '.join(done['contacts']) or 'none'}",
@@ -89,10 +97,20 @@ def distribution_lines(rooms: dict[str, Any]) -> list[str]:
         f"  touched anything           {100 * rooms['touch_share']:12.2f} {100 * rooms['mean_p_touch']:11.2f} %",
         *chances,
         "  of the predicted variance: "
-        + ", ".join(f"{name} {100 * part:.0f} %" for name, part in sources if part >= LEAST_SOURCE),
+        + ", ".join(f"{SOURCES[name].words} {100 * part:.0f} %" for name, part in sources if part >= LEAST_SOURCE),
         *(missed if rooms["unreached"] else []),
         *(guessed if rooms["guessed_touches"] else []),
-        "  not modelled: breathing, a needle that bends, tissue that moves",
+        *_physics(rooms.get("physics")),
+        f"  not modelled: {NOT_MODELLED}",
+    ]
+
+
+def _physics(run_again: dict[str, Any] | None) -> list[str]:
+    if run_again is None:
+        return []
+    return [
+        f"  {run_again['rooms']} of them in the simulator: tips at most {run_again['largest_apart_mm']:.4f} mm "
+        f"from those of the kinematics; contacts in {run_again['rooms_with_contacts']}"
     ]
 
 

@@ -24,6 +24,11 @@ from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import scene_figure
 from puncture_twin.twin.report.page.template import Card, plotly_script, script_json, write_html
 
+TRUTH_IS_BELIEF = (
+    "in this rehearsal the patient lies exactly where they are believed to lie: what the tip misses is the joints' "
+    "alone, and says nothing about the registration"
+)
+
 
 def write_page(
     case: Any,
@@ -51,7 +56,7 @@ def write_page(
     data = {
         "map": map_data(case, candidates),
         "scene": scene_figure(case, anatomy, candidates, plan, user_cache()),
-        "charts": None if rehearsal is None else rehearsal_charts(rehearsal, case.target_ct, demanding(anatomy)),
+        "charts": None if rehearsal is None else rehearsal_charts(rehearsal, demanding(anatomy)),
         "target": [float(v) for v in case.target_ct],
         "probe_mm": float(case.needle.length_mm),
     }
@@ -61,6 +66,7 @@ def write_page(
         path,
         title=f"{case.name}: puncture of {target_words(case)}",
         needle=needle_words(case),
+        notice=TRUTH_IS_BELIEF if rehearsal is not None and rehearsal.truth_is_belief else "",
         refused=_refused(candidates),
         cards=_cards(candidates, plan, rehearsal),
         counts=tables.counts_table(candidates),
@@ -111,5 +117,7 @@ def _cards(candidates: Candidates, plan: Any | None, rehearsal: Any | None) -> l
         touched = len(rehearsal.contacts)
         detail = f"{touched} contact{'s' if touched != 1 else ''}" if touched else "no contact"
         expected = f"expected (rms) {number(rehearsal.predicted_error_mm, 2, 'mm')}; {detail}"
+        if rehearsal.standing is not None:
+            expected = f"{rehearsal.standing.words}; {expected}"
         cards.append(Card("rehearsed tip error", number(rehearsal.tip_error_mm, 2, "mm"), expected))
     return cards

@@ -16,11 +16,11 @@ NAMED_PHASE = 0.07
 """Share of the time that a phase must last to carry its name; shorter ones would overlap."""
 
 
-def rehearsal_charts(rehearsal: Any, target_ct: Any, keep_away: frozenset[str]) -> dict[str, Any]:
+def rehearsal_charts(rehearsal: Any, keep_away: frozenset[str]) -> dict[str, Any]:
     """Two figures as plain values: ``distance`` (tip to target) and ``clearance`` (needle to structures)."""
     every = max(1, len(rehearsal.times_s) // MOST_POINTS)
     times = rehearsal.times_s[::every]
-    away = np.linalg.norm(rehearsal.tip_true_ct[::every] - target_ct, axis=1)
+    away = np.linalg.norm(rehearsal.tip_true_ct[::every] - rehearsal.target_true_ct, axis=1)
     distance = go.Figure(
         data=[go.Scatter(x=times, y=np.round(away, 3), mode="lines", name="tip to target", line={"color": "#00684a"})],
         layout=_layout("true tip to true target, mm"),

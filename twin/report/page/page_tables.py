@@ -191,6 +191,7 @@ def rehearsal_section(rehearsal: Any | None, keep_away: frozenset[str], film: st
     share = np.max(rehearsal.max_joint_speed / rehearsal.speed_limits)
     rows = [
         ("tip error at the end", _bold(number(rehearsal.tip_error_mm, 2, "mm"))),
+        *([] if rehearsal.standing is None else [("of all", rehearsal.standing.words)]),
         ("its lateral part", number(rehearsal.lateral_mm, 2, "mm")),
         ("its depth part", depth),
         ("expected beforehand (rms)", number(rehearsal.predicted_error_mm, 2, "mm")),

@@ -45,7 +45,7 @@ class FrameWords:
 
     def distance(self, row: int) -> float:
         """True tip to true target, mm."""
-        return float(np.linalg.norm(self.rehearsal.tip_true_ct[row] - self.plan.target_ct))
+        return float(np.linalg.norm(self.rehearsal.tip_true_ct[row] - self.rehearsal.target_true_ct))
 
     def contacts(self, moment: float) -> list[Any]:
         """The contacts seen so far."""
@@ -74,7 +74,9 @@ def draw_words(
     annotate.scale_bar(draw, near, case.target_ct, left + 12, below - 12, 90, note="")
     speed = "real time" if words.speed == 1 else f"playback × {words.speed:g}"
     annotate.write(draw, (left + 10, below + 12), str(case.name)[:26], size=17, bold=True)
-    for line, text in enumerate(("rehearsal in the twin", f"{speed}; green: planned path")):
+    standing = words.rehearsal.standing
+    shown = "rehearsal in the twin" if standing is None else standing.short
+    for line, text in enumerate((shown, f"{speed}; green: planned path")):
         annotate.write(draw, (left + 10, below + 37 + 19 * line), text, size=13)
     annotate.body_axes(draw, wide, case.space, (left + near.width / 2, wide.height - 96), 42, size=14)
     annotate.write(draw, (left + 24, wide.height - 204), "directions in the large view", size=11, colour=annotate.FAINT)
@@ -102,7 +104,8 @@ def _strip(draw: ImageDraw.ImageDraw, words: FrameWords, row: int, moment: float
     if row == len(r.times_s) - 1:
         way = "deep" if r.depth_mm >= 0 else "shallow"
         parts = f"lateral {number(r.lateral_mm, 2)}, {number(abs(r.depth_mm), 2)} too {way}"
-        result = f"tip error at the end {number(r.tip_error_mm, 2, 'mm')}: {parts}"
+        place = "" if r.standing is None else f"; {r.standing.place}"
+        result = f"tip error at the end {number(r.tip_error_mm, 2, 'mm')}: {parts}{place}"
         annotate.write(draw, (12, top + 51), result, size=VALUE, bold=True)
     else:
         note = "rigid tissue and needle; research software, not a medical device"

@@ -1,0 +1,112 @@
+"""The truth that a plan meets: as a file says, or as the declared errors draw it, one room or the median of many.
+
+A room without physics says where the needle ended in the patient. For the simulator its errors, those of the markers
+and of the arm alike, become one: where the patient truly lies. Executed by an arm without errors, the same plan then
+ends at the room's own place, and turned as there:
+
+    T_base_ct_true = T_base_tip T_ct_tip^-1,   T_base_tip as planned, T_ct_tip as the room found it
+
+That holds at the target; on the way the arm's own errors would differ a little from those at its end.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.uncertainty.hit import hit_in_ball
+from puncture_twin.planning.uncertainty.pose_error import pose_error
+from puncture_twin.twin.plant.truth import Truth, draw_truth
+from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_rooms
+from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms
+from puncture_twin.twin.rehearsal.standing import Standing
+
+TRIED = 16
+"""Rooms that are drawn for one: the arm may not reach the pose that a room's registration asks for."""
+
+
+def room_truth(puncture: Puncture, rooms: Rooms, row: int, seed: int, source: str) -> Truth:
+    """The truth whose execution ends as one of the rooms did.
+
+    Args:
+        puncture: What the rooms repeat.
+        rooms: As drawn.
+        row: Which.
+        seed: Of their draws.
+        source: In words for the report.
+    """
+    T_base_tip = np.array(flange_pose(puncture.model, puncture.q_insertion))
+    T_base_tip[:3, 3] += puncture.tip_mm * T_base_tip[:3, 2]
+    T_ct_tip = np.eye(4)
+    T_ct_tip[:3, :3], T_ct_tip[:3, 3] = rooms.R_ct_needle[row], rooms.tip_ct[row]
+    return Truth(T_base_tip @ np.linalg.inv(T_ct_tip), np.zeros(6), seed, source, rooms.target_ct[row])
+
+
+def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Truth:
+    """What one rehearsal meets: a room of the declared errors, unless the case names true positions or declares none.
+
+    Args:
+        context: The plan's case.
+        plan: What is executed.
+        seed: Instead of the case's own.
+
+    Raises:
+        InputError: A file of true positions that cannot be used.
+        NoAnswerError: In none of the rooms the arm reaches the pose that its registration asks for.
+    """
+    case = context.case
+    drawn = case.errors is not None and case.registration is not None and case.rehearsal.truth_base is None
+    if not drawn:
+        return draw_truth(case, plan.T_base_ct, seed=seed)
+    seed = case.rehearsal.seed if seed is None else seed
+    found = rehearse_rooms(context, plan.outward_ct, plan.insertion.q[-1], TRIED, seed)
+    return _of_room(found, 0, f"drawn with seed {seed} from {_declared(found)}")
+
+
+def median_truth(found: Distribution) -> Truth:
+    """The truth of the median room by tip error.
+
+    Raises:
+        NoAnswerError: As `plan_truth`.
+    """
+    count = len(found) + found.unreached
+    row = int(spread_rows(found, 1)[0]) if len(found) else 0
+    return _of_room(found, row, f"the median of {count:,} rooms, drawn with seed {found.seed} from {_declared(found)}")
+
+
+def spread_rows(found: Distribution, count: int) -> Ints:
+    """Rooms spread evenly over the order of their tip errors, shape (count,) at most; the median where it is one."""
+    order = np.argsort(found.tip_error_mm, kind="stable")
+    places = ((np.arange(count) + 0.5) / count * len(order) - 0.5).round(9)
+    return np.asarray(np.unique(order[np.floor(places).clip(0).astype(np.int64)]))
+
+
+def _of_room(found: Distribution, row: int, source: str) -> Truth:
+    if len(found) == 0:
+        raise NoAnswerError(
+            f"in none of {found.unreached} rooms did the arm reach the pose that its registration asked for"
+        )
+    return room_truth(found.puncture, found.rooms, row, found.seed, source)
+
+
+def _declared(found: Distribution) -> str:
+    return "[rehearsal.errors], not from what is believed" if found.wrong_belief else "[errors]"
+
+
+def standing(
+    context: CaseContext, q_insertion: Floats, tip_error_mm: float, found: Distribution | None
+) -> Standing | None:
+    """Where a tip error stands among the rooms, or without rooms in the prediction; None without declared errors."""
+    if found is not None:
+        below = np.mean(found.tip_error_mm < tip_error_mm) + np.mean(found.tip_error_mm <= tip_error_mm)
+        return Standing(float(50 * below), len(found) + found.unreached)
+    registration = None if context.placement is None else context.placement.registration
+    error = pose_error(context.case, registration)
+    if error is None:
+        return None
+    cov = error.tip_covariance(q_insertion[None])
+    return Standing(100 * float(hit_in_ball(cov, tip_error_mm, error.freedom)[0]))
