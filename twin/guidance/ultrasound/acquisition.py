@@ -186,11 +186,14 @@ def _after_jog(case: SelfcalCase, poses: Recording, row: int, rng: np.random.Gen
 
 def _recording(room: TwoArms, shots: list[ProbeShot]) -> Recording:
     found = [shot.found for shot in shots if isinstance(shot.found, Detection)]
+    q_probe, q_needle = (np.array([getattr(shot, key) for shot in shots]) for key in ("q_probe", "q_needle"))
     return Recording(
-        flange_pose(room.probe_model, np.array([shot.q_probe for shot in shots])),
-        flange_pose(room.needle_model, np.array([shot.q_needle for shot in shots])),
+        flange_pose(room.probe_model, q_probe),
+        flange_pose(room.needle_model, q_needle),
         np.array([one.tip_image for one in found]),
         np.array([one.direction_image for one in found]),
+        q_probe=q_probe,
+        q_needle=q_needle,
     )
 
 

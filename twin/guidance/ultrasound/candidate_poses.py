@@ -134,7 +134,14 @@ def find_candidates(case: SelfcalCase, room: TwoArms, rng: np.random.Generator) 
     q = np.array(pairs, dtype=np.float64).reshape(-1, 2, 6)
     if len(taken) == 0:
         raise NoAnswerError(f"no pose of {n} can be taken: {counts}", counts=counts)
-    poses = Recording(goals[0][taken], goals[1][taken], seen.tip_mm[taken], seen.direction_image[taken])
+    poses = Recording(
+        goals[0][taken],
+        goals[1][taken],
+        seen.tip_mm[taken],
+        seen.direction_image[taken],
+        q_probe=q[:, 0],
+        q_needle=q[:, 1],
+    )
     return CandidatePoses(q[:, 0], q[:, 1], poses, seen.roll[taken], counts)
 
 

@@ -10,11 +10,15 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, needle_flange
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import Lesion, NeedleInImage, render
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth, nearest_configuration
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
+
+AIM_STEPS = 3
+"""Of the command that counts the needle arm's errors: each leaves a thousandth of what was left before."""
 
 LESION_MM = 4.0
 """Radius of the lesion that is drawn about the target in a picture."""
@@ -29,7 +33,7 @@ class Puncture(NamedTuple):
     needle: NeedleInImage
     """Where the needle truly ended, in the true image."""
     predicted_mm: float
-    """Expected (rms) error from the calibration's covariance alone."""
+    """Expected (rms) error from the calibration and the arms."""
     click_mm: float
     """Standard deviation of the reading, per axis of the image."""
 
@@ -45,7 +49,7 @@ class Puncture(NamedTuple):
 
     @property
     def expected_mm(self) -> float:
-        """Expected (rms) error from the calibration and the reading of the target; the arms' own errors come on top."""
+        """Expected (rms) error from calibration, arms and the reading of the target."""
         return float(np.sqrt(self.predicted_mm**2 + 2.0 * self.click_mm**2))
 
     @property
@@ -100,7 +104,7 @@ def _puncture(
     if np.isnan(q_needle).any() or room.verdict(q_probe, q_needle) is not None:
         return None
     rest_needle = truth.needle_arm.settle(q_needle, q_needle, rng)
-    predicted = float(calibration.predicted_tre_mm(clicked[None], candidates.poses.A[row])[0])
+    predicted = expected_error_mm(calibration, _standing(truth, q_probe, q_needle, clicked))
     ended = truth.needle_in_image(rest_probe, rest_needle)
     return Puncture(row, target, ended, predicted, case.content.truth.click_mm)
 
@@ -119,12 +123,32 @@ def aim(
     """
     poses = candidates.poses
     assert poses.v is not None  # candidates are made with directions
-    T_base2_image = np.linalg.inv(calibration.Y) @ poses.A[row] @ calibration.X
+    q = candidates.q_needle[row]
+    A, _ = calibration.corrected(poses.subset(slice(row, row + 1)))
+    T_base2_image = np.linalg.inv(calibration.Y) @ A[0] @ calibration.X
     tip, along = np.array([[*target_mm, 0.0]]), np.array([[*poses.v[row], 0.0]])
     roll = candidates.roll[row : row + 1]
     V, Q = calibration.needle_direction_end2, calibration.tip_end2
     goal = needle_flange(T_base2_image[None], tip, along, roll, Q, V)[0]
-    return nearest_configuration(truth.needle_arm, goal, candidates.q_needle[row])
+    command = goal
+    for _ in range(AIM_STEPS):
+        q = nearest_configuration(truth.needle_arm, command, q)
+        if calibration.arms is None or np.isnan(q).any():
+            break
+        standing = _standing(truth, candidates.q_probe[row], q, target_mm)
+        command = standing.B[0] @ np.linalg.inv(calibration.corrected(standing)[1][0]) @ goal
+    return q
+
+
+def expected_error_mm(calibration: Calibration, poses: Recording) -> float:
+    """Expected (rms) distance of the tip from where the image has it, over poses that hold the joints."""
+    return float(np.sqrt(np.mean(np.trace(calibration.tip_covariances(poses), axis1=1, axis2=2))))
+
+
+def _standing(truth: WorkcellTruth, q_probe: Floats, q_needle: Floats, tip_mm: Floats) -> Recording:
+    """One pose as both controllers print it, with the tip at a point of the image."""
+    A, B = flange_pose(truth.probe_arm.nominal, q_probe), flange_pose(truth.needle_arm.nominal, q_needle)
+    return Recording(A[None], B[None], tip_mm[None, :2], q_probe=q_probe[None], q_needle=q_needle[None])
 
 
 def held_out_errors_mm(
@@ -136,7 +160,8 @@ def held_out_errors_mm(
 ) -> Floats:
     """Predicted minus true tip at candidates that were not recorded, in the image; shape (n,), mm.
 
-    Both arms stand where they were told to by nominal kinematics, so their errors are in it; the image's are not.
+    Both arms stand where they were told to by nominal kinematics, and their errors that were found are counted; the
+    image's are not in it.
     """
     errors = []
     for row in rows:
@@ -148,8 +173,9 @@ def held_out_errors_mm(
             )
         ]
         seen = truth.needle_in_image(*rests).tip_image
-        T_base1_image = flange_pose(truth.probe_arm.nominal, candidates.q_probe[row]) @ calibration.X
-        T_base1_end2 = calibration.Y @ flange_pose(truth.needle_arm.nominal, candidates.q_needle[row])
+        standing = _standing(truth, candidates.q_probe[row], candidates.q_needle[row], seen)
+        A, B = calibration.corrected(standing)
+        T_base1_image, T_base1_end2 = A[0] @ calibration.X, calibration.Y @ B[0]
         tip = T_base1_end2[:3, :3] @ calibration.tip_end2 + T_base1_end2[:3, 3]
         predicted = np.linalg.inv(T_base1_image) @ np.append(tip, 1.0)
         errors.append(float(np.linalg.norm(predicted[:3] - seen)))

@@ -10,12 +10,13 @@ import numpy as np
 from pydantic import Field, Strict, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, content_input
 from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.case.toml_types import Length, Name, Number, Section, Sextuple, Vector
 from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArm, DeclaredArms
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleEcho
 from puncture_twin.twin.plant.true_arm import ArmErrors
@@ -52,6 +53,13 @@ class ErrorsSection(Section):
         """In mm and rad."""
         angles = np.radians([self.twist_deg, self.joint_deg, self.backlash_deg, self.repeatability_deg])
         return ArmErrors(self.link_mm, *(float(angle) for angle in angles))
+
+    def declared(self, model: UrModel) -> DeclaredArm:
+        """What a calibration is told of the arm. Play leaves a joint at either edge: half of it is its deviation."""
+        twist, joint, play, repeated = np.radians(
+            [self.twist_deg, self.joint_deg, self.backlash_deg, self.repeatability_deg]
+        )
+        return DeclaredArm(model, self.link_mm, twist, joint, float(np.hypot(repeated, play / 2)))
 
 
 class ArmSection(Section):
@@ -172,16 +180,25 @@ class TruthSection(Section):
 class NoiseSection(Section):
     """What the calibration is told; without it, it finds the residuals' spread by itself."""
 
-    robot_mm: Annotated[Number, Field(gt=0, le=100)]
-    robot_deg: Annotated[Number, Field(gt=0, le=10)]
+    robot_mm: Annotated[Number, Field(ge=0, le=100)]
+    robot_deg: Annotated[Number, Field(ge=0, le=10)]
     image_mm: Annotated[Number, Field(gt=0, le=100)]
     direction_deg: Annotated[Number, Field(gt=0, le=45)]
+    off_plane_mm: Deviation = 0.0
+
+    @model_validator(mode="after")
+    def _across_the_image(self) -> Self:
+        if self.robot_mm == 0.0 and self.off_plane_mm == 0.0:
+            raise ValueError(
+                "noise: robot_mm and off_plane_mm are both 0; nothing is measured exactly across the image"
+            )
+        return self
 
     def noise(self) -> Noise:
         """In mm and rad."""
-        return Noise(
-            self.robot_mm, float(np.radians(self.robot_deg)), self.image_mm, float(np.radians(self.direction_deg))
-        )
+        angles = (float(np.radians(angle)) for angle in (self.robot_deg, self.direction_deg))
+        robot_rad, direction_rad = angles
+        return Noise(self.robot_mm, robot_rad, self.image_mm, direction_rad, self.off_plane_mm)
 
 
 class SelfcalFile(Section):
@@ -227,6 +244,12 @@ class SelfcalCase:
     T_end1_image: Floats = field(init=False)
     T_base1_base2: Floats = field(init=False)
     tip_end2: Floats = field(init=False)
+
+    @property
+    def declared_arms(self) -> DeclaredArms:
+        """What the calibration is told of both arms."""
+        arms = (self.content.probe_arm, self.content.needle_arm)
+        return DeclaredArms(*(arm.errors.declared(ur_model(arm.model)) for arm in arms))
 
     def __post_init__(self) -> None:
         content = self.content

@@ -9,7 +9,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.puncture import Puncture
+from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, expected_error_mm
 from puncture_twin.twin.guidance.ultrasound.trial import Choice, SelfcalTrial
 
 
@@ -29,6 +29,7 @@ def calibration_summary(found: Calibration, recording: Recording) -> dict[str, A
         "noise": noise_summary(found),
         "predicted_tre_mm": predicted_tre(found, recording),
         "tip_bias_mm": found.tip_bias_mm,
+        "arms": arms_summary(found),
         "cannot_show": list(found.cannot_show),
     }
 
@@ -42,6 +43,7 @@ def noise_summary(found: Calibration) -> dict[str, float]:
             "robot_deg": float(np.degrees(stated.robot_rad)),
             "image_mm": stated.image_mm,
             "direction_deg": float(np.degrees(stated.direction_rad)),
+            "off_plane_mm": stated.off_plane_mm,
         }
     spread = found.noise
     return {
@@ -51,8 +53,21 @@ def noise_summary(found: Calibration) -> dict[str, float]:
     }
 
 
+def arms_summary(found: Calibration) -> dict[str, Any] | None:
+    """What was found of the declared arms, and whether the residuals agree; None where none were declared."""
+    if found.arms is None:
+        return None
+    return {
+        "found_sd": found.arm_errors.tolist(),
+        "chi2_per_freedom": found.chi_squared_ratio,
+        "chi2_chance": found.chi_squared_chance(),
+    }
+
+
 def predicted_tre(found: Calibration, recording: Recording) -> float:
-    """Expected (rms) error at the recorded tips, from the calibration's covariance alone, mm."""
+    """Expected (rms) error at the recorded tips, from the calibration, and from the arms where declared, mm."""
+    if found.arms is not None:
+        return expected_error_mm(found, recording)
     return float(np.sqrt(np.mean(found.predicted_tre_mm(recording.P, recording.A) ** 2)))
 
 

@@ -13,7 +13,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibrati
 from puncture_twin.twin.jobs.selfcal.facts import Facts, selfcal_facts
 from puncture_twin.twin.jobs.selfcal.page_charts import puncture_chart, residual_charts
 from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun
-from puncture_twin.twin.jobs.selfcal.text import NOISE_WORDS, REASON_WORDS, missed_text
+from puncture_twin.twin.jobs.selfcal.text import NOISE_WORDS, REASON_WORDS, counted, missed_text
 from puncture_twin.twin.report.numbers import number
 from puncture_twin.twin.report.page.page_tables import TIMES, faint, inputs_table, origin_section, pairs, table
 from puncture_twin.twin.report.page.template import Card, data_address, plotly_script, script_json, write_html
@@ -59,15 +59,19 @@ def _origin(run: SelfcalRun) -> Markup:
 def _cards(facts: Facts) -> list[Card]:
     aside, poses = facts["set_aside"], facts["poses"]
     cards = [
-        Card("expected error of the calibration", number(facts["predicted_tre_mm"], 2, "mm"), "rms at the tip"),
+        Card(
+            "expected error of the calibration",
+            number(facts["predicted_tre_mm"], 2, "mm"),
+            f"rms at the tip: {counted(facts)}",
+        ),
         Card("residuals", number(facts["residual_rms_mm"], 2, "mm"), "rms length of the poses that were used"),
         Card("poses", f"{poses - len(aside)} of {poses}", f"set aside: {', '.join(aside) or 'none'}"),
     ]
     reached = facts["punctures"]
     if reached is not None:
         detail = (
-            f"rms over {reached['targets']} targets, worst {number(reached['error_worst_mm'], 2, 'mm')}; calibration "
-            f"and reading let expect {number(reached['predicted_with_reading_rms_mm'], 2, 'mm')}"
+            f"rms over {reached['targets']} targets, worst {number(reached['error_worst_mm'], 2, 'mm')}; calibration, "
+            f"arms and reading let expect {number(reached['predicted_with_reading_rms_mm'], 2, 'mm')}"
         )
         cards.insert(0, Card("tip to target, true", number(reached["error_rms_mm"], 2, "mm"), detail))
     return cards
@@ -92,6 +96,8 @@ def _calibration(facts: Facts, sigma: dict[str, float]) -> Markup:
         ("iterations", str(facts["iterations"])),
         ("condition σ_min/σ_max, lengths in 100 mm", f"{facts['condition']:.2e}"),
     ]
+    if facts["arms"] is not None:
+        rows.append(("χ² of the residuals over their freedom", f"{facts['arms']['chi2_per_freedom']:.2f}"))
     rows += [(NOISE_WORDS[key], f"{value:.3f}") for key, value in facts["noise"].items()]
     known = [(name, f"{value:.4f}") for name, value in sigma.items()]
     shown = table(("parameter", "standard deviation"), known, kind="numbers")
@@ -134,10 +140,10 @@ def _punctures(facts: Facts) -> Markup:
             "along the needle, mean and rms",
             f"{number(reached['depth_mean_mm'], 2)}, {number(reached['depth_rms_mm'], 2, 'mm')}",
         ),
-        ("expected (rms): calibration alone", number(reached["predicted_rms_mm"], 2, "mm")),
+        ("expected (rms): calibration and arms", number(reached["predicted_rms_mm"], 2, "mm")),
         ("expected (rms): with the target's reading", number(reached["predicted_with_reading_rms_mm"], 2, "mm")),
     ]
-    return pairs(rows) + faint("The arms’ own errors come on top of what is expected.")
+    return pairs(rows)
 
 
 def _trials(facts: Facts) -> Markup:
@@ -170,7 +176,7 @@ def _trials(facts: Facts) -> Markup:
                 "–" if reached is None else number(reached["error_rms_mm"], 2),
             )
         )
-    note = "Held-out: predicted minus true tip at poses that were not recorded, with both arms’ errors in it."
+    note = "Held-out: predicted minus true tip at poses that were not recorded, with what is left of the arms’ errors."
     return table(head, rows, kind="numbers") + faint(note)
 
 

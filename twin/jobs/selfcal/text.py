@@ -24,6 +24,7 @@ NOISE_WORDS = MappingProxyType(
         "robot_mm": "stated noise of each flange, mm per axis",
         "robot_deg": "stated noise of each flange, ° per axis",
         "image_mm": "stated noise of the tip in the image, mm per axis",
+        "off_plane_mm": "stated deviation of the tip from the slice, mm",
         "direction_deg": "noise of the direction in the image, °",
         "inside_image_mm": "spread of the residuals in the image, mm per axis",
         "across_image_mm": "spread of the residuals across the slice, mm",
@@ -59,12 +60,19 @@ def _calibration(facts: Facts) -> list[str]:
         "calibration: residuals {residual_rms_mm:.3f} mm rms, {iterations} iterations, "
         "condition {condition:.1e}".format(**facts),
         f"  {noise}",
-        f"  expected error at the tip (rms, calibration alone) {facts['predicted_tre_mm']:.3f} mm",
+        f"  expected error at the tip (rms, {counted(facts)}) {facts['predicted_tre_mm']:.3f} mm",
         f"  tip in the flange's frame ({', '.join(f'{x:.2f}' for x in facts['tip_end2_mm'])}) mm",
     ]
+    if facts["arms"] is not None:
+        lines.append("  chi-squared over freedom {chi2_per_freedom:.2f}".format(**facts["arms"]))
     if facts["set_aside"]:
         lines.append(f"  set aside: {', '.join(facts['set_aside'])}")
     return lines + [f"  cannot be shown: {line}" for line in facts["cannot_show"]]
+
+
+def counted(facts: Facts) -> str:
+    """What the expected error holds."""
+    return "noise alone" if facts["arms"] is None else "noise and the arms' declared errors"
 
 
 def missed_text(trial: Facts) -> str:
@@ -76,7 +84,7 @@ def _trial(trial: Facts) -> str:
     along, spread = trial["detected_tip_along_mm"]
     return (
         "seed {seed}: residuals {residual_rms_mm:.3f} mm, held-out tip error {held_out_error_rms_mm:.3f} mm rms "
-        "(expected {predicted_tre_mm:.3f} + arms); ".format(**trial)
+        "(expected {predicted_tre_mm:.3f}); ".format(**trial)
         + f"detected tip {along:+.2f} mm along the shaft, sd {spread:.2f}; not used: {missed_text(trial)}; "
         f"true contacts of the arms: {trial['true_contacts']}"
     )
@@ -91,6 +99,6 @@ def _punctures(facts: Facts) -> list[str]:
         f"{reached['error_rms_mm']:.2f} mm (rms) from the true target, worst {reached['error_worst_mm']:.2f} mm",
         f"  lateral {reached['lateral_rms_mm']:.2f} mm rms; depth {reached['depth_mean_mm']:+.2f} mm on average "
         f"(+ is too deep), {reached['depth_rms_mm']:.2f} mm rms",
-        f"  expected: {reached['predicted_rms_mm']:.2f} mm from the calibration, "
-        f"{reached['predicted_with_reading_rms_mm']:.2f} mm with the reading of the target, and the arms on top",
+        f"  expected: {reached['predicted_rms_mm']:.2f} mm from calibration and arms, "
+        f"{reached['predicted_with_reading_rms_mm']:.2f} mm with the reading of the target",
     ]

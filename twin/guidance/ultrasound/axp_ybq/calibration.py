@@ -11,19 +11,36 @@ from scipy.stats import chi2, f
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import log_rotation, pose
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, corrected
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, PARAMETERS, T_Q, Estimate, tangent_basis
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import Spread, linearised_tip, tip_residuals
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
+    Problem,
+    Spread,
+    linearise,
+    linearised_tip,
+    problem_covariances,
+    shared_slopes,
+    tip_residuals,
+)
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.solve import Solution, solve
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.spread import SmallSample
 
 SHAFT_BIAS = (
     "a constant error of the detected tip along the shaft moves the tip in the needle's flange frame and leaves every "
     "residual as it is; the known needle length would hold it"
 )
 SCALE_TAKEN = "the image's mm per pixel was taken as given: 1 % off makes the error at the tip half as large again"
+ARMS_TAKEN = (
+    "errors of the arms that repeat from pose to pose (lengths, joint zeros): none were declared with the joints, so "
+    "the stated errors count noise alone and are too small"
+)
 DIRECTION_SIGN = (
     "no directions were measured: the needle's axis comes from the image plane alone, pointing from flange to tip"
 )
+
+NO_NOISE = Noise(0.0, 0.0, 0.0, 0.0)
+"""What is asked is where the tip is, not where it would be seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +63,14 @@ class Calibration:
         parameters: Names with their units; rotations are small turns on the right, R exp([w]x).
         freedom: Residuals minus unknowns.
         noise: What the weights were made from: given, or found from the residuals (``Spread``).
-        noise_ratio: Size of the residuals over what ``noise`` expects; far above 1 says that the noise is larger.
+        noise_ratio: Size of the residuals over what ``noise`` and ``arms`` let expect; far above 1: they are larger.
         tip_bias_mm: How far the detected tip lies beyond the true one along the shaft; None without a needle length.
         orientations: M, rotation from end2 to image, shape (n, 3, 3): how the needle stood in the image.
         cannot_show: What the data cannot tell, in words.
+        arms: Both arms' declared errors, which ``covariance`` then counts; None where they were not declared.
+        arm_errors: Posterior mean of their 46 parameters, in declared standard deviations; shape (0,) without.
+        joint_covariance: Of parameters and arms' errors together, shape (p + 46, p + 46); ``covariance`` without.
+        small_sample: What the doubt of a noise that was found makes of the region, where arms are declared.
     """
 
     X: Floats
@@ -71,6 +92,57 @@ class Calibration:
     tip_bias_mm: float | None
     orientations: Floats
     cannot_show: tuple[str, ...]
+    arms: DeclaredArms | None
+    arm_errors: Floats
+    joint_covariance: Floats
+    small_sample: SmallSample | None
+
+    @property
+    def chi_squared_ratio(self) -> float:
+        """Chi-squared of the residuals over their freedom: 1 where noise and arms are as declared."""
+        return self.noise_ratio**2
+
+    def chi_squared_chance(self) -> float:
+        """How often a right declaration has residuals as large as these."""
+        return float(chi2.sf(self.chi_squared_ratio * self.freedom, self.freedom))
+
+    @property
+    def covariance_counts(self) -> Floats:
+        """What a region is drawn with: the covariance, with the doubt of a noise that was found in it."""
+        return self.covariance if self.small_sample is None else self.small_sample.covariance
+
+    def corrected(self, poses: Recording) -> tuple[Floats, Floats]:
+        """Both flanges as the arms' errors that were found move them: A and B, each (n, 4, 4), mm.
+
+        Args:
+            poses: Nominal flanges, with joints where arms are declared.
+        """
+        if self.arms is None:
+            return poses.A, poses.B
+        errors = arm_errors(self.arms, poses)
+        probe, needle = np.split(self.arm_errors, 2)
+        return corrected(poses.A, errors.probe @ probe), corrected(poses.B, errors.needle @ needle)
+
+    def tip_covariances(self, poses: Recording) -> Floats:
+        """Covariance of where the tip is against where the image has it, shape (n, 3, 3), mm^2, base1.
+
+        With declared arms it counts parameters and arms together, and how differently the joints stop.
+
+        Args:
+            poses: Flanges and the tip in the image; with joints where arms are declared.
+        """
+        errors = None if self.arms is None else arm_errors(self.arms, poses)
+        tip_names = [name for name in self.parameters if not name.startswith("V")]
+        active = np.array([PARAMETERS.index(name) for name in tip_names])
+        problem = Problem(poses, NO_NOISE, active, arms=errors)
+        shared = shared_slopes(problem, self.estimate)
+        J = linearise(problem, self.estimate).jacobian
+        rows = np.arange(len(active))
+        if shared is not None:
+            J = np.concatenate([J, shared], axis=2)
+            rows = np.append(rows, np.arange(len(self.parameters), len(self.joint_covariance)))
+        C = self.joint_covariance[np.ix_(rows, rows)]
+        return np.asarray(J @ C @ J.transpose(0, 2, 1) + problem_covariances(problem, self.estimate))
 
     def tre(self, A: Floats, B: Floats, P: Floats) -> Floats:
         """Length of Y B Q - A X P where the true poses and the true tip are given, shape (n,), mm.
@@ -140,10 +212,13 @@ class Calibration:
     def region_limit(self, level: float = 0.95) -> float:
         """Largest e^T C^-1 e inside the confidence region, e as in ``parameter_error``.
 
-        Chi-squared for a given noise. For a spread found from the residuals Fisher's F; the least-known part of that
-        spread has one residual per pose, so that only this share of the freedom counts.
+        C is ``covariance_counts``. Chi-squared for a given noise; with declared arms ``small_sample`` says it. For a
+        spread found from the residuals Fisher's F; the least-known part of that spread has one residual per pose, so
+        that only this share of the freedom counts.
         """
         p = len(self.parameters)
+        if self.small_sample is not None:
+            return self.small_sample.limit(level)
         if isinstance(self.noise, Noise):
             return float(chi2.ppf(level, p))
         per_pose = 5 if "V_1_rad" in self.parameters else 3
@@ -160,6 +235,7 @@ def calibrate(
     robust: bool = True,
     direction: bool = True,
     start: Estimate | None = None,
+    arms: DeclaredArms | None = None,
 ) -> Calibration:
     """Solve A X P = Y B Q: closed form, then weighted least squares over the poses that agree.
 
@@ -173,28 +249,38 @@ def calibrate(
         robust: Set aside poses that disagree with the others.
         direction: Let measured directions take part, where the recording has them.
         start: Begin here instead of at the closed form.
+        arms: How far both arms may lastingly be from their nominal models; the recording then needs joints. None takes
+            all errors of the flanges for noise.
 
     Raises:
-        InputError: Too few poses, or more than half of them disagree.
+        InputError: Too few poses, or more than half of them disagree; joints that are missing or of another arm.
         Degenerate: The poses cannot show every unknown. It names the motion and proposes further poses.
     """
     if needle_length_mm is not None and not 0 < needle_length_mm < np.inf:
         raise InputError(f"needle length {needle_length_mm}", where="needle_length_mm", allowed="a positive number, mm")
     solution = solve(
-        recording, noise=noise, known_tip=known_tip, scale=scale, robust=robust, direction=direction, start=start
+        recording,
+        noise=noise,
+        known_tip=known_tip,
+        scale=scale,
+        robust=robust,
+        direction=direction,
+        start=start,
+        arms=arms,
     )
-    estimate, covariance, bias = solution.estimate, solution.covariance, None
+    bias = None
     if needle_length_mm is not None and known_tip is None:
-        bias = float(estimate.V @ estimate.t_Q) - needle_length_mm
-        covariance = _with_length(solution, bias)
-        estimate = estimate._replace(t_Q=estimate.t_Q - bias * estimate.V)
+        bias = float(solution.estimate.V @ solution.estimate.t_Q) - needle_length_mm
+        solution = _with_length(solution, bias)
     cannot = [SHAFT_BIAS] * (needle_length_mm is None and known_tip is None) + [SCALE_TAKEN] * (not scale)
-    cannot += [DIRECTION_SIGN] * (recording.v is None)
-    return _assembled(recording, solution._replace(estimate=estimate, covariance=covariance), bias, tuple(cannot))
+    cannot += [DIRECTION_SIGN] * (recording.v is None) + [ARMS_TAKEN] * (arms is None)
+    return _assembled(recording, solution, bias, tuple(cannot), arms)
 
 
-def _assembled(recording: Recording, solution: Solution, bias: float | None, cannot: tuple[str, ...]) -> Calibration:
-    estimate, kept = solution.estimate, solution.tip_kept
+def _assembled(
+    recording: Recording, solution: Solution, bias: float | None, cannot: tuple[str, ...], arms: DeclaredArms | None
+) -> Calibration:
+    estimate, kept, p = solution.estimate, solution.tip_kept, len(solution.active)
     return Calibration(
         _pose(estimate.R_X, estimate.t_X),
         _pose(estimate.R_Y, estimate.t_Y),
@@ -207,7 +293,7 @@ def _assembled(recording: Recording, solution: Solution, bias: float | None, can
         tuple(name for name, used in zip(recording.names, kept, strict=True) if not used),
         solution.iterations,
         solution.observability.ratio,
-        _frozen(solution.covariance),
+        _frozen(solution.covariance[:p, :p]),
         tuple(PARAMETERS[column] for column in solution.active),
         solution.freedom,
         solution.noise,
@@ -215,17 +301,30 @@ def _assembled(recording: Recording, solution: Solution, bias: float | None, can
         bias,
         _frozen(solution.orientations),
         cannot,
+        arms,
+        _frozen(solution.arm_errors),
+        _frozen(solution.covariance),
+        solution.small_sample,
     )
 
 
-def _with_length(solution: Solution, bias: float) -> Floats:
-    """The covariance after t_Q <- t_Q - (V.t_Q - length) V."""
+def _with_length(solution: Solution, bias: float) -> Solution:
+    """The solution after t_Q <- t_Q - (V.t_Q - length) V."""
     V, t_Q = solution.estimate.V, solution.estimate.t_Q
     full = np.eye(len(PARAMETERS))
     full[T_Q, T_Q] -= np.outer(V, V)
     full[T_Q, DIRECTION] = -(bias * np.eye(3) + np.outer(V, t_Q)) @ tangent_basis(V)
     change = full[np.ix_(solution.active, solution.active)]
-    return np.asarray(change @ solution.covariance @ change.T)
+    whole = np.eye(len(solution.covariance))
+    whole[: len(change), : len(change)] = change
+    region = solution.small_sample
+    if region is not None:
+        region = region._replace(covariance=change @ region.covariance @ change.T)
+    return solution._replace(
+        estimate=solution.estimate._replace(t_Q=t_Q - bias * V),
+        covariance=np.asarray(whole @ solution.covariance @ whole.T),
+        small_sample=region,
+    )
 
 
 def _pose(R: Floats, t: Floats) -> Floats:

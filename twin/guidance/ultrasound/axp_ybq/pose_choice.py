@@ -12,7 +12,8 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, active_columns, parameter_units
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import covariances, linearised_tip, whitener
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import covariances, linearised_tip
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import whitener
 
 PRIOR_WEIGHT = 1e-6
 """Information that every parameter is taken to have beforehand, as a share of a candidate's; for the first picks."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,6 +46,8 @@ class Noise(NamedTuple):
     """The tip in the image, per axis of the image."""
     direction_rad: float
     """The needle's direction in the image."""
+    off_plane_mm: float = 0.0
+    """How far the tip lies off the slice and still shows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +62,9 @@ class Recording:
             (n, 3) where the part across the image is measured too; None where it was not measured.
         names: One per pose; numbers where nothing is given.
         pixels: P counts pixels, and mm per pixel is to be found.
+        q_probe: Joints of the probe's arm, shape (n, 6), rad, as its controller prints them; None where they were not
+            recorded. Without them errors of the arms cannot be told from noise.
+        q_needle: Joints of the needle's arm, shape (n, 6), rad; given if and only if the probe's are.
 
     Raises:
         InputError: Shapes that do not match, values that are not finite, matrices that are not rigid motions.
@@ -70,6 +76,8 @@ class Recording:
     v: Floats | None = None
     names: tuple[str, ...] = ()
     pixels: bool = False
+    q_probe: Floats | None = None
+    q_needle: Floats | None = None
 
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(self.A))
@@ -84,6 +92,11 @@ class Recording:
         object.__setattr__(self, "P", _finite(self.P, "P", names, widths=(2,)))
         if self.v is not None:
             object.__setattr__(self, "v", _directions(self.v, names))
+        if (self.q_probe is None) != (self.q_needle is None):
+            raise InputError("joints of one arm only", where="recording", allowed="those of both, or none")
+        for key in ("q_probe", "q_needle"):
+            if getattr(self, key) is not None:
+                object.__setattr__(self, key, _finite(getattr(self, key), key, names, widths=(6,)))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -91,8 +104,8 @@ class Recording:
     def subset(self, rows: NDArray[np.int_] | NDArray[np.bool_] | slice) -> Recording:
         """The same recording with these poses only."""
         names = tuple(np.array(self.names)[rows].tolist())
-        v = None if self.v is None else self.v[rows]
-        return Recording(self.A[rows], self.B[rows], self.P[rows], v, names, self.pixels)
+        v, q_probe, q_needle = (None if part is None else part[rows] for part in (self.v, self.q_probe, self.q_needle))
+        return Recording(self.A[rows], self.B[rows], self.P[rows], v, names, self.pixels, q_probe, q_needle)
 
     def joined(self, other: Recording) -> Recording:
         """Both, one after the other, numbered anew.
@@ -103,9 +116,10 @@ class Recording:
         widths = [None if r.v is None else r.v.shape[1] for r in (self, other)]
         if widths[0] != widths[1] or self.pixels != other.pixels:
             raise InputError("two recordings that hold different things", where="recording", allowed="the same columns")
-        v = None if self.v is None or other.v is None else np.concatenate([self.v, other.v])
         A, B, P = (np.concatenate([getattr(r, key) for r in (self, other)]) for key in "ABP")
-        return Recording(A, B, P, v, (), self.pixels)
+        optional = ("v", "q_probe", "q_needle")
+        v, q_probe, q_needle = (_both(getattr(self, key), getattr(other, key)) for key in optional)
+        return Recording(A, B, P, v, (), self.pixels, q_probe, q_needle)
 
 
 def recording_file(path: Path) -> Path:
@@ -117,7 +131,8 @@ def read_recording(path: Path) -> Recording:
     """Read a recording from its CSV, or from ``recording.csv`` in a folder.
 
     Columns: ``name``; ``A_r11 .. A_r33, A_x_mm, A_y_mm, A_z_mm``; the same for B; ``P_u_mm, P_v_mm`` (or ``_px``); and,
-    where directions were measured, ``v_x, v_y`` or ``v_x, v_y, v_z``. Lines that start with # are passed over.
+    where directions were measured, ``v_x, v_y`` or ``v_x, v_y, v_z``; and, where the joints were recorded,
+    ``A_q1_deg .. A_q6_deg, B_q1_deg .. B_q6_deg``. Lines that start with # are passed over.
 
     Raises:
         InputError: Another header, a field that is no finite number, or a matrix that is no rigid motion.
@@ -138,19 +153,22 @@ def parse_recording(content: bytes, file: Path) -> Recording:
     except csv.Error as error:
         raise InputError(f"is no CSV ({error})", where=file, allowed="one line per pose, fields of numbers") from error
     header = tuple(cell.strip() for cell in rows[0]) if rows else ()
-    kinds = {_columns(pixels, width): (pixels, width) for pixels in (False, True) for width in (0, 2, 3)}
+    choices = product((False, True), (0, 2, 3), (False, True))
+    kinds = {_columns(*choice): choice for choice in choices}
     if header not in kinds:
         raise InputError(
-            f"columns {', '.join(header)[:200]}", where=f"{file}, header", allowed=", ".join(_columns(False, 3))
+            f"columns {', '.join(header)[:200]}", where=f"{file}, header", allowed=", ".join(_columns(False, 3, True))
         )
-    pixels, width = kinds[header]
+    pixels, width, joints = kinds[header]
     values = np.array([_numbers(row, header, f"{file}, row {i}") for i, row in enumerate(rows[1:], start=2)])
     if values.size == 0:
         raise InputError("no pose", where=file, allowed="one row per pose")
     names = tuple(row[0].strip() for row in rows[1:])
     try:
-        v = values[:, 26:] if width else None
-        return Recording(_matrices(values[:, :12]), _matrices(values[:, 12:24]), values[:, 24:26], v, names, pixels)
+        v = values[:, 26 : 26 + width] if width else None
+        q_probe, q_needle = np.radians(np.split(values[:, -12:], 2, axis=1)) if joints else (None, None)
+        A, B = _matrices(values[:, :12]), _matrices(values[:, 12:24])
+        return Recording(A, B, values[:, 24:26], v, names, pixels, q_probe, q_needle)
     except InputError as error:
         raise InputError(error.what, where=f"{file}: {error.where}", allowed=error.allowed) from error
 
@@ -162,20 +180,28 @@ def write_recording(recording: Recording, path: Path) -> None:
         InputError: The file cannot be written.
     """
     width = 0 if recording.v is None else recording.v.shape[1]
+    joints = [np.degrees(q) for q in (recording.q_probe, recording.q_needle) if q is not None]
     parts = [_row_major(recording.A), _row_major(recording.B), recording.P]
-    values = np.column_stack([*parts, recording.v] if recording.v is not None else parts)
+    values = np.column_stack([*parts, *([] if recording.v is None else [recording.v]), *joints])
     with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(_columns(recording.pixels, width))
+        writer.writerow(_columns(recording.pixels, width, bool(joints)))
         writer.writerows([name, *map(repr, row)] for name, row in zip(recording.names, values.tolist(), strict=True))
 
 
-def _columns(pixels: bool, width: int) -> tuple[str, ...]:
+def _columns(pixels: bool, width: int, joints: bool) -> tuple[str, ...]:
     unit = "px" if pixels else "mm"
     poses = [
         [f"{arm}_r{i}{j}" for i in "123" for j in "123"] + [f"{arm}_{axis}_mm" for axis in "xyz"] for arm in ("A", "B")
     ]
-    return ("name", *poses[0], *poses[1], f"P_u_{unit}", f"P_v_{unit}", *("v_x", "v_y", "v_z")[:width])
+    joint_names = [f"{arm}_q{i}_deg" for arm in "AB" for i in "123456"] if joints else []
+    seen = (f"P_u_{unit}", f"P_v_{unit}", *("v_x", "v_y", "v_z")[:width])
+    return ("name", *poses[0], *poses[1], *seen, *joint_names)
+
+
+def _both(first: Floats | None, second: Floats | None) -> Floats | None:
+    """One after the other, where both are there."""
+    return None if first is None or second is None else np.concatenate([first, second])
 
 
 def _numbers(row: list[str], header: tuple[str, ...], where: str) -> list[float]:

@@ -10,13 +10,8 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import N_PARAMETERS, Estimate, parameter_units
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
-    Problem,
-    linearise,
-    problem_covariances,
-    residuals,
-    whitener,
-)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import Problem, linearise, residuals
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import Whitening
 
 MAX_STEPS = 50
 """A good start needs five; what has not settled after fifty does not."""
@@ -43,14 +38,14 @@ def refine(problem: Problem, start: Estimate, weights: Floats, *, max_steps: int
     """
 
     def linearised(estimate: Estimate) -> System[Estimate]:
-        W = whitener(problem_covariances(problem, estimate), weights)
+        whitening = Whitening.of(problem, estimate, weights)
         r, J = linearise(problem, estimate)
         units = parameter_units(problem.active, estimate.scale)
 
         def cost(near: Estimate) -> float:
-            return float(np.sum((W @ residuals(problem, near)[:, :, None]) ** 2))
+            return float(np.sum(whitening.residuals(residuals(problem, near)) ** 2))
 
-        return System((W @ r[:, :, None]).ravel(), (W @ J).reshape(-1, J.shape[2]) * units, cost)
+        return System(whitening.residuals(r), whitening.slopes(J) * units, cost)
 
     def moved(estimate: Estimate, step: Floats) -> Estimate:
         return estimate.moved(_full(problem.active, parameter_units(problem.active, estimate.scale) * step))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.geometry.rigid import skew
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import ArmErrors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
     DIRECTION,
     N_PARAMETERS,
@@ -33,9 +34,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 
 Weights = Floats | Bools
-
-LEAST_WEIGHT = 1e-12
-"""A pose that is set aside keeps this weight: its residual's standard deviation is a million times as large."""
 
 
 class Spread(NamedTuple):
@@ -62,6 +60,8 @@ class Problem(NamedTuple):
     """Which of the 19 parameters are free."""
     lean_rad: float = 0.0
     """How far needles lean out of the slice and still show: all that a direction seen in the image says across it."""
+    arms: ArmErrors | None = None
+    """Errors of both arms, where they are declared."""
 
     @property
     def with_direction(self) -> bool:
@@ -92,7 +92,21 @@ def linearise(problem: Problem, estimate: Estimate) -> Linearised:
 def problem_covariances(problem: Problem, estimate: Estimate) -> Floats:
     """The expected covariance of each pose's residuals, shape (n, k, k)."""
     v_image = directions_image(problem.recording, estimate) if problem.with_direction else None
-    return covariances(estimate, problem.recording, problem.noise, v_image, problem.lean_rad)
+    sigma = covariances(estimate, problem.recording, problem.noise, v_image, problem.lean_rad)
+    if problem.arms is not None:
+        slopes = flange_slopes(estimate, problem.recording, v_image)
+        for by_flange, cov in zip(slopes, (problem.arms.probe_arrival, problem.arms.needle_arrival), strict=True):
+            sigma = sigma + by_flange @ cov @ by_flange.transpose(0, 2, 1)
+    return sigma
+
+
+def shared_slopes(problem: Problem, estimate: Estimate) -> Floats | None:
+    """The residuals' derivative by the arms' lasting errors, each in its standard deviation, shape (n, k, 46)."""
+    if problem.arms is None:
+        return None
+    v_image = directions_image(problem.recording, estimate) if problem.with_direction else None
+    by_probe, by_needle = flange_slopes(estimate, problem.recording, v_image)
+    return np.concatenate([by_probe @ problem.arms.probe, by_needle @ problem.arms.needle], axis=2)
 
 
 def residual_weights(problem: Problem, tip_weights: Weights, direction_weights: Weights) -> Floats:
@@ -229,6 +243,33 @@ def covariances(
     return sigma
 
 
+def flange_slopes(estimate: Estimate, recording: Recording, v_image: Floats | None) -> tuple[Floats, Floats]:
+    """The residuals' derivatives by a small motion of the probe's and of the needle's flange, each (n, k, 6).
+
+    A motion is a shift and a turn about the flange's origin, along the axes of the arm's own base:
+    dF = -(dt_A - [R_A p1]x dw_A) + R_Y (dt_B - [R_B t_Q]x dw_B), p1 = R_X S p + t_X, and of the direction
+    dm = (R_A R_X)^T [R_Y R_B V]x dw_A - (R_A R_X)^T R_Y [R_B V]x dw_B.
+
+    Args:
+        estimate: Where to linearise.
+        recording: The poses.
+        v_image: The measured directions, unit, shape (n, 3), where they are used.
+    """
+    n, size = len(recording), 3 if v_image is None else 5
+    R_A, R_B = recording.A[:, :3, :3], recording.B[:, :3, :3]
+    in_end1, _ = tip_points(estimate, recording)
+    probe, needle = np.zeros((2, n, size, 6))
+    probe[:, :3, :3], needle[:, :3, :3] = -np.eye(3), estimate.R_Y
+    probe[:, :3, 3:] = skew((R_A @ in_end1[:, :, None])[:, :, 0])
+    needle[:, :3, 3:] = -estimate.R_Y @ skew(R_B @ estimate.t_Q)
+    if v_image is not None:
+        rows = across(v_image) @ (R_A @ estimate.R_X).transpose(0, 2, 1)
+        along = R_B @ estimate.V
+        probe[:, 3:, 3:] = rows @ skew(along @ estimate.R_Y.T)
+        needle[:, 3:, 3:] = -rows @ estimate.R_Y @ skew(along)
+    return probe, needle
+
+
 def _propagated(estimate: Estimate, recording: Recording, noise: Noise, v_image: Floats | None) -> Floats:
     """Both flanges' and the tip's noise in the residuals; every source is independent and isotropic."""
     R_A, R_B = recording.A[:, :3, :3], recording.B[:, :3, :3]
@@ -243,41 +284,7 @@ def _propagated(estimate: Estimate, recording: Recording, noise: Noise, v_image:
     in_image = (R_A @ estimate.R_X)[:, :, :2]
     sigma[:, :3, :3] += noise.image_mm**2 * in_image @ in_image.transpose(0, 2, 1)
     sigma[:, :3, :3] += 2 * noise.robot_mm**2 * np.eye(3)
+    if noise.off_plane_mm:
+        normal = (R_A @ estimate.R_X)[:, :, 2]
+        sigma[:, :3, :3] += noise.off_plane_mm**2 * normal[:, :, None] * normal[:, None, :]
     return np.asarray(sigma)
-
-
-def whitener(sigma: Floats, weights: Floats) -> Floats:
-    """W with W^T W the inverse covariance, each pose's times its weight; shape (n, k, k).
-
-    Args:
-        sigma: Shape (n, k, k).
-        weights: Shape (n, k): one per residual; 0 sets it aside.
-    """
-    spread = 1.0 / np.sqrt(np.maximum(weights, LEAST_WEIGHT))
-    scaled = sigma * spread[:, :, None] * spread[:, None, :]
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(scaled)))
-
-
-class Fitted(NamedTuple):
-    """A problem linearised at its fit."""
-
-    residuals: Floats
-    """Shape (n, k)."""
-    jacobian: Floats
-    """Shape (n, k, p)."""
-    sigma: Floats
-    """Expected covariance of each pose's residuals, shape (n, k, k)."""
-    white: Floats
-    """The residuals of the poses that were used, over their spread, shape (n, k)."""
-    covariance: Floats
-    """Of the free parameters, shape (p, p): the inverse of J^T W J over the poses that were used."""
-
-
-def fitted(problem: Problem, estimate: Estimate, tip_kept: Bools, direction_kept: Bools) -> Fitted:
-    """Linearise a problem at its fit; the tips and directions that were used are kept, each shape (n,)."""
-    r, J = linearise(problem, estimate)
-    sigma = problem_covariances(problem, estimate)
-    W = whitener(sigma, residual_weights(problem, tip_kept, direction_kept))
-    slopes = (W @ J).reshape(-1, J.shape[2])
-    C = np.linalg.pinv(slopes.T @ slopes, hermitian=True)
-    return Fitted(r, J, sigma, (W @ r[:, :, None])[:, :, 0], np.asarray(C, dtype=np.float64))

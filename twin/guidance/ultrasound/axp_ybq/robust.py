@@ -21,12 +21,13 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
     Problem,
     Spread,
     directions_image,
-    fitted,
     linearise,
     needle_in_image,
     problem_covariances,
     residual_weights,
+    shared_slopes,
 )
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import fitted
 
 FALSE_ALARMS = 0.01
 """Chance that a recording without outliers loses a pose."""
@@ -152,7 +153,8 @@ def _judge(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[Bo
         fit: The fit.
         alarm: Only ask whether a closer look is due, after a fit of all poses, whose outliers widen the spread.
     """
-    r, J, sigma, _, C = fitted(problem, fit.estimate, fit.tip_kept, fit.direction_kept)
+    at_fit = fitted(problem, fit.estimate, fit.tip_kept, fit.direction_kept)
+    r, J, sigma, C = at_fit.residuals, at_fit.jacobian, at_fit.sigma, at_fit.covariance
     pulled = J @ C @ J.transpose(0, 2, 1)
     kept = []
     for block, used in zip(_blocks(problem), (fit.tip_kept, fit.direction_kept), strict=False):
@@ -191,7 +193,7 @@ def _reweighted(problem: Problem, fit: RobustFit) -> RobustFit:
     estimate, weights = fit.estimate, [np.ones(len(problem.recording))] * 2
     for step in range(HUBER_STEPS + TUKEY_STEPS):
         r = linearise(problem, estimate).residuals
-        sigma = problem_covariances(problem, estimate)
+        sigma = _spread_of_one(problem, estimate)
         for k, block in enumerate(_blocks(problem)):
             squared = _squared(r[:, block.rows], sigma[:, block.rows, block.rows])
             size = np.sqrt(squared / _scale(squared, block))
@@ -200,6 +202,12 @@ def _reweighted(problem: Problem, fit: RobustFit) -> RobustFit:
         estimate = refine(problem, estimate, residual_weights(problem, *weights), max_steps=1).estimate
     steps = fit.iterations + HUBER_STEPS + TUKEY_STEPS
     return RobustFit(estimate, weights[0] > STILL_USED, weights[1] > STILL_USED, steps)
+
+
+def _spread_of_one(problem: Problem, estimate: Estimate) -> Floats:
+    """Covariance of each pose's residuals, whatever the arms' lasting errors are, shape (n, k, k)."""
+    sigma, shared = problem_covariances(problem, estimate), shared_slopes(problem, estimate)
+    return sigma if shared is None else np.asarray(sigma + shared @ shared.transpose(0, 2, 1))
 
 
 def _check_enough(problem: Problem, kept: Bools) -> None:

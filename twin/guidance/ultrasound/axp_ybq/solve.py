@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import LEAST_POSES, LEAST_POSES_KNOWN_TIP, closed_form
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import SeenDirection, needle_direction
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, Estimate, active_columns
@@ -18,12 +19,12 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
     UNWEIGHTED,
     Problem,
     Spread,
-    fitted,
     needle_in_image,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import RobustFit, plain_fit, robust_fit, settled
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.spread import found_spreads
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.spread import SmallSample, found_spreads, small_sample
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.suggested_poses import SuggestedPoses, propose
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import fitted
 
 SPREAD_ROUNDS = 2
 """How often the residuals' spread is found and the fit repeated with it; it settles to a few percent in two."""
@@ -57,6 +58,10 @@ class Solution(NamedTuple):
     iterations: int
     noise: Noise | Spread
     covariance: Floats
+    """Of the free parameters, then of the arms' lasting errors where they are declared, shape (p + 46, p + 46)."""
+    arm_errors: Floats
+    """Posterior mean of the arms' lasting errors, in standard deviations, shape (46,) or (0,)."""
+    small_sample: SmallSample | None
     residuals: Floats
     noise_ratio: float
     freedom: int
@@ -73,6 +78,7 @@ def solve(
     robust: bool,
     direction: bool,
     start: Estimate | None,
+    arms: DeclaredArms | None = None,
 ) -> Solution:
     """The unknowns of a recording; the arguments are those of ``calibration.calibrate``.
 
@@ -85,7 +91,8 @@ def solve(
     if start is not None and known_tip is not None:
         estimate = estimate._replace(t_Q=np.asarray(known_tip, dtype=np.float64))
     active = active_columns(tip=known_tip is None, scale=scale, direction=False)
-    problem = Problem(recording, noise or UNWEIGHTED, active)
+    errors = None if arms is None else arm_errors(arms, recording)
+    problem = Problem(recording, noise or UNWEIGHTED, active, arms=errors)
     fit = (robust_fit if robust else plain_fit)(problem, estimate)
     seen = needle_direction(fit.estimate, recording, fit.tip_kept)
     fit = fit._replace(estimate=fit.estimate._replace(V=seen.V), direction_kept=seen.agrees)
@@ -131,6 +138,7 @@ def _solution(problem: Problem, fit: RobustFit, observability: Observability) ->
     at_fit = fitted(problem, fit.estimate, fit.tip_kept, fit.direction_kept)
     count = 3 * int(fit.tip_kept.sum()) + 2 * int(fit.direction_kept.sum()) * problem.with_direction
     freedom = count - len(problem.active)
+    region = small_sample(problem, fit) if problem.arms is not None else None
     return Solution(
         fit.estimate,
         problem.active,
@@ -138,8 +146,10 @@ def _solution(problem: Problem, fit: RobustFit, observability: Observability) ->
         fit.iterations,
         problem.noise,
         at_fit.covariance,
+        at_fit.shared,
+        region,
         at_fit.residuals[:, :3],
-        float(np.sqrt(np.sum(at_fit.white**2) / max(freedom, 1))),
+        float(np.sqrt(at_fit.chi_squared / max(freedom, 1))),
         freedom,
         observability,
         needle_in_image(fit.estimate, problem.recording),

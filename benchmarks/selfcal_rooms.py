@@ -1,0 +1,260 @@
+"""Two arms in many hidden rooms: does the 95 % region hold the truth, and how far is the tip from where it should be?
+
+Each room is drawn anew: arms that are not their nominal models, mounts and a needle off the drawing. The chosen poses
+are recorded, by tips read with a stated noise or from rendered pictures, and calibrated; then 60 other poses are
+predicted and compared with the truth.
+
+.venv/bin/python -m benchmarks.selfcal_rooms              # 150 rooms a row, 20 of rendered pictures: some minutes
+.venv/bin/python -m benchmarks.selfcal_rooms --rooms 30   # a look
+.venv/bin/python -m benchmarks.selfcal_rooms --only play  # rows whose name contains a word
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.twin.guidance.ultrasound.acquisition import acquire, choose
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
+from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, find_candidates
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth, draw_workcell, jog_into_slice
+from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
+
+CASE = Path(__file__).resolve().parents[1] / "meshes" / "selfcal"
+IMAGE_MM, DIRECTION_RAD = 0.1, float(np.radians(0.3))
+"""Noise of tips that are read without a picture."""
+RENDERED_MM, RENDERED_RAD = 0.06, float(np.radians(0.12))
+"""What is told of tips that are detected in pictures."""
+HELD_OUT = 60
+SEED = 100
+OUTLIER_MM = 5.0
+
+
+class Kind(NamedTuple):
+    """One row of the table: how rooms are drawn, and what the calibration is told."""
+
+    arms: float = 1.0
+    """The declared errors of the arms over the true ones; 0: none are declared."""
+    told: bool = True
+    """Whether the noise is told."""
+    rendered: bool = False
+    """Whether tips are detected in pictures."""
+    play_deg: float = 0.0
+    """Of every joint, in truth and declared."""
+    uniform: bool = False
+    """Whether all errors are uniform instead of normal, of the same deviation."""
+    outliers: int = 0
+    """Tips that are 5 mm off."""
+
+
+class Outcome(NamedTuple):
+    """One room."""
+
+    inside: bool
+    """Whether the 95 % region of all parameters holds the truth."""
+    mahalanobis: float
+    """e^T C^-1 e / p."""
+    errors_mm: Floats
+    """Of the held-out tips, shape (60,)."""
+    predicted_mm: Floats
+    """Expected (rms) of each."""
+    held: float
+    """Share of the held-out tips within their 95 % ellipsoid."""
+    chi2_per_freedom: float
+    lost: int
+    """Poses that were set aside."""
+
+
+ROWS = {
+    "noise told, arms not declared": Kind(arms=0.0),
+    "noise told, arms declared": Kind(),
+    "noise told, arms declared half": Kind(arms=0.5),
+    "noise told, arms declared twice": Kind(arms=2.0),
+    "noise found, arms not declared": Kind(arms=0.0, told=False),
+    "noise found, arms declared": Kind(told=False),
+    "uniform errors, noise told": Kind(uniform=True),
+    "uniform errors, noise found": Kind(uniform=True, told=False),
+    "play .02 deg, noise told": Kind(play_deg=0.02),
+    "play .02 deg, noise found": Kind(play_deg=0.02, told=False),
+    "3 tips 5 mm off, noise told": Kind(outliers=3),
+    "3 tips 5 mm off, noise found": Kind(outliers=3, told=False),
+    "rendered, arms not declared, noise told": Kind(arms=0.0, rendered=True),
+    "rendered, arms declared, noise told": Kind(rendered=True),
+    "rendered, arms declared, noise found": Kind(rendered=True, told=False),
+    "rendered, play .02 deg, noise found": Kind(rendered=True, told=False, play_deg=0.02),
+}
+
+
+class UniformErrors(np.random.Generator):
+    """Draws uniform errors where normal ones are asked for, of the same standard deviation."""
+
+    def normal(self, loc=0.0, scale=1.0, size=None):  # type: ignore[no-untyped-def, override] # as numpy has it
+        """Uniform about ``loc``."""
+        return loc + np.sqrt(3.0) * np.asarray(scale) * self.uniform(-1.0, 1.0, size)
+
+
+@cache
+def room_of(play_deg: float) -> tuple[SelfcalCase, TwoArms, CandidatePoses, Floats]:
+    """The shipped case with a play, its checker, its candidates, and the rows that are recorded."""
+    case = load_selfcal_case(CASE)
+    content = case.content.model_copy(deep=True)
+    arms = {}
+    for name in ("probe_arm", "needle_arm"):
+        arm = getattr(content, name)
+        arms[name] = arm.model_copy(update={"errors": arm.errors.model_copy(update={"backlash_deg": play_deg})})
+    case = SelfcalCase(case.path, content.model_copy(update=arms), case.inputs)
+    room = TwoArms(case)
+    candidates = find_candidates(case, room, np.random.default_rng(case.content.seed))
+    left = np.arange(len(candidates.q_probe))
+    chosen = choose(case, candidates, left, case.content.poses.count, np.random.default_rng(0), [])
+    return case, room, candidates, chosen
+
+
+def outcome(kind: Kind, seed: int) -> Outcome:
+    """Draw a room, record, calibrate, compare."""
+    case, room, candidates, chosen = room_of(kind.play_deg)
+    bits = np.random.PCG64(np.random.SeedSequence([SEED, seed]))
+    rng = UniformErrors(bits) if kind.uniform else np.random.Generator(bits)
+    truth = draw_workcell(case, rng)
+    if kind.rendered:
+        taken = acquire(case, room, candidates, truth, rng)
+        recording, others = taken.recording, taken.left
+    else:
+        recording, _ = recorded(case, candidates, truth, chosen, rng, noise=True)
+        others = np.setdiff1d(np.arange(len(candidates.q_probe)), chosen)
+    recording = with_outliers(recording, kind.outliers, rng)
+    off = case.content.truth.off_plane_mm
+    sizes = (RENDERED_MM, RENDERED_RAD) if kind.rendered else (IMAGE_MM, DIRECTION_RAD)
+    arms = case.declared_arms.scaled(kind.arms) if kind.arms else None
+    noise = Noise(0.0, 0.0, *sizes, off_plane_mm=off) if kind.told else None
+    found = calibrate(recording, noise=noise, arms=arms)
+    held_out = rng.permutation(others)[:HELD_OUT]
+    standing, seen = recorded(case, candidates, truth, held_out, rng, noise=False)
+    return compared(found, truth, standing, seen)
+
+
+def recorded(
+    case: SelfcalCase,
+    candidates: CandidatePoses,
+    truth: WorkcellTruth,
+    rows: Floats,
+    rng: np.random.Generator,
+    *,
+    noise: bool,
+) -> tuple[Recording, Floats]:
+    """Poses as the controllers print them with the tips as they are read, and the true tips, (n, 3), image.
+
+    With noise the needle is jogged into the slice first, as for a picture; without, it stands as the candidate has it.
+    """
+    q_probe, q_needle = candidates.q_probe[rows], np.array(candidates.q_needle[rows])
+    rest = [q_probe[0], q_needle[0]]
+    seen = []
+    for i, row in enumerate(rows):
+        rest[0] = truth.probe_arm.settle(q_probe[i], rest[0], rng)
+        if noise:
+            lean = rng.normal(0.0, np.radians(case.content.truth.lean_deg))
+            v = candidates.poses.v[row]
+            tip = np.array([*candidates.poses.P[row], rng.normal(0.0, case.content.truth.off_plane_mm)])
+            wanted = NeedleInImage(tip, np.array([*(np.cos(lean) * v), np.sin(lean)]))
+            jogged = jog_into_slice(truth, rest[0], q_needle[i], wanted, float(candidates.roll[row]))
+            q_needle[i] = np.where(np.isnan(jogged), q_needle[i], jogged)
+        rest[1] = truth.needle_arm.settle(q_needle[i], rest[1], rng)
+        seen.append(truth.needle_in_image(*rest))
+    tips = np.array([one.tip_image for one in seen])
+    ways = np.array([one.direction_image for one in seen])
+    P, angle = np.array(tips[:, :2]), np.arctan2(ways[:, 1], ways[:, 0])
+    if noise:
+        P += rng.normal(0.0, IMAGE_MM, P.shape)
+        angle = angle + rng.normal(0.0, DIRECTION_RAD, len(P))
+    A, B = flange_pose(truth.probe_arm.nominal, q_probe), flange_pose(truth.needle_arm.nominal, q_needle)
+    v = np.column_stack([np.cos(angle), np.sin(angle)])
+    return Recording(A, B, P, v, q_probe=q_probe, q_needle=q_needle), tips
+
+
+def with_outliers(recording: Recording, count: int, rng: np.random.Generator) -> Recording:
+    """The recording with some tips far off."""
+    if not count:
+        return recording
+    P, rows = np.array(recording.P), rng.choice(len(recording), count, replace=False)
+    angle = rng.uniform(0.0, 2.0 * np.pi, count)
+    P[rows] += OUTLIER_MM * np.column_stack([np.cos(angle), np.sin(angle)])
+    r = recording
+    return Recording(r.A, r.B, P, r.v, r.names, r.pixels, r.q_probe, r.q_needle)
+
+
+def compared(found: Calibration, truth: WorkcellTruth, standing: Recording, tips: Floats) -> Outcome:
+    """A calibration against the truth, and its predictions at held-out poses."""
+    X, Y = truth.X, truth.Y
+    e = found.parameter_error(Estimate(X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3], truth.tip_end2, np.ones(2), truth.V))
+    squared = float(e @ np.linalg.solve(found.covariance_counts, e))
+    A, B = found.corrected(standing)
+    T_base1_image = A @ found.X
+    in_base1 = (found.Y @ B @ np.append(found.tip_end2, 1.0))[:, :3]
+    seen_base1 = (T_base1_image @ np.column_stack([tips, np.ones(len(tips))])[:, :, None])[:, :3, 0]
+    errors, C = in_base1 - seen_base1, found.tip_covariances(standing)
+    inside = np.einsum("ni,ni->n", errors, np.linalg.solve(C, errors[:, :, None])[:, :, 0]) <= chi2.ppf(0.95, 3)
+    return Outcome(
+        squared <= found.region_limit(),
+        squared / len(e),
+        np.linalg.norm(errors, axis=1),
+        np.sqrt(np.trace(C, axis1=1, axis2=2)),
+        float(inside.mean()),
+        found.chi_squared_ratio,
+        len(found.outliers),
+    )
+
+
+def row_text(name: str, outcomes: list[Outcome]) -> str:
+    """One line of the table."""
+    rms = [
+        float(np.sqrt(np.mean(np.concatenate([getattr(o, key) for o in outcomes]) ** 2)))
+        for key in Outcome._fields[2:4]
+    ]
+    means = [float(np.mean([getattr(o, key) for o in outcomes])) for key in ("inside", "mahalanobis", "held")]
+    last = [float(np.mean([getattr(o, key) for o in outcomes])) for key in ("chi2_per_freedom", "lost")]
+    return (
+        f"{name:42s} {len(outcomes):5d} {means[0]:7.3f} {means[1]:8.2f} {rms[0]:7.3f} {rms[1]:7.3f} {means[2]:8.3f} "
+        f"{last[0]:8.2f} {last[1]:6.2f}"
+    )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rooms", type=int, default=150)
+    parser.add_argument("--rendered", type=int, default=20, help="Rooms of rendered pictures.")
+    parser.add_argument("--only", default="", help="Rows whose name contains this.")
+    arguments = parser.parse_args()
+    head = (
+        ("rooms", 5),
+        ("region", 7),
+        ("eCe/p", 8),
+        ("real", 7),
+        ("told", 7),
+        ("within", 8),
+        ("chi2/f", 8),
+        ("lost", 6),
+    )
+    print(" " * 41, *(name.rjust(width) for name, width in head))
+    for name, kind in ROWS.items():
+        if arguments.only in name:
+            rooms = arguments.rendered if kind.rendered else arguments.rooms
+            start = time.perf_counter()
+            text = row_text(name, [outcome(kind, seed) for seed in range(rooms)])
+            print(text, f"{(time.perf_counter() - start) / rooms:6.2f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,253 @@
+"""Errors of both arms that repeat from pose to pose: in the covariance, in the prediction, and in the aim."""
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from benchmarks.selfcal_rooms import Kind, outcome, recorded, room_of
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.rigid import log_rotation
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import arm_errors, corrected
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import (
+    Noise,
+    Recording,
+    read_recording,
+    write_recording,
+)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
+    Problem,
+    Spread,
+    direction_residuals,
+    directions_image,
+    flange_slopes,
+    linearise,
+    problem_covariances,
+    shared_slopes,
+    tip_residuals,
+)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import plain_fit
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.spread import found_spreads
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import Whitening, fitted
+from puncture_twin.twin.guidance.ultrasound.candidate_poses import drawing
+from puncture_twin.twin.guidance.ultrasound.puncture import aim
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
+
+ROOMS = 30
+ALL = active_columns(tip=True, scale=False, direction=True)
+NOISE = Noise(0.0, 0.0, 0.1, float(np.radians(0.3)), off_plane_mm=0.15)
+
+
+@pytest.fixture(scope="module")
+def room():
+    """The embedded case, a true room, and its recording of thirty poses."""
+    case, _, candidates, chosen = room_of(0.0)
+    rng = np.random.default_rng(5)
+    truth = draw_workcell(case, rng)
+    recording, _ = recorded(case, candidates, truth, chosen, rng, noise=True)
+    return case, candidates, truth, recording
+
+
+def with_flanges(recording, A, B):
+    """The recording with other flanges."""
+    r = recording
+    return Recording(A, B, r.P, r.v, r.names, r.pixels, r.q_probe, r.q_needle)
+
+
+def test_the_flanges_slopes_are_the_finite_differences(room):
+    """Every column, tip and direction, of both arms, agrees with central differences."""
+    case, _, _, recording = room
+    estimate, v = drawing(case), directions_image(recording, drawing(case))
+
+    def both(A, B):
+        moved = with_flanges(recording, A, B)
+        return np.hstack([tip_residuals(estimate, moved), direction_residuals(estimate, moved, v)])
+
+    slopes = flange_slopes(estimate, recording, v)
+    for which in (0, 1):
+        for column in range(6):
+            step = np.zeros(6)
+            step[column] = 1e-4
+            ends = []
+            for sign in (1, -1):
+                flanges = [recording.A, recording.B]
+                flanges[which] = corrected(flanges[which], sign * step)
+                ends.append(both(*flanges))
+            np.testing.assert_allclose(slopes[which][:, :, column], (ends[0] - ends[1]) / 2e-4, atol=1e-5)
+
+
+def test_the_declared_errors_move_the_true_arms_flanges(room):
+    """An arm of the twin, drawn from the declaration, has its flange where its errors, to first order, carry it."""
+    case, _, truth, recording = room
+    errors = arm_errors(case.declared_arms, recording)
+    arm, sigma = truth.probe_arm, case.declared_arms.probe.deviations()
+    offsets = (arm.a - arm.nominal.a, (arm.d - arm.nominal.d)[[0, 2, 3, 4, 5]], arm.alpha - arm.nominal.alpha)
+    eta = np.concatenate([*offsets, arm.joint_offsets]) / sigma
+    moved, true = corrected(recording.A, errors.probe @ eta), arm.flange_pose(recording.q_probe)
+    np.testing.assert_allclose(moved[:, :3, 3], true[:, :3, 3], atol=2e-3)
+    turned = log_rotation(moved[:, :3, :3].transpose(0, 2, 1) @ true[:, :3, :3])
+    assert np.abs(turned).max() < 2e-6
+    assert np.linalg.norm(recording.A[:, :3, 3] - true[:, :3, 3], axis=1).min() > 0.02
+
+
+def test_whitening_is_the_inverse_root_of_the_whole_covariance(room):
+    """C^-1 of all residuals, written out dense: Omega and N N^T together."""
+    case, _, _, recording = room
+    problem = Problem(recording, NOISE, ALL, np.radians(0.5), arm_errors(case.declared_arms, recording))
+    estimate = drawing(case)
+    r, J = linearise(problem, estimate)
+    n, k = r.shape
+    C = np.zeros((n * k, n * k))
+    for i, block in enumerate(problem_covariances(problem, estimate)):
+        C[i * k : (i + 1) * k, i * k : (i + 1) * k] = block
+    N = shared_slopes(problem, estimate).reshape(n * k, -1)
+    C += N @ N.T
+    whitening = Whitening.of(problem, estimate, np.ones((n, k)))
+    white, slopes = whitening.residuals(r), whitening.slopes(J)
+    flat = J.reshape(n * k, -1)
+    assert white @ white == pytest.approx(r.ravel() @ np.linalg.solve(C, r.ravel()), rel=1e-7)
+    information = flat.T @ np.linalg.solve(C, flat)
+    scale = np.sqrt(np.diag(information))
+    np.testing.assert_allclose(
+        slopes.T @ slopes / np.outer(scale, scale), information / np.outer(scale, scale), atol=1e-9
+    )
+
+
+def test_the_marginal_covariance_is_that_of_the_joint_estimate(room):
+    """(J^T C^-1 J)^-1 is the parameters' part of the inverse joint information, and eta's mean is -N^T C^-1 r."""
+    case, _, _, recording = room
+    problem = Problem(recording, NOISE, ALL, np.radians(0.5), arm_errors(case.declared_arms, recording))
+    fit = plain_fit(problem, drawing(case))
+    at_fit = fitted(problem, fit.estimate, fit.tip_kept, fit.direction_kept)
+    whitening = Whitening.of(problem, fit.estimate, np.ones((len(recording), 5)))
+    r, J = linearise(problem, fit.estimate)
+    slopes, white = whitening.slopes(J), whitening.residuals(r)
+    C = np.linalg.inv(slopes.T @ slopes)
+    scale = np.sqrt(np.diag(C))
+    p = len(ALL)
+    np.testing.assert_allclose(
+        at_fit.covariance[:p, :p] / np.outer(scale, scale), C / np.outer(scale, scale), atol=1e-6
+    )
+    N = whitening.slopes(shared_slopes(problem, fit.estimate))
+    np.testing.assert_allclose(at_fit.shared, -N.T @ white, atol=1e-5)
+    assert at_fit.chi_squared == pytest.approx(white @ white, rel=1e-6)
+
+
+def test_found_parts_solve_the_likelihood_equation(room):
+    """After the last step r^T P D P r = tr(P D) holds for the parts inside and across the image, written out dense."""
+    case, _, _, recording = room
+    problem = Problem(recording, Spread(1.0, 1.0, 1.0), active_columns(tip=True, scale=False, direction=False))
+    problem = problem._replace(arms=arm_errors(case.declared_arms, recording))
+    fit = plain_fit(problem, drawing(case))
+    for _ in range(6):
+        problem = problem._replace(noise=found_spreads(problem, fit).spread)
+        fit = plain_fit(problem, fit.estimate)
+    r, J = linearise(problem, fit.estimate)
+    size = r.size
+    C, parts = np.zeros((size, size)), [np.zeros((size, size)), np.zeros((size, size))]
+    image = recording.A[:, :3, :3] @ fit.estimate.R_X
+    for i, block in enumerate(problem_covariances(problem, fit.estimate)):
+        rows = slice(3 * i, 3 * i + 3)
+        C[rows, rows] = block
+        parts[0][rows, rows] = image[i][:, :2] @ image[i][:, :2].T
+        parts[1][rows, rows] = np.outer(image[i][:, 2], image[i][:, 2])
+    N, J = shared_slopes(problem, fit.estimate).reshape(size, -1), J.reshape(size, -1)
+    V = np.linalg.inv(C + N @ N.T)
+    P = V - V @ J @ np.linalg.solve(J.T @ V @ J, J.T @ V)
+    for D in parts:
+        assert r.ravel() @ P @ D @ P @ r.ravel() == pytest.approx(np.trace(P @ D), rel=0.03)
+
+
+@pytest.fixture(scope="module")
+def thirty():
+    """Thirty rooms, noise told and found, normal and uniform errors."""
+    kinds = {"told": Kind(), "found": Kind(told=False), "uniform": Kind(uniform=True, told=False)}
+    return {name: [outcome(kind, 1000 + seed) for seed in range(ROOMS)] for name, kind in kinds.items()}
+
+
+@pytest.mark.parametrize("name", ["told", "found", "uniform"])
+def test_the_region_holds_the_truth(thirty, name):
+    """The 95 % region of all parameters, in thirty rooms: as often as the binomial distribution allows (99.9 %)."""
+    inside = sum(one.inside for one in thirty[name])
+    assert max(binom.ppf(0.001, ROOMS, 0.95), 0.85 * ROOMS - 1) <= inside <= ROOMS
+    assert np.mean([one.mahalanobis for one in thirty[name]]) == pytest.approx(1.0, abs=0.25)
+
+
+@pytest.mark.parametrize("name", ["told", "found", "uniform"])
+def test_the_prediction_is_the_error_at_held_out_poses(thirty, name):
+    """Real and predicted rms agree, and the 95 % ellipsoids of single tips hold what they say."""
+    real = np.concatenate([one.errors_mm for one in thirty[name]])
+    predicted = np.concatenate([one.predicted_mm for one in thirty[name]])
+    assert np.sqrt(np.mean(real**2)) == pytest.approx(np.sqrt(np.mean(predicted**2)), rel=0.12)
+    assert 0.91 < np.mean([one.held for one in thirty[name]]) < 0.98
+
+
+def test_the_arms_errors_take_a_third_off_the_held_out_error(thirty):
+    """Beside the same rooms calibrated as if all errors were noise; whose region holds the truth in hardly any."""
+    noise_alone = [outcome(Kind(arms=0.0), 1000 + seed) for seed in range(ROOMS)]
+    rms = [
+        np.sqrt(np.mean(np.concatenate([one.errors_mm for one in rooms]) ** 2))
+        for rooms in (noise_alone, thirty["told"])
+    ]
+    assert rms[1] < 0.72 * rms[0]
+    assert sum(one.inside for one in noise_alone) <= 4
+
+
+def test_arms_declared_too_small_show_in_chi_squared():
+    """Declared at a quarter, chi-squared over its freedom is above the limit of the warning on average."""
+    small = [outcome(Kind(arms=0.25), 1000 + seed).chi2_per_freedom for seed in range(12)]
+    assert np.mean(small) > 1.15
+
+
+def test_wrong_tips_are_set_aside_with_declared_arms():
+    """Three tips 5 mm off are found, others hardly ever, and the regions hold."""
+    rooms = [outcome(Kind(outliers=3, told=False), 1000 + seed) for seed in range(10)]
+    assert all(one.lost >= 3 for one in rooms)
+    assert np.mean([one.lost for one in rooms]) < 3.5
+    assert sum(one.inside for one in rooms) >= 8
+
+
+def test_the_aim_counts_the_needle_arms_errors(room):
+    """Sent to 60 places in the image, the tip is nearer to them than without the errors that were found."""
+    case, candidates, truth, recording = room
+    found = calibrate(recording, noise=NOISE, arms=case.declared_arms)
+    others = np.setdiff1d(np.arange(len(candidates.q_probe)), room_of(0.0)[3])[:60]
+    missed = {}
+    for name, calibration in (("counted", found), ("left", calibrate(recording, noise=NOISE))):
+        gaps = []
+        for row in others:
+            target = candidates.poses.P[row]
+            q = aim(candidates, int(row), target, calibration, truth)
+            ended = truth.needle_in_image(candidates.q_probe[row], q).tip_image
+            gaps.append(np.linalg.norm(ended - np.append(target, 0.0)))
+        missed[name] = np.sqrt(np.nanmean(np.square(gaps)))
+    assert missed["counted"] < 0.8 * missed["left"]
+
+
+def test_the_needle_length_and_declared_arms_go_together(room):
+    """The tip's part along the shaft leaves the joint covariance, and predictions stay finite."""
+    case, _, truth, recording = room
+    length = float(truth.tip_end2 @ truth.V)
+    found = calibrate(recording, arms=case.declared_arms, needle_length_mm=length, direction=False)
+    V, tip = found.needle_direction_end2, slice(12, 15)
+    assert abs(V @ found.covariance[tip, tip] @ V) < 1e-9
+    assert np.linalg.eigvalsh(found.tip_covariances(recording)).min() > 0
+
+
+def test_joints_are_written_and_read(room, tmp_path):
+    """The CSV keeps the joints to rounding."""
+    recording = room[3]
+    write_recording(recording, tmp_path / "recording.csv")
+    again = read_recording(tmp_path / "recording.csv")
+    np.testing.assert_allclose(again.q_probe, recording.q_probe, atol=1e-14)
+    np.testing.assert_allclose(again.q_needle, recording.q_needle, atol=1e-14)
+
+
+def test_declared_arms_need_joints(room):
+    """Without them, and with the joints of one arm alone, the recording is bad input."""
+    case, _, _, r = room
+    with pytest.raises(InputError, match="need the joints"):
+        calibrate(Recording(r.A, r.B, r.P, r.v), arms=case.declared_arms)
+    with pytest.raises(InputError, match="joints of one arm only"):
+        Recording(r.A, r.B, r.P, r.v, q_probe=r.q_probe)
