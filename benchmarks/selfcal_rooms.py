@@ -235,6 +235,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rooms", type=int, default=150)
     parser.add_argument("--rendered", type=int, default=20, help="Rooms of rendered pictures.")
+    parser.add_argument("--first", type=int, default=0, help="Number of the first room.")
     parser.add_argument("--only", default="", help="Rows whose name contains this.")
     arguments = parser.parse_args()
     head = (
@@ -251,8 +252,8 @@ def main() -> None:
     for name, kind in ROWS.items():
         if arguments.only in name:
             rooms = arguments.rendered if kind.rendered else arguments.rooms
-            start = time.perf_counter()
-            text = row_text(name, [outcome(kind, seed) for seed in range(rooms)])
+            first, start = arguments.first, time.perf_counter()
+            text = row_text(name, [outcome(kind, seed) for seed in range(first, first + rooms)])
             print(text, f"{(time.perf_counter() - start) / rooms:6.2f} s", flush=True)
 
 

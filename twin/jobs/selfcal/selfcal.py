@@ -157,7 +157,7 @@ def declaration_warnings(found: Calibration) -> tuple[str, ...]:
     chance = 100.0 * found.chi_squared_chance()
     return (
         f"chi-squared of the residuals is {ratio:.2f} times their freedom ({found.freedom}): noise or arms are "
-        f"probably declared too small, and the stated errors with them; a right declaration gives this in {chance:.2g} %",
+        f"probably declared too small, and the stated errors with them; a right one gives this in {chance:.2g} %",
     )
 
 
