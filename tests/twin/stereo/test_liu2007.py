@@ -9,14 +9,24 @@ from servo_world import NoContacts
 from benchmarks.servo_variants import pixel_detector, varied
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.twin.guidance.stereo.experiment import run_trial, statistics, trial
+from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, TargetRow, run_trial, statistics, trial
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.stereo.session import run_session
-from puncture_twin.twin.jobs.servo.facts import servo_facts
-from puncture_twin.twin.jobs.servo.liu2007 import TABLE_1, TABLE_2, paper_case, paper_columns, paper_servo_only_at_least
-from puncture_twin.twin.jobs.servo.text import statistics_lines
+from puncture_twin.twin.jobs.servo.facts import reproduction_facts, servo_facts
+from puncture_twin.twin.jobs.servo.liu2007 import (
+    TABLE_1,
+    TABLE_2,
+    Liu2007Tables,
+    ServoSessions,
+    paper_case,
+    paper_columns,
+    paper_servo_only_at_least,
+    straightened,
+)
+from puncture_twin.twin.jobs.servo.text import _gain_lines, statistics_lines
 
 SEED = 5
+DRAW = (-0.05, 0.05, -0.02, 0.02)
 
 
 def test_the_papers_means_are_those_of_its_rows_but_one():
@@ -27,6 +37,42 @@ def test_the_papers_means_are_those_of_its_rows_but_one():
     assert columns["before"].printed_mean == 1.47
     assert len(TABLE_1) == 10
     assert len(TABLE_2) == 16
+
+
+def one_trial(seed, gain, after=1.0, stop="converged"):
+    """A trial of four targets with a given gain."""
+    rows = tuple(
+        TargetRow(seed, name, 1.0, 1.0, after + gain + d, after, 0.1, 1, stop)
+        for name, d in zip("abcd", DRAW, strict=True)
+    )
+    return ServoTrial(seed, (0.1,), (0.1,), 0.5, 1.0, rows, "")
+
+
+def tables(gains, **keys):
+    """The reproduction with made-up sessions."""
+    trials = tuple(one_trial(seed, gain, **keys) for seed, gain in enumerate(gains))
+    sessions = ServoSessions(paper_case(), None, trials, statistics(trials))
+    return Liu2007Tables(sessions, sessions)
+
+
+def test_the_exit_code_stands_for_what_is_printed():
+    """A gain that seeds scatter about is chance; one unconfirmed half, or an error far above the mapping's, fails."""
+    assert tables([0.5, 0.6, 0.4]).holds
+    assert [one.holds for one in tables([0.5, -0.6, 0.3]).conditions] == [False, True, True]
+    assert [one.holds for one in tables([0.5, 0.6, 0.4], after=1.6).conditions] == [True, False, True]
+    assert [one.holds for one in tables([0.5, 0.6, 0.4], stop="no_progress").conditions] == [True, True, False]
+    text = "\n".join(_gain_lines(reproduction_facts(tables([0.5, 0.6, 0.4]))))
+    assert "23 deg more" in text
+    assert "paper 0.48 mm" in text
+
+
+def test_the_straight_room_differs_in_the_calibrations_tilt_alone():
+    """Everything else of the paper's room stays."""
+    case = paper_case()
+    straight = straightened(case)
+    assert case.file.calibration.tilt_deg - case.file.tool.tilt_deg == 23.0
+    assert straight.file.calibration.tilt_deg is None
+    assert straight.file.model_copy(update={"calibration": case.file.calibration}) == case.file
 
 
 def test_what_the_servo_alone_left_in_the_paper_is_bounded_from_below():

@@ -9,12 +9,14 @@ import pytest
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.pose_choice import expected_tre_mm
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording
 from puncture_twin.twin.jobs.papers.axp_ybq import (
+    COMPARED_WITH,
     AxpYbqRow,
     AxpYbqTables,
     reproduce,
     reproduction_summary,
     reproduction_text,
     truth_estimate,
+    widened,
 )
 from puncture_twin.twin.jobs.papers.papers import PAPERS
 
@@ -61,6 +63,22 @@ def test_a_number_beyond_its_limit_does_not_hold():
     text = reproduction_text(bad)
     assert text.count("DOES NOT HOLD") == 1
     assert "NOT every limit holds" in text
+
+
+def test_it_says_with_what_it_is_compared(result):
+    """The patent prints no figure: text and summary name the specification, and say that few runs widen the limits."""
+    text = reproduction_text(result)
+    assert text.startswith("compared with this project's specification")
+    assert "the patent application prints no figure" in text
+    assert "widened by what chance adds" in text
+    assert reproduction_summary(result)["compared_with"] == COMPARED_WITH
+
+
+def test_limits_widen_with_few_runs_alone():
+    """Four runs allow tens of percent more, 200 nothing."""
+    rng = np.random.default_rng(3)
+    assert widened(rng.chisquare(3, 200)) == 1.0
+    assert 1.1 < widened(rng.chisquare(3, 4)) < 2.0
 
 
 def test_the_summary_is_plain(result):

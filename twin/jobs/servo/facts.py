@@ -14,6 +14,7 @@ from puncture_twin.twin.jobs.servo.liu2007 import (
     TABLE_2,
     Liu2007Tables,
     paper_columns,
+    paper_gain_mm,
     paper_servo_only_at_least,
 )
 
@@ -37,8 +38,18 @@ def servo_facts(case: ServoCase, trials: Sequence[ServoTrial], ours: Statistics)
 
 def reproduction_facts(result: Liu2007Tables) -> dict[str, Any]:
     """The paper's tables, and our sessions in a room like the paper's."""
-    ours = servo_facts(result.case, result.trials, result.ours)
-    return {"holds": result.holds, **paper_facts(), **ours}
+    tilted = result.tilted
+    calibration = tilted.case.file.calibration.tilt_deg
+    return {
+        "holds": result.holds,
+        "conditions": [condition._asdict() for condition in result.conditions],
+        "paper_gain_mm": paper_gain_mm(),
+        "gain": tilted.gain._asdict(),
+        "gain_with_the_rod_tilted_alike": result.straight.gain._asdict(),
+        "tilted_more_deg": 0.0 if calibration is None else calibration - tilted.case.file.tool.tilt_deg,
+        **paper_facts(),
+        **servo_facts(tilted.case, tilted.trials, tilted.ours),
+    }
 
 
 def paper_facts() -> dict[str, Any]:

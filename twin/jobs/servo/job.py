@@ -24,7 +24,7 @@ class ServoJob(NamedTuple):
     """What came of a job."""
 
     holds: bool
-    """Whether every servo converged; for the paper, whether its finding holds."""
+    """Whether every servo converged; for the paper, whether every condition that is printed holds."""
     summary: dict[str, Any]
     """Plain values."""
     text: str
@@ -64,9 +64,9 @@ def reproduce_paper(out_dir: Path, seeds: int | None) -> ServoJob:
     """Print the paper's tables beside ours, and write pictures, plot and page."""
     with writing(out_dir, "reproduce", names=NAMES) as draft:
         result = liu2007.reproduce(seeds)
-        draft.inputs = result.case.inputs
+        draft.inputs = result.tilted.case.inputs
         facts = reproduction_facts(result)
-        written = _files(result.case, result.first, facts, draft.folder)
+        written = _files(result.tilted.case, result.tilted.first, facts, draft.folder)
     facts["files"] = [str(path) for path in draft.final(written)]
     return ServoJob(result.holds, facts, reproduction_text(facts))
 
