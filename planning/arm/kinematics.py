@@ -16,7 +16,7 @@ import numpy as np
 
 from puncture_twin.planning.arm import kernels
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, Ints
 
 N_BRANCHES = 8
 """Shoulder left or right, times wrist flipped or not, times elbow up or down, in this order of weight 4, 2, 1."""
@@ -118,6 +118,12 @@ def inverse(model: UrModel, T_base_flange: Floats) -> Floats:
     q = np.empty((len(poses), N_BRANCHES, 6))
     kernels.inverse_all(model.lengths, poses, q)
     return q
+
+
+def branch_of(model: UrModel, q: Floats) -> Ints:
+    """Which of the eight branches of `inverse` configurations (n, 6), rad, belong to, shape (n,)."""
+    turns = np.abs(wrap_to_pi(inverse(model, flange_pose(model, q)) - q[:, None])).max(axis=2)
+    return np.asarray(np.argmin(np.where(np.isnan(turns), np.inf, turns), axis=1))
 
 
 def missing_reach_mm(model: UrModel, T_base_flange: Floats) -> Floats:

@@ -46,6 +46,17 @@ class FitUncertainty:
         at = self.map_at(point_base)
         return np.asarray(self.test.scale**2 * at @ self.noise.independent(self.R_base_ct) @ at.T)
 
+    def parts_at(self, point_base: Floats) -> tuple[Floats, Floats]:
+        """`cov_at`'s part of shift, shape (3, 3) each: of the reading in the CT, and of the touch."""
+        marks = self.map_at(point_base)[:3].reshape(3, -1, 3)
+        read = self.R_base_ct @ self.noise.cov_ct @ self.R_base_ct.T
+        of_ct, of_touch = (
+            self.test.scale**2
+            * np.einsum("anb,nbc,dnc->ad", marks, np.broadcast_to(block, self.noise.cov_base.shape), marks)
+            for block in (read, self.noise.cov_base)
+        )
+        return of_ct, of_touch
+
 
 def fit_uncertainty(
     method: str,

@@ -5,12 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.arm.insertion import flange_poses
+from puncture_twin.planning.arm.kinematics import inverse
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case, Obstacle
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
+
+SKIN_POINTS = 2000
+"""Places of the skin that are tried for a marker."""
 
 CONE = np.radians(60.0)
 """A marker is touched from within this angle of the skin's outward normal."""
@@ -62,6 +67,29 @@ def untouchable(case: Case, points_ct: Floats, normals_ct: Floats) -> tuple[tupl
         if blocked and np.any(blocked, axis=0).all():
             found.append((row, _boxes_ct(case)[int(np.argmax(np.sum(blocked, axis=1)))].name))
     return tuple(found)
+
+
+def touchable_points(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> Floats:
+    """Where on the skin a marker could sit and be touched straight: no box before it, within reach, shape (n, 3), mm.
+
+    Args:
+        case: For arm, needle and obstacles.
+        skin: CT frame.
+        T_base_ct: Shape (4, 4), mm.
+    """
+    a, b, c = np.moveaxis(skin.triangles[:: max(1, len(skin.triangles) // SKIN_POINTS)], 1, 0)
+    normals = np.cross(b - a, c - a) * (1.0 if _winds_outward(skin) else -1.0)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
+    points, model, length = (a + b + c) / 3, ur_model(case.robot.model), case.needle.length_mm
+    poses = flange_poses(apply(T_base_ct, points), normals @ T_base_ct[:3, :3].T, length)
+    reached = ~np.isnan(inverse(model, poses)).all(axis=(1, 2))
+    blocked = {row for row, _ in untouchable(case, points, normals)}
+    return points[[row for row in np.flatnonzero(reached) if row not in blocked]]
+
+
+def _winds_outward(skin: TriangleMesh) -> bool:
+    a, b, c = np.moveaxis(skin.triangles - skin.bounds.mean(axis=0), 1, 0)
+    return bool(np.einsum("ij,ij->", a, np.cross(b, c)) >= 0)
 
 
 def _boxes_ct(case: Case) -> tuple[Obstacle, ...]:

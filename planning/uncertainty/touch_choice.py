@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.arm.error_jacobian import PARAMETERS, error_jacobian
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits, singularity
+from puncture_twin.planning.arm.kinematics import branch_of, flange_pose, inverse, nearest_within_limits, singularity
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.geometry.rigid import exp_rotation
@@ -60,7 +60,10 @@ def choose_touches(error: PoseError, points_base: Floats, q_insertion: Floats) -
 
 
 def _candidates(error: PoseError, point_base: Floats, q_insertion: Floats) -> Floats:
-    """Reachable joints that hold the tip on a point, shape (n, 6), rad; the nearest to the insertion's first."""
+    """Reachable joints that hold the tip on a point, shape (n, 6), rad; the nearest to the insertion's first.
+
+    Those of the insertion's own branch alone, where there are any: between branches the arm passes a singularity.
+    """
     R = flange_pose(error.model, q_insertion)[:3, :3]
     sides = np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False)
     leans = [tilt * np.array([np.cos(side), np.sin(side), 0.0]) for tilt in np.radians(TILTS_DEG[1:]) for side in sides]
@@ -73,4 +76,6 @@ def _candidates(error: PoseError, point_base: Floats, q_insertion: Floats) -> Fl
     if not len(q):
         place = ", ".join(f"{value:.1f}" for value in point_base)
         raise NoAnswerError(f"a {error.model.name} cannot touch ({place}) mm near the insertion's orientation")
+    alike = q[branch_of(error.model, q) == branch_of(error.model, q_insertion[None])[0]]
+    q = alike if len(alike) else q
     return q[np.argsort(np.abs(q - q_insertion).max(axis=1), kind="stable")]

@@ -9,14 +9,20 @@ from typing import Any
 
 import numpy as np
 
+from puncture_twin.planning.anatomy.anatomy import load_skin
+from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.provenance import inputs_document
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.certify.certificate import MAX_CERTIFICATE_BYTES, parse_certificate
 from puncture_twin.planning.certify.checker import verify
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.advice import odd_branches, one_more, without_each
 from puncture_twin.planning.registration.marker_check import checked_placement
+from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.registration.touching import touchable_points
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
@@ -46,9 +52,38 @@ def registration_report(path: Path) -> dict[str, Any]:
     report["expected_tre_target_mm"] = placement.target_error_mm
     report["expected_tre_target_interval_mm"] = list(registration.expected_tre_interval_mm(case.target_ct))
     report["expected_tre_along_shaft_mm"] = registration.expected_tre_mm(along).tolist()
-    report["warnings"] = [*case.warnings, *checked.findings.warnings]
+    report["warnings"] = [*case.warnings, *checked.findings.warnings, *_branch_warning(case, registration)]
+    report |= _advice(case, registration)
     report["notes"] = list(checked.findings.notes)
     return report
+
+
+def _branch_warning(case: Case, registration: Registration) -> tuple[str, ...]:
+    odd = odd_branches(registration, ur_model(case.robot.model))
+    if not odd:
+        return ()
+    return (f"{', '.join(odd)} touched in another branch of the arm than the others: its errors do not cancel there",)
+
+
+def _advice(case: Case, registration: Registration) -> dict[str, Any]:
+    """Ellipsoid and sources at the target by the readings alone, and what would make it better; for declared errors."""
+    told = registration.uncertainty
+    if told is None:
+        return {}
+    target_base = apply(registration.T_base_ct, case.target_ct)
+    cov = told.cov_at(target_base)[:3, :3]
+    read, touched = (np.trace(part) for part in told.parts_at(target_base))
+    skin = load_skin(case, user_cache())
+    more = one_more(registration, case.target_ct, touchable_points(case, skin.mesh, registration.T_base_ct))
+    return {
+        "half_axes_95_mm": (told.test.region_factor * np.sqrt(np.linalg.eigvalsh(cov)[::-1])).tolist(),
+        "share": {"markers_ct": float(read / (read + touched)), "touch": float(touched / (read + touched))},
+        "without": {
+            one.name: {"rms_mm": one.rms_mm, "probability": one.probability}
+            for one in without_each(registration, case.target_ct)
+        },
+        "one_more": None if more is None else {"point_ct_mm": more.point_ct.tolist(), "rms_mm": more.rms_mm},
+    }
 
 
 def verify_certificate(path: Path, context: CaseContext) -> dict[str, Any]:

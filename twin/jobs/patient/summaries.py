@@ -15,6 +15,8 @@ from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
 
 def registration_summary(registration: Registration) -> dict[str, Any]:
     """A registration as plain values: mm."""
+    told = registration.uncertainty
+    test = registration.residual_test if told is None else told.test
     return {
         "method": registration.method,
         "T_base_ct": registration.T_base_ct.tolist(),
@@ -23,14 +25,31 @@ def registration_summary(registration: Registration) -> dict[str, Any]:
         "mean_error_mm": registration.mean_error_mm,
         "fle_mm": registration.fle_mm,
         "fle_source": registration.fle_source,
-        "fle_interval_mm": list(registration.residual_test.fle_interval_mm),
-        "chi_squared": finite(registration.residual_test.chi_squared),
-        "degrees_of_freedom": registration.residual_test.freedom,
-        "noise_scale": registration.residual_test.scale,
+        "fle_interval_mm": list(registration.fle_interval_mm),
+        "chi_squared": finite(test.chi_squared),
+        "degrees_of_freedom": test.freedom,
+        "noise_scale": test.scale,
+        **_declared(registration),
         "spread_ratio": registration.conditioning.spread_ratio,
         "altitude_mm": registration.conditioning.altitude_mm,
         "leverage": registration.conditioning.leverage,
         "flags": list(registration.flags),
+    }
+
+
+def _declared(registration: Registration) -> dict[str, Any]:
+    """What declared errors add."""
+    if registration.uncertainty is None:
+        return {}
+    test = registration.uncertainty.test
+    return {
+        "declaration": {
+            "holds": test.holds,
+            "probability": test.probability,
+            "residuals_over_declared": test.estimate,
+            "interval": list(test.interval),
+            "text": test.text(),
+        }
     }
 
 

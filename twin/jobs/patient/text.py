@@ -163,9 +163,30 @@ def registration_text(report: dict[str, Any]) -> str:
         f"  spread s2/s1 {report['spread_ratio']:.2f}, altitude {report['altitude_mm']:.0f} mm, "
         f"TRE/FLE {report['leverage']:.2f}",
     ]
+    lines += _declared_lines(report)
     for kind, key in (("weak", "flags"), ("warning", "warnings"), ("note", "notes")):
         lines += [f"  {kind}: {sentence}" for sentence in report[key]]
     return "\n".join(lines)
+
+
+def _declared_lines(report: dict[str, Any]) -> list[str]:
+    """What the declared errors say of a registration; nothing without them."""
+    if "declaration" not in report:
+        return []
+    axes = ", ".join(f"{mm:.2f}" for mm in report["half_axes_95_mm"])
+    lines = [
+        f"  95 % ellipsoid at the target, by the readings alone: half axes {axes} mm",
+        "  of its variance: " + ", ".join(f"{name} {100 * part:.0f} %" for name, part in report["share"].items()),
+        f"  {report['declaration']['text']}",
+    ]
+    lines += [
+        f"  without {name}: expected {one['rms_mm']:.3f} mm, p of the residuals {one['probability']:.2g}"
+        for name, one in report["without"].items()
+    ]
+    if report["one_more"] is not None:
+        place = ", ".join(f"{mm:.0f}" for mm in report["one_more"]["point_ct_mm"])
+        lines.append(f"  one more marker helps most at ({place}) mm in the CT: {report['one_more']['rms_mm']:.3f} mm")
+    return lines
 
 
 def _interval(bounds: Sequence[float]) -> str:
