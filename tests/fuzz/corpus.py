@@ -234,6 +234,6 @@ def straight_plan():
         standoff_mm=STANDOFF_MM,
         needle_length_mm=case.needle.length_mm,
         approach=Trajectory(np.zeros(1), q[:1]),
-        insertion=evenly((depth - depth[0]) / 5.0, q),
+        insertion=evenly((depth - depth[0]) / 2.0, q),
         clearance_mm={"approach": 20.0, "insertion": 10.0, "needle": 5.0},
     )
