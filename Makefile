@@ -66,6 +66,7 @@ pictures: demo
 	$(BIN)/python run_twin.py selfcal --seeds 1 --out out/selfcal
 	$(BIN)/python run_twin.py servo meshes/head --out out/servo
 	$(BIN)/python docs/concept_pictures.py $(OUT)/plan.json
+	$(BIN)/python docs/reliability_picture.py
 	$(BIN)/python docs/copy_pictures.py $(OUT) out/place out/selfcal out/servo
 
 meshes: install
