@@ -125,3 +125,9 @@ def ray_crossings(origin, direction, mesh):
         if u >= 0 and v >= 0 and u + v <= 1 and t >= 0:
             depths.append(t)
     return sorted(depths)
+
+
+def measure_displaced(engine, origins_ct, outward_ct, length):
+    """Distances (n, k) of needles from (n, 3) along (n, 3), mm: the engine itself, asked of one after the other."""
+    pairs = zip(origins_ct, outward_ct, strict=True)
+    return np.array([engine.measure(origin, along[None], length).distance[0] for origin, along in pairs])

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.clearance.near_faces import NearFaces
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,15 +34,27 @@ class ClearanceEngine(Protocol):
     """
 
     def measure(
-        self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, normals: bool = False
+        self,
+        target_ct: Floats,
+        outward_ct: Floats,
+        length: Floats | float,
+        *,
+        normals: bool = False,
+        shown: bool = True,
     ) -> AxisDistances:
         """Exact distances of the axes from ``target_ct`` (3,) along ``outward_ct`` (n, 3).
 
         ``length`` is one number or shape (k,), mm: as long is an axis for each structure. With ``normals`` each answer
-        says from where it is nearest.
+        says from where it is nearest. Without ``shown`` no progress is told: the same axes are asked again.
         """
         ...
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
         """FCL's own word on whether a capsule of this radius about one axis (3,) touches one structure."""
+        ...
+
+    def near(
+        self, structure: int, origin_ct: Floats, outward_ct: Floats, length: float, reach: tuple[float, float]
+    ) -> NearFaces:
+        """All faces of one structure within reach (mm, at the axis' start and at its end) of an axis, and some more."""
         ...

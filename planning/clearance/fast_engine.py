@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ from puncture_twin.planning.clearance.kernels.lanes import LANES
 from puncture_twin.planning.clearance.kernels.nearest_triangle import nearest_triangle
 from puncture_twin.planning.clearance.kernels.scratch import Found, scratch_for
 from puncture_twin.planning.clearance.kernels.tile_search import COUNTED, search_tiles
+from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 COORDINATE_SLACK = 1e-6
@@ -57,11 +58,18 @@ class FastEngine:
         self._meshes = tuple(meshes)
         self._blocks = tuple(pack(mesh) for mesh in self._meshes)
         self._judges: dict[int, FclEngine] = {}
+        self._seen: tuple[Floats, list[_Placed]] | None = None
         self._progress = progress
         self.counts = np.zeros(len(COUNTED), np.int64)
 
     def measure(
-        self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, normals: bool = False
+        self,
+        target_ct: Floats,
+        outward_ct: Floats,
+        length: Floats | float,
+        *,
+        normals: bool = False,
+        shown: bool = True,
     ) -> AxisDistances:
         """Exact distances of n axes from all k structures; see `ClearanceEngine`."""
         target = np.ascontiguousarray(target_ct, dtype=np.float64)
@@ -73,14 +81,27 @@ class FastEngine:
             raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
         distance, depth = np.empty(shape), np.empty(shape)
         normal = np.empty((*shape, 3)) if normals else None
-        tiles = bundle(outward)
+        tiles, seen = bundle(outward), self._seen_from(target)
         for row, blocks in enumerate(self._blocks):
-            nearest = _one_structure(blocks, tiles, target, lengths[row], distance[row], depth[row], self.counts)
+            placed = next(seen)
+            nearest = _one_structure(
+                blocks, placed, tiles, target, lengths[row], distance[row], depth[row], self.counts
+            )
             if normal is not None:
                 axis_normals(blocks.triangles, nearest, target, outward, distance[row], depth[row], normal[row])
-            if self._progress is not None:
+            if shown and self._progress is not None:
                 self._progress((row + 1) * len(outward), len(self._blocks) * len(outward))
         return AxisDistances(distance.T, depth.T, None if normal is None else normal.transpose(1, 0, 2))
+
+    def _seen_from(self, target: Floats) -> Iterator[_Placed]:
+        """The surfaces as seen from a target, one by one; those of the last target are kept."""
+        if self._seen is None or not np.array_equal(self._seen[0], target):
+            self._seen = (target.copy(), [])
+        kept = self._seen[1]
+        for row, blocks in enumerate(self._blocks):
+            if row == len(kept):
+                kept.append(_placed(blocks, target))
+            yield kept[row]
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
         """FCL collision of a capsule with one structure; see `ClearanceEngine`."""
@@ -88,9 +109,16 @@ class FastEngine:
             self._judges[structure] = FclEngine([self._meshes[structure]])
         return self._judges[structure].collides(0, target_ct, outward_ct, length, radius)
 
+    def near(
+        self, structure: int, origin_ct: Floats, outward_ct: Floats, length: float, reach: tuple[float, float]
+    ) -> NearFaces:
+        """Faces of one structure near an axis; see `ClearanceEngine`."""
+        return near_faces(self._blocks[structure], origin_ct, outward_ct, length, reach)
+
 
 def _one_structure(
     blocks: Blocks,
+    placed: _Placed,
     tiles: Tiles,
     target: Floats,
     length: float,
@@ -99,7 +127,6 @@ def _one_structure(
     counts: NDArray[np.int64],
 ) -> Ints:
     """Fill one structure's distances and depths, in the caller's order; the rows of the nearest triangles."""
-    placed = _placed(blocks, target)
     nearest = np.empty(len(distance), np.int64)
     if placed.distance == 0.0:
         distance[:], depth[:], nearest[:] = 0.0, 0.0, placed.nearest

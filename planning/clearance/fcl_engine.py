@@ -10,6 +10,8 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.engine import AxisDistances
+from puncture_twin.planning.clearance.kernels.blocks import pack
+from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
 from puncture_twin.planning.geometry.crossings import first_crossing
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import frame_about
@@ -35,7 +37,13 @@ class FclEngine:
         self._progress = progress
 
     def measure(
-        self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, normals: bool = False
+        self,
+        target_ct: Floats,
+        outward_ct: Floats,
+        length: Floats | float,
+        *,
+        normals: bool = False,
+        shown: bool = True,
     ) -> AxisDistances:
         """Exact distances of n axes from all k structures; see `ClearanceEngine`."""
         shape = (len(outward_ct), len(self._objects))
@@ -44,7 +52,7 @@ class FclEngine:
         for row, outward in enumerate(outward_ct):
             distance[row], depth[row], away = self._one_direction(target_ct, outward, lengths)
             normal[row] = np.reshape(away, shape[1:] + (3,))
-            if self._progress is not None:
+            if shown and self._progress is not None:
                 self._progress(row + 1, len(outward_ct))
         for column, mesh in enumerate(self._meshes):
             met = distance[:, column] <= 0
@@ -77,6 +85,12 @@ class FclEngine:
         capsule = fcl.CollisionObject(fcl.Capsule(radius, length), pose)
         hits = fcl.collide(capsule, self._objects[structure], fcl.CollisionRequest(), fcl.CollisionResult())
         return bool(hits > 0)
+
+    def near(
+        self, structure: int, origin_ct: Floats, outward_ct: Floats, length: float, reach: tuple[float, float]
+    ) -> NearFaces:
+        """Faces of one structure near an axis; see `ClearanceEngine`."""
+        return near_faces(pack(self._meshes[structure]), origin_ct, outward_ct, length, reach)
 
 
 def _tree(vertices: Floats, faces: np.ndarray) -> fcl.BVHModel:

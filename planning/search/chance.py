@@ -1,13 +1,17 @@
-"""Chances of a search's candidates, and their refusal where a chance breaks the case's limit."""
+"""Chances of a search's candidates, and their refusal where a chance breaks the case's limit.
+
+To first order for all; by line sampling where that may decide: near a limit, and for the best candidates.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
-from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import ClearanceEngine
@@ -15,10 +19,15 @@ from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.uncertainty.chances import Chances, HitModel, hit_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError
+from puncture_twin.planning.uncertainty.refined_touch import Needles, Surroundings, refined
 from puncture_twin.planning.uncertainty.touch import Proximity, joint_touch_chance, proximity, touch_chance
 
 BEST = 200
 """Of the ranked candidates: how many get the dearer chances."""
+
+REFINED_FROM, REFINED_TO = 1 / 20, 3.0
+"""Times its limit: a first-order chance to touch in between is refined. First order is low by up to 12 where a
+structure surrounds the needle, and high by less than 3 where one juts out at it (docs/concepts/uncertainty.md)."""
 
 ROWS_AT_ONCE = 4096
 """Of candidates: a table of gradients of 60 structures stays below 20 MB."""
@@ -77,18 +86,34 @@ def with_chances(
     filled = {name: getattr(blank, name).copy() for name in values}
     for name, value in values.items():
         filled[name][rows] = value
-    return _limited(case, replace(found, chances=Chances(names, **filled, touch_joint=blank.touch_joint)))
+    found = replace(found, chances=Chances(names, **filled, touch_joint=blank.touch_joint))
+    return _limited(case, _refined_near_limits(case, anatomy, engine, found, model))
 
 
 def passing(
     case: Case, anatomy: Anatomy, engine: ClearanceEngine, model: ChanceModel, outward_ct: Floats, cov_ct: Floats
 ) -> Proximity:
     """How some needles pass what must not be touched."""
-    columns = demanding(anatomy.checked)
-    axes = engine.measure(case.target_ct, outward_ct, axis_lengths(case, anatomy.checked), normals=True)
+    columns, lengths = demanding(anatomy.checked), axis_lengths(case, anatomy.checked)
+    axes = engine.measure(case.target_ct, outward_ct, lengths, normals=True, shown=False)
     assert axes.normal is not None
     distance, depth, normal = axes.distance[:, columns], axes.depth[:, columns], axes.normal[:, columns]
     return proximity(distance, depth, normal, outward_ct, cov_ct, model.error.surface_mm)
+
+
+def _needles(
+    case: Case, anatomy: Anatomy, engine: ClearanceEngine, model: ChanceModel, outward_ct: Floats, q: Floats
+) -> Needles:
+    """Some needles and the doubt about them."""
+    cov_ct = model.error.covariance_ct(q)
+    near = passing(case, anatomy, engine, model, outward_ct, cov_ct)
+    return Needles(outward_ct, cov_ct, near, model.error.surface_mm, model.error.freedom)
+
+
+def _thresholds(case: Case, anatomy: Anatomy) -> tuple[Floats, Floats]:
+    """How near a needle's axis touches each structure, and breaks its margin, shape (k,), mm."""
+    margins = np.array([anatomy.checked[column].margin_mm for column in demanding(anatomy.checked)], dtype=np.float64)
+    return np.full(len(margins), case.needle.radius_mm), case.needle.radius_mm + margins
 
 
 def chances_of(
@@ -104,19 +129,111 @@ def chances_of(
         outward_ct: Shape (n, 3), unit.
         q: Shape (n, 6), rad, the tip on the target.
     """
-    near = passing(case, anatomy, engine, model, outward_ct, model.error.covariance_ct(q))
-    margins = np.array([anatomy.checked[column].margin_mm for column in demanding(anatomy.checked)])
-    touch = touch_chance(near, case.needle.radius_mm, model.error.freedom)
-    tip = model.error.tip_covariance_ct(q)
+    needles, (touching, breaking) = _needles(case, anatomy, engine, model, outward_ct, q), _thresholds(case, anatomy)
+    touch = touch_chance(needles.near, touching, model.error.freedom)
+    tip = needles.cov_ct[:, :3, :3] + model.error.target_covariance_ct
     along = np.einsum("na,nab,nb->n", outward_ct, tip, outward_ct)
     return {
-        "hit": model.hit.chance(model.error, q),
+        "hit": model.hit.chance(model.error, needles.cov_ct),
         "touch": touch,
-        "margin": touch_chance(near, case.needle.radius_mm + margins, model.error.freedom),
-        "touch_any": np.minimum(1.0, touch.sum(axis=1)),
+        "margin": touch_chance(needles.near, breaking, model.error.freedom),
+        "touch_any": _any(touch),
         "lateral_mm": np.sqrt(np.maximum(np.trace(tip, axis1=1, axis2=2) - along, 0.0)),
         "depth_mm": np.sqrt(along),
     }
+
+
+def _any(touch: Floats) -> Floats:
+    """Shape (n,), from chances (n, k)."""
+    return np.asarray(np.minimum(1.0, touch.sum(axis=1)))
+
+
+def refined_chances(
+    case: Case,
+    anatomy: Anatomy,
+    engine: ClearanceEngine,
+    model: ChanceModel,
+    needles: tuple[Floats, Floats],
+    first: tuple[Floats, Floats],
+    wanted: Bools | None = None,
+) -> dict[str, Floats]:
+    """Chances to touch, to break a margin and to touch any, by line sampling.
+
+    Args:
+        case: The case.
+        anatomy: Its structures.
+        engine: Prepared for the meshes of ``anatomy.checked``.
+        model: Of the case.
+        needles: Directions (n, 3) and configurations (n, 6), as in `chances_of`.
+        first: Chances (n, k) to touch and to break a margin, to first order.
+        wanted: Shape (n, k), which chances to touch are refined, those of margins not; None refines all of both.
+    """
+    outward_ct, q = needles
+    columns, every = demanding(anatomy.checked), np.ones(first[0].shape, bool)
+    around = Surroundings(engine, columns, axis_lengths(case, anatomy.checked)[columns], case.target_ct)
+    asked, (touching, breaking) = _needles(case, anatomy, engine, model, outward_ct, q), _thresholds(case, anatomy)
+    touch = refined(around, asked, touching, first[0], every if wanted is None else wanted)
+    margin = first[1] if wanted is not None else refined(around, asked, breaking, first[1], every)
+    return {"touch": touch, "margin": margin, "touch_any": _any(touch)}
+
+
+def _with_refined(
+    case: Case,
+    anatomy: Anatomy,
+    engine: ClearanceEngine,
+    found: Candidates,
+    model: ChanceModel,
+    rows: Ints,
+    wanted: Bools | None = None,
+) -> Candidates:
+    """Refine some rows; ``wanted`` as in `refined_chances`."""
+    chances = found.chances
+    assert chances is not None
+    needles, first = (found.outward_ct[rows], found.arm.q_insertion[rows]), (chances.touch[rows], chances.margin[rows])
+    values = refined_chances(case, anatomy, engine, model, needles, first, wanted)
+    filled = {name: getattr(chances, name).copy() for name in values}
+    for name, value in values.items():
+        filled[name][rows] = value
+    return replace(found, chances=replace(chances, **filled))
+
+
+def _refined_near_limits(
+    case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates, model: ChanceModel
+) -> Candidates:
+    """Refine the chances to touch that first order puts near a limit."""
+    chances = found.chances
+    assert chances is not None
+    limits = np.array([touch_limit(case, name) for name in chances.structures])
+    wanted = (chances.touch >= REFINED_FROM * limits) & (chances.touch <= REFINED_TO * limits)
+    rows = np.flatnonzero(wanted.any(axis=1) & found.safe)
+    return _with_refined(case, anatomy, engine, found, model, rows, wanted[rows]) if len(rows) else found
+
+
+def with_best_refined(
+    case: Case,
+    anatomy: Anatomy,
+    engine: ClearanceEngine,
+    found: Candidates,
+    model: ChanceModel | None,
+    ranked: Callable[[Case, Candidates], Candidates],
+) -> Candidates:
+    """Refine the best candidates, reject those that break a limit then, and rank again until no new one is among them.
+
+    Args:
+        case: The case.
+        anatomy: Its structures.
+        engine: Prepared for the meshes of ``anatomy.checked``.
+        found: Ranked, with chances.
+        model: As in `with_chances`.
+        ranked: Gives cost and rank to the safe candidates.
+    """
+    if model is None or found.chances is None:
+        return found
+    done = np.zeros(len(found), bool)
+    while len(rows := (best := found.ranked[:BEST])[~done[best]]):
+        found = ranked(case, _limited(case, _with_refined(case, anatomy, engine, found, model, rows)))
+        done[rows] = True
+    return found
 
 
 def _limited(case: Case, found: Candidates) -> Candidates:
@@ -152,8 +269,7 @@ def with_joint_chances(
     rows = found.ranked[:BEST]
     if model is None or found.chances is None or not len(rows):
         return found
-    cov_ct = model.error.covariance_ct(found.arm.q_insertion[rows])
-    near = passing(case, anatomy, engine, model, found.outward_ct[rows], cov_ct)
+    asked = _needles(case, anatomy, engine, model, found.outward_ct[rows], found.arm.q_insertion[rows])
     joint = found.chances.touch_joint.copy()
-    joint[rows] = joint_touch_chance(near, cov_ct, case.needle.radius_mm, model.error.freedom)
+    joint[rows] = joint_touch_chance(asked.near, asked.cov_ct, case.needle.radius_mm, asked.freedom)
     return replace(found, chances=replace(found.chances, touch_joint=joint))

@@ -28,7 +28,7 @@ from puncture_twin.planning.search.candidates import (
     Ranking,
     Verdict,
 )
-from puncture_twin.planning.search.chance import ChanceModel, with_chances, with_joint_chances
+from puncture_twin.planning.search.chance import ChanceModel, with_best_refined, with_chances, with_joint_chances
 from puncture_twin.planning.search.constraints import judge
 from puncture_twin.planning.search.ranking import rank
 from puncture_twin.planning.search.tissue import tissue_crossed
@@ -78,6 +78,7 @@ def search(
     if reach is not None:
         found = with_reach(case, found, reach, progress)
     found = ranked(case, with_chances(case, anatomy, engine, found, chance))
+    found = with_best_refined(case, anatomy, engine, found, chance, ranked)
     return with_joint_chances(case, anatomy, engine, found, chance)
 
 

@@ -62,12 +62,12 @@ class HitModel:
     radius_mm: float | None
     rays: TargetRays | None
 
-    def chance(self, error: PoseError, q: Floats) -> Floats:
-        """The chance of configurations (n, 6), shape (n,)."""
+    def chance(self, error: PoseError, cov_ct: Floats) -> Floats:
+        """The chance of needles with these Sigma6, shape (n, 6, 6), CT axes: shape (n,)."""
         if self.rays is None or self.radius_mm is not None:
             assert self.radius_mm is not None
-            return hit_in_ball(error.tip_covariance(q), self.radius_mm, error.freedom)
-        return hit_in_mesh(self.rays, error.covariance_ct(q)[:, :3, :3], error.freedom)
+            return hit_in_ball(cov_ct[:, :3, :3] + error.target_covariance_ct, self.radius_mm, error.freedom)
+        return hit_in_mesh(self.rays, np.ascontiguousarray(cov_ct[:, :3, :3]), error.freedom)
 
 
 def hit_model(radius_mm: float | None, mesh: TriangleMesh, target_ct: Floats) -> HitModel:

@@ -74,10 +74,15 @@ class PoseError:
         return self.fit.test.scale * self.errors.surface_mm
 
     @property
+    def target_covariance_ct(self) -> Floats:
+        """Of the target's reading, shape (3, 3), mm^2, CT axes, scaled."""
+        return np.asarray(self.fit.test.scale**2 * self.errors.target_cov_ct)
+
+    @property
     def target_covariance(self) -> Floats:
-        """Of the target's reading, shape (3, 3), mm^2, base axes, scaled."""
+        """`target_covariance_ct` in base axes."""
         R = self.fit.R_base_ct
-        return np.asarray(self.fit.test.scale**2 * R @ self.errors.target_cov_ct @ R.T)
+        return np.asarray(R @ self.target_covariance_ct @ R.T)
 
     def parts(self, q: Floats) -> dict[str, Floats]:
         """Sigma6 by source, each of shape (n, 6, 6); they add up to `covariance`."""

@@ -4,8 +4,8 @@ The axis point f + s u is nearest to structure j at distance D; n is the unit ve
 
     dD = n . (d + s phi x u),   g = (n; s u x n),   sigma^2 = g' Sigma6 g,   P = Phi(-(D - t) / sigma)
 
-(Hasofer, Lind, J. Eng. Mech. Div. 100, 1974). Exact for a flat surface; low by up to .03 between two ribs or over a
-concave lung, high at convex ends (docs/concepts/uncertainty.md).
+(Hasofer, Lind, J. Eng. Mech. Div. 100, 1974). Exact for a flat surface; low between two ribs or over a concave lung,
+high at convex ends: where it may decide, `line_sampling` answers (docs/concepts/uncertainty.md).
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
 from puncture_twin.planning.registration.noise_test import NoiseTest
 from puncture_twin.planning.registration.placement import touches
 from puncture_twin.planning.registration.reading_noise import reading_noise
-from puncture_twin.planning.search.chance import chance_model, chances_of, demanding
+from puncture_twin.planning.search.chance import chance_model, chances_of, demanding, refined_chances
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE
@@ -188,7 +188,9 @@ def _measured(
     cov_ct, error_ct = believed.tip_covariance_ct(q)[0], rooms.tip_ct - rooms.target_ct
     model = chance_model(case, context.anatomy, believed)
     assert model is not None
-    chances = chances_of(case, context.anatomy, context.engine, model, puncture.outward_ct[None], q)
+    asked = (case, context.anatomy, context.engine, model)
+    chances = chances_of(*asked, puncture.outward_ct[None], q)
+    chances |= refined_chances(*asked, (puncture.outward_ct[None], q), (chances["touch"], chances["margin"]))
     inverse = np.linalg.inv(cov_ct + LEAST_VARIANCE * np.eye(3))
     square = np.einsum("na,ab,nb->n", error_ct, inverse, error_ct)
     columns = demanding(context.anatomy.checked)

@@ -1,0 +1,148 @@
+"""The refined chance to touch: closed forms where the shape has one, draws of displaced needles where it has not."""
+
+import numpy as np
+import pytest
+import trimesh
+from oracles import measure_displaced
+from scipy.special import ndtr, stdtr
+from scipy.stats import chi2
+
+from puncture_twin.planning.clearance.fast_engine import FastEngine
+from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.planning.uncertainty.refined_touch import Needles, Surroundings, refined
+from puncture_twin.planning.uncertainty.touch import proximity, touch_chance
+
+LENGTH, RADIUS = 150.0, 0.6
+UP = np.array([0.0, 0.0, 1.0])
+SHIFT = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+LEAN = np.diag([0.5, 0.8, 1.2, 0.006**2, 0.009**2, 0.01**2])
+
+
+def moved(mesh, *at):
+    """A body at a place."""
+    mesh.apply_translation(at or (0, 0, 0))
+    return TriangleMesh(mesh.vertices, mesh.faces)
+
+
+def box(*sizes):
+    """A block about the origin."""
+    return trimesh.creation.box(extents=sizes)
+
+
+def chances(mesh, cov, surface=0.0, freedom=None, threshold=RADIUS):
+    """First order and refined, of one needle along z from the origin."""
+    engine = FastEngine([mesh])
+    axes = engine.measure(np.zeros(3), UP[None], LENGTH, normals=True)
+    near = proximity(axes.distance, axes.depth, axes.normal, UP[None], cov[None], surface)
+    first = touch_chance(near, threshold, freedom)
+    around = Surroundings(engine, np.array([0]), np.array([LENGTH]), np.zeros(3))
+    needles = Needles(UP[None], cov[None], near, surface, freedom)
+    found = refined(around, needles, np.array([threshold]), first, np.ones((1, 1), bool))
+    return first[0, 0], found[0, 0]
+
+
+def displaced(cov, count, seed=0):
+    """Origins and directions of so many needles."""
+    errors = np.random.default_rng(seed).multivariate_normal(np.zeros(6), cov, count, method="eigh")
+    return errors[:, :3], exp_rotation(errors[:, 3:]) @ UP
+
+
+def drawn(mesh, cov, count=100_000, threshold=RADIUS):
+    """How many of so many displaced needles come nearer than a threshold, measured on the faces near them."""
+    origins, outward = displaced(cov, count)
+    faces = FastEngine([mesh]).near(0, np.zeros(3), UP, LENGTH, (15.0, 30.0))
+    return np.mean(faces.distance(origins, outward, LENGTH) < threshold)
+
+
+@pytest.mark.parametrize("freedom", [None, 3, 6])
+@pytest.mark.parametrize("surface", [0.0, 0.7])
+def test_first_order_stays_where_it_is_exact(surface, freedom):
+    """A wide plane: normal, or Student's t where the residuals gave the errors' size.
+
+    A surface that may lie farther away is touched all the same where the needle meets it: that is on the safe side.
+    """
+    for distance in (1.5, 3.0, 4.5):
+        first, found = chances(moved(box(40.0, 4000.0, 4000.0), distance + 20.0, 0, 0), SHIFT, surface, freedom)
+        t = -(distance - RADIUS) / np.hypot(1.0, surface)
+        assert first == pytest.approx(ndtr(t) if freedom is None else stdtr(freedom, t), rel=1e-6)
+        assert first - 0.0015 < found < first + (0.0015 if surface == 0.0 else 0.03)
+
+
+@pytest.mark.parametrize("distance", [1.5, 2.5, 3.5])
+def test_both_sides_of_a_gap_count(distance):
+    """Between two plates of one structure: twice the chance of one, of which first order sees one."""
+    plates = trimesh.util.concatenate(
+        [box(1.0, 4000.0, 4000.0).apply_translation([side * (distance + 0.5), 0, 0]) for side in (1, -1)]
+    )
+    first, found = chances(moved(plates), SHIFT)
+    one = ndtr(-(distance - RADIUS))
+    assert first == pytest.approx(one, rel=1e-6)
+    assert found == pytest.approx(2 * one, abs=0.003)
+
+
+@pytest.mark.parametrize("inner", [1.6, 2.6, 3.6, 4.6])
+def test_a_tube_around_the_needle_has_a_closed_form(inner):
+    """P of a two-dimensional normal to leave a circle, exp(-d^2 / 2): the worst case of first order."""
+    tube = trimesh.creation.annulus(r_min=inner, r_max=inner + 5.0, height=4000.0, sections=512)
+    first, found = chances(moved(tube), SHIFT)
+    exact = np.exp(-((inner - RADIUS) ** 2) / 2)
+    assert first < exact < 13 * first
+    assert found == pytest.approx(exact, abs=0.01)
+
+
+def test_a_thin_wire_is_left_again():
+    """Entry and exit: a wire across is passed by what is displaced farther."""
+    wire = moved(trimesh.creation.cylinder(radius=0.2, height=4000.0, sections=24), 0, 0, 0)
+    wire = moved(trimesh.Trimesh(wire.vertices[:, [0, 2, 1]], wire.faces), 2.5, 0, 60.0)
+    wide = np.diag([4.0, 1.0, 1.0, 0, 0, 0])
+    first, found = chances(wire, wide)
+    exact = ndtr((2.5 + 0.8) / 2) - ndtr((2.5 - 0.8) / 2)
+    assert first > 1.3 * exact
+    assert found == pytest.approx(exact, abs=0.003)
+
+
+SHAPES = {
+    "ball": lambda: moved(trimesh.creation.icosphere(4, 12.0), 14.0, 0, 60),
+    "tip alone": lambda: moved(trimesh.creation.icosphere(3, 3.0), 1.0, 0.5, -4.5),
+    "behind": lambda: moved(box(20.0, 20.0, 5.0), 0, 0, -4.5),
+    "convex top beside the tip": lambda: moved(trimesh.creation.cylinder(radius=3.0, height=20.0), 4.5, 1.0, -9.0),
+    "far along the shaft": lambda: moved(trimesh.creation.icosphere(3, 6.0), 8.5, 0, 140),
+    "beyond the end": lambda: moved(trimesh.creation.icosphere(3, 6.0), 2.0, 0, 157),
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("size", [1.0, 2.0])
+def test_draws_agree(shape, size):
+    """Within .006 of 100,000 displaced needles, for bodies met by the tip, the shaft, its end and from behind."""
+    mesh, cov = SHAPES[shape](), size**2 * LEAN
+    found, realised = chances(mesh, cov)[1], drawn(mesh, cov)
+    assert found == pytest.approx(realised, abs=0.006)
+
+
+@pytest.mark.parametrize("freedom", [3, 6])
+def test_an_unknown_size_is_averaged(freedom):
+    """The tube's chance over the errors' possible sizes, exp(-d^2 / 2 s^2)."""
+    tube = trimesh.creation.annulus(r_min=4.6, r_max=10.0, height=4000.0, sections=512)
+    found = chances(moved(tube), SHIFT, freedom=freedom)[1]
+    sizes = freedom / chi2.ppf((np.arange(20000) + 0.5) / 20000, freedom)
+    assert found == pytest.approx(np.mean(np.exp(-(4.0**2) / 2 / sizes)), abs=0.01)
+
+
+@pytest.mark.parametrize("kind", [FastEngine, FclEngine])
+def test_near_faces_answer_as_the_engine_does(rng, kind):
+    """Displaced needles, asked of the faces near the nominal one and of the whole engine."""
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=25.0)
+    mesh.vertices = mesh.vertices * rng.normal(1, 0.05, (len(mesh.vertices), 1))
+    engine = kind([moved(mesh, 30.0, 5.0, 70.0)])
+    origins, outward = displaced(4 * LEAN, 300)
+    reach = (5.0, 12.0)
+    quick = engine.near(0, np.zeros(3), UP, LENGTH, reach).distance(origins, outward, LENGTH)
+    whole = measure_displaced(FastEngine(engine._meshes), origins, outward, LENGTH)[:, 0]
+    shift = np.linalg.norm(origins, axis=1) + LENGTH * np.linalg.norm(outward - UP, axis=1)
+    sure = whole + shift < min(reach)
+    assert sure.any() or (whole < 3).any()
+    np.testing.assert_allclose(quick[sure], whole[sure], atol=1e-9)
+    assert (quick >= whole - 1e-9).all()
