@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, load_anatomy
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Silent, Stages, Watcher
@@ -27,11 +28,12 @@ from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.registration.placement import Placement, load_placement
 from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
-from puncture_twin.planning.search.chance import ChanceModel, chance_model, passing
+from puncture_twin.planning.search.chance import ChanceModel, chance_model, chances_of, demanding, passing
 from puncture_twin.planning.search.consistency import check_consistency
 from puncture_twin.planning.search.doubt import Doubt, doubt_of
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.search import ArmReach, case_directions, one_direction, search
+from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.pose_error import pose_error
 
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
@@ -94,11 +96,24 @@ class CaseContext:
         return Explanation(self.case, self.anatomy, found, self._doubt(found))
 
     def _doubt(self, found: Candidates) -> Doubt | None:
-        if self.chance is None or not np.isfinite(found.arm.q_insertion[0]).all():
+        if self.chance is None or found.chances is None or not np.isfinite(found.chances.hit[0]):
             return None
-        cov_ct = self.chance.error.covariance_ct(found.arm.q_insertion)
-        near = passing(self.case, self.anatomy, self.engine, self.chance, found.outward_ct, cov_ct)
-        return doubt_of(self.case, found, self.chance, near)
+        q, outward = found.arm.q_insertion, found.outward_ct
+        near = passing(self.case, self.anatomy, self.engine, self.chance, outward, self.chance.error.covariance_ct(q))
+        return doubt_of(self.case, self.chance, near, found.chances, outward[0], q[0])
+
+    def doubt_at(self, outward_ct: Floats, q: Floats) -> Doubt | None:
+        """How sure one direction (3,) is in one configuration (6,), rad, as of a plan; None without declared errors."""
+        model = self.chance
+        if model is None:
+            return None
+        values = chances_of(self.case, self.anatomy, self.engine, model, outward_ct[None], q[None])
+        names = tuple(self.anatomy.checked[column].name for column in demanding(self.anatomy.checked))
+        near = passing(
+            self.case, self.anatomy, self.engine, model, outward_ct[None], model.error.covariance_ct(q[None])
+        )
+        chances = Chances(names, **values, touch_joint=np.full(1, np.nan))
+        return doubt_of(self.case, model, near, chances, outward_ct, q)
 
     def cross_check(self, count: int) -> CrossChecked:
         """Measure random directions of the grid again with FCL.

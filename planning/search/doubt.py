@@ -15,8 +15,8 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.chance import ChanceModel, touch_limit
+from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.hit import hit_in_ball, hit_in_mesh
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget, error_budget
 from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES, deviation, reading_parts
@@ -176,27 +176,24 @@ def chance_words(chance: float) -> str:
     return f"{chance:.{digits}f}"
 
 
-def doubt_of(case: Case, found: Candidates, model: ChanceModel | None, near: Proximity | None) -> Doubt | None:
-    """The doubt of the only candidate; None where no chances were computed.
+def doubt_of(case: Case, model: ChanceModel, near: Proximity, chances: Chances, outward_ct: Floats, q: Floats) -> Doubt:
+    """The doubt of one candidate.
 
     Args:
         case: The case.
-        found: A search's result with this candidate alone.
         model: Of the case.
         near: How the candidate passes what must not be touched.
+        chances: Of it alone, all finite.
+        outward_ct: Shape (3,), unit, from the target along the needle.
+        q: Shape (6,), rad, the tip on the target.
     """
-    chances = found.chances
-    if chances is None or model is None or near is None or not np.isfinite(chances.hit[0]):
-        return None
-    q = found.arm.q_insertion[0]
-    outward_base = model.error.fit.R_base_ct @ found.outward_ct[0]
     touch = dict(zip(chances.structures, map(float, chances.touch[0]), strict=True))
     needle = shrinkable(case, model, near, chances.structures, q)
     return Doubt(
         float(chances.hit[0]),
         MappingProxyType(touch),
         float(chances.touch_any[0]),
-        error_budget(model.error, q, outward_base),
+        error_budget(model.error, q, model.error.fit.R_base_ct @ outward_ct),
         model.error.fit.test.text(),
         tuple(goals_of(needle, float(chances.hit[0]), touch)),
     )

@@ -38,12 +38,13 @@ from puncture_twin.twin.rehearsal.physics import physics_rooms
 from puncture_twin.twin.rehearsal.plan_truth import median_truth, plan_truth, standing
 from puncture_twin.twin.rehearsal.rehearsal import Rehearsal, rehearse
 from puncture_twin.twin.report.map.map_picture import draw_map
-from puncture_twin.twin.report.page.page import write_page
+from puncture_twin.twin.report.page.page import Uncertainty, write_page
+from puncture_twin.twin.report.rooms_picture import draw_rooms_picture
 from puncture_twin.twin.report.scene.film import draw_film
 from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
 PICTURES = ("map.png", "scene.png", "report.html")
-CERTIFICATE, FILM = "certificate.json", "rehearsal.mp4"
+CERTIFICATE, FILM, ROOMS = "certificate.json", "rehearsal.mp4", "rooms.png"
 
 DEMO_ROOMS = 1000
 """What a stranger sees first is a distribution, where the case declares what it may be off by."""
@@ -96,7 +97,7 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
         NoAnswerError: No plan; the search's files are written all the same.
     """
     _refuse_without_arm(context)
-    names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, *PICTURES)
+    names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
     with _writing(out, "plan", context, names) as draft:
         run = _searched_and_planned(context, draft.folder)
         planned = run.files
@@ -173,7 +174,7 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     source, plan = _read_plan(plan_path, context.watcher.note)
     with context.stages.time("plan"):
         candidates = check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
-    with _writing(out, "rehearse", context, ("rehearsal.json", FILM), source) as draft:
+    with _writing(out, "rehearse", context, ("rehearsal.json", FILM, ROOMS), source) as draft:
         run = _rehearsed(Run(context, candidates, (), plan, read=(source,)), draft.folder, rooms)
         if not draft.source_has("scene.png"):
             with context.stages.time("scene"):
@@ -209,7 +210,12 @@ def _rehearsed(run: Run, out: Path, rooms: RoomCount | None) -> Run:
             out / FILM,
             progress=partial(context.watcher.count, "film"),
         )
-    return _with(run, film)
+    run = _with(run, film)
+    if run.distribution is None:
+        return run
+    with context.stages.time("rooms.png"):
+        draw_rooms_picture(run.distribution, out / ROOMS)
+    return _with(run, out / ROOMS)
 
 
 def _executed(run: Run, plan: Plan) -> Rehearsal:
@@ -294,8 +300,24 @@ def _with_pictures(run: Run, out: Path) -> Run:
     shown = None if registration is None else registration_summary(registration)
     film = next((path.name for path in run.files if path.stem == Path(FILM).stem and path.suffix != ".json"), None)
     with stages.time("page"):
-        write_page(case, anatomy, found, run.plan, run.rehearsal, shown, out / "report.html", film=film)
+        page, told = out / "report.html", _uncertainty(run)
+        write_page(case, anatomy, found, run.plan, run.rehearsal, shown, page, film=film, uncertainty=told)
     return _with(run, out / "map.png", out / "scene.png", out / "report.html")
+
+
+def _uncertainty(run: Run) -> Uncertainty | None:
+    """What the page says of chances: of the plan as it is driven, or without one of the best direction."""
+    context, found = run.context, run.candidates
+    if context.case.errors is None:
+        return None
+    picture = next((path for path in run.files if path.name == ROOMS), None)
+    rooms = None if run.distribution is None else run.distribution.summary()
+    if run.plan is not None:
+        return Uncertainty(context.doubt_at(run.plan.outward_ct, run.plan.insertion.q[-1]), rooms, picture)
+    if not len(found.ranked):
+        return Uncertainty(None, rooms, picture)
+    row = found.ranked[0]
+    return Uncertainty(context.explain(found.theta[row], found.beta[row]).doubt, rooms, picture)
 
 
 def _write_json(summary: dict[str, Any], path: Path) -> Path:

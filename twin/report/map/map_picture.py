@@ -18,6 +18,8 @@ from scipy import ndimage
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.doubt import chance_words
+from puncture_twin.twin.report.map.chance_layer import chance_legend, draw_chances
 from puncture_twin.twin.report.map.map_raster import MapRaster, clearance_range, map_raster
 from puncture_twin.twin.report.map_view import MapView, map_view, step_of
 from puncture_twin.twin.report.numbers import (
@@ -73,6 +75,7 @@ def draw_map(candidates: Candidates, case: Any, path: Path) -> None:
     axes = figure.add_axes(MAP_BOX)
     axes.imshow(raster.rgba, extent=(-1, 1, -1, 1), interpolation="antialiased", zorder=1)
     _frame(axes, view)
+    draw_chances(axes, candidates, raster.rows)
     _outline(axes, raster, candidates)
     _names(axes, raster, candidates)
     _marks(axes, view, candidates)
@@ -194,6 +197,7 @@ def _side(axes: Axes, case: Any, candidates: Candidates, view: MapView) -> None:
     axes.set_axis_off()
     y = _legend(axes, candidates)
     y = _scale(axes, candidates, y + 0.03)
+    y = chance_legend(axes, candidates, y)
     y = _mark_legend(axes, candidates, y + 0.05)
     y = _chosen(axes, candidates, y + 0.035)
     toward = f"Centre (+), θ = 0: {view.centre}.\n" if view.centre else ""
@@ -278,7 +282,7 @@ def _chosen(axes: Axes, candidates: Candidates, y: float) -> float:
     name, clearance = nearest_structure(candidates, row)
     theta, beta = np.degrees(candidates.theta[row]), np.degrees(candidates.beta[row])
     lines = (
-        f"Best: θ {theta:g}°, β {beta:g}°",
+        f"Best: θ {theta:g}°, β {beta:g}°{_chances(candidates, row)}",
         f"path in the body {number(candidates.path.length[row], 1, 'mm')}, "
         f"skin angle {number(float(np.degrees(candidates.path.skin_angle[row])), 0)}°",
         f"nearest: {name.replace('_', ' ') or 'none'}, {number(clearance, 1, 'mm')}",
@@ -286,6 +290,15 @@ def _chosen(axes: Axes, candidates: Candidates, y: float) -> float:
     box = {"facecolor": "#eef7f2", "edgecolor": "#00684a", "boxstyle": "round,pad=0.5"}
     axes.text(0.02, y + 0.02, "\n".join(lines), fontsize=11, va="top", linespacing=1.4, bbox=box)
     return y + 0.12
+
+
+def _chances(candidates: Candidates, row: int) -> str:
+    """The chosen direction's chances, to follow it; nothing where there are none."""
+    chances = candidates.chances
+    if chances is None or not np.isfinite(chances.hit[row]):
+        return ""
+    hit, touch = chance_words(float(chances.hit[row])), chance_words(float(chances.touch_any[row]))
+    return f"; p(hit) {hit}, p(touch) {touch}"
 
 
 def _text(axes: Axes, x: float, y: float, words: str, *, size: float, style: str = "normal") -> None:

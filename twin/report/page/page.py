@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.doubt import Doubt
 from puncture_twin.twin.report.numbers import (
     chosen_row,
     demanding,
@@ -19,6 +20,7 @@ from puncture_twin.twin.report.numbers import (
     target_words,
 )
 from puncture_twin.twin.report.page import page_tables as tables
+from puncture_twin.twin.report.page.page_chances import chance_card, chances_section, rooms_section
 from puncture_twin.twin.report.page.page_charts import rehearsal_charts
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import scene_figure
@@ -28,6 +30,20 @@ TRUTH_IS_BELIEF = (
     "in this rehearsal the patient lies exactly where they are believed to lie: what the tip misses is the joints' "
     "alone, and says nothing about the registration"
 )
+
+
+class Uncertainty(NamedTuple):
+    """What a page says of chances.
+
+    Attributes:
+        doubt: Of the chosen direction, or None where it has no chances.
+        rooms: A `Distribution` as plain values, or None.
+        picture: ``rooms.png``, or None.
+    """
+
+    doubt: Doubt | None
+    rooms: Mapping[str, Any] | None = None
+    picture: Path | None = None
 
 
 def write_page(
@@ -40,6 +56,7 @@ def write_page(
     path: Path,
     *,
     film: str | None = None,
+    uncertainty: Uncertainty | None = None,
 ) -> None:
     """Write the page.
 
@@ -52,6 +69,7 @@ def write_page(
         registration: The registration as plain values, or None.
         path: The HTML to write; it appears whole or not at all.
         film: Name of the rehearsal's film, which lies beside the page and is linked; None without one.
+        uncertainty: What there is to say of chances and rooms; None where the case declares no errors.
     """
     data = {
         "map": map_data(case, candidates),
@@ -68,7 +86,9 @@ def write_page(
         needle=needle_words(case),
         notice=TRUTH_IS_BELIEF if rehearsal is not None and rehearsal.truth_is_belief else "",
         refused=_refused(candidates),
-        cards=_cards(candidates, plan, rehearsal),
+        cards=_cards(candidates, plan, rehearsal, None if uncertainty is None else uncertainty.doubt),
+        chances=None if uncertainty is None else chances_section(uncertainty.doubt, registration),
+        rooms=None if uncertainty is None else rooms_section(uncertainty.rooms, uncertainty.picture),
         counts=tables.counts_table(candidates),
         best=tables.best_table(candidates),
         plan=tables.plan_section(plan),
@@ -90,7 +110,7 @@ def _refused(candidates: Candidates) -> str:
     return f"All {len(candidates):,} directions are refused ({counts})."
 
 
-def _cards(candidates: Candidates, plan: Any | None, rehearsal: Any | None) -> list[Card]:
+def _cards(candidates: Candidates, plan: Any | None, rehearsal: Any | None, doubt: Doubt | None) -> list[Card]:
     row = chosen_row(candidates)
     safe = int(candidates.safe.sum())
     if safe == 0:
@@ -109,6 +129,8 @@ def _cards(candidates: Candidates, plan: Any | None, rehearsal: Any | None) -> l
         if name:
             detail += f"; nearest {name.replace('_', ' ')}, {number(clearance, 1, 'mm')}"
         cards.append(Card("best direction", where, detail))
+    if doubt is not None:
+        cards.append(chance_card(doubt))
     if not candidates.arm_checked:
         cards.append(Card("arm", "not checked", candidates.arm_note.removeprefix("not checked: ")))
     if plan is None:

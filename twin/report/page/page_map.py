@@ -23,6 +23,8 @@ DETAIL_UNITS = {
     Reason.UNKNOWN_REGION: ("clearance", "mm"),
     Reason.TOO_LONG: ("path", "mm"),
     Reason.SKIN_ANGLE: ("skin angle", "°"),
+    Reason.HIT_UNLIKELY: ("chance to hit", " "),
+    Reason.TOUCH_LIKELY: ("chance to touch", " "),
 }
 """What ``Candidates.verdict.amount`` is, by reason."""
 
@@ -72,7 +74,16 @@ def map_data(case: Any, candidates: Candidates) -> dict[str, Any]:
         "outward": _rounded(candidates.outward_ct.ravel(), 5),
         "best": candidates.ranked[:10].tolist(),
         "pareto": np.flatnonzero(candidates.ranking.pareto & candidates.safe).tolist(),
+        **_chances(candidates),
     }
+
+
+def _chances(candidates: Candidates) -> dict[str, Any]:
+    """Chances for the pointer to read; nothing of a case without declared errors."""
+    found = candidates.chances
+    if found is None:
+        return {}
+    return {"p_hit": _rounded(found.hit, 6), "p_touch_any": _rounded(found.touch_any, 6)}
 
 
 def map_raster_rows(rows: Any) -> list[int]:

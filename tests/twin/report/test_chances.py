@@ -1,0 +1,129 @@
+"""What map and page show of chances: where there are some, and nothing new where there are none."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import report_world as world
+from PIL import Image
+
+from puncture_twin.planning.search.doubt import Doubt, Goal, Remedy
+from puncture_twin.planning.uncertainty.chances import Chances
+from puncture_twin.planning.uncertainty.pose_error import ErrorBudget
+from puncture_twin.twin.report.map.chance_layer import chance_raster, touch_nothing
+from puncture_twin.twin.report.map.map_picture import draw_map
+from puncture_twin.twin.report.map.map_raster import map_raster
+from puncture_twin.twin.report.map_view import map_view
+from puncture_twin.twin.report.page.page import Uncertainty, write_page
+from puncture_twin.twin.report.page.page_chances import rooms_section
+from puncture_twin.twin.report.rooms_picture import draw_rooms_picture, needle_frame
+
+BUDGET = ErrorBudget(1.0, 0.8, 0.6, np.array([1.9, 1.5, 1.2]), {"touch": 0.75, "ct_slice": 0.25})
+DOUBT = Doubt(
+    0.93, {"rib_right_9": 0.02}, 0.02, BUDGET, "residuals agree with the declared errors",
+    (Goal("", 0.99, False, (Remedy("touch", 0.35, 0.1),), 0.6),),
+)  # fmt: skip
+ROOMS = {
+    "rooms": 1000, "seed": 7, "unreached": 3, "realised_rms_mm": 1.01, "predicted_rms_mm": 1.0, "coverage_95": 0.947,
+    "hit_share": 0.93, "mean_p_hit": 0.931, "touch_share": 0.02, "mean_p_touch": 0.021, "wrong_belief": True,
+    "touch_share_by_structure": {"rib_right_9": 0.02}, "p_touch_by_structure": {"rib_right_9": 0.021},
+    "guessed_touches": True,
+}  # fmt: skip
+
+TOLD = (
+    "How sure it is",
+    "0.93",
+    "touch noise (touch_mm) would have to be 0.1 mm, not 0.35",
+    "75.0 %",
+    "breathing, a needle that bends",
+    "In many rooms",
+    "94.70 %",
+    "p_touch_any",
+    "wrong by design",
+)
+
+
+@pytest.fixture(scope="module")
+def shown():
+    """A case, its candidates with chances that grow with the clearance, and its plan."""
+    case = world.make_case()
+    found = world.make_candidates(case)
+    touch = np.where(found.safe, np.exp(-found.clearance.least / 3), np.nan)
+    blank = np.where(found.safe, 0.93, np.nan)
+    wide = np.stack([touch, np.zeros(len(found))], axis=1)
+    chances = Chances(found.clearance.structures, blank, wide, wide, touch, touch, blank, blank)
+    return case, replace(found, chances=chances)
+
+
+def test_the_layer_shows_what_the_table_holds(shown):
+    """Within the safe region, smoothed by less than half a cell; nothing of a case without chances."""
+    case, found = shown
+    rows = map_raster(found, map_view(case, found), 400).rows
+    chance = chance_raster(found, rows)
+    known = np.append(found.safe, False)[rows]
+    assert np.array_equal(np.isfinite(chance), known)
+    assert np.median(np.abs(chance[known] - touch_nothing(found)[rows[known]])) < 0.02
+    assert chance_raster(replace(found, chances=None), rows) is None
+
+
+def test_the_map_has_the_layer_only_with_chances(shown, tmp_path):
+    """Hatched and lined, with its legend."""
+    case, found = shown
+    draw_map(found, case, tmp_path / "with.png")
+    draw_map(replace(found, chances=None), case, tmp_path / "without.png")
+    with_it, without = (np.asarray(Image.open(tmp_path / name)) for name in ("with.png", "without.png"))
+    assert (with_it != without).any(axis=2).mean() > 0.01
+
+
+def test_the_page_says_how_sure_it_is(shown, tmp_path):
+    """Chances, sources, the test, what would have to shrink, what is not modelled; the pointer reads both chances."""
+    case, found = shown
+    picture = tmp_path / "rooms.png"
+    Image.new("RGB", (4, 4)).save(picture)
+    told, plain = tmp_path / "told.html", tmp_path / "plain.html"
+    anatomy, plan = world.make_anatomy(), world.make_plan(case, found)
+    parts = (case, anatomy, found, plan, None, world.make_registration())
+    write_page(*parts, told, uncertainty=Uncertainty(DOUBT, ROOMS, picture))
+    write_page(case, anatomy, replace(found, chances=None), *parts[3:], plain)
+    text = told.read_text()
+    for words in TOLD:
+        assert words in text
+    for words in ("How sure it is", "In many rooms", "p_touch_any"):
+        assert words not in plain.read_text()
+
+
+def test_a_truth_that_equals_the_belief_is_said_above_all(shown, tmp_path):
+    """Before the cards."""
+    case, found = shown
+    plan = world.make_plan(case, found)
+    done = world.make_rehearsal(plan)
+    done.truth_is_belief = True
+    write_page(case, world.make_anatomy(), found, plan, done, None, tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text()
+    assert 0 < text.index("The truth equals the belief") < text.index("safe directions")
+
+
+def test_rooms_without_any_that_was_reached_say_nothing():
+    """There is no table of nothing."""
+    assert rooms_section({**ROOMS, "realised_rms_mm": None}, None) == ""
+
+
+def test_the_cloud_is_drawn_in_the_needles_frame(tmp_path):
+    """The last axis is depth, positive too deep; the others are across."""
+    outward = np.array([0.6, 0.0, 0.8])
+    R = needle_frame(outward)
+    assert np.allclose(R @ R.T, np.eye(3)) and np.allclose(R @ -outward, [0, 0, 1]) and np.linalg.det(R) > 0
+    error = np.random.default_rng(0).normal(size=(300, 3)) * [1.0, 2.0, 0.5]
+    found = SimpleNamespace(
+        puncture=SimpleNamespace(outward_ct=outward), error_ct=error, cov_ct=np.diag([1.0, 4.0, 0.25]), seed=0,
+        in_region=np.arange(300) < 285, realised_rms_mm=2.3, predicted_rms_mm=2.29,
+        tip_error_mm=np.linalg.norm(error, axis=1), __len__=lambda: 300,
+    )  # fmt: skip
+
+    class Found(SimpleNamespace):
+        def __len__(self):
+            return 300
+
+    draw_rooms_picture(Found(**vars(found)), tmp_path / "rooms.png")
+    assert Image.open(tmp_path / "rooms.png").size[0] > 1000

@@ -1,0 +1,110 @@
+"""``rooms.png``: where the tips of many rooms ended, in the needle's own frame, over what was predicted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy.special import chdtri
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.uncertainty.hit import hit_in_ball
+from puncture_twin.twin.report.palette import PNG_LEVEL
+
+FIGURE_INCHES, DPI = (13.2, 4.7), 110
+MOST_POINTS = 4000
+"""Of a cloud: more hide one another."""
+
+WITHIN, BEYOND, PREDICTED = "#0072b2", "#d55e00", "#000000"
+"""Okabe and Ito's blue and vermilion; what lies beyond is a cross too."""
+
+BINS = 40
+REGION = 0.95
+CROWDED = 0.6
+"""Radii of the ellipse that stay free around it."""
+
+
+def needle_frame(outward_ct: Floats) -> Floats:
+    """R_needle_ct, shape (3, 3), of a needle that comes along a unit vector (3,): two lateral axes, then depth."""
+    depth = -outward_ct
+    helper = np.eye(3)[np.argmin(np.abs(depth))]
+    x = np.cross(helper, depth)
+    x = x / np.linalg.norm(x)
+    return np.stack([x, np.cross(depth, x), depth])
+
+
+def draw_rooms_picture(found: Any, path: Path) -> None:
+    """Write the picture.
+
+    Args:
+        found: A `Distribution` of one room or more.
+        path: The PNG to write; it appears whole or not at all.
+    """
+    R = needle_frame(found.puncture.outward_ct)
+    error, cov = found.error_ct @ R.T, R @ found.cov_ct @ R.T
+    figure = Figure(figsize=FIGURE_INCHES, dpi=DPI, facecolor="white", layout="constrained")
+    side, along, sizes = figure.subplots(1, 3)
+    _cloud(side, error, cov, found.in_region, (0, 1), ("lateral x, mm", "lateral y, mm"))
+    side.set_title("tip in the patient, seen along the needle", fontsize=10)
+    _cloud(along, error, cov, found.in_region, (0, 2), ("lateral x, mm", "depth, mm (down: too deep)"))
+    along.invert_yaxis()
+    along.set_title("seen from the side", fontsize=10)
+    _histogram(sizes, found)
+    figure.suptitle(
+        f"{len(found):,} rooms, seed {found.seed}: {100 * found.in_region.mean():.1f} % inside of the predicted 95 % "
+        f"ellipsoid; rms {found.realised_rms_mm:.2f} mm, predicted {found.predicted_rms_mm:.2f} mm",
+        fontsize=11.5,
+    )
+    with atomic(Path(path)) as temporary:
+        FigureCanvasAgg(figure)
+        figure.savefig(temporary, format="png", pil_kwargs={"compress_level": PNG_LEVEL})
+
+
+def _cloud(axes: Axes, error: Floats, cov: Floats, within: Any, pair: tuple[int, int], names: tuple[str, str]) -> None:
+    """The errors on two axes, and the shadow of the 95 % ellipsoid there."""
+    shown = np.arange(len(error)) < MOST_POINTS
+    for rows, colour, marker, words in (
+        (shown & within, WITHIN, ".", "tip inside of the ellipsoid"),
+        (shown & ~within, BEYOND, "x", "outside of it, in some direction"),
+    ):
+        points = error[rows][:, list(pair)]
+        axes.scatter(points[:, 0], points[:, 1], s=14, c=colour, marker=marker, linewidths=0.8, alpha=0.6, label=words)
+    turns = np.linspace(0, 2 * np.pi, 241)
+    values, vectors = np.linalg.eigh(cov[np.ix_(pair, pair)])
+    ring = vectors @ (np.sqrt(chdtri(3, 1 - REGION) * np.maximum(values, 0))[:, None] * [np.cos(turns), np.sin(turns)])
+    axes.plot(*ring, color=PREDICTED, lw=1.6, label="predicted 95 % ellipsoid")
+    axes.plot([0], [0], marker="+", color=PREDICTED, ms=11, mew=1.6, ls="none", label="true target")
+    reach = (1 + CROWDED) * max(float(np.abs(ring).max()), float(np.abs(error[:, list(pair)]).max()) / (1 + CROWDED))
+    axes.set_xlim(-reach, reach)
+    axes.set_ylim(-reach, reach)
+    axes.set_aspect("equal")
+    axes.set_xlabel(names[0])
+    axes.set_ylabel(names[1])
+    axes.grid(visible=True, color="0.9")
+    axes.set_axisbelow(True)
+    if pair == (0, 1):
+        axes.legend(fontsize=7.5, loc="upper left")
+
+
+def _histogram(axes: Axes, found: Any) -> None:
+    """How far the tips ended from the true target, over the predicted density."""
+    sizes = found.tip_error_mm
+    top = 1.02 * max(float(sizes.max()), 2.5 * found.predicted_rms_mm)
+    edges = np.linspace(0, top, BINS + 1)
+    axes.hist(sizes, bins=list(edges), color=WITHIN, alpha=0.55, label="rooms")
+    fine = np.linspace(0, top, 4 * BINS + 1)
+    reached = np.array([hit_in_ball(found.cov_ct[None], radius)[0] if radius > 0 else 0.0 for radius in fine.tolist()])
+    density = np.diff(reached) * len(found) * 4
+    axes.plot((fine[1:] + fine[:-1]) / 2, density, color=PREDICTED, lw=1.6, label="predicted")
+    median = float(np.median(sizes))
+    axes.axvline(median, color=BEYOND, ls="--", lw=1.5, label=f"median {median:.2f} mm")
+    axes.set_xlim(0, top)
+    axes.set_xlabel("true tip to true target, mm")
+    axes.set_ylabel("rooms")
+    axes.set_title("tip error", fontsize=10)
+    axes.legend(fontsize=8)
