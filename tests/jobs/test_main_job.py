@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -83,7 +84,9 @@ def test_of_many_rooms_the_median_is_shown(carton, tmp_path, capfd):
     """Headline, film and numbers are of the room in the middle, which the simulator confirms."""
     here = tmp_path / "case"
     shutil.copytree(carton.parent, here)
-    text = (here / "case_m.toml").read_text().split("\n[errors]")[0].split("\n[end]")[0]
+    text = re.sub(r"\n\[errors\].*?(?=\n\[)", "", (here / "case_m.toml").read_text(), flags=re.DOTALL).split("\n[end]")[
+        0
+    ]
     errors = "\n[errors]\ntouch_mm = 0.2\nct_in_plane_mm = 0.3\nct_slice_mm = 0.3\n"
     (here / "case_m.toml").write_text(f"{text}\n{errors}\n[end]\nstructures = 4\n")
     arguments = ("rehearse", here / "case_m.toml", "--seeds", 201, "--physics", 1, "--out", tmp_path / "out")
