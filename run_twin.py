@@ -25,6 +25,7 @@ from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.batch.batch import run_batch
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.export.exporter import FORMATS
+from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, exit_code_of
 from puncture_twin.twin.jobs.patient import answers, main_job, text as words
@@ -245,9 +246,25 @@ def export(
 
 
 @app.command()
-def register(case: CaseArgument, as_json: JsonOption = False) -> None:
-    """Register a case's markers; print residuals, FRE, expected TRE and weak points."""
-    report = answers.registration_report(case)
+def register(
+    source: Annotated[Path, typer.Argument(metavar="CASE_OR_MARKERS_CT", help="A case, or markers read in the CT.")],
+    markers_base: Annotated[
+        Path | None, typer.Argument(metavar="MARKERS_BASE", help="The same markers as the robot touched them.")
+    ] = None,
+    target: Annotated[str | None, typer.Option("--target", help="X,Y,Z in mm, of two lists of markers.")] = None,
+    space: Annotated[
+        Space, typer.Option("--space", help="Of the CT's list and the target, where the file is silent.")
+    ] = Space.LPS,
+    fle: Annotated[float | None, typer.Option("--fle", min=0.001, help="Known localisation error (rms), mm.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Register a case's markers, or two lists of markers; print residuals, FRE, expected TRE and weak points."""
+    if markers_base is None:
+        report = answers.registration_report(source)
+    elif target is None:
+        raise InputError("two lists of markers need a target", where="register", allowed="--target X,Y,Z in mm")
+    else:
+        report = answers.lists_report(source, markers_base, target, space, fle)
     _print(report, words.registration_text(report), as_json)
 
 

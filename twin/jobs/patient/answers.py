@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -13,15 +14,19 @@ from puncture_twin.planning.anatomy.anatomy import load_skin
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.base.output.manifest import read_output
-from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.certify.certificate import MAX_CERTIFICATE_BYTES, parse_certificate
 from puncture_twin.planning.certify.checker import verify
+from puncture_twin.planning.formats.points.point_files import MAX_FILE_BYTES, parse_points
+from puncture_twin.planning.formats.points.raw_points import parse_coordinate
 from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.registration.advice import odd_branches, one_more, without_each
 from puncture_twin.planning.registration.marker_check import checked_placement
-from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.registration.registration import Registration, match, register
 from puncture_twin.planning.registration.touching import touchable_points
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
@@ -55,6 +60,37 @@ def registration_report(path: Path) -> dict[str, Any]:
     report["warnings"] = [*case.warnings, *checked.findings.warnings, *_branch_warning(case, registration)]
     report |= _advice(case, registration)
     report["notes"] = list(checked.findings.notes)
+    return report
+
+
+def lists_report(
+    markers_ct: Path, markers_base: Path, target: str, space: Space, fle_mm: float | None
+) -> dict[str, Any]:
+    """The registration of two lists of markers alone, as plain values.
+
+    Raises:
+        InputError: Lists that cannot be read, matched or trusted, or a target that is no point.
+    """
+    where = "--target"
+    numbers = [parse_coordinate(part.strip(), where) for part in target.split(",")]
+    if len(numbers) != 3:
+        raise InputError(f"{len(numbers)} numbers", where=where, allowed="X,Y,Z in mm")
+    content = [read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path)) for path in (markers_ct, markers_base)]
+    read = [parse_points(content[0], markers_ct, default_space=space), parse_points(content[1], markers_base)]
+    target_ct = to_lps(np.array([numbers]), space)[0]
+    pairs = match(*read, use=None, where=f"{markers_ct}, {markers_base}")
+    registration = register(pairs, method="rigid", target_ct=target_ct, fle_mm=fle_mm, where=str(markers_base))
+    report = registration_summary(registration)
+    report["case"] = f"{markers_ct} and {markers_base}"
+    named = zip(("markers_ct", "markers_base"), (markers_ct, markers_base), content, strict=True)
+    report["inputs"] = inputs_document(
+        tuple(Input(role, str(path), hashlib.sha256(data).hexdigest()) for role, path, data in named)
+    )
+    report["expected_tre_target_mm"] = float(registration.expected_tre_mm(target_ct[None])[0])
+    report["expected_tre_target_interval_mm"] = list(registration.expected_tre_interval_mm(target_ct))
+    report["expected_tre_along_shaft_mm"] = []
+    report["warnings"] = []
+    report["notes"] = ["two lists alone: neither skin nor couch was asked whether axes or names have slipped"]
     return report
 
 

@@ -159,7 +159,7 @@ def registration_text(report: dict[str, Any]) -> str:
         f"  FLE {report['fle_mm']:.3f} mm, {report['fle_source']}{_interval(report['fle_interval_mm'])}",
         f"  expected error at the target {report['expected_tre_target_mm']:.3f} mm"
         + _interval(report["expected_tre_target_interval_mm"]),
-        "  along the shaft, target to hub: " + ", ".join(f"{mm:.3f}" for mm in report["expected_tre_along_shaft_mm"]),
+        *_along_shaft(report["expected_tre_along_shaft_mm"]),
         f"  spread s2/s1 {report['spread_ratio']:.2f}, altitude {report['altitude_mm']:.0f} mm, "
         f"TRE/FLE {report['leverage']:.2f}",
     ]
@@ -167,6 +167,10 @@ def registration_text(report: dict[str, Any]) -> str:
     for kind, key in (("weak", "flags"), ("warning", "warnings"), ("note", "notes")):
         lines += [f"  {kind}: {sentence}" for sentence in report[key]]
     return "\n".join(lines)
+
+
+def _along_shaft(expected_mm: Sequence[float]) -> list[str]:
+    return ["  along the shaft, target to hub: " + ", ".join(f"{mm:.3f}" for mm in expected_mm)] if expected_mm else []
 
 
 def _declared_lines(report: dict[str, Any]) -> list[str]:
