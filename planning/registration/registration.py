@@ -146,6 +146,9 @@ class Registration:
 
     def expected_tre_interval_mm(self, point_ct: Floats) -> Interval:
         """The same at one point (3,), at both ends of the noise's 95 % interval, mm."""
+        if self.uncertainty is None:
+            lever = float(leverage(self.markers.points_ct, point_ct[None])[0])
+            return Interval(*(fle * lever for fle in self.fle_interval_mm))
         expected = float(self.expected_tre_mm(point_ct[None])[0])
         return Interval(*(expected * fle / self.fle_mm for fle in self.fle_interval_mm))
 
