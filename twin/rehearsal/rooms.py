@@ -17,7 +17,7 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fit_map import fit_weighted
+from puncture_twin.planning.registration.fit_map import design, fit_weighted, least_squares_map
 from puncture_twin.planning.registration.reading_noise import ReadingNoise, parameter_variances
 from puncture_twin.planning.registration.registration import fit_rigid, fit_triad
 from puncture_twin.twin.plant.true_needle import driven_onto, true_needle
@@ -62,6 +62,7 @@ class Rooms(NamedTuple):
         T_base_ct: Shape (n, 4, 4), what each room registered.
         reached: Shape (n,), whether the arm could reach the pose that followed.
         R_ct_needle: Shape (n, 3, 3), the needle's axes as columns; z points to the tip.
+        chi_squared: Shape (n,), of the weighted residuals of each room's markers against the believed noise.
     """
 
     tip_ct: Floats
@@ -70,6 +71,7 @@ class Rooms(NamedTuple):
     T_base_ct: Floats
     reached: Bools
     R_ct_needle: Floats
+    chi_squared: Floats
 
     def reached_alone(self) -> Rooms:
         """Without the rooms in which the arm did not reach the pose."""
@@ -81,6 +83,7 @@ class Rooms(NamedTuple):
             self.T_base_ct[kept],
             self.reached[kept],
             self.R_ct_needle[kept],
+            self.chi_squared[kept],
         )
 
 
@@ -94,7 +97,7 @@ def draw_rooms(puncture: Puncture, errors: ErrorModel, count: int, rng: np.rando
         rng: The source of all draws.
     """
     eta = rng.normal(size=(count, 28)) * np.sqrt(parameter_variances(errors.arm))
-    T_base_ct = _registered(puncture, errors, eta, rng)
+    T_base_ct, residuals = _registered(puncture, errors, eta, rng)
     q, reached = _commanded(puncture, T_base_ct)
     arrival = rng.normal(size=(count, 6)) * np.hypot(errors.arm.repeatability, errors.arm.drift)
     needle = true_needle(puncture.model, q + arrival, eta, puncture.tip_mm)
@@ -102,11 +105,24 @@ def draw_rooms(puncture: Puncture, errors: ErrorModel, count: int, rng: np.rando
     target_ct = puncture.target_ct + _normal(rng, errors.target_cov_ct, (count,))
     outward_ct = -needle.R_base_needle[:, :, 2] @ T_ct_base[:3, :3].T
     R_ct_needle = T_ct_base[:3, :3] @ needle.R_base_needle
-    return Rooms(apply(T_ct_base, needle.tip_base), outward_ct, target_ct, T_base_ct, reached, R_ct_needle)
+    tip_ct, squares = apply(T_ct_base, needle.tip_base), _chi_squared(puncture, residuals)
+    return Rooms(tip_ct, outward_ct, target_ct, T_base_ct, reached, R_ct_needle, squares)
 
 
-def _registered(puncture: Puncture, errors: ErrorModel, eta: Floats, rng: np.random.Generator) -> Floats:
-    """T_base_ct of every room, shape (n, 4, 4), from markers read with errors and touched by an arm that errs."""
+def _chi_squared(puncture: Puncture, residuals: Floats) -> Floats:
+    """Of residuals (n, 3 N) in base axes, by the nominal registration's weights, as `noise_test` computes it."""
+    R, points = puncture.T_base_ct[:3, :3], apply(puncture.T_base_ct, puncture.points_ct)
+    A = design(points, points.mean(axis=0))
+    weights = np.asarray(np.linalg.inv(puncture.noise.independent(R) + puncture.noise.shared()), dtype=np.float64)
+    left = weights - weights @ A @ least_squares_map(A, weights)
+    return np.asarray(np.einsum("na,ab,nb->n", residuals, left, residuals, optimize=True))
+
+
+def _registered(puncture: Puncture, errors: ErrorModel, eta: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """T_base_ct of every room, shape (n, 4, 4), and its residuals, shape (n, 3 N), mm, base axes.
+
+    Markers are read with errors, and touched by an arm that errs.
+    """
     count, markers = len(eta), len(puncture.points_ct)
     eta_of = np.broadcast_to(eta[:, None], (count, markers, 28))
     read_ct = puncture.points_ct + _normal(rng, errors.marker_cov_ct, (count, markers))
@@ -116,6 +132,12 @@ def _registered(puncture: Puncture, errors: ErrorModel, eta: Floats, rng: np.ran
     flange = flange_pose(puncture.model, q_encoder)
     touched = flange[..., :3, 3] + puncture.tip_mm * flange[..., :3, 2]
     touched = touched + rng.normal(size=touched.shape) * errors.touch_mm
+    T_base_ct = _fitted(puncture, read_ct, touched)
+    there = read_ct @ np.swapaxes(T_base_ct[:, :3, :3], 1, 2) + T_base_ct[:, None, :3, 3]
+    return T_base_ct, (touched - there).reshape(count, -1)
+
+
+def _fitted(puncture: Puncture, read_ct: Floats, touched: Floats) -> Floats:
     if puncture.method == "triad":
         return fit_triad(read_ct, touched)
     fitted = fit_rigid(read_ct, touched)

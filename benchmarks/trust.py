@@ -1,0 +1,343 @@
+"""Do the predicted chances come true? Many rooms drawn from a declaration, against what it predicts.
+
+python -m benchmarks.trust                     100,000 rooms of each anatomy and set of markers, minutes
+python -m benchmarks.trust --quick             a tenth of the directions and 4,000 rooms
+python -m benchmarks.trust --rooms N --out F   N rooms; the table in a file too
+
+Every room has its own truth: markers read and touched with errors, registered, and the needle driven by exact
+kinematics. Where the noise is ``found``, the declaration gives the errors' shape alone, and each room's residuals
+their size s; regions are Fisher's F then, and chances Student's t.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.special import chdtri, fdtri
+
+from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.insertion import flange_poses
+from puncture_twin.planning.arm.kinematics import inverse, singularity
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.geometry.containment import inside_each
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.reach.standoff import axis_lengths
+from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
+from puncture_twin.planning.registration.noise_test import NoiseTest
+from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.registration.reading_noise import reading_noise
+from puncture_twin.planning.registration.registration import MarkerPairs, fit_rigid, register
+from puncture_twin.planning.registration.touch_poses import touching_configuration
+from puncture_twin.planning.search.chance import chance_model, chances_of, demanding, refined_chances
+from puncture_twin.planning.search.context import CaseContext, prepare
+from puncture_twin.planning.search.search import case_directions, organ_candidates
+from puncture_twin.planning.uncertainty.hit import hit_in_ball
+from puncture_twin.planning.uncertainty.pose_error import PoseError
+from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+REAL_CT = REPOSITORY.parent / "shared" / "data" / "totalseg_abdomen_3mm"
+REAL_ERRORS = "\n[errors]\nct_pixel_mm = 1.5\nct_spacing_mm = 3.0\n"
+MARKERS = (3, 4, 6)
+SEED = 20191104
+BINS = 10
+RADII = (0.4, 0.7, 1.0, 1.4)
+"""Of balls about the target, over the tip's predicted rms: a lesion that is hit for certain shows no calibration."""
+
+TRUE_SIZES = np.geomspace(1 / 16, 4.0, 24)
+"""Of the errors over the declared ones, where the residuals are to find it."""
+
+SIZES = np.geomspace(0.003, 16.0, 33)
+"""Errors' size by the residuals over the declared one, for which chances are computed; between them interpolated."""
+
+RATIO, COVERAGE, ECE = (0.97, 1.03), (0.94, 0.96), 0.01
+TARGETS = f"ratio {RATIO[0]} to {RATIO[1]}, region {COVERAGE[0]} to {COVERAGE[1]}, ECE at most {ECE}"
+
+
+@dataclass(frozen=True, eq=False)
+class Tally:
+    """Predictions beside what came, over all directions of one row of the table.
+
+    Attributes:
+        ratio: Realised over predicted rms of the tip's error, all directions together.
+        coverage: Of the predicted 95 % regions.
+        ece_hit: Expected calibration error of p_hit over ten bins.
+        ece_touch: Of p_touch, all structures that may be touched.
+        noticed: Share of rooms whose residuals break the declaration's test at its 1 %, were it taken at its word.
+    """
+
+    ratio: float
+    coverage: float
+    ece_hit: float
+    ece_touch: float
+    noticed: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether every figure is where it should be."""
+        inside = RATIO[0] <= self.ratio <= RATIO[1] and COVERAGE[0] <= self.coverage <= COVERAGE[1]
+        return inside and self.ece_hit <= ECE and self.ece_touch <= ECE
+
+    def text(self) -> str:
+        """Cells of a table."""
+        figures = f"{self.ratio:.3f} | {self.coverage:.3f} | {self.ece_hit:.4f} | {self.ece_touch:.4f}"
+        return f"{figures} | {self.noticed:.3f} | {'yes' if self.holds else 'NO'}"
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One anatomy, the errors declared of it, and directions that a UR3 reaches.
+
+    Attributes:
+        outward_ct: Shape (d, 3), unit; half of them those that pass nearest to what must not be touched.
+        q: Shape (d, 6), rad.
+        points_ct: Shape (6, 3), markers, mm.
+        T_base_ct: Shape (4, 4).
+    """
+
+    name: str
+    context: CaseContext
+    errors: ErrorModel
+    outward_ct: np.ndarray
+    q: np.ndarray
+    points_ct: np.ndarray
+    T_base_ct: np.ndarray
+
+
+def calibration_error(predicted: np.ndarray, came: np.ndarray) -> float:
+    """ECE: the mean, over ten bins weighted by their counts, of |mean prediction - share that came|."""
+    which = np.minimum((predicted * BINS).astype(int), BINS - 1)
+    parts = [abs(float((predicted[which == b] - came[which == b]).sum())) for b in range(BINS)]
+    return sum(parts) / max(len(predicted), 1)
+
+
+def scene(name: str, path: Path, directions: int) -> Scene:
+    """Prepare a case: its directions are those that the organs leave and an arm reaches by its kinematics alone."""
+    context = prepare(path, arm=False)
+    case, found = context.case, load_placement(context.case)
+    assert case.errors is not None and found is not None and found.registration is not None
+    markers = found.registration.markers
+    T, points = fit_rigid(markers.points_ct, markers.points_base), markers.points_ct
+    pairs = [(i, j) for j in range(len(points)) for i in range(j)]
+    while len(points) < max(MARKERS):  # beside the case's own: the middles between two of them
+        i, j = pairs[len(points) - len(markers.points_ct)]
+        points = np.vstack([points, 0.5 * (points[i] + points[j])])
+    outward, q = _reached(context, T, directions)
+    return Scene(name, context, case.errors, outward, q, points[: max(MARKERS)], T)
+
+
+def _reached(context: CaseContext, T_base_ct: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    case, rng = context.case, np.random.default_rng(SEED)
+    judged = organ_candidates(case, context.anatomy, context.engine, case_directions(case))
+    rows = np.flatnonzero(judged.safe)
+    nearest = rows[np.argsort(judged.clearance.least[rows])]
+    order = [row for pair in zip(nearest, rng.permutation(rows), strict=True) for row in pair]
+    model, tip, rolls = ur_model(case.robot.model), case.needle.length_mm, np.radians(np.arange(0, 360, 30))
+    outward, kept = [], []
+    for row in order:
+        along = judged.outward_ct[row]
+        poses = flange_poses(apply(T_base_ct, case.target_ct), T_base_ct[:3, :3] @ along, tip, rolls)
+        q = inverse(model, poses).reshape(-1, 6)
+        if np.isfinite(q).all(axis=1).any() and len(kept) < count:
+            outward.append(along)
+            kept.append(q[np.nanargmax(singularity(model, q).least())])
+    return np.array(outward), np.array(kept)
+
+
+def punctures(of: Scene, markers: int) -> Iterator[tuple[Puncture, PoseError]]:
+    """Each direction's puncture, and the belief that the declaration gives of it."""
+    case, T = of.context.case, of.T_base_ct
+    model, tip, points = ur_model(case.robot.model), case.needle.length_mm, of.points_ct[:markers]
+    there, down = apply(T, points), -(T[:3, :3] @ case.T_ct_entry[:3, 2])
+    q_touch = np.array([touching_configuration(model, tip, point, down) for point in there])
+    noise = reading_noise(of.errors, model, tip, q_touch, known=True)
+    pairs = MarkerPairs(tuple(f"M{i}" for i in range(markers)), points, there)
+    fitted = register(pairs, method="weighted", target_ct=case.target_ct, noise=noise)
+    assert fitted.uncertainty is not None
+    error = PoseError(model, tip, apply(T, case.target_ct), of.errors, fitted.uncertainty)
+    for outward, q in zip(of.outward_ct, of.q, strict=True):
+        yield Puncture(model, tip, "weighted", noise, points, q_touch, T, case.target_ct, outward, q), error
+
+
+def tally(
+    of: Scene, markers: int, rooms: int, *, truth: float = 1.0, found: bool = True, seed: int = SEED
+) -> dict[str, Tally]:
+    """Rooms of one anatomy and set of markers, by what is known of the noise.
+
+    ``known``: the declaration is taken at its word. ``found``: the residuals give the size, whatever it is: it is drawn
+    evenly on a logarithmic scale. ``found, size 1``: likewise, but the true size is always the declared one, which a
+    chance that follows from the residuals alone cannot know.
+
+    Args:
+        of: The anatomy.
+        markers: How many of its markers are used.
+        rooms: In all, divided among the directions.
+        truth: The true errors over the declared ones.
+        found: Whether rooms of found noise are drawn too.
+        seed: Of all draws.
+    """
+    rng, each, freedom = np.random.default_rng(seed), max(rooms // len(of.q), 1), 3 * markers - 6
+    sums = {"known": _Sums.empty(), "found": _Sums.empty(), "found, size 1": _Sums.empty()}
+    for puncture, error in punctures(of, markers):
+        drawn = draw_rooms(puncture, of.errors.scaled(truth), each, rng).reached_alone()
+        came, sizes = _came(of, puncture, error, drawn), np.sqrt(drawn.chi_squared / freedom)
+        sums["known"].add(*_predicted(of, error, puncture, None), np.ones(len(sizes)), drawn, came)
+        if not found:
+            continue
+        told = _predicted(of, error, puncture, freedom)
+        sums["found, size 1"].add(*told, sizes, drawn, came)
+        for true_size in TRUE_SIZES:
+            drawn = draw_rooms(puncture, of.errors.scaled(truth * true_size), each // len(TRUE_SIZES), rng)
+            drawn = drawn.reached_alone()
+            came, sizes = _came(of, puncture, error, drawn), np.sqrt(drawn.chi_squared / freedom)
+            sums["found"].add(*told, sizes, drawn, came)
+    radius = {"known": chdtri(3, 0.05), "found": 3 * fdtri(3, freedom, 0.95)}
+    drawn_for = {name: part for name, part in sums.items() if part.hits}
+    return {name: part.tally(radius[name.partition(",")[0]], freedom) for name, part in drawn_for.items()}
+
+
+def _predicted(of: Scene, error: PoseError, puncture: Puncture, freedom: int | None) -> tuple[np.ndarray, ...]:
+    """Sizes (m,), the tip's covariance at size 1, and chances at each size: to hit (m, 5), to touch (m, k)."""
+    sizes = np.ones(1) if freedom is None else SIZES
+    hit, touch, outward, q = [], [], puncture.outward_ct[None], puncture.q_insertion[None]
+    for size in sizes:
+        fit, test = error.fit, NoiseTest(len(puncture.points_ct), float(3 * len(puncture.points_ct) - 6))
+        if freedom is not None:
+            test = NoiseTest(len(puncture.points_ct), float(size**2 * freedom), found=True)
+        told = replace(error, fit=FitUncertainty(fit.noise, fit.R_base_ct, fit.center_base, fit.fit_map, test))
+        model = chance_model(of.context.case, of.context.anatomy, told)
+        assert model is not None
+        asked = (of.context.case, of.context.anatomy, of.context.engine, model)
+        first = chances_of(*asked, outward, q)
+        every = np.ones(first["touch"].shape, bool)
+        refined = refined_chances(*asked, (outward, q), (first["touch"], first["margin"]), every)
+        hit.append([first["hit"][0], *(hit_in_ball(told.tip_covariance(q), r, freedom)[0] for r in _radii(error, q))])
+        touch.append(refined["touch"][0])
+    return sizes, error.tip_covariance_ct(q)[0] / error.fit.test.scale**2, np.array(hit), np.array(touch)
+
+
+def _radii(error: PoseError, q: np.ndarray) -> np.ndarray:
+    """Of the balls, mm."""
+    return np.array(RADII) * np.sqrt(np.trace(error.tip_covariance(q)[0]))
+
+
+def _came(of: Scene, puncture: Puncture, error: PoseError, rooms: Rooms) -> tuple[np.ndarray, np.ndarray]:
+    """Which rooms hit lesion and balls, shape (n, 5), and which touch what, shape (n, k)."""
+    case, anatomy = of.context.case, of.context.anatomy
+    away = np.linalg.norm(rooms.tip_ct - rooms.target_ct, axis=1)
+    if case.hit_radius_mm is not None:
+        hit = away < case.hit_radius_mm
+    else:
+        hit = inside_each(anatomy.structure(case.target_structure).mesh, rooms.tip_ct)
+    columns, lengths = demanding(anatomy.checked), axis_lengths(case, anatomy.checked)
+    shift = np.linalg.norm(rooms.tip_ct - case.target_ct, axis=1).max(initial=0.0)
+    turn = np.linalg.norm(rooms.outward_ct - puncture.outward_ct, axis=1).max(initial=0.0)
+    touched = np.zeros((len(rooms.tip_ct), len(columns)), bool)
+    for place, column in enumerate(columns):
+        length, radius = float(lengths[column]), case.needle.radius_mm
+        reach = (radius + shift + 1e-6, radius + shift + length * turn + 1e-6)
+        faces = of.context.engine.near(int(column), case.target_ct, puncture.outward_ct, length, reach)
+        touched[:, place] = faces.distance(rooms.tip_ct, rooms.outward_ct, length) < radius
+    within = away[:, None] < _radii(error, puncture.q_insertion[None])
+    return np.column_stack([hit, within]), touched
+
+
+@dataclass(eq=False)
+class _Sums:
+    """What is collected over the directions of one row of the table."""
+
+    squares: list[np.ndarray]
+    errors: list[tuple[float, float]]
+    hits: list[np.ndarray]
+    touches: list[np.ndarray]
+    tests: list[np.ndarray]
+
+    @classmethod
+    def empty(cls) -> _Sums:
+        return cls([], [], [], [], [])
+
+    def add(
+        self,
+        grid: np.ndarray,
+        cov_ct: np.ndarray,
+        p_hit: np.ndarray,
+        p_touch: np.ndarray,
+        sizes: np.ndarray,
+        rooms: Rooms,
+        came: tuple[np.ndarray, np.ndarray],
+    ) -> None:
+        """One direction: chances on a grid of sizes, each room's own size, and what came."""
+        error = rooms.tip_ct - rooms.target_ct
+        square = np.einsum("na,ab,nb->n", error, np.linalg.inv(cov_ct), error)
+        self.squares.append(square / sizes**2)
+        self.errors.append((float((error**2).sum()), float(np.trace(cov_ct) * (sizes**2).sum())))
+        for told, hit in zip(p_hit.T, came[0].T, strict=True):
+            self.hits.append(np.array([np.interp(np.log(sizes), np.log(grid), told), hit]))
+        for place in np.flatnonzero((p_touch.max(axis=0) > 1e-6) | came[1].any(axis=0)):
+            told = np.interp(np.log(sizes), np.log(grid), p_touch[:, place])
+            self.touches.append(np.array([told, came[1][:, place]]))
+        self.tests.append(rooms.chi_squared)
+
+    def tally(self, radius_squared: float, freedom: int) -> Tally:
+        """The figures."""
+        realised, predicted = np.sum(self.errors, axis=0)
+        hits = np.concatenate(self.hits, axis=1)
+        touches = np.concatenate([np.zeros((2, 0)), *self.touches], axis=1)
+        return Tally(
+            ratio=float(np.sqrt(realised / predicted)),
+            coverage=float(np.mean(np.concatenate(self.squares) <= radius_squared)),
+            ece_hit=calibration_error(*hits),
+            ece_touch=calibration_error(*touches),
+            noticed=float(np.mean(np.concatenate(self.tests) > chdtri(freedom, 0.01))),
+        )
+
+
+def scenes(directions: int, temporary: Path) -> Iterator[Scene]:
+    """Three anatomies: the embedded abdomen and carton, and a real CT where it is on this machine."""
+    yield scene("abdomen", folder() / "abdomen", directions)
+    yield scene("carton-m", folder() / "carton" / "case_m.toml", directions)
+    if not REAL_CT.is_dir():
+        yield scene("carton-l", folder() / "carton" / "case_l.toml", directions)
+        return
+    for source in (*REAL_CT.iterdir(), *(REPOSITORY / "tests" / "real").iterdir()):
+        shutil.copy(source, temporary)
+    text = (temporary / "case_v2.toml").read_text("utf-8")
+    for simpler in ("fle_mm = 1.0\n", "fle_ct_mm = 0.9\n", "fle_touch_mm = 0.1\n"):
+        text = text.replace(simpler, "")
+    (temporary / "case.toml").write_text(text + REAL_ERRORS, "utf-8")
+    yield scene("real CT", temporary / "case.toml", directions)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rooms", type=int, default=100_000, help="of each anatomy and set of markers")
+    parser.add_argument("--quick", action="store_true", help="fewer directions, 4,000 rooms")
+    parser.add_argument("--out", type=Path, help="a file that gets the table too")
+    options = parser.parse_args()
+    rooms, directions = (4_000, 4) if options.quick else (options.rooms, 20)
+    head = "anatomy | markers | noise | realised / predicted rms | 95 % region | ECE hit | ECE touch | warned | holds"
+    lines = [f"{rooms} rooms a row; targets: {TARGETS}", f"| {head} |", "|" + "---|" * 9]
+    print("\n".join(lines), flush=True)
+    with tempfile.TemporaryDirectory() as temporary:
+        for of in scenes(directions, Path(temporary)):
+            for markers in MARKERS:
+                right, wrong = tally(of, markers, rooms), tally(of, markers, rooms // 4, truth=2.0, found=False)
+                rows = list(right.items())
+                rows.append(("known, true errors twice the declared", wrong["known"]))
+                for noise, figures in rows:
+                    lines.append(f"| {of.name} | {markers} | {noise} | {figures.text()} |")
+                    print(lines[-1], flush=True)
+    if options.out is not None:
+        options.out.write_text("\n".join(lines) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()
