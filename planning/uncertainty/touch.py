@@ -10,12 +10,14 @@ high at convex ends: where it may decide, `line_sampling` answers (docs/concepts
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import ndtr, stdtr
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.numba_kernels import nb
 
 NORMALS = 4096
 """Fixed draws of the jointly linearised chance: its own error is .008 at most."""
@@ -52,10 +54,26 @@ def proximity(
         cov_ct: Shape (n, 6, 6), Sigma6, CT axes, its point of reference the target.
         surface_mm: By which a structure's surface may lie off as a whole, along the normal.
     """
-    turning = depth[..., None] * np.cross(outward_ct[:, None, :], normal)
-    gradient = np.concatenate([normal, turning], axis=-1)
-    variance = np.einsum("nka,nab,nkb->nk", gradient, cov_ct, gradient, optimize=True) + surface_mm**2
-    return Proximity(distance, gradient, np.sqrt(np.maximum(variance, 0.0)))
+    gradient, deviation = np.empty((*distance.shape, 6)), np.empty(distance.shape)
+    _first_order(depth, normal, outward_ct, cov_ct, float(surface_mm), gradient, deviation)
+    return Proximity(distance, gradient, deviation)
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _first_order(depth, normal, outward, cov, surface_mm, gradient, deviation):  # type: ignore[no-untyped-def]  # numba infers
+    """Fill g = (n; s u x n) and sigma of every pair."""
+    for i in range(len(outward)):
+        ux, uy, uz = outward[i]
+        for j in range(depth.shape[1]):
+            g, s = gradient[i, j], depth[i, j]
+            nx, ny, nz = normal[i, j]
+            g[0], g[1], g[2] = nx, ny, nz
+            g[3], g[4], g[5] = s * (uy * nz - uz * ny), s * (uz * nx - ux * nz), s * (ux * ny - uy * nx)
+            variance = surface_mm * surface_mm
+            for a in range(6):
+                for b in range(6):
+                    variance += g[a] * cov[i, a, b] * g[b]
+            deviation[i, j] = math.sqrt(max(variance, 0.0)) if variance == variance else math.nan
 
 
 def touch_chance(near: Proximity, threshold_mm: Floats | float, freedom: int | None = None) -> Floats:

@@ -1,0 +1,140 @@
+"""The chances to touch against needles that are truly displaced, and what the chances cost.
+
+python -m benchmarks.touch_draws              200 directions of each of three anatomies, 10,000 displaced needles each
+python -m benchmarks.touch_draws --quick      20 directions
+python -m benchmarks.touch_draws --size 3     with errors three times as large
+
+Every displaced needle is measured with the engine's own arithmetic on all faces that it can come near to; some of them
+are measured again by the whole engine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.trust import Scene, punctures, scenes
+from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.planning.reach.standoff import axis_lengths
+from puncture_twin.planning.search.chance import ChanceModel, chance_model, chances_of, demanding, passing
+from puncture_twin.planning.uncertainty.line_sampling import line_chance, needle_doubt
+from puncture_twin.planning.uncertainty.touch import touch_chance
+
+SEED, MARKERS = 20191104, 4
+SURE = 1e-3
+"""Pairs whose chance is nearer than this to 0 or 1, by every count, are left out."""
+
+AGREE_MM = 1e-9
+REPEATS = 3
+
+
+def model_of(scene: Scene, size: float) -> ChanceModel:
+    """Of the scene's declaration, its errors so many times as large."""
+    _, error = next(iter(punctures(replace(scene, errors=scene.errors.scaled(size)), MARKERS)))
+    model = chance_model(scene.context.case, scene.context.anatomy, error)
+    assert model is not None
+    return model
+
+
+def pairs_of(scene: Scene, model: ChanceModel, draws: int) -> np.ndarray:
+    """Rows: by draws, to first order, by lines, seconds of these; of each direction, structure and threshold."""
+    case, anatomy, engine, rng = scene.context.case, scene.context.anatomy, scene.context.engine, _rng()
+    columns, lengths = demanding(anatomy.checked), axis_lengths(case, anatomy.checked)
+    cov_ct, rows = model.error.covariance_ct(scene.q), []
+    near = passing(case, anatomy, engine, model, scene.outward_ct, cov_ct)
+    for i, outward in enumerate(scene.outward_ct):
+        errors = rng.multivariate_normal(np.zeros(6), cov_ct[i], draws, method="eigh")
+        origins, along = case.target_ct + errors[:, :3], exp_rotation(errors[:, 3:]) @ outward
+        doubt = needle_doubt(case.target_ct, outward, cov_ct[i], 0.0)
+        for place, column in enumerate(columns):
+            length = float(lengths[column])
+            for threshold in case.needle.radius_mm + np.array([0.0, anatomy.checked[column].margin_mm]):
+                first = touch_chance(near, threshold)[i, place]
+                start = time.perf_counter()
+                reach = doubt.reach(length, threshold)
+                if near.distance[i, place] > max(reach):
+                    continue
+                faces = engine.near(int(column), case.target_ct, outward, length, reach)
+                lines = line_chance(faces, doubt, length, threshold, near.gradient[i, place])
+                took = time.perf_counter() - start
+                distance = faces.distance(origins, along, length)
+                drawn = float(np.mean(distance < threshold))
+                if max(first, lines, drawn) > SURE and min(first, lines, drawn) < 1 - SURE:
+                    rows.append((drawn, first, lines, took))
+                    _measured_again(scene, int(column), origins, along, threshold, distance)
+    return np.array(rows).reshape(-1, 4)
+
+
+def _rng() -> np.random.Generator:
+    return np.random.default_rng(SEED)
+
+
+def _measured_again(
+    scene: Scene, column: int, origins: np.ndarray, along: np.ndarray, threshold: float, distance: np.ndarray
+) -> None:
+    """The needle that passes nearest to touching, by the whole engine: the same."""
+    row = int(np.argmin(np.abs(distance - 0.9 * threshold)))
+    lengths = axis_lengths(scene.context.case, scene.context.anatomy.checked)
+    whole = scene.context.engine.measure(origins[row], along[row][None], lengths, shown=False).distance[0, column]
+    if min(whole, distance[row]) < threshold and abs(whole - distance[row]) > AGREE_MM:
+        raise AssertionError(f"the engine says {whole} mm, the faces near the needle {distance[row]} mm")
+
+
+def cost(scene: Scene, model: ChanceModel) -> tuple[float, float, float]:
+    """Microseconds a direction: search of the structures, chances to touch, chances to hit."""
+    case, anatomy, engine = scene.context.case, scene.context.anatomy, scene.context.engine
+    many = 4000 // len(scene.q)
+    outward, q = np.tile(scene.outward_ct, (many, 1)), np.tile(scene.q, (many, 1))
+    lengths = axis_lengths(case, anatomy.checked)
+    works = (
+        lambda: engine.measure(case.target_ct, outward, lengths, shown=False),
+        lambda: chances_of(case, anatomy, engine, model, outward, q),
+        lambda: model.hit.chance(model.error, model.error.covariance_ct(q)),
+        lambda: model.error.covariance_ct(q),
+    )
+    search, whole, hit, covariance = (_least(work) / len(q) * 1e6 for work in works)
+    return search, whole - (hit - covariance), hit - covariance
+
+
+def _least(work) -> float:  # type: ignore[no-untyped-def]
+    work()
+    times = []
+    for _ in range(REPEATS):
+        start = time.thread_time()
+        work()
+        times.append(time.thread_time() - start)
+    return min(times)
+
+
+def main() -> None:
+    """Print one table of errors and one of costs."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="20 directions")
+    parser.add_argument("--draws", type=int, default=10_000, help="displaced needles of each direction")
+    parser.add_argument("--size", type=float, default=1.0, help="of the errors, over the declared ones")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        for scene in scenes(20 if options.quick else 200, Path(temporary)):
+            model = model_of(scene, options.size)
+            rows = pairs_of(scene, model, options.draws)
+            noise = np.sqrt(np.mean(rows[:, 0] * (1 - rows[:, 0])) / options.draws)
+            print(f"{scene.name}: {len(scene.q)} directions, {len(rows)} pairs; the draws' own error {noise:.4f} rms")
+            for name, column, target in (("first order", 1, 0.01), ("lines", 2, 0.005)):
+                error = rows[:, column] - rows[:, 0]
+                figures = f"{np.sqrt(np.mean(error**2)):.4f} rms, largest {np.abs(error).max():.4f}"
+                print(f"  {name}: {figures}, too low by at most {-error.min():.4f} (target {target} rms)")
+            took = rows[:, 3] * 1e6
+            print(f"  lines: {np.median(took):.0f} us a pair, mean {took.mean():.0f}")
+            search, touch, hit = cost(scene, model)
+            print(
+                f"  a direction: search {search:.1f} us, touch {touch:.1f} us (target 20), hit {hit:.1f} us", flush=True
+            )
+
+
+if __name__ == "__main__":
+    main()
