@@ -33,6 +33,12 @@ MAX_RESIDUAL_MM = 15.0
 
 ALLOWED_RESIDUALS = "names and readings checked, the true errors declared, or registration.accept_residuals = true"
 
+LEAST_FOUND_MM = 0.01
+"""FRE from which on the markers can say how large the errors are: no arm repeats so well, so one side was computed."""
+
+SINGULAR = 1e-12
+"""Least over greatest variance of the readings below which some of them count as free of error."""
+
 Method = Literal["triad", "rigid", "weighted", "affine"]
 
 MIRROR_GAIN = 2.0
@@ -218,10 +224,12 @@ def register(
 
     Raises:
         InputError: Fewer than three markers, collinear, mirrored, a unit slip, a marker far off, ``affine``,
-            ``weighted`` without noise, or residuals that the noise does not explain.
+            ``weighted`` without noise, noise that is none, or residuals that the noise does not explain.
     """
     _check_method(method, noise, where)
     check_pairs(markers, where)
+    if noise is not None:
+        _check_noise(markers, method, noise, found=noise_found, where=where)
     if method == "triad" and len(markers) != MIN_MARKERS:
         raise InputError(f"triad takes 3 markers, not {len(markers)}", where=where, allowed="3 names in use")
     fit = _fit(method, noise)
@@ -252,6 +260,18 @@ def _check_method(method: Method, noise: ReadingNoise | None, where: str | Path)
         raise InputError(
             "method 'weighted' weighs by declared errors", where=where, allowed="[errors], or method rigid"
         )
+
+
+def _check_noise(markers: MarkerPairs, method: Method, noise: ReadingNoise, *, found: bool, where: str | Path) -> None:
+    """Refuse noise that cannot be weighed, and residuals in which there is none to be found."""
+    R = fit_rigid(markers.points_ct, markers.points_base)[:3, :3]
+    values = np.linalg.eigvalsh(noise.independent(R) if method == "weighted" else noise.whole(R))
+    if not values[0] > SINGULAR * values[-1]:
+        message = "the declared errors leave readings of the markers without any"
+        raise InputError(message, where=where, allowed="ct_in_plane_mm, ct_slice_mm or touch_mm above 0")
+    if found and _rigid_fre(markers) < LEAST_FOUND_MM:
+        message = f"marker_noise = 'found', but the residuals ({_rigid_fre(markers):.2g} mm) hold none"
+        raise InputError(message, where=where, allowed="markers measured on both sides, or marker_noise = 'declared'")
 
 
 def _fit(method: Method, noise: ReadingNoise | None) -> Callable[[Floats, Floats], Floats]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import ClearanceEngine
@@ -47,10 +48,17 @@ class ChanceModel:
 
 
 def chance_model(case: Case, anatomy: Anatomy, error: PoseError | None) -> ChanceModel | None:
-    """The model of a case; None where it declares no errors, or nothing ties its frames."""
+    """The model of a case; None where it declares no errors, or nothing ties its frames.
+
+    Raises:
+        InputError: Neither a radius nor a closed mesh says where the target is hit.
+    """
     if error is None:
         return None
     mesh = anatomy.structure(case.target_structure).mesh
+    if case.hit_radius_mm is None and not mesh.closed:
+        message = f"the mesh of '{case.target_structure}' is open: what lies in it, and is hit, is not known"
+        raise InputError(message, where=case.path, allowed="target.hit_radius_mm, or a closed mesh")
     return ChanceModel(error, hit_model(case.hit_radius_mm, mesh, case.target_ct))
 
 
@@ -70,9 +78,13 @@ def with_chances(
         engine: Prepared for the meshes of ``anatomy.checked``.
         found: Checked against organs and arm.
         model: None where the pose's error is not known: the chances are blank.
+
+    Raises:
+        InputError: A limit that nothing can be held against.
     """
     if case.errors is None:
         return found
+    check_limits(case, anatomy, model)
     columns = demanding(anatomy.checked)
     names = tuple(anatomy.checked[column].name for column in columns)
     blank = Chances.unknown(names, len(found))
@@ -88,6 +100,25 @@ def with_chances(
         filled[name][rows] = value
     found = replace(found, chances=Chances(names, **filled, touch_joint=blank.touch_joint))
     return _limited(case, _refined_near_limits(case, anatomy, engine, found, model))
+
+
+def check_limits(case: Case, anatomy: Anatomy, model: ChanceModel | None) -> None:
+    """Refuse limits that no candidate can be held against: it would pass unasked.
+
+    Raises:
+        InputError: Limits without a pose error, or of a structure that has no chance to be touched.
+    """
+    settings = case.search
+    limited = settings.min_hit is not None or settings.max_touch is not None or bool(settings.max_touch_of)
+    if limited and model is None:
+        message = "search.min_hit and max_touch cannot be judged: only markers and the arm give the needle's error"
+        allowed = "[registration] with markers, and a search with the arm; or no such limit"
+        raise InputError(message, where=case.path, allowed=allowed)
+    names = [anatomy.checked[column].name for column in demanding(anatomy.checked)]
+    unknown = sorted(set(settings.max_touch_of) - set(names))
+    if unknown:
+        message = f"search.max_touch_of '{unknown[0]}' is no structure that must not be touched"
+        raise InputError(message, where=case.path, allowed=", ".join(names))
 
 
 def passing(
@@ -241,11 +272,13 @@ def _limited(case: Case, found: Candidates) -> Candidates:
     chances, least = found.chances, case.search.min_hit
     assert chances is not None
     if least is not None:
-        rows = np.flatnonzero(found.safe & (chances.hit < least))
+        rows = np.flatnonzero(found.safe & ~(chances.hit >= least))  # what is not known is not enough
         target = np.full(len(rows), case.target_structure, dtype=object)
         found = replace(found, verdict=found.verdict.rejected(rows, Reason.HIT_UNLIKELY, target, chances.hit[rows]))
     limits = np.array([touch_limit(case, name) for name in chances.structures])
-    beyond = np.where(chances.touch > limits, chances.touch - limits, -np.inf)
+    touch = np.where(np.isnan(chances.touch), np.inf, chances.touch)  # nor is it little enough
+    with np.errstate(invalid="ignore"):  # without a limit both may be infinite
+        beyond = np.where(touch > limits, touch - limits, -np.inf)
     rows = np.flatnonzero(found.safe & (beyond > 0).any(axis=1))
     worst = beyond[rows].argmax(axis=1) if len(rows) else rows
     names = np.array(chances.structures, dtype=object)[worst]

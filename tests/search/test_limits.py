@@ -1,0 +1,148 @@
+"""Limits of chances that nothing can be held against, and errors that are none: refused, never passed as safe."""
+
+from dataclasses import replace
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+import trimesh
+from case_world import points_file
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.search.chance import _limited
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.uncertainty.chances import Chances
+
+CASE = """schema = 2
+region = "phantom"
+name = "ball"
+space = "local"
+[target]
+position_mm = [0.0, 0.0, 0.0]
+structure = "organ"
+[needle]
+length_mm = 210.0
+shaft_mm = 150.0
+diameter_mm = 1.2
+[search]
+theta_deg = [20, 20]
+beta_deg = [0, 80]
+step_deg = 20.0
+{search}
+[errors]
+{errors}
+[robot]
+model = "ur3"
+{base}
+[[structure]]
+name = "skin"
+mesh = "skin.ply"
+unit = "mm"
+role = "skin"
+[[structure]]
+name = "organ"
+mesh = "organ.ply"
+unit = "mm"
+role = "target"
+[[structure]]
+name = "rib"
+mesh = "rib.ply"
+unit = "mm"
+role = "avoid"
+margin_mm = 2.0
+[end]
+structures = 3
+"""
+MARKERS = '[registration]\nmarkers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"\n'
+MOUNT = "[robot.mount]\nposition_mm = [0.0, 380.0, -60.0]\nx_axis = [1.0, 0.0, 0.0]\nz_axis = [0.0, 0.0, 1.0]\n"
+LIMITS = "min_hit = 0.999\nmax_touch = 0.0001"
+TO_BASE = np.array([0.0, -380.0, 60.0])
+SIDES = np.array([[0.3, 0.2, 1], [-0.5, 0.3, 0.9], [0.1, -0.7, 0.8], [0.8, 0.1, 0.6], [-0.3, -0.5, 1], [0.2, 0.9, 0.5]])
+NO_READING = (
+    "ct_in_plane_mm = 0\nct_slice_mm = {across}\nbed_axis = [1.0, 2.0, 3.0]\ntouch_mm = 0\nrepeatability_deg = 0\n"
+)
+NO_ARM = "link_mm = 0\ntwist_deg = 0\njoint_deg = 0\ntip_offset_mm = 0\n"
+
+
+def ball(folder, *, search="", errors="", base=MARKERS, noise=0.3, organ=None):
+    """A round patient in front of a UR3, with six markers on its skin; returns the case's file."""
+    meshes = {"skin": (75.0, (0, 0, 0)), "organ": (6.0, (0, 0, 0)), "rib": (5.0, (20, 0, 40))}
+    for name, (radius, center) in meshes.items():
+        mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+        mesh.apply_translation(center)
+        (organ if name == "organ" and organ is not None else mesh).export(folder / f"{name}.ply")
+    points = 75.0 * SIDES / np.linalg.norm(SIDES, axis=1)[:, None]
+    off = noise * np.random.default_rng(1).normal(size=points.shape)
+    (folder / "markers_ct.csv").write_text(points_file(points))
+    (folder / "touch.csv").write_text(points_file(points + TO_BASE + off))
+    (folder / "case.toml").write_text(CASE.format(search=search, errors=errors, base=base))
+    return folder / "case.toml"
+
+
+def test_limits_without_the_arm_are_refused(tmp_path):
+    """Without a configuration there is no error of the needle, so that no limit can be kept."""
+    context = prepare(ball(tmp_path, search=LIMITS), arm=False)
+    with pytest.raises(InputError, match="cannot be judged"):
+        context.search()
+    with pytest.raises(InputError, match="cannot be judged"):
+        context.check(0.35, 0.0)
+
+
+@pytest.mark.parametrize("base", [MOUNT, ""])
+def test_limits_without_markers_are_refused(tmp_path, base):
+    """A stated mount has no errors of its own, and no base at all has no arm."""
+    with pytest.raises(InputError, match="cannot be judged"):
+        prepare(ball(tmp_path, search=LIMITS, base=base)).search()
+
+
+def test_without_limits_the_same_cases_are_searched(tmp_path):
+    """Chances are blank, as without errors."""
+    found = prepare(ball(tmp_path), arm=False).search()
+    assert found.safe.any() and np.isnan(found.chances.hit).all()
+
+
+@pytest.mark.parametrize("name", ["ribb", "organ", "skin"])
+def test_a_limit_of_a_structure_that_none_is_judged_by_is_refused(tmp_path, name):
+    """A name that is mistyped, and structures that may be touched."""
+    with pytest.raises(InputError, match=f"'{name}' is no structure that must not be touched"):
+        prepare(ball(tmp_path, search=f"max_touch_of = {{ {name} = 0.001 }}")).search()
+
+
+def test_a_chance_that_is_not_known_keeps_no_limit(tmp_path):
+    """NaN is neither likely enough to hit, nor unlikely enough to touch; without a limit it is let pass."""
+    context = prepare(ball(tmp_path), arm=False)
+    found = context.search()
+    found = replace(found, chances=Chances.unknown(("rib",), len(found)))
+    settings = context.case.search
+    for keys, left in (
+        ({}, True),
+        ({"min_hit": 0.5}, False),
+        ({"max_touch": 0.5}, False),
+        ({"max_touch_of": MappingProxyType({"rib": 0.5})}, False),
+    ):
+        case = replace(context.case, search=replace(settings, **keys))
+        assert _limited(case, found).safe.any() == left
+
+
+@pytest.mark.parametrize("across", [0, 1])
+def test_readings_without_any_error_are_refused(tmp_path, across):
+    """A covariance that has no inverse weighs nothing, along an oblique axis too."""
+    with pytest.raises(InputError, match="without any"):
+        prepare(ball(tmp_path, errors=NO_READING.format(across=across) + NO_ARM))
+
+
+def test_noise_is_not_found_in_computed_readings(tmp_path):
+    """Residuals of rounding alone say that one side was made from the other, not that nothing errs."""
+    with pytest.raises(InputError, match="hold none"):
+        prepare(ball(tmp_path, errors='marker_noise = "found"', noise=0.0))
+    assert prepare(ball(tmp_path, errors='marker_noise = "found"')).chance is not None
+
+
+def test_an_open_target_has_no_chance_to_be_hit(tmp_path):
+    """A sheet holds no tip; a radius says what a hit is."""
+    sheet = trimesh.Trimesh([[-8, -8, -6], [8, -8, -6], [8, 8, -6], [-8, 8, -6]], [[0, 1, 2], [0, 2, 3]])
+    path = ball(tmp_path, organ=sheet)
+    with pytest.raises(InputError, match="is open"):
+        prepare(path)
+    path.write_text(path.read_text().replace('structure = "organ"', 'structure = "organ"\nhit_radius_mm = 2.0', 1))
+    assert prepare(path).chance is not None
