@@ -21,7 +21,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.uncertainty.chances import Chances, HitModel, hit_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.planning.uncertainty.refined_touch import Needles, Surroundings, refined
-from puncture_twin.planning.uncertainty.touch import Proximity, joint_touch_chance, proximity, touch_chance
+from puncture_twin.planning.uncertainty.touch import Proximity, joint_touch_chance, proximity, touch_bound, touch_chance
 
 BEST = 200
 """Of the ranked candidates: how many get the dearer chances."""
@@ -231,13 +231,27 @@ def _with_refined(
 def _refined_near_limits(
     case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates, model: ChanceModel
 ) -> Candidates:
-    """Refine the chances to touch that first order puts near a limit."""
+    """Refine the chances to touch that first order puts near a limit, or that may be there if the needle leans."""
     chances = found.chances
     assert chances is not None
     limits = np.array([touch_limit(case, name) for name in chances.structures])
-    wanted = (chances.touch >= REFINED_FROM * limits) & (chances.touch <= REFINED_TO * limits)
+    if not np.isfinite(limits).any():
+        return found
+    greatest = np.fmax(chances.touch, _touch_bounds(case, anatomy, found, model))
+    wanted = (greatest >= REFINED_FROM * limits) & (chances.touch <= REFINED_TO * limits)
     rows = np.flatnonzero(wanted.any(axis=1) & found.safe)
     return _with_refined(case, anatomy, engine, found, model, rows, wanted[rows]) if len(rows) else found
+
+
+def _touch_bounds(case: Case, anatomy: Anatomy, found: Candidates, model: ChanceModel) -> Floats:
+    """Shape (n, k), of the safe candidates' chances to touch; NaN for others."""
+    error, columns = model.error, demanding(anatomy.checked)
+    length = float(axis_lengths(case, anatomy.checked)[columns].max())
+    bounds, rows = np.full((len(found), len(columns)), np.nan), np.flatnonzero(found.safe)
+    for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
+        slack, cov_ct = found.clearance.distance[part][:, columns], error.covariance_ct(found.arm.q_insertion[part])
+        bounds[part] = touch_bound(slack, found.outward_ct[part], cov_ct, length, error.surface_mm, error.freedom)
+    return bounds
 
 
 def with_best_refined(

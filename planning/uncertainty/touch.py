@@ -18,6 +18,7 @@ from scipy.special import ndtr, stdtr
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.geometry.rigid import skew
 
 NORMALS = 4096
 """Fixed draws of the jointly linearised chance: its own error is .008 at most."""
@@ -89,6 +90,34 @@ def touch_chance(near: Proximity, threshold_mm: Floats | float, freedom: int | N
         quantile = np.where(near.deviation > 0, -slack / near.deviation, np.where(slack > 0, -np.inf, np.inf))
     chance = ndtr(quantile) if freedom is None else stdtr(freedom, quantile)
     return np.asarray(np.where(np.isnan(near.gradient[..., 0]), np.nan, chance))
+
+
+def touch_bound(
+    slack_mm: Floats,
+    outward_ct: Floats,
+    cov_ct: Floats,
+    length_mm: float,
+    surface_mm: float,
+    freedom: int | None = None,
+) -> Floats:
+    """What the chance would be if the nearest point were the axis' most doubtful one, to first order, shape (n, k).
+
+    A needle that leans may touch a structure far from where it is nearest, which first order does not see. No point of
+    the axis is nearer than the nearest, and none is more doubtful than the worse end: the variance is convex in depth.
+
+    Args:
+        slack_mm: Shape (n, k), distance beyond the threshold.
+        outward_ct: Shape (n, 3), unit.
+        cov_ct: Shape (n, 6, 6), Sigma6, CT axes, its point of reference the target.
+        length_mm: Of the axis.
+        surface_mm: As in `proximity`.
+        freedom: As in `touch_chance`.
+    """
+    lever = np.concatenate([np.broadcast_to(np.eye(3), (len(cov_ct), 3, 3)), -length_mm * skew(outward_ct)], axis=-1)
+    ends = np.stack([cov_ct[:, :3, :3], lever @ cov_ct @ np.swapaxes(lever, -1, -2)])
+    variance = np.maximum(np.linalg.eigvalsh(ends)[..., -1].max(axis=0), 0.0) + surface_mm**2
+    quantile = -slack_mm / np.sqrt(variance + np.finfo(float).tiny)[:, None]
+    return np.asarray(ndtr(quantile) if freedom is None else stdtr(freedom, quantile))
 
 
 def joint_touch_chance(
