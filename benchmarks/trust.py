@@ -54,7 +54,7 @@ RADII = (0.4, 0.7, 1.0, 1.4)
 TRUE_SIZES = np.geomspace(1 / 16, 4.0, 24)
 """Of the errors over the declared ones, where the residuals are to find it."""
 
-SIZES = np.geomspace(0.003, 16.0, 33)
+SIZES = np.geomspace(0.05, 10.0, 16)
 """Errors' size by the residuals over the declared one, for which chances are computed; between them interpolated."""
 
 RATIO, COVERAGE, ECE = (0.97, 1.03), (0.94, 0.96), 0.01
@@ -322,7 +322,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="fewer directions, 4,000 rooms")
     parser.add_argument("--out", type=Path, help="a file that gets the table too")
     options = parser.parse_args()
-    rooms, directions = (4_000, 4) if options.quick else (options.rooms, 20)
+    rooms, directions = (4_000, 4) if options.quick else (options.rooms, 10)
     head = "anatomy | markers | noise | realised / predicted rms | 95 % region | ECE hit | ECE touch | warned | holds"
     lines = [f"{rooms} rooms a row; targets: {TARGETS}", f"| {head} |", "|" + "---|" * 9]
     print("\n".join(lines), flush=True)

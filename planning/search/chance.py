@@ -26,9 +26,9 @@ from puncture_twin.planning.uncertainty.touch import Proximity, joint_touch_chan
 BEST = 200
 """Of the ranked candidates: how many get the dearer chances."""
 
-REFINED_FROM, REFINED_TO = 1 / 20, 3.0
-"""Times its limit: a first-order chance to touch in between is refined. First order is low by up to 12 where a
-structure surrounds the needle, and high by less than 3 where one juts out at it (docs/concepts/uncertainty.md)."""
+REFINED_FROM, REFINED_TO = 1 / 60, 3.0
+"""Times its limit: what first order, or its bound, puts in between is refined. The chance to be displaced so far to any
+side at all is 56 times that to one side at 3.5 standard deviations, and less for less."""
 
 ROWS_AT_ONCE = 4096
 """Of candidates: a table of gradients of 60 structures stays below 20 MB."""

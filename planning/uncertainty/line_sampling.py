@@ -8,8 +8,9 @@ nowhere), xi = B z, B B' = Sigma5, and z standard normal, every line is
 over the stretches of the line on which the needle is nearer than the threshold (line sampling: Koutsourelakis,
 Pradlwarter, Schueller, Prob. Eng. Mech. 19, 2004). The mean over y is a rule of 25 lines, exact to the fifth degree
 (Stroud, Approximate Calculation of Multiple Integrals, 1971, E_n^r2 5-2 with n = 4); where its lines disagree, 128
-lines. A line is walked in steps that no approach can outrun (the axis' fastest point bounds how fast its distance
-falls), so that entry *and* exit of every stretch are found. A surface that may lie off as a whole is one more normal.
+lines; where several things are about as likely, 512. Where another direction touches sooner than first order's, which
+51 rays tell, a is that one. A line is walked in steps that no approach can outrun, so that entry *and* exit of every
+stretch are found. A surface that may lie off as a whole is one more normal.
 """
 
 from __future__ import annotations
@@ -24,16 +25,20 @@ from scipy.special import chdtri, ndtr, ndtri, stdtr
 from scipy.stats import qmc
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.clearance.kernels.displaced_axis import displaced_distance
 from puncture_twin.planning.clearance.near_faces import NearFaces
 from puncture_twin.planning.geometry.rigid import frame_about, skew
+from puncture_twin.planning.uncertainty.needle_lines import FARTHEST, first_touches, walked
 
-FARTHEST = 5.0
-"""Standard deviations that a line is walked to either side; a stretch that is open there goes on for ever."""
+Problem = tuple[Floats, Floats, Floats, Floats, Floats, float, float]
+"""Faces near a needle and spheres around them, its start and direction, its length and the threshold."""
 
-MOST_LINES = 128
-"""Where the lines of the small rule disagree."""
+MANY_LINES, MOST_LINES = 128, 512
+"""Where the lines of the small rule disagree; where something else is touched about as soon as what is likeliest."""
+
+PREFERRED, SOONER, NO_MATTER = 0.1, 0.8, 3.8
+"""Standard deviations by which another direction must be better than first order's; how much sooner than a plane
+something else is touched; and how far out it does not matter."""
 
 WIDEST = 4.0
 """Standard deviations across which a line may lie: what lies beyond has a chance of .003 and less to matter."""
@@ -41,19 +46,8 @@ WIDEST = 4.0
 DISAGREE = 0.06
 """Standard deviation of the lines' chances from which on the small rule is not trusted with .005."""
 
-SMALLEST_STEP, INSIDE_STEP = 0.04, 0.25
-"""Standard deviations: of a walk that all but touches, and through what it touches."""
-
-HALVINGS = 5
-"""Of the step in which an end of a stretch lies: it is then known to .001."""
-
 SIZES = 12
 """Of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
-
-NUDGE_MM = 1e-6
-"""By which a tip's way is moved aside, so that it does not run through an edge of a face."""
-
-ROOT_HALF = math.sqrt(0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,31 +120,75 @@ def line_chance(near: NearFaces, doubt: NeedleDoubt, length: float, threshold: f
         threshold: Needle radius, or that and a margin, mm.
         gradient: Shape (6,), g: what shift and rotation do to the distance, to first order.
     """
+    problem = (near.triangles, near.faces, near.blocks, doubt.origin, doubt.outward, float(length), float(threshold))
     slope = doubt.root.T @ gradient
     sigma = math.hypot(float(np.linalg.norm(slope)), doubt.surface_mm)
-    if not sigma > 0.0:
+    likeliest, alone = _likeliest(problem, doubt, slope, _slack(problem))
+    steep = math.hypot(float(np.linalg.norm(likeliest)), doubt.surface_mm)
+    if not steep > 0.0:
         return math.nan
-    basis = _basis(slope, doubt.surface_mm / sigma, float(np.linalg.norm(slope)) / sigma)
-    problem = (near.triangles, near.faces, near.blocks, doubt.origin, doubt.outward, float(length), float(threshold))
+    basis = _basis(likeliest, doubt.surface_mm / steep, float(np.linalg.norm(likeliest)) / steep)
     if doubt.freedom is None:
-        return _chance(problem, doubt.root, doubt.surface_mm, basis)
-    origin = (float(doubt.origin[0]), float(doubt.origin[1]), float(doubt.origin[2]))
-    along = (float(doubt.outward[0]), float(doubt.outward[1]), float(doubt.outward[2]))
-    slack = displaced_distance(near.triangles, near.faces, near.blocks, origin, along, float(length), -1.0, 0)[0]
-    first = -(min(slack, 1e9) - threshold) / sigma
-    beyond = 0.0
+        return _chance(problem, doubt.root, doubt.surface_mm, basis, alone)
+    first, beyond = -_slack(problem) / max(sigma, 1e-12), 0.0
     for size in _sizes(doubt.freedom):
-        beyond += _chance(problem, size * doubt.root, size * doubt.surface_mm, basis) - float(ndtr(first / size))
+        chance = _chance(problem, size * doubt.root, size * doubt.surface_mm, basis, alone)
+        beyond += chance - float(ndtr(first / size))
     return float(np.clip(stdtr(doubt.freedom, first) + beyond / SIZES, 0.0, 1.0))
 
 
-def _chance(problem: tuple[object, ...], root: Floats, surface_mm: float, basis: Floats) -> float:
-    """By the small rule; by many lines where its lines disagree."""
+def _slack(problem: Problem) -> float:
+    """Of the nominal needle, mm."""
+    triangles, faces, blocks, origin, outward, length, threshold = problem
+    tip = (float(origin[0]), float(origin[1]), float(origin[2]))
+    along = (float(outward[0]), float(outward[1]), float(outward[2]))
+    return min(float(displaced_distance(triangles, faces, blocks, tip, along, length, -1.0, 0)[0]), 1e9) - threshold
+
+
+def _likeliest(problem: Problem, doubt: NeedleDoubt, slope: Floats, slack: float) -> tuple[Floats, bool]:
+    """The slope (5,) along which the needle touches soonest, and whether nothing else touches about as soon.
+
+    The nearest face need not be the likeliest, where a farther one lies in the direction of greater doubt: rays are
+    sent in 51 directions. What touches sooner than a plane across the likeliest direction would is something else.
+    """
+    size = float(np.linalg.norm(slope))
+    directions = np.vstack([-slope / size if size > 0.0 else np.eye(5)[0], _rays()])
+    radii = np.empty(len(directions))
+    first_touches(problem, doubt.root, directions, radii)
+    best = int(np.argmin(radii))
+    if not np.isfinite(radii[best]) or radii[best] <= 0.0 or radii[0] < radii[best] + PREFERRED:
+        best = 0
+    flat = np.full(len(radii), np.inf)
+    towards = directions @ directions[best]
+    np.divide(radii[best], towards, out=flat, where=towards > 0.05)
+    alone = not bool(((radii < SOONER * flat) & (radii < NO_MATTER)).any())
+    return (slope, alone) if best == 0 else (-directions[best] * (slack / radii[best]), alone)
+
+
+@cache
+def _rays() -> Floats:
+    """Along each of five normals and between each two, both ways: shape (50, 5)."""
+    signs = (1.0, -1.0)
+    ones = [sign * np.eye(5)[k] for k in range(5) for sign in signs]
+    twos = [
+        math.sqrt(0.5) * (one * np.eye(5)[i] + other * np.eye(5)[j])
+        for i, j in itertools.combinations(range(5), 2)
+        for one in signs
+        for other in signs
+    ]
+    return np.array(ones + twos)
+
+
+def _chance(problem: Problem, root: Floats, surface_mm: float, basis: Floats, alone: bool) -> float:
+    """By the small rule; by many lines where its lines disagree, by more where several things are touched."""
     offsets, weights = _few_lines(surface_mm > 0.0)
-    chances = _lines(problem, root, surface_mm, basis, offsets)
-    mean = float(weights @ chances)
-    if float(weights @ (chances - mean) ** 2) > DISAGREE**2:
-        mean = float(_lines(problem, root, surface_mm, basis, _many_lines(surface_mm > 0.0)).mean())
+    count = 0 if alone else MOST_LINES
+    if alone:
+        chances = walked(problem, root, surface_mm, basis, offsets)
+        mean = float(weights @ chances)
+        count = MANY_LINES if float(weights @ (chances - mean) ** 2) > DISAGREE**2 else 0
+    if count > 0:
+        mean = float(walked(problem, root, surface_mm, basis, _many_lines(surface_mm > 0.0, count)).mean())
     return min(max(mean, 0.0), 1.0)
 
 
@@ -176,12 +214,12 @@ def _few_lines(surface: bool) -> tuple[Floats, Floats]:
 
 
 @cache
-def _many_lines(surface: bool) -> Floats:
+def _many_lines(surface: bool, count: int) -> Floats:
     """Offsets (n, 5), spread evenly over a normal."""
-    drawn = qmc.Sobol(5 if surface else 4, scramble=True, seed=20191104).random(MOST_LINES)
+    drawn = qmc.Sobol(5 if surface else 4, scramble=True, seed=20191104).random(count)
     normal = ndtri(np.clip(drawn, 1e-12, 1 - 1e-12))
     length = np.linalg.norm(normal, axis=1)[:, None]
-    offsets = np.zeros((MOST_LINES, 5))
+    offsets = np.zeros((count, 5))
     offsets[:, : normal.shape[1]] = normal * np.minimum(1.0, WIDEST / length)
     return offsets
 
@@ -196,125 +234,3 @@ def _basis(slope: Floats, by_surface: float, by_pose: float) -> Floats:
     basis[1:5, :5] = frame[:, 1:5].T
     basis[5, :5], basis[5, 5] = by_surface * down, by_pose
     return basis
-
-
-@nb.njit(cache=True, error_model="numpy")
-def _lines(problem, root, surface_mm, basis, offsets):  # type: ignore[no-untyped-def]  # numba infers
-    """The chance along each line, shape (n,)."""
-    chances, hint = np.empty(len(offsets)), 0
-    triangles, faces, blocks, origin, outward, length, threshold = problem
-    scene = (triangles, faces, blocks, origin, outward, length, threshold, surface_mm)
-    ahead = _displacement(root, basis[0])
-    for line in range(len(offsets)):
-        z = np.zeros(6)
-        for k in range(5):
-            for x in range(6):
-                z[x] += offsets[line, k] * basis[k + 1, x]
-        chances[line], hint = _walk(scene, _displacement(root, z), ahead, hint)
-    return chances
-
-
-@nb.njit(cache=True, error_model="numpy")
-def _displacement(root, z):  # type: ignore[no-untyped-def]
-    """Shift, lean and the surface's normal, shape (7,)."""
-    found = np.zeros(7)
-    for row in range(6):
-        for k in range(5):
-            found[row] += root[row, k] * z[k]
-    found[6] = z[5]
-    return found
-
-
-@nb.njit(cache=True, error_model="numpy")
-def _walk(scene, start, ahead, hint):  # type: ignore[no-untyped-def]
-    """Sum of Phi over the stretches of one line that touch."""
-    fastest = _fastest(scene, start, ahead)
-    low, high, halvings, inside, entry, total = -np.inf, -FARTHEST, 0, False, -np.inf, 0.0
-    while True:  # one place that asks for the distance: it is compiled into each
-        beta = 0.5 * (low + high) if halvings > 0 else high
-        gap, hint = _gap(scene, start, ahead, beta, hint)
-        doubtful = inside or low == -np.inf or scene[7] > 0.0
-        touches = gap < 0.0 or (doubtful and _swallowed(scene, start, ahead, beta))
-        if low == -np.inf:
-            inside = touches
-        elif halvings > 0 or touches != inside:  # an end of a stretch lies between low and high
-            low, high = (beta, high) if touches == inside and halvings > 0 else (low, beta)
-            halvings = halvings - 1 if halvings > 0 else HALVINGS
-            if halvings > 0:
-                continue
-            if inside:
-                total += _normal(high) - _normal(entry)
-            entry, inside, beta, gap = low, not inside, high, SMALLEST_STEP * fastest
-        if beta >= FARTHEST:
-            return total + (_normal(-entry) if inside else 0.0), hint
-        low, high = beta, min(beta + (INSIDE_STEP if inside else max(gap / fastest, SMALLEST_STEP)), FARTHEST)
-
-
-@nb.njit(cache=True, error_model="numpy")
-def _swallowed(scene, start, ahead, beta):  # type: ignore[no-untyped-def]
-    """Whether a needle that is near no face is inside: its tip came through an odd number of them on its way.
-
-    Faces that the tip can come through are near the nominal needle, all of them.
-    """
-    triangles, origin = scene[0], scene[3]
-    ox, oy, oz = origin[0] + NUDGE_MM, origin[1] - 0.61 * NUDGE_MM, origin[2] + 0.37 * NUDGE_MM
-    x, y, z = start[0] + beta * ahead[0], start[1] + beta * ahead[1], start[2] + beta * ahead[2]
-    odd = False
-    for row in range(len(triangles)):
-        t = triangles[row]
-        ax, ay, az, bx, by, bz = t[0] - ox, t[1] - oy, t[2] - oz, t[3] - ox, t[4] - oy, t[5] - oz
-        cx, cy, cz = t[6] - ox, t[7] - oy, t[8] - oz
-        wa = x * (by * cz - bz * cy) + y * (bz * cx - bx * cz) + z * (bx * cy - by * cx)
-        wb = x * (cy * az - cz * ay) + y * (cz * ax - cx * az) + z * (cx * ay - cy * ax)
-        wc = x * (ay * bz - az * by) + y * (az * bx - ax * bz) + z * (ax * by - ay * bx)
-        if not ((wa > 0.0 and wb > 0.0 and wc > 0.0) or (wa < 0.0 and wb < 0.0 and wc < 0.0)):
-            continue
-        total = wa + wb + wc
-        px, py, pz = wa * ax + wb * bx + wc * cx, wa * ay + wb * by + wc * cy, wa * az + wb * bz + wc * cz
-        along = (px * x + py * y + pz * z) / total
-        if 0.0 < along < x * x + y * y + z * z and not (row > 0 and np.array_equal(t, triangles[row - 1])):
-            odd = not odd  # the last block of a surface repeats its last face
-    return odd
-
-
-@nb.njit(cache=True, error_model="numpy")
-def _normal(x):  # type: ignore[no-untyped-def]
-    return 0.5 * math.erfc(-x * ROOT_HALF)
-
-
-@nb.njit(cache=True, error_model="numpy")
-def _fastest(scene, start, ahead):  # type: ignore[no-untyped-def]
-    """The most by which the distance can fall per standard deviation: an end of the axis is its fastest point."""
-    outward, length, surface_mm = scene[4], scene[5], scene[7]
-    ux, uy, uz = outward[0], outward[1], outward[2]
-    dx, dy, dz, px, py, pz = ahead[0], ahead[1], ahead[2], ahead[3], ahead[4], ahead[5]
-    at_tip = dx * dx + dy * dy + dz * dz
-    x, y = dx + length * (py * uz - pz * uy), dy + length * (pz * ux - px * uz)
-    z = dz + length * (px * uy - py * ux)
-    turn = math.sqrt(px * px + py * py + pz * pz)
-    lean = math.sqrt(start[3] ** 2 + start[4] ** 2 + start[5] ** 2) + FARTHEST * turn
-    fastest = math.sqrt(max(at_tip, x * x + y * y + z * z)) + length * lean * turn
-    return fastest + surface_mm * abs(ahead[6]) + 1e-12
-
-
-@nb.njit(cache=True, error_model="numpy")
-def _gap(scene, start, ahead, beta, hint):  # type: ignore[no-untyped-def]
-    """Distance of the displaced needle beyond its threshold, mm; negative where it touches."""
-    triangles, faces, blocks, origin, outward, length, threshold, surface_mm = scene
-    ux, uy, uz = outward[0], outward[1], outward[2]
-    px, py, pz = start[3] + beta * ahead[3], start[4] + beta * ahead[4], start[5] + beta * ahead[5]
-    turn = math.sqrt(px * px + py * py + pz * pz)
-    sine, cosine = (math.sin(turn) / turn if turn > 1e-12 else 1.0), math.cos(turn)
-    along = (
-        cosine * ux + sine * (py * uz - pz * uy),
-        cosine * uy + sine * (pz * ux - px * uz),
-        cosine * uz + sine * (px * uy - py * ux),
-    )
-    tip = (
-        origin[0] + start[0] + beta * ahead[0],
-        origin[1] + start[1] + beta * ahead[1],
-        origin[2] + start[2] + beta * ahead[2],
-    )
-    enough = max(threshold - surface_mm * (start[6] + beta * ahead[6]), 0.0)  # a surface that is met is touched
-    distance, nearest = displaced_distance(triangles, faces, blocks, tip, along, length, enough, hint)
-    return (-1.0 if distance == 0.0 else distance - enough), nearest

@@ -122,6 +122,19 @@ def test_draws_agree(shape, size):
     assert found == pytest.approx(realised, abs=0.006)
 
 
+def test_the_nearest_face_is_not_always_the_likeliest():
+    """Near where there is no doubt, farther where there is: first order is low without limit."""
+    near, far = box(40.0, 4000.0, 4000.0), box(4000.0, 40.0, 4000.0)
+    near.apply_translation([22.0, 0, 0])
+    far.apply_translation([0, 23.0, 0])
+    plates = moved(trimesh.util.concatenate([near, far]))
+    cov = np.diag([0.01, 4.0, 0.01, 0, 0, 0])
+    first, found = chances(plates, cov)
+    exact = ndtr(-(3.0 - RADIUS) / 2.0)
+    assert first < 1e-9 < 0.1 < exact
+    assert found == pytest.approx(exact, abs=0.003)
+
+
 @pytest.mark.parametrize("freedom", [3, 6])
 def test_an_unknown_size_is_averaged(freedom):
     """The tube's chance over the errors' possible sizes, exp(-d^2 / 2 s^2)."""

@@ -1,0 +1,170 @@
+"""Lines of displaced needles, walked to where they touch: the compiled inside of `line_sampling`.
+
+A step is never longer than the needle's distance over the fastest that any of its points moves, so that no approach
+is outrun; through what it touches it goes in small steps, and asks at every exit whether it has been swallowed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.clearance.kernels.displaced_axis import displaced_distance
+
+FARTHEST = 5.0
+"""Standard deviations that a line is walked to either side; a stretch that is open there goes on for ever."""
+
+SMALLEST_STEP, INSIDE_STEP = 0.04, 0.25
+"""Standard deviations: of a walk that all but touches, and through what it touches."""
+
+HALVINGS = 5
+"""Of the step in which an end of a stretch lies: it is then known to .001."""
+
+NUDGE_MM = 1e-6
+"""By which a tip's way is moved aside, so that it does not run through an edge of a face."""
+
+ROOT_HALF = math.sqrt(0.5)
+
+
+@nb.njit(cache=True, error_model="numpy")
+def walked(problem, root, surface_mm, basis, offsets):  # type: ignore[no-untyped-def]  # numba infers
+    """The chance along each line, shape (n,)."""
+    chances, hint = np.empty(len(offsets)), 0
+    triangles, faces, blocks, origin, outward, length, threshold = problem
+    scene = (triangles, faces, blocks, origin, outward, length, threshold, surface_mm)
+    ahead = _displacement(root, basis[0])
+    for line in range(len(offsets)):
+        z = np.zeros(6)
+        for k in range(5):
+            for x in range(6):
+                z[x] += offsets[line, k] * basis[k + 1, x]
+        chances[line], hint = _walk(scene, _displacement(root, z), ahead, hint)
+    return chances
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _displacement(root, z):  # type: ignore[no-untyped-def]
+    """Shift, lean and the surface's normal, shape (7,)."""
+    found = np.zeros(7)
+    for row in range(6):
+        for k in range(5):
+            found[row] += root[row, k] * z[k]
+    found[6] = z[5]
+    return found
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _walk(scene, start, ahead, hint):  # type: ignore[no-untyped-def]
+    """Sum of Phi over the stretches of one line that touch."""
+    fastest = _fastest(scene, start, ahead)
+    low, high, halvings, inside, entry, total = -np.inf, -FARTHEST, 0, False, -np.inf, 0.0
+    while True:  # one place that asks for the distance: it is compiled into each
+        beta = 0.5 * (low + high) if halvings > 0 else high
+        gap, hint = _gap(scene, start, ahead, beta, hint)
+        doubtful = inside or low == -np.inf or scene[7] > 0.0
+        touches = gap < 0.0 or (doubtful and _swallowed(scene, start, ahead, beta))
+        if low == -np.inf:
+            inside = touches
+        elif halvings > 0 or touches != inside:  # an end of a stretch lies between low and high
+            low, high = (beta, high) if touches == inside and halvings > 0 else (low, beta)
+            halvings = halvings - 1 if halvings > 0 else HALVINGS
+            if halvings > 0:
+                continue
+            if inside:
+                total += _normal(high) - _normal(entry)
+            entry, inside, beta, gap = low, not inside, high, SMALLEST_STEP * fastest
+        if beta >= FARTHEST:
+            return total + (_normal(-entry) if inside else 0.0), hint
+        low, high = beta, min(beta + (INSIDE_STEP if inside else max(gap / fastest, SMALLEST_STEP)), FARTHEST)
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _swallowed(scene, start, ahead, beta):  # type: ignore[no-untyped-def]
+    """Whether a needle that is near no face is inside: its tip came through an odd number of them on its way.
+
+    Faces that the tip can come through are near the nominal needle, all of them.
+    """
+    triangles, origin = scene[0], scene[3]
+    ox, oy, oz = origin[0] + NUDGE_MM, origin[1] - 0.61 * NUDGE_MM, origin[2] + 0.37 * NUDGE_MM
+    x, y, z = start[0] + beta * ahead[0], start[1] + beta * ahead[1], start[2] + beta * ahead[2]
+    odd = False
+    for row in range(len(triangles)):
+        t = triangles[row]
+        ax, ay, az, bx, by, bz = t[0] - ox, t[1] - oy, t[2] - oz, t[3] - ox, t[4] - oy, t[5] - oz
+        cx, cy, cz = t[6] - ox, t[7] - oy, t[8] - oz
+        wa = x * (by * cz - bz * cy) + y * (bz * cx - bx * cz) + z * (bx * cy - by * cx)
+        wb = x * (cy * az - cz * ay) + y * (cz * ax - cx * az) + z * (cx * ay - cy * ax)
+        wc = x * (ay * bz - az * by) + y * (az * bx - ax * bz) + z * (ax * by - ay * bx)
+        if not ((wa > 0.0 and wb > 0.0 and wc > 0.0) or (wa < 0.0 and wb < 0.0 and wc < 0.0)):
+            continue
+        total = wa + wb + wc
+        px, py, pz = wa * ax + wb * bx + wc * cx, wa * ay + wb * by + wc * cy, wa * az + wb * bz + wc * cz
+        along = (px * x + py * y + pz * z) / total
+        if 0.0 < along < x * x + y * y + z * z and not (row > 0 and np.array_equal(t, triangles[row - 1])):
+            odd = not odd  # the last block of a surface repeats its last face
+    return odd
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _normal(x):  # type: ignore[no-untyped-def]
+    return 0.5 * math.erfc(-x * ROOT_HALF)
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _fastest(scene, start, ahead):  # type: ignore[no-untyped-def]
+    """The most by which the distance can fall per standard deviation: an end of the axis is its fastest point."""
+    outward, length, surface_mm = scene[4], scene[5], scene[7]
+    ux, uy, uz = outward[0], outward[1], outward[2]
+    dx, dy, dz, px, py, pz = ahead[0], ahead[1], ahead[2], ahead[3], ahead[4], ahead[5]
+    at_tip = dx * dx + dy * dy + dz * dz
+    x, y = dx + length * (py * uz - pz * uy), dy + length * (pz * ux - px * uz)
+    z = dz + length * (px * uy - py * ux)
+    turn = math.sqrt(px * px + py * py + pz * pz)
+    lean = math.sqrt(start[3] ** 2 + start[4] ** 2 + start[5] ** 2) + FARTHEST * turn
+    fastest = math.sqrt(max(at_tip, x * x + y * y + z * z)) + length * lean * turn
+    return fastest + surface_mm * abs(ahead[6]) + 1e-12
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _gap(scene, start, ahead, beta, hint):  # type: ignore[no-untyped-def]
+    """Distance of the displaced needle beyond its threshold, mm; negative where it touches."""
+    triangles, faces, blocks, origin, outward, length, threshold, surface_mm = scene
+    ux, uy, uz = outward[0], outward[1], outward[2]
+    px, py, pz = start[3] + beta * ahead[3], start[4] + beta * ahead[4], start[5] + beta * ahead[5]
+    turn = math.sqrt(px * px + py * py + pz * pz)
+    sine, cosine = (math.sin(turn) / turn if turn > 1e-12 else 1.0), math.cos(turn)
+    along = (
+        cosine * ux + sine * (py * uz - pz * uy),
+        cosine * uy + sine * (pz * ux - px * uz),
+        cosine * uz + sine * (px * uy - py * ux),
+    )
+    tip = (
+        origin[0] + start[0] + beta * ahead[0],
+        origin[1] + start[1] + beta * ahead[1],
+        origin[2] + start[2] + beta * ahead[2],
+    )
+    enough = max(threshold - surface_mm * (start[6] + beta * ahead[6]), 0.0)  # a surface that is met is touched
+    distance, nearest = displaced_distance(triangles, faces, blocks, tip, along, length, enough, hint)
+    return (-1.0 if distance == 0.0 else distance - enough), nearest
+
+
+@nb.njit(cache=True, error_model="numpy")
+def first_touches(problem, root, directions, radii):  # type: ignore[no-untyped-def]
+    """Fill, for rays along ``directions`` (n, 5) from the nominal needle, how far out each touches; or infinity."""
+    triangles, faces, blocks, origin, outward, length, threshold = problem
+    scene = (triangles, faces, blocks, origin, outward, length, threshold, 0.0)
+    start, z, hint = np.zeros(7), np.zeros(6), 0
+    for ray in range(len(directions)):
+        for k in range(5):
+            z[k] = directions[ray, k]
+        ahead = _displacement(root, z)
+        fastest, beta, radii[ray] = _fastest(scene, start, ahead), 0.0, np.inf
+        while True:
+            gap, hint = _gap(scene, start, ahead, beta, hint)
+            if gap < 0.0:
+                radii[ray] = beta
+            if gap < 0.0 or beta >= FARTHEST:
+                break
+            beta = min(beta + max(gap / fastest, SMALLEST_STEP), FARTHEST)
