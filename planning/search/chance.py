@@ -26,6 +26,9 @@ from puncture_twin.planning.uncertainty.touch import Proximity, joint_touch_chan
 BEST = 200
 """Of the ranked candidates: how many get the dearer chances."""
 
+TAKEN = frozenset({"any", "joint"})
+"""Names whose column ``p_touch_<name>`` says something else than one structure's chance."""
+
 REFINED_FROM, REFINED_TO = 1 / 60, 3.0
 """Times its limit: what first order, or its bound, puts in between is refined. The chance to be displaced so far to any
 side at all is 56 times that to one side at 3.5 standard deviations, and less for less."""
@@ -51,10 +54,15 @@ def chance_model(case: Case, anatomy: Anatomy, error: PoseError | None) -> Chanc
     """The model of a case; None where it declares no errors, or nothing ties its frames.
 
     Raises:
-        InputError: Neither a radius nor a closed mesh says where the target is hit.
+        InputError: Neither a radius nor a closed mesh says where the target is hit, or a structure has the name of
+            another column.
     """
     if error is None:
         return None
+    taken = [anatomy.checked[column].name for column in demanding(anatomy.checked)]
+    if not TAKEN.isdisjoint(taken):
+        message = f"structures {', '.join(sorted(TAKEN.intersection(taken)))}: p_touch_<name> is another column"
+        raise InputError(message, where=case.path, allowed="other names than any and joint")
     mesh = anatomy.structure(case.target_structure).mesh
     if case.hit_radius_mm is None and not mesh.closed:
         message = f"the mesh of '{case.target_structure}' is open: what lies in it, and is hit, is not known"

@@ -67,7 +67,9 @@ class HitModel:
         if self.rays is None or self.radius_mm is not None:
             assert self.radius_mm is not None
             return hit_in_ball(cov_ct[:, :3, :3] + error.target_covariance_ct, self.radius_mm, error.freedom)
-        return hit_in_mesh(self.rays, np.ascontiguousarray(cov_ct[:, :3, :3]), error.freedom)
+        # a surface that lies off takes from the target as a tip would that errs so
+        cov = cov_ct[:, :3, :3] + error.surface_mm**2 * np.eye(3)
+        return hit_in_mesh(self.rays, np.ascontiguousarray(cov), error.freedom)
 
 
 def hit_model(radius_mm: float | None, mesh: TriangleMesh, target_ct: Floats) -> HitModel:

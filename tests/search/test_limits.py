@@ -140,6 +140,26 @@ def test_noise_is_not_found_in_computed_readings(tmp_path):
     assert prepare(ball(tmp_path, errors='marker_noise = "found"')).chance is not None
 
 
+@pytest.mark.parametrize("name", ["any", "joint"])
+def test_a_structure_with_the_name_of_another_column_is_refused(tmp_path, name):
+    """Its chance would be lost beside the sum's."""
+    path = ball(tmp_path)
+    path.write_text(path.read_text().replace('name = "rib"', f'name = "{name}"'))
+    with pytest.raises(InputError, match="is another column"):
+        prepare(path)
+
+
+def test_a_surface_that_lies_off_takes_from_the_chance_to_hit(tmp_path):
+    """Half a centimetre of a target of six millimetres."""
+    chances = []
+    for surface in (0.0, 5.0):
+        folder = tmp_path / str(surface)
+        folder.mkdir()
+        found = prepare(ball(folder, errors=f"surface_mm = {surface}")).search()
+        chances.append(np.nanmax(found.chances.hit))
+    assert chances[1] < 0.7 < chances[0]
+
+
 def test_an_open_target_has_no_chance_to_be_hit(tmp_path):
     """A sheet holds no tip; a radius says what a hit is."""
     sheet = trimesh.Trimesh([[-8, -8, -6], [8, -8, -6], [8, 8, -6], [-8, 8, -6]], [[0, 1, 2], [0, 2, 3]])
