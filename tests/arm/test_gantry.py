@@ -75,7 +75,7 @@ thickness_mm = 300.0
 wall_mm = 150.0
 tilt_deg = {tilt}
 """
-REGISTRATION = '[registration]\nmethod = "rigid"\nmarkers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"\n'
+REGISTRATION = '[registration]\nmarkers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"\n'
 
 
 @pytest.fixture

@@ -175,7 +175,7 @@ def test_bounds_that_make_no_sense_are_refused(case_folder, lines, match):
 def test_mount_lines_state_the_pose(case_folder):
     """Pasted into the case in place of its registration they give the pose, in LPS and in RAS, to the rounding."""
     T_ct_base = np.linalg.inv(load_placement(load_case(folder() / "abdomen")).T_base_ct)
-    registration = '[registration]\nmethod = "rigid"\nmarkers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"\n'
+    registration = '[registration]\nmarkers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"\n'
     for space in ("LPS", "RAS"):
         case = load_case(case_folder(('space = "LPS"', f'space = "{space}"'), name=space))
         mount = mount_section(T_ct_base, case.space)
