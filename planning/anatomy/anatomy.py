@@ -336,10 +336,10 @@ class _Loader:
 
     def _volume(self, name: str) -> VolumeSurfaces:
         if name not in self._volumes:
-            files, beside = self._case.files, self._case.data_beside(name)
-            data = None if beside is None else files.content(beside)
-            hashes = tuple(files.sha256(file) for file in (name, beside) if file is not None)
-            self._volumes[name] = VolumeSurfaces(self._file(name), files.content(name), data, hashes, self._cache)
+            source = self._case.volumes.source(name)
+            hashes = tuple(self._case.files.sha256(file) for file in source.files)
+            self._volumes[name] = VolumeSurfaces(source, hashes, self._cache)
+            self.warnings.extend(source.notes)
         return self._volumes[name]
 
     def _file(self, name: str) -> Path:

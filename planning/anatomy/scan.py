@@ -38,7 +38,6 @@ from puncture_twin.planning.base.cache.array_cache import Arrays
 from puncture_twin.planning.formats.guard import fits
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.volumes.orientation import Oriented, canonical
-from puncture_twin.planning.formats.volumes.volume_files import parse_header
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.voxelize import voxels_inside
@@ -153,9 +152,9 @@ class Scan:
 
     def holds(self, point_ct: NDArray[np.float64]) -> bool:
         """Whether a point (3,), LPS mm, lies in the image; only the header is read."""
-        header = parse_header(self.source.content, self.source.path)
-        index = np.linalg.solve(header.T_ct_index, np.append(point_ct, 1.0))[:3]
-        return bool(np.all((index >= -0.5) & (index <= np.array(header.shape) - 0.5)))
+        grid = self.source.source.grid
+        index = np.linalg.solve(grid.T_ct_index, np.append(point_ct, 1.0))[:3]
+        return bool(np.all((index >= -0.5) & (index <= np.array(grid.shape) - 0.5)))
 
     def hu_at(self, points_ct: NDArray[np.float64]) -> NDArray[np.float64]:
         """Hounsfield units of the nearest voxel, NaN outside of the image.

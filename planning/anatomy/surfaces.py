@@ -15,7 +15,8 @@ from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.formats.labels.label_surface import label_mesh
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap, labelmap_of, segment_names
-from puncture_twin.planning.formats.volumes.volume_files import Volume, parse_header, parse_volume
+from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.formats.volumes.volume_source import VolumeSource
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 LABELS_PRESENT = "labels present"
@@ -26,23 +27,24 @@ class VolumeSurfaces:
     """The surfaces of one label map or CT. Its voxels are decoded only if something is not in the cache.
 
     Attributes:
-        path: The volume's name.
-        content: The file that was named.
-        data: The file that it names for its voxels, or None.
-        sha256: Of content and data.
+        source: The volume's file or files.
+        sha256: Of these.
         cache: Where surfaces are kept.
     """
 
-    path: Path
-    content: bytes
-    data: bytes | None
+    source: VolumeSource
     sha256: tuple[str, ...]
     cache: Cache
+
+    @property
+    def path(self) -> Path:
+        """The volume's name."""
+        return self.source.path
 
     @cached_property
     def volume(self) -> Volume:
         """The volume itself."""
-        return parse_volume(self.content, self.path, self.data)
+        return self.source.volume()
 
     @cached_property
     def labelmap(self) -> LabelMap:
@@ -52,7 +54,7 @@ class VolumeSurfaces:
     @property
     def names(self) -> dict[int, str] | None:
         """The names that the file holds for its labels."""
-        return segment_names(parse_header(self.content, self.path).fields, self.path)
+        return segment_names(self.source.grid.fields, self.path)
 
     def labels_present(self) -> tuple[int, ...]:
         """The labels that have a voxel, ascending."""

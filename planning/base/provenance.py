@@ -21,7 +21,8 @@ CASE_ROLE = "case"
 """The file that names the others; what it is called decides nothing."""
 
 KEPT_BYTES = 10_000_000
-"""Files up to this size stay in memory with their case: points and names. Volumes are let go of once parsed."""
+"""So much in all stays in memory with its case, the smallest files first: points and names. Volumes, and the many
+slices of a series, are let go of once parsed."""
 
 
 @dataclass(frozen=True, order=True)
@@ -140,8 +141,13 @@ class InputFiles:
         return next(one.sha256 for one in self._inputs.values() if one.path == name)
 
     def release(self) -> None:
-        """Let go of large files; their hashes stay."""
-        self._held = {name: content for name, content in self._held.items() if len(content) <= KEPT_BYTES}
+        """Let go of all but the smallest files; every hash stays."""
+        kept, total = {}, 0
+        for name, content in sorted(self._held.items(), key=lambda one: len(one[1])):
+            total += len(content)
+            if total <= KEPT_BYTES:
+                kept[name] = content
+        self._held = kept
 
     def __getstate__(self) -> dict[str, Any]:
         """Another process is not sent gigabytes: it reads what it needs, and holds that against the hash."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -30,6 +30,7 @@ from puncture_twin.planning.case.case_file import (
     StructureSection,
     StructuresSection,
 )
+from puncture_twin.planning.case.case_volumes import VOLUME_ROLES, CaseVolumes
 from puncture_twin.planning.case.entry import entry_frame, view_frame
 from puncture_twin.planning.case.errors import Cells, ErrorModel, error_model
 from puncture_twin.planning.case.errors_section import ErrorsSection
@@ -154,6 +155,7 @@ class Case:
         target_ct: Shape (3,), the point to reach.
         T_ct_entry: Shape (4, 4), the entry frame, its origin on the target.
         files: The case file and all that it names, read once.
+        volumes: Those of them that are volumes: the CT and the label maps.
         stated_structures: How many structures the case says that it has, the skin among them; None in schema 1.
         region: Which part of the body it shows; None in schema 1.
         warnings: What the case file itself leaves open, one sentence each.
@@ -179,6 +181,7 @@ class Case:
     obstacles: tuple[Obstacle, ...]
     rehearsal: RehearsalSection
     files: InputFiles
+    volumes: CaseVolumes
     ct: CtSettings = CtSettings()
     gantry: Gantry | None = None
     place: PlaceSection = field(default_factory=PlaceSection)
@@ -203,10 +206,6 @@ class Case:
         """The case file and all that it names, each with its role and hash."""
         return self.files.inputs
 
-    def data_beside(self, name: str) -> str | None:
-        """The file that a volume's detached header names for its voxels; None for a volume in one file."""
-        return _data_beside(self.files, self.path, name)
-
 
 def load_case(path: Path | str) -> Case:
     """Read and validate a case file, or a folder that holds ``case.toml``.
@@ -216,11 +215,14 @@ def load_case(path: Path | str) -> Case:
     """
     path = find_toml(path, "case.toml")
     files = InputFiles(path.parent)
+    case_volumes = CaseVolumes(files, path)
     stated = files.add(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE))
     content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md")
     for one in _named_files(content):
-        files.read(one.role, one.name, max_bytes=one.max_bytes, key=one.key, where=path)
-        _read_data_beside(files, one, path)
+        if one.role in VOLUME_ROLES:
+            case_volumes.read(one.role, one.name, key=one.key)
+        else:
+            files.read(one.role, one.name, max_bytes=one.max_bytes, key=one.key, where=path)
     space = Space(content.space)
     target = _target(content, path, space, files)
     settings = content.search
@@ -258,6 +260,7 @@ def load_case(path: Path | str) -> Case:
         ),
         rehearsal=content.rehearsal,
         files=files,
+        volumes=case_volumes,
         ct=CtSettings(**content.ct.model_dump(), trust_labels=settings.trust_labels),
         gantry=None if content.gantry is None else _gantry(content.gantry, space, path),
         place=content.place,
@@ -265,13 +268,13 @@ def load_case(path: Path | str) -> Case:
         region=content.region,
         warnings=wholeness_warnings(content, files, path),
         hit_radius_mm=content.target.hit_radius_mm,
-        errors=_errors(content, content.errors, files, path),
-        truth_errors=_errors(content, content.rehearsal.errors, files, path, truth=True),
+        errors=_errors(content, content.errors, case_volumes, path),
+        truth_errors=_errors(content, content.rehearsal.errors, case_volumes, path, truth=True),
     )
 
 
 def _errors(
-    content: CaseFile, section: ErrorsSection | None, files: InputFiles, path: Path, *, truth: bool = False
+    content: CaseFile, section: ErrorsSection | None, case_volumes: CaseVolumes, path: Path, *, truth: bool = False
 ) -> ErrorModel | None:
     """The declared errors, or the truth's own, which know no short form and no older names."""
     if section is None:
@@ -279,21 +282,21 @@ def _errors(
     return error_model(
         section,
         space=Space(content.space),
-        cells=_ct_cells(content, files, path),
+        cells=_ct_cells(content, case_volumes),
         fle_mm=None if truth or content.registration is None else content.registration.fle_mm,
         rehearsal=None if truth else content.rehearsal,
         where=f"{path}: {'rehearsal.errors' if truth else 'errors'}",
     )
 
 
-def _ct_cells(content: CaseFile, files: InputFiles, path: Path) -> Cells | None:
+def _ct_cells(content: CaseFile, case_volumes: CaseVolumes) -> Cells | None:
     """Pixel, slice spacing and slice normal of the case's CT; None without one."""
     names = [one.ct for one in content.structure if one.ct is not None] + [content.ct.file]
     if names[0] is None:
         return None
-    header = volumes.parse_header(files.content(names[0]), path.parent / names[0])
-    spacing = header.spacing_mm
-    return Cells(float(spacing[:2].max()), float(spacing[2]), header.T_ct_index[:3, 2] / spacing[2])
+    grid = case_volumes.source(names[0]).grid
+    spacing = grid.spacing_mm
+    return Cells(float(spacing[:2].max()), float(spacing[2]), grid.T_ct_index[:3, 2] / spacing[2])
 
 
 def _target(content: CaseFile, path: Path, space: Space, files: InputFiles) -> Floats:
@@ -392,21 +395,6 @@ def _named_files(content: CaseFile) -> Iterator[_Named]:
             yield _Named(side, getattr(content.registration, side), f"registration.{side}", points.MAX_FILE_BYTES)
     if content.rehearsal.truth_base is not None:
         yield _Named("truth_base", content.rehearsal.truth_base, "rehearsal.truth_base", points.MAX_FILE_BYTES)
-
-
-def _read_data_beside(files: InputFiles, header: _Named, path: Path) -> None:
-    """Read the file that a volume's detached header names, which holds what decides."""
-    if header.role not in {"labelmap", "ct"}:
-        return
-    name = _data_beside(files, path, header.name)
-    if name is not None:
-        files.read(f"{header.role} data", name, max_bytes=volumes.MAX_FILE_BYTES, key=header.key, where=path)
-
-
-def _data_beside(files: InputFiles, path: Path, name: str) -> str | None:
-    """The data file of a detached header, as a name relative to the case's folder."""
-    beside = volumes.data_file(files.content(name), path.parent / name)
-    return None if beside is None else str(PurePosixPath(name).with_name(beside))
 
 
 def _read_only(array: ArrayLike) -> Floats:

@@ -12,8 +12,7 @@ from puncture_twin.planning.anatomy.regions import absent_organs
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.formats.volumes.volume_files import parse_header
-from puncture_twin.planning.formats.volumes.volume_header import VolumeHeader
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 from puncture_twin.planning.geometry.winding import odd_fraction, winding_number
@@ -22,7 +21,7 @@ from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.constraints import longest_path
 from puncture_twin.planning.search.resolution import resolution_warnings
 
-Headers = Mapping[str, VolumeHeader]
+Headers = Mapping[str, VolumeGrid]
 
 USUAL_INSIDE = 0.99
 """Of a structure's area, inside the skin; a smaller fraction is a warning. One percent is what smoothing moves."""
@@ -108,7 +107,7 @@ def _surface_tolerance_mm(structure: Structure, skin_volume: str | None, headers
     return max(LEAST_TOLERANCE_MM, sum(halves))
 
 
-def volume_headers(case: Case) -> dict[str, VolumeHeader]:
+def volume_headers(case: Case) -> dict[str, VolumeGrid]:
     """The headers of the CT and the label maps that the case's structures come from, by file name.
 
     Raises:
@@ -117,7 +116,7 @@ def volume_headers(case: Case) -> dict[str, VolumeHeader]:
     named = {section.ct or section.labelmap for section in case.structure}
     named |= {section.labelmap for section in case.structures}
     files = sorted(name for name in named if name)
-    return {name: parse_header(case.files.content(name), case.folder / name) for name in files}
+    return {name: case.volumes.source(name).grid for name in files}
 
 
 def _refuse_open_around_target(case: Case, anatomy: Anatomy) -> None:

@@ -9,9 +9,9 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM
-from puncture_twin.planning.formats.volumes.volume_header import VolumeHeader
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 
-Headers = Mapping[str, VolumeHeader]
+Headers = Mapping[str, VolumeGrid]
 
 STEP_SLACK = 1e-9
 """Steps by which a range may miss a whole number of them: rounding of radians."""

@@ -47,6 +47,20 @@ def test_a_large_file_that_was_let_go_of_must_be_the_same_when_it_is_read_again(
     assert len(pickle.dumps(files)) < 1000
 
 
+def test_many_files_are_let_go_of_as_one_large_file_is(tmp_path: Path) -> None:
+    """The slices of a series are small one by one: what stays is bounded in all, the smallest files first."""
+    files = InputFiles(tmp_path)
+    for number, size in enumerate((4_000_000, 4_000_001, 4_000_002, 10)):
+        (tmp_path / f"{number}.dcm").write_bytes(bytes(size))
+        files.read("ct", f"{number}.dcm", max_bytes=1 << 30, key="x", where=tmp_path)
+    files.release()
+    for number in range(4):
+        (tmp_path / f"{number}.dcm").write_bytes(b"other")
+    assert [len(files.content(name)) for name in ("0.dcm", "1.dcm", "3.dcm")] == [4_000_000, 4_000_001, 10]
+    with pytest.raises(InputError, match="has changed since it was read"):
+        files.content("2.dcm")
+
+
 @pytest.mark.parametrize("name", ["gone.csv", "folder", "x" * 5000, "a\0b", "../none"])
 def test_a_file_that_is_not_there_is_named_by_its_key(files: InputFiles, tmp_path: Path, name: str) -> None:
     """Missing, a folder, a name that no file system takes."""

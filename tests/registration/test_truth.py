@@ -13,6 +13,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case import Case, Needle, RobotSettings, SearchSettings, load_case
 from puncture_twin.planning.case.case_file import RankingSection, RegistrationSection, RehearsalSection
+from puncture_twin.planning.case.case_volumes import CaseVolumes
 from puncture_twin.planning.case.entry import view_frame
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
@@ -75,6 +76,7 @@ def case(folder: Path, *, markers: bool = True, method: str = "rigid", **rehears
         obstacles=(),
         rehearsal=RehearsalSection(**rehearsal),
         files=files_in(folder),
+        volumes=CaseVolumes(files_in(folder), folder / "case.toml"),
     )
 
 

@@ -45,22 +45,18 @@ class VoxelLayout:
 
 
 @dataclass(frozen=True, eq=False)
-class VolumeHeader:
-    """One volume as its header describes it; the data have not been looked at.
+class VolumeGrid:
+    """Where the voxels of a volume lie; what they hold has not been looked at.
 
     Attributes:
         shape: Voxels along i, j, k.
         T_ct_index: Shape (4, 4), maps voxel index (i, j, k) to LPS mm.
-        fields: The file's own key/value remarks (NRRD ``key:=value``), empty for NIfTI.
-        cells: How the voxels are stored.
-        data_path: The file that holds them: the header's own, or one beside it.
+        fields: The file's own key/value remarks (NRRD ``key:=value``), empty for the other formats.
     """
 
     shape: tuple[int, int, int]
     T_ct_index: NDArray[np.float64]
     fields: dict[str, str]
-    cells: VoxelLayout
-    data_path: Path
 
     @property
     def count(self) -> int:
@@ -71,6 +67,19 @@ class VolumeHeader:
     def spacing_mm(self) -> NDArray[np.float64]:
         """Distance of neighbouring voxels along i, j and k, shape (3,)."""
         return np.asarray(np.linalg.norm(self.T_ct_index[:3, :3], axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class VolumeHeader(VolumeGrid):
+    """One volume in one or two files as its header describes it.
+
+    Attributes:
+        cells: How the voxels are stored.
+        data_path: The file that holds them: the header's own, or one beside it.
+    """
+
+    cells: VoxelLayout
+    data_path: Path
 
 
 def check_shape(shape: tuple[int, ...], *, where: Path) -> tuple[int, int, int]:

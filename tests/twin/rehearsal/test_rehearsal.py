@@ -18,6 +18,7 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case import Case, Needle, Obstacle, RobotSettings, SearchSettings
 from puncture_twin.planning.case.case_file import RankingSection, RehearsalSection
+from puncture_twin.planning.case.case_volumes import CaseVolumes
 from puncture_twin.planning.case.entry import view_frame
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
@@ -94,6 +95,7 @@ def case(*obstacles: Obstacle) -> Case:
         obstacles=obstacles,
         rehearsal=RehearsalSection(),
         files=InputFiles(Path()),
+        volumes=CaseVolumes(InputFiles(Path()), Path("case.toml")),
     )
 
 
