@@ -22,7 +22,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import StructureSection, StructuresSection
 from puncture_twin.planning.case.case_schema import count_difference
-from puncture_twin.planning.formats.labels.naming import RuleKind, names_for, select
+from puncture_twin.planning.formats.labels.naming import BUILT_IN, RuleKind, names_for, select
 from puncture_twin.planning.formats.meshes.mesh_files import mesh_warnings, parse_mesh
 from puncture_twin.planning.formats.volumes.volume_files import NRRD_ENDINGS
 from puncture_twin.planning.geometry.containment import Side, side_of
@@ -242,6 +242,7 @@ class _Loader:
             traverse=section.traverse,
             ignore=section.ignore,
             target=section.target,
+            all_named=section.naming in BUILT_IN,
             where=self._case.path,
         )
         self.warnings.extend(rules.warnings)

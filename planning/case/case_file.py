@@ -24,6 +24,7 @@ from puncture_twin.planning.case.toml_types import (
     Positive,
     Section,
     Sextuple,
+    StructureName,
     Text,
     Vector,
     Weight,
@@ -54,7 +55,7 @@ class TargetSection(Section):
     position_mm: Vector | None = None
     points: str | None = None
     name: Text = "target"
-    structure: Name
+    structure: StructureName
     hit_radius_mm: Annotated[Number, Field(gt=0, le=100)] | None = None
 
     @model_validator(mode="after")
@@ -144,7 +145,7 @@ Role = Literal["avoid", "traverse", "target", "skin", "unknown"]
 class StructureSection(Section):
     """One structure from one source."""
 
-    name: Name
+    name: StructureName
     role: Role
     margin_mm: Margin | None = None
     mesh: str | None = None

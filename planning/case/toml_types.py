@@ -21,6 +21,8 @@ Vector = tuple[Coordinate, Coordinate, Coordinate]
 Sextuple = tuple[JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees]
 Text = Annotated[str, StringConstraints(min_length=1, max_length=MAX_NAME)]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=80)]
+StructureName = Annotated[str, StringConstraints(pattern=r"^\S(.*\S)?$", max_length=MAX_NAME)]
+"""As other programs name structures, such as "right lung"; that it is printable is checked for the whole file."""
 Degrees360 = Annotated[Number, Field(ge=0, le=360)]
 Degrees180 = Annotated[Number, Field(ge=0, le=180)]
 Yes = Annotated[bool, Strict()]

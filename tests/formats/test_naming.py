@@ -100,7 +100,7 @@ def test_unknown_namings_are_refused_with_the_nearest(tmp_path: Path) -> None:
 
 
 def test_patterns_give_every_label_its_rule() -> None:
-    """Kinds and margins come from the pattern that matches; the largest margin of several holds."""
+    """Kinds and margins come from the pattern that matches."""
     assert chosen() == {
         "liver": ("target", 0.0),
         "rib_left_7": ("avoid", 1.0),
@@ -108,8 +108,6 @@ def test_patterns_give_every_label_its_rule() -> None:
         "lung_lower_lobe_left": ("traverse", 0.0),
         "aorta": ("avoid", 5.0),
     }
-    assert chosen(avoid={"rib_*": 1.0, "aorta": 5.0, "*_7": 3.0})["rib_left_7"] == ("avoid", 3.0)
-    assert chosen(avoid={"*_7": 3.0, "rib_*": 1.0, "aorta": 5.0})["rib_left_7"] == ("avoid", 3.0)
     first = select(NAMES, [5], avoid={"aorta": 2}, where="case.toml").rules
     assert first == (LabelRule(5, "aorta", RuleKind.AVOID, 2.0, "aorta"),)
 
@@ -122,19 +120,62 @@ def test_a_label_that_no_rule_names_is_an_error_that_lists_all_such() -> None:
         chosen(present=(1, 9))
 
 
-@pytest.mark.parametrize("rules", [{"ignore": ["rib_left_7"]}, {"traverse": ["lung_*", "aort?"]}, {"target": ["*"]}])
-def test_a_label_of_two_kinds_is_an_error(rules: dict[str, list[str]]) -> None:
-    """Whatever the margins, two kinds for one label contradict each other."""
+@pytest.mark.parametrize(
+    ("avoid", "rules", "rib"),
+    [
+        ({"rib_*": 1.0, "*": 9.0}, {}, ("avoid", 1.0)),
+        ({"*": 9.0, "rib_*": 1.0, "rib_left_*": 2.0}, {}, ("avoid", 2.0)),
+        ({"rib_left_?": 2.0, "rib_*": 3.0, "*": 9.0}, {}, ("avoid", 2.0)),
+        ({"rib_left_*": 2.0, "rib_left_?": 3.0, "*": 9.0}, {}, ("avoid", 3.0)),
+        ({"rib_left_*": 2.0, "*": 9.0}, {"traverse": ["rib_left_7", "lung_*"]}, ("traverse", 0.0)),
+        ({"rib_left_7": 0.5, "*": 9.0}, {"ignore": ["rib_left_*"]}, ("avoid", 0.5)),
+        ({"*": 9.0}, {"traverse": ["lung_*", "rib_*"], "ignore": ["rib_left_[78]"]}, ("ignore", 0.0)),
+        ({"aorta": 1.0}, {"traverse": ["*"]}, ("traverse", 0.0)),
+    ],
+)
+def test_the_most_specific_pattern_holds(
+    avoid: dict[str, float], rules: dict[str, list[str]], rib: tuple[str, float]
+) -> None:
+    """Its own name, then the most characters that are no wildcards, whatever the order; the asterisk is the rest."""
+    assert chosen(avoid=avoid, **rules)["rib_left_7"] == rib
+    assert chosen(avoid=dict(reversed(avoid.items())), **rules)["rib_left_7"] == rib
+
+
+@pytest.mark.parametrize("rules", [{"ignore": ["rib_lef?_*"]}, {"traverse": ["lung_*", "aort?"]}, {"target": ["*"]}])
+def test_two_kinds_that_are_equally_specific_are_an_error(rules: dict[str, list[str]]) -> None:
+    """Nothing says which is meant; both are named."""
     with pytest.raises(InputError, match="is named by .* and by"):
-        chosen(**rules)
+        chosen(avoid={"rib_?eft_*": 1.0, "a?rta": 5.0, "*": 2.0}, **rules)
     with pytest.raises(InputError, match="is named by"):
         select(NAMES, [5], avoid={"aorta": 0.0}, ignore=["aorta"], where="case.toml")
 
 
+def test_a_larger_margin_that_does_not_hold_is_told() -> None:
+    """But not where the label's own name was written, and not of the rest."""
+    selection = select(NAMES, [2], avoid={"rib_*": 1.0, "*_7": 3.0, "*": 9.0}, where="case.toml")
+    assert [rule.margin_mm for rule in selection.rules] == [1.0]
+    assert selection.warnings == (
+        "case.toml: 'rib_left_7' is named by avoid 'rib_*' and by avoid '*_7' = 3; the more specific holds: "
+        "avoid 'rib_*', 1 mm",
+    )
+    assert select(NAMES, [2], avoid={"rib_left_7": 1.0, "*_7": 3.0}, where="case.toml").warnings == ()
+    weaker = select(NAMES, [2], avoid={"*_7": 3.0}, traverse=["rib_*"], where="case.toml").warnings
+    assert len(weaker) == 1 and "traverse 'rib_*'" in weaker[0]
+
+
+def test_names_with_spaces_can_be_named() -> None:
+    """As Slicer writes them: in every kind, whole or by pattern."""
+    names = {1: "right lung", 2: "left lung", 3: "liver lesion 1"}
+    found = select(names, names, avoid={"left lung": 2.0}, traverse=["right *"], target=["liver lesion*"], where="c")
+    assert [str(rule.kind) for rule in found.rules] == ["traverse", "avoid", "target"]
+
+
 def test_a_pattern_that_names_nothing_is_an_error_or_a_warning() -> None:
-    """Unknown to the naming: refused with the nearest names. Known but not in this map: a warning."""
+    """Unknown to a naming that knows all: refused with the nearest names. Known, or of one's own list: a warning."""
     with pytest.raises(InputError, match=r"'aotra\*' matches no name.*aorta"):
         chosen(avoid={"rib_*": 1.0, "aotra*": 5.0})
+    free = {"avoid": {"*": 5.0, "aotra*": 5.0}, "all_named": False, "where": "case.toml"}
+    assert select(NAMES, [5], **free).warnings == ("case.toml: avoid pattern 'aotra*' matches no label present",)
     selection = select(NAMES, [5], avoid={"aorta": 0.0}, ignore=["lung_*"], where="case.toml")
     assert selection.warnings == ("case.toml: ignore pattern 'lung_*' matches no label present",)
 

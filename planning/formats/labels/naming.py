@@ -6,7 +6,8 @@ import csv
 import difflib
 import io
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from fnmatch import fnmatchcase
@@ -24,6 +25,10 @@ BUILT_IN: Mapping[str, Mapping[int, str]] = {
 }
 OWN_NAMES = "seg.nrrd"
 """The naming that takes the names inside a .seg.nrrd."""
+REST = "*"
+"""The pattern of whatever no other pattern names."""
+WILDCARD = re.compile(r"\[[^\]]+\]|[*?]")
+"""What stands for characters in a shell pattern."""
 MAX_CSV_BYTES = 10_000_000
 """A table of all 65,535 labels stays below 4 MB."""
 
@@ -121,12 +126,14 @@ def select(
     traverse: Sequence[str] = (),
     target: Sequence[str] = (),
     ignore: Sequence[str] = (),
+    all_named: bool = True,
     where: str | Path,
 ) -> Selection:
     """Gives every label present its rule.
 
-    Patterns are shell patterns (``*``, ``?``, ``[...]``), capitals count. Where several ``avoid`` patterns name
-    one label, the largest margin holds.
+    Patterns are shell patterns (``*``, ``?``, ``[...]``), capitals count. Of several that name one label the most
+    specific holds: the label's own name, else the one with most characters that are no wildcards; ``"*"`` is the rest.
+    Of equally specific ``avoid`` patterns the largest margin holds.
 
     Args:
         names: Label to name.
@@ -135,16 +142,20 @@ def select(
         traverse: Patterns of what may be crossed.
         target: Patterns of what holds the lesion.
         ignore: Patterns of what does not count.
+        all_named: Whether ``names`` holds every name that can occur, so that a pattern of none is a slip.
         where: The case file and entry, for messages.
 
     Raises:
-        InputError: A label present that has no name or that no pattern names, one that two kinds name, a
-            pattern that matches no name of the naming, or a margin that is negative or not finite.
+        InputError: A label present that has no name or that no pattern names, one that two equally specific patterns
+            of different kinds name, a pattern that matches no name although all are known, or a margin that is
+            negative or not finite.
     """
     patterns = [LabelRule(0, "", RuleKind.AVOID, float(margin), pattern) for pattern, margin in avoid.items()]
     for kind, listed in ((RuleKind.TRAVERSE, traverse), (RuleKind.TARGET, target), (RuleKind.IGNORE, ignore)):
         patterns += [LabelRule(0, "", kind, 0.0, pattern) for pattern in listed]
-    _check_patterns(patterns, names, where)
+    _check_margins(patterns, where)
+    if all_named:
+        _refuse_unknown(patterns, names, where)
     nameless = [label for label in sorted(present) if label not in names]
     if nameless:
         raise InputError(f"labels without a name: {_listed(nameless)}", where=where, allowed="labels of the naming")
@@ -155,32 +166,63 @@ def select(
         raise InputError(what, where=where, allowed="a pattern in avoid, traverse, target or ignore for each")
     here = [names[label] for label in present]
     unused = [p for p in patterns if not any(fnmatchcase(name, p.pattern) for name in here)]
-    warnings = tuple(f"{where}: {p.kind} pattern {p.pattern!r} matches no label present" for p in unused)
-    return Selection(tuple(rule for rule in rules if rule is not None), warnings)
+    absent = [f"{where}: {p.kind} pattern {p.pattern!r} matches no label present" for p in unused]
+    taken = tuple(rule for rule in rules if rule is not None)
+    weaker = [said for rule in taken for said in _weaker_warnings(rule, patterns, where)]
+    return Selection(taken, (*absent, *weaker))
 
 
-def _check_patterns(patterns: Sequence[LabelRule], names: Mapping[int, str], where: str | Path) -> None:
+def _check_margins(patterns: Sequence[LabelRule], where: str | Path) -> None:
     for rule in patterns:
         if not (math.isfinite(rule.margin_mm) and rule.margin_mm >= 0):
             what = f"margin {rule.margin_mm} of pattern {rule.pattern!r}"
             raise InputError(what, where=where, allowed="mm, 0 or more")
-        if not any(fnmatchcase(name, rule.pattern) for name in names.values()):
+
+
+def _refuse_unknown(patterns: Sequence[LabelRule], names: Mapping[int, str], where: str | Path) -> None:
+    for rule in patterns:
+        if rule.pattern != REST and not any(fnmatchcase(name, rule.pattern) for name in names.values()):
             near = difflib.get_close_matches(rule.pattern.strip("*?"), names.values(), n=3, cutoff=0.4)
             allowed = f"names like {', '.join(near)}" if near else f"one of {_listed(sorted(names.values()))}"
             what = f"{rule.kind} pattern {rule.pattern!r} matches no name of the naming"
             raise InputError(what, where=where, allowed=allowed)
 
 
+def specificity(pattern: str, name: str) -> float:
+    """How closely a pattern names one name: infinite for the name itself, else its characters that are no wildcards.
+
+    >>> specificity("aorta", "aorta"), specificity("rib_*_7", "rib_left_7"), specificity("*", "aorta")
+    (inf, 6, 0)
+    """
+    return math.inf if pattern == name else len(WILDCARD.sub("", pattern))
+
+
 def _rule(label: int, name: str, patterns: Sequence[LabelRule], where: str | Path) -> LabelRule | None:
     matching = [p for p in patterns if fnmatchcase(name, p.pattern)]
     if not matching:
         return None
-    first = max(matching, key=lambda p: p.margin_mm)
-    other = next((p for p in matching if p.kind is not first.kind), None)
+    most = max(specificity(p.pattern, name) for p in matching)
+    closest = [p for p in matching if specificity(p.pattern, name) == most]
+    first = max(closest, key=lambda p: p.margin_mm)
+    other = next((p for p in closest if p.kind is not first.kind), None)
     if other is not None:
         what = f"label {name!r} is named by {first.kind} {first.pattern!r} and by {other.kind} {other.pattern!r}"
-        raise InputError(what, where=where, allowed="one kind of rule per label")
+        raise InputError(what, where=where, allowed="one of the two, or its full name under the kind that is meant")
     return LabelRule(label, name, first.kind, first.margin_mm, first.pattern)
+
+
+def _weaker_warnings(rule: LabelRule, patterns: Sequence[LabelRule], where: str | Path) -> Iterator[str]:
+    """Patterns that would demand more of a label than the one that holds, where nobody wrote the label's own name."""
+    if rule.pattern == rule.name:
+        return
+    for other in patterns:
+        overruled = other.kind is RuleKind.AVOID and other.pattern != REST and fnmatchcase(rule.name, other.pattern)
+        if overruled and (rule.kind is not RuleKind.AVOID or other.margin_mm > rule.margin_mm):
+            holds = f"{rule.kind} {rule.pattern!r}"
+            yield (
+                f"{where}: {rule.name!r} is named by {holds} and by avoid {other.pattern!r} = {other.margin_mm:g}; "
+                f"the more specific holds: {holds}, {rule.margin_mm:g} mm"
+            )
 
 
 def _listed(items: Sequence[object]) -> str:
