@@ -2,38 +2,30 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.anatomy.beyond_labels import BEYOND_LABELS, beyond_labels
 from puncture_twin.planning.anatomy.body.support import support_warnings
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.second_witness import Named
-from puncture_twin.planning.anatomy.skin import Skin, flat_ends, skin_from_mesh
-from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
+from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.anatomy.sources import Progress, StructureSources
+from puncture_twin.planning.anatomy.structure import Role as Role, Structure as Structure
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.case_file import StructureSection, StructuresSection
+from puncture_twin.planning.case.case_file import StructureSection
 from puncture_twin.planning.case.case_schema import count_difference
-from puncture_twin.planning.formats.labels.naming import BUILT_IN, RuleKind, names_for, select
-from puncture_twin.planning.formats.meshes.mesh_files import mesh_warnings, parse_mesh
-from puncture_twin.planning.formats.volumes.volume_files import NRRD_ENDINGS
+from puncture_twin.planning.formats.meshes.mesh_files import mesh_warnings
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space, parse_space, parse_unit
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
-Progress = Callable[[str], None]
-
-UNNAMED_SHOWN = 8
-"""Labels that a warning lists; a person looks at the map for the rest."""
 OUTSIDE_BODY, ATTACHED_LIMB = "outside_body", "attached_limb"
 UNNAMED_DENSE, UNNAMED_GAS = "unnamed_dense", "unnamed_gas"
 """Names of the structures that the CT adds."""
@@ -59,43 +51,6 @@ LABELS_TRUSTED = "search.trust_labels: what the CT shows inside the body beside 
 
 ON_SURFACE_MM = 1e-3
 """A target this close to its structure's surface lies on it: meshes in single precision round to 1e-5 mm."""
-
-
-class Role(StrEnum):
-    """What a structure means to a needle."""
-
-    AVOID = "avoid"
-    TRAVERSE = "traverse"
-    TARGET = "target"
-    SKIN = "skin"
-    UNKNOWN = "unknown"
-
-
-@dataclass(frozen=True, eq=False)
-class Structure:
-    """A named surface with a role.
-
-    Attributes:
-        name: Unique in the case.
-        role: What it means to the needle.
-        margin_mm: The clearance that it demands, where its role demands one.
-        mesh: In the CT frame, mm.
-        source: The file it comes from, and the label in it.
-        outside: Whether it is outside of the body, where the needle waits at its standoff: it is then checked
-            against the needle's axis up to where the flange waits, not only to where the flange ends.
-    """
-
-    name: str
-    role: Role
-    margin_mm: float
-    mesh: TriangleMesh
-    source: str
-    outside: bool = False
-
-    @property
-    def demands_margin(self) -> bool:
-        """Whether a needle too close to it is rejected."""
-        return self.role in {Role.AVOID, Role.UNKNOWN}
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +102,7 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
     Raises:
         InputError: A file that cannot be trusted, a label that no rule names, or a target that contradicts them.
     """
-    loader = _Loader(case, progress or (lambda _: None), cache)
+    loader = StructureSources(case, progress or (lambda _: None), cache)
     structures = [loader.one(section) for section in case.structure if section.role != "skin"]
     for section in case.structures:
         structures.extend(loader.many(section))
@@ -168,6 +123,7 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
         if case.ct.trust_labels:
             loader.warnings.append(LABELS_TRUSTED)
         structures.extend(_unnamed(case, scan, structures))
+    structures.extend(_beyond(case, skin, structures, loader.warnings))
     _check_names(case, [*structures, *outside])
     warnings = [*loader.warnings, *loader.unnamed_warnings(), *skin.warnings]
     for structure in structures:
@@ -199,152 +155,25 @@ def _unnamed(case: Case, scan: Scan, structures: Sequence[Structure]) -> Iterato
             yield Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: {name}")
 
 
+def _beyond(case: Case, skin: Skin, structures: Sequence[Structure], warnings: list[str]) -> Iterator[Structure]:
+    """The body beyond label maps that end in it, within the needle's reach: no organ there has a label."""
+    found = beyond_labels(case, skin, structures)
+    warnings.extend(found.warnings)
+    if found.mesh is not None:
+        yield Structure(BEYOND_LABELS, Role.UNKNOWN, found.margin_mm, found.mesh, BEYOND_LABELS)
+
+
 def load_skin(case: Case, cache: Cache = NO_CACHE) -> Skin:
     """The skin of a case alone.
 
     Raises:
         InputError: A file that cannot be trusted.
     """
-    return _Loader(case, lambda _: None, cache).skin(_skin_section(case))
+    return StructureSources(case, lambda _: None, cache).skin(_skin_section(case))
 
 
 def _skin_section(case: Case) -> StructureSection:
     return next(section for section in case.structure if section.role == "skin")
-
-
-class _Loader:
-    """Reads the sources of one case, each volume at most once."""
-
-    def __init__(self, case: Case, progress: Progress, cache: Cache) -> None:
-        self._case = case
-        self._progress = progress
-        self._cache = cache
-        self._volumes: dict[str, VolumeSurfaces] = {}
-        self.warnings: list[str] = []
-        self.ignored: list[str] = []
-
-    def one(self, section: StructureSection) -> Structure:
-        """One structure from a mesh or a label."""
-        self._progress(section.name)
-        if section.mesh is not None:
-            mesh, source = self._mesh(section), section.mesh
-        else:
-            mesh, source = self._label(section), f"{section.labelmap}:{section.label}"
-        return Structure(section.name, Role(section.role), section.margin_mm or 0.0, mesh, source)
-
-    def many(self, section: StructuresSection) -> list[Structure]:
-        """All labels of one map that the rules do not ignore."""
-        volume = self._labels(section.labelmap)
-        rules = select(
-            names_for(section.naming, self._case.folder, self._case.files.content, volume),
-            volume.labels_present(),
-            avoid=section.avoid,
-            traverse=section.traverse,
-            ignore=section.ignore,
-            target=section.target,
-            all_named=section.naming in BUILT_IN,
-            where=self._case.path,
-        )
-        self.warnings.extend(rules.warnings)
-        structures = []
-        for rule in rules.rules:
-            if rule.kind is RuleKind.IGNORE:
-                self.ignored.append(rule.name)
-                continue
-            self._progress(rule.name)
-            source = f"{section.labelmap}:{rule.label}"
-            role = Role(rule.kind.value)
-            structures.append(Structure(rule.name, role, rule.margin_mm, volume.label(rule.label), source))
-        return structures
-
-    def unnamed_warnings(self) -> list[str]:
-        """Maps from which the case takes single labels, and which hold others that nobody names."""
-        named: dict[str, set[int]] = {}
-        for section in self._case.structure:
-            if section.labelmap is not None and section.label is not None:
-                named.setdefault(section.labelmap, set()).add(section.label)
-        whole = {section.labelmap for section in self._case.structures}
-        return [w for name, labels in sorted(named.items()) if name not in whole for w in self._unnamed(name, labels)]
-
-    def _unnamed(self, name: str, labels: set[int]) -> list[str]:
-        volume = self._labels(name)
-        others = [label for label in volume.labels_present() if label not in labels]
-        if not others:
-            return []
-        names = (volume.names or {}) if name.lower().endswith(NRRD_ENDINGS) else {}
-        shown = [f"{label} {names[label]}" if label in names else str(label) for label in others[:UNNAMED_SHOWN]]
-        more = f" and {len(others) - len(shown)} more" if len(others) > len(shown) else ""
-        return [f"{name} holds labels that the case does not name, and they count as free: {', '.join(shown)}{more}"]
-
-    def skin(self, section: StructureSection) -> Skin:
-        """The body's surface, from whatever the case names."""
-        self._progress(section.name)
-        if section.ct is not None:
-            return self._volume(section.ct).skin_of_ct()
-        if section.labelmap is not None and section.label is not None:
-            return self._labels(section.labelmap).skin_of_label(section.label)
-        mesh = self._mesh(section)
-        ends = () if self._case.space is Space.LOCAL or section.cut is not None else flat_ends(mesh)
-        if ends:
-            raise InputError(
-                f"skin mesh {section.mesh} ends flat at its {', '.join(ends)} side: was the body cut there?",
-                where=self._case.path,
-                allowed=f"cut = {json.dumps(ends)} where no skin is, or cut = [] if all of it is skin",
-            )
-        return skin_from_mesh(mesh, section.cut or ())
-
-    def scan(self, skin_section: StructureSection, skin: Skin) -> Scan | None:
-        """The CT of the case: of its skin, or the one that ``[ct]`` names; None where there is none."""
-        own, named = skin_section.ct, self._case.ct.file
-        if own is not None and named not in {None, own}:
-            raise InputError(
-                f"[ct] file '{named}' is not the CT of the skin, '{own}'",
-                where=self._case.path,
-                allowed="one CT: leave out [ct] file where the skin comes from a CT",
-            )
-        name = own or named
-        if name is None:
-            return None
-        self._progress("CT beside the structures")
-        scan = Scan(name, self._volume(name), None if own else skin)
-        if not scan.holds(self._case.target_ct):
-            raise InputError(
-                f"[ct] file '{name}' does not show the target: a slip of file or space?",
-                where=self._case.path,
-                allowed="a CT that holds the target, in the space of the structures",
-            )
-        return scan
-
-    def _mesh(self, section: StructureSection) -> TriangleMesh:
-        where = f"{self._case.path}: structure '{section.name}'"
-        if section.mesh is None or section.unit is None:
-            raise InputError("no mesh with a unit", where=where, allowed="mesh and unit")
-        space = parse_space(section.space or self._case.space, where=where)
-        unit = parse_unit(section.unit, where=where)
-        return parse_mesh(self._case.files.content(section.mesh), self._file(section.mesh), unit=unit, space=space)
-
-    def _label(self, section: StructureSection) -> TriangleMesh:
-        if section.labelmap is None or section.label is None:
-            raise InputError(f"'{section.name}' has no source", where=self._case.path, allowed="mesh or labelmap")
-        return self._labels(section.labelmap).label(section.label)
-
-    def _labels(self, name: str) -> VolumeSurfaces:
-        if self._case.space is Space.LOCAL:
-            raise InputError(
-                f'label map {name} in a case of space "local"', where=self._case.path, allowed='space "LPS" or "RAS"'
-            )
-        return self._volume(name)
-
-    def _volume(self, name: str) -> VolumeSurfaces:
-        if name not in self._volumes:
-            source = self._case.volumes.source(name)
-            hashes = tuple(self._case.files.sha256(file) for file in source.files)
-            self._volumes[name] = VolumeSurfaces(source, hashes, self._cache)
-            self.warnings.extend(source.notes)
-        return self._volumes[name]
-
-    def _file(self, name: str) -> Path:
-        return self._case.folder / name
 
 
 def _check_count(case: Case, structures: list[Structure]) -> None:

@@ -15,6 +15,7 @@ from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.formats.labels.label_surface import label_mesh
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap, labelmap_of, segment_names
+from puncture_twin.planning.formats.labels.mask_folder import mask_label
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.formats.volumes.volume_source import VolumeSource
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -60,6 +61,16 @@ class VolumeSurfaces:
         """The labels that have a voxel, ascending."""
         stored = self._arrays(LABELS_PRESENT, lambda: {"labels": np.array(self.labelmap.labels_present(), np.int64)})
         return tuple(int(label) for label in stored["labels"])
+
+    def mask_label(self) -> int | None:
+        """Of a file that is one structure's mask, its voxels' value; None where it is empty."""
+
+        def make() -> Arrays:
+            label = mask_label(labelmap_of(self.volume, may_be_empty=True))
+            return {"labels": np.array([] if label is None else [label], np.int64)}
+
+        stored = self.kept({"what": "mask label"}, make, by=__name__, check=_check_mask)["labels"]
+        return int(stored[0]) if len(stored) else None
 
     def label(self, label: int) -> TriangleMesh:
         """The surface of one label, LPS mm."""
@@ -123,6 +134,12 @@ def kept_mesh(stored: Arrays, number: int | str = "") -> TriangleMesh:
     if vertices.dtype != np.float64 or faces.dtype != np.int32:
         raise TypeError("a mesh of other types than ours")
     return guard_mesh(vertices, faces, where="cache")
+
+
+def _check_mask(stored: Arrays) -> None:
+    labels = stored["labels"]
+    if labels.ndim != 1 or labels.dtype != np.int64 or len(labels) > 1:
+        raise ValueError("at most one label")
 
 
 def _check_labels(stored: Arrays) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -38,6 +38,7 @@ from puncture_twin.planning.case.html import case_html
 from puncture_twin.planning.case.toml_types import Anatomical
 from puncture_twin.planning.case.whole_case import wholeness_warnings
 from puncture_twin.planning.formats.labels import naming
+from puncture_twin.planning.formats.labels.mask_folder import mask_files, structure_name
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
 from puncture_twin.planning.formats.points import point_files as points
 from puncture_twin.planning.formats.points.point_files import parse_points
@@ -47,6 +48,9 @@ from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 ALLOWED_CASE = "a TOML case file with schema = 1 or 2, or a folder with case.toml"
 
+
+MASK_ROLE = "mask "
+"""How the role of a mask begins; its structure's name follows."""
 
 AXES_PARALLEL = 0.999
 """|cos| above which a mount's x and z axes do not span a frame (2.6 degrees)."""
@@ -206,6 +210,12 @@ class Case:
         """The case file and all that it names, each with its role and hash."""
         return self.files.inputs
 
+    def masks(self, folder: str) -> dict[str, str]:
+        """The masks of a folder that the case names: structure to file, relative to the case's folder."""
+        inside = PurePosixPath(folder)
+        files = [one.path for one in self.inputs if one.role.startswith(MASK_ROLE)]
+        return {structure_name(file): file for file in files if PurePosixPath(file).parent == inside}
+
 
 def load_case(path: Path | str) -> Case:
     """Read and validate a case file, or a folder that holds ``case.toml``.
@@ -218,8 +228,8 @@ def load_case(path: Path | str) -> Case:
     case_volumes = CaseVolumes(files, path)
     stated = files.add(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE))
     content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md")
-    for one in _named_files(content):
-        if one.role in VOLUME_ROLES:
+    for one in _named_files(content, path):
+        if one.role in VOLUME_ROLES or one.role.startswith(MASK_ROLE):
             case_volumes.read(one.role, one.name, key=one.key)
         else:
             files.read(one.role, one.name, max_bytes=one.max_bytes, key=one.key, where=path)
@@ -372,8 +382,8 @@ class _Named(NamedTuple):
     max_bytes: int
 
 
-def _named_files(content: CaseFile) -> Iterator[_Named]:
-    """Every file that a case names, in the order of its sections."""
+def _named_files(content: CaseFile, path: Path) -> Iterator[_Named]:
+    """Every file that a case names, in the order of its sections; of a folder of masks every mask."""
     if content.target.points is not None:
         yield _Named("target", content.target.points, "target.points", points.MAX_FILE_BYTES)
     for one in content.structure:
@@ -385,7 +395,7 @@ def _named_files(content: CaseFile) -> Iterator[_Named]:
         if one.ct is not None:
             yield _Named("ct", one.ct, key, volumes.MAX_FILE_BYTES)
     for number, many in enumerate(content.structures):
-        yield _Named("labelmap", many.labelmap, f"structures.{number}.labelmap", volumes.MAX_FILE_BYTES)
+        yield from _many_files(many, f"structures.{number}", path)
         if many.naming is not None and naming.is_naming_file(many.naming):
             yield _Named("naming", many.naming, f"structures.{number}.naming", naming.MAX_CSV_BYTES)
     if content.ct.file is not None:
@@ -395,6 +405,16 @@ def _named_files(content: CaseFile) -> Iterator[_Named]:
             yield _Named(side, getattr(content.registration, side), f"registration.{side}", points.MAX_FILE_BYTES)
     if content.rehearsal.truth_base is not None:
         yield _Named("truth_base", content.rehearsal.truth_base, "rehearsal.truth_base", points.MAX_FILE_BYTES)
+
+
+def _many_files(many: StructuresSection, key: str, path: Path) -> Iterator[_Named]:
+    """A label map, or every file of a folder of masks: also empty ones decide what is there."""
+    if many.labelmap is not None:
+        yield _Named("labelmap", many.labelmap, f"{key}.labelmap", volumes.MAX_FILE_BYTES)
+    if many.masks is not None:
+        for file in mask_files(path.parent / many.masks, where=f"{path}: {key}.masks"):
+            name = str(PurePosixPath(many.masks) / file)
+            yield _Named(f"{MASK_ROLE}{structure_name(file)}", name, f"{key}.masks", volumes.MAX_FILE_BYTES)
 
 
 def _read_only(array: ArrayLike) -> Floats:

@@ -180,14 +180,28 @@ Patterns = Annotated[tuple[Text, ...], Field(max_length=MAX_STRUCTURES)]
 
 
 class StructuresSection(Section):
-    """Many structures of one label map, by name pattern."""
+    """Many structures of one label map, or of a folder of masks, by name pattern."""
 
-    labelmap: str
+    labelmap: str | None = None
+    masks: str | None = None
     naming: str | None = None
     target: Patterns = ()
     avoid: Annotated[dict[Text, Margin], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
     traverse: Patterns = ()
     ignore: Patterns = ()
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if (self.labelmap is None) == (self.masks is None):
+            raise ValueError("needs either labelmap (a file) or masks (a folder with one file a structure), not both")
+        if self.masks is not None and self.naming is not None:
+            raise ValueError("naming belongs to labelmap; masks are named after their files")
+        return self
+
+    @property
+    def source(self) -> str:
+        """The file or the folder, as the case writes it."""
+        return self.labelmap or self.masks or ""
 
 
 class CtSection(Section):

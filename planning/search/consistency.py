@@ -8,12 +8,12 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
 from puncture_twin.planning.anatomy.inside_skin import LEAST_TOLERANCE_MM, inside_skin
+from puncture_twin.planning.anatomy.label_grids import label_grids
 from puncture_twin.planning.anatomy.regions import absent_organs
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
-from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 from puncture_twin.planning.geometry.winding import odd_fraction, winding_number
 from puncture_twin.planning.registration.marker_check import check_markers
@@ -39,9 +39,6 @@ CAUSES = "a part of the body that the skin does not hold (such as an arm), or a 
 MOST_AROUND = 0.5
 """An open mesh may go so far around the target: of the rays that cross it oddly, and of its winding number."""
 
-VOXELS_OF_SLACK = 1.0
-"""A map may end so many voxels inside the skin's box: the skin itself is found to that."""
-
 
 def check_consistency(case: Case, anatomy: Anatomy, placement: Placement | None) -> tuple[str, ...]:
     """Hold the inputs against each other.
@@ -50,14 +47,12 @@ def check_consistency(case: Case, anatomy: Anatomy, placement: Placement | None)
         Warnings, one sentence each.
 
     Raises:
-        InputError: A structure of which too much lies outside the body, an open one that may hold the target, a
-            label map that ends inside the body within the needle's reach, or markers whose names or axes have likely
-            slipped.
+        InputError: A structure of which too much lies outside the body, an open one that may hold the target, or
+            markers whose names or axes have likely slipped.
     """
     headers = volume_headers(case)
     outside = _outside_warnings(case, anatomy, headers)
     _refuse_open_around_target(case, anatomy)
-    _refuse_short_maps(case, anatomy, headers)
     return (
         *outside,
         *_marker_warnings(case, anatomy, placement),
@@ -113,9 +108,8 @@ def volume_headers(case: Case) -> dict[str, VolumeGrid]:
     Raises:
         InputError: A header that cannot be trusted.
     """
-    named = {section.ct or section.labelmap for section in case.structure}
-    named |= {section.labelmap for section in case.structures}
-    files = sorted(name for name in named if name)
+    named = {section.ct for section in case.structure if section.ct is not None}
+    files = sorted(named.union(*(grid.files for grid in label_grids(case))))
     return {name: case.volumes.source(name).grid for name in files}
 
 
@@ -136,28 +130,6 @@ def _refuse_open_around_target(case: Case, anatomy: Anatomy) -> None:
                 f"{turns:.2f})",
                 where=case.path,
                 allowed="a closed mesh, or one that goes less than half around the target",
-            )
-
-
-def _refuse_short_maps(case: Case, anatomy: Anatomy, headers: Headers) -> None:
-    """Beyond a label map's box organs have no label: within the needle's reach the box must hold the body.
-
-    Both are compared along the map's own axes, in voxels, which may be oblique to the patient's.
-    """
-    for name in sorted({s.labelmap for s in case.structure if s.labelmap} | {s.labelmap for s in case.structures}):
-        header = headers[name]
-        T_index_ct = np.linalg.inv(header.T_ct_index)
-        skin = apply(T_index_ct, anatomy.skin.mesh.vertices)
-        target = apply(T_index_ct, case.target_ct[None])[0]
-        # |row| is how many voxels an axis advances for a step of 1 mm along its normal
-        reach = case.needle.length_mm * np.linalg.norm(T_index_ct[:3, :3], axis=1)
-        low, high = np.maximum(skin.min(axis=0), target - reach), np.minimum(skin.max(axis=0), target + reach)
-        outside = max((-0.5 - low).max(), (high - (np.array(header.shape) - 0.5)).max())
-        if outside > VOXELS_OF_SLACK:
-            raise InputError(
-                f"label map {name} ends {outside:.0f} voxels inside the body, within the needle's reach",
-                where=case.path,
-                allowed="a label map of the whole body about the target",
             )
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.label_grids import label_grids
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
@@ -25,21 +26,20 @@ def resolution_warnings(case: Case, anatomy: Anatomy, headers: Headers) -> tuple
         anatomy: Its structures.
         headers: Of the case's CT and label maps, by file name.
     """
-    return (*_map_warnings(case, anatomy, headers), *_skin_warnings(case, headers), *_grid_warnings(case))
+    return (*_map_warnings(case, anatomy), *_skin_warnings(case, headers), *_grid_warnings(case))
 
 
-def _map_warnings(case: Case, anatomy: Anatomy, headers: Headers) -> Iterator[str]:
+def _map_warnings(case: Case, anatomy: Anatomy) -> Iterator[str]:
     """Label maps whose voxels lie farther apart than the least margin that is demanded from them."""
-    maps = {section.labelmap for section in case.structure} | {section.labelmap for section in case.structures}
-    for name in sorted(set(headers) & maps):
-        demanding = [s for s in anatomy.structures if s.demands_margin and s.source.rpartition(":")[0] == name]
+    for grid in label_grids(case):
+        demanding = [structure for structure in grid.own(anatomy.structures) if structure.demands_margin]
         if not demanding:
             continue
         least = min(demanding, key=lambda structure: structure.margin_mm)
-        spacing = float(headers[name].spacing_mm.max())
+        spacing = float(grid.voxels.spacing_mm.max())
         if spacing > least.margin_mm:
             yield (
-                f"{name}: slices {spacing:.3g} mm apart, and the least margin demanded from it is "
+                f"{grid.name}: slices {spacing:.3g} mm apart, and the least margin demanded from it is "
                 f"{least.margin_mm:g} mm ({least.name}): what lies between two slices is not seen"
             )
 

@@ -1,4 +1,4 @@
-"""A label map must hold the body within the needle's reach; both are compared along the map's own axes."""
+"""A label map that ends in the body: what lies beyond is unknown, never free; compared along the map's own axes."""
 
 import numpy as np
 import pytest
@@ -7,6 +7,7 @@ from case_world import write_case
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.search.context import prepare
 
 STEP_MM = 2.0
@@ -38,22 +39,75 @@ def test_an_oblique_map_that_holds_the_body_is_accepted(tmp_path, degrees):
 
 
 @pytest.mark.parametrize("degrees", [(0, 0, 0), (20, -30, 40)])
-def test_an_oblique_map_that_ends_in_the_body_is_refused(tmp_path, degrees):
-    """By six voxels of 2 mm at every face, within the needle's reach."""
+def test_the_body_beyond_an_oblique_map_is_unknown(tmp_path, degrees):
+    """The map ends six voxels of 2 mm before the skin at every face: the body there is inside one closed surface."""
     turn = Rotation.from_euler("xyz", degrees, degrees=True)
-    with pytest.raises(InputError, match=r"label map labels.nrrd ends [56] voxels inside the body"):
-        prepare(oblique_case(tmp_path, 78.0, turn), arm=False)
+    anatomy = prepare(oblique_case(tmp_path, 78.0, turn), arm=False).anatomy
+    assert any("ends 6 voxels inside the body" in said and "(beyond_labels)" in said for said in anatomy.warnings)
+    beyond = anatomy.structure("beyond_labels")
+    assert (beyond.role, beyond.mesh.closed, beyond.margin_mm) == ("unknown", True, 3.0 + STEP_MM / 2)
+    for axis in turn.as_matrix().T:
+        for sign in (-1, 1):
+            assert side_of(beyond.mesh, sign * 84.0 * axis) is Side.INSIDE
+            assert side_of(beyond.mesh, sign * 77.9 * axis) is Side.OUTSIDE
+            assert side_of(beyond.mesh, sign * 96.0 * axis) is Side.OUTSIDE, "air beyond the map stays air"
 
 
-@pytest.mark.parametrize(("half_mm", "refused"), [(70.0, False), (50.0, True)])
-def test_only_what_the_needle_reaches_counts(tmp_path, half_mm, refused):
+@pytest.mark.parametrize(("half_mm", "ends"), [(70.0, False), (50.0, True)])
+def test_only_what_the_needle_reaches_counts(tmp_path, half_mm, ends):
     """With a needle of 62 mm a map of 70 mm to each side is enough, though the body goes on."""
     path = oblique_case(tmp_path, half_mm, Rotation.from_euler("xyz", (20, -30, 40), degrees=True))
     path.write_text(
         path.read_text().replace("length_mm = 210.0\nshaft_mm = 150.0", "length_mm = 62.0\nshaft_mm = 60.0")
     )
-    if refused:
-        with pytest.raises(InputError, match=r"ends [56] voxels inside the body"):
-            prepare(path, arm=False)
-    else:
-        prepare(path, arm=False)
+    names = [one.name for one in prepare(path, arm=False).anatomy.structures]
+    assert ("beyond_labels" in names) == ends
+
+
+def vessels():
+    """Labels (z, y, x) of the usual body's box: one vessel to each side of the target, label 3."""
+    at = np.arange(100) * STEP_MM - 99.0
+    z, y, x = np.meshgrid(at, at, at, indexing="ij")
+    labels = np.zeros(z.shape, np.uint8)
+    for middle in ([60, 20, 10], [-60, 0, 20], [20, 60, 0], [0, -60, 20], [10, 20, 60]):
+        labels[(np.abs(np.stack([x, y, z], axis=-1) - middle) < 8.0).all(axis=-1)] = 3
+    return labels
+
+
+def verdicts(folder, labels, first):
+    """Which of all directions are safe, and the reasons, with a map whose voxel (0, 0, 0) is at an index (z, y, x)."""
+    folder.mkdir()
+    search = "theta_deg = [0, 180]\nstep_deg = 6.0"
+    path = write_case(folder, ("theta_deg = [0, 10]\nstep_deg = 10.0", search))
+    image = sitk.GetImageFromArray(labels)
+    image.SetSpacing([STEP_MM] * 3)
+    image.SetOrigin([-99.0 + STEP_MM * one for one in reversed(first)])
+    sitk.WriteImage(image, str(folder / "labels.nrrd"))
+    found = prepare(path, arm=False).search()
+    return found.safe, found.verdict.reason, found.verdict.structure
+
+
+@pytest.mark.parametrize(
+    "kept",
+    [
+        np.s_[:, :, :68], np.s_[:, :, 32:], np.s_[:, :72, :], np.s_[:, 30:, :], np.s_[:75, :, :], np.s_[20:80, :, :],
+        np.s_[25:70, 28:70, 31:88], np.s_[:, :, :78], np.s_[:, :70, 25:],
+    ],
+)  # fmt: skip
+def test_what_was_unsafe_is_never_safe_with_a_cropped_map(tmp_path, kept):
+    """Whichever sides were cut off, with or without the vessel there; and some directions stay safe."""
+    labels = vessels()
+    before, *_ = verdicts(tmp_path / "whole", labels, (0, 0, 0))
+    after, reason, structure = verdicts(tmp_path / "cut", labels[kept], [one.start or 0 for one in kept])
+    assert before.sum() > 1000
+    assert not (after & ~before).any()
+    assert 0 < after.sum() < before.sum()
+    unknown = reason[before & ~after] == "unknown_region"
+    assert unknown.all()
+    assert set(structure[before & ~after]) == {"beyond_labels"}
+
+
+def test_a_map_that_does_not_hold_the_target_is_refused(tmp_path):
+    """All about the target is unknown then."""
+    with pytest.raises(InputError, match=r"label map labels.nrrd ends before the target"):
+        verdicts(tmp_path / "cut", vessels()[:, :, 55:], (0, 0, 55))

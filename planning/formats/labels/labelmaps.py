@@ -26,19 +26,19 @@ class LabelMap:
     """Labels in patient space.
 
     Attributes:
-        labels: Shape (ni, nj, nk), int32, read-only; 0 is background.
+        labels: Shape (ni, nj, nk), of the file's own type where that is whole numbers, read-only; 0 is background.
         T_ct_index: Shape (4, 4), maps voxel index (i, j, k), at the voxel's centre, to LPS mm.
         names: Label to name, as a .seg.nrrd states it, or None.
         path: Where it came from.
     """
 
-    labels: NDArray[np.int32]
+    labels: NDArray[np.integer]
     T_ct_index: NDArray[np.float64]
     names: dict[int, str] | None
     path: Path
 
     def __post_init__(self) -> None:
-        labels = np.asarray(self.labels, dtype=np.int32).view()
+        labels = np.asarray(self.labels).view()
         labels.setflags(write=False)
         object.__setattr__(self, "labels", labels)
 
@@ -53,26 +53,32 @@ class LabelMap:
         return tuple(self.boxes)
 
 
-def labelmap_of(volume: Volume) -> LabelMap:
+def labelmap_of(volume: Volume, *, may_be_empty: bool = False) -> LabelMap:
     """The label map that a volume is, in LPS mm.
+
+    Args:
+        volume: The volume.
+        may_be_empty: Whether a map with background only is one: the mask of an organ that is not there.
 
     Raises:
         InputError: Values that are negative, not whole or above ``MAX_LABEL``; a map with background only; segment
             names that contradict each other.
     """
     names = segment_names(volume.fields, volume.path)
-    return LabelMap(_whole(volume.values, volume.path), volume.T_ct_index, names, volume.path)
+    return LabelMap(_whole(volume.values, volume.path, may_be_empty), volume.T_ct_index, names, volume.path)
 
 
-def _whole(values: NDArray[Any], path: Path) -> NDArray[np.int32]:
+def _whole(values: NDArray[Any], path: Path, may_be_empty: bool) -> NDArray[np.integer]:
     allowed = f"whole numbers from 0 (background) to {MAX_LABEL}"
     low, high = values.min(), values.max()
     if low < 0 or high > MAX_LABEL:
         raise InputError(f"values from {low} to {high} are no labels", where=path, allowed=allowed)
-    if high == 0:
+    if high == 0 and not may_be_empty:
         raise InputError("the label map is empty: every voxel is 0", where=path, allowed=allowed)
-    labels = values.astype(np.int32)
-    if values.dtype.kind == "f" and not np.array_equal(labels, values):
+    if values.dtype.kind != "f":
+        return values
+    labels = values.astype(np.uint16)
+    if not np.array_equal(labels, values):
         example = float(values[labels != values][0])
         raise InputError(f"value {example} is not whole", where=path, allowed=allowed)
     return labels

@@ -1,0 +1,204 @@
+"""Reads what a case's structures come from: meshes, label maps, folders of masks, the CT."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from puncture_twin.planning.anatomy.scan import Scan
+from puncture_twin.planning.anatomy.skin import Skin, flat_ends, skin_from_mesh
+from puncture_twin.planning.anatomy.structure import Role, Structure
+from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
+from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.case_file import StructureSection, StructuresSection
+from puncture_twin.planning.formats.labels.mask_folder import check_one_grid
+from puncture_twin.planning.formats.labels.naming import BUILT_IN, LabelRule, RuleKind, names_for, select
+from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
+from puncture_twin.planning.formats.volumes.volume_files import NRRD_ENDINGS
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.spaces import Space, parse_space, parse_unit
+
+Progress = Callable[[str], None]
+
+UNNAMED_SHOWN = 8
+"""Labels that a warning lists; a person looks at the map for the rest."""
+
+EMPTY_MASKS = "{folder}: {count} masks are empty, so that nothing is there: {names}"
+
+
+class StructureSources:
+    """Reads the sources of one case, each volume at most once."""
+
+    def __init__(self, case: Case, progress: Progress, cache: Cache) -> None:
+        self._case = case
+        self._progress = progress
+        self._cache = cache
+        self._volumes: dict[str, VolumeSurfaces] = {}
+        self.warnings: list[str] = []
+        self.ignored: list[str] = []
+
+    def one(self, section: StructureSection) -> Structure:
+        """One structure from a mesh or a label."""
+        self._progress(section.name)
+        if section.mesh is not None:
+            mesh, source = self._mesh(section), section.mesh
+        else:
+            mesh, source = self._label(section), f"{section.labelmap}:{section.label}"
+        return Structure(section.name, Role(section.role), section.margin_mm or 0.0, mesh, source)
+
+    def many(self, section: StructuresSection) -> list[Structure]:
+        """All labels of one map, or masks of one folder, that the rules do not ignore."""
+        if section.masks is not None:
+            return self._masks(section, section.masks)
+        name = section.source
+        volume = self._labels(name)
+        names = names_for(section.naming, self._case.folder, self._case.files.content, volume)
+        structures = []
+        for rule in self._kept_rules(section, names, volume.labels_present()):
+            self._progress(rule.name)
+            mesh = volume.label(rule.label)
+            structures.append(_ruled(rule, mesh, f"{name}:{rule.label}"))
+        return structures
+
+    def _masks(self, section: StructuresSection, folder: str) -> list[Structure]:
+        """One structure a mask that is not empty; the voxels of one mask at a time are in memory."""
+        self._refuse_local(folder, "masks")
+        files = self._case.masks(folder)
+        check_one_grid({one: self._case.volumes.source(one).grid for one in files.values()}, where=self._file(folder))
+        names = dict(enumerate(files, start=1))
+        labels = {number: self._open(files[name]).mask_label() for number, name in names.items()}
+        present = [number for number, label in labels.items() if label is not None]
+        if empty := [name for number, name in names.items() if number not in present]:
+            self.warnings.append(EMPTY_MASKS.format(folder=folder, count=len(empty), names=_shown(empty)))
+        structures = []
+        for rule in self._kept_rules(section, names, present):
+            self._progress(rule.name)
+            label = labels[rule.label] or 0
+            mesh = self._open(files[rule.name]).label(label)
+            structures.append(_ruled(rule, mesh, f"{files[rule.name]}:{label}"))
+        return structures
+
+    def _kept_rules(
+        self, section: StructuresSection, names: Mapping[int, str], present: Collection[int]
+    ) -> Iterator[LabelRule]:
+        """The rules of those that are present; names of what is ignored are noted."""
+        selection = select(
+            names,
+            present,
+            avoid=section.avoid,
+            traverse=section.traverse,
+            ignore=section.ignore,
+            target=section.target,
+            all_named=section.naming in BUILT_IN,
+            where=self._case.path,
+        )
+        self.warnings.extend(selection.warnings)
+        self.ignored.extend(rule.name for rule in selection.rules if rule.kind is RuleKind.IGNORE)
+        yield from (rule for rule in selection.rules if rule.kind is not RuleKind.IGNORE)
+
+    def unnamed_warnings(self) -> list[str]:
+        """Maps from which the case takes single labels, and which hold others that nobody names."""
+        named: dict[str, set[int]] = {}
+        for section in self._case.structure:
+            if section.labelmap is not None and section.label is not None:
+                named.setdefault(section.labelmap, set()).add(section.label)
+        whole = {section.source for section in self._case.structures}
+        return [w for name, labels in sorted(named.items()) if name not in whole for w in self._unnamed(name, labels)]
+
+    def _unnamed(self, name: str, labels: set[int]) -> list[str]:
+        volume = self._labels(name)
+        others = [label for label in volume.labels_present() if label not in labels]
+        if not others:
+            return []
+        names = (volume.names or {}) if name.lower().endswith(NRRD_ENDINGS) else {}
+        shown = _shown([f"{label} {names[label]}" if label in names else str(label) for label in others])
+        return [f"{name} holds labels that the case does not name, and they count as free: {shown}"]
+
+    def skin(self, section: StructureSection) -> Skin:
+        """The body's surface, from whatever the case names."""
+        self._progress(section.name)
+        if section.ct is not None:
+            return self._volume(section.ct).skin_of_ct()
+        if section.labelmap is not None and section.label is not None:
+            return self._labels(section.labelmap).skin_of_label(section.label)
+        mesh = self._mesh(section)
+        ends = () if self._case.space is Space.LOCAL or section.cut is not None else flat_ends(mesh)
+        if ends:
+            raise InputError(
+                f"skin mesh {section.mesh} ends flat at its {', '.join(ends)} side: was the body cut there?",
+                where=self._case.path,
+                allowed=f"cut = {json.dumps(ends)} where no skin is, or cut = [] if all of it is skin",
+            )
+        return skin_from_mesh(mesh, section.cut or ())
+
+    def scan(self, skin_section: StructureSection, skin: Skin) -> Scan | None:
+        """The CT of the case: of its skin, or the one that ``[ct]`` names; None where there is none."""
+        own, named = skin_section.ct, self._case.ct.file
+        if own is not None and named not in {None, own}:
+            raise InputError(
+                f"[ct] file '{named}' is not the CT of the skin, '{own}'",
+                where=self._case.path,
+                allowed="one CT: leave out [ct] file where the skin comes from a CT",
+            )
+        name = own or named
+        if name is None:
+            return None
+        self._progress("CT beside the structures")
+        scan = Scan(name, self._volume(name), None if own else skin)
+        if not scan.holds(self._case.target_ct):
+            raise InputError(
+                f"[ct] file '{name}' does not show the target: a slip of file or space?",
+                where=self._case.path,
+                allowed="a CT that holds the target, in the space of the structures",
+            )
+        return scan
+
+    def _mesh(self, section: StructureSection) -> TriangleMesh:
+        where = f"{self._case.path}: structure '{section.name}'"
+        if section.mesh is None or section.unit is None:
+            raise InputError("no mesh with a unit", where=where, allowed="mesh and unit")
+        space = parse_space(section.space or self._case.space, where=where)
+        unit = parse_unit(section.unit, where=where)
+        return parse_mesh(self._case.files.content(section.mesh), self._file(section.mesh), unit=unit, space=space)
+
+    def _label(self, section: StructureSection) -> TriangleMesh:
+        if section.labelmap is None or section.label is None:
+            raise InputError(f"'{section.name}' has no source", where=self._case.path, allowed="mesh or labelmap")
+        return self._labels(section.labelmap).label(section.label)
+
+    def _labels(self, name: str) -> VolumeSurfaces:
+        self._refuse_local(name, "label map")
+        return self._volume(name)
+
+    def _refuse_local(self, name: str, kind: str) -> None:
+        if self._case.space is Space.LOCAL:
+            raise InputError(
+                f'{kind} {name} in a case of space "local"', where=self._case.path, allowed='space "LPS" or "RAS"'
+            )
+
+    def _volume(self, name: str) -> VolumeSurfaces:
+        if name not in self._volumes:
+            self._volumes[name] = self._open(name)
+            self.warnings.extend(self._volumes[name].source.notes)
+        return self._volumes[name]
+
+    def _open(self, name: str) -> VolumeSurfaces:
+        """A volume that nobody else holds, so that its voxels go when it does."""
+        source = self._case.volumes.source(name)
+        return VolumeSurfaces(source, tuple(self._case.files.sha256(file) for file in source.files), self._cache)
+
+    def _file(self, name: str) -> Path:
+        return self._case.folder / name
+
+
+def _ruled(rule: LabelRule, mesh: TriangleMesh, source: str) -> Structure:
+    return Structure(rule.name, Role(rule.kind.value), rule.margin_mm, mesh, source)
+
+
+def _shown(names: Sequence[str]) -> str:
+    """The first few of a list."""
+    more = f" and {len(names) - UNNAMED_SHOWN} more" if len(names) > UNNAMED_SHOWN else ""
+    return ", ".join(names[:UNNAMED_SHOWN]) + more

@@ -1,0 +1,127 @@
+"""A folder of masks, one volume a structure, is the same to a search as the label map that they were taken from."""
+
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813
+from case_world import SKIN, case_text, image_of, structure, vessel_voxels, write_balls
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.search.context import prepare
+
+RULES = '{source}\ntarget = ["organ"]\n[structures.avoid]\n"vessel *" = 3.0\n'
+END = "[end]\nstructures = {}\n"
+
+
+def labels():
+    """The usual patient's vessel (3), and its organ (1), voxels (z, y, x)."""
+    voxels = vessel_voxels()
+    at = np.arange(100) * 2.0 - 99.0
+    z, y, x = np.meshgrid(at, at, at, indexing="ij")
+    voxels[x**2 + y**2 + z**2 < 20.0**2] = 1
+    return voxels
+
+
+def write_mask(path, mask, value=1, spacing=(2.0, 2.0, 2.0), dtype=np.uint8):
+    """One mask."""
+    path.parent.mkdir(exist_ok=True)
+    sitk.WriteImage(image_of((value * mask).astype(dtype), spacing), str(path))
+
+
+def write_masks(folder):
+    """Two masks of different values and types, and an empty one."""
+    write_mask(folder / "organ.nii.gz", labels() == 1)
+    write_mask(folder / "vessel left.nii.gz", labels() == 3, value=255, dtype=np.int16)
+    write_mask(folder / "gallbladder.nii.gz", labels() == 9)
+    (folder / "statistics.json").write_text("{}")
+
+
+def case_of(folder, source):
+    """A case of the usual skin and a source of structures."""
+    write_balls(folder, "skin")
+    text = case_text(SKIN, "[[structures]]\n" + RULES.format(source=source), END.format(3), schema="2")
+    (folder / "case.toml").write_text(text.replace("schema = 2", 'schema = 2\nregion = "phantom"'))
+    return folder / "case.toml"
+
+
+def test_a_folder_of_masks_is_searched_as_its_label_map_is(tmp_path):
+    """Same surfaces, same verdicts; an empty mask is no structure, and a note says so."""
+    write_masks(tmp_path / "seg")
+    sitk.WriteImage(image_of(labels()), str(tmp_path / "labels.nrrd"))
+    (tmp_path / "names.csv").write_text("id,name\n1,organ\n3,vessel left\n")
+    by_masks = prepare(case_of(tmp_path, 'masks = "seg"'), arm=False)
+    by_map = prepare(case_of(tmp_path, 'labelmap = "labels.nrrd"\nnaming = "names.csv"'), arm=False)
+    for one, other in zip(by_masks.anatomy.structures, by_map.anatomy.structures, strict=True):
+        assert (one.name, one.role, one.margin_mm) == (other.name, other.role, other.margin_mm)
+        assert np.array_equal(one.mesh.vertices, other.mesh.vertices)
+        assert np.array_equal(one.mesh.faces, other.mesh.faces)
+    found, plain = by_masks.search(), by_map.search()
+    assert np.array_equal(found.verdict.reason, plain.verdict.reason)
+    assert "seg: 1 masks are empty, so that nothing is there: gallbladder" in by_masks.anatomy.warnings
+    assert by_masks.anatomy.structure("vessel left").source == "seg/vessel left.nii.gz:255"
+
+
+def test_every_mask_is_an_input(tmp_path):
+    """The empty one decided that there is nothing; what is no volume decided nothing."""
+    write_masks(tmp_path / "seg")
+    case = load_case(case_of(tmp_path, 'masks = "seg"'))
+    files = {one.role: one.path for one in case.inputs}
+    assert files == {
+        "case": "case.toml",
+        "mesh skin": "skin.stl",
+        "mask gallbladder": "seg/gallbladder.nii.gz",
+        "mask organ": "seg/organ.nii.gz",
+        "mask vessel left": "seg/vessel left.nii.gz",
+    }
+
+
+def test_patterns_hold_for_masks(tmp_path):
+    """A mask that nobody names is an error; one that is empty need not be named."""
+    write_masks(tmp_path / "seg")
+    write_mask(tmp_path / "seg" / "rib.nii.gz", labels() == 3)
+    with pytest.raises(InputError, match="no rule names these labels, which are present: rib;"):
+        prepare(case_of(tmp_path, 'masks = "seg"'), arm=False)
+
+
+def test_a_mask_on_another_grid_is_refused(tmp_path):
+    """Of other voxels, or elsewhere: both files and the difference are named."""
+    write_masks(tmp_path / "seg")
+    path = case_of(tmp_path, 'masks = "seg"')
+    write_mask(tmp_path / "seg" / "organ.nii.gz", (labels() == 1)[:90])
+    with pytest.raises(InputError, match="seg/organ.nii.gz lies on another grid than seg/gallbladder.nii.gz: 100 x"):
+        prepare(path, arm=False)
+    write_mask(tmp_path / "seg" / "organ.nii.gz", labels() == 1, spacing=(2.0, 2.0, 2.1))
+    with pytest.raises(InputError, match=r"up to 9.9 mm away"):
+        prepare(path, arm=False)
+
+
+def test_what_is_no_folder_of_masks_is_refused(tmp_path):
+    """No folder, an empty one, a label map among the masks, two files of one name, both sources at once."""
+    path = case_of(tmp_path, 'masks = "seg"')
+    with pytest.raises(InputError, match=r"structures.0.masks: 'seg' is no folder"):
+        load_case(path)
+    (tmp_path / "seg").mkdir()
+    with pytest.raises(InputError, match="'seg' holds 0 masks"):
+        load_case(path)
+    write_mask(tmp_path / "seg" / "organ.nii.gz", labels())
+    with pytest.raises(InputError, match="is no mask: its voxels have the labels 1, 3"):
+        prepare(path, arm=False)
+    write_mask(tmp_path / "seg" / "organ.nrrd", labels() == 1)
+    with pytest.raises(InputError, match="'organ.nii.gz' and 'organ.nrrd' are masks of one name"):
+        load_case(path)
+    with pytest.raises(InputError, match="needs either labelmap .* or masks"):
+        load_case(case_of(tmp_path, 'masks = "seg"\nlabelmap = "labels.nrrd"'))
+    with pytest.raises(InputError, match="naming belongs to labelmap"):
+        load_case(case_of(tmp_path, 'masks = "seg"\nnaming = "a.csv"'))
+
+
+def test_a_name_belongs_to_one_structure(tmp_path):
+    """Also where one is a mask and the other a mesh."""
+    write_masks(tmp_path / "seg")
+    path = case_of(tmp_path, 'masks = "seg"')
+    write_balls(tmp_path, "organ")
+    path.write_text(
+        path.read_text().replace("structures = 3", "structures = 4").replace(SKIN, SKIN + structure("organ", "target"))
+    )
+    with pytest.raises(InputError, match="structure 'organ' stands twice"):
+        prepare(path, arm=False)
