@@ -238,14 +238,19 @@ def read_mesh(path: Path | str, *, unit: str = "mm", space: str = "LPS") -> Tria
 
 
 def read_volume(path: Path | str) -> Volume:
-    """A CT or label map from NIfTI or NRRD: its voxels, and where they lie in LPS mm.
+    """A CT or label map from NIfTI or NRRD, or a CT from a DICOM series: its voxels, and where they lie in LPS mm.
+
+    A series is named by its folder, or by any of its files where the folder holds several.
 
     Raises:
         InputError: It is cut, contradicts itself, or holds a voxel that is no finite number.
     """
+    from puncture_twin.planning.formats.dicom.choose_series import is_series
+    from puncture_twin.planning.formats.dicom.ct_series import read_series
     from puncture_twin.planning.formats.volumes.volume_files import read_volume
 
-    return read_volume(Path(path))
+    path = Path(path)
+    return read_series(path) if is_series(path) else read_volume(path)
 
 
 def read_recording(path: Path | str) -> Recording:

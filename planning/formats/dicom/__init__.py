@@ -1,0 +1,5 @@
+"""DICOM: CT series with their true geometry, segmentations and structure sets, read strictly."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

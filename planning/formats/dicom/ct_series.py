@@ -1,0 +1,196 @@
+"""A CT series as a volume in Hounsfield units and LPS mm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.formats.dicom.attributes import text
+from puncture_twin.planning.formats.dicom.choose_series import choose_series
+from puncture_twin.planning.formats.dicom.dicom_file import parse_dicom
+from puncture_twin.planning.formats.dicom.pixels import PixelLayout, pixel_layout, stored_values
+from puncture_twin.planning.formats.dicom.recognise import described
+from puncture_twin.planning.formats.dicom.slices import Slice, slices_of
+from puncture_twin.planning.formats.dicom.stack import Stack, stack_of
+from puncture_twin.planning.formats.dicom.tilt import StraightGrid, moved, straight_grid
+from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, Volume
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, check_affine, check_shape
+from puncture_twin.planning.formats.volumes.volume_source import Content
+
+UNMEASURED_HU = -2000.0
+"""Written where the scanner did not measure: far below air, so that nothing takes it for air or body."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Series:
+    """What the headers of all files say together."""
+
+    stack: Stack
+    grid: StraightGrid
+    layouts: dict[str, PixelLayout]
+    series_uid: str
+    frame_of_reference: str
+    lossy: bool
+
+
+@dataclass(frozen=True, eq=False)
+class CtSeries:
+    """A CT series in one folder. Its headers are read once, its pixels at each call of `volume`.
+
+    Attributes:
+        path: What was named: the folder, or a file in it.
+        files: Every file of the series, as the content is asked for it.
+        content: Gives the bytes of each.
+        aside: What else lies in the folder, one sentence.
+    """
+
+    path: Path
+    files: tuple[str, ...]
+    content: Content
+    aside: tuple[str, ...] = ()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was left out, and what was done to the slices."""
+        notes = list(self.aside)
+        if (tilt := self._series.grid.tilt_deg) > 0:
+            notes.append(
+                f"{self.path.name}: scanned with the gantry tilted by {tilt:.1f} degrees; its slices were moved to a "
+                "grid with right angles, and what they do not cover there counts as not scanned"
+            )
+        if self._series.lossy:
+            notes.append(f"{self.path.name}: its images were compressed with loss, so that their values are not exact")
+        return tuple(notes)
+
+    @property
+    def frame_of_reference(self) -> str:
+        """The UID of the coordinates in which it lies; empty where it is not stated."""
+        return self._series.frame_of_reference
+
+    @property
+    def series_uid(self) -> str:
+        """The UID of the series."""
+        return self._series.series_uid
+
+    @property
+    def stack(self) -> Stack:
+        """Its slices as they were scanned."""
+        return self._series.stack
+
+    @property
+    def slice_shape(self) -> tuple[int, int]:
+        """Columns and rows of a slice as it was scanned."""
+        layout = next(iter(self._series.layouts.values()))
+        return layout.columns, layout.rows
+
+    @cached_property
+    def grid(self) -> VolumeGrid:
+        """Where the voxels of `volume` lie, LPS mm.
+
+        Raises:
+            InputError: Headers that cannot be trusted, or that make no volume.
+        """
+        straight = self._series.grid
+        shape = check_shape(straight.shape, where=self.path)
+        return VolumeGrid(shape, check_affine(straight.T_ct_index, where=self.path), {})
+
+    def volume(self) -> Volume:
+        """The voxels in Hounsfield units, single precision; ``UNMEASURED_HU`` where nothing was measured.
+
+        Raises:
+            InputError: Pixels that are damaged, or in a transfer syntax that is not read.
+        """
+        grid, series = self.grid, self._series
+        values = np.empty(grid.shape, np.float32, order="F")
+        places: dict[str, list[int]] = {}
+        for number, one in enumerate(series.stack.slices):
+            places.setdefault(one.file, []).append(number)
+        for file, numbers in places.items():
+            layout = series.layouts[file]
+            frames = stored_values(parse_dicom(self.content(file), Path(file)), layout, file)
+            for number in numbers:
+                one = series.stack.slices[number]
+                image = _hounsfield(frames[one.frame], one, layout)
+                values[:, :, number] = _filled(moved(image, series.grid.shifts[number], grid.shape[:2]))
+        return Volume(values, grid.T_ct_index, self.path)
+
+    @cached_property
+    def _series(self) -> _Series:
+        slices: list[Slice] = []
+        layouts: dict[str, PixelLayout] = {}
+        stated = set()
+        lossy = False
+        for file in self.files:
+            data = parse_dicom(self.content(file), Path(file))
+            header = described(data, Path(file))
+            if not header.is_slice:
+                raise InputError(f"{header.sop_class}, no slice of a CT", where=file, allowed="has the file changed?")
+            stated.add((header.series_uid, header.frame_of_reference))
+            layouts[file] = pixel_layout(data, file)
+            slices += slices_of(data, file, layouts[file].frames)
+            lossy = lossy or text(data, "LossyImageCompression", where=file) == "01"
+        series_uid, frame_of_reference = _one(stated, self.path)
+        stack = stack_of(slices, self.path)
+        rows, columns = _one_size(layouts, self.path)
+        grid = straight_grid(stack, rows, columns, self.path)
+        return _Series(stack, grid, layouts, series_uid, frame_of_reference, lossy)
+
+
+def _hounsfield(stored: NDArray[Any], one: Slice, layout: PixelLayout) -> NDArray[np.float32]:
+    """A slice in Hounsfield units, shape (columns, rows), NaN where it is padded."""
+    scaled = stored.astype(np.float64) * one.slope + one.intercept
+    if layout.padding is not None:
+        low, high = layout.padding
+        scaled[(stored >= low) & (stored <= high)] = np.nan
+    return np.asarray(scaled.T, np.float32)
+
+
+def _filled(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.where(np.isnan(image), np.float32(UNMEASURED_HU), image)
+
+
+def _one(stated: set[tuple[str, str]], path: Path) -> tuple[str, str]:
+    if len(stated) != 1:
+        series, frames = (len({one[at] for one in stated}) for at in (0, 1))
+        what = f"files of {series} series and {frames} frames of reference"
+        raise InputError(what, where=path, allowed="one of each")
+    return next(iter(stated))
+
+
+def _one_size(layouts: dict[str, PixelLayout], path: Path) -> tuple[int, int]:
+    first, size = "", (0, 0)
+    for file, layout in layouts.items():
+        if first and (layout.rows, layout.columns) != size:
+            what = f"{first} has {size[0]} x {size[1]} pixels, {file} has {layout.rows} x {layout.columns}"
+            raise InputError(what, where=path, allowed="slices of one size")
+        first, size = file, (layout.rows, layout.columns)
+    return size
+
+
+def parse_series(path: Path, files: Sequence[str], content: Content, aside: tuple[str, ...] = ()) -> CtSeries:
+    """A series whose headers have been checked."""
+    series = CtSeries(path, tuple(files), content, aside)
+    _ = series.grid
+    return series
+
+
+def read_series(path: Path) -> Volume:
+    """The CT of a folder with one series, or of the series of a file in it.
+
+    Raises:
+        InputError: Anything wrong with a file, or slices that make no volume.
+    """
+    chosen = choose_series(path)
+
+    def content(name: str) -> bytes:
+        return read_input(chosen.folder / name, max_bytes=MAX_FILE_BYTES, where=str(chosen.folder / name))
+
+    return parse_series(path, chosen.names, content, chosen.notes).volume()

@@ -1,0 +1,43 @@
+"""What a DICOM file is, by its SOP class: never by its name, and not by its modality.
+
+Unique identifiers from DICOM PS3.4 (2024), table B.5-1, and PS3.6, table A-1.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Kind(StrEnum):
+    """What this project makes of a DICOM file."""
+
+    CT = "CT"
+    SEGMENTATION = "SEG"
+    STRUCTURE_SET = "RTSTRUCT"
+    OTHER = "other"
+
+
+CLASSIC_CT = "1.2.840.10008.5.1.4.1.1.2"
+ENHANCED_CT = ("1.2.840.10008.5.1.4.1.1.2.1", "1.2.840.10008.5.1.4.1.1.2.2")
+"""Enhanced CT Image Storage, and Legacy Converted Enhanced CT Image Storage."""
+SEGMENTATION = "1.2.840.10008.5.1.4.1.1.66.4"
+STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
+
+_KINDS = {
+    CLASSIC_CT: Kind.CT,
+    **dict.fromkeys(ENHANCED_CT, Kind.CT),
+    SEGMENTATION: Kind.SEGMENTATION,
+    STRUCTURE_SET: Kind.STRUCTURE_SET,
+}
+
+IMPLICIT = "1.2.840.10008.1.2"
+EXPLICIT = "1.2.840.10008.1.2.1"
+DEFLATED = "1.2.840.10008.1.2.1.99"
+BIG_ENDIAN = "1.2.840.10008.1.2.2"
+PLAIN = (IMPLICIT, EXPLICIT, DEFLATED)
+"""Transfer syntaxes whose pixels are stored as they are."""
+
+
+def kind_of(sop_class: str) -> Kind:
+    """What a file of this SOP class is."""
+    return _KINDS.get(sop_class, Kind.OTHER)

@@ -1,0 +1,138 @@
+"""DICOM files written by pydicom from known arrays: series, multi-frame images, segmentations, structure sets."""
+
+from pathlib import Path
+
+import numpy as np
+from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
+from pydicom.sequence import Sequence
+from pydicom.uid import UID, ExplicitVRLittleEndian
+
+CT_CLASS = "1.2.840.10008.5.1.4.1.1.2"
+ENHANCED_CLASS = "1.2.840.10008.5.1.4.1.1.2.1"
+SEG_CLASS = "1.2.840.10008.5.1.4.1.1.66.4"
+RT_CLASS = "1.2.840.10008.5.1.4.1.1.481.3"
+CAPTURE_CLASS = "1.2.840.10008.5.1.4.1.1.7"
+ROOT = "1.2.826.0.1.3680043.8.498.7."
+STUDY, SERIES, FRAME = ROOT + "1", ROOT + "2", ROOT + "3"
+
+SHAPE = (7, 5, 4)
+"""Columns, rows, slices of the phantom."""
+SPACING = (0.7, 0.9)
+"""Between columns, between rows."""
+ORIGIN = (-101.5, 33.0, 812.25)
+
+
+def phantom(shape=SHAPE):
+    """Stored values, (columns, rows, slices), each another: no flip and no swap maps it to itself."""
+    return np.arange(np.prod(shape), dtype=np.int16).reshape(shape) * 3 + 11
+
+
+def rotation(angle=0.0, about=(0, 1)):
+    """Axes of rows, columns and normal, turned in the plane of two of the patient's axes."""
+    R = np.eye(3)
+    i, j = about
+    R[i, i] = R[j, j] = np.cos(angle)
+    R[i, j], R[j, i] = -np.sin(angle), np.sin(angle)
+    return R
+
+
+def affine(axes=None, step=(0.0, 0.0, 2.5), spacing=SPACING, origin=ORIGIN):
+    """Index (column, row, slice) to LPS mm, from what each slice states; the oracle of every test of places."""
+    axes = np.eye(3) if axes is None else axes
+    T = np.eye(4)
+    T[:3, 0], T[:3, 1], T[:3, 2], T[:3, 3] = axes[:, 0] * spacing[0], axes[:, 1] * spacing[1], step, origin
+    return T
+
+
+def ds(numbers):
+    """Decimal strings of at most 16 characters."""
+    return [f"{float(number):.12g}"[:16] for number in np.ravel(numbers)]
+
+
+def base(sop_class, uid, series=SERIES, number=1, description="abdomen 2.5"):
+    """What every object has."""
+    meta = FileMetaDataset()
+    meta.MediaStorageSOPClassUID = sop_class
+    meta.MediaStorageSOPInstanceUID = uid
+    meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    data = FileDataset("", {}, file_meta=meta, preamble=b"\0" * 128)
+    data.SOPClassUID, data.SOPInstanceUID = sop_class, uid
+    data.StudyInstanceUID, data.SeriesInstanceUID, data.FrameOfReferenceUID = STUDY, series, FRAME
+    data.SeriesNumber, data.SeriesDescription, data.PatientID = number, description, "phantom"
+    data.Modality = {SEG_CLASS: "SEG", RT_CLASS: "RTSTRUCT"}.get(sop_class, "CT")
+    return data
+
+
+def image(data, stored, bits=16, signed=True):
+    """The pixels, shape (columns, rows) or (columns, rows, frames)."""
+    data.Columns, data.Rows = stored.shape[:2]
+    data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
+    data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 16, bits, bits - 1, int(signed)
+    data.PixelData = stored.T.astype("<i2" if signed else "<u2").tobytes()
+    return data
+
+
+def ct_slice(stored, T, k=0, number=None, **more):
+    """One classic slice at its place in a stack of affine ``T``."""
+    data = base(CT_CLASS, f"{ROOT}100.{number or k}", **more)
+    data.ImageType = ["ORIGINAL", "PRIMARY", "AXIAL"]
+    spacing = np.linalg.norm(T[:3, :2], axis=0)
+    data.PixelSpacing = ds(spacing[::-1])
+    data.ImageOrientationPatient = ds((T[:3, :2] / spacing).T)
+    data.ImagePositionPatient = ds((T @ [0, 0, k, 1])[:3])
+    data.InstanceNumber = number or k
+    data.RescaleSlope, data.RescaleIntercept, data.RescaleType = "1", "-1024", "HU"
+    return image(data, stored)
+
+
+def series(values=None, T=None, **more):
+    """The slices of a series, in order."""
+    values, T = phantom() if values is None else values, affine() if T is None else T
+    return [ct_slice(values[:, :, k], T, k, **more) for k in range(values.shape[2])]
+
+
+def enhanced(values=None, T=None):
+    """The same as one multi-frame file."""
+    values, T = phantom() if values is None else values, affine() if T is None else T
+    data = base(ENHANCED_CLASS, ROOT + "200")
+    data.ImageType = ["ORIGINAL", "PRIMARY", "VOLUME", "NONE"]
+    spacing = np.linalg.norm(T[:3, :2], axis=0)
+    shared = Dataset()
+    shared.PixelMeasuresSequence = [item(PixelSpacing=ds(spacing[::-1]), SliceThickness="2.5")]
+    shared.PlaneOrientationSequence = [item(ImageOrientationPatient=ds((T[:3, :2] / spacing).T))]
+    rescale = item(RescaleSlope="1", RescaleIntercept="-1024", RescaleType="HU")
+    shared.PixelValueTransformationSequence = [rescale]
+    data.SharedFunctionalGroupsSequence = [shared]
+    frames = []
+    for k in range(values.shape[2]):
+        place = item(ImagePositionPatient=ds((T @ [0, 0, k, 1])[:3]))
+        kind = item(FrameType=["ORIGINAL", "PRIMARY", "VOLUME", "NONE"])
+        frames.append(item(PlanePositionSequence=[place], CTImageFrameTypeSequence=[kind]))
+    data.PerFrameFunctionalGroupsSequence = frames
+    data.NumberOfFrames = values.shape[2]
+    return image(data, values)
+
+
+def item(**values):
+    """A data set in a sequence."""
+    made = Dataset()
+    for keyword, value in values.items():
+        setattr(made, keyword, Sequence(value) if isinstance(value, list) and isinstance(value[0], Dataset) else value)
+    return made
+
+
+def write(data, path, syntax=None):
+    """One file."""
+    if syntax is not None:
+        data.file_meta.TransferSyntaxUID = UID(syntax)
+    data.save_as(path, enforce_file_format=True)
+    return path
+
+
+def write_series(folder, slices, names=None):
+    """A folder of slices, whose names say nothing of their order."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, one in enumerate(slices):
+        write(one, folder / (names[number] if names else f"IM{(number * 7919) % 1000:04d}_{number}"))
+    return folder

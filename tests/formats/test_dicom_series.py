@@ -1,0 +1,382 @@
+"""CT series: every voxel at its place in LPS with its Hounsfield units, or a refusal that names the slice."""
+
+import itertools
+import re
+import zlib
+
+import dicom_world as world
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
+from pydicom.uid import DeflatedExplicitVRLittleEndian, ImplicitVRLittleEndian, RLELossless
+
+from puncture_twin.planning.anatomy.body.unscanned import UNSCANNED_HU
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.dicom.choose_series import choose_series
+from puncture_twin.planning.formats.dicom.ct_series import UNMEASURED_HU, read_series
+
+HU = world.phantom().astype(np.float32) - 1024
+
+
+def place(T, *index):
+    """Where a voxel's centre lies."""
+    return (T @ [*index, 1.0])[:3]
+
+
+def by_place(volume):
+    """Every measured voxel by its place in LPS, rounded to a hundredth of a mm."""
+    at = np.argwhere(volume.values > UNMEASURED_HU)
+    places = (at @ volume.T_ct_index[:3, :3].T + volume.T_ct_index[:3, 3]).round(2) + 0.0
+    return {tuple(where): float(volume.values[tuple(index)]) for where, index in zip(places, at, strict=True)}
+
+
+def expected(T, hu=HU):
+    """The same from the affine that wrote the slices."""
+    return {
+        tuple(place(T, *index).round(2) + 0.0): float(hu[index]) for index in itertools.product(*map(range, hu.shape))
+    }
+
+
+def with_simpleitk(folder):
+    """What SimpleITK's series reader makes of a folder: values by place."""
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(folder)))
+    image = reader.Execute()
+    values = sitk.GetArrayFromImage(image).transpose(2, 1, 0)
+    places = {}
+    for index in itertools.product(*map(range, values.shape)):
+        where = np.round(image.TransformIndexToPhysicalPoint(index), 2) + 0.0
+        places[tuple(where)] = float(values[index])
+    return places
+
+
+TURNS = {
+    "head first, supine": np.eye(3),
+    "feet first, supine": np.diag([-1.0, 1.0, -1.0]),
+    "head first, prone": np.diag([-1.0, -1.0, 1.0]),
+    "feet first, prone": np.diag([1.0, -1.0, -1.0]),
+    "decubitus": np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
+    "coronal": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "oblique": world.rotation(0.3, (0, 1)) @ world.rotation(0.2, (1, 2)),
+}
+
+
+@pytest.mark.parametrize("turn", sorted(TURNS))
+@pytest.mark.parametrize("kind", ["classic", "enhanced"])
+def test_every_voxel_lies_where_its_slice_says(tmp_path, turn, kind):
+    """However the patient lies, in one file or in many, and whatever the files are called; SimpleITK says the same."""
+    axes = TURNS[turn]
+    T = world.affine(axes, step=2.5 * np.cross(axes[:, 0], axes[:, 1]))
+    if kind == "classic":
+        folder = world.write_series(tmp_path, world.series(T=T))
+        assert with_simpleitk(folder) == pytest.approx(expected(T))
+    else:
+        world.write(world.enhanced(T=T), tmp_path / "a")
+    volume = read_series(tmp_path)
+    assert by_place(volume) == expected(T)
+    assert not volume.values.flags.writeable
+
+
+def test_a_backward_stack_is_sorted_by_place_and_not_by_number(tmp_path):
+    """Instance numbers that run against the normal, or say nothing, decide nothing."""
+    T = world.affine(step=(0, 0, -2.5))
+    slices = world.series(T=T)
+    for one, number in zip(slices, (4, 4, 1, 9), strict=True):
+        one.InstanceNumber = number
+    assert by_place(read_series(world.write_series(tmp_path, slices))) == expected(T)
+
+
+@pytest.mark.parametrize("angle", [0.3, -0.45])
+def test_a_tilted_gantry_is_put_right_where_simpleitk_is_not(tmp_path, angle):
+    """Slices whose planes lean against the table's way: a linear image comes back exactly; SimpleITK's is off by mm."""
+    axes = world.rotation(angle, (1, 2))
+    shape, step = (12, 14, 9), np.array([0.0, 0.0, 3.0])
+    T = world.affine(axes, step)
+    index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
+    places = index @ T[:3, :3].T + T[:3, 3]
+    linear = places @ [2.0, -3.0, 1.5]
+    stored = np.round(10 * (linear - linear.min())).astype(np.int16)
+    folder = world.write_series(tmp_path, world.series(stored, T))
+    volume = read_series(folder)
+    axes_found = volume.T_ct_index[:3, :3] / np.linalg.norm(volume.T_ct_index[:3, :3], axis=0)
+    assert np.allclose(axes_found.T @ axes_found, np.eye(3), atol=1e-6)
+    assert np.linalg.norm(volume.T_ct_index[:3, 2]) == pytest.approx(3.0 * np.cos(angle))
+    at = np.argwhere(volume.values > UNMEASURED_HU)
+    truth = (
+        10 * ((at @ volume.T_ct_index[:3, :3].T + volume.T_ct_index[:3, 3]) @ [2.0, -3.0, 1.5] - linear.min()) - 1024
+    )
+    assert np.abs(volume.values[tuple(at.T)] - truth).max() <= 0.51  # stored values were rounded to 1
+    assert len(at) >= 0.85 * stored.size
+    assert set(np.unique(volume.values[volume.values < UNSCANNED_HU])) == {UNMEASURED_HU}
+    for k in range(shape[2]):  # every slice keeps its plane
+        assert (volume.values[:, :, k] > UNMEASURED_HU).any()
+    last = place(T, 0, 0, 8)
+    assert np.linalg.norm(places[0, 0, 8] - last) < 1e-9
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(folder)))
+    ends = [reader.Execute().TransformIndexToPhysicalPoint((0, 0, k)) for k in (0, 8)]
+    assert min(np.linalg.norm(np.array(ends) - last, axis=1)) > 24.0 * abs(np.sin(angle)) - 1.0
+
+
+def changed(at, **values):
+    """A series whose slice number ``at`` says something else."""
+    slices = world.series()
+    for keyword, value in values.items():
+        if value is None:
+            delattr(slices[at], keyword)
+        else:
+            setattr(slices[at], keyword, value)
+    return slices
+
+
+def moved(at, z, x=world.ORIGIN[0]):
+    """A series whose slice number ``at`` lies elsewhere."""
+    return changed(at, ImagePositionPatient=world.ds([x, world.ORIGIN[1], z]))
+
+
+def shorter(slices):
+    """The last slice has lost a row of pixels."""
+    slices[-1].PixelData = slices[-1].PixelData[:-14]
+    return slices
+
+
+REFUSED = {
+    "one slice": (lambda: world.series()[:1], "1 slice"),
+    "missing slice": (
+        lambda: world.series(world.phantom((7, 5, 6)))[:3] + world.series(world.phantom((7, 5, 6)))[4:],
+        "1 slice is missing between .*_2 and .*_3: 5 mm apart.*2.5 mm",
+    ),
+    "uneven step": (lambda: moved(2, 812.25 + 5.9), "uneven steps: 3.4 mm between .*_1 and .*_2"),
+    "two at one place": (lambda: moved(2, 812.25 + 2.5), "several slices at one place: .*_1 and .*_2"),
+    "two time points": (lambda: world.series() + world.series(), "several slices at one place.*one time point"),
+    "one slice off the line": (
+        lambda: changed(2, ImagePositionPatient=world.ds([-101.0, 33.0, 817.25])),
+        "off the line",
+    ),
+    "another orientation": (
+        lambda: changed(1, ImageOrientationPatient=["1", "0", "0", "0", "0.98", "0.199"]),
+        "other orientations",
+    ),
+    "another pixel size": (lambda: changed(1, PixelSpacing=["0.9", "0.8"]), "pixels of other sizes"),
+    "no position": (
+        lambda: changed(1, ImagePositionPatient=None),
+        r"_1.*ImagePositionPatient \(0020,0032\) is missing",
+    ),
+    "no orientation": (lambda: changed(1, ImageOrientationPatient=None), r"ImageOrientationPatient \(0020,0037\)"),
+    "no spacing": (lambda: changed(1, PixelSpacing=None), r"PixelSpacing \(0028,0030\) is missing"),
+    "no slope": (lambda: changed(1, RescaleSlope=None), r"_1.*RescaleSlope \(0028,1053\) is missing"),
+    "slope 0": (lambda: changed(1, RescaleSlope="0"), "rescaling by 0"),
+    "no Hounsfield units": (lambda: changed(1, RescaleType="MGML"), "RescaleType .* is 'MGML'"),
+    "a skewed plane": (lambda: changed(1, ImageOrientationPatient=list("100") + ["0.5", "1", "0"]), "right angle"),
+    "axes of no length": (lambda: changed(1, ImageOrientationPatient=list("000000")), "unit vectors"),
+    "inverted": (lambda: changed(1, PhotometricInterpretation="MONOCHROME1"), "MONOCHROME1"),
+    "colours": (lambda: changed(1, SamplesPerPixel=3), "SamplesPerPixel .* is 3"),
+    "another frame of reference": (lambda: changed(1, FrameOfReferenceUID=world.ROOT + "9"), "2 frames of reference"),
+    "a high bit elsewhere": (lambda: changed(1, BitsStored=12), "HighBit"),
+    "pixels cut short": (lambda: shorter(world.series()), "_3.*PixelData .* has 56 bytes where .* 70"),
+    "no pixels": (lambda: changed(1, PixelData=None), "PixelData .* is missing"),
+    "slices side by side": (lambda: world.series(T=world.affine(step=(5.0, 0, 2.5))), "63 degrees apart"),
+    "frames in a classic file": (lambda: changed(1, NumberOfFrames=2), "has 70 bytes where the header promises 140"),
+}
+
+
+@pytest.mark.parametrize("name", sorted(REFUSED))
+def test_a_series_that_is_no_regular_stack_is_refused_naming_the_slice(tmp_path, name):
+    """One line, with the file that is wrong."""
+    make, message = REFUSED[name]
+    folder = world.write_series(tmp_path, make(), [f"a{number:02d}_{number}" for number in range(20)])
+    with pytest.raises(InputError, match=message) as caught:
+        read_series(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_simpleitk_takes_the_uneven_and_the_missing_slice(tmp_path):
+    """Why steps are checked: its reader moves what lies behind the gap, here by 1.7 mm in the middle of four slices."""
+    T = world.affine()
+    slices = world.series(world.phantom((7, 5, 6)), world.affine())
+    folder = world.write_series(tmp_path, slices[:1] + slices[2:])
+    theirs = with_simpleitk(folder)
+    truth = expected(T, world.phantom((7, 5, 6)).astype(np.float32) - 1024)
+    wrong = [where for where, value in theirs.items() if truth.get(where) != value]
+    assert len(wrong) >= 35
+    with pytest.raises(InputError, match="1 slice is missing"):
+        read_series(folder)
+
+
+def scout():
+    """A localizer: a CT image by its class, in the same folder."""
+    data = world.ct_slice(world.phantom()[:, :, 0], world.affine(TURNS["coronal"]), series=world.ROOT + "50", number=77)
+    data.ImageType = ["ORIGINAL", "PRIMARY", "LOCALIZER"]
+    return data
+
+
+def capture():
+    """A dose page: a secondary capture, with the same series number."""
+    data = world.base(world.CAPTURE_CLASS, world.ROOT + "60", series=world.ROOT + "51", description="dose")
+    return world.image(data, world.phantom()[:, :, 0])
+
+
+def page():
+    """A page of text that is stored as a CT image without a place, in the series itself."""
+    data = changed(0, ImagePositionPatient=None, ImageOrientationPatient=None)[0]
+    data.ImageType = ["DERIVED", "SECONDARY", "OTHER"]
+    return data
+
+
+def test_scouts_pages_and_other_files_are_left_out_and_told(tmp_path):
+    """By SOP class and ImageType; a folder is read as if they were not there, and a note counts them."""
+    folder = world.write_series(tmp_path / "s", [*world.series(), scout(), capture(), page()])
+    (folder / "README.txt").write_text("x" * 300)
+    assert by_place(read_series(folder)) == expected(world.affine())
+    note = " ".join(choose_series(folder).notes)
+    assert "2 CT Image Storage '1 abdomen 2.5'" in note
+    assert "1 Secondary Capture Image Storage" in note
+
+
+def test_two_series_are_refused_with_names_and_a_file_chooses_one(tmp_path):
+    """Their descriptions, counts and a file of each; then one file of a series stands for it."""
+    other = world.series(world.phantom() + 5, series=world.ROOT + "70", description="arterial")
+    folder = world.write_series(tmp_path / "s", [*world.series(), *other], [f"{n}.dcm" for n in range(8)])
+    listed = r"2 CT series: 4 files of '1 abdomen 2.5' \(such as 0.dcm.*'1 arterial'"
+    with pytest.raises(InputError, match=listed) as caught:
+        read_series(folder)
+    assert "name one of its files" in str(caught.value)
+    assert by_place(read_series(folder / "2.dcm")) == expected(world.affine())
+    assert by_place(read_series(folder / "6.dcm")) == expected(world.affine(), HU + 5)
+
+
+@pytest.mark.parametrize("what", ["empty", "text", "folders", "capture alone"])
+def test_a_folder_without_a_series_says_what_it_holds(tmp_path, what):
+    """Nothing, no DICOM, only folders, or no CT."""
+    if what == "text":
+        (tmp_path / "a.txt").write_text("no")
+    elif what == "folders":
+        (tmp_path / "series 1").mkdir()
+    elif what == "capture alone":
+        world.write_series(tmp_path, [capture()])
+    told = {"folders": "were not entered", "capture alone": "1 Secondary Capture"}.get(what, "no DICOM file")
+    with pytest.raises(InputError, match=f"no CT series here.*{told}"):
+        read_series(tmp_path)
+
+
+def test_rescaling_is_that_of_each_slice(tmp_path):
+    """Slope and intercept differ from slice to slice."""
+    slices = world.series()
+    slices[1].RescaleSlope, slices[1].RescaleIntercept = "0.5", "-1000.25"
+    values = read_series(world.write_series(tmp_path, slices)).values
+    assert np.array_equal(values[:, :, 1], 0.5 * world.phantom()[:, :, 1] - 1000.25)
+    assert np.array_equal(values[:, :, 2], HU[:, :, 2])
+
+
+@pytest.mark.parametrize(("bits", "signed"), [(16, True), (16, False), (12, True), (12, False)])
+def test_bits_above_the_stored_ones_do_not_count(tmp_path, bits, signed):
+    """Two's complement of 12 bits, unsigned values of 16, and overlay bits above 12."""
+    rng = np.random.default_rng(3)
+    low, high = (-(1 << (bits - 1)), 1 << (bits - 1)) if signed else (0, 1 << bits)
+    truth = rng.integers(low, high, world.SHAPE)
+    above = rng.integers(0, 1 << (16 - bits), world.SHAPE) << bits
+    slices = world.series()
+    for k, one in enumerate(slices):
+        world.image(one, ((truth[:, :, k] & ((1 << bits) - 1)) | above[:, :, k]).astype(np.uint16).view(np.int16), bits)
+        one.PixelRepresentation = int(signed)
+    assert np.array_equal(read_series(world.write_series(tmp_path, slices)).values, truth - 1024)
+
+
+@pytest.mark.parametrize("limit", [False, True])
+def test_padding_is_not_scanned(tmp_path, limit):
+    """What the header calls padding is neither air nor body: it is below what anything measured can be."""
+    slices = world.series()
+    for one in slices:
+        one.add_new("PixelPaddingValue", "SS", 11)
+        if limit:
+            one.add_new("PixelPaddingRangeLimit", "SS", 17)
+    values = read_series(world.write_series(tmp_path, slices)).values
+    padded = (world.phantom() >= 11) & (world.phantom() <= (17 if limit else 11))
+    assert (values[padded] == UNMEASURED_HU).all()
+    assert UNMEASURED_HU < UNSCANNED_HU
+    assert np.array_equal(values[~padded], HU[~padded])
+
+
+@pytest.mark.parametrize("syntax", [ImplicitVRLittleEndian, DeflatedExplicitVRLittleEndian, RLELossless])
+def test_transfer_syntaxes_without_loss_hold_the_same_voxels(tmp_path, syntax):
+    """Implicit, deflated, run-length encoded."""
+    slices = world.series()
+    for one in slices:
+        if syntax == RLELossless:
+            one.compress(RLELossless)
+        else:
+            one.file_meta.TransferSyntaxUID = syntax
+    assert by_place(read_series(world.write_series(tmp_path, slices))) == expected(world.affine())
+
+
+@pytest.mark.parametrize("io", ["JPEG-LS", "JPEG 2000", "JPEG lossless"])
+def test_compressed_pixels_are_read_where_a_decoder_is_installed(tmp_path, io):
+    """As SimpleITK's library writes them; the decoder is another build of the same library's, the oracle the array."""
+    gdcm = pytest.importorskip("gdcm")
+    codes = {"JPEG-LS": gdcm.TransferSyntax.JPEGLSLossless, "JPEG 2000": gdcm.TransferSyntax.JPEG2000Lossless}
+    syntax = gdcm.TransferSyntax(codes.get(io, gdcm.TransferSyntax.JPEGLosslessProcess14_1))
+    plain = world.write_series(tmp_path / "plain", world.series(world.phantom((16, 12, 3))))
+    (tmp_path / "packed").mkdir()
+    for path in plain.iterdir():
+        reader = gdcm.ImageReader()
+        reader.SetFileName(str(path))
+        assert reader.Read()
+        change = gdcm.ImageChangeTransferSyntax()
+        change.SetTransferSyntax(syntax)
+        change.SetInput(reader.GetImage())
+        assert change.Change()
+        writer = gdcm.ImageWriter()
+        writer.SetFileName(str(tmp_path / "packed" / path.name))
+        writer.SetFile(reader.GetFile())
+        writer.SetImage(change.GetOutput())
+        assert writer.Write()
+    assert not re.search(rb"1\.2\.840\.10008\.1\.2\.1\0", next((tmp_path / "packed").iterdir()).read_bytes()[:400])
+    assert np.array_equal(read_series(tmp_path / "packed").values, read_series(plain).values)
+
+
+def test_every_cut_of_a_slice_is_refused_naming_it(tmp_path):
+    """Wherever the last file ends, classic or enhanced."""
+    folder = world.write_series(tmp_path / "s", world.series(), [f"{n}.dcm" for n in range(4)])
+    multi = world.write(world.enhanced(), tmp_path / "multi.dcm")
+    for path, call in ((folder / "3.dcm", folder), (multi, multi)):
+        whole = path.read_bytes()
+        for length in [*range(132, len(whole), 29), len(whole) - 1]:
+            path.write_bytes(whole[:length])
+            with pytest.raises(InputError, match=path.name):
+                read_series(call / "3.dcm" if call == folder else call)
+        path.write_bytes(whole)
+
+
+def test_a_deflate_bomb_is_not_inflated(tmp_path):
+    """80 megabytes of zeros in 80 kilobytes."""
+    folder = world.write_series(tmp_path, changed_syntax(DeflatedExplicitVRLittleEndian), [f"{n}" for n in range(4)])
+    content = (folder / "3").read_bytes()
+    start = 132 + 12 + int.from_bytes(content[140:144], "little")
+    packer = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
+    bomb = b"".join(packer.compress(bytes(1 << 24)) for _ in range(5)) + packer.flush()
+    (folder / "3").write_bytes(content[:start] + bomb)
+    with pytest.raises(InputError, match="3: inflates to more than"):
+        read_series(folder)
+
+
+def changed_syntax(syntax):
+    """A series in another transfer syntax."""
+    slices = world.series()
+    for one in slices:
+        one.file_meta.TransferSyntaxUID = syntax
+    return slices
+
+
+@pytest.mark.parametrize("syntax", ["1.2.840.10008.1.2.2", "1.2.840.10008.1.2.4.100", "1.2.3.4"])
+def test_other_transfer_syntaxes_are_refused_with_what_to_do(tmp_path, syntax):
+    """Big endian, video, unknown ones."""
+    slices = world.series()
+    folder = world.write_series(tmp_path, slices, [f"{n}" for n in range(4)])
+    for path in folder.iterdir():
+        content = path.read_bytes()
+        old = b"1.2.840.10008.1.2.1\0"
+        new = syntax.encode() + b"\0" * (len(syntax) % 2)
+        at = content.index(old)
+        path.write_bytes(content[: at - 2] + len(new).to_bytes(2, "little") + new + content[at + len(old) :])
+    with pytest.raises(InputError, match=f"transfer syntax .*{re.escape(syntax)}.*gdcmconv --raw"):
+        read_series(folder)

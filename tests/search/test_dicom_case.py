@@ -1,0 +1,150 @@
+"""A case whose CT is a DICOM series gives the verdicts of the same CT in NIfTI, and lists every slice."""
+
+import hashlib
+import json
+import shutil
+
+import dicom_world as world
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813
+from case_world import structure
+from places import REAL_CT, TESTS
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.provenance import differing_input
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.formats.volumes.volume_files import read_volume
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.twin.phantoms import supine
+from puncture_twin.twin.phantoms.ct_image import rendered
+
+SPINE = structure("spine", "avoid", {"labelmap": "labels.nii.gz", "label": 2}, margin_mm=2.0)
+LESION = structure("lesion", "target", {"labelmap": "labels.nii.gz", "label": 1})
+HEAD = """schema = 1
+name = "supine"
+space = "LPS"
+[target]
+position_mm = [-55.0, 20.0, 0.0]
+structure = "lesion"
+[needle]
+length_mm = 210.0
+shaft_mm = 150.0
+diameter_mm = 1.2
+[search]
+theta_deg = [0, 180]
+step_deg = 15.0
+max_skin_angle_deg = 75
+"""
+
+
+def write_dicom(nifti, folder):
+    """The CT of a NIfTI file as a series, slice by slice along its last axis."""
+    volume = read_volume(nifti)
+    values, T = volume.values, volume.T_ct_index.copy()
+    if np.linalg.det(T[:3, :3]) < 0:  # rows, columns and slices of a series are right-handed or run backward: both are
+        T[:3, 3] += T[:3, 2] * (values.shape[2] - 1)
+        T[:3, 2], values = -T[:3, 2], values[:, :, ::-1]
+    stored = (np.asarray(values, np.int32) + 1024).astype(np.int16)
+    assert np.array_equal(stored.astype(np.float32) - 1024, values)
+    return world.write_series(folder, world.series(stored, T))
+
+
+def write_scene(folder):
+    """A trunk on a bed as NIfTI and as a series, with labels of lesion (1) and spine (2)."""
+    grid, parts = supine.grid(), supine.trunk_parts() + supine.bed_parts()
+    hu = rendered(parts, grid, noise_hu=15.0, rng=np.random.default_rng(3))
+    labels = np.zeros(grid.shape, np.uint8)
+    for label, name in enumerate(("lesion", "spine"), start=1):
+        field = next(part.field for part in parts if part.name == name)
+        labels[(field(grid.centres()) < 0).reshape(grid.shape)] = label
+    for name, values in (("ct", hu.astype(np.int16)), ("labels", labels)):
+        image = sitk.GetImageFromArray(values.transpose(2, 1, 0))
+        image.SetSpacing(grid.spacing_mm)
+        image.SetOrigin(grid.low_mm)
+        sitk.WriteImage(image, str(folder / f"{name}.nii.gz"))
+    write_dicom(folder / "ct.nii.gz", folder / "series")
+    write_case(folder, "nifti", "ct.nii.gz")
+    write_case(folder, "dicom", "series")
+
+
+def write_case(folder, name, ct):
+    """A case with this CT."""
+    text = HEAD + structure("skin", "skin", {"ct": ct}) + LESION + SPINE
+    (folder / f"{name}.toml").write_text(text)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """The folder of both cases."""
+    folder = tmp_path_factory.mktemp("scene")
+    write_scene(folder)
+    return folder
+
+
+def same_verdicts(one, other):
+    """Two searches that agree in every verdict, reason and clearance."""
+    assert np.array_equal(one.verdict.reason, other.verdict.reason)
+    assert np.allclose(one.clearance.distance, other.clearance.distance, atol=1e-3, equal_nan=True)
+    assert np.allclose(one.path.length, other.path.length, atol=1e-3, equal_nan=True)
+    assert one.safe.any()
+
+
+def test_a_series_gives_the_verdicts_of_the_same_ct_in_nifti(scene):
+    """Skin, bed and what no label names come from the series as from the file."""
+    nifti, dicom = (prepare(scene / f"{name}.toml", arm=False) for name in ("nifti", "dicom"))
+    same_verdicts(nifti.search(), dicom.search())
+    assert dicom.anatomy.warnings == tuple(line.replace("ct.nii.gz", "series") for line in nifti.anatomy.warnings)
+
+
+def test_every_slice_is_an_input_with_the_hash_of_its_bytes(scene):
+    """A slice that another replaces, and one more of them, are seen."""
+    case = load_case(scene / "dicom.toml")
+    slices = [one for one in case.inputs if one.role == "ct"]
+    files = sorted((scene / "series").iterdir())
+    assert [one.path for one in slices] == [f"series/{path.name}" for path in files]
+    assert [one.sha256 for one in slices] == [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
+    content = files[3].read_bytes()
+    files[3].write_bytes(content[:-2] + b"\0\1")
+    try:
+        assert differing_input(case.inputs, load_case(scene / "dicom.toml").inputs) == f"ct ({slices[3].path})"
+        case.files.release()
+        held = len(case.files._held)
+        assert held < len(files)
+        with pytest.raises(InputError, match="has changed since it was read"):
+            [case.files.content(one.path) for one in slices]
+    finally:
+        files[3].write_bytes(content)
+
+
+def test_a_file_of_the_series_names_it(scene):
+    """The same files decide."""
+    write_case(scene, "file", f"series/{sorted(path.name for path in (scene / 'series').iterdir())[5]}")
+    inputs = [
+        {one for one in load_case(scene / f"{name}.toml").inputs if one.role == "ct"} for name in ("file", "dicom")
+    ]
+    assert inputs[0] == inputs[1]
+
+
+def test_a_folder_as_a_label_map_is_refused(scene):
+    """Only a CT may be a folder."""
+    text = (scene / "dicom.toml").read_text()
+    (scene / "wrong.toml").write_text(text.replace(json.dumps("labels.nii.gz"), json.dumps("series"), 1))
+    with pytest.raises(InputError, match="file 'series' is not there"):
+        load_case(scene / "wrong.toml")
+
+
+@pytest.mark.skipif(not REAL_CT.is_dir(), reason="the real CT (totalseg_abdomen_3mm) is not on this machine")
+def test_a_real_ct_as_a_series_gives_the_verdicts_of_its_nifti(tmp_path):
+    """The abdomen with its label map of version 1, at 8 degrees."""
+    for file in (TESTS / "real").iterdir():
+        shutil.copy(file, tmp_path)
+    for name in ("ct", "labels_v1_normal"):
+        (tmp_path / f"{name}.nii.gz").symlink_to(REAL_CT / f"{name}.nii.gz")
+    write_dicom(REAL_CT / "ct.nii.gz", tmp_path / "series")
+    text = (tmp_path / "case_v1.toml").read_text().replace("step_deg = 2.0", "step_deg = 8.0")
+    found = []
+    for ct in ("ct.nii.gz", "series"):
+        (tmp_path / "one.toml").write_text(text.replace('ct = "ct.nii.gz"', f'ct = "{ct}"'))
+        found.append(prepare(tmp_path / "one.toml", arm=False).search())
+    same_verdicts(*found)
