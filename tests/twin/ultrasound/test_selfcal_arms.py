@@ -22,14 +22,12 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
     direction_residuals,
     directions_image,
     flange_slopes,
-    linearise,
-    problem_covariances,
-    shared_slopes,
+    linear_model,
     tip_residuals,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import plain_fit
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import plain_fit, weighed
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.spread import found_spreads
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import Whitening, fitted
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import Whitening
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import drawing
 from puncture_twin.twin.guidance.ultrasound.puncture import aim
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
@@ -96,14 +94,14 @@ def test_whitening_is_the_inverse_root_of_the_whole_covariance(room):
     case, _, _, recording = room
     problem = Problem(recording, NOISE, ALL, np.radians(0.5), arm_errors(case.declared_arms, recording))
     estimate = drawing(case)
-    r, J = linearise(problem, estimate)
+    r, J, sigma, shared = linear_model(problem, estimate)
     n, k = r.shape
     C = np.zeros((n * k, n * k))
-    for i, block in enumerate(problem_covariances(problem, estimate)):
+    for i, block in enumerate(sigma):
         C[i * k : (i + 1) * k, i * k : (i + 1) * k] = block
-    N = shared_slopes(problem, estimate).reshape(n * k, -1)
+    N = shared.reshape(n * k, -1)
     C += N @ N.T
-    whitening = Whitening.of(problem, estimate, np.ones((n, k)))
+    whitening = Whitening.of(sigma, shared, np.ones((n, k)))
     white, slopes = whitening.residuals(r), whitening.slopes(J)
     flat = J.reshape(n * k, -1)
     assert white @ white == pytest.approx(r.ravel() @ np.linalg.solve(C, r.ravel()), rel=1e-7)
@@ -119,9 +117,9 @@ def test_the_marginal_covariance_is_that_of_the_joint_estimate(room):
     case, _, _, recording = room
     problem = Problem(recording, NOISE, ALL, np.radians(0.5), arm_errors(case.declared_arms, recording))
     fit = plain_fit(problem, drawing(case))
-    at_fit = fitted(problem, fit.estimate, fit.tip_kept, fit.direction_kept)
-    whitening = Whitening.of(problem, fit.estimate, np.ones((len(recording), 5)))
-    r, J = linearise(problem, fit.estimate)
+    at_fit = weighed(problem, fit)
+    r, J, sigma, shared = linear_model(problem, fit.estimate)
+    whitening = Whitening.of(sigma, shared, np.ones((len(recording), 5)))
     slopes, white = whitening.slopes(J), whitening.residuals(r)
     C = np.linalg.inv(slopes.T @ slopes)
     scale = np.sqrt(np.diag(C))
@@ -129,7 +127,7 @@ def test_the_marginal_covariance_is_that_of_the_joint_estimate(room):
     np.testing.assert_allclose(
         at_fit.covariance[:p, :p] / np.outer(scale, scale), C / np.outer(scale, scale), atol=1e-6
     )
-    N = whitening.slopes(shared_slopes(problem, fit.estimate))
+    N = whitening.slopes(shared)
     np.testing.assert_allclose(at_fit.shared, -N.T @ white, atol=1e-5)
     assert at_fit.chi_squared == pytest.approx(white @ white, rel=1e-6)
 
@@ -143,16 +141,16 @@ def test_found_parts_solve_the_likelihood_equation(room):
     for _ in range(6):
         problem = problem._replace(noise=found_spreads(problem, fit).spread)
         fit = plain_fit(problem, fit.estimate)
-    r, J = linearise(problem, fit.estimate)
+    r, J, sigma, shared = linear_model(problem, fit.estimate)
     size = r.size
     C, parts = np.zeros((size, size)), [np.zeros((size, size)), np.zeros((size, size))]
     image = recording.A[:, :3, :3] @ fit.estimate.R_X
-    for i, block in enumerate(problem_covariances(problem, fit.estimate)):
+    for i, block in enumerate(sigma):
         rows = slice(3 * i, 3 * i + 3)
         C[rows, rows] = block
         parts[0][rows, rows] = image[i][:, :2] @ image[i][:, :2].T
         parts[1][rows, rows] = np.outer(image[i][:, 2], image[i][:, 2])
-    N, J = shared_slopes(problem, fit.estimate).reshape(size, -1), J.reshape(size, -1)
+    N, J = shared.reshape(size, -1), J.reshape(size, -1)
     V = np.linalg.inv(C + N @ N.T)
     P = V - V @ J @ np.linalg.solve(J.T @ V @ J, J.T @ V)
     for D in parts:

@@ -17,10 +17,8 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Reco
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
     Problem,
     Spread,
-    linearise,
+    linear_model,
     linearised_tip,
-    problem_covariances,
-    shared_slopes,
     tip_residuals,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.solve import Solution, solve
@@ -135,14 +133,13 @@ class Calibration:
         tip_names = [name for name in self.parameters if not name.startswith("V")]
         active = np.array([PARAMETERS.index(name) for name in tip_names])
         problem = Problem(poses, NO_NOISE, active, arms=errors)
-        shared = shared_slopes(problem, self.estimate)
-        J = linearise(problem, self.estimate).jacobian
-        rows = np.arange(len(active))
-        if shared is not None:
-            J = np.concatenate([J, shared], axis=2)
+        model = linear_model(problem, self.estimate)
+        J, rows = model.jacobian, np.arange(len(active))
+        if model.shared is not None:
+            J = np.concatenate([J, model.shared], axis=2)
             rows = np.append(rows, np.arange(len(self.parameters), len(self.joint_covariance)))
         C = self.joint_covariance[np.ix_(rows, rows)]
-        return np.asarray(J @ C @ J.transpose(0, 2, 1) + problem_covariances(problem, self.estimate))
+        return np.asarray(J @ C @ J.transpose(0, 2, 1) + model.sigma)
 
     def tre(self, A: Floats, B: Floats, P: Floats) -> Floats:
         """Length of Y B Q - A X P where the true poses and the true tip are given, shape (n,), mm.

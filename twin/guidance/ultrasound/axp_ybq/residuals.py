@@ -78,6 +78,25 @@ class Linearised(NamedTuple):
     """Shape (n, k, 19), by the parameters of ``estimate.PARAMETERS``."""
 
 
+class LinearModel(NamedTuple):
+    """A problem at an estimate: residuals, derivatives, and what is expected of the residuals."""
+
+    residuals: Floats
+    """Shape (n, k), k = 3, or 5 with directions."""
+    jacobian: Floats
+    """Shape (n, k, p), by the free parameters."""
+    sigma: Floats
+    """Expected covariance of each pose's own noise, shape (n, k, k)."""
+    shared: Floats | None
+    """Derivative by the arms' lasting errors, each in its standard deviation, shape (n, k, 46); None undeclared."""
+
+
+def linear_model(problem: Problem, estimate: Estimate) -> LinearModel:
+    """Everything that a fit or a test of it needs to know of a problem at one estimate."""
+    r, J = linearise(problem, estimate)
+    return LinearModel(r, J, _pose_covariances(problem, estimate), _shared_slopes(problem, estimate))
+
+
 def linearise(problem: Problem, estimate: Estimate) -> Linearised:
     """All residuals (n, 3 or 5) and their Jacobian by the free parameters (n, 3 or 5, p)."""
     tip = linearised_tip(estimate, problem.recording)
@@ -89,7 +108,7 @@ def linearise(problem: Problem, estimate: Estimate) -> Linearised:
     return Linearised(np.concatenate([tip.residuals, turn.residuals], axis=1), jacobian)
 
 
-def problem_covariances(problem: Problem, estimate: Estimate) -> Floats:
+def _pose_covariances(problem: Problem, estimate: Estimate) -> Floats:
     """The expected covariance of each pose's residuals, shape (n, k, k)."""
     v_image = directions_image(problem.recording, estimate) if problem.with_direction else None
     sigma = covariances(estimate, problem.recording, problem.noise, v_image, problem.lean_rad)
@@ -100,7 +119,7 @@ def problem_covariances(problem: Problem, estimate: Estimate) -> Floats:
     return sigma
 
 
-def shared_slopes(problem: Problem, estimate: Estimate) -> Floats | None:
+def _shared_slopes(problem: Problem, estimate: Estimate) -> Floats | None:
     """The residuals' derivative by the arms' lasting errors, each in its standard deviation, shape (n, k, 46)."""
     if problem.arms is None:
         return None

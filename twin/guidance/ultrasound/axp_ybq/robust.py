@@ -16,18 +16,17 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import HALF_NORMAL
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import refine
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Fitted, fitted, refine
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
+    LinearModel,
     Problem,
     Spread,
     directions_image,
+    linear_model,
     linearise,
     needle_in_image,
-    problem_covariances,
     residual_weights,
-    shared_slopes,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import fitted
 
 FALSE_ALARMS = 0.01
 """Chance that a recording without outliers loses a pose."""
@@ -75,6 +74,11 @@ class _Block(NamedTuple):
     """Of the squared studentised residual, for a recording of this size."""
     least: float
     """Variance over the expected one below which it is not believed: told noise is there; less than rounding is not."""
+
+
+def weighed(problem: Problem, fit: RobustFit) -> Fitted:
+    """A problem at a fit, with the poses that made it."""
+    return fitted(problem, fit.estimate, residual_weights(problem, fit.tip_kept, fit.direction_kept))
 
 
 def plain_fit(problem: Problem, start: Estimate) -> RobustFit:
@@ -153,7 +157,7 @@ def _judge(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[Bo
         fit: The fit.
         alarm: Only ask whether a closer look is due, after a fit of all poses, whose outliers widen the spread.
     """
-    at_fit = fitted(problem, fit.estimate, fit.tip_kept, fit.direction_kept)
+    at_fit = weighed(problem, fit)
     r, J, sigma, C = at_fit.residuals, at_fit.jacobian, at_fit.sigma, at_fit.covariance
     pulled = J @ C @ J.transpose(0, 2, 1)
     kept = []
@@ -192,8 +196,8 @@ def _reweighted(problem: Problem, fit: RobustFit) -> RobustFit:
     """Huber, then Tukey; every pose still counts as used, with a weight below 1."""
     estimate, weights = fit.estimate, [np.ones(len(problem.recording))] * 2
     for step in range(HUBER_STEPS + TUKEY_STEPS):
-        r = linearise(problem, estimate).residuals
-        sigma = _spread_of_one(problem, estimate)
+        model = linear_model(problem, estimate)
+        r, sigma = model.residuals, _spread_of_one(model)
         for k, block in enumerate(_blocks(problem)):
             squared = _squared(r[:, block.rows], sigma[:, block.rows, block.rows])
             size = np.sqrt(squared / _scale(squared, block))
@@ -204,10 +208,11 @@ def _reweighted(problem: Problem, fit: RobustFit) -> RobustFit:
     return RobustFit(estimate, weights[0] > STILL_USED, weights[1] > STILL_USED, steps)
 
 
-def _spread_of_one(problem: Problem, estimate: Estimate) -> Floats:
+def _spread_of_one(model: LinearModel) -> Floats:
     """Covariance of each pose's residuals, whatever the arms' lasting errors are, shape (n, k, k)."""
-    sigma, shared = problem_covariances(problem, estimate), shared_slopes(problem, estimate)
-    return sigma if shared is None else np.asarray(sigma + shared @ shared.transpose(0, 2, 1))
+    if model.shared is None:
+        return model.sigma
+    return np.asarray(model.sigma + model.shared @ model.shared.transpose(0, 2, 1))
 
 
 def _check_enough(problem: Problem, kept: Bools) -> None:

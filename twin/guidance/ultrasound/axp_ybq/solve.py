@@ -21,10 +21,9 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
     Spread,
     needle_in_image,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import RobustFit, plain_fit, robust_fit, settled
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import RobustFit, plain_fit, robust_fit, settled, weighed
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.spread import SmallSample, found_spreads, small_sample
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.suggested_poses import SuggestedPoses, propose
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import fitted
 
 SPREAD_ROUNDS = 2
 """How often the residuals' spread is found and the fit repeated with it; it settles to a few percent in two."""
@@ -135,7 +134,7 @@ def _full_fit(problem: Problem, fit: RobustFit, seen: SeenDirection, *, robust: 
 
 
 def _solution(problem: Problem, fit: RobustFit, observability: Observability) -> Solution:
-    at_fit = fitted(problem, fit.estimate, fit.tip_kept, fit.direction_kept)
+    at_fit = weighed(problem, fit)
     count = 3 * int(fit.tip_kept.sum()) + 2 * int(fit.direction_kept.sum()) * problem.with_direction
     freedom = count - len(problem.active)
     region = small_sample(problem, fit) if problem.arms is not None else None

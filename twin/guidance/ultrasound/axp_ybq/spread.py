@@ -18,9 +18,9 @@ import numpy as np
 from scipy.stats import f
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Fitted
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import UNWEIGHTED, Problem, Spread
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import LEAST_MM, RobustFit
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import Fitted, fitted
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import LEAST_MM, RobustFit, weighed
 
 LEAST_FREEDOM = 15
 """Residuals minus unknowns below which inside and across are not told apart: their ratio would be chance."""
@@ -61,7 +61,7 @@ def found_spreads(problem: Problem, fit: RobustFit) -> ResidualSpreads:
     """
     if problem.arms is not None:
         return _by_likelihood(problem, fit)
-    at_fit = fitted(problem, fit.estimate, fit.tip_kept, fit.direction_kept)
+    at_fit = weighed(problem, fit)
     turn, lean = 1.0, problem.lean_rad
     if problem.with_direction:
         turn, lean = (_direction_part(at_fit, fit, column) for column in (3, 4))
@@ -119,7 +119,7 @@ def small_sample(problem: Problem, fit: RobustFit) -> SmallSample | None:
     D = _structures(problem, fit)
     if not D:
         return None
-    at_fit = fitted(problem, fit.estimate, fit.tip_kept, fit.direction_kept)
+    at_fit = weighed(problem, fit)
     p = len(problem.active)
     own = _block_diagonal(at_fit.whitener.transpose(0, 2, 1) @ at_fit.whitener)
     slopes = at_fit.jacobian.reshape(len(own), -1)
@@ -135,7 +135,7 @@ def _by_likelihood(problem: Problem, fit: RobustFit) -> ResidualSpreads:
     found = ResidualSpreads(problem.noise if isinstance(problem.noise, Spread) else UNWEIGHTED, problem.lean_rad)
     for _ in range(STEPS):
         problem = problem._replace(noise=problem.noise if told else found.spread, lean_rad=found.lean_rad)
-        at_fit = fitted(problem, fit.estimate, fit.tip_kept, fit.direction_kept)
+        at_fit = weighed(problem, fit)
         found = _step(problem, fit, at_fit, found)
     return found
 
