@@ -31,7 +31,8 @@ from puncture_twin.planning.place.mounts import Region, Site
 from puncture_twin.planning.place.search import search_placements
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.search import case_directions, organ_candidates
+from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import case_directions
 
 AXIS_WORDS = {AGAINST_Z: "base -z", TOWARD_AXIS: "to base axis"}
 LESION_M_CT = np.array([50.0, 130.0, 63.0])

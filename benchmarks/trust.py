@@ -37,7 +37,8 @@ from puncture_twin.planning.registration.registration import MarkerPairs, fit_ri
 from puncture_twin.planning.registration.touch_poses import touching_configuration
 from puncture_twin.planning.search.chance import chance_model, chances_of, demanding, refined_chances
 from puncture_twin.planning.search.context import CaseContext, prepare
-from puncture_twin.planning.search.search import case_directions, organ_candidates
+from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import case_directions
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms

@@ -96,7 +96,7 @@ def rerank(candidates: Candidates, cost: ArrayLike) -> Candidates:
     Raises:
         InputError: Another shape, or a safe candidate without a finite cost.
     """
-    from puncture_twin.planning.search.search import ranked_by
+    from puncture_twin.planning.search.ranking import ranked_by
 
     return ranked_by(candidates, np.asarray(cost, dtype=np.float64))
 

@@ -9,7 +9,7 @@ import numpy as np
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.search import ranked
+from puncture_twin.planning.search.ranking import ranked
 
 
 def with_safe_cone(case: Case, found: Candidates, certificate: Certificate) -> Candidates:

@@ -16,9 +16,10 @@ from puncture_twin.planning.plan.motion import motion_contact, phase_clearances
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import INSERTION_MM_S
 from puncture_twin.planning.reach.goals import approach_goals
+from puncture_twin.planning.search.arm_reach import reach_request
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.search import ranked, reach_request
+from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
 
 MAX_TRIES = 20

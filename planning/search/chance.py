@@ -5,7 +5,6 @@ To first order for all; by line sampling where that may decide: near a limit, an
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +17,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.uncertainty.chances import Chances, HitModel, hit_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.planning.uncertainty.refined_touch import Needles, Surroundings, refined
@@ -268,7 +268,6 @@ def with_best_refined(
     engine: ClearanceEngine,
     found: Candidates,
     model: ChanceModel | None,
-    ranked: Callable[[Case, Candidates], Candidates],
 ) -> Candidates:
     """Refine the best candidates, reject those that break a limit then, and rank again until no new one is among them.
 
@@ -278,7 +277,6 @@ def with_best_refined(
         engine: Prepared for the meshes of ``anatomy.checked``.
         found: Ranked, with chances.
         model: As in `with_chances`.
-        ranked: Gives cost and rank to the safe candidates.
     """
     if model is None or found.chances is None:
         return found

@@ -14,7 +14,7 @@ from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Needle
 from puncture_twin.planning.clearance.measure import Clearances
 from puncture_twin.planning.reach.standoff import waiting_flange
-from puncture_twin.planning.search.candidates import Verdict
+from puncture_twin.planning.search.candidates import Candidates, Verdict
 
 Column = NDArray[Any] | str | float
 
@@ -32,7 +32,7 @@ def longest_path(needle: Needle) -> float:
     return min(needle.shaft_mm, needle.standoff_mm - needle.skin_gap_mm)
 
 
-def judge(
+def first_broken(
     paths: SkinPaths,
     clearances: Clearances,
     structures: tuple[Structure, ...],
@@ -42,7 +42,7 @@ def judge(
 ) -> Verdict:
     """Apply every constraint; the reason given is the first that is broken, in the order of the code.
 
-    Unknown regions come first among those on the path: nothing behind them can be judged. Those that only the needle
+    Unknown regions come first among those on the path: nothing behind them is known. Those that only the needle
     enters whose tip waits at its standoff come after the constraints on the path without which no tip ever waits.
 
     Args:
@@ -94,3 +94,22 @@ def worst_violation(clearances: Clearances, structures: tuple[Structure, ...]) -
     lack = np.where(clearances.violated, margins - clearances.clearance, -np.inf)
     most = lack.max(axis=1, keepdims=True)
     return np.argmin(np.where(lack == most, clearances.depth, np.inf), axis=1)
+
+
+def closest_miss(found: Candidates) -> int | None:
+    """Row of the rejected candidate that came closest: the least lack of clearance among those that lack only that.
+
+    Without such a row, the one that passed most constraints; None for no rows at all.
+    """
+    lacking = np.flatnonzero(found.verdict.reason == Reason.TOO_CLOSE.value)
+    if len(lacking):
+        demanded = ~np.isnan(found.clearance.margins)
+        lack = (found.clearance.margins - found.clearance.distance)[:, demanded].max(axis=1)
+        return int(lacking[np.argmin(lack[lacking])])
+    chances = (Reason.TOUCH_LIKELY, Reason.HIT_UNLIKELY)
+    order = (*chances, Reason.APPROACH_NOT_FOUND, Reason.INSERTION_BLOCKED, Reason.ARM_COLLISION, Reason.UNREACHABLE)
+    for reason in (*order, Reason.SKIN_ANGLE, Reason.TOO_LONG, Reason.REENTERS_SKIN, Reason.UNKNOWN_REGION):
+        rows = np.flatnonzero(found.verdict.reason == reason.value)
+        if len(rows):
+            return int(rows[0])
+    return None

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import RankingSection
+from puncture_twin.planning.search.candidates import Candidates, Ranking
 
 COMFORT_MM = 20.0
 """Clearance from which on more is no better: several times any registration error that a case should have."""
@@ -27,8 +30,8 @@ TERMS = ("clearance", "path_length", "skin_angle", "tissue", "reach", "safe_cone
 
 
 @dataclass(frozen=True, eq=False)
-class Ranking:
-    """The order of n safe candidates.
+class Order:
+    """The order of n safe candidates, by their cost.
 
     Attributes:
         terms: Shape (n, 6), each in 0..1, 0 is best, columns as `TERMS`.
@@ -43,6 +46,47 @@ class Ranking:
     pareto: NDArray[np.bool_]
 
 
+def ranked(case: Case, found: Candidates) -> Candidates:
+    """Give cost, rank and Pareto mark to the safe candidates."""
+    rows = np.flatnonzero(found.safe)
+    order = rank(
+        min_clearance=found.clearance.least[rows],
+        path_length=found.path.length[rows],
+        skin_angle=found.path.skin_angle[rows],
+        tissue=found.path.tissue[rows],
+        reach_margin=found.arm.margin[rows],
+        safe_cone=found.safe_cone[rows],
+        shaft=case.needle.shaft_mm,
+        max_skin_angle=case.search.max_skin_angle,
+        weights=case.ranking,
+        touch_chance=None if found.chances is None else found.chances.touch_any[rows],
+    )
+    blank = Ranking.none(len(found))
+    cost, ranks, pareto = blank.cost.copy(), blank.rank.copy(), blank.pareto.copy()
+    cost[rows], ranks[rows], pareto[rows] = order.cost, order.rank, order.pareto
+    return replace(found, ranking=Ranking(cost, ranks, pareto))
+
+
+def ranked_by(found: Candidates, cost: Floats) -> Candidates:
+    """The safe candidates ranked by a cost of the caller's, smaller is better; equal costs keep their order.
+
+    Args:
+        found: Candidates.
+        cost: Shape (n,); rejected candidates' entries are not looked at.
+
+    Raises:
+        InputError: Another shape, or a safe candidate whose cost is not finite.
+    """
+    rows = np.flatnonzero(found.safe)
+    if cost.shape != (len(found),) or not np.isfinite(cost[rows]).all():
+        allowed = f"shape ({len(found)},), finite for the {len(rows)} safe candidates"
+        raise InputError(f"a cost of shape {cost.shape}", where="rerank", allowed=allowed)
+    ranks = np.zeros(len(found), np.int32)
+    ranks[rows[np.argsort(cost[rows], kind="stable")]] = np.arange(1, len(rows) + 1)
+    ranking = Ranking(np.where(found.safe, cost, np.nan), ranks, found.ranking.pareto)
+    return replace(found, ranking=ranking)
+
+
 def rank(
     *,
     min_clearance: Floats,
@@ -55,13 +99,13 @@ def rank(
     max_skin_angle: float,
     weights: RankingSection,
     touch_chance: Floats | None = None,
-) -> Ranking:
+) -> Order:
     """Rank candidates; all arrays have shape (n,), mm and rad.
 
     The terms: 1 - min(clearance, 20 mm)/20 mm to the nearest structure with a margin, or where chances are known the
     risk min(1, log10(p/1e-6)/6), at least 0, of touching any; path length over usable shaft;
     skin angle over the largest allowed; length through other structures over usable shaft; 1 - reach margin
-    (0 for all where reach was not asked); 1 - min(safe cone, 5 degrees)/5 degrees (0 for all without a certificate).
+    (0 for all where reach was not checked); 1 - min(safe cone, 5 degrees)/5 degrees (0 for all without a certificate).
     """
     terms = np.stack(
         [
@@ -80,7 +124,7 @@ def rank(
     order = np.argsort(np.round(cost, TIE_DIGITS), kind="stable")
     ranks = np.empty(len(cost), np.int32)
     ranks[order] = np.arange(1, len(cost) + 1)
-    return Ranking(terms, cost, ranks, pareto_front(terms))
+    return Order(terms, cost, ranks, pareto_front(terms))
 
 
 def _risk(min_clearance: Floats, touch_chance: Floats | None) -> Floats:

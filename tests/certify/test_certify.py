@@ -33,7 +33,7 @@ from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.search import organ_candidates
+from puncture_twin.planning.search.organs import organ_candidates
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import OK
 

@@ -35,8 +35,10 @@ from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.triangle_distance import to_triangle
 from puncture_twin.planning.reach.reach import ReachAnswer, assess_reach_all
+from puncture_twin.planning.search.arm_reach import reach_request
 from puncture_twin.planning.search.context import CaseContext, prepare
-from puncture_twin.planning.search.search import case_directions, organ_candidates, reach_request
+from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import case_directions
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)

@@ -40,8 +40,10 @@ from puncture_twin.planning.place.needle_start import needle_can_start
 from puncture_twin.planning.place.obstacle_field import Boxes, SkinField
 from puncture_twin.planning.place.search import search_placements
 from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.search import ArmReach, case_directions, organ_candidates, with_reach
+from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import case_directions
 from puncture_twin.twin.jobs.patient.place_text import needle_line
 
 UR3 = ur_model("ur3")

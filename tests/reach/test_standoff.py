@@ -29,7 +29,8 @@ from puncture_twin.planning.reach.standoff import (
     waiting_flange,
 )
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.search import case_directions, organ_candidates
+from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import case_directions
 
 DEG = np.pi / 180.0
 

@@ -11,7 +11,7 @@ from puncture_twin.planning.case.case import Needle, SearchSettings
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.clearance.measure import measure
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.search.constraints import judge, longest_path
+from puncture_twin.planning.search.constraints import first_broken, longest_path
 
 NEEDLE = Needle(200.0, 150.0, 1.0, None, 10.0, 30.0)
 UP = np.array([[0.0, 0.0, 1.0]])
@@ -25,7 +25,7 @@ def verdict(skin, structures=(), direction=UP, needle=NEEDLE, target=(0, 0, 0), 
     structures = tuple(structures)
     engine = FclEngine([s.mesh for s in structures])
     found = measure(engine, structures, target, direction, length=needle.length_mm, radius=needle.radius_mm)
-    rated = judge(paths, found, structures, needle=needle, max_skin_angle=np.radians(max_angle))
+    rated = first_broken(paths, found, structures, needle=needle, max_skin_angle=np.radians(max_angle))
     return str(rated.reason[0]), str(rated.structure[0]), rated.depth[0], rated.amount[0]
 
 

@@ -17,9 +17,10 @@ from puncture_twin.planning.case.case_file import RankingSection
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.clearance.cross_check import CrossCheckError
 from puncture_twin.planning.clearance.engine import AxisDistances
+from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.ranking import pareto_front, rank
-from puncture_twin.planning.search.search import closest_miss, organ_candidates, ranked
+from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.ranking import pareto_front, rank, ranked
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.planning.search.tissue import inside_length
 from tests.carton_truth import carton_field

@@ -11,7 +11,7 @@ from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Needle
 from puncture_twin.planning.clearance.measure import Clearances
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.search.constraints import judge, longest_path, worst_violation
+from puncture_twin.planning.search.constraints import first_broken, longest_path, worst_violation
 
 NEEDLE = Needle(200.0, 150.0, 1.0, None, 10.0, 30.0)
 DOT = TriangleMesh([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
@@ -41,7 +41,7 @@ def rated(skin_rows, clearances=None, structures=(), needle=NEEDLE):
     """Verdicts as rows of (reason, structure, depth, amount)."""
     skin = paths(skin_rows)
     clearances = nothing(len(skin_rows)) if clearances is None else clearances
-    found = judge(skin, clearances, tuple(structures), needle=needle, max_skin_angle=MAX_ANGLE)
+    found = first_broken(skin, clearances, tuple(structures), needle=needle, max_skin_angle=MAX_ANGLE)
     return list(zip(found.reason, found.structure, found.depth, found.amount, strict=True))
 
 

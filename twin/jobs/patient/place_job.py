@@ -14,9 +14,12 @@ from puncture_twin.planning.case.case import mount_pose
 from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.place.document import place_document, write_place_document, write_placements
 from puncture_twin.planning.place.search import PlaceSearch, search_placements
+from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.candidates import ARM_CHECKED
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.search import ArmReach, case_directions, organ_candidates, ranked, with_reach
+from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.ranking import ranked
+from puncture_twin.planning.search.search import case_directions
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.placement_picture import draw_placements
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from puncture_twin.planning.export.exporter import Exported
+from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.explain import needle_warnings, reason_text
-from puncture_twin.planning.search.search import closest_miss
 from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
 from puncture_twin.twin.jobs.patient.run import Run
 from puncture_twin.twin.jobs.patient.summaries import plan_summary, rehearsal_summary

@@ -1,0 +1,60 @@
+"""Which of the candidates that the organs allow the arm can reach and insert along."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.progress import Count
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.reach.reach import ReachRequest, assess_reach_all
+from puncture_twin.planning.reach.standoff import standoffs
+from puncture_twin.planning.search.candidates import ARM_CHECKED, ArmColumns, Candidates, Verdict
+
+
+@dataclass(frozen=True, eq=False)
+class ArmReach:
+    """Checks whether the arm reaches a candidate: the workcell, and where the patient is in it."""
+
+    checker: CellChecker
+    T_base_ct: Floats
+
+
+def with_reach(case: Case, found: Candidates, reach: ArmReach, progress: Count | None = None) -> Candidates:
+    """Check the arm for every candidate that the organs allow; progress counts the checked ones."""
+    rows = np.flatnonzero(found.safe)
+    requests = [reach_request(case, found, int(row), reach.T_base_ct) for row in rows]
+    answers = assess_reach_all(reach.checker, requests, progress)
+    verdict = {field.name: getattr(found.verdict, field.name).copy() for field in fields(found.verdict)}
+    reachable, margin, q_insertion = (getattr(found.arm, field.name).copy() for field in fields(found.arm))
+    for row, answer in zip(rows, answers, strict=True):
+        reachable[row] = int(answer.reachable)
+        margin[row] = answer.margin
+        if answer.reachable:
+            q_insertion[row] = answer.insertion_q[-1]
+        else:
+            verdict["reason"][row], verdict["detail"][row] = answer.reason.value, answer.detail
+            verdict["structure"][row] = "" if answer.contact is None else "/".join(answer.contact)
+            depth = answer.depth_mm
+            verdict["depth"][row] = np.nan if depth is None else reach_depth(case, found, int(row), depth)
+    return replace(
+        found, verdict=Verdict(**verdict), arm=ArmColumns(reachable, margin, q_insertion), arm_note=ARM_CHECKED
+    )
+
+
+def reach_request(case: Case, candidates: Candidates, row: int, T_base_ct: Floats) -> ReachRequest:
+    """What the arm has to reach for one candidate."""
+    return ReachRequest(
+        target_base=T_base_ct[:3, :3] @ case.target_ct + T_base_ct[:3, 3],
+        outward_base=T_base_ct[:3, :3] @ candidates.outward_ct[row],
+        needle_length_mm=case.needle.length_mm,
+        standoff_mm=float(standoffs(case.needle, candidates.path.length[row], candidates.path.skin_angle[row])),
+    )
+
+
+def reach_depth(case: Case, found: Candidates, row: int, inserted_mm: float) -> float:
+    """Where the tip is after so many mm of insertion: its distance from the target along the needle, mm."""
+    return float(standoffs(case.needle, found.path.length[row], found.path.skin_angle[row])) - inserted_mm

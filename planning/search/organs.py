@@ -1,0 +1,49 @@
+"""What skin and organs allow: path, clearance and verdict of every direction, without the arm."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.skin_entry import skin_paths
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.entry import Directions
+from puncture_twin.planning.clearance.engine import ClearanceEngine
+from puncture_twin.planning.clearance.measure import measure
+from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange
+from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking
+from puncture_twin.planning.search.constraints import first_broken
+from puncture_twin.planning.search.tissue import tissue_crossed
+
+
+def organ_candidates(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> Candidates:
+    """Check every direction against skin and organs alone; nothing is ranked yet."""
+    needle, outward = case.needle, directions.outward_ct
+    checked, farthest = anatomy.checked, farthest_flange(needle, case.search.max_skin_angle)
+    paths = skin_paths(anatomy.skin, case.target_ct, outward, needle.length_mm, farthest)
+    lengths = axis_lengths(case, checked)
+    clearances = measure(engine, checked, case.target_ct, outward, length=lengths, radius=needle.radius_mm)
+    verdicts = first_broken(paths, clearances, checked, needle=needle, max_skin_angle=case.search.max_skin_angle)
+    demanding = np.array([s.demands_margin for s in checked], bool)
+    count = len(directions)
+    return Candidates(
+        theta=directions.theta,
+        beta=directions.beta,
+        outward_ct=outward,
+        verdict=verdicts,
+        path=Path(
+            entry_ct=paths.entry_ct,
+            length=paths.path_length,
+            skin_angle=paths.skin_angle,
+            tissue=tissue_crossed(checked, case.target_structure, case.target_ct, outward, paths.path_length),
+        ),
+        clearance=Clearance(
+            structures=tuple(s.name for s in checked),
+            margins=np.array([s.margin_mm if s.demands_margin else np.nan for s in checked]),
+            distance=clearances.clearance,
+            least=clearances.clearance[:, demanding].min(axis=1, initial=np.inf),
+        ),
+        arm=ArmColumns.unknown(count),
+        ranking=Ranking.none(count),
+        safe_cone=np.full(count, np.nan),
+    )
