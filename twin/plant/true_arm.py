@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from puncture_twin.planning.arm.erring_arm import ErringArm
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 
@@ -44,13 +45,7 @@ class TrueArm(NamedTuple):
 
     def link_poses(self, q_true: Floats) -> Floats:
         """T_base_link, shape (..., 7, 4, 4), mm, of true configurations (..., 6), rad: base first, flange last."""
-        q = np.asarray(q_true, dtype=np.float64) + self.joint_offsets
-        poses = np.empty((*q.shape[:-1], 7, 4, 4))
-        poses[..., 0, :, :] = np.eye(4)
-        for i in range(6):
-            step = dh_step(q[..., i], self.d[i], self.a[i], self.alpha[i])
-            poses[..., i + 1, :, :] = poses[..., i, :, :] @ step
-        return poses
+        return ErringArm(self.a, self.d, self.alpha, self.joint_offsets).link_poses(q_true)
 
     def flange_pose(self, q_true: Floats) -> Floats:
         """T_base_flange, shape (..., 4, 4), mm, of true configurations (..., 6), rad."""
@@ -88,14 +83,3 @@ def draw_true_arm(nominal: UrModel, errors: ArmErrors, rng: np.random.Generator)
         backlash_rad=errors.backlash_rad,
         repeatability_rad=errors.repeatability_rad,
     )
-
-
-def dh_step(q: Floats, d: Floats | float, a: Floats | float, alpha: Floats | float) -> Floats:
-    """T_{i-1}_{i} = Rz(q) Tz(d) Tx(a) Rx(alpha), shape (..., 4, 4), of angles (...); d, a, alpha: as many, or one."""
-    c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
-    T = np.zeros((*np.shape(q), 4, 4))
-    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2], T[..., 0, 3] = c, -s * ca, s * sa, a * c
-    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2], T[..., 1, 3] = s, c * ca, -c * sa, a * s
-    T[..., 2, 1], T[..., 2, 2], T[..., 2, 3] = sa, ca, d
-    T[..., 3, 3] = 1.0
-    return T
