@@ -65,6 +65,23 @@ def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
     return TargetRays(directions, found.ray, found.depth, np.where(from_last % 2 == 0, 1.0, -1.0))
 
 
+def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
+    """A ball about the target, as a tip sees it that is believed elsewhere: a known mean error beside the covariance.
+
+    Args:
+        offset: Shape (3,), mm, believed tip minus target, in the covariance's axes.
+        radius_mm: Of the ball.
+    """
+    directions = _fibonacci(DIRECTIONS)
+    along = directions @ offset
+    inside = along**2 - offset @ offset + radius_mm**2
+    half = np.sqrt(np.maximum(inside, 0.0))
+    depth, sign = np.concatenate([half - along, -half - along]), np.repeat([1.0, -1.0], DIRECTIONS)
+    met = (np.tile(inside, 2) > 0) & (depth > 0)
+    ray = np.tile(np.arange(DIRECTIONS), 2)
+    return TargetRays(directions, ray[met], depth[met], sign[met])
+
+
 def hit_in_mesh(rays: TargetRays, cov_ct: Floats, freedom: int | None = None) -> Floats:
     """The chance that the tip is within a mesh.
 

@@ -6,7 +6,7 @@ import trimesh
 from scipy.special import chdtr
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.uncertainty.hit import hit_in_ball, hit_in_mesh, target_rays
+from puncture_twin.planning.uncertainty.hit import hit_in_ball, hit_in_mesh, rays_to_ball, target_rays
 from puncture_twin.planning.uncertainty.quadratic_form import chance_within
 
 DRAWS = np.random.default_rng(3).normal(size=(1_000_000, 3))
@@ -56,6 +56,19 @@ def test_within_a_ball_of_triangles_from_inside_on_its_face_and_outside(deviatio
     found = hit_in_mesh(target_rays(TriangleMesh(ball.vertices, ball.faces), np.array([off, 0.0, 0.0])), cov[None])[0]
     tips = (DRAWS * deviations) @ axes.T + [off, 0, 0]
     assert found == pytest.approx(np.mean(np.sum(tips**2, axis=1) < 64), abs=0.004)
+
+
+@pytest.mark.parametrize("deviations", DEVIATIONS)
+@pytest.mark.parametrize("off", [0.0, 0.4, 2.0, 5.0])
+def test_within_a_radius_of_a_target_beside_which_the_tip_is_believed(deviations, off):
+    """A known offset beside the covariance: to .004 of a million draws; without one it is Ruben's series."""
+    cov, axes = covariance(deviations, seed=2)
+    offset = off * np.array([0.6, 0.0, 0.8])
+    found = hit_in_mesh(rays_to_ball(offset, 2.0), cov[None])[0]
+    tips = (DRAWS * deviations) @ axes.T + offset
+    assert found == pytest.approx(np.mean(np.sum(tips**2, axis=1) < 4), abs=0.004)
+    if off == 0:
+        assert found == pytest.approx(hit_in_ball(cov[None], 2.0)[0], abs=0.004)
 
 
 def test_a_target_on_a_flat_face_is_hit_half_of_the_time_at_most():
