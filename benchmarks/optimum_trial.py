@@ -10,19 +10,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
+from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors
 from puncture_twin.twin.guidance.stereo.detection import picture_detector
-from puncture_twin.twin.guidance.stereo.joint_model import LENS, Guess, Observed, Unknowns
-from puncture_twin.twin.guidance.stereo.optimum import Adjusted, bound
+from puncture_twin.twin.guidance.stereo.joint.joint_model import Guess, Observed, Unknowns
+from puncture_twin.twin.guidance.stereo.joint.optimum import Adjusted, bound
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.session import DetectorOf, run_session
-from puncture_twin.twin.guidance.stereo.stereo_room import (
-    CAMERA_AXIS_PX,
-    CAMERA_FOCAL,
-    CAMERA_SHIFT_MM,
-    CAMERA_TURN_RAD,
-    StereoWorkcell,
-)
-from puncture_twin.twin.plant.true_arm import ArmErrors, TrueArm
+from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell
 
 Floats = NDArray[np.float64]
 
@@ -59,7 +53,7 @@ def optimum_trial(case: ServoCase, seed: int, detector_of: DetectorOf = picture_
         index = case.targets.names.index(one.target)
         until = len(session.calibration.q_command) + int(end)
         floor = room_bound(room, first_stays(observed, until), spheres[:until])
-        offset = floor.offset(-1, case.targets.points[index], case.file.head.target_mm)
+        offset = floor.offset(-1, case.targets.points[index])
         seen, ball, target = one.servoed.visits[-1].seen, spheres[until - 1], room.targets_c[index]
         errors = (seen.ball_c - ball, seen.target_c - target, (seen.target_c - seen.ball_c) - (target - ball))
         bounds = (offset.ball_covariance, offset.target_covariance, offset.covariance)
@@ -80,10 +74,11 @@ def first_stays(observed: Observed, count: int) -> Observed:
 def room_bound(room: StereoWorkcell, observed: Observed, balls_c: Floats) -> Adjusted:
     """The Cramer-Rao bound at the truth of a room, the ball having been at ``balls_c`` (s, 3)."""
     guess = Guess(room.T_c_base, room.T_c_m, balls_c)
+    errors = observed.errors
     truth = Unknowns(
-        np.array([camera_errors(*pair) for pair in zip(observed.planned, room.cameras, strict=True)]),
+        np.array([camera_errors(*pair, errors) for pair in zip(observed.planned, room.cameras, strict=True)]),
         np.zeros(6),
-        arm_spreads(room.arm, observed.arm),
+        rod_errors(room, errors),
         np.zeros(6),
         np.array(room.case.markers.points),
         balls_c,
@@ -91,19 +86,23 @@ def room_bound(room: StereoWorkcell, observed: Observed, balls_c: Floats) -> Adj
     return bound(observed, guess, truth)
 
 
-def camera_errors(planned: Camera, true: Camera) -> Floats:
-    """A camera's errors (13,), in spreads: the inverse of ``camera_of`` for square pixels."""
+def camera_errors(planned: Camera, true: Camera, errors: ServoErrors) -> Floats:
+    """A camera's errors (13,), in declared deviations: the inverse of ``camera_of`` for square pixels."""
     moved = true.T_camera_c @ np.linalg.inv(planned.T_camera_c)
-    axis = np.array([true.cx - planned.cx, true.cy - planned.cy]) / CAMERA_AXIS_PX
-    turn = Rotation.from_matrix(moved[:3, :3]).as_rotvec() / CAMERA_TURN_RAD
-    focal = (true.fx / planned.fx - 1.0) / CAMERA_FOCAL
-    return np.concatenate([[focal], axis, true.distortion / LENS, turn, moved[:3, 3] / CAMERA_SHIFT_MM])
+    turn = Rotation.from_matrix(moved[:3, :3]).as_rotvec()
+    axis = [true.cx - planned.cx, true.cy - planned.cy]
+    focal, lens = true.fx / planned.fx - 1.0, true.distortion - planned.distortion
+    return in_deviations(np.concatenate([[focal], axis, lens, turn, moved[:3, 3]]), errors.camera_deviations())
 
 
-def arm_spreads(arm: TrueArm, spreads: ArmErrors) -> Floats:
-    """An arm's errors (23,), in spreads: the inverse of ``arm_of``; 0 where the spread is."""
-    nominal = arm.nominal
+def rod_errors(room: StereoWorkcell, errors: ServoErrors) -> Floats:
+    """Errors of arm and ball (26,), in declared deviations: the inverse of ``rod_poses``."""
+    arm, nominal = room.arm, room.arm.nominal
     lengths = np.concatenate([arm.a - nominal.a, np.delete(arm.d - nominal.d, 1)])
-    parts = [(lengths, spreads.link_mm), (arm.alpha - nominal.alpha, spreads.twist_rad),
-             (arm.joint_offsets, spreads.joint_rad)]  # fmt: skip
-    return np.concatenate([part / spread if spread > 0 else np.zeros_like(part) for part, spread in parts])
+    every = np.concatenate([lengths, arm.alpha - nominal.alpha, arm.joint_offsets, room.tool.ball_offset])
+    return in_deviations(every, errors.arm_deviations())
+
+
+def in_deviations(errors: Floats, deviations: Floats) -> Floats:
+    """Errors over their deviations; 0 where the deviation is."""
+    return np.where(deviations > 0, errors / np.where(deviations > 0, deviations, 1.0), 0.0)

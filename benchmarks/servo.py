@@ -59,7 +59,8 @@ def figures(case: ServoCase, seeds: int, jobs: int) -> None:
     """The figures to reach, each beside what was measured."""
     print(f"figures: {seeds} seeds x {len(case.targets.names)} targets; mean max; mm\n{HEAD}")
     near = study("UR-like arm", case, seeds, jobs)
-    paper = study("UR-like arm, markers as the paper's", varied(case, head={"marker_mm": PAPER_MARKER_MM}), seeds, jobs)
+    as_paper = varied(case, errors={"marker_mm": PAPER_MARKER_MM})
+    paper = study("UR-like arm, markers as the paper's", as_paper, seeds, jobs)
     checks = (
         ("stereo mean", near.stereo_mean, 0.05),
         ("stereo max", near.stereo_max, 0.10),
@@ -85,8 +86,8 @@ def sensitivity(case: ServoCase, seeds: int, jobs: int) -> None:
          {"cameras": {"model_distortion": False, "distortion": [-0.3, 0.02, 0.0005, -0.0005]}}),
         ("noise 6 grey levels", {"cameras": {"noise_grey": 6.0}}),
         ("baseline 200 mm", {"cameras": {"baseline_mm": 200.0}}),
-        ("backlash 0.3 deg", {"robot": {"backlash_deg": 0.3}}),
-        ("repeatability 0.02 deg", {"robot": {"repeatability_deg": 0.02}}),
+        ("backlash 0.3 deg", {"errors": {"backlash_deg": 0.3}}),
+        ("repeatability 0.02 deg", {"errors": {"repeatability_deg": 0.02}}),
         ("15 % of the ball hidden", {"cameras": {"occlusion": 0.15}}),
         ("30 % of the ball hidden", {"cameras": {"occlusion": 0.30}}),
         ("a lamp instead of diffuse light", {"cameras": {"light": "lamp"}}),

@@ -32,5 +32,5 @@ def varied(case: ServoCase, **sections: dict[str, Any]) -> ServoCase:
     """
     content = case.file.model_dump(by_alias=True)
     for section, keys in sections.items():
-        content[section] |= keys
+        content[section] = (content[section] or {}) | keys
     return replace(case, file=type(case.file).model_validate(content))

@@ -1,6 +1,5 @@
 """A servo session without pictures, for tests: the embedded head, a drawn arm, pixels with normal errors."""
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -9,13 +8,13 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.registration import fit_rigid
-from puncture_twin.twin.guidance.stereo.joint_model import LENS, Guess, Observed, Unknowns
+from puncture_twin.twin.guidance.stereo.joint.erring_rod import N_ROD
+from puncture_twin.twin.guidance.stereo.joint.joint_model import Guess, Observed, Unknowns
 from puncture_twin.twin.guidance.stereo.poses import configurations, rod_orientation
 from puncture_twin.twin.guidance.stereo.robot_calibration import grid_points
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.stereo.servo_law import HeldRod, ball_base
 from puncture_twin.twin.guidance.stereo.stereo_room import (
-    arm_errors,
     calibration_frame,
     draw_workcell,
     head_pose,
@@ -62,10 +61,9 @@ def simulate(seed, stays=2):
     """A session up to the marker pictures and a few stays at targets, everything with normal errors."""
     rng = np.random.default_rng(seed)
     room = draw_workcell(CASE, rng)
-    lens = rng.normal(size=(2, 4))
-    cameras = [replace(c, distortion=np.array(LENS) * u) for c, u in zip(room.cameras, lens, strict=True)]
+    cameras = room.cameras
     q = start_configurations()[: 12 + stays]
-    spread = np.sqrt(room.arm.repeatability_rad**2 + room.arm.backlash_rad**2 / 12)
+    spread = np.sqrt(room.arm.repeatability_rad**2 + room.arm.backlash_rad**2 / 4)
     spheres = room.ball_c(q + rng.normal(0.0, spread, q.shape))
     pixels, markers = ([c.project(p) for c in cameras] for p in (spheres, room.markers_c))
     pixels, markers = (np.array(p) + rng.normal(0.0, PIXEL_PX, np.shape(p)) for p in (pixels, markers))
@@ -76,8 +74,7 @@ def simulate(seed, stays=2):
     T_c_m = np.linalg.inv(calibration_frame(CASE)) @ head_pose(CASE)
     guess = Guess(T_c_base, T_c_m, np.concatenate([measured, apply(T_c_base, ball_base(HELD, q[12:]))]))
     observed = Observed(
-        planned_cameras(CASE), HELD, arm_errors(CASE), q, pixels, round_errors[0], measured, MEASURING_MM, markers,
-        round_errors[1], image, IMAGE_MM,
+        planned_cameras(CASE), HELD, CASE.errors, q, pixels, round_errors[0], measured, markers, round_errors[1], image
     )  # fmt: skip
-    truth = Unknowns(np.zeros((2, 13)), np.zeros(6), np.zeros(23), np.zeros(6), CASE.markers.points.copy(), spheres)
+    truth = Unknowns(np.zeros((2, 13)), np.zeros(6), np.zeros(N_ROD), np.zeros(6), CASE.markers.points.copy(), spheres)
     return Simulated(observed, guess, spheres, room.targets_c, room, truth)

@@ -16,7 +16,6 @@ MOST_MODULES = 16
 """A folder that a person can take in at a glance."""
 
 PLANT_IN_GUIDANCE = {
-    "puncture_twin.twin.guidance.stereo.joint_model",
     "puncture_twin.twin.guidance.stereo.stereo_room",
     "puncture_twin.twin.guidance.ultrasound.selfcal_case",
     "puncture_twin.twin.guidance.ultrasound.selfcal_truth",
@@ -75,6 +74,14 @@ def test_guidance_never_sees_the_plant():
     guidance, plant = f"{NAME}.twin.guidance", [f"{NAME}.twin.plant"]
     assert broken(guidance, plant, but=PLANT_IN_GUIDANCE) == []
     assert {line.split()[0] for line in broken(guidance, plant)} == PLANT_IN_GUIDANCE
+
+
+def test_the_cameras_estimate_believes_what_is_declared_and_nothing_else():
+    """It sees neither plant nor drawn room, and nobody takes a number from the module that draws it."""
+    stereo = f"{NAME}.twin.guidance.stereo"
+    assert broken(f"{stereo}.joint", [f"{NAME}.twin.plant", f"{stereo}.stereo_room"]) == []
+    taken = {line.rpartition(".")[2] for line in broken(stereo, [f"{stereo}.stereo_room"])}
+    assert {name for name in taken if name.isupper()} == set()
 
 
 def test_the_ways_of_guidance_do_not_meet():

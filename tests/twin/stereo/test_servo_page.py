@@ -1,5 +1,6 @@
 """The words and the page of a servo session, from plain numbers."""
 
+import json
 import re
 
 import numpy as np
@@ -7,23 +8,48 @@ import pytest
 from PIL import Image
 from servo_world import CASE
 
+from benchmarks.servo_variants import varied
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, TargetRow, statistics
+from puncture_twin.twin.guidance.stereo.experiment import (
+    DeclarationTest,
+    ServoTrial,
+    TargetRow,
+    needle_statistics,
+    statistics,
+)
+from puncture_twin.twin.guidance.stereo.joint.needle_outcome import NeedleOutcome
 from puncture_twin.twin.jobs.servo.facts import paper_facts, servo_facts
 from puncture_twin.twin.jobs.servo.page import write_servo_page
 from puncture_twin.twin.jobs.servo.text import servo_text
 
 
+def needle(predicted, realised, square, hit):
+    """A needle's outcome, of which the rest does not matter here."""
+    return NeedleOutcome(predicted, 0.05, (0.5, 0.4, 0.3), 0.2, 0.1, 0.2, 0.9, realised, 0.15, square, 5.0, hit)
+
+
 def trials():
     """Two seeds of two targets, one not confirmed; a third seed that could not be held."""
     rows = [
-        TargetRow(1, "T1", 0.30, 0.25, 0.9, 0.31, 0.05, 1, "converged"),
+        TargetRow(
+            1,
+            "T1",
+            0.30,
+            0.25,
+            0.9,
+            0.31,
+            0.05,
+            1,
+            "converged",
+            needle(0.9, 1.2, 9.0, False),
+            needle(0.3, 0.4, 2.0, True),
+        ),
         TargetRow(1, "T2", 0.20, 0.25, 1.1, 0.25, 0.15, 10, "tolerance_not_reached"),
         TargetRow(2, "T1", 0.10, 0.25, 0.7, 0.12, 0.04, 2, "converged"),
         TargetRow(2, "T2", 0.40, 0.25, 0.5, 0.32, 0.08, 1, "converged"),
     ]
-    held = [ServoTrial(seed, (0.01, 0.03), (0.02, 0.03), 0.4, 0.2, tuple(r for r in rows if r.seed == seed), "")
-            for seed in (1, 2)]  # fmt: skip
+    held = [ServoTrial(seed, (0.01, 0.03), (0.02, 0.03), 0.4, 0.2, tuple(r for r in rows if r.seed == seed), "",
+                        DeclarationTest(300.0, 200) if seed == 1 else None) for seed in (1, 2)]  # fmt: skip
     return [*held, ServoTrial(3, (), (), float("nan"), float("nan"), (), "calibration, point 4: camera 1: few_inliers")]
 
 
@@ -55,6 +81,25 @@ def test_the_words_say_what_was_not_reached():
     assert facts["stops"] == {"converged": 3, "tolerance_not_reached": 1}
 
 
+def test_needles_are_told_beside_what_was_predicted():
+    """Rms, share in the ellipsoid, hits and the declaration's test, against the rows; a wrong belief is said first."""
+    rows = [row for one in trials() for row in one.rows]
+    ours = needle_statistics([row.needle_servoed for row in rows])
+    assert (ours.needles, ours.realised_rms_mm, ours.coverage_95, ours.hit_share) == (1, 0.4, 1.0, 1.0)
+    assert needle_statistics([row.needle_open_loop for row in rows]).coverage_95 == 0.0
+    assert needle_statistics([None]) is None
+    facts = servo_facts(CASE, trials(), statistics(trials()))
+    text = servo_text({**facts, "files": []})
+    assert "p = 0.000; WARNING: they are larger than declared" in text
+    assert "T2     unknown: nothing was seen at the end" in text
+    assert "wrong by design" not in text
+    assert facts["needle"]["declared"]["joint_deg"] == pytest.approx(0.05)
+    assert facts["sessions"][0]["targets"][0]["needle_servoed"]["in_region"]
+    json.dumps(facts, allow_nan=False)
+    wrong = varied(CASE, rehearsal={"errors": CASE.errors.scaled(2.0).stated()})
+    assert "wrong by design" in servo_text({**servo_facts(wrong, trials(), statistics(trials())), "files": []})
+
+
 def test_the_page_needs_no_network_and_shows_every_number(tmp_path):
     """Pictures are embedded, nothing is loaded, and cards, rows and the paper's columns are there."""
     picture = tmp_path / "one.png"
@@ -70,6 +115,8 @@ def test_the_page_needs_no_network_and_shows_every_number(tmp_path):
     assert "tolerance not reached" in text
     assert "1.47 / 2.41 (not what the rows give)" in text
     assert "1.479 / 2.41" in text
+    assert "The needle against the anatomy" in text
+    assert "1.200 / 0.900" in text
     without = tmp_path / "plain.html"
     write_servo_page(CASE, facts, [picture], picture, without)
     assert "Liu et al." not in without.read_text(encoding="utf-8")

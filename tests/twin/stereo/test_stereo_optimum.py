@@ -6,8 +6,8 @@ from servo_world import CASE, HELD, IMAGE_MM, simulate
 
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.twin.guidance.stereo.joint_model import JointModel, first_unknowns
-from puncture_twin.twin.guidance.stereo.optimum import adjust, bound
+from puncture_twin.twin.guidance.stereo.joint.joint_model import JointModel, first_unknowns
+from puncture_twin.twin.guidance.stereo.joint.optimum import adjust, bound
 from puncture_twin.twin.guidance.stereo.servo_law import ball_base
 
 TARGET = CASE.targets.points[1]
@@ -77,14 +77,13 @@ def test_the_offset_knows_that_ball_and_target_err_together(one):
 def test_a_perfect_session_is_found_exactly(one):
     """Without errors in the pixels of a nominal room the adjustment returns the truth."""
     observed, cameras = one.observed, one.observed.planned
-    flat = [type(c)(**{**vars(c), "distortion": np.zeros(4)}) for c in cameras]
     x = first_unknowns(observed, one.guess)
     balls = apply(one.guess.T_c_base, ball_base(HELD, observed.q_command))
     markers = apply(one.guess.T_c_m, CASE.markers.points)
     exact = type(observed)(**{
         **vars(observed),
-        "pixels": np.array([c.project(balls) for c in flat]),
-        "marker_pixels": np.array([c.project(markers) for c in flat]),
+        "pixels": np.array([c.project(balls) for c in cameras]),
+        "marker_pixels": np.array([c.project(markers) for c in cameras]),
         "measured_c": balls[:12],
         "markers_m": CASE.markers.points,
     })  # fmt: skip

@@ -7,11 +7,13 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import chdtrc
 
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.planning.base.progress import Count, uncounted
 from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.twin.guidance.stereo.joint.needle_outcome import NeedleOutcome
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import ServoStop
 from puncture_twin.twin.guidance.stereo.session import Session, run_session
@@ -33,6 +35,23 @@ class TargetRow(NamedTuple):
     servo_only_mm: float
     steps: int
     stop: str
+    needle_open_loop: NeedleOutcome | None = None
+    """The needle where the robot alone brought it, predicted and realised; None where there is no prediction."""
+    needle_servoed: NeedleOutcome | None = None
+    """Likewise at the last look of the servo."""
+
+
+class DeclarationTest(NamedTuple):
+    """Are the measurements as far apart as the declared errors make them?"""
+
+    chi_squared: float
+    """Of the joint estimate's residuals."""
+    freedom: int
+
+    @property
+    def p(self) -> float:
+        """Chance of residuals so large, or larger, if the declaration holds."""
+        return float(chdtrc(self.freedom, self.chi_squared))
 
 
 class ServoTrial(NamedTuple):
@@ -46,6 +65,25 @@ class ServoTrial(NamedTuple):
     rows: tuple[TargetRow, ...]
     refused: str
     """Why the session could not be held at all; empty when it was."""
+    declaration: DeclarationTest | None = None
+    """Of everything that was measured; None where the joint estimate does not settle."""
+
+
+class NeedleStatistics(NamedTuple):
+    """Predicted beside realised, over the needles of all seeds that have a prediction; mm."""
+
+    needles: int
+    predicted_rms_mm: float
+    realised_rms_mm: float
+    predicted_direction_deg: float
+    """Rms."""
+    realised_direction_deg: float
+    """Rms."""
+    coverage_95: float
+    """Share of the 95 % ellipsoids that hold the true tip."""
+    hit_share: float | None
+    """None where the case states no radius."""
+    mean_p_hit: float | None
 
 
 class Statistics(NamedTuple):
@@ -87,12 +125,31 @@ def trial(session: Session) -> ServoTrial:
             one.servo_only_mm,
             one.servoed.steps,
             str(one.servoed.stop),
+            one.unseen,
+            one.seen,
         )
         for one in session.reached
     )
     stereo = tuple(float(error) for error in session.stereo_mm)
     residual = float(np.mean(session.calibration.robot_residual_mm))
-    return ServoTrial(session.seed, stereo, session.calibration.rms_px, session.mapping.fre_mm, residual, rows, "")
+    held = (session.calibration.rms_px, session.mapping.fre_mm, residual, rows, "", _declaration(session))
+    return ServoTrial(session.seed, stereo, *held)
+
+
+def _declaration(session: Session) -> DeclarationTest | None:
+    try:
+        found = session.guide.adjusted()
+    except NoAnswerError:
+        return None
+    return DeclarationTest(found.chi2, found.freedom)
+
+
+def declaration_test(trials: Sequence[ServoTrial]) -> DeclarationTest | None:
+    """All seeds together; None where none has a test."""
+    known = [one.declaration for one in trials if one.declaration is not None]
+    if not known:
+        return None
+    return DeclarationTest(sum(one.chi_squared for one in known), sum(one.freedom for one in known))
 
 
 def run_trial(case: ServoCase, seed: int, empty: StateChecker | None = None) -> ServoTrial:
@@ -163,4 +220,26 @@ def statistics(trials: Sequence[ServoTrial]) -> Statistics:
         float(only.max()),
         float(np.median([row.steps for row in rows])),
         float(np.mean([row.stop != ServoStop.CONVERGED for row in rows])),
+    )
+
+
+def needle_statistics(outcomes: Sequence[NeedleOutcome | None]) -> NeedleStatistics | None:
+    """What needles say together; None where none has a prediction. Those of one seed share a room."""
+    known = [one for one in outcomes if one is not None]
+    if not known:
+        return None
+
+    def rms(name: str) -> float:
+        return float(np.sqrt(np.mean([getattr(one, name) ** 2 for one in known])))
+
+    chances = [one.p_hit for one in known if one.p_hit is not None]
+    return NeedleStatistics(
+        needles=len(known),
+        predicted_rms_mm=rms("predicted_rms_mm"),
+        realised_rms_mm=rms("realised_mm"),
+        predicted_direction_deg=rms("predicted_direction_deg"),
+        realised_direction_deg=rms("realised_direction_deg"),
+        coverage_95=float(np.mean([one.in_region for one in known])),
+        hit_share=float(np.mean([bool(one.hit) for one in known])) if chances else None,
+        mean_p_hit=float(np.mean(chances)) if chances else None,
     )

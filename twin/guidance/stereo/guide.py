@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.guidance.stereo.detection import Detections, Detector, LocatedPair, Search, in_space, look_at
-from puncture_twin.twin.guidance.stereo.joint_model import Guess, Observed, Unknowns
+from puncture_twin.twin.guidance.stereo.joint.joint_model import Guess, Observed, Unknowns
+from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleError, open_loop_error, servoed_error
+from puncture_twin.twin.guidance.stereo.joint.optimum import Adjusted, adjust
 from puncture_twin.twin.guidance.stereo.mapping import Mapping
-from puncture_twin.twin.guidance.stereo.optimum import Adjusted, adjust
 from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration, held_rod
 from puncture_twin.twin.guidance.stereo.servo_law import ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, arm_errors, planned_cameras
+from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, planned_cameras
 
 
 class Known(NamedTuple):
@@ -45,6 +48,8 @@ class Guide:
         self._q = [*calibration.q_command]
         self._pixels = [*calibration.pixels.transpose(1, 0, 2)]
         self._covariances = [*calibration.covariances.transpose(1, 0, 2, 3)]
+        self._balls = [*calibration.measured_c]
+        self._found: Adjusted | None = None
         self.target_m = np.zeros(3)
         self.target_c = np.zeros(3)
 
@@ -74,53 +79,71 @@ class Guide:
 
     def _judge(self, detections: Detections) -> Seen:
         points = in_space(self._calibration.cameras, detections)
+        self._balls.append(points.points_c[0])
         return Seen(points.points_c[0], self.target_c, points.covariance[0])
+
+    def needle_unseen(self, q_command: Floats) -> NeedleError | None:
+        """What is believed of the needle where the arm is sent, (6,), rad; None where the estimate does not settle."""
+        return self._believed(lambda found: open_loop_error(found, q_command, self.target_m))
+
+    def needle_seen(self) -> NeedleError | None:
+        """What is believed of the needle since the last look at its ball, of which there was one; None likewise."""
+        return self._believed(lambda found: servoed_error(found, -1, self.target_m))
+
+    def _believed(self, ask: Callable[[Adjusted], NeedleError]) -> NeedleError | None:
+        try:
+            return ask(self.adjusted())
+        except NoAnswerError:
+            return None
+
+    def adjusted(self) -> Adjusted:
+        """The joint estimate of everything measured so far.
+
+        Raises:
+            NoAnswerError: It does not settle.
+        """
+        if self._found is None or len(self._found.unknowns.balls_c) < len(self._balls):
+            guess = Guess(self._T_c_base, self._mapping.T_c_m, np.array(self._balls))
+            start = None if self._found is None else self._with_new_balls(self._found.unknowns)
+            self._found = adjust(self.observed(), guess, start)
+        return self._found
+
+    def _with_new_balls(self, last: Unknowns) -> Unknowns:
+        new = np.array(self._balls[len(last.balls_c) :]).reshape(-1, 3)
+        return last._replace(balls_c=np.concatenate([last.balls_c, new]))
 
     def observed(self) -> Observed:
         """Everything measured so far: the stays of the calibration first, then every look that found the ball."""
-        case = self._case
+        case, marks = self._case, self._markers
         return Observed(
             planned_cameras(case),
             self._held,
-            arm_errors(case),
+            case.errors,
             np.array(self._q),
             np.stack(self._pixels, axis=1),
-            np.stack(self._covariances, axis=1),
+            self._of_pixels(np.stack(self._covariances, axis=1)),
             self._calibration.measured_c,
-            case.file.calibration.measuring_arm_mm,
-            np.stack([m.pixels for m in self._markers], axis=1),
-            np.stack([m.covariances for m in self._markers], axis=1),
+            np.stack([m.pixels for m in marks], axis=1),
+            self._of_pixels(np.stack([m.covariances for m in marks], axis=1)),
             self._markers_m,
-            case.file.head.marker_mm,
         )
+
+    def _of_pixels(self, told: Floats) -> Floats:
+        """Covariances (c, n, 2, 2), px^2: what is declared, else what the tracker told of each picture."""
+        declared = self._case.errors.ball_px
+        return told if declared is None else np.broadcast_to(declared**2 * np.eye(2), told.shape)
 
 
 class JointGuide(Guide):
     """The joint estimate: every picture of the session, the servo's own among them, is adjusted together."""
 
-    def __init__(self, known: Known) -> None:
-        super().__init__(known)
-        self._spheres = [*known.calibration.measured_c]
-        self._last: Unknowns | None = None
-
     def aim_at(self, target_m: Floats) -> None:
         """Name the target; it moves as the estimate does."""
         self.target_m = target_m
-        self.target_c = self._adjusted().offset(0, target_m).target_c
+        self.target_c = self.adjusted().offset(0, target_m).target_c
 
     def _judge(self, detections: Detections) -> Seen:
-        self._spheres.append(in_space(self._calibration.cameras, detections).points_c[0])
-        found = self._adjusted().offset(-1, self.target_m)
+        super()._judge(detections)
+        found = self.adjusted().offset(-1, self.target_m)
         self.target_c = found.target_c
         return Seen(found.ball_c, found.target_c, found.ball_covariance)
-
-    def _adjusted(self) -> Adjusted:
-        guess = Guess(self._T_c_base, self._mapping.T_c_m, np.array(self._spheres))
-        start = None if self._last is None else self._with_new_ball(self._last)
-        found = adjust(self.observed(), guess, start)
-        self._last = found.unknowns
-        return found
-
-    def _with_new_ball(self, last: Unknowns) -> Unknowns:
-        new = np.array(self._spheres[len(last.balls_c) :]).reshape(-1, 3)
-        return last._replace(balls_c=np.concatenate([last.balls_c, new]))

@@ -103,7 +103,7 @@ def calibrate_by_robot(
         contact = path_contact(checker, np.stack([start, end]))
         if contact is not None:
             raise NoAnswerError(f"calibration: {contact.body} would touch {contact.other} on the way to point {number}")
-    sigma, q_true = case.file.calibration.measuring_arm_mm, q_command[0]
+    sigma, q_true = case.truth_errors.measuring_mm, q_command[0]
     measured, detections, stood = [], [], []
     for number, q in enumerate(q_command, start=1):
         q_true = room.arm.settle(q, q_true, rng)

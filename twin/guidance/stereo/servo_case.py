@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -20,6 +21,8 @@ from puncture_twin.planning.formats.points.point_files import NamedPoints, parse
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.registration.registration import MIN_MARKERS
+from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors, declared_errors
+from puncture_twin.twin.guidance.stereo.errors_section import ServoErrorsSection, ServoRehearsalSection
 
 CASE_NAME = "servo.toml"
 ALLOWED_CASE = "a TOML servo case with schema = 1, or a folder with servo.toml"
@@ -51,14 +54,14 @@ class CamerasSection(Section):
 
 
 class ServoRobotSection(Section):
-    """The arm, and how far it is from its nominal model: standard deviations, and the full width of the play."""
+    """The arm; how far it is from its nominal model stands here under older names of ``[errors]``."""
 
     model: Name = "ur3"
-    link_mm: Millimetres = 0.0
-    twist_deg: SmallDegrees = 0.0
-    joint_deg: SmallDegrees = 0.0
-    backlash_deg: SmallDegrees = 0.0
-    repeatability_deg: SmallDegrees = 0.0
+    link_mm: Millimetres | None = None
+    twist_deg: SmallDegrees | None = None
+    joint_deg: SmallDegrees | None = None
+    backlash_deg: SmallDegrees | None = None
+    repeatability_deg: SmallDegrees | None = None
 
 
 class ToolSection(Section):
@@ -88,7 +91,7 @@ class CalibrationSection(Section):
 
     center_mm: Vector
     size_mm: tuple[Length, Length, Length] = (160.0, 120.0, 120.0)
-    measuring_arm_mm: Annotated[Number, Field(ge=0, le=1)] = 0.01
+    measuring_arm_mm: Annotated[Number, Field(ge=0, le=1)] | None = None
     tilt_deg: Annotated[Number, Field(ge=-60, le=60)] | None = None
 
 
@@ -102,8 +105,14 @@ class HeadSection(Section):
     position_mm: Vector
     yaw_deg: Annotated[Number, Field(ge=-360, le=360)] = 0.0
     marker_diameter_mm: Annotated[Number, Field(ge=1, le=100)] = 8.0
-    marker_mm: Millimetres = 0.3
-    target_mm: Millimetres = 0.0
+    marker_mm: Millimetres | None = None
+    target_mm: Millimetres | None = None
+
+
+class ServoTargetSection(Section):
+    """When a needle hits: within which distance of a target its tip ends."""
+
+    hit_radius_mm: Annotated[Number, Field(gt=0, le=100)] | None = None
 
 
 class ServoSection(Section):
@@ -130,6 +139,15 @@ class BoxSection(Section):
     size_mm: tuple[Length, Length, Length]
 
 
+OLDER_NAMES = (
+    *(("robot", key) for key in ("link_mm", "twist_deg", "joint_deg", "backlash_deg", "repeatability_deg")),
+    ("calibration", "measuring_arm_mm"),
+    ("head", "marker_mm"),
+    ("head", "target_mm"),
+)
+"""Sections and keys that are called alike in ``[errors]``."""
+
+
 class ServoFile(Section):
     """The whole file."""
 
@@ -141,8 +159,25 @@ class ServoFile(Section):
     tool: ToolSection = ToolSection()
     calibration: CalibrationSection
     head: HeadSection
+    target: ServoTargetSection = ServoTargetSection()
     servo: ServoSection = ServoSection()
+    errors: ServoErrorsSection | None = None
+    rehearsal: ServoRehearsalSection = ServoRehearsalSection()
     box: tuple[BoxSection, ...] = ()
+
+    @model_validator(mode="after")
+    def _errors_are_declared_once(self) -> Self:
+        if self.errors is None and self.rehearsal.errors is not None:
+            raise ValueError("[rehearsal.errors] is a truth that differs from [errors], which is not there")
+        for section, key in OLDER_NAMES:
+            if getattr(getattr(self, section), key) is not None and getattr(self.errors, key, None) is not None:
+                raise ValueError(f"{section}.{key} and errors.{key} state the same error; keep errors.{key}")
+        return self
+
+    @property
+    def stated_elsewhere(self) -> dict[str, float | None]:
+        """Declared errors that other tables state under the same names."""
+        return {key: getattr(getattr(self, section), key) for section, key in OLDER_NAMES}
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,6 +204,22 @@ class ServoCase:
     def name(self) -> str:
         """The case's name."""
         return self.file.name
+
+    @cached_property
+    def errors(self) -> ServoErrors:
+        """What is declared; all that guidance believes of errors."""
+        return declared_errors(self.file.errors or ServoErrorsSection(), self.file.stated_elsewhere)
+
+    @cached_property
+    def truth_errors(self) -> ServoErrors:
+        """From what the truth is drawn: what is declared, unless ``[rehearsal.errors]`` states another on purpose."""
+        other = self.file.rehearsal.errors
+        return self.errors if other is None else declared_errors(other, {})
+
+    @property
+    def wrong_belief(self) -> bool:
+        """Whether the truth is drawn from other errors than the belief declares, on purpose."""
+        return self.file.rehearsal.errors is not None
 
 
 def load_servo_case(path: Path | str) -> ServoCase:

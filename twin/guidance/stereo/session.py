@@ -22,6 +22,8 @@ from puncture_twin.twin.guidance.stereo.detection import (
     picture_detector,
 )
 from puncture_twin.twin.guidance.stereo.guide import Guide, JointGuide, Known
+from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleError
+from puncture_twin.twin.guidance.stereo.joint.needle_outcome import NeedleOutcome, needle_outcome
 from puncture_twin.twin.guidance.stereo.mapping import Mapping, SeenMarkers, map_head
 from puncture_twin.twin.guidance.stereo.poses import configurations, path_upward
 from puncture_twin.twin.guidance.stereo.robot_calibration import (
@@ -60,6 +62,10 @@ class Reached(NamedTuple):
     """The same at the end."""
     servo_only_mm: float
     """True ball to estimated target at the end: what the servo answers for."""
+    unseen: NeedleOutcome | None = None
+    """The needle where the robot alone brought it; None where it could not start, or nothing can be predicted."""
+    seen: NeedleOutcome | None = None
+    """The needle at the last look, if there was one."""
 
     @property
     def confirmed(self) -> bool:
@@ -126,8 +132,9 @@ def run_session(
     detector = detector_of(room, parts.pictures)
     calibration = calibrate_by_robot(room, detector, empty or workcell_checker(case, None), parts.arm)
     stereo_mm = _try_stereo(room, calibration, detector, parts.tests)
-    markers_m = case.markers.points + parts.image.normal(0.0, case.file.head.marker_mm, case.markers.points.shape)
-    targets_m = case.targets.points + parts.image.normal(0.0, case.file.head.target_mm, case.targets.points.shape)
+    truth = case.truth_errors
+    markers_m = case.markers.points + parts.image.normal(0.0, truth.marker_mm, case.markers.points.shape)
+    targets_m = case.targets.points + parts.image.normal(0.0, truth.target_mm, case.targets.points.shape)
     seen = see_markers(room, calibration, detector, parts.tests)
     mapping = _map(case, calibration, seen, markers_m, targets_m)
     joint = case.file.servo.estimate == "joint"
@@ -163,7 +170,7 @@ def _map(
     points = [in_space(calibration.cameras, detections) for detections in seen]
     markers = SeenMarkers(np.concatenate([p.points_c for p in points]), np.concatenate([p.covariance for p in points]))
     names = case.markers.names
-    return map_head(names, markers, markers_m, case.file.head.marker_mm, targets_m, where=f"{case.path}: mapping")
+    return map_head(names, markers, markers_m, case.errors.marker_mm, targets_m, where=f"{case.path}: mapping")
 
 
 def _try_stereo(
@@ -210,12 +217,12 @@ def _reach_all(
         limits.max_step_mm, float(np.radians(limits.max_joint_step_deg)), float(np.radians(limits.max_drift_deg))
     )
     task = Task(held, calibration.T_base_c, limits.tolerance_mm, limits.max_steps, limits.looks, steps, checker)
-    expected = mapping.expected_tre_mm(targets_m, case.file.head.target_mm)
+    expected = mapping.expected_tre_mm(targets_m, case.errors.target_mm)
     q_true, reached = calibration.q_true[-1], []
     for row, index in enumerate(chosen):
         q_true = room.arm.settle(q[len(chosen) + row], q_true, rng)
         guide.aim_at(targets_m[index])
-        one = _Aim(names[index], room.targets_c[index], float(expected[index]))
+        one = _Aim(index, names[index], room.targets_c[index], float(expected[index]))
         done = _reach(room, guide, task, q[len(chosen) + row], q[row], q_true, one, rng)
         q_true = room.arm.settle(q[len(chosen) + row], done.servoed.q_true, rng)
         reached.append(done)
@@ -223,6 +230,7 @@ def _reach_all(
 
 
 class _Aim(NamedTuple):
+    number: int
     name: str
     target_c: Floats
     expected_mm: float
@@ -239,9 +247,10 @@ def _reach(
     rng: np.random.Generator,
 ) -> Reached:
     """From where the arm hovers onto the target by the robot alone, then by the servo."""
-    contact = path_contact(task.checker, np.stack([q_hover, q_aim]))
+    contact, unseen, seen = path_contact(task.checker, np.stack([q_hover, q_aim])), None, None
     if contact is None:
         q_true = room.arm.settle(q_aim, q_true, rng)
+        unseen = _outcome(room, guide.needle_unseen(q_aim), q_true, aim)
     before = float(np.linalg.norm(room.ball_c(q_true) - aim.target_c))
     if contact is None:
         state = [q_true]
@@ -251,6 +260,7 @@ def _reach(
             return state[0]
 
         done = servo(task, q_aim, q_true, guide.look, drive)
+        seen = _outcome(room, guide.needle_seen(), done.q_true, aim) if _was_seen(done) else None
     else:
         done = Servoed(ServoStop.CONTACT, (), q_hover, q_true, f"{contact.body} and {contact.other}")
     ball, estimated = room.ball_c(done.q_true), guide.target_c
@@ -262,4 +272,16 @@ def _reach(
         before,
         float(np.linalg.norm(ball - aim.target_c)),
         float(np.linalg.norm(ball - estimated)),
+        unseen,
+        seen,
     )
+
+
+def _was_seen(done: Servoed) -> bool:
+    """Whether the ball was seen where the arm ended."""
+    return bool(done.visits) and done.visits[-1].q_true is done.q_true
+
+
+def _outcome(room: StereoWorkcell, believed: NeedleError | None, q_true: Floats, aim: _Aim) -> NeedleOutcome | None:
+    radius = room.case.file.target.hit_radius_mm
+    return None if believed is None else needle_outcome(believed, room.needle_m(q_true, aim.number), radius)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,20 +19,26 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.crossings import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import apply, exp_rotation, frame_yz, pose
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, frame_yz, pose, turned_about
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, stereo_pair, tangent_axes
+from puncture_twin.twin.guidance.stereo.declared_errors import CameraErrors
+from puncture_twin.twin.guidance.stereo.joint.needle_outcome import TrueNeedle
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, ToolSection
 from puncture_twin.twin.plant.true_arm import ArmErrors, TrueArm, draw_true_arm
 
 LINE_OF_SIGHT_RINGS = ((0.0, 1), (0.55, 6), (0.95, 12))
 """Where on the ball's disc a line of sight ends: share of the radius, and how many around."""
 
-CAMERA_TURN_RAD = 0.004
-CAMERA_SHIFT_MM = 3.0
-CAMERA_AXIS_PX = 8.0
-CAMERA_FOCAL = 0.01
-"""How far a camera is from where it was planned: turn about each axis, shift along each, principal point, focal length
-(share). The calibration takes them out; until then the ball is searched for in a wide region."""
+
+class TrueTool(NamedTuple):
+    """Errors of rod and needle, flange axes."""
+
+    ball_offset: Floats
+    """Shape (3,), mm: the ball's centre against where the controller has it."""
+    tip_offset: Floats
+    """Shape (3,), mm: the needle's tip against the ball's centre."""
+    lean: Floats
+    """Shape (3,), rad: the needle's rotation against the flange, about x and y."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +50,9 @@ class StereoWorkcell:
         arm: The true arm.
         T_c_base: Shape (4, 4), mm: the true arm's base in C.
         cameras: The true cameras.
-        T_c_m: Shape (4, 4), mm: where the head truly stands, image frame to C.
+        T_c_m: Shape (4, 4), mm: where the head truly stands when its markers are seen, image frame to C.
+        T_c_m_after: Shape (4, 4), mm: where it stands from then on.
+        tool: What the arm truly carries.
     """
 
     case: ServoCase
@@ -51,6 +60,8 @@ class StereoWorkcell:
     T_c_base: Floats
     cameras: tuple[Camera, ...]
     T_c_m: Floats
+    T_c_m_after: Floats
+    tool: TrueTool
 
     @property
     def model(self) -> UrModel:
@@ -64,19 +75,36 @@ class StereoWorkcell:
 
     @property
     def targets_c(self) -> Floats:
-        """Where the targets truly are, shape (n, 3), mm."""
-        return apply(self.T_c_m, self.case.targets.points)
+        """Where the targets truly are when the ball comes, shape (n, 3), mm."""
+        return apply(self.T_c_m_after, self.case.targets.points)
 
     @cached_property
     def head_c(self) -> TriangleMesh:
-        """The head's surface where it truly stands, C, mm."""
-        return self.case.skin.transformed(self.T_c_m)
+        """The head's surface where it truly stands when the ball comes, C, mm."""
+        return self.case.skin.transformed(self.T_c_m_after)
 
     def ball_c(self, q_true: Floats) -> Floats:
         """Where the ball's centre truly is, shape (..., 3), mm, at true configurations (..., 6), rad."""
-        rod = self.case.file.tool.rod_mm
+        return self._on_flange_c(q_true, self.tool.ball_offset)
+
+    def tip_c(self, q_true: Floats) -> Floats:
+        """Where the needle's tip truly is, shape (..., 3), mm, likewise."""
+        return self._on_flange_c(q_true, self.tool.ball_offset + self.tool.tip_offset)
+
+    def _on_flange_c(self, q_true: Floats, offset: Floats) -> Floats:
         flange = self.arm.flange_pose(q_true)
-        return apply(self.T_c_base, flange[..., :3, 3] + rod * flange[..., :3, 2])
+        beside = offset + np.array([0.0, 0.0, self.case.file.tool.rod_mm])
+        return apply(self.T_c_base, flange[..., :3, 3] + flange[..., :3, :3] @ beside)
+
+    def needle_c(self, q_true: Floats) -> Floats:
+        """The needle's true axes as columns, z to the tip, shape (3, 3), C, at a true configuration (6,), rad."""
+        R = self.T_c_base[:3, :3] @ self.arm.flange_pose(q_true)[:3, :3]
+        return np.asarray(R @ exp_rotation(self.tool.lean))
+
+    def needle_m(self, q_true: Floats, target: int) -> TrueNeedle:
+        """The needle against a target of the case, by its number, at a true configuration (6,), rad."""
+        R_m_c = self.T_c_m_after[:3, :3].T
+        return TrueNeedle(R_m_c @ (self.tip_c(q_true) - self.targets_c[target]), R_m_c @ self.needle_c(q_true))
 
     def rod_c(self, q_true: Floats) -> Floats:
         """Unit direction from the ball along the rod to the flange, shape (3,), C."""
@@ -115,17 +143,27 @@ class StereoWorkcell:
 
 
 def draw_workcell(case: ServoCase, rng: np.random.Generator) -> StereoWorkcell:
-    """A room with its errors drawn from the case's standard deviations.
+    """A room with its errors drawn from what the case declares, or from what it says that its truth is.
 
     Raises:
         InputError: Cameras or arm that cannot be.
     """
-    file = case.file
-    arm = draw_true_arm(ur_model(file.robot.model), arm_errors(case), rng)
+    file, errors = case.file, case.truth_errors
+    spread = ArmErrors(errors.link_mm, errors.twist, errors.joint, errors.backlash, errors.repeatability)
+    arm = draw_true_arm(ur_model(file.robot.model), spread, rng)
     T_base_c = calibration_frame(case)
     T_c_base = np.asarray(np.linalg.inv(T_base_c), dtype=np.float64)
-    cameras = tuple(_misplaced(camera, rng) for camera in planned_cameras(case))
-    return StereoWorkcell(case, arm, T_c_base, cameras, T_c_base @ head_pose(case))
+    cameras = tuple(_misplaced(camera, errors.camera, rng) for camera in planned_cameras(case))
+    cameras = tuple(_with_other_lens(camera, errors.camera, rng) for camera in cameras)
+    tool = TrueTool(
+        rng.normal(0.0, errors.ball_offset_mm, 3),
+        rng.normal(0.0, errors.tip_offset_mm, 3),
+        np.append(rng.normal(0.0, errors.needle_direction, 2), 0.0),
+    )
+    T_c_m = T_c_base @ head_pose(case)
+    moved = np.concatenate([rng.normal(0.0, errors.head_turn, 3), rng.normal(0.0, errors.head_shift_mm, 3)])
+    after = turned_about(T_c_m, apply(T_c_m, case.markers.points.mean(axis=0)), moved)
+    return StereoWorkcell(case, arm, T_c_base, cameras, T_c_m, after, tool)
 
 
 def planned_cameras(case: ServoCase) -> tuple[Camera, ...]:
@@ -134,19 +172,16 @@ def planned_cameras(case: ServoCase) -> tuple[Camera, ...]:
     return stereo_pair(*plan.size_px, plan.focal_px, plan.baseline_mm, plan.distance_mm, plan.distortion)
 
 
-def _misplaced(camera: Camera, rng: np.random.Generator) -> Camera:
+def _misplaced(camera: Camera, errors: CameraErrors, rng: np.random.Generator) -> Camera:
     """A camera as it was really put up: turned, shifted, its lens off its focal length and axis."""
-    T = pose(exp_rotation(rng.normal(0.0, CAMERA_TURN_RAD, 3)), rng.normal(0.0, CAMERA_SHIFT_MM, 3))
-    cx, cy = np.array([camera.cx, camera.cy]) + rng.normal(0.0, CAMERA_AXIS_PX, 2)
-    focal = camera.fx * (1.0 + rng.normal(0.0, CAMERA_FOCAL))
+    T = pose(exp_rotation(rng.normal(0.0, errors.turn, 3)), rng.normal(0.0, errors.shift_mm, 3))
+    cx, cy = np.array([camera.cx, camera.cy]) + rng.normal(0.0, errors.axis_px, 2)
+    focal = camera.fx * (1.0 + rng.normal(0.0, errors.focal))
     return replace(camera, fx=focal, fy=focal, cx=float(cx), cy=float(cy), T_camera_c=T @ camera.T_camera_c)
 
 
-def arm_errors(case: ServoCase) -> ArmErrors:
-    """How far the case's arm is from its nominal model, mm and rad."""
-    robot = case.file.robot
-    angles = (robot.twist_deg, robot.joint_deg, robot.backlash_deg, robot.repeatability_deg)
-    return ArmErrors(robot.link_mm, *(float(np.radians(angle)) for angle in angles))
+def _with_other_lens(camera: Camera, errors: CameraErrors, rng: np.random.Generator) -> Camera:
+    return replace(camera, distortion=camera.distortion + rng.normal(0.0, errors.lens))
 
 
 def calibration_frame(case: ServoCase) -> Floats:

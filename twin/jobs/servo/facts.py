@@ -7,7 +7,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from puncture_twin.planning.base.provenance import inputs_document
-from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, Statistics
+from puncture_twin.twin.guidance.stereo.experiment import (
+    ServoTrial,
+    Statistics,
+    TargetRow,
+    declaration_test,
+    needle_statistics,
+)
+from puncture_twin.twin.guidance.stereo.joint.needle_outcome import NeedleOutcome
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.jobs.servo.liu2007 import (
     TABLE_1,
@@ -17,6 +24,9 @@ from puncture_twin.twin.jobs.servo.liu2007 import (
     paper_gain_mm,
     paper_servo_only_at_least,
 )
+
+WAYS = ("open_loop", "servoed")
+"""By mapping and robot alone, and after the servo."""
 
 Facts = Mapping[str, Any]
 """What `servo_facts` or `reproduction_facts` returns: mm, shares 0..1."""
@@ -33,7 +43,25 @@ def servo_facts(case: ServoCase, trials: Sequence[ServoTrial], ours: Statistics)
         "stops": dict(stops),
         "statistics": {**ours._asdict(), "after_over_mapping": ours.after_over_mapping},
         "sessions": [_session(one) for one in trials],
+        "needle": _needle(case, trials),
     }
+
+
+def _needle(case: ServoCase, trials: Sequence[ServoTrial]) -> dict[str, Any]:
+    """The needle against the anatomy, predicted beside realised, over all seeds."""
+    test = declaration_test(trials)
+    return {
+        **{way: _needles([getattr(row, f"needle_{way}") for one in trials for row in one.rows]) for way in WAYS},
+        "hit_radius_mm": case.file.target.hit_radius_mm,
+        "wrong_belief": case.wrong_belief,
+        "declared": case.errors.stated(),
+        "declaration": None if test is None else {**test._asdict(), "p": test.p},
+    }
+
+
+def _needles(outcomes: Sequence[NeedleOutcome | None]) -> dict[str, Any] | None:
+    found = needle_statistics(outcomes)
+    return None if found is None else found._asdict()
 
 
 def reproduction_facts(result: Liu2007Tables) -> dict[str, Any]:
@@ -71,8 +99,17 @@ def _session(one: ServoTrial) -> dict[str, Any]:
         "calibration_rms_px": list(one.rms_px),
         "fre_mm": one.fre_mm if held else None,
         "robot_residual_mm": one.robot_residual_mm if held else None,
-        "targets": [row._asdict() for row in one.rows],
+        "targets": [_target(row) for row in one.rows],
     }
+
+
+def _target(row: TargetRow) -> dict[str, Any]:
+    needles = {f"needle_{way}": getattr(row, f"needle_{way}") for way in WAYS}
+    return {**row._asdict(), **{key: None if one is None else _outcome(one) for key, one in needles.items()}}
+
+
+def _outcome(one: NeedleOutcome) -> dict[str, Any]:
+    return {**one._asdict(), "half_axes_mm": list(one.half_axes_mm), "in_region": one.in_region}
 
 
 class MeanAndMost(NamedTuple):

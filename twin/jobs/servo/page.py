@@ -10,6 +10,7 @@ from markupsafe import Markup
 
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.jobs.servo.facts import Facts, our_errors
+from puncture_twin.twin.jobs.servo.page_needle import needle_section
 from puncture_twin.twin.report.numbers import number, percent
 from puncture_twin.twin.report.page.page_tables import faint, inputs_table, pairs, table, two
 from puncture_twin.twin.report.page.template import Card, data_address, write_html
@@ -40,18 +41,19 @@ def write_servo_page(case: ServoCase, facts: Facts, pictures: Sequence[Path], co
         convergence=data_address(convergence),
         cameras=[(picture.stem, data_address(picture)) for picture in pictures],
         statistics=_statistics(facts["statistics"]),
+        needle=needle_section(facts["needle"], first),
         calibration=_calibration(case, first),
         inputs=inputs_table(case.inputs),
     )
 
 
 def _setup(case: ServoCase) -> str:
-    plan, robot, servo = case.file.cameras, case.file.robot, case.file.servo
+    plan, robot, servo, arm = case.file.cameras, case.file.robot, case.file.servo, case.errors.stated()
     return (
         f"Two cameras of {plan.size_px[0]} x {plan.size_px[1]} px, {plan.baseline_mm:g} mm apart, "
         f"{plan.distance_mm:g} mm away, noise {plan.noise_grey:g} grey levels; centre by {plan.centre}; "
-        f"{robot.model} off by {robot.link_mm:g} mm, {robot.joint_deg:g}°, play {robot.backlash_deg:g}°, "
-        f"repeatability {robot.repeatability_deg:g}°; tolerance {servo.tolerance_mm:g} mm; "
+        f"{robot.model} off by {arm['link_mm']:g} mm, {arm['joint_deg']:g}°, play {arm['backlash_deg']:g}°, "
+        f"repeatability {arm['repeatability_deg']:g}°; tolerance {servo.tolerance_mm:g} mm; "
         f"estimate: {'joint' if servo.estimate == 'joint' else 'the chain'}."
     )
 
@@ -109,7 +111,7 @@ def _calibration(case: ServoCase, first: Mapping[str, Any]) -> Markup:
     return pairs(
         [
             ("points held by the robot", f"12, over {' x '.join(f'{mm:g}' for mm in cal.size_mm)} mm"),
-            ("measuring arm, per axis", number(cal.measuring_arm_mm, 3, "mm")),
+            ("measuring arm, per axis", number(case.errors.measuring_mm, 3, "mm")),
             ("residual of each camera (rms)", f"{residuals} px"),
             ("robot against C after the rigid fit (mean)", number(first["robot_residual_mm"], 2, "mm")),
             ("markers, residual (rms; not the accuracy at a target)", number(first["fre_mm"], 2, "mm")),

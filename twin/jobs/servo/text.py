@@ -9,6 +9,15 @@ import numpy as np
 
 from puncture_twin.twin.jobs.servo.facts import Facts, our_errors
 
+NEEDLE_HEAD = "needle expected  95 % half axes      lateral  depth  direction  realised   (mm, deg; after the servo)"
+
+WAY_WORDS = {"open_loop": "by mapping and robot alone", "servoed": "after the servo"}
+
+NOT_MODELLED = "a rod that bends, cameras that move after the calibration, tissue"
+
+DOUBTED = 0.01
+"""Chance of residuals so large below which the declaration is doubted, as in the CT case."""
+
 HEAD = "target  mapping  expected  before   after  servo-only  steps  stop"
 
 
@@ -22,6 +31,7 @@ def servo_text(facts: Facts) -> str:
         lines += _session_lines(first)
     if len(facts["sessions"]) > 1:
         lines += ["", *statistics_lines(facts["statistics"])]
+    lines += ["", *needle_lines(facts["needle"])]
     return "\n".join([*lines, *(f"  {name}" for name in facts["files"])])
 
 
@@ -34,6 +44,8 @@ def _session_lines(first: Mapping[str, Any]) -> list[str]:
         f"  markers: residual {first['fre_mm']:.2f} (rms; not the accuracy at a target)",
         HEAD,
         *(_row_line(row) for row in first["targets"]),
+        NEEDLE_HEAD,
+        *(_needle_row(row) for row in first["targets"]),
     ]
 
 
@@ -43,6 +55,50 @@ def _row_line(row: Mapping[str, Any]) -> str:
         "{servo_only_mm:11.3f} {steps:6d}  ".format(**row)
         + row["stop"].replace("_", " ")
     )
+
+
+def _needle_row(row: Mapping[str, Any]) -> str:
+    """The needle of one target at the servo's last look."""
+    one = row["needle_servoed"]
+    if one is None:
+        return f"{row['target']:6s} unknown: nothing was seen at the end, or the measurements contradict each other"
+    axes = " x ".join(f"{mm:.2f}" for mm in one["half_axes_mm"])
+    chance = "" if one["p_hit"] is None else f"{one['p_hit']:.2f} to hit"
+    return (
+        f"{row['target']:6s} "
+        + "{predicted_rms_mm:9.2f}  {axes:18s} {lateral_mm:8.2f} {depth_mm:6.2f} {predicted_direction_deg:10.2f}"
+        "  {realised_mm:8.2f}  {chance}".format(**one, axes=axes, chance=chance)
+    )
+
+
+def needle_lines(needle: Mapping[str, Any]) -> list[str]:
+    """Tip and direction against the anatomy, before and after the servo: realised beside predicted."""
+    wrong = ", drawn from [rehearsal.errors]: the belief is wrong by design" if needle["wrong_belief"] else ""
+    lines = [f"needle against the anatomy{wrong}:   realised   predicted"]
+    for way, words in WAY_WORDS.items():
+        lines += _way_lines(words, needle[way], needle["hit_radius_mm"])
+    return [*lines, *_declaration_lines(needle["declaration"]), f"  not modelled: {NOT_MODELLED}"]
+
+
+def _way_lines(words: str, one: Mapping[str, Any] | None, radius_mm: float | None) -> list[str]:
+    if one is None:
+        return [f"  {words}: unknown"]
+    hit = f"    hit, within {radius_mm:g} mm" if radius_mm is not None else ""
+    return [
+        f"  {words}, {one['needles']} needles",
+        "    tip error, rms         {realised_rms_mm:12.3f} {predicted_rms_mm:11.3f} mm".format(**one),
+        "    direction, rms         {realised_direction_deg:12.3f} {predicted_direction_deg:11.3f} deg".format(**one),
+        f"    in the 95 % ellipsoid  {100 * one['coverage_95']:12.1f} {95.0:11.1f} %",
+        *([f"{hit:27s}{100 * one['hit_share']:12.1f} {100 * one['mean_p_hit']:11.1f} %"] if hit else []),
+    ]
+
+
+def _declaration_lines(test: Mapping[str, Any] | None) -> list[str]:
+    """Whether what was measured is as far apart as declared."""
+    if test is None:
+        return ["  declared errors: not tested, the joint estimate does not settle"]
+    told = "  declared errors: residuals {chi_squared:.0f} for {freedom} degrees of freedom, p = {p:.3f}".format(**test)
+    return [told + ("; WARNING: they are larger than declared" if test["p"] < DOUBTED else "")]
 
 
 def statistics_lines(ours: Mapping[str, Any]) -> list[str]:
@@ -73,6 +129,7 @@ def reproduction_text(facts: Facts) -> str:
         f"ours: median of steps {ours['median_steps']:g}, not confirmed {100 * ours['not_confirmed']:.1f} %, "
         f"after/mapping {ours['after_over_mapping']:.3f} (paper: {1.00 / 1.06:.2f}, below 1 by chance)",
         *_gain_lines(facts),
+        *needle_lines(facts["needle"]),
         "demanded here (the exit code):",
         *(f"  {one['words']}: {'holds' if one['holds'] else 'DOES NOT HOLD'}" for one in facts["conditions"]),
         *(f"  {name}" for name in facts["files"]),

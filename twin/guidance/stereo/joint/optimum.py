@@ -17,7 +17,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.twin.guidance.stereo.joint_model import Guess, JointModel, Observed, Unknowns, first_unknowns
+from puncture_twin.twin.guidance.stereo.joint.joint_model import Guess, JointModel, Observed, Unknowns, first_unknowns
 
 MAX_ITERATIONS = 30
 ARRIVED = 1e-4
@@ -54,6 +54,7 @@ class Adjusted:
         unknowns: Their values.
         covariance: Shape (N, N): of the unknowns, by Fisher's information.
         chi2: Sum of the squared residuals.
+        freedom: Their number, less that of the unknowns: what chi2 is on average if the declaration holds.
         iterations: Steps taken.
     """
 
@@ -61,6 +62,7 @@ class Adjusted:
     unknowns: Unknowns
     covariance: Floats
     chi2: float
+    freedom: int
     iterations: int
 
     def offset(self, stay: int, target_m: Floats) -> Offset:
@@ -105,7 +107,12 @@ def adjust(observed: Observed, guess: Guess, start: Unknowns | None = None) -> A
         raise NoAnswerError(UNSETTLED)
     covariance = np.asarray(np.linalg.inv(fit.system.information), dtype=np.float64)
     chi2 = float(np.sum((fit.system.residuals + fit.system.slopes @ fit.step) ** 2))
-    return Adjusted(model, fit.estimate, covariance, chi2, fit.iterations)
+    return Adjusted(model, fit.estimate, covariance, chi2, _freedom(fit.system), fit.iterations)
+
+
+def _freedom(system: System[Unknowns]) -> int:
+    rows, unknowns = system.slopes.shape
+    return rows - unknowns
 
 
 def _arrived(system: System[Unknowns], step: Floats) -> bool:
@@ -123,4 +130,5 @@ def bound(observed: Observed, guess: Guess, truth: Unknowns) -> Adjusted:
     model = JointModel(observed, guess)
     system = model.linearised(truth)
     covariance = np.asarray(np.linalg.inv(system.information), dtype=np.float64)
-    return Adjusted(model, truth, covariance, float(system.residuals @ system.residuals), 0)
+    chi2 = float(system.residuals @ system.residuals)
+    return Adjusted(model, truth, covariance, chi2, _freedom(system), 0)

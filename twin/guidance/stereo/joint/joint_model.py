@@ -1,10 +1,10 @@
 """Everything that was measured in a session, as one least-squares problem: the bundle adjustment over all images.
 
-Unknown are both cameras, where C lies in the base, the arm's errors, where the head stands, its markers, and the ball
-at every stay. Known are the ball and marker pixels, the measuring arm's readings, the markers in the image, what the
-arm was commanded, and how far each of these and the drawn errors may be off. Each residual is divided by its standard
-deviation, so the normal matrix is Fisher's information and its inverse the Cramer-Rao bound (van Trees' for the drawn
-ones). What has a known spread is counted in that spread, so that a spread of 0 fixes it.
+Unknown are both cameras, where C lies in the base, the errors of arm and rod, where the head stands, its markers, and
+the ball at every stay. Known are the ball and marker pixels, the measuring arm's readings, the markers in the image,
+what the arm was commanded, and how far each of these may be off, as the case declares it. Each residual is divided by
+its standard deviation, so the normal matrix is Fisher's information and its inverse the Cramer-Rao bound (van Trees'
+for what has a declared deviation). That is counted in deviations, so that one of 0 fixes it.
 """
 
 from __future__ import annotations
@@ -15,30 +15,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.geometry.gauss_newton import System
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, turned_about
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.lens import coefficient_slope
+from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors
+from puncture_twin.twin.guidance.stereo.joint.erring_rod import N_ROD, RodPoses, rod_poses
 from puncture_twin.twin.guidance.stereo.mapping import turn_and_shift_slopes
 from puncture_twin.twin.guidance.stereo.servo_law import HeldRod, ball_jacobian
-from puncture_twin.twin.guidance.stereo.stereo_room import (
-    CAMERA_AXIS_PX,
-    CAMERA_FOCAL,
-    CAMERA_SHIFT_MM,
-    CAMERA_TURN_RAD,
-)
-from puncture_twin.twin.plant.true_arm import ArmErrors, TrueArm
-
-LENS = (0.2, 0.2, 0.002, 0.002)
-"""Spread of k1, k2, p1, p2 about 0: what a lens of this kind may have."""
 
 PER_CAMERA = 13
 """Focal length, principal point, four of the lens, turn, shift: square pixels are known."""
-
-ARM = 23
-"""a1..a6, d1, d3..d6, alpha1..alpha6, six zeros of the joints."""
 
 FLOOR_MM = 1e-3
 """Nothing is known better than this."""
@@ -51,30 +39,26 @@ class Observed:
     Attributes:
         planned: The cameras as they were planned.
         held: The nominal arm.
-        arm: Spreads of the arm's errors.
+        errors: As declared.
         q_command: Shape (s, 6), rad.
         pixels: Shape (c, s, 2): the ball in each camera.
         pixel_covariance: Shape (c, s, 2, 2), px^2.
         measured_c: Shape (k, 3), mm.
-        measuring_mm: Standard deviation per axis of ``measured_c``.
         marker_pixels: Shape (c, n, 2).
         marker_covariance: Shape (c, n, 2, 2), px^2.
         markers_m: Shape (n, 3), mm: the markers in the image.
-        image_mm: Standard deviation per axis of ``markers_m``.
     """
 
     planned: tuple[Camera, ...]
     held: HeldRod
-    arm: ArmErrors
+    errors: ServoErrors
     q_command: Floats
     pixels: Floats
     pixel_covariance: Floats
     measured_c: Floats
-    measuring_mm: float
     marker_pixels: Floats
     marker_covariance: Floats
     markers_m: Floats
-    image_mm: float
 
 
 class Guess(NamedTuple):
@@ -92,11 +76,11 @@ class Unknowns(NamedTuple):
     """The unknowns of the session."""
 
     cameras: Floats
-    """Shape (c, 13), in spreads."""
+    """Shape (c, 13), in declared deviations."""
     base: Floats
     """Shape (6,): turn (rad) about the first balls' middle and shift (mm) of the base from the guess."""
     arm: Floats
-    """Shape (23,), in spreads."""
+    """Shape (26,), in declared deviations."""
     head: Floats
     """Shape (6,): likewise of the head, about the markers' middle."""
     markers_m: Floats
@@ -124,32 +108,21 @@ class Unknowns(NamedTuple):
 def first_unknowns(observed: Observed, guess: Guess) -> Unknowns:
     """All errors 0."""
     cameras = np.zeros((len(observed.planned), PER_CAMERA))
-    return Unknowns(cameras, np.zeros(6), np.zeros(ARM), np.zeros(6), observed.markers_m.copy(), guess.balls_c.copy())
+    return Unknowns(cameras, np.zeros(6), np.zeros(N_ROD), np.zeros(6), observed.markers_m.copy(), guess.balls_c.copy())
 
 
 def camera_of(planned: Camera, errors: Floats) -> Camera:
-    """A planned camera with its errors (13,), in spreads."""
-    focal = planned.fx * (1.0 + CAMERA_FOCAL * errors[0])
-    cx, cy = np.array([planned.cx, planned.cy]) + CAMERA_AXIS_PX * errors[1:3]
-    T = pose(exp_rotation(CAMERA_TURN_RAD * errors[7:10]), CAMERA_SHIFT_MM * errors[10:13])
-    lens = np.array(LENS) * errors[3:7]
+    """A planned camera with its errors (13,): part of the focal length, px, lens, rad, mm."""
+    focal = planned.fx * (1.0 + errors[0])
+    T = pose(exp_rotation(errors[7:10]), errors[10:13])
     return replace(
-        planned, fx=focal, fy=focal, cx=float(cx), cy=float(cy), distortion=lens, T_camera_c=T @ planned.T_camera_c
-    )
-
-
-def arm_of(model: UrModel, spreads: ArmErrors, errors: Floats) -> TrueArm:
-    """A nominal arm with its errors (23,), in spreads."""
-    d = np.array(model.d)
-    d[[0, 2, 3, 4, 5]] += spreads.link_mm * errors[6:11]
-    return TrueArm(
-        model,
-        a=np.array(model.a) + spreads.link_mm * errors[:6],
-        d=d,
-        alpha=np.array(model.alpha) + spreads.twist_rad * errors[11:17],
-        joint_offsets=spreads.joint_rad * errors[17:23],
-        backlash_rad=spreads.backlash_rad,
-        repeatability_rad=spreads.repeatability_rad,
+        planned,
+        fx=focal,
+        fy=focal,
+        cx=planned.cx + float(errors[1]),
+        cy=planned.cy + float(errors[2]),
+        distortion=planned.distortion + errors[3:7],
+        T_camera_c=T @ planned.T_camera_c,
     )
 
 
@@ -181,6 +154,18 @@ class JointModel:
         """Derivative (n, 3, 6) of points (n, 3) of the head by ``x.head``."""
         return _pose_slopes(points_c, self._head_center, x.head[:3], x.head[3:])
 
+    def pose_of_base(self, x: Unknowns) -> Floats:
+        """T_c_base, shape (4, 4), mm."""
+        return turned_about(self.guess.T_c_base, self._base_center, x.base)
+
+    def base_slopes(self, x: Unknowns, points_c: Floats) -> Floats:
+        """Derivative (n, 3, 6) of points (n, 3) of the base by ``x.base``."""
+        return _pose_slopes(points_c, self._base_center, x.base[:3], x.base[3:])
+
+    def held_at(self, x: Unknowns, q: Floats) -> RodPoses:
+        """Ball and flange at configurations (s, 6), rad, base frame."""
+        return rod_poses(self.observed.held, self.observed.errors.arm_deviations() * x.arm, q)
+
     def linearised(self, x: Unknowns) -> System[Unknowns]:
         """Residuals and slopes at x."""
         rows = [*self._seen(x), self._measured(x), self._commanded(x), self._imaged(x), self._drawn(x)]
@@ -193,12 +178,13 @@ class JointModel:
         points = np.concatenate([x.balls_c, markers_c])
         pixels = np.concatenate([o.pixels, o.marker_pixels], axis=1)
         roots = _roots(np.concatenate([o.pixel_covariance, o.marker_covariance], axis=1))
-        n_balls, rows = len(x.balls_c), []
+        n_balls, rows, deviations = len(x.balls_c), [], o.errors.camera_deviations()
         for index, planned in enumerate(o.planned):
-            camera = camera_of(planned, x.cameras[index])
+            errors = deviations * x.cameras[index]
+            camera = camera_of(planned, errors)
             J = np.zeros((len(points), 2, x.vector().size))
             start = x.span("cameras").start + PER_CAMERA * index
-            J[:, :, start : start + PER_CAMERA] = _camera_slopes(planned, camera, x.cameras[index], points)
+            J[:, :, start : start + PER_CAMERA] = _camera_slopes(planned, camera, errors, points) * deviations
             by_point = camera.jacobian(points)
             _diagonal(J, 0, x.span("balls_c").start, by_point[:n_balls])
             J[n_balls:, :, x.span("head")] = by_point[n_balls:] @ self.head_slopes(x, markers_c)
@@ -209,7 +195,7 @@ class JointModel:
 
     def _measured(self, x: Unknowns) -> tuple[Floats, Floats]:
         """The measuring arm's readings."""
-        k, sigma = len(self.observed.measured_c), max(self.observed.measuring_mm, FLOOR_MM)
+        k, sigma = len(self.observed.measured_c), max(self.observed.errors.measuring_mm, FLOOR_MM)
         J = np.zeros((k, 3, x.vector().size))
         _diagonal(J, 0, x.span("balls_c").start, np.tile(np.eye(3), (k, 1, 1)))
         roots = np.tile(np.eye(3) / sigma, (k, 1, 1))
@@ -217,34 +203,38 @@ class JointModel:
 
     def _commanded(self, x: Unknowns) -> tuple[Floats, Floats]:
         """Where the arm, with its errors, should have the ball; its play and repeatability let it stray."""
-        o = self.observed
-        T = turned_about(self.guess.T_c_base, self._base_center, x.base)
-        arm = arm_of(o.held.model, o.arm, x.arm)
-        flange = arm.flange_pose(o.q_command)
-        balls = apply(T, flange[:, :3, 3] + o.held.rod_mm * flange[:, :3, 2])
+        q = self.observed.q_command
+        strays, J = self.strays(x, np.arange(len(q)))
+        return _whitened(strays, J, self._stray_roots)
+
+    def strays(self, x: Unknowns, stays: Ints) -> tuple[Floats, Floats]:
+        """How far the ball is from where its arm should have it at k stays: (k, 3), mm, C, and slopes (k, 3, N)."""
+        T, held = self.pose_of_base(x), self.held_at(x, self.observed.q_command[stays])
+        balls = apply(T, held.ball)
         J = np.zeros((len(balls), 3, x.vector().size))
-        _diagonal(J, 0, x.span("balls_c").start, np.tile(np.eye(3), (len(balls), 1, 1)))
-        J[:, :, x.span("base")] = -_pose_slopes(balls, self._base_center, x.base[:3], x.base[3:])
-        J[:, :, x.span("arm")] = -T[:3, :3] @ _arm_slopes(arm, o.arm, o.q_command, o.held.rod_mm)
-        return _whitened(x.balls_c - balls, J, self._outlier_roots)
+        for row, stay in enumerate(stays):
+            start = x.span("balls_c").start + 3 * int(stay)
+            J[row, :, start : start + 3] = np.eye(3)
+        J[:, :, x.span("base")] = -self.base_slopes(x, balls)
+        J[:, :, x.span("arm")] = -T[:3, :3] @ held.slopes[:, :3] * self.observed.errors.arm_deviations()
+        return x.balls_c[stays] - balls, J
 
     @cached_property
-    def _outlier_roots(self) -> Floats:
-        """Roots of the inverse covariance of where the arm has its ball, (s, 3, 3): play (uniform), repeatability."""
+    def _stray_roots(self) -> Floats:
+        """Roots of the inverse covariance of where the arm has its ball, (s, 3, 3): play and repeatability."""
         o, R = self.observed, self.guess.T_c_base[:3, :3]
-        joint = o.arm.repeatability_rad**2 + o.arm.backlash_rad**2 / 12
         slopes = np.array([R @ ball_jacobian(o.held, q)[:3] for q in o.q_command])
-        return _roots(joint * slopes @ slopes.transpose(0, 2, 1) + FLOOR_MM**2 * np.eye(3))
+        return _roots(o.errors.arrival**2 * slopes @ slopes.transpose(0, 2, 1) + FLOOR_MM**2 * np.eye(3))
 
     def _imaged(self, x: Unknowns) -> tuple[Floats, Floats]:
         """The markers in the image."""
-        n, sigma = len(x.markers_m), max(self.observed.image_mm, FLOOR_MM)
+        n, sigma = len(x.markers_m), max(self.observed.errors.marker_mm, FLOOR_MM)
         J = np.zeros((n, 3, x.vector().size))
         _diagonal(J, 0, x.span("markers_m").start, np.tile(np.eye(3), (n, 1, 1)))
         return _whitened(x.markers_m - self.observed.markers_m, J, np.tile(np.eye(3) / sigma, (n, 1, 1)))
 
     def _drawn(self, x: Unknowns) -> tuple[Floats, Floats]:
-        """What has a known spread about its nominal value."""
+        """What has a declared deviation from its nominal value."""
         J = np.eye(x.vector().size)
         drawn = np.r_[x.span("cameras"), x.span("arm")]
         return x.vector()[drawn], J[drawn]
@@ -256,12 +246,11 @@ def _camera_slopes(planned: Camera, camera: Camera, errors: Floats, points: Floa
     pixels, by_point = camera.project(points), camera.jacobian(points)
     inside = apply(camera.T_camera_c, points)
     flat = inside[:, :2] / inside[:, 2:]
-    J[:, :, 0] = (pixels - [camera.cx, camera.cy]) * (planned.fx * CAMERA_FOCAL / camera.fx)
-    J[:, :, 1:3] = CAMERA_AXIS_PX * np.eye(2)
-    J[:, :, 3:7] = camera.fx * coefficient_slope(flat) * LENS
+    J[:, :, 0] = (pixels - [camera.cx, camera.cy]) * (planned.fx / camera.fx)
+    J[:, :, 1:3] = np.eye(2)
+    J[:, :, 3:7] = camera.fx * coefficient_slope(flat)
     by_inside = by_point @ camera.T_camera_c[:3, :3].T
-    move = _pose_slopes(inside, np.zeros(3), CAMERA_TURN_RAD * errors[7:10], CAMERA_SHIFT_MM * errors[10:13])
-    J[:, :, 7:] = by_inside @ move * np.repeat([CAMERA_TURN_RAD, CAMERA_SHIFT_MM], 3)
+    J[:, :, 7:] = by_inside @ _pose_slopes(inside, np.zeros(3), errors[7:10], errors[10:13])
     return J
 
 
@@ -272,19 +261,6 @@ def _pose_slopes(points: Floats, center: Floats, turn: Floats, shift: Floats) ->
     left = np.eye(3) + 0.5 * np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # to second order in the turn
     slopes[:, :, :3] = slopes[:, :, :3] @ left
     return slopes
-
-
-def _arm_slopes(arm: TrueArm, spreads: ArmErrors, q: Floats, rod_mm: float) -> Floats:
-    """Derivative (s, 3, 23), base frame, of the ball by the arm's errors: each shifts or turns all that follows it."""
-    poses = arm.link_poses(q)
-    origins, axes = poses[..., :3, 3], poses[..., :3, :3]
-    ball = origins[:, 6] + rod_mm * axes[:, 6, :, 2]
-    x, z = axes[:, 1:, :, 0], axes[:, :-1, :, 2]
-    twist = np.cross(x, ball[:, None] - origins[:, 1:])
-    zero = np.cross(z, ball[:, None] - origins[:, :-1])
-    d = np.delete(z, 1, axis=1)
-    parts = (spreads.link_mm * x, spreads.link_mm * d, spreads.twist_rad * twist, spreads.joint_rad * zero)
-    return np.concatenate(parts, axis=1).transpose(0, 2, 1)
 
 
 def _diagonal(J: Floats, row: int, column: int, blocks: Floats) -> None:

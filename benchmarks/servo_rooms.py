@@ -1,0 +1,258 @@
+"""Does the needle's predicted error by the cameras hold? Many rooms without pictures, each drawn anew.
+
+    python -m benchmarks.servo_rooms [--rooms 2000] [--sessions 40] [--jobs 2] [--only WORD]
+
+A fast room draws everything that a servo case declares: arm, cameras, lenses, rod, needle, head, readings. The arm
+holds the ball at the calibration's points, the cameras see balls and markers with normal errors of the declared size,
+the arm is sent to one target by the mapping alone, then corrected by one look. Left out are pictures, contacts and the
+play's memory: each arrival errs by itself. A session has all but the pictures, the paper's chain among it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache, partial
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtrc, chdtri
+
+from benchmarks.servo_variants import pixel_detector, varied
+from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.kinematics import inverse
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.base.processes import process_pool
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.registration import fit_rigid
+from puncture_twin.twin.guidance.stereo.detection import Detector
+from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, needle_statistics, trial
+from puncture_twin.twin.guidance.stereo.joint.joint_model import Guess, Observed
+from puncture_twin.twin.guidance.stereo.joint.needle_error import open_loop_error, servoed_error
+from puncture_twin.twin.guidance.stereo.joint.needle_outcome import NeedleOutcome, needle_outcome
+from puncture_twin.twin.guidance.stereo.joint.optimum import Adjusted, adjust
+from puncture_twin.twin.guidance.stereo.poses import flange_poses
+from puncture_twin.twin.guidance.stereo.robot_calibration import calibrating_rod, grid_points, held_rod
+from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
+from puncture_twin.twin.guidance.stereo.servo_law import HeldRod, ball_base, ball_jacobian
+from puncture_twin.twin.guidance.stereo.session import run_session
+from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_workcell, planned_cameras
+
+PIXEL_PX = 0.03
+"""Of a centre by edges, per axis; declared here, since there are no pictures of which a tracker could tell it."""
+
+BRANCH = 6
+"""Of the inverse kinematics, as a session chooses it."""
+
+DOUBTED = 0.01
+"""Chance of residuals so large below which a declaration is doubted."""
+
+
+class RoomOutcome(NamedTuple):
+    """One fast room."""
+
+    open_loop: NeedleOutcome
+    servoed: NeedleOutcome
+    chi_squared: float
+    """Of the joint estimate's residuals."""
+    freedom: int
+
+
+@cache
+def commands(case: ServoCase, branch: int) -> Floats:
+    """Joints for the calibration's points, shape (12, 6), rad."""
+    held = calibrating_rod(case, draw_workcell(case, np.random.default_rng(0)))
+    return reached(held, grid_points(case), branch)
+
+
+def reached(held: HeldRod, points_base: Floats, branch: int) -> Floats:
+    """Joints that put the nominal ball on points (n, 3), one branch, shape (n, 6), rad."""
+    q = inverse(held.model, flange_poses(held, points_base))[:, branch]
+    if np.isnan(q).any():
+        raise NoAnswerError(f"branch {branch} does not reach")
+    return q
+
+
+class Room:
+    """One drawn room, what was measured in it so far, and its truth."""
+
+    def __init__(self, case: ServoCase, seed: int, branch: int) -> None:
+        self.case, self.branch = case, branch
+        self.rng = np.random.default_rng(seed)
+        self.room: StereoWorkcell = draw_workcell(case, self.rng)
+        self.held = held_rod(case, self.room)
+        self.q = list(commands(case, branch))
+        self.q_true = [self.arrived(q) for q in self.q]
+        self.pixels = [self.seen(self.room.ball_c(q)) for q in self.q_true]
+        truth = case.truth_errors
+        self.measured_c = self.room.ball_c(np.array(self.q_true)) + self.rng.normal(0.0, truth.measuring_mm, (12, 3))
+        self.markers = np.array([self.seen(point) for point in self.room.markers_c])
+        self.markers_m = case.markers.points + self.rng.normal(0.0, truth.marker_mm, case.markers.points.shape)
+        self.T_base_c = fit_rigid(self.measured_c, ball_base(calibrating_rod(case, self.room), np.array(self.q)))
+        self.found: Adjusted | None = None
+
+    def arrived(self, q: Floats) -> Floats:
+        """Where the joints come to rest."""
+        return q + self.rng.normal(0.0, self.case.truth_errors.arrival, 6)
+
+    def seen(self, point_c: Floats) -> Floats:
+        """Pixels of a point in both cameras, shape (2, 2)."""
+        exact = np.array([camera.project(point_c) for camera in self.room.cameras])
+        return exact + self.rng.normal(0.0, self.case.truth_errors.ball_px or PIXEL_PX, exact.shape)
+
+    def go(self, q: Floats) -> Floats:
+        """Send the arm, without a look; returns where it truly is."""
+        self.q.append(q)
+        self.q_true.append(self.arrived(q))
+        return self.q_true[-1]
+
+    def look(self) -> None:
+        """See the ball where it is."""
+        self.pixels.append(self.seen(self.room.ball_c(self.q_true[-1])))
+
+    def adjusted(self) -> Adjusted:
+        """The joint estimate of what was seen."""
+        count, told = len(self.pixels), self.case.errors.ball_px or PIXEL_PX
+        pixels, markers = np.array(self.pixels).transpose(1, 0, 2), self.markers.transpose(1, 0, 2)
+        round_errors = [np.broadcast_to(told**2 * np.eye(2), (*one.shape, 2)) for one in (pixels, markers)]
+        observed = Observed(
+            planned_cameras(self.case), self.held, self.case.errors, np.array(self.q[:count]), pixels, round_errors[0],
+            self.measured_c, markers, round_errors[1], self.markers_m,
+        )  # fmt: skip
+        T_c_base = np.asarray(np.linalg.inv(self.T_base_c))
+        more = apply(T_c_base, ball_base(self.held, np.array(self.q[12:count]).reshape(-1, 6)))
+        guess = Guess(T_c_base, self.room.T_c_m, np.concatenate([self.measured_c, more]))
+        start = None
+        if self.found is not None:
+            before = self.found.unknowns
+            start = before._replace(balls_c=np.concatenate([before.balls_c, more[len(before.balls_c) - 12 :]]))
+        self.found = adjust(observed, guess, start)
+        return self.found
+
+
+def room_outcome(case: ServoCase, seed: int, branch: int = BRANCH) -> RoomOutcome:
+    """One room: to one target by the mapping alone, then by a look."""
+    one = Room(case, seed, branch)
+    target = int(one.rng.integers(len(case.targets.names)))
+    target_m = case.targets.points[target] + one.rng.normal(0.0, case.truth_errors.target_mm, 3)
+    radius = case.file.target.hit_radius_mm
+    found = one.adjusted()
+    aim = found.offset(0, target_m).target_c
+    q = reached(one.held, apply(one.T_base_c, aim[None]), branch)[0]
+    unseen = needle_outcome(open_loop_error(found, q, target_m), one.room.needle_m(one.go(q), target), radius)
+    one.look()
+    offset = one.adjusted().offset(-1, target_m)
+    move = np.concatenate([one.T_base_c[:3, :3] @ (offset.target_c - offset.ball_c), np.zeros(3)])
+    q_true = one.go(q + np.linalg.solve(ball_jacobian(one.held, q), move))
+    one.look()
+    found = one.adjusted()
+    seen = needle_outcome(servoed_error(found, -1, target_m), one.room.needle_m(q_true, target), radius)
+    return RoomOutcome(unseen, seen, found.chi2, found.freedom)
+
+
+def told_of_pixels(case: ServoCase, **errors: float | str) -> ServoCase:
+    """The case with the pixels' error declared, and other errors where they are named."""
+    return varied(case, errors={"ball_px": PIXEL_PX, **errors})
+
+
+def drawn_from(case: ServoCase, factor: float) -> ServoCase:
+    """The case with a truth whose errors are all so many times as large as the belief declares them."""
+    return varied(case, rehearsal={"errors": case.errors.scaled(factor).stated()})
+
+
+def rows() -> dict[str, ServoCase]:
+    """What is drawn and declared in each row."""
+    head = told_of_pixels(load_servo_case(folder() / "head"))
+    plain = replace(head, file=head.file.model_copy(update={"errors": None}))
+    return {
+        "meshes/head as declared": head,
+        "the defaults of [errors]": told_of_pixels(varied(plain, errors={}), target_mm=0.3),
+        "arm nominal, no play": told_of_pixels(varied(plain, errors={"arm": "nominal"})),
+        "cameras of .3 px, head moves .2 mm, .1 deg": told_of_pixels(
+            head, ball_px=0.3, head_shift_mm=0.2, head_turn_deg=0.1
+        ),
+        "liu2007": told_of_pixels(load_servo_case(folder() / "head" / "liu2007.toml")),
+        "declared half of the truth": drawn_from(head, 2.0),
+        "declared twice the truth": drawn_from(head, 0.5),
+    }
+
+
+HEAD = (
+    f"{'':52s} {'tip, mm':>15s} {'ratio':>6s} {'in 95 %':>7s} {'direction, deg':>15s} {'pose':>6s} {'hit, %':>13s}"
+    + "  doubted"
+)
+
+
+def line(name: str, outcomes: Sequence[NeedleOutcome], doubted: float) -> str:
+    """One way in a line: realised and predicted, share in both 95 % regions, hits, share of rooms that are doubted."""
+    ours = needle_statistics(outcomes)
+    assert ours is not None
+    pose = np.mean([one.square_of_pose <= chdtri(6, 0.05) for one in outcomes])
+    ratio = ours.realised_rms_mm / ours.predicted_rms_mm
+    hit = "" if ours.hit_share is None else f"{100 * ours.hit_share:5.1f} {100 * (ours.mean_p_hit or 0.0):5.1f}"
+    return (
+        f"{name:52s} {ours.realised_rms_mm:7.3f} {ours.predicted_rms_mm:7.3f} {ratio:6.3f} {ours.coverage_95:7.3f} "
+        f"{ours.realised_direction_deg:7.3f} {ours.predicted_direction_deg:7.3f} {pose:6.3f} {hit:>13s} "
+        f"{100 * doubted:6.1f} %"
+    )
+
+
+def fast_rooms(name: str, case: ServoCase, count: int, jobs: int) -> None:
+    """One row of the table."""
+    with process_pool(jobs, count) as pool:
+        found = list(pool.map(partial(room_outcome, case), range(count), chunksize=50))
+    doubted = float(np.mean([chdtrc(one.freedom, one.chi_squared) < DOUBTED for one in found]))
+    print(line(f"{name}: unseen", [one.open_loop for one in found], doubted))
+    print(line(f"{'':{len(name)}s}  servoed", [one.servoed for one in found], doubted), flush=True)
+
+
+def pixels_alone(room: StereoWorkcell, rng: np.random.Generator) -> Detector:
+    """True pixels with normal errors of ``PIXEL_PX``."""
+    return pixel_detector(room, PIXEL_PX, rng)
+
+
+def _session(case: ServoCase, seed: int) -> ServoTrial:
+    return trial(run_session(case, seed, detector_of=pixels_alone))
+
+
+def sessions(name: str, case: ServoCase, count: int, jobs: int) -> None:
+    """Whole sessions: 16 targets in one room, so rooms count, not targets."""
+    with process_pool(jobs, count) as pool:
+        trials = list(pool.map(partial(_session, case), range(count)))
+    doubted = float(np.mean([one.declaration is None or one.declaration.p < DOUBTED for one in trials]))
+    for way in ("open_loop", "servoed"):
+        needles = [getattr(row, f"needle_{way}") for one in trials for row in one.rows]
+        print(line(f"{name}: {way}", [one for one in needles if one is not None], doubted), flush=True)
+
+
+def main() -> None:
+    """Parse, run, print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rooms", type=int, default=2000)
+    parser.add_argument("--sessions", type=int, default=40)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--only", default="", help="rows whose name contains a word")
+    asked = parser.parse_args()
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")  # for the processes that are started: one thread each
+    start = time.perf_counter()
+    print(f"numpy {np.__version__}, Python {platform.python_version()}, {os.cpu_count()} cores, {asked.jobs} processes")
+    print(f"fast rooms: {asked.rooms} a row; realised, predicted\n{HEAD}")
+    for name, case in rows().items():
+        if asked.only in name:
+            fast_rooms(name, case, asked.rooms, asked.jobs)
+    if asked.sessions:
+        head = told_of_pixels(load_servo_case(folder() / "head"))
+        print(f"sessions without pictures: {asked.sessions} of 16 targets\n{HEAD}")
+        sessions("meshes/head as declared", head, asked.sessions, asked.jobs)
+        sessions("no play", told_of_pixels(head, backlash_deg=0.0), asked.sessions, asked.jobs)
+    print(f"{time.perf_counter() - start:.0f} s")
+
+
+if __name__ == "__main__":
+    main()
