@@ -136,3 +136,64 @@ def write_series(folder, slices, names=None):
     for number, one in enumerate(slices):
         write(one, folder / (names[number] if names else f"IM{(number * 7919) % 1000:04d}_{number}"))
     return folder
+
+
+def segmentation(masks, T, step="2.5", fractional=None, omit=True):
+    """A SEG of named masks (columns, rows, slices), each in as many frames as are not empty.
+
+    ``fractional``: values of 0 to 200 instead of masks, whose half is 100.
+    """
+    data = base(SEG_CLASS, ROOT + "300", series=ROOT + "30", description="segments")
+    spacing = np.linalg.norm(T[:3, :2], axis=0)
+    shared = Dataset()
+    measures = item(PixelSpacing=ds(spacing[::-1]), SliceThickness="2.5")
+    if step:
+        measures.SpacingBetweenSlices = step
+    shared.PixelMeasuresSequence = [measures]
+    shared.PlaneOrientationSequence = [item(ImageOrientationPatient=ds((T[:3, :2] / spacing).T))]
+    data.SharedFunctionalGroupsSequence = [shared]
+    data.SegmentSequence = [item(SegmentNumber=n, SegmentLabel=name) for n, name in enumerate(masks, start=1)]
+    groups, images = [], []
+    for number, mask in enumerate(masks.values(), start=1):
+        for k in range(mask.shape[2]):
+            if omit and not mask[:, :, k].any():
+                continue
+            place = item(ImagePositionPatient=ds((T @ [0, 0, k, 1])[:3]))
+            whose = item(ReferencedSegmentNumber=number)
+            groups.append(item(PlanePositionSequence=[place], SegmentIdentificationSequence=[whose]))
+            images.append(mask[:, :, k].T)
+    data.PerFrameFunctionalGroupsSequence = groups
+    data.NumberOfFrames = len(images)
+    data.Rows, data.Columns = images[0].shape
+    data.SamplesPerPixel, data.PhotometricInterpretation, data.PixelRepresentation = 1, "MONOCHROME2", 0
+    bits = 8 if fractional else 1
+    data.BitsAllocated, data.BitsStored, data.HighBit = bits, bits, bits - 1
+    data.SegmentationType = "FRACTIONAL" if fractional else "BINARY"
+    flat = np.concatenate([image.ravel() for image in images]).astype(np.uint8)
+    if fractional:
+        data.SegmentationFractionalType, data.MaximumFractionalValue = "PROBABILITY", 200
+    stored = flat if fractional else np.packbits(flat, bitorder="little")
+    data.PixelData = stored.tobytes() + b"\0" * (len(stored) % 2)
+    return data
+
+
+def structure_set(regions, frame=FRAME):
+    """An RTSTRUCT: name to contours, each an array (n, 3) in LPS mm, or a pair of its type and the array."""
+    data = base(RT_CLASS, ROOT + "400", series=ROOT + "40", description="contours")
+    del data.FrameOfReferenceUID
+    rows, contours = [], []
+    for number, (name, listed) in enumerate(regions.items(), start=1):
+        rows.append(item(ROINumber=number, ReferencedFrameOfReferenceUID=frame, ROIName=name))
+        drawn = Dataset()
+        drawn.ReferencedROINumber = number
+        made = []
+        for one in listed:
+            kind, points = one if isinstance(one, tuple) else ("CLOSED_PLANAR", one)
+            made.append(
+                item(ContourGeometricType=kind, NumberOfContourPoints=len(points), ContourData=ds(points)),
+            )
+        if made:
+            drawn.ContourSequence = Sequence(made)
+        contours.append(drawn)
+    data.StructureSetROISequence, data.ROIContourSequence = Sequence(rows), Sequence(contours)
+    return data

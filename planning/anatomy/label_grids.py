@@ -1,4 +1,4 @@
-"""The grids on which a case's labels lie: of each label map, and one of each folder of masks."""
+"""The grids on which a case's labels lie: of each label map, and one of each folder or DICOM file of masks."""
 
 from __future__ import annotations
 
@@ -41,6 +41,7 @@ def label_grids(case: Case) -> tuple[LabelGrid, ...]:
 def _grids(case: Case) -> Iterator[LabelGrid]:
     maps = {one.labelmap for one in case.structure} | {many.labelmap for many in case.structures}
     sources = {name: [name] for name in maps if name is not None}
-    sources |= {one.masks: list(case.masks(one.masks).values()) for one in case.structures if one.masks is not None}
+    sets = [one.mask_set for one in case.structures if one.mask_set is not None]
+    sources |= {one: list(case.masks(one).values()) for one in sets}
     for name, files in sources.items():
         yield LabelGrid(name, frozenset(files), case.volumes.source(files[0]).grid)

@@ -51,8 +51,8 @@ class StructureSources:
 
     def many(self, section: StructuresSection) -> list[Structure]:
         """All labels of one map, or masks of one folder, that the rules do not ignore."""
-        if section.masks is not None:
-            return self._masks(section, section.masks)
+        if section.mask_set is not None:
+            return self._masks(section, section.mask_set)
         name = section.source
         volume = self._labels(name)
         names = names_for(section.naming, self._case.folder, self._case.files.content, volume)
@@ -64,9 +64,10 @@ class StructureSources:
         return structures
 
     def _masks(self, section: StructuresSection, folder: str) -> list[Structure]:
-        """One structure a mask that is not empty; the voxels of one mask at a time are in memory."""
+        """One structure a mask (a file or part of one) that is not empty; one mask's voxels at a time are in memory."""
         self._refuse_local(folder, "masks")
         files = self._case.masks(folder)
+        self.warnings.extend(self._case.volumes.mask_notes(folder))
         check_one_grid({one: self._case.volumes.source(one).grid for one in files.values()}, where=self._file(folder))
         names = dict(enumerate(files, start=1))
         labels = {number: self._open(files[name]).mask_label() for number, name in names.items()}
@@ -188,7 +189,8 @@ class StructureSources:
     def _open(self, name: str) -> VolumeSurfaces:
         """A volume that nobody else holds, so that its voxels go when it does."""
         source = self._case.volumes.source(name)
-        return VolumeSurfaces(source, tuple(self._case.files.sha256(file) for file in source.files), self._cache)
+        hashes = (self._case.files.sha256(file) for file in source.files)
+        return VolumeSurfaces(source, (*hashes, *source.part), self._cache)
 
     def _file(self, name: str) -> Path:
         return self._case.folder / name

@@ -211,7 +211,9 @@ class Case:
         return self.files.inputs
 
     def masks(self, folder: str) -> dict[str, str]:
-        """The masks of a folder that the case names: structure to file, relative to the case's folder."""
+        """The masks of a folder or a DICOM file that the case names: structure to the name of its volume."""
+        if parts := self.volumes.masks(folder):
+            return parts
         inside = PurePosixPath(folder)
         files = [one.path for one in self.inputs if one.role.startswith(MASK_ROLE)]
         return {structure_name(file): file for file in files if PurePosixPath(file).parent == inside}
@@ -233,6 +235,8 @@ def load_case(path: Path | str) -> Case:
             case_volumes.read(one.role, one.name, key=one.key)
         else:
             files.read(one.role, one.name, max_bytes=one.max_bytes, key=one.key, where=path)
+    for many in content.structures:
+        case_volumes.read_masks(many, _ct_name(content))
     space = Space(content.space)
     target = _target(content, path, space, files)
     settings = content.search
@@ -301,12 +305,17 @@ def _errors(
 
 def _ct_cells(content: CaseFile, case_volumes: CaseVolumes) -> Cells | None:
     """Pixel, slice spacing and slice normal of the case's CT; None without one."""
-    names = [one.ct for one in content.structure if one.ct is not None] + [content.ct.file]
-    if names[0] is None:
+    name = _ct_name(content)
+    if name is None:
         return None
-    grid = case_volumes.source(names[0]).grid
+    grid = case_volumes.source(name).grid
     spacing = grid.spacing_mm
     return Cells(float(spacing[:2].max()), float(spacing[2]), grid.T_ct_index[:3, 2] / spacing[2])
+
+
+def _ct_name(content: CaseFile) -> str | None:
+    """The CT that the skin comes from, or the one that stands beside it."""
+    return next((one.ct for one in content.structure if one.ct is not None), content.ct.file)
 
 
 def _target(content: CaseFile, path: Path, space: Space, files: InputFiles) -> Floats:
@@ -411,6 +420,11 @@ def _many_files(many: StructuresSection, key: str, path: Path) -> Iterator[_Name
     """A label map, or every file of a folder of masks: also empty ones decide what is there."""
     if many.labelmap is not None:
         yield _Named("labelmap", many.labelmap, f"{key}.labelmap", volumes.MAX_FILE_BYTES)
+    for role in ("seg", "rtstruct"):
+        if (file := getattr(many, role)) is not None:
+            yield _Named(role, file, f"{key}.{role}", volumes.MAX_FILE_BYTES)
+    if many.ct is not None:
+        yield _Named("ct", many.ct, f"{key}.ct", volumes.MAX_FILE_BYTES)
     if many.masks is not None:
         for file in mask_files(path.parent / many.masks, where=f"{path}: {key}.masks"):
             name = str(PurePosixPath(many.masks) / file)

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
 
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
+from puncture_twin.planning.case.case_file import StructuresSection
 from puncture_twin.planning.formats.dicom.choose_series import choose_series, is_series
 from puncture_twin.planning.formats.dicom.ct_series import CtSeries, parse_series
+from puncture_twin.planning.formats.dicom.named_masks import NamedMasks, check_frame_of_reference
+from puncture_twin.planning.formats.dicom.segmentation import parse_segmentation
+from puncture_twin.planning.formats.dicom.structure_set import parse_structure_set
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, data_file
 from puncture_twin.planning.formats.volumes.volume_source import VolumeFile, VolumeSource
 
@@ -26,6 +31,7 @@ class CaseVolumes:
         self._files = files
         self._path = path
         self._sources: dict[str, VolumeSource] = {}
+        self._masks: dict[str, NamedMasks] = {}
 
     def read(self, role: str, name: str, *, key: str) -> None:
         """Read every file of a volume; those that hold its voxels decide as much as its header.
@@ -53,6 +59,45 @@ class CaseVolumes:
         """The volume of this name."""
         return self._sources[name]
 
+    def read_masks(self, section: StructuresSection, case_ct: str | None) -> None:
+        """The structures of a DICOM SEG or RTSTRUCT whose file has been read, and its CT; other sections have none.
+
+        Args:
+            section: Names the file, and the CT series on which it was drawn where that is not the case's.
+            case_ct: The CT of the case, or None.
+
+        Raises:
+            InputError: Structures that cannot be trusted, or that were drawn in other coordinates.
+        """
+        name, series = section.seg or section.rtstruct, self._ct_series(section.ct or case_ct)
+        if name is None:
+            return
+        path = self._path.parent / name
+        shown = self._ct_series(case_ct)
+        if series is not None and shown is not None:
+            check_frame_of_reference(series.frame_of_reference, shown, series.path)
+        if section.rtstruct is None:
+            found = parse_segmentation(path, name, self._files.content, series)
+        elif series is None:
+            what = f"rtstruct '{name}' needs the CT on which it was drawn, as a DICOM series"
+            raise InputError(what, where=self._path, allowed='ct = "FOLDER" beside it, or as the CT of the case')
+        else:
+            found = parse_structure_set(path, name, self._files.content, series)
+        self._masks[name] = found
+        self._sources |= {_key(name, called): mask for called, mask in found.masks.items()}
+
+    def masks(self, name: str) -> dict[str, str]:
+        """The structures of a DICOM file: each one's name to that of its volume; none of another file."""
+        return {called: _key(name, called) for called in self._masks[name].masks} if name in self._masks else {}
+
+    def mask_notes(self, name: str) -> tuple[str, ...]:
+        """What to tell of the structures of a DICOM file."""
+        return self._masks[name].notes if name in self._masks else ()
+
+    def _ct_series(self, name: str | None) -> CtSeries | None:
+        source = None if name is None else self._sources.get(name)
+        return source if isinstance(source, CtSeries) else None
+
     def _series(self, path: Path, name: str, key: str) -> CtSeries:
         """A folder of slices, or the series of one: every slice is a file that decides."""
         chosen = choose_series(path)
@@ -61,3 +106,8 @@ class CaseVolumes:
         for file in files:
             self._files.read("ct", file, max_bytes=MAX_FILE_BYTES, key=key, where=self._path)
         return parse_series(path, files, self._files.content, chosen.notes)
+
+
+def _key(file: str, called: str) -> str:
+    """The name of one structure's volume."""
+    return f"{file}#{called}"

@@ -11,6 +11,7 @@ import SimpleITK as sitk  # noqa: N813
 from case_world import structure
 from places import REAL_CT, TESTS
 
+from puncture_twin.planning.anatomy.anatomy import load_anatomy
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import differing_input
 from puncture_twin.planning.case.case import load_case
@@ -125,6 +126,72 @@ def test_a_folder_as_a_label_map_is_refused(scene):
     (scene / "wrong.toml").write_text(text.replace(json.dumps("labels.nii.gz"), json.dumps("series"), 1))
     with pytest.raises(InputError, match="file 'series' is not there"):
         load_case(scene / "wrong.toml")
+
+
+def boxes_of(mask, T):
+    """Contours of a mask, slice by slice: the edges of each run of voxels in a column, as a rectangle."""
+    contours = []
+    for k, j in np.argwhere(mask.any(axis=0).T):
+        edges = np.flatnonzero(np.diff(np.pad(mask[:, j, k].astype(int), 1)))
+        for low, high in edges.reshape(-1, 2):
+            corners = [(low - 0.5, j - 0.5), (high - 0.5, j - 0.5), (high - 0.5, j + 0.5), (low - 0.5, j + 0.5)]
+            contours.append(np.array([(T @ [x, y, k, 1])[:3] for x, y in corners]))
+    return contours
+
+
+def write_structures(folder):
+    """Lesion and spine of the label map as SEG and as RTSTRUCT, and the cases that name them."""
+    labels = read_volume(folder / "labels.nii.gz")
+    masks = {"the lesion": labels.values == 1, "spine": labels.values == 2}
+    world.write(world.segmentation(masks, labels.T_ct_index), folder / "seg.dcm")
+    contours = {name: boxes_of(mask, labels.T_ct_index) for name, mask in masks.items()}
+    world.write(world.structure_set(contours), folder / "rt.dcm")
+    head = HEAD.replace('structure = "lesion"', 'structure = "the lesion"') + structure(
+        "skin", "skin", {"ct": "series"}
+    )
+    for kind, file in (("seg", "seg.dcm"), ("rtstruct", "rt.dcm")):
+        rules = 'target = ["the lesion"]\navoid = { "spi*" = 2.0 }\n'
+        (folder / f"{kind}.toml").write_text(f'{head}[[structures]]\n{kind} = "{file}"\n{rules}')
+
+
+def test_seg_and_rtstruct_give_the_verdicts_of_a_label_map(scene):
+    """Names by pattern, roles and margins as for labels; file and slices are inputs."""
+    write_structures(scene)
+    labels = prepare(scene / "dicom.toml", arm=False).search()
+    for kind, file in (("seg", "seg.dcm"), ("rtstruct", "rt.dcm")):
+        context = prepare(scene / f"{kind}.toml", arm=False)
+        assert [one.name for one in context.anatomy.structures[:2]] == ["the lesion", "spine"]
+        assert (kind, file) in [(one.role, one.path) for one in context.case.inputs]
+        found = context.search()
+        assert np.array_equal(found.verdict.reason, labels.verdict.reason)
+        assert np.allclose(found.path.length, labels.path.length, atol=1e-3, equal_nan=True)
+
+
+WRONG = {
+    "rtstruct without a series": (("series", "ct.nii.gz"), "rtstruct 'rt.dcm' needs the CT on which it was drawn"),
+    "an organ that no rule names": (('avoid = { "spi*" = 2.0 }', ""), "no rule names .*spine"),
+    "a naming": (('rtstruct = "rt.dcm"', 'rtstruct = "rt.dcm"\nnaming = "x.csv"'), "naming belongs to labelmap"),
+    "two sources": (('rtstruct = "rt.dcm"', 'rtstruct = "rt.dcm"\nseg = "seg.dcm"'), "it has seg and rtstruct"),
+    "ct beside a label map": (
+        ('rtstruct = "rt.dcm"', 'labelmap = "labels.nii.gz"\nct = "series"'),
+        "ct belongs to seg",
+    ),
+    "a file that is not there": (('rtstruct = "rt.dcm"', 'rtstruct = "none.dcm"'), "file 'none.dcm' is not there"),
+    "the other kind": (('rtstruct = "rt.dcm"', 'seg = "rt.dcm"'), "allowed: a DICOM SEG"),
+}
+
+
+@pytest.mark.parametrize("name", sorted(WRONG))
+def test_what_is_wrong_with_structures_of_dicom_is_said(scene, name):
+    """As for label maps."""
+    if not (scene / "rtstruct.toml").is_file():
+        write_structures(scene)
+    change, message = WRONG[name]
+    text = (scene / "rtstruct.toml").read_text()
+    assert change[0] in text
+    (scene / "wrong.toml").write_text(text.replace(*change))
+    with pytest.raises(InputError, match=message):
+        load_anatomy(load_case(scene / "wrong.toml"))
 
 
 @pytest.mark.skipif(not REAL_CT.is_dir(), reason="the real CT (totalseg_abdomen_3mm) is not on this machine")

@@ -56,6 +56,7 @@ class CtSeries:
     files: tuple[str, ...]
     content: Content
     aside: tuple[str, ...] = ()
+    part: tuple[str, ...] = ()
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.dicom.attributes import items, name, number, numbers, text, texts
 from puncture_twin.planning.formats.dicom.recognise import NO_SLICES
 from puncture_twin.planning.formats.dicom.storage import CLASSIC_CT
+from puncture_twin.planning.formats.volumes.volume_header import MAX_ORIGIN_MM, MAX_SPACING_MM, MIN_SPACING_MM
 
 UNIT_TOLERANCE = 1e-3
 """Of an axis' length, and of the cosine between two: positions are written with six digits, some with four."""
@@ -139,6 +140,17 @@ def plane_of(groups: Groups, label: str) -> Plane:
     between_rows, between_columns = numbers(
         groups.holder("PixelMeasuresSequence", label), "PixelSpacing", 2, where=label
     )
+    if max(map(abs, origin)) > MAX_ORIGIN_MM:
+        raise InputError(
+            f"{name('ImagePositionPatient')} is {list(origin)}", where=label, allowed=f"{MAX_ORIGIN_MM} mm"
+        )
+    if not all(MIN_SPACING_MM <= one <= MAX_SPACING_MM for one in (between_rows, between_columns)):
+        allowed = f"{MIN_SPACING_MM} to {MAX_SPACING_MM} mm"
+        raise InputError(
+            f"{name('PixelSpacing')} is {between_rows:g}, {between_columns:g}", where=label, allowed=allowed
+        )
+    if max(map(abs, cosines)) > 2:
+        raise InputError(f"{name('ImageOrientationPatient')} is {list(cosines)}", where=label, allowed="unit vectors")
     axes = np.array(cosines).reshape(2, 3).T
     lengths = np.linalg.norm(axes, axis=0)
     if np.abs(lengths - 1.0).max() > UNIT_TOLERANCE or abs(axes[:, 0] @ axes[:, 1]) > UNIT_TOLERANCE:

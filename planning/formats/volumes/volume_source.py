@@ -21,6 +21,7 @@ class VolumeSource(Protocol):
     Attributes:
         path: What was named.
         files: Every file that decides a voxel or its place, as the content is asked for it.
+        part: Which part of these files it is, where they hold several volumes.
         notes: What a person should be told of how it was read, one sentence each.
         grid: Where the voxels lie, LPS mm.
     """
@@ -29,6 +30,8 @@ class VolumeSource(Protocol):
     def path(self) -> Path: ...  # noqa: D102  the class says it
     @property
     def files(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def part(self) -> tuple[str, ...]: ...  # noqa: D102
     @property
     def notes(self) -> tuple[str, ...]: ...  # noqa: D102
     @property
@@ -51,6 +54,7 @@ class VolumeFile:
     path: Path
     files: tuple[str, ...]
     content: Content
+    part: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     @cached_property

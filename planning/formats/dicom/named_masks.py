@@ -1,0 +1,83 @@
+"""Structures of one DICOM file, which may overlap: a mask each, made one at a time on the grid that all share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.dicom.ct_series import CtSeries
+from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
+
+Mask = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class MaskVolume:
+    """One structure as a volume of 0 and 1, whose voxels are made at each call.
+
+    Attributes:
+        path: The file that holds it.
+        files: Every file that decides it, as the content is asked for it: also the CT's, where it lies on its grid.
+        part: Which structure of the file it is.
+        grid: Where the voxels lie, LPS mm; sheared where the CT's gantry was tilted.
+        make: Makes the voxels, of the grid's shape.
+    """
+
+    path: Path
+    files: tuple[str, ...]
+    part: tuple[str, ...]
+    grid: VolumeGrid
+    make: Callable[[], Mask]
+    notes: tuple[str, ...] = ()
+
+    def volume(self) -> Volume:
+        """The mask with its voxels."""
+        return Volume(self.make(), self.grid.T_ct_index, self.path)
+
+
+@dataclass(frozen=True, eq=False)
+class NamedMasks:
+    """The structures of one file.
+
+    Attributes:
+        masks: Name to mask.
+        notes: What a person should be told, one sentence each.
+    """
+
+    masks: dict[str, MaskVolume]
+    notes: tuple[str, ...]
+
+
+def unique_names(names: Sequence[str], where: Path) -> None:
+    """Whether each structure has a name of its own.
+
+    Raises:
+        InputError: One has none, or two share one.
+    """
+    if not names:
+        raise InputError("holds no structure", where=where, allowed="a file with structures")
+    for name in names:
+        if not name or names.count(name) > 1:
+            what = f"{names.count(name)} structures are called {name!r}" if name else "a structure has no name"
+            raise InputError(what, where=where, allowed="a name of its own for each structure")
+
+
+def check_frame_of_reference(stated: str, ct: CtSeries, where: Path) -> None:
+    """Whether structures and CT lie in the same coordinates.
+
+    Raises:
+        InputError: They state two, or one states none.
+    """
+    if stated != ct.frame_of_reference or not stated:
+        what = f"lies in the frame of reference {stated or 'not stated'}, the CT {ct.path.name} in "
+        raise InputError(
+            f"{what}{ct.frame_of_reference or 'one that is not stated'}",
+            where=where,
+            allowed="structures that were drawn on this CT, or on one that was registered to it",
+        )

@@ -1,0 +1,232 @@
+"""DICOM SEG: segments as masks, which may overlap (DICOM PS3.3, A.51 and C.8.20)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydicom.dataset import Dataset
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.dicom.attributes import has, items, name, number, text, whole
+from puncture_twin.planning.formats.dicom.ct_series import CtSeries
+from puncture_twin.planning.formats.dicom.dicom_file import how_to_convert, parse_dicom
+from puncture_twin.planning.formats.dicom.named_masks import (
+    Mask,
+    MaskVolume,
+    NamedMasks,
+    check_frame_of_reference,
+    unique_names,
+)
+from puncture_twin.planning.formats.dicom.pixels import check_length, sizes
+from puncture_twin.planning.formats.dicom.slices import Groups, Plane, frame_groups, plane_of
+from puncture_twin.planning.formats.dicom.stack import AXES_TOLERANCE, PLACE_TOLERANCE, SPACING_TOLERANCE
+from puncture_twin.planning.formats.dicom.storage import PLAIN, SEGMENTATION
+from puncture_twin.planning.formats.volumes.volume_header import MAX_SPACING_MM, MIN_SPACING_MM, VolumeGrid, check_shape
+from puncture_twin.planning.formats.volumes.volume_source import Content
+
+MAX_SLICES = 20_000
+"""Between the first and the last frame."""
+ON_GRID = 0.05
+"""Of a voxel, by which a segmentation's grid may miss the CT's and still be on it."""
+HALF = 0.5
+"""From this fraction on, a voxel of a fractional segment belongs to it."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Frames:
+    """The frames of a segmentation.
+
+    Attributes:
+        segments: Shape (n,), the segment of each frame.
+        slices: Shape (n,), where it lies, in steps from the first.
+        T_ct_index: Shape (4, 4), maps (column, row, slice) to LPS mm.
+        rows, columns: Of each.
+    """
+
+    segments: NDArray[np.int64]
+    slices: NDArray[np.int64]
+    T_ct_index: Floats
+    rows: int
+    columns: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """The grid on which the masks are made, and where the frames' own grid begins in it."""
+
+    grid: VolumeGrid
+    offset: tuple[int, int, int]
+
+
+def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | None) -> NamedMasks:
+    """The segments of a DICOM SEG, each by its label.
+
+    Args:
+        path: Its name.
+        file: As the content is asked for it.
+        content: Gives its bytes.
+        ct: The CT on which it was drawn, where that is DICOM too: masks lie on its grid where they fit it.
+
+    Raises:
+        InputError: No segmentation, one that cannot be trusted, or one of another frame of reference.
+    """
+    data = parse_dicom(content(file), path)
+    where = path.name
+    if (sop_class := text(data, "SOPClassUID", where=where)) != SEGMENTATION:
+        raise InputError(f"SOP class {sop_class or 'missing'}", where=path, allowed="a DICOM SEG")
+    kind = _checked_kind(data, path)
+    if ct is not None:
+        check_frame_of_reference(text(data, "FrameOfReferenceUID", where=where), ct, path)
+    names = _names(data, where)
+    unique_names(list(names.values()), path)
+    frames = _frames(data, names, path)
+    placed = _placed(frames, ct, path)
+    files = (file,) if ct is None else (file, *ct.files)
+    masks = {
+        called: MaskVolume(path, files, (called,), placed.grid, partial(_mask, data, frames, placed, segment, path))
+        for segment, called in names.items()
+    }
+    notes = [] if ct else [f"{where}: whether it was drawn on this case's CT is not known, which is no DICOM series"]
+    if kind == "FRACTIONAL":
+        notes.append(f"{where}: fractional segments; a voxel counts from {HALF:g} on")
+    return NamedMasks(masks, tuple(notes))
+
+
+def _checked_kind(data: Dataset, path: Path) -> str:
+    where = path.name
+    kind = text(data, "SegmentationType", where=where)
+    if kind not in ("BINARY", "FRACTIONAL"):
+        raise InputError(f"{name('SegmentationType')} is {kind or 'missing'}", where=path, allowed="BINARY, FRACTIONAL")
+    if data.file_meta.TransferSyntaxUID not in PLAIN:
+        syntax = data.file_meta.TransferSyntaxUID
+        raise InputError(f"transfer syntax {syntax.name} ({syntax})", where=path, allowed=how_to_convert())
+    bits = 1 if kind == "BINARY" else 8
+    whole(data, "BitsAllocated", low=bits, high=bits, where=where)
+    rows, columns, count = sizes(data, where)
+    check_length(data, (rows * columns * count * bits + 7) // 8, where)
+    return kind
+
+
+def _names(data: Dataset, where: str) -> dict[int, str]:
+    found: dict[int, str] = {}
+    for item in items(data, "SegmentSequence", where=where):
+        segment = whole(item, "SegmentNumber", low=1, high=65535, where=where)
+        if segment in found:
+            raise InputError(f"two segments have the number {segment}", where=where, allowed="each number once")
+        found[segment] = text(item, "SegmentLabel", where=where)
+    return found
+
+
+def _frames(data: Dataset, names: dict[int, str], path: Path) -> _Frames:
+    where = path.name
+    rows, columns, count = sizes(data, where)
+    groups = frame_groups(data, count, where=where)
+    segments = np.array([_segment(one, f"{where}, frame {k + 1}", names) for k, one in enumerate(groups)])
+    planes = [plane_of(one, f"{where}, frame {k + 1}") for k, one in enumerate(groups)]
+    T, slices = _regular(planes, _stated_step(groups[0], where), path)
+    pairs = set(zip(segments.tolist(), slices.tolist(), strict=True))
+    if len(pairs) < count:
+        raise InputError("two frames of one segment lie at one place", where=path, allowed="one frame a slice")
+    return _Frames(segments, slices, T, rows, columns)
+
+
+def _segment(groups: Groups, label: str, names: dict[int, str]) -> int:
+    found = groups.find("SegmentIdentificationSequence", label)
+    if len(found) != 1:
+        raise InputError(f"{len(found)} items say whose segment it is", where=label, allowed="one")
+    segment = whole(found[0], "ReferencedSegmentNumber", low=1, high=65535, where=label)
+    if segment not in names:
+        raise InputError(f"is of segment {segment}, which is not listed", where=label, allowed=f"{sorted(names)}"[:200])
+    return segment
+
+
+def _stated_step(groups: Groups, where: str) -> float | None:
+    measures = groups.holder("PixelMeasuresSequence", where)
+    for keyword in ("SpacingBetweenSlices", "SliceThickness"):
+        if has(measures, keyword):
+            step = number(measures, keyword, where=where)
+            return step if MIN_SPACING_MM <= step <= MAX_SPACING_MM else None
+    return None
+
+
+def _regular(planes: list[Plane], stated_mm: float | None, path: Path) -> tuple[Floats, NDArray[np.int64]]:
+    """The affine of the frames' own grid, and the slice of each frame; frames that are left out are empty."""
+    first = planes[0]
+    for other in planes[1:]:
+        if np.abs(other.axes_ct - first.axes_ct).max() > AXES_TOLERANCE or not np.allclose(
+            other.spacing_mm, first.spacing_mm, rtol=SPACING_TOLERANCE
+        ):
+            raise InputError("its frames have several orientations or pixel sizes", where=path, allowed="one of each")
+    origins = np.array([plane.origin_ct for plane in planes])
+    along = origins @ first.normal_ct
+    order = np.argsort(along, kind="stable")
+    low, high = origins[order[0]], origins[order[-1]]
+    step = _least_step(np.diff(along[order]), stated_mm, path)
+    count = round(float((along[order[-1]] - along[order[0]]) / step))
+    if count > MAX_SLICES:
+        raise InputError(f"{count} slices from its first to its last frame", where=path, allowed=f"{MAX_SLICES}")
+    step_ct = (high - low) / count if count else step * first.normal_ct
+    slices = np.round((along - along[order[0]]) / step).astype(np.int64)
+    off = np.linalg.norm(origins - low - slices[:, None] * step_ct, axis=1)
+    if off.max() > PLACE_TOLERANCE * step:
+        what = f"frame {int(np.argmax(off)) + 1} lies {off.max():.2f} mm off the grid of the others"
+        raise InputError(what, where=path, allowed=f"frames at whole steps of {step:.4g} mm along one line")
+    T = np.eye(4)
+    T[:3, :2], T[:3, 2], T[:3, 3] = first.axes_ct * first.spacing_mm, step_ct, low
+    return T, slices
+
+
+def _least_step(gaps: Floats, stated_mm: float | None, path: Path) -> float:
+    """The distance of neighbouring slices, mm: the stated one where the frames keep to it, else their least."""
+    real = gaps[gaps > 1e-3]
+    if not len(real):
+        if stated_mm is None:
+            raise InputError("one slice, and how thick it is is not stated", where=path, allowed="SliceThickness")
+        return stated_mm
+    least = float(real.min())
+    if stated_mm is not None and stated_mm <= least * (1 + PLACE_TOLERANCE):
+        times = round(least / stated_mm)
+        if abs(least - times * stated_mm) <= PLACE_TOLERANCE * stated_mm:
+            return least / times
+    return least
+
+
+def _placed(frames: _Frames, ct: CtSeries | None, path: Path) -> _Placed:
+    """On the CT's own slices where the frames lie on them, else on a grid of their own."""
+    own = (frames.columns, frames.rows, int(frames.slices.max()) + 1)
+    if ct is not None:
+        T_ct_slices, shape = ct.stack.T_ct_index, (*ct.slice_shape, len(ct.stack.slices))
+        between = np.linalg.inv(T_ct_slices) @ frames.T_ct_index
+        offset = np.round(between[:3, 3]).astype(int)
+        reach = np.abs(between[:3, :3] - np.eye(3)) @ np.array(own) + np.abs(between[:3, 3] - offset)
+        if reach.max() <= ON_GRID + PLACE_TOLERANCE and (offset >= 0).all() and (offset + own <= shape).all():
+            return _Placed(VolumeGrid(shape, T_ct_slices, {}), (int(offset[0]), int(offset[1]), int(offset[2])))
+    return _Placed(VolumeGrid(check_shape((*own[:2], max(own[2], 2)), where=path), frames.T_ct_index, {}), (0, 0, 0))
+
+
+def _mask(data: Dataset, frames: _Frames, placed: _Placed, segment: int, path: Path) -> Mask:
+    """The voxels of one segment."""
+    made = np.zeros(placed.grid.shape, np.uint8, order="F")
+    i, j, k = placed.offset
+    for frame in np.flatnonzero(frames.segments == segment).tolist():
+        image = _image(data, frame, frames.rows, frames.columns, path)
+        made[i : i + frames.columns, j : j + frames.rows, k + int(frames.slices[frame])] = image.T
+    return made
+
+
+def _image(data: Dataset, frame: int, rows: int, columns: int, path: Path) -> Mask:
+    """One frame, shape (rows, columns), 0 and 1; bits are packed over frames without a gap, the lowest first."""
+    count = rows * columns
+    if text(data, "SegmentationType", where=path.name) == "FRACTIONAL":
+        highest = whole(data, "MaximumFractionalValue", low=1, high=255, where=path.name)
+        cells = np.frombuffer(data.PixelData, np.uint8, count, frame * count)
+        return (cells >= HALF * highest).astype(np.uint8).reshape(rows, columns)
+    first, last = frame * count // 8, ((frame + 1) * count + 7) // 8
+    bits = np.unpackbits(np.frombuffer(data.PixelData, np.uint8, last - first, first), bitorder="little")
+    start = frame * count - 8 * first
+    return bits[start : start + count].reshape(rows, columns)

@@ -1,0 +1,219 @@
+"""DICOM RTSTRUCT: contours as masks on the slices of the CT on which they were drawn (PS3.3, C.8.8.5 and C.8.8.6)."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from pydicom.dataelem import RawDataElement
+from pydicom.dataset import Dataset
+
+from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.dicom.attributes import has, items, name, text, whole
+from puncture_twin.planning.formats.dicom.ct_series import CtSeries
+from puncture_twin.planning.formats.dicom.dicom_file import parse_dicom, refused_if_damaged
+from puncture_twin.planning.formats.dicom.named_masks import (
+    Mask,
+    MaskVolume,
+    NamedMasks,
+    check_frame_of_reference,
+    unique_names,
+)
+from puncture_twin.planning.formats.dicom.polygon_fill import polygon_fill
+from puncture_twin.planning.formats.dicom.storage import STRUCTURE_SET
+from puncture_twin.planning.formats.volumes.volume_header import MAX_ORIGIN_MM, VolumeGrid, check_shape
+from puncture_twin.planning.formats.volumes.volume_source import Content
+from puncture_twin.planning.geometry.rigid import apply
+
+CLOSED = ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
+"""Contours that enclose an area; several in one slice leave out what an even number of them enclose."""
+ON_SLICE = 0.1
+"""Of the step, by which a contour may miss its slice."""
+MAX_CONTOUR_POINTS = 100_000
+"""In one contour: an image of 1000 pixels has 4000 around it."""
+MAX_LENGTH = 5_000_000
+"""Pixels along one contour's columns; the finest line through every pixel of an image has fewer."""
+SHOWN = 8
+"""Structures that a note names."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contour:
+    """A closed contour in a slice.
+
+    Attributes:
+        slice: Its number in the CT.
+        points: Shape (n, 2), columns and rows, in pixels.
+    """
+
+    slice: int
+    points: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class _Region:
+    """A region of interest: its closed contours, and how many others it has."""
+
+    contours: tuple[Contour, ...]
+    others: int
+
+
+def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -> NamedMasks:
+    """The regions of an RTSTRUCT, each by its name, on the slices of a CT.
+
+    A slice between two contoured ones is filled with what either of them encloses, where they overlap: programs leave
+    slices out and interpolate, and a gap in an organ would count as free. A contour that encloses no pixel's centre
+    counts for the pixels of its points. Both are noted.
+
+    Args:
+        path: Its name.
+        file: As the content is asked for it.
+        content: Gives its bytes.
+        ct: The CT on which it was drawn.
+
+    Raises:
+        InputError: No structure set, one that cannot be trusted, of another frame of reference, or with contours that
+            lie beside the CT's slices.
+    """
+    data = parse_dicom(content(file), path)
+    where = path.name
+    if (sop_class := text(data, "SOPClassUID", where=where)) != STRUCTURE_SET:
+        raise InputError(f"SOP class {sop_class or 'missing'}", where=path, allowed="a DICOM RTSTRUCT")
+    names = _names(data, ct, path)
+    unique_names(list(names.values()), path)
+    grid = _slices_grid(ct)
+    regions = _regions(data, names, grid, path)
+    files = (file, *ct.files)
+    masks = {
+        called: MaskVolume(path, files, (called,), grid, partial(_mask, regions[roi].contours, grid.shape))
+        for roi, called in names.items()
+    }
+    return NamedMasks(masks, tuple(_notes({names[roi]: region for roi, region in regions.items()}, grid, where)))
+
+
+def _slices_grid(ct: CtSeries) -> VolumeGrid:
+    """The CT's slices as they were scanned, sheared where the gantry was tilted: contours lie in them."""
+    return VolumeGrid(check_shape((*ct.slice_shape, len(ct.stack.slices)), where=ct.path), ct.stack.T_ct_index, {})
+
+
+def _names(data: Dataset, ct: CtSeries, path: Path) -> dict[int, str]:
+    found: dict[int, str] = {}
+    for item in items(data, "StructureSetROISequence", where=path.name):
+        roi = whole(item, "ROINumber", low=-(2**31), high=2**31 - 1, where=path.name)
+        if roi in found:
+            raise InputError(f"two regions have the number {roi}", where=path, allowed="each number once")
+        check_frame_of_reference(text(item, "ReferencedFrameOfReferenceUID", where=path.name), ct, path)
+        found[roi] = text(item, "ROIName", where=path.name)
+    return found
+
+
+def _regions(data: Dataset, names: dict[int, str], grid: VolumeGrid, path: Path) -> dict[int, _Region]:
+    found: dict[int, _Region] = {}
+    if not has(data, "ROIContourSequence"):
+        raise InputError(f"{name('ROIContourSequence')} is missing: was the file cut?", where=path, allowed="contours")
+    T_index_ct = np.asarray(np.linalg.inv(grid.T_ct_index), np.float64)
+    for item in items(data, "ROIContourSequence", where=path.name):
+        roi = whole(item, "ReferencedROINumber", low=-(2**31), high=2**31 - 1, where=path.name)
+        if roi not in names or roi in found:
+            what = f"contours of region {roi}, which is {'listed twice' if roi in found else 'not listed'}"
+            raise InputError(what, where=path, allowed="one list of contours for each region")
+        label = f"{path.name}, {names[roi]!r}"
+        listed = items(item, "ContourSequence", where=label)
+        closed = [one for one in listed if text(one, "ContourGeometricType", where=label) in CLOSED]
+        contours = tuple(_contour(one, T_index_ct, grid, label) for one in closed)
+        found[roi] = _Region(contours, len(listed) - len(closed))
+    return {roi: found.get(roi, _Region((), 0)) for roi in names}
+
+
+def _contour(item: Dataset, T_index_ct: Floats, grid: VolumeGrid, label: str) -> Contour:
+    points_ct = _points(item, label)
+    index = apply(T_index_ct, points_ct)
+    slices = np.unique(np.round(index[:, 2]))
+    at = points_ct[0].round(2).tolist()
+    if len(slices) != 1 or np.abs(index[:, 2] - slices[0]).max() > ON_SLICE:
+        allowed = "contours in the slices of the CT on which they were drawn"
+        raise InputError(f"the contour through {at} lies between the CT's slices", where=label, allowed=allowed)
+    if not 0 <= slices[0] < grid.shape[2]:
+        allowed = "contours within the CT on which they were drawn"
+        raise InputError(f"the contour through {at} lies beyond the CT's slices", where=label, allowed=allowed)
+    length = float(np.abs(np.diff(index[:, 1])).sum())
+    if length > MAX_LENGTH:
+        raise InputError(f"the contour through {at} is {length:.3g} pixels long", where=label, allowed=f"{MAX_LENGTH}")
+    return Contour(int(slices[0]), index[:, :2])
+
+
+def _points(item: Dataset, label: str) -> Floats:
+    """The points of a contour, shape (n, 3), LPS mm; split here, as the library takes microseconds a number."""
+    with refused_if_damaged(f"{label}: {name('ContourData')}"):
+        raw = item.get_item("ContourData")
+        stored = raw.value if isinstance(raw, RawDataElement) else None
+        words = bytes(stored or b"").rstrip(b" \0").split(b"\\")
+        flat = np.array(words, dtype=np.float64) if words != [b""] else np.zeros(0)
+    count = len(flat) // 3
+    if len(flat) != 3 * count or not 3 <= count <= MAX_CONTOUR_POINTS or not (np.abs(flat) <= MAX_ORIGIN_MM).all():
+        what = f"{name('ContourData')} holds {len(flat)} numbers"
+        raise InputError(what, where=label, allowed="three finite numbers for each of at least three points")
+    if has(item, "NumberOfContourPoints"):
+        whole(item, "NumberOfContourPoints", low=count, high=count, where=label)
+    return flat.reshape(-1, 3)
+
+
+def _mask(contours: tuple[Contour, ...], shape: tuple[int, int, int]) -> Mask:
+    """The voxels of one region."""
+    made = np.zeros(shape, np.uint8, order="F")
+    for number in {one.slice for one in contours}:
+        made[:, :, number] = _slice_mask([one for one in contours if one.slice == number], shape[:2])
+    for below, above in _gaps(contours):
+        if (made[:, :, below] & made[:, :, above]).any():
+            made[:, :, below + 1 : above] = (made[:, :, below] | made[:, :, above])[:, :, None]
+    return made
+
+
+def _slice_mask(contours: list[Contour], shape: tuple[int, int]) -> Bools:
+    """What an odd number of contours enclose; and the pixels of those too small to enclose a centre."""
+    inside, small = np.zeros(shape, bool), np.zeros(shape, bool)
+    for contour in contours:
+        filled = polygon_fill(contour.points, shape)
+        inside ^= filled
+        if not filled.any():
+            near = np.round(contour.points).astype(int)
+            near = near[((near >= 0) & (near < shape)).all(axis=1)]
+            small[near[:, 0], near[:, 1]] = True
+    return inside | small
+
+
+def _gaps(contours: tuple[Contour, ...]) -> list[tuple[int, int]]:
+    """Neighbouring slices with contours that leave slices without any between them."""
+    slices = sorted({one.slice for one in contours})
+    return [(below, above) for below, above in itertools.pairwise(slices) if above - below > 1]
+
+
+def _notes(regions: dict[str, _Region], grid: VolumeGrid, where: str) -> list[str]:
+    size = np.array(grid.shape[:2])
+    points = {called: [one.points for one in region.contours] for called, region in regions.items()}
+    cut = [c for c, some in points.items() if any((p < -0.5).any() or (p > size - 0.5).any() for p in some)]
+    small = [c for c, some in points.items() if any(_is_tiny(one, grid.shape[:2]) for one in some)]
+    gaps = [called for called, region in regions.items() if _gaps(region.contours)]
+    others = [called for called, region in regions.items() if region.others]
+    told = (
+        (others, "contours that are not closed (points, lines) were left out of"),
+        (gaps, "slices without a contour between two with one were filled where both overlap, in"),
+        (small, "contours smaller than a pixel count for the pixels of their points, in"),
+        (cut, "contours that reach beyond the CT's image end there, in"),
+    )
+    return [f"{where}: {said} {_listed(some)}" for some, said in told if some]
+
+
+def _is_tiny(points: Floats, shape: tuple[int, int]) -> bool:
+    """Whether a contour encloses no pixel's centre; one that is wide in both directions is not tried."""
+    narrow = (points.max(axis=0) - points.min(axis=0)).min() < 2.0
+    return bool(narrow) and not polygon_fill(points, shape).any()
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(names[:SHOWN]) + more

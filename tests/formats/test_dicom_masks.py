@@ -1,0 +1,339 @@
+"""SEG and RTSTRUCT: each structure's voxels where they were drawn, or a refusal."""
+
+import dicom_world as world
+import highdicom as hd
+import numpy as np
+import pytest
+from pydicom.sr.codedict import codes
+from pydicom.uid import RLELossless, generate_uid
+from skimage.draw import polygon2mask
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.dicom.ct_series import parse_series
+from puncture_twin.planning.formats.dicom.polygon_fill import polygon_fill
+from puncture_twin.planning.formats.dicom.segmentation import parse_segmentation
+from puncture_twin.planning.formats.dicom.structure_set import parse_structure_set
+
+SHAPE = (19, 15, 8)
+LEAN = np.array([0.0, 0.4, 2.5])
+
+
+def masks():
+    """Three structures: two that overlap, one in slices 2 and 5 alone."""
+    i, j, k = np.indices(SHAPE)
+    liver = (i - 8) ** 2 / 49 + (j - 7) ** 2 / 25 + (k - 4) ** 2 / 9 < 1
+    vessel = (abs(i - 10) <= 2) & (abs(j - 6) <= 1) & (k > 1)
+    return {"Liver": liver, "portal vein": vessel, "tip": (i == 3) & (j == 2) & ((k == 2) | (k == 5))}
+
+
+@pytest.fixture(params=["upright", "tilted"])
+def scanned(request, tmp_path):
+    """A series, its affine and its data sets."""
+    T = world.affine(step=(0.0, 0.0, 2.5) if request.param == "upright" else LEAN)
+    slices = world.series(world.phantom(SHAPE), T)
+    folder = world.write_series(tmp_path / "ct", slices)
+    names = [path.name for path in folder.iterdir()]
+    return parse_series(folder, names, lambda name: (folder / name).read_bytes()), T, slices
+
+
+def read_seg(data, folder, ct):
+    """A segmentation from its file."""
+    path = world.write(data, folder / "seg.dcm")
+    return parse_segmentation(path, "seg.dcm", lambda name: path.read_bytes(), ct)
+
+
+def read_rt(data, folder, ct):
+    """A structure set from its file."""
+    path = world.write(data, folder / "rt.dcm")
+    return parse_structure_set(path, "rt.dcm", lambda name: path.read_bytes(), ct)
+
+
+def places(mask, T):
+    """The places of a mask's voxels."""
+    at = np.argwhere(mask)
+    return {tuple(where) for where in (at @ T[:3, :3].T + T[:3, 3]).round(2) + 0.0}
+
+
+def same(found, truth, T):
+    """Every structure's voxels lie where they were drawn, and nowhere else."""
+    assert list(found.masks) == list(truth)
+    for name, mask in found.masks.items():
+        volume = mask.volume()
+        assert set(np.unique(volume.values)) <= {0, 1}
+        assert places(volume.values, volume.T_ct_index) == places(truth[name], T), name
+
+
+@pytest.mark.parametrize("omit", [True, False])
+def test_segments_lie_where_they_were_drawn(scanned, tmp_path, omit):
+    """Overlapping, with and without empty frames; on the CT's own slices, also where its gantry was tilted."""
+    ct, T, _ = scanned
+    found = read_seg(world.segmentation(masks(), T, omit=omit), tmp_path, ct)
+    same(found, masks(), T)
+    assert all(mask.grid.shape == SHAPE for mask in found.masks.values())
+    assert found.notes == ()
+    assert found.masks["Liver"].files == ("seg.dcm", *ct.files)
+
+
+def test_segments_of_highdicom_come_back(scanned, tmp_path):
+    """The library that most programs write SEG with."""
+    ct, T, slices = scanned
+    for number, one in enumerate(slices):
+        one.StudyDate = one.StudyTime = one.AccessionNumber = one.StudyID = one.PatientName = ""
+        one.PatientBirthDate = one.PatientSex = one.ReferringPhysicianName = ""
+        one.InstanceNumber, one.SliceThickness = number + 1, "2.5"
+    described = [
+        hd.seg.SegmentDescription(
+            segment_number=number,
+            segment_label=name,
+            segmented_property_category=codes.SCT.Organ,
+            segmented_property_type=codes.SCT.Liver,
+            algorithm_type="MANUAL",
+        )
+        for number, name in enumerate(masks(), start=1)
+    ]
+    stacked = np.stack([mask.transpose(2, 1, 0) for mask in masks().values()], axis=-1).astype(np.uint8)
+    made = hd.seg.Segmentation(
+        source_images=slices,
+        pixel_array=stacked,
+        segmentation_type="BINARY",
+        segment_descriptions=described,
+        series_instance_uid=generate_uid(),
+        series_number=9,
+        sop_instance_uid=generate_uid(),
+        instance_number=1,
+        manufacturer="a",
+        manufacturer_model_name="b",
+        software_versions="1",
+        device_serial_number="1",
+    )
+    same(read_seg(made, tmp_path, ct), masks(), T)
+
+
+def test_fractional_segments_count_from_one_half_on(scanned, tmp_path):
+    """And it is told."""
+    ct, T, _ = scanned
+    values = np.random.default_rng(2).integers(0, 201, SHAPE)
+    found = read_seg(world.segmentation({"lesion": values}, T, fractional=True), tmp_path, ct)
+    same(found, {"lesion": values >= 100}, T)
+    assert "0.5" in found.notes[0]
+
+
+def test_a_segmentation_without_its_ct_lies_on_a_grid_of_its_own(tmp_path):
+    """Sparse frames keep the stated step; that the CT is not known is told."""
+    T = world.affine()
+    for step in ("2.5", ""):
+        found = read_seg(world.segmentation(masks(), T, step=step), tmp_path, None)
+        same(found, masks(), T)
+        assert "is not known" in found.notes[0]
+
+
+def broken(change, names=None):
+    """A segmentation that a function changes."""
+    made = world.segmentation(names or masks(), world.affine())
+    change(made)
+    return made
+
+
+def of(keyword, value):
+    """Sets an element."""
+    return lambda data: setattr(data, keyword, value)
+
+
+def frame(number, change):
+    """Changes one frame's groups."""
+    return lambda data: change(data.PerFrameFunctionalGroupsSequence[number])
+
+
+def push(group):
+    """Moves a frame between two slices."""
+    group.PlanePositionSequence[0].ImagePositionPatient = world.ds([*world.ORIGIN[:2], 815.9])
+
+
+def again(data):
+    """Gives the second frame the first one's place."""
+    groups = data.PerFrameFunctionalGroupsSequence
+    groups[1].PlanePositionSequence = groups[0].PlanePositionSequence
+
+
+WRONG_SEG = {
+    "another frame of reference": (of("FrameOfReferenceUID", "1.2.3"), "frame of reference 1.2.3, the CT"),
+    "no frame of reference": (of("FrameOfReferenceUID", ""), "frame of reference not stated"),
+    "a CT": (of("SOPClassUID", world.CT_CLASS), "SOP class"),
+    "a label map": (of("SegmentationType", "LABELMAP"), "LABELMAP"),
+    "fewer groups than frames": (of("NumberOfFrames", 3), "bytes where the header promises|items for 3 frames"),
+    "pixels cut": (lambda data: setattr(data, "PixelData", data.PixelData[:-2]), "where the header promises"),
+    "a frame of no segment": (
+        frame(0, lambda one: setattr(one.SegmentIdentificationSequence[0], "ReferencedSegmentNumber", 9)),
+        "frame 1: is of segment 9",
+    ),
+    "two frames at one place": (again, "two frames of one segment lie at one place"),
+    "a frame beside the others": (frame(2, push), "frame . lies .* off the grid"),
+    "two of one name": (
+        lambda data: setattr(data.SegmentSequence[1], "SegmentLabel", "Liver"),
+        "structures are called",
+    ),
+    "no name": (lambda data: setattr(data.SegmentSequence[1], "SegmentLabel", ""), "a structure has no name"),
+    "one number twice": (
+        lambda data: setattr(data.SegmentSequence[1], "SegmentNumber", 1),
+        "have the number",
+    ),
+    "compressed": (lambda data: setattr(data.file_meta, "TransferSyntaxUID", RLELossless), "transfer syntax RLE"),
+}
+
+
+@pytest.mark.parametrize("name", sorted(WRONG_SEG))
+def test_a_wrong_segmentation_is_refused(tmp_path, name):
+    """In one line that names the file."""
+    folder = world.write_series(tmp_path / "ct", world.series(world.phantom(SHAPE)))
+    ct = parse_series(folder, [path.name for path in folder.iterdir()], lambda one: (folder / one).read_bytes())
+    change, message = WRONG_SEG[name]
+    made = broken(change)
+    if name == "compressed":
+        made.PixelData = b"\xfe\xff\x00\xe0\0\0\0\0\xfe\xff\x00\xe0\x02\0\0\0ab"
+        made["PixelData"].is_undefined_length = True
+    with pytest.raises(InputError, match=f"seg.dcm.*({message})"):
+        read_seg(made, tmp_path, ct)
+
+
+def outline(T, k, corners):
+    """A contour in a slice, LPS mm, from columns and rows."""
+    index = np.column_stack([corners, np.full(len(corners), k), np.ones(len(corners))])
+    return (index @ T.T)[:, :3]
+
+
+def box(low, high):
+    """A rectangle's corners between pixel edges: the pixels from low to high are inside."""
+    (x0, y0), (x1, y1) = np.array(low) - 0.5, np.array(high) + 0.5
+    return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+
+
+KEYHOLE = [(1.5, 1.5), (10.5, 1.5), (10.5, 9.5), (1.5, 9.5), (1.5, 5.5)]
+KEYHOLE += [(4.5, 5.5), (4.5, 7.5), (7.5, 7.5), (7.5, 3.5), (4.5, 3.5), (4.5, 5.5), (1.5, 5.5)]
+
+
+def test_contours_enclose_what_they_were_drawn_around(scanned, tmp_path):
+    """Holes by a second contour and by a keyhole, two parts in one slice; also on a tilted CT's own slices."""
+    ct, T, _ = scanned
+    hole, island = outline(T, 3, box((5, 4), (7, 7))), outline(T, 3, box((12, 11), (13, 12)))
+    found = read_rt(
+        world.structure_set(
+            {
+                "ring": [outline(T, 3, box((2, 2), (10, 9))), hole, island],
+                "key": [outline(T, 3, KEYHOLE)],
+                "XOR": [("CLOSEDPLANAR_XOR", outline(T, 3, box((2, 2), (10, 9)))), ("CLOSEDPLANAR_XOR", hole)],
+            }
+        ),
+        tmp_path,
+        ct,
+    )
+    ring = np.zeros(SHAPE, bool)
+    ring[2:11, 2:10, 3] = True
+    ring[5:8, 4:8, 3] = False
+    both = ring.copy()
+    both[12:14, 11:13, 3] = True
+    same(found, {"ring": both, "key": ring, "XOR": ring}, T)
+    assert found.notes == ()
+
+
+def test_slices_that_were_left_out_are_filled_and_small_contours_are_kept(tmp_path, scanned):
+    """Where both neighbours overlap, with what either encloses; parts apart stay apart. Each is told."""
+    ct, T, _ = scanned
+    small = outline(T, 1, [(14.1, 3.1), (14.3, 3.1), (14.2, 3.3)])
+    found = read_rt(
+        world.structure_set(
+            {
+                "organ": [outline(T, 1, box((2, 2), (6, 6))), outline(T, 4, box((4, 2), (8, 6)))],
+                "nodes": [outline(T, 1, box((2, 2), (3, 3))), outline(T, 4, box((9, 9), (10, 10)))],
+                "vessel": [small],
+                "couch": [outline(T, 2, box((-9, 12), (40, 13)))],
+                "isocentre": [("POINT", outline(T, 2, [(3, 3)]))],
+                "nothing": [],
+            }
+        ),
+        tmp_path,
+        ct,
+    )
+    truth = {name: np.zeros(SHAPE, bool) for name in found.masks}
+    truth["organ"][2:7, 2:7, 1] = truth["organ"][4:9, 2:7, 4] = truth["organ"][2:9, 2:7, 2:4] = True
+    truth["nodes"][2:4, 2:4, 1] = truth["nodes"][9:11, 9:11, 4] = True
+    truth["vessel"][14, 3, 1] = truth["couch"][:, 12:14, 2][...] = True
+    same(found, truth, T)
+    notes = " | ".join(found.notes)
+    assert "not closed (points, lines) were left out of isocentre" in notes
+    assert "filled where both overlap, in organ, nodes" in notes
+    assert "smaller than a pixel count for the pixels of their points, in vessel" in notes
+    assert "beyond the CT's image end there, in couch" in notes
+
+
+def test_a_polygon_is_filled_as_by_the_slow_rule():
+    """Random polygons, that cross themselves too: a ray's crossings counted for each pixel; skimage for simple ones."""
+    rng = np.random.default_rng(7)
+    for count in (3, 5, 12, 40):
+        points = rng.uniform(-4, 24, (count, 2))
+        filled = polygon_fill(points, (20, 17))
+        for i, j in np.ndindex(filled.shape):
+            odd = False
+            for (x0, y0), (x1, y1) in zip(points, np.roll(points, -1, axis=0), strict=True):
+                if (y0 > j) != (y1 > j) and i < x0 + (j - y0) * (x1 - x0) / (y1 - y0):
+                    odd = not odd
+            assert filled[i, j] == odd
+    angle = np.linspace(0, 2 * np.pi, 50, endpoint=False)
+    circle = np.column_stack([9.3 + 6.1 * np.cos(angle), 8.2 + 7.7 * np.sin(angle)])
+    assert np.array_equal(polygon_fill(circle, (20, 17)), polygon2mask((20, 17), circle))
+
+
+CORNERS = box((2, 2), (6, 6))
+WRONG_RT = {
+    "another frame of reference": (lambda T: world.structure_set({"a": [outline(T, 1, CORNERS)]}, "1.2.3"), "1.2.3"),
+    "between slices": (
+        lambda T: world.structure_set({"a": [outline(T, 1.4, CORNERS)]}),
+        "'a'.*between the CT",
+    ),
+    "beyond the slices": (
+        lambda T: world.structure_set({"a": [outline(T, 9, CORNERS)]}),
+        "'a'.*beyond the CT",
+    ),
+    "not planar": (
+        lambda T: world.structure_set({"a": [outline(T, np.arange(4), CORNERS)]}),
+        "between the CT's slices",
+    ),
+    "two points": (lambda T: world.structure_set({"a": [outline(T, 1, CORNERS[:2])]}), "'a'.*6 numbers"),
+    "no structure": (lambda T: world.structure_set({}), "holds no structure"),
+    "a SEG": (lambda T: world.segmentation(masks(), T), "SOP class"),
+}
+
+
+@pytest.mark.parametrize("name", sorted(WRONG_RT))
+def test_a_wrong_structure_set_is_refused(tmp_path, name):
+    """In one line that names file and region."""
+    folder = world.write_series(tmp_path / "ct", world.series(world.phantom(SHAPE)))
+    ct = parse_series(folder, [path.name for path in folder.iterdir()], lambda one: (folder / one).read_bytes())
+    make, message = WRONG_RT[name]
+    with pytest.raises(InputError, match=f"rt.dcm.*{message}"):
+        read_rt(make(world.affine()), tmp_path, ct)
+
+
+@pytest.mark.parametrize("kind", ["seg", "rt"])
+@pytest.mark.parametrize("undefined", [True, False])
+def test_every_cut_is_refused_whatever_the_lengths_say(tmp_path, kind, undefined):
+    """Sequences with a length and with a delimiter: a contour or a frame is never lost without a word."""
+    T = world.affine()
+    folder = world.write_series(tmp_path / "ct", world.series(world.phantom(SHAPE)))
+    ct = parse_series(folder, [path.name for path in folder.iterdir()], lambda one: (folder / one).read_bytes())
+    contours = [outline(T, k, CORNERS) for k in range(3)]
+    data = world.segmentation(masks(), T) if kind == "seg" else world.structure_set({"a": contours, "b": contours})
+    for element in data.iterall():
+        if element.VR == "SQ":
+            element.is_undefined_length = undefined
+            for one in element.value:
+                one.is_undefined_length_sequence_item = undefined
+    path = world.write(data, tmp_path / "whole.dcm")
+    whole, parse = path.read_bytes(), parse_segmentation if kind == "seg" else parse_structure_set
+    truth = {name: mask.volume().values for name, mask in parse(path, "x", lambda _: whole, ct).masks.items()}
+    step = max(1, len(whole) // 250)
+    for length in range(132, len(whole), step):
+        try:
+            found = parse(path, "x", lambda _, n=length: whole[:n], ct)
+        except InputError:
+            continue
+        assert all(np.array_equal(found.masks[name].volume().values, values) for name, values in truth.items())
