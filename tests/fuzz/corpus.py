@@ -7,11 +7,13 @@ import json
 import struct
 import zlib
 
+import dicom_world as world
 import numpy as np
 import SimpleITK
 import trimesh
 from case_world import MARKERS, registration_section
 from hostile.makers import CASE, MOUNT, RIB, certificate, glb, recording, sound_case
+from pydicom.uid import ImplicitVRLittleEndian, RLELossless
 
 from puncture_twin.meshes import folder as embedded
 from puncture_twin.planning.arm.ur import ur_model
@@ -46,6 +48,8 @@ FCSV = (
     "label,desc,associatedNodeID\n1,0,0,80,0,0,0,1,1,1,0,A,,\n2,50,0,75,0,0,0,1,1,1,0,B,,\n3,0,60,70,0,0,0,1,1,1,0,C,,\n"
 )
 
+DICOM_SHAPE = (6, 5, 3)
+
 SET_FILES = ("map.png", "sub/candidates.parquet", "plan.json", "sub/scene.png", "left.csv", "gone/report.html")
 """Of an output folder: two of ``search``, two of ``plan``, two that an interrupted run left."""
 
@@ -57,6 +61,7 @@ def make_corpus(folder):
     """Write every file into a folder."""
     make_meshes(folder)
     make_volumes(folder)
+    make_dicom(folder)
     make_points(folder)
     sound_case(folder, CASE + RIB)
     text = CASE + RIB + LABELS + REGISTRATION + TABLE
@@ -181,6 +186,25 @@ def make_volumes(folder):
     hu.CopyInformation(image)
     SimpleITK.WriteImage(hu, folder / "ct.nii.gz")
     SimpleITK.WriteImage(hu, folder / "ct.nrrd", useCompression=False)
+
+
+def make_dicom(folder):
+    """Slices of a series in several encodings, an enhanced image, a segmentation and a structure set."""
+    T, stored = world.affine(), world.phantom(DICOM_SHAPE)
+    slices = world.series(stored, T)
+    slices[1].compress(RLELossless)
+    for number, (one, syntax) in enumerate(zip(slices, (None, None, ImplicitVRLittleEndian), strict=True)):
+        world.write(one, folder / f"slice{number}.dcm", syntax)
+    world.write(world.enhanced(stored, T), folder / "enhanced.dcm")
+    mask = np.zeros(DICOM_SHAPE, bool)
+    mask[2:4, 1:4, :2] = True
+    world.write(world.segmentation({"liver": mask, "vessel": np.roll(mask, 1, 0)}, T), folder / "seg.dcm")
+    contours = [(T @ np.array([[1, 4, 4, 1], [1, 1, 3, 3], [k] * 4, [1] * 4])).T[:, :3] for k in range(2)]
+    data = world.structure_set({"liver": contours, "vessel": contours[:1]})
+    for element in data.iterall():
+        if element.VR == "SQ":
+            element.is_undefined_length = True
+    world.write(data, folder / "rt.dcm")
 
 
 def make_points(folder):

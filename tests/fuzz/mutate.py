@@ -269,6 +269,28 @@ def inside_gzip(how):
     return change
 
 
+def change_element(rng, data, others):
+    """A value or a length of a DICOM element is another, or the element is gone or doubled; found by its short head."""
+    found = list(_ELEMENT.finditer(data))
+    if not found:
+        return flip(rng, data, others)
+    place = pick(rng, found)
+    at, length = place.start() + 8, struct.unpack("<H", place.group()[6:8])[0]
+    how = int(rng.integers(5))
+    if how == 0:
+        return data[: at - 2] + struct.pack("<H", int(rng.choice([0, 1, 2, 255, 65535, min(length + 2, 65534)]))) + data[at:]
+    if how == 1:
+        return data[: place.start()] + data[at + length :]
+    if how == 2:
+        return data[:at] + data[place.start() : at + length] + data[at:]
+    if how == 3 and place.group()[4:6] == b"US" and length == 2:
+        return data[:at] + struct.pack("<H", int(rng.choice([0, 1, 2, 8, 12, 16, 32, 4096, 65535]))) + data[at + 2 :]
+    new = b"\\".join(pick(rng, NUMBERS).encode()[:16] for _ in range(int(rng.integers(1, 4))))[: max(length, 2)]
+    return data[:at] + new.ljust(length) + data[at + length :]
+
+
+_ELEMENT = re.compile(rb"[\x02-\x30][\x00\x30].[\x00-\x20](?:DS|IS|US|UI|CS|LO|SH)..", re.DOTALL)
+
 PLAIN = [flip, truncate, remove, insert, splice]
 TEXT = [*PLAIN, change_number, change_number, change_number, change_word, change_lines, change_lines]
 KINDS = {
@@ -279,6 +301,7 @@ KINDS = {
     "stl": [*PLAIN, change_head, change_floats, change_floats, change_floats],
     "headed": [*PLAIN, change_floats, change_floats, *[change_text_head] * 4],
     "nifti": [*PLAIN, change_floats, *[change_head] * 5],
+    "dicom": [*PLAIN, *[change_element] * 8],
     "gzip": [*PLAIN, *[inside_gzip(how) for how in (flip, truncate, insert, change_floats, *[change_head] * 5)]],
 }
 """Name of a kind of file to its mutators; one that stands several times is drawn more often."""

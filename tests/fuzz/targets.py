@@ -11,6 +11,10 @@ from puncture_twin.planning.case.case_schema import SCHEMA_ONE_NOTE
 from puncture_twin.planning.certify.certificate import read_certificate
 from puncture_twin.planning.collision_cases.pytest_plugin import read_checks
 from puncture_twin.planning.export.csv_times import read_csv
+from puncture_twin.planning.formats.dicom.ct_series import parse_series
+from puncture_twin.planning.formats.dicom.recognise import recognise
+from puncture_twin.planning.formats.dicom.segmentation import parse_segmentation
+from puncture_twin.planning.formats.dicom.structure_set import parse_structure_set
 from puncture_twin.planning.formats.labels.labelmaps import labelmap_of
 from puncture_twin.planning.formats.labels.naming import names_for
 from puncture_twin.planning.formats.meshes.mesh_files import mesh_warnings, read_mesh
@@ -152,6 +156,35 @@ def read_own_points(path):
     return read_points(path, default_space=Space.LPS, default_unit=Unit.MM)
 
 
+DICOM_SERIES = ("slice0.dcm", "slice1.dcm", "slice2.dcm")
+DICOM = {**dict.fromkeys((*DICOM_SERIES, "enhanced.dcm"), "dicom")}
+DICOM_MASKS = {"seg.dcm": "dicom", "rt.dcm": "dicom"}
+
+
+def dicom_series(path):
+    """The series of three slices beside a file, or the enhanced image; recognised, then with its voxels."""
+    recognise(path)
+    names = DICOM_SERIES if path.name in DICOM_SERIES else (path.name,)
+    return parse_series(path, names, lambda name: (path.parent / name).read_bytes())
+
+
+def read_dicom_masks(path):
+    """The structures of a file on the series beside it, with their voxels."""
+    recognise(path)
+    ct = dicom_series(path.parent / DICOM_SERIES[0])
+    parse = parse_segmentation if path.name == "seg.dcm" else parse_structure_set
+    found = parse(path, path.name, lambda name: (path.parent / name).read_bytes(), ct)
+    return [mask.volume() for mask in found.masks.values()]
+
+
+def whole_masks(volumes):
+    """Each mask is of 0 and 1, on a regular grid."""
+    assert volumes
+    for volume in volumes:
+        whole_volume(volume)
+        assert set(np.unique(volume.values)) <= {0, 1}
+
+
 def read_names(path):
     """The names of a naming table; no label map is asked."""
     return names_for(path.name, path.parent, lambda name: (path.parent / name).read_bytes(), None)
@@ -184,6 +217,8 @@ CASES = ("full.toml", "stated.toml", "case.toml", "mount.toml")
 TARGETS = [
     Target("mesh", MESHES, read_own_mesh, whole_mesh),
     Target("volume", {"ct.nii.gz": "gzip", "ct.nrrd": "headed", **LABELS}, read_volume, whole_volume),
+    Target("series", DICOM, lambda path: dicom_series(path).volume(), whole_volume),
+    Target("dicom masks", DICOM_MASKS, read_dicom_masks, whole_masks),
     Target("label map", LABELS, lambda path: labelmap_of(read_volume(path)), whole_labelmap),
     Target(
         "points",
