@@ -11,7 +11,8 @@ import math
 import numpy as np
 
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.clearance.kernels.displaced_axis import displaced_distance
+from puncture_twin.planning.clearance.kernels.displaced_axis import beyond, displaced_distance
+from puncture_twin.planning.clearance.kernels.lanes import LANES
 
 FARTHEST = 5.0
 """Standard deviations that a line is walked to either side; a stretch that is open there goes on for ever."""
@@ -19,8 +20,14 @@ FARTHEST = 5.0
 SMALLEST_STEP, INSIDE_STEP = 0.04, 0.25
 """Standard deviations: of a walk that all but touches, and through what it touches."""
 
-HALVINGS = 5
-"""Of the step in which an end of a stretch lies: it is then known to .001."""
+END_WITHIN = 0.005
+"""Standard deviations within which an end of a stretch is known; counted as touched, so that no chance is too small."""
+
+LITTLE = 0.01
+"""A walk ends where what is left of its normal is this part of what it has: all that is left counts as touched."""
+
+RAYS_TO, RAY_STEP = 4.0, 0.1
+"""Standard deviations that a ray is followed, and its smallest step: it only tells what is touched about as soon."""
 
 NUDGE_MM = 1e-6
 """By which a tip's way is moved aside, so that it does not run through an edge of a face."""
@@ -29,18 +36,19 @@ ROOT_HALF = math.sqrt(0.5)
 
 
 @nb.njit(cache=True, error_model="numpy")
-def walked(problem, root, surface_mm, basis, offsets):  # type: ignore[no-untyped-def]  # numba infers
-    """The chance along each line, shape (n,)."""
+def walked(problem, root, surface_mm, basis, offsets, sizes):  # type: ignore[no-untyped-def]  # numba infers
+    """The chance along each line, shape (n,); its errors are so many times as large (n,)."""
     chances, hint = np.empty(len(offsets)), 0
     triangles, faces, blocks, origin, outward, length, threshold = problem
     scene = (triangles, faces, blocks, origin, outward, length, threshold, surface_mm)
-    ahead = _displacement(root, basis[0])
+    down = _displacement(root, basis[0])
     for line in range(len(offsets)):
         z = np.zeros(6)
         for k in range(5):
             for x in range(6):
                 z[x] += offsets[line, k] * basis[k + 1, x]
-        chances[line], hint = _walk(scene, _displacement(root, z), ahead, hint)
+        start, ahead = sizes[line] * _displacement(root, z), sizes[line] * down
+        chances[line], hint = _walk(scene, start, ahead, hint)
     return chances
 
 
@@ -59,25 +67,46 @@ def _displacement(root, z):  # type: ignore[no-untyped-def]
 def _walk(scene, start, ahead, hint):  # type: ignore[no-untyped-def]
     """Sum of Phi over the stretches of one line that touch."""
     fastest = _fastest(scene, start, ahead)
-    low, high, halvings, inside, entry, total = -np.inf, -FARTHEST, 0, False, -np.inf, 0.0
+    low, high, closing, inside, entry, total = -np.inf, -FARTHEST, False, False, -np.inf, 0.0
+    clear = 0.0  # beyond low, of what the last distance leaves free
     while True:  # one place that asks for the distance: it is compiled into each
-        beta = 0.5 * (low + high) if halvings > 0 else high
+        beta = 0.5 * (low + high) if closing else high
         gap, hint = _gap(scene, start, ahead, beta, hint)
         doubtful = inside or low == -np.inf or scene[7] > 0.0
         touches = gap < 0.0 or (doubtful and _swallowed(scene, start, ahead, beta))
         if low == -np.inf:
             inside = touches
-        elif halvings > 0 or touches != inside:  # an end of a stretch lies between low and high
-            low, high = (beta, high) if touches == inside and halvings > 0 else (low, beta)
-            halvings = halvings - 1 if halvings > 0 else HALVINGS
-            if halvings > 0:
+        elif not inside and not closing and _outran(low + clear, beta, gap / fastest, SMALLEST_STEP):
+            high = low + max(clear, SMALLEST_STEP)
+            continue
+        elif closing or touches != inside:  # an end of a stretch lies between low and high
+            low, high = (beta, high) if touches == inside else (low, beta)
+            closing = high - low > END_WITHIN
+            if closing:
                 continue
             if inside:
                 total += _normal(high) - _normal(entry)
             entry, inside, beta, gap = low, not inside, high, SMALLEST_STEP * fastest
-        if beta >= FARTHEST:
-            return total + (_normal(-entry) if inside else 0.0), hint
-        low, high = beta, min(beta + (INSIDE_STEP if inside else max(gap / fastest, SMALLEST_STEP)), FARTHEST)
+        left, so_far = _normal(-beta), total + (_normal(beta) - _normal(entry) if inside else 0.0)
+        if beta >= FARTHEST or left <= LITTLE * so_far:
+            return so_far + (left if so_far > 0.0 else 0.0), hint
+        step = INSIDE_STEP if inside else _step(gap / fastest, clear, beta - low, SMALLEST_STEP)
+        low, high, clear = beta, min(beta + step, FARTHEST), gap / fastest
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _step(clear, before, stepped, smallest):  # type: ignore[no-untyped-def]
+    """How far on, where nothing is nearer than ``clear``: as far as what is clear there will reach back, it seems."""
+    if clear < smallest:
+        return smallest
+    falls = min(max((before - clear) / stepped, -0.8), 1.0) if before > 0.0 else 1.0
+    return 2.0 * clear / (1.0 + falls)
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _outran(clear_to, beta, clear, smallest):  # type: ignore[no-untyped-def]
+    """Whether something may have been passed between what was clear before a step and what is clear after it."""
+    return beta - clear_to > smallest and beta - max(clear, 0.0) > clear_to
 
 
 @nb.njit(cache=True, error_model="numpy")
@@ -89,8 +118,14 @@ def _swallowed(scene, start, ahead, beta):  # type: ignore[no-untyped-def]
     triangles, origin = scene[0], scene[3]
     ox, oy, oz = origin[0] + NUDGE_MM, origin[1] - 0.61 * NUDGE_MM, origin[2] + 0.37 * NUDGE_MM
     x, y, z = start[0] + beta * ahead[0], start[1] + beta * ahead[1], start[2] + beta * ahead[2]
+    size = math.sqrt(x * x + y * y + z * z)
+    ux, uy, uz = (x / size, y / size, z / size) if size > 0.0 else (0.0, 0.0, 0.0)
     odd = False
     for row in range(len(triangles)):
+        if row % LANES == 0:
+            passed = beyond(scene[2][row // LANES], ox, oy, oz, ux, uy, uz, size, 0.0)
+        if passed:
+            continue
         t = triangles[row]
         ax, ay, az, bx, by, bz = t[0] - ox, t[1] - oy, t[2] - oz, t[3] - ox, t[4] - oy, t[5] - oz
         cx, cy, cz = t[6] - ox, t[7] - oy, t[8] - oz
@@ -155,16 +190,23 @@ def first_touches(problem, root, directions, radii):  # type: ignore[no-untyped-
     """Fill, for rays along ``directions`` (n, 5) from the nominal needle, how far out each touches; or infinity."""
     triangles, faces, blocks, origin, outward, length, threshold = problem
     scene = (triangles, faces, blocks, origin, outward, length, threshold, 0.0)
-    start, z, hint = np.zeros(7), np.zeros(6), 0
+    start, z = np.zeros(7), np.zeros(6)
+    nominal, nearest = _gap(scene, start, start, 0.0, 0)
     for ray in range(len(directions)):
         for k in range(5):
             z[k] = directions[ray, k]
-        ahead = _displacement(root, z)
-        fastest, beta, radii[ray] = _fastest(scene, start, ahead), 0.0, np.inf
-        while True:
+        radii[ray] = _first_touch(scene, start, _displacement(root, z), nominal, nearest)
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _first_touch(scene, start, ahead, gap, hint):  # type: ignore[no-untyped-def]
+    """How far out a ray touches, from where the distance is ``gap``."""
+    fastest, beta, low, clear = _fastest(scene, start, ahead), 0.0, 0.0, 0.0
+    while gap >= 0.0 and beta < RAYS_TO:
+        step = _step(gap / fastest, clear, beta - low, RAY_STEP)
+        low, clear, beta = beta, gap / fastest, min(beta + step, RAYS_TO)
+        gap, hint = _gap(scene, start, ahead, beta, hint)
+        if _outran(low + clear, beta, gap / fastest, RAY_STEP):
+            beta = low + max(clear, RAY_STEP)
             gap, hint = _gap(scene, start, ahead, beta, hint)
-            if gap < 0.0:
-                radii[ray] = beta
-            if gap < 0.0 or beta >= FARTHEST:
-                break
-            beta = min(beta + max(gap / fastest, SMALLEST_STEP), FARTHEST)
+    return beta if gap < 0.0 else np.inf

@@ -74,7 +74,7 @@ def _sphere(points, sphere):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _beyond(sphere, ox, oy, oz, ux, uy, uz, length, best):  # type: ignore[no-untyped-def]
+def beyond(sphere, ox, oy, oz, ux, uy, uz, length, best):  # type: ignore[no-untyped-def]
     """Whether all that a sphere holds is at least ``best`` from the axis."""
     x, y, z = sphere[0] - ox, sphere[1] - oy, sphere[2] - oz
     s = min(max(x * ux + y * uy + z * uz, 0.0), length)
@@ -100,14 +100,15 @@ def displaced_distance(triangles, faces, blocks, origin, outward, length, enough
     ox, oy, oz = origin
     ux, uy, uz = outward
     best, nearest = np.inf, hint
-    for turn in range(-1, len(blocks)):
-        block = hint // LANES if turn < 0 else turn  # where the last axis was nearest, first
+    if len(triangles) > 0:  # where the last axis was nearest, first
+        best = _face(triangles, hint, ox, oy, oz, outward, length)
+    for block in range(len(blocks)):
         if best < enough:
             break
-        if block >= len(blocks) or _beyond(blocks[block], ox, oy, oz, ux, uy, uz, length, best):
+        if beyond(blocks[block], ox, oy, oz, ux, uy, uz, length, best):
             continue
         for row in range(block * LANES, (block + 1) * LANES):
-            if not _beyond(faces[row], ox, oy, oz, ux, uy, uz, length, best):
+            if not beyond(faces[row], ox, oy, oz, ux, uy, uz, length, best):
                 found = _face(triangles, row, ox, oy, oz, outward, length)
                 if found < best:
                     best, nearest = found, row
