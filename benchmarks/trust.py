@@ -6,7 +6,9 @@ python -m benchmarks.trust --rooms N --out F   N rooms; the table in a file too
 
 Every room has its own truth: markers read and touched with errors, registered, and the needle driven by exact
 kinematics. Where the noise is ``found``, the declaration gives the errors' shape alone, and each room's residuals
-their size s; regions are Fisher's F then, and chances Student's t.
+their size s; regions are Fisher's F then, and chances Student's t. That is what s tells where nothing is known of the
+true size, so the true size is drawn evenly on a logarithmic scale, as far out as rooms that are counted can come from:
+rooms with s between 1/8 and 2 of the declaration.
 """
 
 from __future__ import annotations
@@ -17,15 +19,20 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 from scipy.special import chdtri, fdtri
 
 from puncture_twin.meshes import folder
+from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.kinematics import inverse, singularity
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.reach.standoff import axis_lengths
@@ -35,10 +42,11 @@ from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.registration.registration import MarkerPairs, fit_rigid, register
 from puncture_twin.planning.registration.touch_poses import touching_configuration
-from puncture_twin.planning.search.chance import chance_model, chances_of, demanding, refined_chances
+from puncture_twin.planning.search.chance import ChanceModel, chances_of, demanding, refined_chances
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.organs import organ_candidates
 from puncture_twin.planning.search.search import case_directions
+from puncture_twin.planning.uncertainty.chances import HitModel, hit_model
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
@@ -52,11 +60,20 @@ BINS = 10
 RADII = (0.4, 0.7, 1.0, 1.4)
 """Of balls about the target, over the tip's predicted rms: a lesion that is hit for certain shows no calibration."""
 
-TRUE_SIZES = np.geomspace(1 / 16, 4.0, 24)
-"""Of the errors over the declared ones, where the residuals are to find it."""
+FOUND = (1 / 8, 2.0)
+"""Errors' size by the residuals over the declared one: rooms in which it lies outside are not counted."""
 
-SIZES = np.geomspace(0.05, 10.0, 16)
-"""Errors' size by the residuals over the declared one, for which chances are computed; between them interpolated."""
+STEPS = 24
+"""Of the errors' true size, evenly on a logarithmic scale as far out as residuals within `FOUND` may come from."""
+
+RARELY = 1e-3
+"""Part of the rooms with residuals at an end of `FOUND` whose true size is left out there."""
+
+SIZES = np.geomspace(*FOUND, 12)
+"""At which chances to touch are computed, those to hit at eight times as many; between them interpolated."""
+
+PARTS = (0.5, 0.9, 0.99, 1.0)
+"""Of the rooms by how far the tip is off: those that are less far are asked about fewer faces."""
 
 RATIO, COVERAGE, ECE = (0.97, 1.03), (0.94, 0.96), 0.01
 TARGETS = f"ratio {RATIO[0]} to {RATIO[1]}, region {COVERAGE[0]} to {COVERAGE[1]}, ECE at most {ECE}"
@@ -105,6 +122,7 @@ class Scene:
 
     name: str
     context: CaseContext
+    hit: HitModel
     errors: ErrorModel
     outward_ct: np.ndarray
     q: np.ndarray
@@ -131,7 +149,9 @@ def scene(name: str, path: Path, directions: int) -> Scene:
         i, j = pairs[len(points) - len(markers.points_ct)]
         points = np.vstack([points, 0.5 * (points[i] + points[j])])
     outward, q = _reached(context, T, directions)
-    return Scene(name, context, case.errors, outward, q, points[: max(MARKERS)], T)
+    mesh = context.anatomy.structure(case.target_structure).mesh
+    hit = hit_model(case.hit_radius_mm, mesh, case.target_ct)
+    return Scene(name, context, hit, case.errors, outward, q, points[: max(MARKERS)], T)
 
 
 def _reached(context: CaseContext, T_base_ct: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -172,9 +192,9 @@ def tally(
 ) -> dict[str, Tally]:
     """Rooms of one anatomy and set of markers, by what is known of the noise.
 
-    ``known``: the declaration is taken at its word. ``found``: the residuals give the size, whatever it is: it is drawn
-    evenly on a logarithmic scale. ``found, size 1``: likewise, but the true size is always the declared one, which a
-    chance that follows from the residuals alone cannot know.
+    ``known``: the declaration is taken at its word. ``found``: the residuals give the size, whatever it is (`FOUND`).
+    ``found, size 1``: likewise, but the true size is always the declared one, which a chance that follows from the
+    residuals alone cannot know.
 
     Args:
         of: The anatomy.
@@ -189,39 +209,83 @@ def tally(
     for puncture, error in punctures(of, markers):
         drawn = draw_rooms(puncture, of.errors.scaled(truth), each, rng).reached_alone()
         came, sizes = _came(of, puncture, error, drawn), np.sqrt(drawn.chi_squared / freedom)
-        sums["known"].add(*_predicted(of, error, puncture, None), np.ones(len(sizes)), drawn, came)
+        sums["known"].add(_predicted(of, error, puncture, None), np.ones(len(sizes)), drawn, came)
         if not found:
             continue
         told = _predicted(of, error, puncture, freedom)
-        sums["found, size 1"].add(*told, sizes, drawn, came)
-        for true_size in TRUE_SIZES:
-            drawn = draw_rooms(puncture, of.errors.scaled(truth * true_size), each // len(TRUE_SIZES), rng)
-            drawn = drawn.reached_alone()
-            came, sizes = _came(of, puncture, error, drawn), np.sqrt(drawn.chi_squared / freedom)
-            sums["found"].add(*told, sizes, drawn, came)
+        sums["found, size 1"].add(told, sizes, drawn, came)
+        true_sizes = _true_sizes(freedom)
+        many = each * np.log(true_sizes[-1] / true_sizes[0]) / np.log(FOUND[1] / FOUND[0]) / len(true_sizes)
+        for true_size in true_sizes:
+            drawn = draw_rooms(puncture, of.errors.scaled(truth * true_size), int(np.ceil(many)), rng).reached_alone()
+            sizes = np.sqrt(drawn.chi_squared / freedom)
+            counted = (sizes >= FOUND[0]) & (sizes <= FOUND[1])
+            if counted.any():
+                drawn = drawn.of(counted)
+                sums["found"].add(told, sizes[counted], drawn, _came(of, puncture, error, drawn))
     radius = {"known": chdtri(3, 0.05), "found": 3 * fdtri(3, freedom, 0.95)}
     drawn_for = {name: part for name, part in sums.items() if part.hits}
     return {name: part.tally(radius[name.partition(",")[0]], freedom) for name, part in drawn_for.items()}
 
 
-def _predicted(of: Scene, error: PoseError, puncture: Puncture, freedom: int | None) -> tuple[np.ndarray, ...]:
-    """Sizes (m,), the tip's covariance at size 1, and chances at each size: to hit (m, 5), to touch (m, k)."""
-    sizes = np.ones(1) if freedom is None else SIZES
-    hit, touch, outward, q = [], [], puncture.outward_ct[None], puncture.q_insertion[None]
-    for size in sizes:
-        fit, test = error.fit, NoiseTest(len(puncture.points_ct), float(3 * len(puncture.points_ct) - 6))
-        if freedom is not None:
-            test = NoiseTest(len(puncture.points_ct), float(size**2 * freedom), found=True)
-        told = replace(error, fit=FitUncertainty(fit.noise, fit.R_base_ct, fit.center_base, fit.fit_map, test))
-        model = chance_model(of.context.case, of.context.anatomy, told)
-        assert model is not None
-        asked = (of.context.case, of.context.anatomy, of.context.engine, model)
+def _true_sizes(freedom: int) -> np.ndarray:
+    """From which residuals within `FOUND` come, shape (m,)."""
+    low, high = np.sqrt(freedom / chdtri(freedom, (RARELY, 1 - RARELY)))
+    return np.geomspace(FOUND[0] * low, FOUND[1] * high, STEPS)
+
+
+class Told(NamedTuple):
+    """What is predicted of one puncture.
+
+    Attributes:
+        cov_ct: Shape (3, 3), of the tip, the errors' size 1.
+        hit: Shape (m, 5), chances to hit lesion and balls at m sizes.
+        touch: Shape (t, k), chances to touch at t sizes.
+    """
+
+    cov_ct: np.ndarray
+    hit: np.ndarray
+    touch: np.ndarray
+
+    def at(self, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Chances (n, 5) and (n, k) of rooms with these sizes (n,) by their residuals."""
+        return _between(sizes, self.hit), _between(sizes, self.touch)
+
+
+def _between(sizes: np.ndarray, chances: np.ndarray) -> np.ndarray:
+    """Chances (m, k), at sizes spread over `FOUND`, at other sizes; of one alone, where size does not matter."""
+    if len(chances) == 1:
+        return np.broadcast_to(chances[0], (len(sizes), chances.shape[1]))
+    grid = np.log(np.geomspace(*FOUND, len(chances)))
+    at = np.log(np.clip(sizes, *FOUND))
+    return np.clip(PchipInterpolator(grid, chances)(at), 0.0, 1.0)
+
+
+def _predicted(of: Scene, error: PoseError, puncture: Puncture, freedom: int | None) -> Told:
+    """Chances as the search computes them, those to touch refined."""
+    outward, q = puncture.outward_ct[None], puncture.q_insertion[None]
+    hit, touch = [], []
+    for size in SIZES if freedom else (1.0,):
+        _, asked = _believed(of, error, size, freedom)
         first = chances_of(*asked, outward, q)
         every = np.ones(first["touch"].shape, bool)
-        refined = refined_chances(*asked, (outward, q), (first["touch"], first["margin"]), every)
-        hit.append([first["hit"][0], *(hit_in_ball(told.tip_covariance(q), r, freedom)[0] for r in _radii(error, q))])
-        touch.append(refined["touch"][0])
-    return sizes, error.tip_covariance_ct(q)[0] / error.fit.test.scale**2, np.array(hit), np.array(touch)
+        touch.append(refined_chances(*asked, (outward, q), (first["touch"], first["margin"]), every)["touch"][0])
+    for size in np.geomspace(*FOUND, 8 * len(SIZES)) if freedom else (1.0,):
+        told, _ = _believed(of, error, size, freedom)
+        cov, tip = told.covariance_ct(q), told.tip_covariance(q)
+        balls = [hit_in_ball(tip, radius, freedom)[0] for radius in _radii(error, q)]
+        hit.append([of.hit.chance(told, cov)[0], *balls])
+    return Told(error.tip_covariance_ct(q)[0] / error.fit.test.scale**2, np.array(hit), np.array(touch))
+
+
+def _believed(
+    of: Scene, error: PoseError, size: float, freedom: int | None
+) -> tuple[PoseError, tuple[Case, Anatomy, ClearanceEngine, ChanceModel]]:
+    """The pose's error where the residuals have a size, and what chances are computed from."""
+    fit, count = error.fit, error.fit.noise.cov_base.shape[0]
+    test = NoiseTest(count, float(size**2 * (3 * count - 6)), found=freedom is not None)
+    told = replace(error, fit=FitUncertainty(fit.noise, fit.R_base_ct, fit.center_base, fit.fit_map, test))
+    return told, (of.context.case, of.context.anatomy, of.context.engine, ChanceModel(told, of.hit))
 
 
 def _radii(error: PoseError, q: np.ndarray) -> np.ndarray:
@@ -237,17 +301,28 @@ def _came(of: Scene, puncture: Puncture, error: PoseError, rooms: Rooms) -> tupl
         hit = away < case.hit_radius_mm
     else:
         hit = inside_each(anatomy.structure(case.target_structure).mesh, rooms.tip_ct)
-    columns, lengths = demanding(anatomy.checked), axis_lengths(case, anatomy.checked)
-    shift = np.linalg.norm(rooms.tip_ct - case.target_ct, axis=1).max(initial=0.0)
+    shift = np.linalg.norm(rooms.tip_ct - case.target_ct, axis=1)
+    ends = np.unique(np.ceil(len(shift) * np.array(PARTS)).astype(int))
+    touched = np.zeros((len(shift), len(demanding(anatomy.checked))), bool)
+    for part in np.split(np.argsort(shift), ends[:-1]):
+        touched[part] = _touched(of, puncture, rooms.of(part), float(shift[part].max(initial=0.0)))
+    within = away[:, None] < _radii(error, puncture.q_insertion[None])
+    return np.column_stack([hit, within]), touched
+
+
+def _touched(of: Scene, puncture: Puncture, rooms: Rooms, shift: float) -> np.ndarray:
+    """Which rooms touch what, shape (n, k); their tips are no farther off than a shift."""
+    case, checked = of.context.case, of.context.anatomy.checked
+    columns, lengths, radius = demanding(checked), axis_lengths(case, checked), case.needle.radius_mm
     turn = np.linalg.norm(rooms.outward_ct - puncture.outward_ct, axis=1).max(initial=0.0)
     touched = np.zeros((len(rooms.tip_ct), len(columns)), bool)
     for place, column in enumerate(columns):
-        length, radius = float(lengths[column]), case.needle.radius_mm
+        length = float(lengths[column])
         reach = (radius + shift + 1e-6, radius + shift + length * turn + 1e-6)
         faces = of.context.engine.near(int(column), case.target_ct, puncture.outward_ct, length, reach)
-        touched[:, place] = faces.distance(rooms.tip_ct, rooms.outward_ct, length) < radius
-    within = away[:, None] < _radii(error, puncture.q_insertion[None])
-    return np.column_stack([hit, within]), touched
+        if len(faces):
+            touched[:, place] = faces.distance(rooms.tip_ct, rooms.outward_ct, length) < radius
+    return touched
 
 
 @dataclass(eq=False)
@@ -264,26 +339,16 @@ class _Sums:
     def empty(cls) -> _Sums:
         return cls([], [], [], [], [])
 
-    def add(
-        self,
-        grid: np.ndarray,
-        cov_ct: np.ndarray,
-        p_hit: np.ndarray,
-        p_touch: np.ndarray,
-        sizes: np.ndarray,
-        rooms: Rooms,
-        came: tuple[np.ndarray, np.ndarray],
-    ) -> None:
-        """One direction: chances on a grid of sizes, each room's own size, and what came."""
+    def add(self, told: Told, sizes: np.ndarray, rooms: Rooms, came: tuple[np.ndarray, np.ndarray]) -> None:
+        """One direction: what was predicted, each room's own size, and what came."""
         error = rooms.tip_ct - rooms.target_ct
-        square = np.einsum("na,ab,nb->n", error, np.linalg.inv(cov_ct), error)
+        square = np.einsum("na,ab,nb->n", error, np.linalg.inv(told.cov_ct), error)
         self.squares.append(square / sizes**2)
-        self.errors.append((float((error**2).sum()), float(np.trace(cov_ct) * (sizes**2).sum())))
-        for told, hit in zip(p_hit.T, came[0].T, strict=True):
-            self.hits.append(np.array([np.interp(np.log(sizes), np.log(grid), told), hit]))
-        for place in np.flatnonzero((p_touch.max(axis=0) > 1e-6) | came[1].any(axis=0)):
-            told = np.interp(np.log(sizes), np.log(grid), p_touch[:, place])
-            self.touches.append(np.array([told, came[1][:, place]]))
+        self.errors.append((float((error**2).sum()), float(np.trace(told.cov_ct) * (sizes**2).sum())))
+        hit, touch = told.at(sizes)
+        self.hits += [np.array(pair) for pair in zip(hit.T, came[0].T, strict=True)]
+        for place in np.flatnonzero((touch.max(axis=0) > 1e-6) | came[1].any(axis=0)):
+            self.touches.append(np.array([touch[:, place], came[1][:, place]]))
         self.tests.append(rooms.chi_squared)
 
     def tally(self, radius_squared: float, freedom: int) -> Tally:

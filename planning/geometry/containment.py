@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.winding import winding_number
+from puncture_twin.planning.geometry.winding import winding_number, winding_numbers
 
 RAYS, SEED = 5, 3
 """Random directions that vote, always the same: where one of them happens to meet an edge, the others do not."""
@@ -51,7 +51,7 @@ def inside_each(mesh: TriangleMesh, points: NDArray[np.float64]) -> NDArray[np.b
     low, high = mesh.bounds
     inside = np.all((points > low) & (points < high), axis=1)
     rows = np.flatnonzero(inside)
-    inside[rows] = [round(winding_number(mesh, points[row])) != 0 for row in rows]
+    inside[rows] = np.round(winding_numbers(mesh, points[rows])) != 0
     return inside
 
 

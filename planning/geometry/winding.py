@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.geometry.crossings import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -30,6 +31,32 @@ def winding_number(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
     denominator += np.einsum("ij,ij->i", b, c) * na
     denominator += np.einsum("ij,ij->i", c, a) * nb
     return float(2 * np.sum(np.arctan2(triple, denominator)) / (4 * np.pi))
+
+
+def winding_numbers(mesh: TriangleMesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`winding_number` of many points (n, 3), mm: shape (n,)."""
+    found = np.empty(len(points))
+    _solid_angles(np.ascontiguousarray(mesh.triangles), np.ascontiguousarray(points, dtype=np.float64), found)
+    return found / (4 * np.pi)
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _solid_angles(triangles, points, found):  # type: ignore[no-untyped-def]  # numba infers
+    """The sum over all triangles (m, 3, 3), as in `winding_number`, of each point."""
+    for row in range(len(points)):
+        x, y, z = points[row]
+        total = 0.0
+        for t in triangles:
+            ax, ay, az = t[0, 0] - x, t[0, 1] - y, t[0, 2] - z
+            bx, by, bz = t[1, 0] - x, t[1, 1] - y, t[1, 2] - z
+            cx, cy, cz = t[2, 0] - x, t[2, 1] - y, t[2, 2] - z
+            na, nb_ = np.sqrt(ax * ax + ay * ay + az * az), np.sqrt(bx * bx + by * by + bz * bz)
+            nc = np.sqrt(cx * cx + cy * cy + cz * cz)
+            triple = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
+            below = na * nb_ * nc + (ax * bx + ay * by + az * bz) * nc
+            below += (bx * cx + by * cy + bz * cz) * na + (cx * ax + cy * ay + cz * az) * nb_
+            total += 2.0 * np.arctan2(triple, below)
+        found[row] = total
 
 
 def odd_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:

@@ -21,7 +21,7 @@ from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.shapes import convex, surface, touch
 from puncture_twin.planning.collision.sweep import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.winding import winding_number
+from puncture_twin.planning.geometry.winding import winding_number, winding_numbers
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
@@ -285,6 +285,15 @@ def test_an_open_skin_is_known_as_open() -> None:
     assert CellChecker(UR3, TOOL, patient=whole).patient_closed
     assert not CellChecker(UR3, TOOL, patient=cut).patient_closed
     assert not CellChecker(UR3, TOOL).patient_closed
+
+
+def test_winding_numbers_of_many_points_are_those_of_each() -> None:
+    """Inside, outside and next to a face, of a closed and of an open surface."""
+    box = cuboid(np.full(3, -50.0), np.full(3, 50.0))
+    points = np.random.default_rng(5).uniform(-60.0, 70.0, (50, 3))
+    for mesh in (box, TriangleMesh(box.vertices, box.faces[:-2])):
+        alone = [winding_number(mesh, point) for point in points]
+        assert winding_numbers(mesh, points) == pytest.approx(alone, abs=1e-12)
 
 
 def test_winding_number_counts_the_inside() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, wrap_to_pi
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fit_map import design, fit_weighted, least_squares_map
@@ -73,18 +73,21 @@ class Rooms(NamedTuple):
     R_ct_needle: Floats
     chi_squared: Floats
 
+    def of(self, rows: Bools | Ints) -> Rooms:
+        """Some of the rooms."""
+        return Rooms(
+            self.tip_ct[rows],
+            self.outward_ct[rows],
+            self.target_ct[rows],
+            self.T_base_ct[rows],
+            self.reached[rows],
+            self.R_ct_needle[rows],
+            self.chi_squared[rows],
+        )
+
     def reached_alone(self) -> Rooms:
         """Without the rooms in which the arm did not reach the pose."""
-        kept = self.reached
-        return Rooms(
-            self.tip_ct[kept],
-            self.outward_ct[kept],
-            self.target_ct[kept],
-            self.T_base_ct[kept],
-            self.reached[kept],
-            self.R_ct_needle[kept],
-            self.chi_squared[kept],
-        )
+        return self.of(self.reached)
 
 
 def draw_rooms(puncture: Puncture, errors: ErrorModel, count: int, rng: np.random.Generator) -> Rooms:
