@@ -88,14 +88,15 @@ class Tally:
         coverage: Of the predicted 95 % regions.
         ece_hit: Expected calibration error of p_hit over ten bins.
         ece_touch: Of p_touch, all structures that may be touched.
-        noticed: Share of rooms whose residuals break the declaration's test at its 1 %, were it taken at its word.
+        noticed: Share of rooms whose residuals break the declaration's test at its 1 %, were it taken at its word; None
+            where the noise is found.
     """
 
     ratio: float
     coverage: float
     ece_hit: float
     ece_touch: float
-    noticed: float
+    noticed: float | None
 
     @property
     def holds(self) -> bool:
@@ -106,7 +107,8 @@ class Tally:
     def text(self) -> str:
         """Cells of a table."""
         figures = f"{self.ratio:.3f} | {self.coverage:.3f} | {self.ece_hit:.4f} | {self.ece_touch:.4f}"
-        return f"{figures} | {self.noticed:.3f} | {'yes' if self.holds else 'NO'}"
+        noticed = "" if self.noticed is None else f"{self.noticed:.3f}"
+        return f"{figures} | {noticed} | {'yes' if self.holds else 'NO'}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,10 +221,12 @@ def tally(
         for true_size in true_sizes:
             drawn = draw_rooms(puncture, of.errors.scaled(truth * true_size), int(np.ceil(many)), rng).reached_alone()
             sizes = np.sqrt(drawn.chi_squared / freedom)
+            if FOUND[0] <= true_size <= FOUND[1]:
+                sums["found"].add_error(told, sizes / true_size, drawn, true_size)
             counted = (sizes >= FOUND[0]) & (sizes <= FOUND[1])
             if counted.any():
                 drawn = drawn.of(counted)
-                sums["found"].add(told, sizes[counted], drawn, _came(of, puncture, error, drawn))
+                sums["found"].add_chances(told, sizes[counted], drawn, _came(of, puncture, error, drawn))
     radius = {"known": chdtri(3, 0.05), "found": 3 * fdtri(3, freedom, 0.95)}
     drawn_for = {name: part for name, part in sums.items() if part.hits}
     return {name: part.tally(radius[name.partition(",")[0]], freedom) for name, part in drawn_for.items()}
@@ -341,15 +345,24 @@ class _Sums:
 
     def add(self, told: Told, sizes: np.ndarray, rooms: Rooms, came: tuple[np.ndarray, np.ndarray]) -> None:
         """One direction: what was predicted, each room's own size, and what came."""
+        self.add_error(told, sizes, rooms)
+        self.add_chances(told, sizes, rooms, came)
+        self.tests.append(rooms.chi_squared)
+
+    def add_error(self, told: Told, sizes: np.ndarray, rooms: Rooms, true_size: float = 1.0) -> None:
+        """Squares of what came and was predicted, both over the true size: their means are alike where it is fixed."""
+        came = float(((rooms.tip_ct - rooms.target_ct) ** 2).sum()) / true_size**2
+        self.errors.append((came, float(np.trace(told.cov_ct) * (sizes**2).sum())))
+
+    def add_chances(self, told: Told, sizes: np.ndarray, rooms: Rooms, came: tuple[np.ndarray, np.ndarray]) -> None:
+        """Whether regions held, and chances came true, of rooms with these sizes."""
         error = rooms.tip_ct - rooms.target_ct
         square = np.einsum("na,ab,nb->n", error, np.linalg.inv(told.cov_ct), error)
         self.squares.append(square / sizes**2)
-        self.errors.append((float((error**2).sum()), float(np.trace(told.cov_ct) * (sizes**2).sum())))
         hit, touch = told.at(sizes)
         self.hits += [np.array(pair) for pair in zip(hit.T, came[0].T, strict=True)]
         for place in np.flatnonzero((touch.max(axis=0) > 1e-6) | came[1].any(axis=0)):
             self.touches.append(np.array([touch[:, place], came[1][:, place]]))
-        self.tests.append(rooms.chi_squared)
 
     def tally(self, radius_squared: float, freedom: int) -> Tally:
         """The figures."""
@@ -361,7 +374,7 @@ class _Sums:
             coverage=float(np.mean(np.concatenate(self.squares) <= radius_squared)),
             ece_hit=calibration_error(*hits),
             ece_touch=calibration_error(*touches),
-            noticed=float(np.mean(np.concatenate(self.tests) > chdtri(freedom, 0.01))),
+            noticed=float(np.mean(np.concatenate(self.tests) > chdtri(freedom, 0.01))) if self.tests else None,
         )
 
 
