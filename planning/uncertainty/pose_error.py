@@ -52,7 +52,11 @@ class PoseError:
 
     def covariance(self, q: Floats) -> Floats:
         """Sigma6 of configurations (n, 6), rad: shape (n, 6, 6), tip (mm) then rotation (rad), base axes."""
-        return np.asarray(sum(self.parts(q).values()))
+        J, arm = error_jacobian(self.model, q, self.tip_mm), self.errors.arm
+        lasting = self._lasting(J) * np.sqrt(self.fit.noise.eta_variances)
+        anew = J[..., PARAMETERS["joint"]] * np.hypot(arm.drift, arm.repeatability)
+        root = self.fit.test.scale * np.concatenate([lasting, anew], axis=-1)
+        return self.fit.cov_at(self.target_base) + root @ np.swapaxes(root, -1, -2)
 
     def tip_covariance(self, q: Floats) -> Floats:
         """Of the tip against the point that was meant, its reading included: shape (n, 3, 3), mm^2, base axes."""
@@ -108,13 +112,18 @@ class PoseError:
 
     def _arm_parts(self, J: Floats) -> dict[str, Floats]:
         """Of the arm's parameters, of its drift since the touches, and of one arrival at the target."""
-        known, eta = self.fit.noise.touches_known, self.fit.noise.eta_variances
-        G = J - self.fit.map_at(self.target_base) @ self.fit.noise.arm_jacobian if known else np.sqrt(2.0) * J
+        G, eta = self._lasting(J), self.fit.noise.eta_variances
         found = {source: _outer(G[..., part], eta[part]) for source, part in PARAMETERS.items()}
         Jq, arm = J[..., PARAMETERS["joint"]], self.errors.arm
         found["drift"] = _outer(Jq, np.full(6, arm.drift**2))
         found["arrival"] = _outer(Jq, np.full(6, arm.repeatability**2))
         return found
+
+    def _lasting(self, J: Floats) -> Floats:
+        """G, shape (n, 6, 28): what the arm's parameters do at the target, that they did at the markers taken off."""
+        if not self.fit.noise.touches_known:
+            return np.asarray(np.sqrt(2.0) * J)
+        return np.asarray(J - self.fit.map_at(self.target_base) @ self.fit.noise.arm_jacobian)
 
 
 def _outer(J: Floats, variances: Floats) -> Floats:

@@ -46,6 +46,14 @@ def test_the_chance_grows_with_the_radius_and_is_never_above_one():
         assert 1 - 1e-6 < found[-1] <= 1
 
 
+def test_a_size_that_is_all_but_known_gives_the_chance_of_a_known_one():
+    """Fisher's F with ten million degrees, by scipy, from a ball that is all but missed to one that is never left."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=8.0)
+    rays = target_rays(TriangleMesh(ball.vertices, ball.faces), np.array([3.0, 0.0, 0.0]))
+    covs = np.array([covariance(size * np.array([1.0, 2.0, 3.0]))[0] for size in np.geomspace(0.1, 50.0, 20)])
+    np.testing.assert_allclose(hit_in_mesh(rays, covs), hit_in_mesh(rays, covs, 10**7), atol=5e-6)
+
+
 @pytest.mark.parametrize("deviations", DEVIATIONS)
 @pytest.mark.parametrize("off", [0.0, 6.0, 8.0, 12.0])
 def test_within_a_ball_of_triangles_from_inside_on_its_face_and_outside(deviations, off):
