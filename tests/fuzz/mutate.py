@@ -278,7 +278,8 @@ def change_element(rng, data, others):
     at, length = place.start() + 8, struct.unpack("<H", place.group()[6:8])[0]
     how = int(rng.integers(5))
     if how == 0:
-        return data[: at - 2] + struct.pack("<H", int(rng.choice([0, 1, 2, 255, 65535, min(length + 2, 65534)]))) + data[at:]
+        other = int(rng.choice([0, 1, 2, 255, 65535, min(length + 2, 65534)]))
+        return data[: at - 2] + struct.pack("<H", other) + data[at:]
     if how == 1:
         return data[: place.start()] + data[at + length :]
     if how == 2:
