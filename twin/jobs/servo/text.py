@@ -77,6 +77,7 @@ def needle_lines(needle: Mapping[str, Any]) -> list[str]:
     lines = [f"needle against the anatomy{wrong}:   realised   predicted"]
     for way, words in WAY_WORDS.items():
         lines += _way_lines(words, needle[way], needle["hit_radius_mm"])
+    lines.append("  the needles of one seed share its room: seeds count, not needles")
     return [*lines, *_declaration_lines(needle["declaration"]), f"  not modelled: {NOT_MODELLED}"]
 
 
