@@ -13,7 +13,7 @@ from contextlib import suppress
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 from rich.console import Console
@@ -24,8 +24,9 @@ from puncture_twin.planning.base.files import check_writable
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.batch.batch import run_batch
 from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.case_schema import Region
 from puncture_twin.planning.export.exporter import FORMATS
-from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, exit_code_of
 from puncture_twin.twin.jobs.patient import answers, main_job, text as words
@@ -92,6 +93,41 @@ def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> 
     with progress_display() as progress:
         run = main_job.demo_case(prepare(meshes_folder() / "abdomen", watcher=progress), out_dir)
     _print(run.summary(), words.rehearsal_text(run), as_json)
+
+
+@app.command()
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="With a CT and a segmentation.")],
+    target: Annotated[str | None, typer.Option("--target", help="X,Y,Z in mm.")] = None,
+    target_label: Annotated[str | None, typer.Option("--target-label", help="Or the deepest point of this.")] = None,
+    space: Annotated[Space, typer.Option("--space", help="Of the target, of the case, and of meshes.")] = Space.LPS,
+    region: Annotated[str | None, typer.Option("--region", help="What the CT shows; else told by organs.")] = None,
+    naming: Annotated[
+        str | None, typer.Option("--naming", help="Of labels: totalsegmentator-v1, -v2, a table.")
+    ] = None,
+    unit: Annotated[Unit | None, typer.Option("--unit", help="Of meshes; else told by their extent.")] = None,
+    ct: Annotated[str | None, typer.Option("--ct", help="Which file, where FOLDER holds several CTs.")] = None,
+    segmentation: Annotated[
+        str | None, typer.Option("--segmentation", help="Which file or folder, where FOLDER holds several.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a case.toml that is there.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Write FOLDER/case.toml from what is in the folder: roles and margins from the table of default roles."""
+    from puncture_twin.planning.case.init.finder import Wanted
+    from puncture_twin.planning.case.init.start import Request
+    from puncture_twin.twin.jobs.patient.init_job import init_case, init_text
+
+    if region is not None and region not in get_args(Region):
+        raise InputError(f"region '{region[:40]}' is not known", where="--region", allowed=", ".join(get_args(Region)))
+    if space is Space.LOCAL:
+        raise InputError("a patient's space", where="--space", allowed="LPS or RAS")
+    wanted = Wanted(space, naming, unit, ct, segmentation)
+    with progress_display() as progress:
+        run = init_case(Request(folder, target, target_label, region, wanted), force=force, watcher=progress)
+    for warning in run.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    _print(run.summary(), init_text(run), as_json)
 
 
 @app.command()

@@ -69,7 +69,8 @@ def test_namings_by_name_by_file_and_by_the_map_itself(tmp_path: Path) -> None:
     ("content", "match"),
     [
         (b"", "header"),
-        (b"label,name\n1,a\n", "header"),
+        (b"label,colour\n1,a\n", "header"),
+        (b"1,liver\n", "header"),
         (b"id,name\n", "no label"),
         (b"id,name\n0,a\n", "line 2"),
         (b"id,name\n-1,a\n", "line 2"),

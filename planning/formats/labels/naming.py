@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import difflib
-import io
 import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -17,7 +15,7 @@ from typing import Protocol
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.text_names import check_name
 from puncture_twin.planning.formats.labels import totalsegmentator
-from puncture_twin.planning.formats.labels.labelmaps import MAX_LABEL
+from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS, parse_names
 
 BUILT_IN: Mapping[str, Mapping[int, str]] = {
     "totalsegmentator-v1": totalsegmentator.V1,
@@ -88,31 +86,31 @@ class OwnNames(Protocol):
 
 def is_naming_file(naming: str | None) -> bool:
     """Whether a naming is a file, and not a table of this package or of the label map itself."""
-    return naming is not None and naming not in BUILT_IN and naming.lower().endswith(".csv")
+    return naming is not None and naming not in BUILT_IN and naming.lower().endswith(NAME_ENDINGS)
 
 
 def names_for(naming: str | None, folder: Path, content: Callable[[str], bytes], labelmap: OwnNames) -> dict[int, str]:
     """The names of labels, by number.
 
     Args:
-        naming: ``"totalsegmentator-v1"``, ``"totalsegmentator-v2"``, the path of a CSV with the columns
-            ``id,name``, or None or ``"seg.nrrd"`` for the names that a .seg.nrrd holds.
-        folder: What a CSV's path is relative to.
-        content: Gives the bytes of a CSV by its path.
+        naming: ``"totalsegmentator-v1"``, ``"totalsegmentator-v2"``, the path of a table of names (CSV,
+            JSON, ITK-SNAP's or Slicer's list), or None or ``"seg.nrrd"`` for the names that a .seg.nrrd holds.
+        folder: What a table's path is relative to.
+        content: Gives the bytes of a table by its path.
         labelmap: The map, for its own names.
 
     Raises:
-        InputError: An unknown naming, a map without names of its own, or a CSV that cannot be used.
+        InputError: An unknown naming, a map without names of its own, or a table that cannot be used.
     """
-    allowed = f"{', '.join(BUILT_IN)}, a CSV with id,name, or a .seg.nrrd with names"
+    allowed = f"{', '.join(BUILT_IN)}, a table of names ({', '.join(NAME_ENDINGS)}), or a .seg.nrrd with names"
     if naming is None or naming == OWN_NAMES:
         if labelmap.names is None:
             raise InputError("the label map holds no names", where=labelmap.path, allowed=allowed)
         return _unique(labelmap.names, labelmap.path)
     if naming in BUILT_IN:
         return dict(BUILT_IN[naming])
-    if naming.lower().endswith(".csv"):
-        return _unique(_read_csv(content(naming), folder / naming), folder / naming)
+    if naming.lower().endswith(NAME_ENDINGS):
+        return _unique(parse_names(content(naming), folder / naming), folder / naming)
     near = difflib.get_close_matches(naming, BUILT_IN, n=1)
     hint = f" (nearest: {near[0]})" if near else ""
     raise InputError(f"unknown naming {naming!r}{hint}", where=labelmap.path, allowed=allowed)
@@ -239,27 +237,3 @@ def _unique(names: Mapping[int, str], where: Path) -> dict[int, str]:
             raise InputError(what, where=where, allowed="a name of its own for each label")
         seen[name] = label
     return dict(names)
-
-
-def _read_csv(data: bytes, path: Path) -> dict[int, str]:
-    allowed = "a CSV with the header id,name and one label per line"
-    try:
-        rows = list(csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"is no CSV text ({error})", where=path, allowed=allowed) from error
-    if not rows or [cell.strip().lower() for cell in rows[0]] != ["id", "name"]:
-        raise InputError(f"header {rows[0] if rows else 'missing'}", where=path, allowed=allowed)
-    names: dict[int, str] = {}
-    for number, row in enumerate(rows[1:], start=2):
-        if not row:
-            continue
-        where = f"{path}, line {number}"
-        cell = row[0].strip()
-        if len(row) != 2 or not (cell.isascii() and cell.isdigit() and len(cell) < 7 and 0 < int(cell) <= MAX_LABEL):
-            raise InputError(f"{row}", where=where, allowed=f"id,name with an id from 1 to {MAX_LABEL}")
-        if int(cell) in names:
-            raise InputError(f"id {cell} stands twice", where=where, allowed="each id once")
-        names[int(cell)] = row[1].strip()
-    if not names:
-        raise InputError("the naming holds no label", where=path, allowed=allowed)
-    return names

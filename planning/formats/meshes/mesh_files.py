@@ -14,6 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
@@ -74,6 +75,19 @@ def parse_mesh(data: bytes, path: Path, *, unit: Unit, space: Space) -> Triangle
         raw = reader(data, name)
         vertices = to_lps(raw.vertices, space) * unit.mm
     return guard_mesh(vertices, raw.faces, where=name)
+
+
+def mesh_extent(path: Path) -> NDArray[np.float64]:
+    """The box of a mesh file in its own unit, whatever that is: lowest and highest corner, shape (2, 3).
+
+    Raises:
+        InputError: As `read_mesh`, but for the guard.
+    """
+    reader = _reader(path)
+    raw = reader(read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path)), str(path))
+    if not np.isfinite(raw.vertices).all() or len(raw.vertices) == 0:
+        raise InputError("a vertex is not finite, or there is none", where=path, allowed="finite vertices")
+    return np.stack([raw.vertices.min(axis=0), raw.vertices.max(axis=0)]).astype(np.float64)
 
 
 def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:

@@ -1,0 +1,395 @@
+"""What a structure means to a needle where nobody says: one line per class or group of classes, each with its reason.
+
+Names are those of TotalSegmentator's tasks and of Slicer's segments, in any spelling of capitals, spaces and signs:
+``lung_upper_lobe_left``, "Left Lung". Of several lines that match a name the most specific holds, as in a case. Margins
+are a start to be looked at for each patient, not a rule of any society.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from fnmatch import fnmatchcase
+from types import MappingProxyType
+from typing import Literal, NamedTuple
+
+from puncture_twin.planning.formats.labels.naming import specificity
+
+Kind = Literal["avoid", "traverse", "ignore"]
+
+
+class DefaultRole(NamedTuple):
+    """One line of the table.
+
+    Attributes:
+        group: What a person reads.
+        patterns: Shell patterns of names in lower case with underscores.
+        kind: What it means to a needle: ``ignore`` for outlines of the body, which the skin is.
+        margin_mm: The clearance that it demands; 0 where it demands none.
+        reason: Why.
+    """
+
+    group: str
+    patterns: tuple[str, ...]
+    kind: Kind
+    margin_mm: float
+    reason: str
+
+
+def _line(group: str, patterns: str, kind: Kind, margin_mm: float, reason: str) -> DefaultRole:
+    """A line of the table; patterns with spaces between them."""
+    return DefaultRole(group, tuple(patterns.split()), kind, margin_mm, reason)
+
+
+UNKNOWN_NAME = _line(
+    "unknown name",
+    "",
+    "avoid",
+    5.0,
+    "nobody knows what it is: the largest margin of the table",
+)
+"""Of a name that no line matches."""
+
+BODY = _line(
+    "outline of the body",
+    "skin body body_trunc body_extremities body_envelope external outline patient",
+    "ignore",
+    0.0,
+    "the skin is found in the CT, or is the skin mesh",
+)
+"""Structures that are the body itself."""
+
+LESION = _line(
+    "lesion",
+    "*lesion* *tumor* *tumour* *nodule* *metastas* *carcinoma* *neoplas* *cancer* *mass mass_*",
+    "avoid",
+    3.0,
+    "tumour cells are not carried along the needle; the one that holds the target is the target",
+)
+"""What a target usually is; this line comes before all others."""
+
+GENERAL: tuple[DefaultRole, ...] = (
+    BODY,
+    _line(
+        "vertebrae, spine",
+        "*vertebra* spine *spinal_column* *intervertebral* *disc *disk",
+        "avoid",
+        2.0,
+        "bone deflects a needle; nerve roots leave beside it",
+    ),
+    _line(
+        "ribs",
+        "rib* *_rib* *thoracic_cage*",
+        "avoid",
+        1.0,
+        "bone deflects; the intercostal vessels run below it",
+    ),
+    _line(
+        "costal cartilages, sternum",
+        "*costal_cart* *sternum*",
+        "avoid",
+        1.0,
+        "bone and cartilage deflect a needle",
+    ),
+    _line(
+        "pelvis",
+        "hip hip_* *_hip *pelvi*bone* *ilium *ischium *pubis *sacrum* *coccyx*",
+        "avoid",
+        1.0,
+        "bone deflects a needle",
+    ),
+    _line(
+        "limbs and girdles",
+        "*femur* *tibia* *fibula* *patella* *humerus* *radius* *ulna* *scapula* *clavicula* *clavicle* "
+        "*carpal* *tarsal* *metacarpal* *metatarsal* *phalanges* *bone bone*",
+        "avoid",
+        1.0,
+        "bone deflects a needle",
+    ),
+    _line(
+        "skull and face",
+        "*skull* *crani* *mandible* *maxilla* *zygomatic* *teeth* face* *hyoid*",
+        "avoid",
+        1.0,
+        "bone deflects a needle",
+    ),
+    _line(
+        "spinal cord",
+        "*spinal_cord* *spinal_canal* *medulla_spinalis* *cauda_equina*",
+        "avoid",
+        5.0,
+        "palsy",
+    ),
+    _line(
+        "nerves",
+        "*nerve* *plexus* *optic* *chiasm*",
+        "avoid",
+        5.0,
+        "palsy, pain; they move with their surroundings",
+    ),
+    _line(
+        "brain",
+        "*brain* *cerebr* *cerebell* *thalamus* *caudate* *putamen* *pallidum* *capsule* *subarachnoid* "
+        "*septum_pellucidum* *insular* *parenchyma*",
+        "avoid",
+        3.0,
+        "eloquent tissue",
+    ),
+    _line(
+        "eyes",
+        "*eye* *orbit* *lens* *lacrimal*",
+        "avoid",
+        3.0,
+        "sight",
+    ),
+    _line(
+        "aorta and venae cavae",
+        "*aorta* *vena_cava* vena_cava* ivc svc",
+        "avoid",
+        5.0,
+        "large vessel: bleeding",
+    ),
+    _line(
+        "great vessels of the chest and neck",
+        "*pulmonary_arter* *pulmonary_vein* *pulmonary_venous* *pulmonary_trunk* *brachiocephalic* "
+        "*subclavian* *carotid* *jugular*",
+        "avoid",
+        5.0,
+        "large vessel: bleeding, embolism",
+    ),
+    _line(
+        "portal vein",
+        "*portal_vein* portal* *splenic_vein* *mesenteric*",
+        "avoid",
+        4.0,
+        "bleeding",
+    ),
+    _line(
+        "iliac vessels",
+        "iliac_arter* iliac_ven* *_iliac_arter* *_iliac_ve*",
+        "avoid",
+        4.0,
+        "bleeding",
+    ),
+    _line(
+        "other vessels",
+        "*arter* *vein* hepatic_ve* *vena* *venous* *vessel* *vascul* *sinus_sagitt*",
+        "avoid",
+        3.0,
+        "bleeding; smaller ones are rarely segmented whole",
+    ),
+    _line(
+        "heart",
+        "*heart* *cardi* *atri* *ventricle_left* *ventricle_right* *coronar*",
+        "avoid",
+        5.0,
+        "it moves; tamponade",
+    ),
+    _line(
+        "lungs",
+        "*lung* *pulmo* *pleura* *bronch*",
+        "avoid",
+        2.0,
+        "pneumothorax; it moves with the breath",
+    ),
+    _line(
+        "airways",
+        "*trachea* *airway* *larynx* *pharynx* *thyroid_cartilage* *cricoid* nasal* *sinus*",
+        "avoid",
+        3.0,
+        "air leaks; infection",
+    ),
+    _line(
+        "oesophagus",
+        "*esophag*",
+        "avoid",
+        3.0,
+        "perforation, infection",
+    ),
+    _line(
+        "stomach and bowel",
+        "*stomach* *duoden* *bowel* *intestin* *jejun* ileum *colon* *rectum* *sigmoid* *c?ecum* *append*x*",
+        "avoid",
+        3.0,
+        "perforation, infection; it moves",
+    ),
+    _line(
+        "gallbladder and bile ducts",
+        "*gallbladder* *gall_bladder* *bile* *biliary* *common_duct*",
+        "avoid",
+        3.0,
+        "bile leaks",
+    ),
+    _line(
+        "urinary bladder and ureters",
+        "*bladder* *ureter* *urethra*",
+        "avoid",
+        3.0,
+        "urine leaks",
+    ),
+    _line(
+        "liver",
+        "*liver* *hepatic* *hepar*",
+        "avoid",
+        3.0,
+        "it bleeds; make it traverse where a path through the liver is meant",
+    ),
+    _line(
+        "spleen",
+        "*spleen* *splenic*",
+        "avoid",
+        3.0,
+        "it bleeds",
+    ),
+    _line(
+        "kidneys",
+        "*kidney* *renal*",
+        "avoid",
+        3.0,
+        "it bleeds; cysts leak",
+    ),
+    _line(
+        "pancreas",
+        "*pancrea*",
+        "avoid",
+        3.0,
+        "pancreatitis",
+    ),
+    _line(
+        "adrenal glands",
+        "*adrenal* *suprarenal*",
+        "avoid",
+        2.0,
+        "it bleeds; blood pressure crises",
+    ),
+    _line(
+        "thyroid, glands of the neck",
+        "*thyroid* *parotid* *submandibular* *gland* *thymus*",
+        "avoid",
+        2.0,
+        "it bleeds",
+    ),
+    _line(
+        "organs of the pelvis",
+        "*prostate* *uter?s* *ovar* *seminal* *vagina* *testi* *penis*",
+        "avoid",
+        2.0,
+        "bleeding, infection",
+    ),
+    _line(
+        "lymph nodes",
+        "*lymph* *node",
+        "avoid",
+        2.0,
+        "seeding; vessels lie beside them",
+    ),
+    _line(
+        "devices",
+        "*implant* *stent* *pacemaker* *catheter* *port_a* *electrode* *prosthe*",
+        "avoid",
+        3.0,
+        "a needle damages it, or is deflected",
+    ),
+    _line(
+        "muscles",
+        "*gluteus* *autochthon* *iliopsoas* *psoas* *muscle* *pectoralis* *quadriceps* *rectus_abdom* "
+        "*oblique* *latissimus* *trapezius* *deltoid* *serratus* *erector* *sartorius* thigh_* *levator* "
+        "*sternocleido* *platysma* *scalen* *digastric* *masseter* *temporalis*",
+        "traverse",
+        0.0,
+        "needles pass muscle",
+    ),
+    _line(
+        "fat, breast",
+        "*fat *fat_* *adipose* *subcutan* breast* *_breast",
+        "traverse",
+        0.0,
+        "needles pass fat",
+    ),
+)
+"""The lines for every region."""
+
+BY_REGION: Mapping[str, tuple[DefaultRole, ...]] = MappingProxyType(
+    {
+        "brain": (
+            _line(
+                "brain",
+                "*brain *cerebrum* *cerebral_hemi* *parenchyma* *white_matter* *grey_matter* *gray_matter*",
+                "traverse",
+                0.0,
+                "the path to a target in the brain leads through it",
+            ),
+            _line(
+                "skull",
+                "*skull* *crani*",
+                "traverse",
+                0.0,
+                "the path leads through a burr hole",
+            ),
+            _line(
+                "ventricles of the brain",
+                "*ventric*",
+                "avoid",
+                3.0,
+                "leak of fluid, bleeding; the needle deflects at their wall",
+            ),
+            _line(
+                "brainstem",
+                "*brainstem* *brain_stem* *truncus_enceph* *pons*",
+                "avoid",
+                5.0,
+                "vital centres",
+            ),
+        ),
+        "head": (
+            _line(
+                "ventricles of the brain",
+                "*ventric*",
+                "avoid",
+                3.0,
+                "leak of fluid, bleeding",
+            ),
+            _line(
+                "brainstem",
+                "*brainstem* *brain_stem*",
+                "avoid",
+                5.0,
+                "vital centres",
+            ),
+        ),
+    }
+)
+"""Lines that hold in a region before the general ones; other regions have none of their own."""
+
+
+def default_role(name: str, region: str) -> DefaultRole | None:
+    """The line of the table that a name belongs to, or None.
+
+    Args:
+        name: A structure's, in any spelling.
+        region: As a case states it.
+    """
+    plain = plain_name(name)
+    for lines in ((LESION,), BY_REGION.get(region, ()), GENERAL):
+        found = list(_matching(plain, lines))
+        if found:
+            return max(found, key=lambda one: one[0])[1]
+    return None
+
+
+def plain_name(name: str) -> str:
+    """A name in lower case with underscores.
+
+    >>> plain_name("Left Lung"), plain_name("rib-left.7"), plain_name("SpinalCord")
+    ('left_lung', 'rib_left_7', 'spinal_cord')
+    """
+    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)
+    return re.sub(r"[\W_]+", "_", spaced).strip("_").lower()
+
+
+def _matching(plain: str, lines: tuple[DefaultRole, ...]) -> Iterator[tuple[float, DefaultRole]]:
+    """How closely each line names a name, for those that do."""
+    for line in lines:
+        close = [specificity(pattern, plain) for pattern in line.patterns if fnmatchcase(plain, pattern)]
+        if close:
+            yield max(close), line

@@ -1,0 +1,9 @@
+"""The start: a folder with a CT and a segmentation in, the text of a case that runs out.
+
+What a file is, is told by its content. Each kind of segmentation has a recogniser, and gives what `Segmentation` asks
+of it; the finder asks them all.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,112 @@
+"""The text of a new case: every section with its reason, ending in ``[end]``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.init.finder import Markers
+from puncture_twin.planning.case.init.segmentation import Assigned, Segmentation, quoted
+from puncture_twin.planning.geometry.spaces import Space, to_lps
+
+HEAD = """# Written by `init`: a start. Look at the roles and margins below before any result is trusted.
+# Every key: docs/reference/case.md; where roles and margins come from: docs/reference/default-roles.md.
+schema = 2
+region = "{region}"
+name = {name}
+space = "{space}"  # of the coordinates in this file
+
+[target]
+position_mm = [{position}]
+structure = {structure}
+
+[needle]
+length_mm = 200.0  # tip to flange
+shaft_mm = 150.0  # usable length
+diameter_mm = 1.2
+
+[search]
+theta_deg = [0, 90]
+step_deg = 2.0
+max_skin_angle_deg = 60.0
+
+"""
+SKIN_OF_CT = """[[structure]]
+name = "skin"
+ct = {ct}  # the body is found in the CT
+role = "skin"
+
+"""
+REGISTRATION = """
+# Markers, for the arm: the same names as the robot touched them go into markers_base.
+# [registration]
+# markers_ct = {ct}
+# markers_base = {base}
+"""
+END = """
+[end]
+structures = {count}  # the last line: a file that was cut lacks it
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class CaseParts:
+    """What a new case is made of.
+
+    Attributes:
+        name: Of the folder.
+        space: Of its coordinates.
+        region: Which part of the body it shows.
+        target_ct: Shape (3,), LPS mm.
+        structure: Which holds the target.
+        ct: The CT whose body is the skin, or None where a mesh is.
+        sources: Each segmentation with what the case says of its structures.
+        markers: Lists of points.
+    """
+
+    name: str
+    space: Space
+    region: str
+    target_ct: Floats
+    structure: str
+    ct: str | None
+    sources: tuple[tuple[Segmentation, Sequence[Assigned]], ...]
+    markers: tuple[Markers, ...]
+
+    @property
+    def rows(self) -> list[Assigned]:
+        """All that the case says of structures."""
+        return [row for _, rows in self.sources for row in rows]
+
+
+def case_text(parts: CaseParts) -> str:
+    """The whole file."""
+    position = to_lps(parts.target_ct[None], parts.space)[0]
+    head = HEAD.format(
+        region=parts.region,
+        name=quoted(case_name(parts.name)),
+        space=parts.space,
+        position=", ".join(repr(float(one)) for one in position),
+        structure=quoted(parts.structure),
+    )
+    skin = "" if parts.ct is None else SKIN_OF_CT.format(ct=quoted(parts.ct))
+    count = sum(row.kind != "ignore" for row in parts.rows) + (parts.ct is not None)
+    sections = "\n".join(segmentation.section(rows) for segmentation, rows in parts.sources)
+    return head + skin + sections + _markers_text(parts.markers) + END.format(count=count)
+
+
+def case_name(folder: str) -> str:
+    """A folder's name as a case may be called."""
+    plain = re.sub(r"[^A-Za-z0-9_.\-]+", "_", folder).strip("_.-")[:80]
+    return plain or "case"
+
+
+def _markers_text(markers: Sequence[Markers]) -> str:
+    if not markers:
+        return ""
+    base = next(
+        (one.source for one in markers[1:] if set(one.points.names) == set(markers[0].points.names)), "touch.csv"
+    )
+    return REGISTRATION.format(ct=quoted(markers[0].source), base=quoted(base))

@@ -1,0 +1,207 @@
+"""What a folder holds for a case: CT, segmentations and lists of markers, told by content."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.init.label_files import Mask, Masks, label_file, mask_of
+from puncture_twin.planning.case.init.mesh_folder import is_mesh, mesh_folder
+from puncture_twin.planning.case.init.segmentation import Place, Segmentation
+from puncture_twin.planning.formats.labels.labelmaps import labelmap_of
+from puncture_twin.planning.formats.labels.mask_folder import MASK_ENDINGS
+from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points
+from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS, Volume
+from puncture_twin.planning.geometry.spaces import Space, Unit
+
+DEPTH = 2
+"""Levels of folders below the one that is given."""
+AIR_HU = -200
+"""A CT of a body shows something less dense than fat: air or lung."""
+MOST_LABELS = 1000
+"""A map with more different labels is an image."""
+POINT_ENDINGS = (".csv", ".mrk.json", ".fcsv")
+LEAST_MARKERS = 3
+"""Fewer register nothing."""
+MANIFEST = "manifest.json"
+"""A folder that holds it was written by this program."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the user says of the files.
+
+    Attributes:
+        space: Of meshes, and of lists that do not say theirs.
+        naming: Of label maps without names.
+        unit: Of meshes.
+        ct: The CT, where there are several.
+        segmentation: The label map or folder, where there are several.
+    """
+
+    space: Space
+    naming: str | None = None
+    unit: Unit | None = None
+    ct: str | None = None
+    segmentation: str | None = None
+
+    def takes(self, kind: str, name: str) -> bool:
+        """Whether a file may be the CT (``ct``), or a segmentation (``labels``)."""
+        stated = self.ct if kind == "ct" else self.segmentation
+        return stated is None or name == stated or name.startswith(f"{stated.rstrip('/')}/")
+
+
+@dataclass(frozen=True, eq=False)
+class Ct:
+    """A CT, with the surfaces that are found in it."""
+
+    source: str
+    surfaces: VolumeSurfaces
+
+
+@dataclass(frozen=True, eq=False)
+class Markers:
+    """A list of named points."""
+
+    source: str
+    points: NamedPoints
+
+
+@dataclass(eq=False)
+class Found:
+    """What a folder holds.
+
+    Attributes:
+        cts: CTs.
+        segmentations: Label maps, masks, meshes.
+        markers: Lists of at least three points.
+        problems: What could not be read or told, one line each.
+        notes: What is neither.
+    """
+
+    cts: list[Ct] = field(default_factory=list)
+    segmentations: list[Segmentation] = field(default_factory=list)
+    markers: list[Markers] = field(default_factory=list)
+    problems: list[InputError] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def find(place: Place, wanted: Wanted) -> Found:
+    """Look through a folder and the folders below it, `DEPTH` levels deep.
+
+    Args:
+        place: The case's folder.
+        wanted: What the user says of the files.
+    """
+    found = Found()
+    for folder in _folders(place.folder, DEPTH):
+        _Looker(place, wanted, folder, found).look()
+    return found
+
+
+def _folders(folder: Path, depth: int) -> Iterator[Path]:
+    """A folder and those below it, but for hidden ones and this program's outputs."""
+    yield folder
+    if depth > 0:
+        for one in sorted(folder.iterdir()):
+            if one.is_dir() and not one.name.startswith(".") and not (one / MANIFEST).exists():
+                yield from _folders(one, depth - 1)
+
+
+class _Looker:
+    """Asks each kind's recogniser about one folder."""
+
+    def __init__(self, place: Place, wanted: Wanted, folder: Path, found: Found) -> None:
+        self._place = place
+        self._wanted = wanted
+        self._found = found
+        self._source = folder.relative_to(place.folder).as_posix()
+        files = sorted(one for one in folder.iterdir() if one.is_file() and not one.name.startswith("."))
+        self._names = [one.relative_to(place.folder).as_posix() for one in files]
+
+    def look(self) -> None:
+        """Volumes, then meshes, then points."""
+        self._volumes([name for name in self._names if name.lower().endswith(NIFTI_ENDINGS + NRRD_ENDINGS)])
+        self._meshes([name for name in self._names if is_mesh(name) and self._wanted.takes("labels", name)])
+        for name in self._names:
+            if name.lower().endswith(POINT_ENDINGS):
+                self._points(name)
+
+    def _volumes(self, names: Sequence[str]) -> None:
+        """CTs and label maps one by one; masks together, as a folder of masks where it holds nothing else."""
+        masks: list[Mask] = []
+        empty: list[str] = []
+        for name in names:
+            try:
+                self._volume(name, masks, empty)
+            except InputError as error:
+                self._found.problems.append(error)
+        if not masks:
+            return
+        alone = len(masks) + len(empty) == len(names) and all(one.lower().endswith(MASK_ENDINGS) for one in names)
+        numbered = dict(enumerate(masks, start=1))
+        said = () if alone or not empty else (f"empty masks, so that nothing is there: {', '.join(empty)}",)
+        self._found.segmentations.append(Masks(self._place, self._source, numbered, said, alone))
+
+    def _volume(self, name: str, masks: list[Mask], empty: list[str]) -> None:
+        if not any(self._wanted.takes(kind, name) for kind in ("ct", "labels")):
+            return
+        surfaces = self._place.volume(name)
+        kind = volume_kind(surfaces.volume)
+        if kind != "other" and not self._wanted.takes(kind, name):
+            return
+        if kind == "ct":
+            self._found.cts.append(Ct(name, surfaces))
+        elif kind == "labels" and surfaces.names is None and self._wanted.naming is None:
+            labels = labelmap_of(surfaces.volume, may_be_empty=True)
+            if len(labels.boxes) > 1:
+                self._label_file(name, surfaces)
+            elif (mask := mask_of(name, labels)) is not None:
+                masks.append(mask)
+            else:
+                empty.append(name.rpartition("/")[2])
+        elif kind == "labels":
+            self._label_file(name, surfaces)
+        else:
+            self._found.notes.append(f"{name}: neither a CT in Hounsfield units nor labels; left out")
+
+    def _label_file(self, name: str, surfaces: VolumeSurfaces) -> None:
+        self._found.segmentations.append(label_file(self._place, name, surfaces, self._wanted.naming))
+
+    def _meshes(self, names: Sequence[str]) -> None:
+        if not names:
+            return
+        try:
+            found = mesh_folder(self._place, self._source, names, self._wanted.space, self._wanted.unit)
+            self._found.segmentations.append(found)
+        except InputError as error:
+            self._found.problems.append(error)
+
+    def _points(self, name: str) -> None:
+        """Other tables are no lists of points, and no problem."""
+        try:
+            points = read_points(self._place.folder / name, default_space=self._wanted.space, default_unit=Unit.MM)
+        except InputError:
+            return
+        if len(points.names) >= LEAST_MARKERS:
+            self._found.markers.append(Markers(name, points))
+
+
+def volume_kind(volume: Volume) -> str:
+    """What a volume shows: ``ct`` (Hounsfield units), ``labels`` (few whole numbers from 0 on), or ``other``."""
+    values = volume.values
+    low, high = float(values.min()), float(values.max())
+    if low <= AIR_HU:
+        return "ct" if high > 0 else "other"
+    if low < 0 or high > np.iinfo(np.uint16).max:
+        return "other"
+    whole = values.astype(np.uint16)
+    if values.dtype.kind == "f" and not np.array_equal(whole, values):
+        return "other"
+    counts = np.bincount(whole.ravel(order="K"))
+    return "labels" if counts[0] > 0 and np.count_nonzero(counts) <= MOST_LABELS else "other"

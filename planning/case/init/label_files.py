@@ -1,0 +1,194 @@
+"""Label maps in one file, and masks, as segmentations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.case.init.segmentation import Assigned, Place, margin_line, quoted, rules_text
+from puncture_twin.planning.formats.labels.labelmaps import Box, LabelMap
+from puncture_twin.planning.formats.labels.mask_folder import structure_name
+from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS, parse_names
+from puncture_twin.planning.formats.labels.naming import BUILT_IN, MAX_CSV_BYTES, names_for
+from puncture_twin.planning.formats.labels.numbering import told_numbering
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
+
+NUMBERING_TOLD = "{source}: numbered as {naming}, told by where its organs lie"
+NUMBERING_NOT_TOLD = (
+    "whether totalsegmentator-v1 or -v2 numbered its labels is not told by where its organs lie, and no table of names "
+    "is beside it: --naming totalsegmentator-v1, totalsegmentator-v2 or a table (CSV, JSON) decides"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class LabelFile:
+    """A label map in one file.
+
+    Attributes:
+        source: The file.
+        naming: As the case states it; None for names inside the file.
+        names: Label to name, of the labels present.
+        notes: How the naming was found.
+        surfaces: Of its labels.
+    """
+
+    source: str
+    naming: str | None
+    names: Mapping[int, str]
+    notes: tuple[str, ...]
+    surfaces: VolumeSurfaces
+
+    def near(self, point_ct: Floats) -> tuple[int, ...]:
+        """The labels whose box holds a point (3,), LPS mm."""
+        labels = self.surfaces.labelmap
+        return tuple(label for label, box in labels.boxes.items() if in_box(point_ct, box, labels.T_ct_index))
+
+    def surface(self, label: int) -> TriangleMesh:
+        """The surface of one label, LPS mm."""
+        return self.surfaces.label(label)
+
+    def section(self, rows: Sequence[Assigned]) -> str:
+        """A ``[[structures]]`` of the map."""
+        naming = "" if self.naming is None else f"naming = {quoted(self.naming)}\n"
+        return f"[[structures]]\nlabelmap = {quoted(self.source)}\n{naming}{rules_text(rows)}"
+
+
+@dataclass(frozen=True, eq=False)
+class Mask:
+    """One mask that is not empty.
+
+    Attributes:
+        file: Relative to the case's folder.
+        label: The value of its voxels.
+        box: Of these, in voxels.
+        T_ct_index: Shape (4, 4), voxel index to LPS mm.
+    """
+
+    file: str
+    label: int
+    box: Box
+    T_ct_index: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Masks:
+    """Masks of one folder, one file a structure.
+
+    Attributes:
+        place: Where the files are.
+        source: The folder.
+        masks: By number, those that are not empty.
+        notes: Which are empty.
+        whole_folder: Whether the folder holds nothing else, so that the case can name it.
+    """
+
+    place: Place
+    source: str
+    masks: Mapping[int, Mask]
+    notes: tuple[str, ...] = ()
+    whole_folder: bool = True
+    names: Mapping[int, str] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", {number: structure_name(one.file) for number, one in self.masks.items()})
+
+    def near(self, point_ct: Floats) -> tuple[int, ...]:
+        """The masks whose box holds a point (3,), LPS mm."""
+        return tuple(number for number, one in self.masks.items() if in_box(point_ct, one.box, one.T_ct_index))
+
+    def surface(self, label: int) -> TriangleMesh:
+        """The surface of one mask, LPS mm."""
+        mask = self.masks[label]
+        return self.place.volume(mask.file).label(mask.label)
+
+    def section(self, rows: Sequence[Assigned]) -> str:
+        """A ``[[structures]]`` of the folder, or each mask as a ``[[structure]]``."""
+        if self.whole_folder:
+            return f"[[structures]]\nmasks = {quoted(self.source)}\n{rules_text(rows)}"
+        return "\n".join(self._single(row) for row in rows if row.kind != "ignore")
+
+    def _single(self, row: Assigned) -> str:
+        mask = self.masks[row.label]
+        return (
+            f"[[structure]]\nname = {quoted(row.name)}\nlabelmap = {quoted(mask.file)}\nlabel = {mask.label}\n"
+            f'role = "{row.kind}"\n{margin_line(row)}'
+        )
+
+
+def in_box(point_ct: Floats, box: Box, T_ct_index: Floats) -> bool:
+    """Whether a point (3,), LPS mm, lies in a box of voxels, up to their outer faces."""
+    index = apply(np.linalg.inv(T_ct_index), np.reshape(point_ct, (1, 3)))[0]
+    return all(axis.start - 0.5 <= one <= axis.stop - 0.5 for axis, one in zip(box, index, strict=True))
+
+
+def mask_of(file: str, labels: LabelMap) -> Mask | None:
+    """The mask in a file; None for an empty one."""
+    if not labels.boxes:
+        return None
+    ((label, box),) = labels.boxes.items()
+    return Mask(file, label, box, labels.T_ct_index)
+
+
+def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str | None) -> LabelFile:
+    """A label map with the names of its labels: stated, inside the file, in a table beside it, or TotalSegmentator's.
+
+    Args:
+        place: The case's folder.
+        source: The file.
+        surfaces: What was read of it.
+        naming: As the user states it, or None.
+
+    Raises:
+        InputError: No names are found, or they do not name every label.
+    """
+    present = surfaces.labels_present()
+    if naming is None and surfaces.names is None:
+        naming, notes = _found_naming(place, source, surfaces.labelmap, present)
+    else:
+        notes = ()
+    named = names_for(naming, place.folder, lambda name: _table(place.folder / name), surfaces)
+    missing = [label for label in present if label not in named]
+    if missing:
+        shown = ", ".join(map(str, missing[:10]))
+        raise InputError(
+            f"labels without a name: {shown}",
+            where=place.folder / source,
+            allowed="--naming with a name for each label",
+        )
+    return LabelFile(source, naming, {label: named[label] for label in present}, notes, surfaces)
+
+
+def _found_naming(place: Place, source: str, labels: LabelMap, present: Sequence[int]) -> tuple[str, tuple[str, ...]]:
+    for table in _tables_beside(place.folder, source):
+        try:
+            names = parse_names(_table(place.folder / table), place.folder / table)
+        except InputError:
+            continue
+        if set(present) <= names.keys():
+            return table, (f"{source}: names from {table}",)
+    naming = told_numbering(labels)
+    if naming is None:
+        allowed = f"--naming with {', '.join(BUILT_IN)} or a table"
+        raise InputError(NUMBERING_NOT_TOLD, where=place.folder / source, allowed=allowed)
+    return naming, (NUMBERING_TOLD.format(source=source, naming=naming),)
+
+
+def _tables_beside(folder: Path, source: str) -> Iterator[str]:
+    """Files that may be tables of names, those first that are named like the map."""
+    parent = (folder / source).parent
+    files = [one for one in parent.iterdir() if one.name.lower().endswith(NAME_ENDINGS) and one.is_file()]
+    stem = structure_name(source)
+    for one in sorted(files, key=lambda file: (file.name.split(".")[0] != stem.split(".")[0], file.name)):
+        yield one.relative_to(folder).as_posix()
+
+
+def _table(path: Path) -> bytes:
+    return read_input(path, max_bytes=MAX_CSV_BYTES, where=str(path))

@@ -1,0 +1,120 @@
+"""A folder of meshes as a segmentation: the unit is guessed by their extent, and told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.default_roles import BODY, default_role
+from puncture_twin.planning.anatomy.skin import flat_ends
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.init.segmentation import Assigned, Place, margin_line, quoted
+from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES, mesh_extent, read_mesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.spaces import Space, Unit
+
+LEAST_EXTENT = ((Unit.MM, 130.0), (Unit.CM, 5.0), (Unit.M, 0.0))
+"""From which diagonal of all meshes together on a unit is guessed. A body in mm, with its skin, is seldom smaller than
+130 mm, and in cm (13 to 130) seldom larger; in metres it is smaller than 5."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeshFolder:
+    """Meshes of one folder, one file a structure.
+
+    Attributes:
+        place: The case's folder.
+        source: The folder of the meshes.
+        files: By number, relative to the case's folder.
+        unit: Of all of them.
+        space: Of all of them.
+    """
+
+    place: Place
+    source: str
+    files: Mapping[int, str]
+    unit: Unit
+    space: Space
+    notes: tuple[str, ...] = ()
+    names: Mapping[int, str] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", {number: mesh_name(file) for number, file in self.files.items()})
+
+    @cached_property
+    def meshes(self) -> Mapping[int, TriangleMesh]:
+        """Each mesh in LPS mm."""
+        files = {number: self.place.folder / file for number, file in self.files.items()}
+        return {number: read_mesh(file, unit=self.unit, space=self.space) for number, file in files.items()}
+
+    @property
+    def skin(self) -> int | None:
+        """The mesh that is named like the body."""
+        return next((n for n, name in self.names.items() if default_role(name, "other") == BODY), None)
+
+    def near(self, point_ct: Floats) -> tuple[int, ...]:
+        """The meshes whose box holds a point (3,), LPS mm."""
+        boxes = {number: mesh.bounds for number, mesh in self.meshes.items()}
+        return tuple(n for n, (low, high) in boxes.items() if np.all((low <= point_ct) & (point_ct <= high)))
+
+    def surface(self, label: int) -> TriangleMesh:
+        """One mesh, LPS mm."""
+        return self.meshes[label]
+
+    def section(self, rows: Sequence[Assigned]) -> str:
+        """A ``[[structure]]`` for each mesh."""
+        return "\n".join(self._single(row) for row in rows if row.kind != "ignore")
+
+    def _single(self, row: Assigned) -> str:
+        ends = flat_ends(self.meshes[row.label]) if row.kind == "skin" else ()
+        cut = (
+            f"cut = [{', '.join(map(quoted, ends))}]  # flat there: the scan ended, the body did not\n" if ends else ""
+        )
+        return (
+            f"[[structure]]\nname = {quoted(row.name)}\nmesh = {quoted(self.files[row.label])}\n"
+            f'unit = "{self.unit}"\nrole = "{row.kind}"\n{margin_line(row)}{cut}'
+        )
+
+
+def mesh_name(file: str) -> str:
+    """The name of the structure in a file: the file's own, without its ending.
+
+    >>> mesh_name("organs/right lung.stl")
+    'right lung'
+    """
+    return file.rpartition("/")[2].rpartition(".")[0]
+
+
+def mesh_folder(place: Place, source: str, names: Sequence[str], space: Space, stated: Unit | None) -> MeshFolder:
+    """The meshes of a folder, in the unit that their extent tells.
+
+    Args:
+        place: The case's folder.
+        source: The folder of the meshes.
+        names: Of the files in it.
+        space: Of their coordinates.
+        stated: Their unit where the user says it, or None.
+
+    Raises:
+        InputError: A mesh that cannot be read, or two of one name.
+    """
+    if len({mesh_name(one) for one in names}) < len(names):
+        raise InputError("two meshes have one name", where=place.folder / source, allowed="one mesh a structure")
+    boxes = np.stack([mesh_extent(place.folder / name) for name in names])
+    diagonal = float(np.linalg.norm(boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0)))
+    unit = stated or next(one for one, least in LEAST_EXTENT if diagonal >= least)
+    guess = "as stated" if stated else "guessed by their extent (--unit says otherwise)"
+    said = (
+        f"{source}: {len(names)} meshes in {unit} ({guess}) and {space}, together {diagonal * unit.mm:.0f} mm from "
+        "corner to corner; no mesh file says either"
+    )
+    return MeshFolder(place, source, dict(enumerate(sorted(names), start=1)), unit, space, (said,))
+
+
+def is_mesh(name: str) -> bool:
+    """Whether a file's ending is that of a mesh."""
+    return name.lower().endswith(MESH_SUFFIXES)

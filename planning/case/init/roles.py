@@ -1,0 +1,89 @@
+"""The roles that a new case gives its structures, and the region that they show."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+from puncture_twin.planning.anatomy.default_roles import BODY, LESION, UNKNOWN_NAME, default_role
+from puncture_twin.planning.anatomy.regions import USUAL, absent_organs
+from puncture_twin.planning.case.init.segmentation import Assigned
+
+LEAST_SHOWN = 0.3
+"""Of a region's usual organs; with fewer the region is told by nothing."""
+
+
+class Holding(NamedTuple):
+    """The structures that hold the target.
+
+    Attributes:
+        target: The one that the case names.
+        others: Those around it, which a path must cross.
+    """
+
+    target: str
+    others: frozenset[str]
+
+
+def assign(names: Mapping[int, str], region: str, holding: Holding) -> list[Assigned]:
+    """What a case says of each structure, by label.
+
+    Args:
+        names: Label to name.
+        region: As the case states it.
+        holding: What holds the target.
+    """
+    return [_assigned(label, names[label], region, holding) for label in sorted(names)]
+
+
+def _assigned(label: int, name: str, region: str, holding: Holding) -> Assigned:
+    line = default_role(name, region) or UNKNOWN_NAME
+    if name == holding.target:
+        return Assigned(label, name, "target", 0.0, line)
+    if name in holding.others and line != BODY:
+        return Assigned(label, name, "traverse", 0.0, line)
+    return Assigned(label, name, line.kind, line.margin_mm, line)
+
+
+def role_notes(rows: Sequence[Assigned], holding: Holding) -> Iterator[str]:
+    """What a person should look at: names that the table does not know, and what is crossed because of the target."""
+    unknown = [row.name for row in rows if row.line == UNKNOWN_NAME and row.kind == "avoid"]
+    if unknown:
+        yield f"not in the table of default roles, so avoided by {UNKNOWN_NAME.margin_mm:g} mm: {_list(unknown)}"
+    crossed = [row.name for row in rows if row.name in holding.others and row.kind == "traverse"]
+    if crossed:
+        yield f"they hold the target too, so paths cross them (traverse): {_list(crossed)}"
+
+
+def _list(names: Sequence[str]) -> str:
+    return ", ".join(names)
+
+
+def chosen_target(names: Collection[str]) -> str:
+    """Of the structures that hold the target the one that it is: a lesion, else the first; never the body's outline.
+
+    Args:
+        names: At least one, the smallest first.
+    """
+    lines = {name: default_role(name, "other") for name in names}
+    lesions = [name for name, line in lines.items() if line == LESION]
+    return next(iter([*lesions, *names]))
+
+
+def told_region(names: Collection[str], target: str) -> str:
+    """The region of which most usual organs are there, the target's own among them; ``other`` where few are."""
+    shown = {region: _shown(region, names) + _holds(region, target) for region, organs in USUAL.items() if organs}
+    region = max(shown, key=lambda one: shown[one])
+    return region if _shown(region, names) >= LEAST_SHOWN else "other"
+
+
+def _shown(region: str, names: Collection[str]) -> float:
+    absent = absent_organs(region, names)
+    wholly = [organ for organ in USUAL[region] if organ.name in absent]
+    return 1.0 - len(wholly) / len(USUAL[region])
+
+
+def _holds(region: str, target: str) -> float:
+    """A tenth for a region among whose usual organs the target is."""
+    names = {organ.name for organ in USUAL[region]}
+    return 0.1 if len(names.intersection(absent_organs(region, [target]))) < len(names) else 0.0

@@ -1,0 +1,122 @@
+"""What every kind of segmentation answers, whatever file or folder it comes from: the seam of the finder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple, Protocol
+
+from puncture_twin.planning.anatomy.default_roles import DefaultRole
+from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, data_file
+from puncture_twin.planning.formats.volumes.volume_source import VolumeFile
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+
+class Assigned(NamedTuple):
+    """What the case says of one structure.
+
+    Attributes:
+        label: Its number within the segmentation.
+        name: Its name.
+        kind: ``target``, ``avoid``, ``traverse``, ``ignore`` or ``skin``.
+        margin_mm: The clearance that it demands.
+        line: Of the table of default roles.
+    """
+
+    label: int
+    name: str
+    kind: str
+    margin_mm: float
+    line: DefaultRole
+
+
+class Segmentation(Protocol):
+    """Structures of one file or folder.
+
+    Attributes:
+        source: The file or folder, relative to the case's.
+        names: Label to name, of the structures that are there.
+        notes: What a person should be told, one sentence each.
+    """
+
+    @property
+    def source(self) -> str: ...  # noqa: D102  the class says it
+    @property
+    def names(self) -> Mapping[int, str]: ...  # noqa: D102
+    @property
+    def notes(self) -> tuple[str, ...]: ...  # noqa: D102
+
+    def near(self, point_ct: Floats) -> tuple[int, ...]:
+        """The labels whose box holds a point (3,), LPS mm."""
+
+    def surface(self, label: int) -> TriangleMesh:
+        """The surface of one structure, LPS mm."""
+
+    def section(self, rows: Sequence[Assigned]) -> str:
+        """The part of the case file that names all of its structures."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """The folder of the case, and where surfaces are kept."""
+
+    folder: Path
+    cache: Cache
+
+    def volume(self, name: str) -> VolumeSurfaces:
+        """A volume file of the folder.
+
+        Raises:
+            InputError: It cannot be read.
+        """
+        read = partial(_content, self.folder)
+        content = read(name)
+        beside = data_file(content, self.folder / name)
+        names = (name,) if beside is None else (name, str(PurePosixPath(name).with_name(beside)))
+        hashes = [hashlib.sha256(content).hexdigest(), *(hashlib.sha256(read(one)).hexdigest() for one in names[1:])]
+        return VolumeSurfaces(VolumeFile(self.folder / name, names, read), tuple(hashes), self.cache)
+
+
+def _content(folder: Path, name: str) -> bytes:
+    return read_input(folder / name, max_bytes=MAX_FILE_BYTES, where=str(folder / name))
+
+
+def quoted(text: str) -> str:
+    """A text as TOML writes it."""
+    return json.dumps(text, ensure_ascii=False)
+
+
+def margin_line(row: Assigned) -> str:
+    """The margin of a ``[[structure]]`` with its reason; empty where it demands none."""
+    return f"margin_mm = {row.margin_mm:g}  # {row.line.group}: {row.line.reason}\n" if row.kind == "avoid" else ""
+
+
+def rules_text(rows: Sequence[Assigned]) -> str:
+    """The lists and the table of a ``[[structures]]``: each structure by its own name, with the reason of its line."""
+    parts = []
+    for kind in ("target", "traverse", "ignore"):
+        names = [row.name for row in rows if row.kind == kind]
+        if names:
+            parts.append(f"{kind} = [\n" + "".join(f"    {quoted(name)},\n" for name in names) + "]\n")
+    avoided = [row for row in rows if row.kind == "avoid"]
+    if avoided:
+        parts.append("\n[structures.avoid]  # margins, mm\n" + _grouped(avoided))
+    return "".join(parts)
+
+
+def _grouped(rows: Sequence[Assigned]) -> str:
+    """The rows of each line of the table below its reason, in the order of the rows."""
+    lines = dict.fromkeys(row.line for row in rows)
+    parts = []
+    for line in lines:
+        parts.append(f"# {line.group}: {line.reason}\n")
+        parts += [f"{quoted(row.name)} = {row.margin_mm:g}\n" for row in rows if row.line == line]
+    return "".join(parts)

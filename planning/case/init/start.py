@@ -1,0 +1,193 @@
+"""A folder in, the text of a case out: what is found, whether it fits together, and what a person should look at."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.default_roles import BODY
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.init.case_text import CaseParts, case_text
+from puncture_twin.planning.case.init.finder import Ct, Found, Markers, Wanted, find
+from puncture_twin.planning.case.init.mesh_folder import MeshFolder
+from puncture_twin.planning.case.init.roles import assign, role_notes, told_region
+from puncture_twin.planning.case.init.segmentation import Assigned, Place, Segmentation
+from puncture_twin.planning.case.init.target import Target, label_target, parse_point, shown, typed_target
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
+from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.spaces import Space, to_lps
+
+ALLOWED = "a folder with a CT (NIfTI or NRRD) and a segmentation, see docs/how-to/your-own-ct.md"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user asks for.
+
+    Attributes:
+        folder: Where the files are, and the case will be.
+        target: ``X,Y,Z`` in mm, or None for ``target_label``.
+        target_label: The name of a structure.
+        region: As a case states it, or None to be told by the structures.
+        wanted: What the user says of the files.
+    """
+
+    folder: Path
+    target: str | None
+    target_label: str | None
+    region: str | None
+    wanted: Wanted
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A new case, not yet written.
+
+    Attributes:
+        text: The file.
+        parts: What it was made of.
+        notes: What a person should look at, one sentence each.
+    """
+
+    text: str
+    parts: CaseParts
+    notes: tuple[str, ...]
+
+
+def start_case(request: Request, cache: Cache) -> Start:
+    """Find the files of a folder, and write the text of a case with them.
+
+    Args:
+        request: What the user asks for.
+        cache: Where surfaces are kept.
+
+    Raises:
+        InputError: All that keeps a case from being made, in one line.
+    """
+    space = request.wanted.space
+    point = None if request.target is None else parse_point(request.target, space)
+    found = find(Place(request.folder, cache), request.wanted)
+    ct = _checked(found, point, request)
+    if point is not None and ct is not None:
+        _refuse_outside(point, ct, space)
+    target = _target(request, point, found.segmentations)
+    names = [name for one in found.segmentations for name in one.names.values()]
+    region = request.region or told_region(names, target.holding.target)
+    rows = [assign(one.names, region, target.holding) for one in found.segmentations]
+    if ct is None:
+        rows = [_with_skin(one, some) for one, some in zip(found.segmentations, rows, strict=True)]
+    parts = CaseParts(
+        name=request.folder.resolve().name,
+        space=space,
+        region=region,
+        target_ct=target.point_ct,
+        structure=target.holding.target,
+        ct=None if ct is None else ct.source,
+        sources=tuple(zip(found.segmentations, rows, strict=True)),
+        markers=tuple(_markers_of_ct(found.markers, ct)),
+    )
+    return Start(case_text(parts), parts, tuple(_notes(request, found, target, parts)))
+
+
+def _target(request: Request, point: Floats | None, segmentations: Sequence[Segmentation]) -> Target:
+    if point is not None:
+        return typed_target(point, segmentations, request.wanted.space)
+    return label_target(str(request.target_label), segmentations, request.wanted.space)
+
+
+def _checked(found: Found, point: Floats | None, request: Request) -> Ct | None:
+    """The one CT, or None where a mesh is the skin.
+
+    Raises:
+        InputError: Everything that is missing, doubled or could not be read.
+    """
+    problems = [f"{_below(error.where, request.folder)}: {error.what}" for error in found.problems]
+    cts = _holding(found.cts, point)
+    if len(cts) > 1:
+        problems.append(f"several CTs: {', '.join(one.source for one in cts)} (--ct says which)")
+    if not found.segmentations and not problems:
+        problems.append("no segmentation: no label map, masks or meshes")
+    skins = [one for one in found.segmentations if isinstance(one, MeshFolder) and one.skin is not None]
+    if not cts and not skins and not found.problems:
+        problems.append("no CT in Hounsfield units (min below -200), and no mesh named like the skin")
+    problems += _doubled(found.segmentations)
+    if problems:
+        raise InputError("; ".join(problems), where=request.folder, allowed=ALLOWED)
+    return cts[0] if cts else None
+
+
+def _below(where: str, folder: Path) -> str:
+    return where.removeprefix(f"{folder}/")
+
+
+def _holding(cts: Sequence[Ct], point: Floats | None) -> list[Ct]:
+    """The CTs that hold a point, or all where none does."""
+    holding = [one for one in cts if point is not None and _holds(one.surfaces.source.grid, point)]
+    return holding or list(cts)
+
+
+def _holds(grid: VolumeGrid, point_ct: Floats) -> bool:
+    index = apply(np.linalg.inv(grid.T_ct_index), point_ct[None])[0]
+    return bool(np.all((index >= -0.5) & (index <= np.array(grid.shape) - 0.5)))
+
+
+def _doubled(segmentations: Sequence[Segmentation]) -> Iterator[str]:
+    """Names that two segmentations have: one of the two is meant."""
+    counts = Counter(name for one in segmentations for name in one.names.values())
+    twice = [name for name, count in counts.items() if count > 1]
+    if twice:
+        sources = ", ".join(one.source for one in segmentations if set(one.names.values()) & set(twice))
+        yield f"{sources} hold structures of one name, such as '{twice[0]}' (--segmentation says which)"
+
+
+def _refuse_outside(point: Floats, ct: Ct, space: Space) -> None:
+    """A target outside of the CT or of the body in it."""
+    where, other = "--target", Space.RAS if space is Space.LPS else Space.LPS
+    mirrored = to_lps(point[None], Space.RAS)[0]
+    inside = _holds(ct.surfaces.source.grid, point)
+    if inside and side_of(ct.surfaces.skin_of_ct().mesh, point) is not Side.OUTSIDE:
+        return
+    hint = ""
+    if _holds(ct.surfaces.source.grid, mirrored):
+        in_body = side_of(ct.surfaces.skin_of_ct().mesh, mirrored) is not Side.OUTSIDE
+        hint = f" (read in {other} it lies in the body: --space {other})" if in_body else ""
+    what = "the body" if inside else "the CT"
+    raise InputError(
+        f"target ({shown(point, space)}) lies outside {what} of {ct.source}{hint}",
+        where=where,
+        allowed="a point in the body",
+    )
+
+
+def _with_skin(segmentation: Segmentation, rows: Sequence[Assigned]) -> list[Assigned]:
+    """The same rows, with the mesh that is named like the body as the skin."""
+    skin = segmentation.skin if isinstance(segmentation, MeshFolder) else None
+    return [row._replace(kind="skin", line=BODY) if row.label == skin else row for row in rows]
+
+
+def _markers_of_ct(markers: Sequence[Markers], ct: Ct | None) -> list[Markers]:
+    """Lists of points, those whose points lie in the CT first; without a CT those of the patient's space first."""
+    if ct is None:
+        return sorted(markers, key=lambda one: one.source)
+    grid = ct.surfaces.source.grid
+    return sorted(markers, key=lambda one: (not all(_holds(grid, point) for point in one.points.points), one.source))
+
+
+def _notes(request: Request, found: Found, target: Target, parts: CaseParts) -> Iterator[str]:
+    yield from found.notes
+    for one in found.segmentations:
+        yield from one.notes
+    yield from target.notes
+    yield from role_notes(parts.rows, target.holding)
+    if request.region is None:
+        yield f'region = "{parts.region}" is told by the structures; --region says otherwise'
+    if parts.markers:
+        names = ", ".join(one.source for one in parts.markers)
+        yield f"{names}: may be markers, named in comments; without [registration] no arm is checked"

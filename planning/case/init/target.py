@@ -1,0 +1,141 @@
+"""The target of a new case: a point that was typed, or the middle of a structure; and what holds it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from puncture_twin.planning.anatomy.default_roles import BODY, default_role
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.init.roles import Holding, chosen_target
+from puncture_twin.planning.case.init.segmentation import Segmentation
+from puncture_twin.planning.formats.points.raw_points import parse_coordinate
+from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.geometry.triangle_distance import squared_distance
+from puncture_twin.planning.geometry.voxelize import voxels_inside
+
+CELLS = 64
+"""Along the longest edge of a structure's box, to find its deepest point."""
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A point to reach.
+
+    Attributes:
+        point_ct: Shape (3,), LPS mm.
+        holding: The structures that hold it.
+        notes: How it was found.
+    """
+
+    point_ct: Floats
+    holding: Holding
+    notes: tuple[str, ...]
+
+
+def parse_point(text: str, space: Space) -> Floats:
+    """A point as it is typed, ``X,Y,Z`` in mm, in LPS; shape (3,).
+
+    Raises:
+        InputError: Not three numbers.
+    """
+    numbers = [parse_coordinate(part.strip(), "--target") for part in text.split(",")]
+    if len(numbers) != 3:
+        raise InputError(f"{len(numbers)} numbers", where="--target", allowed="X,Y,Z in mm")
+    return np.asarray(to_lps(np.array([numbers]), space)[0])
+
+
+def shown(point_ct: Floats, space: Space) -> str:
+    """A point in the user's space, as text."""
+    return ", ".join(f"{one:.1f}" for one in to_lps(point_ct[None], space)[0]) + f" mm {space}"
+
+
+def typed_target(point_ct: Floats, segmentations: Sequence[Segmentation], space: Space) -> Target:
+    """A point that was typed, with the structures that hold it.
+
+    Raises:
+        InputError: No structure holds it; names the nearest, and those of the other space's reading.
+    """
+    names = _holders(point_ct, segmentations)
+    if not names:
+        raise InputError(
+            f"target ({shown(point_ct, space)}) lies in no structure{_other_reading(point_ct, segmentations, space)}",
+            where="--target",
+            allowed=f"a point inside a structure; the nearest is {_nearest(point_ct, segmentations)}",
+        )
+    chosen = chosen_target(names)
+    holding = Holding(chosen, frozenset(names) - {chosen})
+    return Target(point_ct, holding, (f"the target lies in '{chosen}', which is the target's structure",))
+
+
+def label_target(name: str, segmentations: Sequence[Segmentation], space: Space) -> Target:
+    """The deepest point of the largest part of a structure.
+
+    Raises:
+        InputError: No structure has this name.
+    """
+    known = {one: (seg, label) for seg in segmentations for label, one in seg.names.items()}
+    if name not in known:
+        near = ", ".join(sorted(known))
+        raise InputError(f"no structure is named '{name}'", where="--target-label", allowed=near or "none is there")
+    segmentation, label = known[name]
+    point, parts = deepest_point(segmentation.surface(label))
+    notes = [f"the target is the deepest point of '{name}': {shown(point, space)}"]
+    if parts > 1:
+        notes.append(f"'{name}' has {parts} parts; the largest was taken")
+    others = frozenset(_holders(point, segmentations)) - {name}
+    return Target(point, Holding(name, others), tuple(notes))
+
+
+def _holders(point_ct: Floats, segmentations: Sequence[Segmentation]) -> list[str]:
+    """The names of the structures that hold a point, the smallest first; none that is the body's outline."""
+    found: list[tuple[float, str]] = []
+    for segmentation in segmentations:
+        for label in segmentation.near(point_ct):
+            name = segmentation.names[label]
+            if default_role(name, "other") == BODY:
+                continue
+            mesh = segmentation.surface(label)
+            if side_of(mesh, point_ct) is Side.INSIDE:
+                found.append((float(np.prod(np.ptp(mesh.bounds, axis=0))), name))
+    return [name for _, name in sorted(found)]
+
+
+def _other_reading(point_ct: Floats, segmentations: Sequence[Segmentation], space: Space) -> str:
+    """What the same numbers would mean in the other space, where that is inside of something."""
+    if space is Space.LOCAL:
+        return ""
+    other = Space.RAS if space is Space.LPS else Space.LPS
+    names = _holders(to_lps(point_ct[None], Space.RAS)[0], segmentations)
+    return f" (read in {other} it lies in '{names[0]}': --space {other})" if names else ""
+
+
+def _nearest(point_ct: Floats, segmentations: Sequence[Segmentation]) -> str:
+    meshes = [(name, seg.surface(label)) for seg in segmentations for label, name in seg.names.items()]
+    gaps = [(float(np.sqrt(squared_distance(point_ct, mesh.triangles).min())), name) for name, mesh in meshes]
+    gap, name = min(gaps, default=(np.inf, ""))
+    return f"'{name}', {gap:.1f} mm away"
+
+
+def deepest_point(mesh: TriangleMesh) -> tuple[Floats, int]:
+    """The point of a closed surface's largest part that lies farthest inside, shape (3,), and how many parts it has.
+
+    Found on a grid of `CELLS` cells along the longest edge.
+    """
+    low, high = mesh.bounds
+    cell = float((high - low).max()) / CELLS
+    shape = np.ceil((high - low) / cell).astype(int) + 2
+    T_ct_index = pose(np.eye(3) * cell, low - cell / 2)
+    inside = voxels_inside(mesh, T_ct_index, (int(shape[0]), int(shape[1]), int(shape[2])))
+    parts, count = ndimage.label(inside)
+    largest = parts == np.argmax(np.bincount(parts.ravel())[1:]) + 1 if count > 1 else inside
+    depth = ndimage.distance_transform_edt(largest)
+    index = np.array(np.unravel_index(np.argmax(depth), depth.shape))
+    return np.round(low - cell / 2 + cell * index, 1), count

@@ -1,0 +1,94 @@
+"""The job ``init``: a folder with a CT and a segmentation becomes a case that has been read as a search reads it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.files import atomic, is_folder, is_plain_file
+from puncture_twin.planning.base.progress import Watcher
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.case.init.start import ALLOWED, Request, Start, start_case
+from puncture_twin.planning.geometry.spaces import to_lps
+from puncture_twin.planning.search.context import CaseContext, prepare
+
+CASE = "case.toml"
+
+
+@dataclass(frozen=True, eq=False)
+class InitRun:
+    """A case that was written, and what a person should look at."""
+
+    path: Path
+    start: Start
+    context: CaseContext
+    warnings: tuple[str, ...]
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON: mm, in the case's space."""
+        parts = self.start.parts
+        position = to_lps(parts.target_ct[None], parts.space)[0]
+        return {
+            "case": str(self.path),
+            "space": str(parts.space),
+            "region": parts.region,
+            "ct": parts.ct,
+            "segmentations": [segmentation.source for segmentation, _ in parts.sources],
+            "target_mm": [float(one) for one in position],
+            "target_structure": parts.structure,
+            "structures": dict(Counter(row.kind for row in parts.rows)),
+            "warnings": list(self.warnings),
+            "inputs": inputs_document(self.context.case.inputs),
+            "files": [str(self.path)],
+        }
+
+
+def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
+    """Make the case, read it as `search` does, and write it; what is wrong leaves nothing behind.
+
+    Args:
+        request: What the user asks for.
+        force: Whether a case that is there may be replaced.
+        watcher: Is told how far reading is.
+
+    Raises:
+        InputError: Everything that keeps the case from being searched, in one line.
+    """
+    folder, path = request.folder, request.folder / CASE
+    if not is_folder(folder):
+        raise InputError("is no folder", where=str(folder)[:200], allowed=ALLOWED)
+    if is_plain_file(path) and not force:
+        raise InputError("there is a case already", where=path, allowed="--force to replace it")
+    if (request.target is None) == (request.target_label is None):
+        raise InputError("one target", where="init", allowed="either --target X,Y,Z or --target-label NAME")
+    start = start_case(request, user_cache())
+    with atomic(path) as draft:
+        draft.write_text(start.text, encoding="utf-8")
+        try:
+            context = prepare(draft, arm=False, watcher=watcher)
+        except InputError as error:
+            what, where = (text.replace(draft.name, CASE) for text in (error.what, error.where))
+            raise InputError(what, where=where, allowed=error.allowed) from error
+        found = [one.replace(draft.name, CASE) for one in context.provenance()["warnings"]]
+    return InitRun(path, start, context, (*start.notes, *found))
+
+
+def init_text(run: InitRun) -> str:
+    """What was found, and the next command."""
+    parts, counts = run.start.parts, Counter(row.kind for row in run.start.parts.rows)
+    position = ", ".join(f"{one:.1f}" for one in to_lps(parts.target_ct[None], parts.space)[0])
+    roles = ", ".join(f"{count} {kind}" for kind, count in sorted(counts.items()))
+    lines = [
+        f"{run.path}",
+        f"  skin           {parts.ct or 'a mesh'}",
+        f"  structures     {roles}, of {', '.join(one.source for one, _ in parts.sources)}",
+        f"  target         {position} mm {parts.space}, in {parts.structure}",
+        f"  region         {parts.region}",
+        "  needle         200 mm, shaft 150 mm, diameter 1.2 mm",
+        f"next: search {run.path.parent}",
+    ]
+    return "\n".join(lines)
