@@ -57,6 +57,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 docs: install
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	$(BIN)/python docs/command_line.py
+	$(BIN)/python docs/default_roles.py
 	$(BIN)/mkdocs build --quiet
 
 pictures: demo

@@ -24,11 +24,20 @@ class InputError(PlanningError):
         allowed: What would have been accepted.
     """
 
+    most_what = MOST_WHAT
+    """Characters of what is wrong."""
+
     def __init__(self, what: str, *, where: str | Path, allowed: str) -> None:
-        self.what = one_line(what, MOST_WHAT)
+        self.what = one_line(what, self.most_what)
         self.where = one_line(str(where), MOST_WHERE)
         self.allowed = one_line(allowed, MOST_ALLOWED)
         super().__init__(f"{self.where}: {self.what}; allowed: {self.allowed}")
+
+
+class InputListError(InputError):
+    """Several things that are wrong with one input, in one line."""
+
+    most_what = 900
 
 
 class NoAnswerError(PlanningError):

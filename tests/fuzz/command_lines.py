@@ -7,7 +7,7 @@ from fuzz.mutate import NUMBERS, pick
 
 COMMANDS = [
     *["search", "verify", "check", "plan", "rehearse", "place", "mirror", "export", "register", "batch"],
-    *["selfcal", "servo", "reproduce", "", "serch", "x" * 3000, "--help", "-h", "--version"],
+    *["init", "selfcal", "servo", "reproduce", "", "serch", "x" * 3000, "--help", "-h", "--version"],
 ]
 """Not ``demo``, which needs nothing and takes a minute."""
 
@@ -23,6 +23,10 @@ OPTIONS = {
     "--seconds": "number",
     "--rate": "number",
     "--certify-size": "number",
+    "--target": "word",
+    "--target-label": "word",
+    "--space": "word",
+    "--force": None,
     "--cross-check": "number",
     "--engine": "word",
     "--format": "word",

@@ -10,6 +10,7 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.files import is_folder, is_plain_file
 from puncture_twin.planning.case.init.label_files import Mask, Masks, label_file, mask_of
 from puncture_twin.planning.case.init.mesh_folder import is_mesh, mesh_folder
 from puncture_twin.planning.case.init.segmentation import Place, Segmentation
@@ -26,6 +27,8 @@ AIR_HU = -200
 MOST_LABELS = 1000
 """A map with more different labels is an image."""
 POINT_ENDINGS = (".csv", ".mrk.json", ".fcsv")
+MOST_ENTRIES = 5_000
+"""Files and folders of a patient's folder; more are a disk, or a DICOM archive."""
 LEAST_MARKERS = 3
 """Fewer register nothing."""
 MANIFEST = "manifest.json"
@@ -97,31 +100,50 @@ def find(place: Place, wanted: Wanted) -> Found:
     Args:
         place: The case's folder.
         wanted: What the user says of the files.
+
+    Raises:
+        InputError: A folder that cannot be read, or is no patient's.
     """
     found = Found()
-    for folder in _folders(place.folder, DEPTH):
-        _Looker(place, wanted, folder, found).look()
+    for folder, files in _folders(place.folder, DEPTH):
+        _Looker(place, wanted, folder, files, found).look()
     return found
 
 
-def _folders(folder: Path, depth: int) -> Iterator[Path]:
-    """A folder and those below it, but for hidden ones and this program's outputs."""
-    yield folder
+def _folders(folder: Path, depth: int) -> Iterator[tuple[Path, list[Path]]]:
+    """A folder with its files, and those below it, but for hidden ones and this program's outputs."""
+    entries = _entries(folder)
+    yield folder, [one for one in entries if is_plain_file(one)]
     if depth > 0:
-        for one in sorted(folder.iterdir()):
-            if one.is_dir() and not one.name.startswith(".") and not (one / MANIFEST).exists():
+        for one in entries:
+            if is_folder(one) and not is_plain_file(one / MANIFEST):
                 yield from _folders(one, depth - 1)
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What lies in a folder, sorted, but for hidden files.
+
+    Raises:
+        InputError: It cannot be read, or holds too much.
+    """
+    allowed = f"a readable folder of one patient, with up to {MOST_ENTRIES} files"
+    try:
+        found = sorted(one for one in folder.iterdir() if not one.name.startswith("."))
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=folder, allowed=allowed) from error
+    if len(found) > MOST_ENTRIES:
+        raise InputError(f"holds {len(found)} files", where=folder, allowed=allowed)
+    return found
 
 
 class _Looker:
     """Asks each kind's recogniser about one folder."""
 
-    def __init__(self, place: Place, wanted: Wanted, folder: Path, found: Found) -> None:
+    def __init__(self, place: Place, wanted: Wanted, folder: Path, files: Sequence[Path], found: Found) -> None:
         self._place = place
         self._wanted = wanted
         self._found = found
         self._source = folder.relative_to(place.folder).as_posix()
-        files = sorted(one for one in folder.iterdir() if one.is_file() and not one.name.startswith("."))
         self._names = [one.relative_to(place.folder).as_posix() for one in files]
 
     def look(self) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.default_roles import BODY
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, InputListError
 from puncture_twin.planning.case.init.case_text import CaseParts, case_text
 from puncture_twin.planning.case.init.finder import Ct, Found, Markers, Wanted, find
 from puncture_twin.planning.case.init.mesh_folder import MeshFolder
@@ -119,7 +119,7 @@ def _checked(found: Found, point: Floats | None, request: Request) -> Ct | None:
         problems.append("no CT in Hounsfield units (min below -200), and no mesh named like the skin")
     problems += _doubled(found.segmentations)
     if problems:
-        raise InputError("; ".join(problems), where=request.folder, allowed=ALLOWED)
+        raise InputListError("; ".join(problems), where=request.folder, allowed=ALLOWED)
     return cts[0] if cts else None
 
 
@@ -149,7 +149,7 @@ def _doubled(segmentations: Sequence[Segmentation]) -> Iterator[str]:
 
 def _refuse_outside(point: Floats, ct: Ct, space: Space) -> None:
     """A target outside of the CT or of the body in it."""
-    where, other = "--target", Space.RAS if space is Space.LPS else Space.LPS
+    other = Space.RAS if space is Space.LPS else Space.LPS
     mirrored = to_lps(point[None], Space.RAS)[0]
     inside = _holds(ct.surfaces.source.grid, point)
     if inside and side_of(ct.surfaces.skin_of_ct().mesh, point) is not Side.OUTSIDE:
@@ -158,12 +158,9 @@ def _refuse_outside(point: Floats, ct: Ct, space: Space) -> None:
     if _holds(ct.surfaces.source.grid, mirrored):
         in_body = side_of(ct.surfaces.skin_of_ct().mesh, mirrored) is not Side.OUTSIDE
         hint = f" (read in {other} it lies in the body: --space {other})" if in_body else ""
-    what = "the body" if inside else "the CT"
-    raise InputError(
-        f"target ({shown(point, space)}) lies outside {what} of {ct.source}{hint}",
-        where=where,
-        allowed="a point in the body",
-    )
+    place = "the body in" if inside else "the CT"
+    what = f"target ({shown(point, space)}) lies outside {place} {ct.source}{hint}"
+    raise InputError(what, where="--target", allowed="a point in the body")
 
 
 def _with_skin(segmentation: Segmentation, rows: Sequence[Assigned]) -> list[Assigned]:

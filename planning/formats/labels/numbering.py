@@ -21,8 +21,11 @@ from puncture_twin.planning.geometry.rigid import apply
 
 LEAST_RULES = 3
 """With fewer that can be checked, chance decides."""
-MOST_BROKEN, LEAST_BROKEN = 0.1, 0.25
+MOST_BROKEN, LEAST_BROKEN = 0.1, 0.15
 """Of the rules: so few may be broken in the right naming (curved spines, moved organs), so many are in the wrong."""
+
+LEAST_WRONG = 2
+"""One rule alone may be broken by a patient."""
 
 _SPINE = [f"vertebrae_{part}{n}" for part, last in (("C", 7), ("T", 12), ("L", 5)) for n in range(1, last + 1)]
 _RIBS = [[f"rib_{side}_{n}" for n in range(1, 13)] for side in ("left", "right")]
@@ -30,11 +33,18 @@ FROM_HEAD = (
     [*_SPINE, "sacrum"], *_RIBS,
     ["brain", "heart", "liver", "urinary_bladder"], ["brain", "trachea", "aorta", "sacrum", "femur_left"],
     ["heart_myocardium", "pancreas", "hip_left"], ["lung_lower_lobe_left", "stomach", "colon", "gluteus_maximus_left"],
-    ["esophagus", "duodenum", "urinary_bladder"],
+    ["esophagus", "duodenum", "urinary_bladder"], ["brain", "kidney_left", "prostate"], ["skull", "spleen", "prostate"],
 )  # fmt: skip
 """Chains of structures, each farther from the head than the one before."""
 FROM_RIGHT = (["liver", "aorta", "spleen"], ["gallbladder", "stomach"], ["inferior_vena_cava", "aorta"])
 """Chains of structures from the patient's right to the left."""
+
+
+BESIDE_SPINE = (
+    "kidney", "adrenal", "rib", "hip", "femur", "lung", "gluteus", "iliopsoas", "autochthon",
+    "scapula", "humerus", "clavicula",
+)  # fmt: skip
+"""How names of structures begin of which each lies on its own side of the spine."""
 
 
 class Plausibility(NamedTuple):
@@ -58,7 +68,7 @@ class Plausibility(NamedTuple):
     @property
     def fails(self) -> bool:
         """Whether they surely do not."""
-        return self.nameless > 0 or (self.rules >= LEAST_RULES and self.broken >= LEAST_BROKEN * self.rules)
+        return self.nameless > 0 or self.broken >= max(LEAST_WRONG, LEAST_BROKEN * self.rules)
 
 
 def told_numbering(labelmap: LabelMap) -> str | None:
@@ -96,6 +106,12 @@ def _rules(at: Mapping[str, Floats]) -> Iterator[bool]:
         other = re.sub("left", "right", name)
         if other != name and other in at:
             yield bool(at[name][0] > at[other][0])
+    spine = [centre[0] for name, centre in at.items() if name.startswith("vertebrae")]
+    if spine:
+        middle = float(np.mean(spine))
+        beside = {name: at[name][0] - middle for name in at if name.startswith(BESIDE_SPINE)}
+        yield from (bool(x > 0) for name, x in beside.items() if "left" in name)
+        yield from (bool(x < 0) for name, x in beside.items() if "right" in name)
     for chains, axis, sign in ((FROM_RIGHT, 0, 1.0), (FROM_HEAD, 2, -1.0)):
         for chain in chains:
             known = [at[name] for name in chain if name in at]

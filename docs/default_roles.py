@@ -1,0 +1,36 @@
+"""Write docs/reference/default-roles.md from the table that ``init`` uses: ``python docs/default_roles.py``."""
+
+from pathlib import Path
+
+from puncture_twin.planning.anatomy.default_roles import BY_REGION, GENERAL, UNKNOWN_NAME
+
+HEAD = """# Default roles and margins
+
+What `init` writes for a structure, by its name. Capitals, spaces and signs do not count: "Left Lung" is `left_lung`.
+Of several lines that match, the one with the longest pattern holds; a lesion is a lesion whatever organ it is of. The
+structure that holds the target gets the role `target`, others that hold it too `traverse`. Margins, in mm, are a start
+that a physician looks at for each patient, not a rule of any society; they are those of the cases in this repository.
+
+*Written by `python docs/default_roles.py`.*
+"""
+TABLE = ["| structures | names | role | margin | reason |", "|---|---|---|---|---|"]
+
+
+def row(line):
+    """A row of the table."""
+    names = " ".join(f"`{pattern}`" for pattern in line.patterns) or "any other"
+    margin = f"{line.margin_mm:g}" if line.kind == "avoid" else ""
+    return f"| {line.group} | {names} | {line.kind} | {margin} | {line.reason} |"
+
+
+def main() -> None:
+    """Write the page."""
+    lines = [HEAD, "## Every region", *TABLE, *map(row, GENERAL), row(UNKNOWN_NAME)]
+    for region, own in BY_REGION.items():
+        lines += ["", f'## `region = "{region}"`, before the others', *TABLE, *map(row, own)]
+    path = Path(__file__).parent / "reference" / "default-roles.md"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+"""The table of default roles: what TotalSegmentator and Slicer name is known, in any spelling."""
+
+import pytest
+from places import ROOT
+
+from puncture_twin.planning.anatomy.default_roles import BODY, BY_REGION, GENERAL, UNKNOWN_NAME, default_role
+from puncture_twin.planning.base.toml_file import read_toml
+from puncture_twin.planning.case.case_file import CaseFile
+from puncture_twin.planning.formats.labels.naming import RuleKind, select
+from puncture_twin.planning.formats.labels.totalsegmentator import V1, V2
+
+
+@pytest.mark.parametrize("region", ["abdomen", "brain", "head"])
+def test_every_class_of_totalsegmentator_is_known(region):
+    """Both versions, and nothing is free that could be hurt: what may be crossed is muscle, or brain and skull."""
+    found = {name: default_role(name, region) for table in (V1, V2) for name in table.values()}
+    assert [name for name, line in found.items() if line is None] == []
+    crossed = {name for name, line in found.items() if line.kind == "traverse"}
+    muscles = {name for name in found if name.startswith(("gluteus", "autochthon", "iliopsoas"))}
+    assert crossed == muscles | ({"brain", "skull"} if region == "brain" else set())
+    assert {line.kind for line in found.values()} == {"avoid", "traverse"}
+
+
+def test_the_cases_written_by_hand_are_met():
+    """Whatever the case of the real CT avoids, the table avoids by as much; what it crosses is crossed."""
+    case = read_toml(ROOT / "tests" / "real" / "case_v2.toml", CaseFile, allowed="", keys="")
+    (section,) = case.structures
+    rules = select(
+        V2, V2, avoid={**section.avoid, "*": 0.0}, traverse=section.traverse, target=section.target, where="case"
+    ).rules
+    for rule in rules:
+        line = default_role(rule.name, "abdomen")
+        if rule.kind is RuleKind.TRAVERSE:
+            assert line.kind == "traverse", rule.name
+        elif rule.pattern != "*" and rule.kind is RuleKind.AVOID:
+            assert (line.kind, line.margin_mm) == ("avoid", rule.margin_mm), rule.name
+
+
+@pytest.mark.parametrize(
+    ("names", "group"),
+    [
+        (["Left Lung", "right lung", "lung_upper_lobe_left", "RightLung"], "lungs"),
+        (
+            ["liver_lesion", "Liver Tumor 1", "kidney tumour", "lung_nodules", "colon_cancer_primaries", "Lesion"],
+            "lesion",
+        ),
+        (["liver_vessels", "Hepatic veins", "femoral artery"], "other vessels"),
+        (["portal_vein", "Portal Vein and Splenic Vein"], "portal vein"),
+        (["gall-bladder", "Gallbladder"], "gallbladder and bile ducts"),
+        (["urinary_bladder"], "urinary bladder and ureters"),
+        (["SpinalCord", "spinal cord"], "spinal cord"),
+        (["heart_atrium_left", "pericardium"], "heart"),
+        (["Body", "skin", "body_trunc"], BODY.group),
+        (["subcutaneous_fat", "torso_fat"], "fat, breast"),
+        (["skeletal_muscle"], "muscles"),
+        (["oesophagus", "esophagus"], "oesophagus"),
+    ],
+)
+def test_spellings_of_other_programs_are_known(names, group):
+    """Capitals, spaces and signs say nothing; a tumour of an organ is a tumour."""
+    assert {default_role(name, "abdomen").group for name in names} == {group}
+
+
+def test_what_no_line_knows_is_not_guessed():
+    """It is avoided by the largest margin of the table."""
+    assert default_role("Segment_1", "abdomen") is None
+    assert default_role("qwerty", "brain") is None
+    lines = [*GENERAL, *(line for region in BY_REGION.values() for line in region)]
+    assert (UNKNOWN_NAME.kind, UNKNOWN_NAME.margin_mm) == ("avoid", max(line.margin_mm for line in lines))
+    assert all((line.margin_mm > 0) == (line.kind == "avoid") for line in lines)
+
+
+def test_a_region_has_its_own_lines():
+    """The brain is crossed where the target is in it, and nowhere else; its ventricles are no heart's."""
+    assert default_role("brain", "brain").kind == "traverse"
+    assert default_role("brain", "neck").kind == "avoid"
+    assert default_role("Left lateral ventricle", "brain").group == "ventricles of the brain"
+    assert default_role("brainstem", "brain").margin_mm == 5.0
+
+
+def test_the_page_shows_the_table():
+    """Every line with its role, margin and reason, as docs/default_roles.py writes it."""
+    page = (ROOT / "docs" / "reference" / "default-roles.md").read_text(encoding="utf-8")
+    for line in (UNKNOWN_NAME, *GENERAL, *(line for region in BY_REGION.values() for line in region)):
+        margin = f"{line.margin_mm:g}" if line.kind == "avoid" else ""
+        assert f"| {line.kind} | {margin} | {line.reason} |" in page, line.group
+        assert all(f"`{pattern}`" in page for pattern in line.patterns), line.group

@@ -1,0 +1,257 @@
+"""`init`: from a folder of files to a case that a search takes, on a round patient with known organs."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813
+from case_world import MARKERS, ball, image_of
+
+from puncture_twin.planning.base.toml_file import read_toml
+from puncture_twin.planning.case.case_file import CaseFile
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.run_twin import main
+
+SPACING = (4.0, 4.0, 4.0)
+AT = np.arange(50) * 4.0 - 98.0
+Z, Y, X = np.meshgrid(AT, AT, AT, indexing="ij")
+ORGANS = {
+    "right lung": ((-40.0, 0.0, 10.0), 18.0),
+    "aorta": ((36.0, 36.0, 0.0), 8.0),
+    "odd thing": ((30.0, -40.0, 0.0), 7.0),
+}
+"""Middle (LPS, mm) and radius of balls in the body."""
+TARGET = "-40,0,10"
+
+
+def inside(middle, radius):
+    """Voxels (z, y, x) of a ball."""
+    return (X - middle[0]) ** 2 + (Y - middle[1]) ** 2 + (Z - middle[2]) ** 2 < radius**2
+
+
+def write_ct(path):
+    """A body of 90 mm about the origin, with noise, in HU."""
+    noise = np.random.default_rng(5).normal(0.0, 12.0, X.shape)
+    hu = np.where(inside((0, 0, 0), 90.0), 40.0, -1000.0) + noise
+    sitk.WriteImage(image_of(hu.astype(np.int16), SPACING), str(path))
+
+
+def labels():
+    """Labels 1, 2, 3 of the organs."""
+    voxels = np.zeros(X.shape, np.uint8)
+    for number, (middle, radius) in enumerate(ORGANS.values(), start=1):
+        voxels[inside(middle, radius)] = number
+    return voxels
+
+
+def write_masks(folder):
+    """A mask an organ, and an empty one."""
+    folder.mkdir(exist_ok=True)
+    for name, (middle, radius) in ORGANS.items():
+        sitk.WriteImage(image_of(inside(middle, radius).astype(np.uint8), SPACING), str(folder / f"{name}.nii.gz"))
+    sitk.WriteImage(image_of(np.zeros(X.shape, np.uint8), SPACING), str(folder / "spleen.nii.gz"))
+
+
+def write_seg_nrrd(path):
+    """As Slicer writes segments of one layer."""
+    image = image_of(labels(), SPACING)
+    for number, name in enumerate(ORGANS):
+        image.SetMetaData(f"Segment{number}_Name", name)
+        image.SetMetaData(f"Segment{number}_LabelValue", str(number + 1))
+    sitk.WriteImage(image, str(path))
+
+
+def init(capfd, folder, *words):
+    """Run it; returns exit code, stdout, stderr's lines that are no progress."""
+    code = main(["init", str(folder), *words])
+    out, err = capfd.readouterr()
+    return code, out, [line for line in err.splitlines() if not line.startswith("stage")]
+
+
+def roles(folder):
+    """Name to role and margin of the case's structures, as a search reads them."""
+    context = prepare(folder, arm=False)
+    return {one.name: (str(one.role), one.margin_mm) for one in context.anatomy.structures}
+
+
+EXPECTED = {"right lung": ("target", 0.0), "aorta": ("avoid", 5.0), "odd thing": ("avoid", 5.0)}
+
+
+def segmentation_of(kind, folder):
+    """The same organs as another program writes them."""
+    if kind == "masks":
+        write_masks(folder / "segmentations")
+    elif kind == "masks beside the CT":
+        write_masks(folder)
+    elif kind == "masks two levels down":
+        (folder / "run").mkdir()
+        write_masks(folder / "run" / "seg")
+    elif kind == "seg.nrrd":
+        write_seg_nrrd(folder / "Segmentation.seg.nrrd")
+    elif kind == "csv":
+        sitk.WriteImage(image_of(labels(), SPACING), str(folder / "map.nii.gz"))
+        (folder / "organs.csv").write_text("Structure,Value\nright lung,1\naorta,2\nodd thing,3\n")
+        (folder / "notes.txt").write_text("seen by two\n")
+    elif kind == "json":
+        sitk.WriteImage(sitk.Cast(image_of(labels(), SPACING), sitk.sitkFloat32), str(folder / "map.nii.gz"))
+        (folder / "map.json").write_text(json.dumps({str(n): name for n, name in enumerate(ORGANS, start=1)}))
+
+
+@pytest.mark.parametrize("kind", ["masks", "masks beside the CT", "masks two levels down", "seg.nrrd", "csv", "json"])
+def test_every_kind_of_segmentation_becomes_the_same_case(tmp_path, capfd, kind):
+    """Names with spaces, an empty mask, a name that nobody knows: read by a search at once."""
+    write_ct(tmp_path / "scan.nii.gz")
+    segmentation_of(kind, tmp_path)
+    code, out, said = init(capfd, tmp_path, "--target", TARGET)
+    assert code == 0, said
+    assert roles(tmp_path) == EXPECTED
+    assert any("the target lies in 'right lung'" in line for line in said)
+    assert any("default roles" in line and "odd thing" in line for line in said)
+    assert all(line.startswith("warning: ") for line in said)
+    assert ("spleen" in " ".join(said)) == kind.startswith("masks")
+    assert "next: search" in out
+    assert ".case-" not in out + " ".join(said)
+    assert list(tmp_path.glob(".case*")) == []
+
+
+def test_a_target_typed_in_ras_is_answered_in_ras(tmp_path, capfd):
+    """The numbers as they were typed; the same verdicts as in LPS; a slip of space is named."""
+    write_ct(tmp_path / "scan.nii.gz")
+    write_seg_nrrd(tmp_path / "a.seg.nrrd")
+    assert init(capfd, tmp_path, "--target", "40,0,10", "--space", "RAS")[0] == 0
+    written = read_toml(tmp_path / "case.toml", CaseFile, allowed="", keys="")
+    assert (written.space, written.target.position_mm, written.schema_) == ("RAS", (40.0, 0.0, 10.0), 2)
+    ras = prepare(tmp_path, arm=False).search()
+    assert init(capfd, tmp_path, "--target", TARGET, "--force")[0] == 0
+    lps = prepare(tmp_path, arm=False).search()
+    assert np.array_equal(ras.verdict.reason, lps.verdict.reason)
+    assert 0 < lps.safe.sum() < len(lps)
+    code, out, said = init(capfd, tmp_path, "--target", "40,0,10", "--force")
+    assert (code, out) == (2, "")
+    assert len(said) == 1 and "read in RAS it lies in 'right lung': --space RAS" in said[0]
+
+
+def test_the_middle_of_a_label_is_a_target(tmp_path, capfd):
+    """The deepest point of a ball is its middle, to a cell of the grid."""
+    write_ct(tmp_path / "scan.nii.gz")
+    write_masks(tmp_path / "seg")
+    code, out, _ = init(capfd, tmp_path, "--target-label", "right lung", "--json")
+    assert code == 0
+    told = json.loads(out)
+    assert np.linalg.norm(np.subtract(told["target_mm"], ORGANS["right lung"][0])) < 3.0
+    assert told["target_structure"] == "right lung"
+    assert told["structures"] == {"target": 1, "avoid": 2}
+    assert {one["role"] for one in told["inputs"]} >= {"case", "ct", "mask aorta", "mask spleen"}
+    assert any("deepest point" in line for line in told["warnings"])
+    code, _, said = init(capfd, tmp_path, "--target-label", "liver", "--force")
+    assert code == 2 and "no structure is named 'liver'" in said[0] and "right lung" in said[0]
+
+
+def test_a_lesion_in_an_organ_is_the_target_and_the_organ_is_crossed(tmp_path, capfd):
+    """Of two masks that hold the target the lesion is meant; the other cannot be avoided."""
+    write_ct(tmp_path / "scan.nii.gz")
+    write_masks(tmp_path / "seg")
+    lesion = image_of(inside((-40, 0, 10), 6.0).astype(np.uint8), SPACING)
+    sitk.WriteImage(lesion, str(tmp_path / "seg" / "lung tumor.nii.gz"))
+    code, _, said = init(capfd, tmp_path, "--target", TARGET, "--region", "chest")
+    assert code == 0, said
+    assert roles(tmp_path)["lung tumor"] == ("target", 0.0)
+    assert roles(tmp_path)["right lung"] == ("traverse", 0.0)
+    assert any("paths cross them (traverse): right lung" in line for line in said)
+
+
+def test_a_case_that_is_there_is_kept(tmp_path, capfd):
+    """Unless --force; and a start that fails leaves what is there."""
+    write_ct(tmp_path / "scan.nii.gz")
+    write_masks(tmp_path / "seg")
+    (tmp_path / "case.toml").write_text("mine")
+    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+    assert code == 2 and "there is a case already" in said[0] and "--force" in said[0]
+    assert init(capfd, tmp_path, "--target", "5000,0,0", "--force")[0] == 2
+    assert (tmp_path / "case.toml").read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["case.toml", "scan.nii.gz", "seg"]
+
+
+@pytest.mark.parametrize(
+    ("words", "match"),
+    [
+        (["--target", "0,0"], "--target: 2 numbers"),
+        (["--target", "a,0,0"], "'a' is not a number"),
+        (["--target", "500,0,0"], "lies outside the CT scan.nii.gz"),
+        (["--target", "-95,-95,0"], "lies outside the body in scan.nii.gz"),
+        (["--target", "0,0,-40"], r"lies in no structure; .* the nearest is '.*', \d+\.\d mm away"),
+        ([], "either --target X,Y,Z or --target-label NAME"),
+        (["--target", "0,0,0", "--target-label", "aorta"], "either --target X,Y,Z or --target-label NAME"),
+        (["--target", TARGET, "--region", "belly"], "region 'belly' is not known"),
+        (["--target", TARGET, "--space", "local"], "LPS or RAS"),
+    ],
+)
+def test_what_cannot_be_a_target_is_refused_in_one_line(tmp_path, capfd, words, match):
+    """With what is allowed, and nothing written."""
+    write_ct(tmp_path / "scan.nii.gz")
+    write_masks(tmp_path / "seg")
+    code, out, said = init(capfd, tmp_path, *words)
+    assert (code, out, len(said)) == (2, "", 1), said
+    assert re.search(match, said[0]), said
+    assert not (tmp_path / "case.toml").exists()
+
+
+def test_all_that_is_wrong_is_said_at_once(tmp_path, capfd):
+    """A truncated mask, two CTs, two maps of the same organs; each is named."""
+    for name in ("a.nii.gz", "b.nii.gz"):
+        write_ct(tmp_path / name)
+    write_masks(tmp_path / "seg")
+    write_seg_nrrd(tmp_path / "map.seg.nrrd")
+    whole = (tmp_path / "seg" / "aorta.nii.gz").read_bytes()
+    (tmp_path / "seg" / "aorta.nii.gz").write_bytes(whole[: len(whole) // 2])
+    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+    assert (code, len(said)) == (2, 1)
+    for part in ("seg/aorta.nii.gz: ", "compressed", "several CTs: a.nii.gz, b.nii.gz", "one name"):
+        assert part in said[0], said
+    (tmp_path / "seg" / "aorta.nii.gz").write_bytes(whole)
+    code, _, said = init(capfd, tmp_path, "--target", TARGET, "--ct", "b.nii.gz", "--segmentation", "seg")
+    assert code == 0, said
+    assert "b.nii.gz" in (tmp_path / "case.toml").read_text()
+
+
+@pytest.mark.parametrize(("write", "missing"), [(write_ct, "no segmentation"), (write_seg_nrrd, "no CT in Hounsfield")])
+def test_a_folder_without_a_half_is_refused(tmp_path, capfd, write, missing):
+    """A CT alone, a segmentation alone, no folder at all."""
+    write(tmp_path / "one.seg.nrrd")
+    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+    assert (code, len(said)) == (2, 1) and missing in said[0], said
+    code, _, said = init(capfd, tmp_path / "nothing", "--target", TARGET)
+    assert code == 2 and "is no folder" in said[0]
+
+
+def test_a_numbering_that_is_not_told_is_asked_for(tmp_path, capfd):
+    """Three balls lie in no order of a body: the option that decides is named, and decides."""
+    write_ct(tmp_path / "scan.nii.gz")
+    sitk.WriteImage(image_of(labels(), SPACING), str(tmp_path / "map.nii.gz"))
+    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+    assert (code, len(said)) == (2, 1) and "--naming" in said[0], said
+    code, _, said = init(capfd, tmp_path, "--target", TARGET, "--naming", "totalsegmentator-v2")
+    assert code == 0, said
+    assert set(roles(tmp_path)) == {"spleen", "kidney_right", "kidney_left"}
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("mm", 1.0), ("cm", 0.1), ("m", 0.001)])
+def test_the_unit_of_meshes_is_guessed_and_told(tmp_path, capfd, unit, scale):
+    """By the extent of all of them; the surfaces are the same in mm. Lists of points are named in comments."""
+    (tmp_path / "meshes").mkdir()
+    balls = {"skin": ((0.0, 0.0, 0.0), 90.0), **ORGANS}
+    for name, (middle, radius) in balls.items():
+        ball(tmp_path / "meshes" / f"{name}.stl", radius * scale, np.array(middle) * scale)
+    (tmp_path / "points.csv").write_text(MARKERS)
+    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+    assert code == 0, said
+    assert any(f"4 meshes in {unit} (guessed" in line for line in said)
+    assert roles(tmp_path) == EXPECTED
+    mesh = prepare(tmp_path, arm=False).anatomy.structure("aorta").mesh
+    assert np.ptp(mesh.bounds[:, 0]) == pytest.approx(16.0, abs=0.3)
+    text = (tmp_path / "case.toml").read_text()
+    assert '# markers_ct = "points.csv"' in text
+    assert not re.search(r"^\[registration\]", text, re.MULTILINE)
+    stated = init(capfd, tmp_path, "--target", TARGET, "--force", "--unit", unit)
+    assert stated[0] == 0 and any("as stated" in line for line in stated[2])
