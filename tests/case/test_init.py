@@ -3,6 +3,7 @@
 import json
 import re
 
+import dicom_world as world
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
@@ -113,6 +114,38 @@ def test_every_kind_of_segmentation_becomes_the_same_case(tmp_path, capfd, kind)
     assert "next: search" in out
     assert ".case-" not in out + " ".join(said)
     assert list(tmp_path.glob(".case*")) == []
+
+
+def write_series(folder, number):
+    """The CT as a DICOM series, and a scout among its slices."""
+    noise = np.random.default_rng(5).normal(0.0, 12.0, X.shape)
+    hu = np.where(inside((0, 0, 0), 90.0), 40.0, -1000.0) + noise
+    T = np.diag([4.0, 4.0, 4.0, 1.0])
+    T[:3, 3] = -98.0
+    slices = world.series((hu + 1024).astype(np.int16).transpose(2, 1, 0), T)
+    for one in slices:
+        one.SeriesInstanceUID = f"1.2.3.{number}"
+    world.write_series(folder, slices)
+
+
+def test_a_dicom_series_is_the_ct(tmp_path, capfd):
+    """Named by its folder; of two series in one folder the user says which, by a file of it."""
+    write_series(tmp_path / "dicom", 1)
+    write_masks(tmp_path / "seg")
+    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+    assert code == 0, said
+    assert 'ct = "dicom"' in (tmp_path / "case.toml").read_text()
+    assert roles(tmp_path) == EXPECTED
+    write_series(tmp_path / "more", 2)
+    for path in (tmp_path / "more").iterdir():
+        path.rename(tmp_path / "dicom" / f"b-{path.name}")
+    (tmp_path / "more").rmdir()
+    code, _, said = init(capfd, tmp_path, "--target", TARGET, "--force")
+    assert code == 2
+    names = re.search(r"several CTs: (\S+), (\S+) ", said[0])
+    code, _, said = init(capfd, tmp_path, "--target", TARGET, "--force", "--ct", names[2])
+    assert code == 0, said
+    assert f'ct = "{names[2]}"' in (tmp_path / "case.toml").read_text()
 
 
 def test_a_target_typed_in_ras_is_answered_in_ras(tmp_path, capfd):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from puncture_twin.planning.base.files import is_folder, is_plain_file
 from puncture_twin.planning.case.init.label_files import Mask, Masks, label_file, mask_of
 from puncture_twin.planning.case.init.mesh_folder import is_mesh, mesh_folder
 from puncture_twin.planning.case.init.segmentation import Place, Segmentation
+from puncture_twin.planning.formats.dicom.recognise import list_folder
+from puncture_twin.planning.formats.dicom.storage import Kind
 from puncture_twin.planning.formats.labels.labelmaps import labelmap_of
 from puncture_twin.planning.formats.labels.mask_folder import MASK_ENDINGS
 from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points
@@ -143,16 +146,34 @@ class _Looker:
         self._place = place
         self._wanted = wanted
         self._found = found
+        self._folder = folder
         self._source = folder.relative_to(place.folder).as_posix()
         self._names = [one.relative_to(place.folder).as_posix() for one in files]
 
     def look(self) -> None:
-        """Volumes, then meshes, then points."""
+        """DICOM, volumes, meshes, points."""
+        self._dicom()
         self._volumes([name for name in self._names if name.lower().endswith(NIFTI_ENDINGS + NRRD_ENDINGS)])
         self._meshes([name for name in self._names if is_mesh(name) and self._wanted.takes("labels", name)])
         for name in self._names:
             if name.lower().endswith(POINT_ENDINGS):
                 self._points(name)
+
+    def _dicom(self) -> None:
+        """Each CT series of the folder: it is named by the folder, or where there are several by a file of each."""
+        try:
+            files = list_folder(self._folder)
+            series = {one.series_uid: one.name for one in reversed(files) if one.is_slice}
+            names = {uid: (PurePosixPath(self._source) / file).as_posix() for uid, file in series.items()}
+            for name in sorted(names.values()) if len(names) > 1 else [self._source][: len(names)]:
+                if self._wanted.takes("ct", name):
+                    self._found.cts.append(Ct(name, self._place.volume(name)))
+        except InputError as error:
+            self._found.problems.append(error)
+            return
+        others = Counter(one.sop_class for one in files if one.kind is not Kind.CT)
+        for kind, count in sorted(others.items()):
+            self._found.notes.append(f"{self._source}: {count} {kind} left out")
 
     def _volumes(self, names: Sequence[str]) -> None:
         """CTs and label maps one by one; masks together, as a folder of masks where it holds nothing else."""

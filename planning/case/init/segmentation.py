@@ -15,8 +15,10 @@ from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.formats.dicom.choose_series import choose_series, is_series
+from puncture_twin.planning.formats.dicom.ct_series import parse_series
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, data_file
-from puncture_twin.planning.formats.volumes.volume_source import VolumeFile
+from puncture_twin.planning.formats.volumes.volume_source import Content, VolumeFile
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 
@@ -72,17 +74,28 @@ class Place:
     cache: Cache
 
     def volume(self, name: str) -> VolumeSurfaces:
-        """A volume file of the folder.
+        """A volume file of the folder, or a DICOM series.
 
         Raises:
             InputError: It cannot be read.
         """
         read = partial(_content, self.folder)
+        if is_series(self.folder / name):
+            return self._series(name, read)
         content = read(name)
         beside = data_file(content, self.folder / name)
         names = (name,) if beside is None else (name, str(PurePosixPath(name).with_name(beside)))
         hashes = [hashlib.sha256(content).hexdigest(), *(hashlib.sha256(read(one)).hexdigest() for one in names[1:])]
         return VolumeSurfaces(VolumeFile(self.folder / name, names, read), tuple(hashes), self.cache)
+
+    def _series(self, name: str, read: Content) -> VolumeSurfaces:
+        """A folder with one series, or the series of one file."""
+        path = self.folder / name
+        chosen = choose_series(path)
+        inside = PurePosixPath(name) if chosen.folder == path else PurePosixPath(name).parent
+        files = [str(inside / file) for file in chosen.names]
+        hashes = tuple(hashlib.sha256(read(file)).hexdigest() for file in files)
+        return VolumeSurfaces(parse_series(path, files, read, chosen.notes), hashes, self.cache)
 
 
 def _content(folder: Path, name: str) -> bytes:
