@@ -100,7 +100,9 @@ def init(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="With a CT and a segmentation.")],
     target: Annotated[str | None, typer.Option("--target", help="X,Y,Z in mm.")] = None,
     target_label: Annotated[str | None, typer.Option("--target-label", help="Or the deepest point of this.")] = None,
-    space: Annotated[Space, typer.Option("--space", help="Of the target, of the case, and of meshes.")] = Space.LPS,
+    space: Annotated[
+        Space | None, typer.Option("--space", help="Of the target, of the case, and of meshes.", show_default="LPS")
+    ] = None,
     region: Annotated[str | None, typer.Option("--region", help="What the CT shows; else told by organs.")] = None,
     naming: Annotated[
         str | None, typer.Option("--naming", help="Of labels: totalsegmentator-v1, -v2, a table.")
@@ -122,9 +124,10 @@ def init(
         raise InputError(f"region '{region[:40]}' is not known", where="--region", allowed=", ".join(get_args(Region)))
     if space is Space.LOCAL:
         raise InputError("a patient's space", where="--space", allowed="LPS or RAS")
-    wanted = Wanted(space, naming, unit, ct, segmentation)
+    wanted = Wanted(space or Space.LPS, naming, unit, ct, segmentation)
     with progress_display() as progress:
-        run = init_case(Request(folder, target, target_label, region, wanted), force=force, watcher=progress)
+        asked = Request(folder, target, target_label, region, wanted, space_stated=space is not None)
+        run = init_case(asked, force=force, watcher=progress)
     for warning in run.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     _print(run.summary(), init_text(run), as_json)

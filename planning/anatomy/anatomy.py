@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.beyond_labels import BEYOND_LABELS, beyond_labels
 from puncture_twin.planning.anatomy.body.support import support_warnings
+from puncture_twin.planning.anatomy.own_target import own_target
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.anatomy.skin import Skin
@@ -110,6 +111,7 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
     skin = loader.skin(skin_section)
     _check_count(case, structures)
     _check_demands(case, structures)
+    structures.extend(own_target(case))
     outside: tuple[Structure, ...] = ()
     scan = loader.scan(skin_section, skin)
     if scan is None:

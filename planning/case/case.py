@@ -166,6 +166,8 @@ class Case:
         hit_radius_mm: Within which of the target the tip hits; None counts the target's own mesh.
         errors: What is declared to err, or None.
         truth_errors: From what a rehearsal's truth is drawn instead, to test a wrong belief; None draws from `errors`.
+        own_target: Whether the target lies in no structure: its own is then the ball of the hit radius about it, which
+            has its name.
     """
 
     path: Path
@@ -195,6 +197,7 @@ class Case:
     hit_radius_mm: float | None = None
     errors: ErrorModel | None = None
     truth_errors: ErrorModel | None = None
+    own_target: bool = False
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""
@@ -246,7 +249,8 @@ def load_case(path: Path | str) -> Case:
         space=space,
         target_ct=target,
         target_name=content.target.name,
-        target_structure=content.target.structure,
+        target_structure=content.target.structure or content.target.name,
+        own_target=content.target.structure is None,
         needle=Needle(**content.needle.model_dump()),
         search=SearchSettings(
             theta=(np.radians(settings.theta_deg[0]), np.radians(settings.theta_deg[1])),

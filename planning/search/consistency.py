@@ -9,6 +9,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
 from puncture_twin.planning.anatomy.inside_skin import LEAST_TOLERANCE_MM, inside_skin
 from puncture_twin.planning.anatomy.label_grids import label_grids
+from puncture_twin.planning.anatomy.own_target import OWN_TARGET
 from puncture_twin.planning.anatomy.regions import absent_organs
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.errors import InputError
@@ -63,8 +64,9 @@ def check_consistency(case: Case, anatomy: Anatomy, placement: Placement | None)
 
 
 def _outside_warnings(case: Case, anatomy: Anatomy, headers: Headers) -> tuple[str, ...]:
-    """An organ that is elsewhere protects nothing; what is `unknown` may lie anywhere."""
-    placed = [structure for structure in anatomy.structures if structure.role is not Role.UNKNOWN]
+    """An organ that is elsewhere protects nothing; what is `unknown`, or a ball about the target, may lie anywhere."""
+    known = [structure for structure in anatomy.structures if structure.role is not Role.UNKNOWN]
+    placed = [structure for structure in known if structure.source != OWN_TARGET]
     _refuse_wholly_outside(case, anatomy.skin, placed)
     if not anatomy.skin.mesh.closed:
         return ("the skin mesh is open: how much of each structure lies inside the body is not known",)

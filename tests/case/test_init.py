@@ -79,6 +79,9 @@ def roles(folder):
 EXPECTED = {"right lung": ("target", 0.0), "aorta": ("avoid", 5.0), "odd thing": ("avoid", 5.0)}
 
 
+EXPECTED_REST = {name: EXPECTED[name] for name in ("aorta", "odd thing")}
+
+
 def segmentation_of(kind, folder):
     """The same organs as another program writes them."""
     if kind == "masks":
@@ -194,6 +197,24 @@ def test_a_lesion_in_an_organ_is_the_target_and_the_organ_is_crossed(tmp_path, c
     assert any("paths cross them (traverse): right lung" in line for line in said)
 
 
+def test_a_target_in_no_structure_is_a_ball_of_its_own(tmp_path, capfd):
+    """In fat; also where the other space's reading lies in an organ, if the space was stated."""
+    write_ct(tmp_path / "scan.nii.gz")
+    write_masks(tmp_path / "seg")
+    for words in (["--target", "0,0,-40"], ["--target", "40,0,10", "--space", "LPS"]):
+        code, _, said = init(capfd, tmp_path, *words, "--force")
+        assert code == 0, said
+        assert any("the target lies in no structure" in line and "nearest is" in line for line in said)
+    assert roles(tmp_path) == {"right lung": ("avoid", 2.0), **EXPECTED_REST, "target": ("target", 0.0)}
+    context = prepare(tmp_path, arm=False)
+    mesh = context.anatomy.structure("target").mesh
+    distance = np.linalg.norm(mesh.vertices - [40.0, 0.0, 10.0], axis=1)
+    assert mesh.closed and np.abs(distance - 5.0).max() < 0.05
+    found = context.search()
+    assert 0 < found.safe.sum() < len(found)
+    assert context.explain(0.3, 1.0).target_depth_mm == pytest.approx(5.0, abs=0.05)
+
+
 def test_a_case_that_is_there_is_kept(tmp_path, capfd):
     """Unless --force; and a start that fails leaves what is there."""
     write_ct(tmp_path / "scan.nii.gz")
@@ -213,7 +234,7 @@ def test_a_case_that_is_there_is_kept(tmp_path, capfd):
         (["--target", "a,0,0"], "'a' is not a number"),
         (["--target", "500,0,0"], "lies outside the CT scan.nii.gz"),
         (["--target", "-95,-95,0"], "lies outside the body in scan.nii.gz"),
-        (["--target", "0,0,-40"], r"lies in no structure; .* the nearest is '.*', \d+\.\d mm away"),
+        (["--target", "40,0,10"], r"lies in no structure \(read in RAS it lies in 'right lung': --space RAS\)"),
         ([], "either --target X,Y,Z or --target-label NAME"),
         (["--target", "0,0,0", "--target-label", "aorta"], "either --target X,Y,Z or --target-label NAME"),
         (["--target", TARGET, "--region", "belly"], "region 'belly' is not known"),

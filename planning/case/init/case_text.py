@@ -20,7 +20,7 @@ space = "{space}"  # of the coordinates in this file
 
 [target]
 position_mm = [{position}]
-structure = {structure}
+{structure}
 
 [needle]
 length_mm = 200.0  # tip to flange
@@ -33,6 +33,7 @@ step_deg = 2.0
 max_skin_angle_deg = 60.0
 
 """
+OWN_TARGET = "hit_radius_mm = 5.0  # it lies in no structure: what is hit is this ball about it"
 SKIN_OF_CT = """[[structure]]
 name = "skin"
 ct = {ct}  # the body is found in the CT
@@ -60,7 +61,7 @@ class CaseParts:
         space: Of its coordinates.
         region: Which part of the body it shows.
         target_ct: Shape (3,), LPS mm.
-        structure: Which holds the target.
+        structure: Which holds the target, or None.
         ct: The CT whose body is the skin, or None where a mesh is.
         sources: Each segmentation with what the case says of its structures.
         markers: Lists of points.
@@ -70,7 +71,7 @@ class CaseParts:
     space: Space
     region: str
     target_ct: Floats
-    structure: str
+    structure: str | None
     ct: str | None
     sources: tuple[tuple[Segmentation, Sequence[Assigned]], ...]
     markers: tuple[Markers, ...]
@@ -89,7 +90,7 @@ def case_text(parts: CaseParts) -> str:
         name=quoted(case_name(parts.name)),
         space=parts.space,
         position=", ".join(repr(float(one)) for one in position),
-        structure=quoted(parts.structure),
+        structure=OWN_TARGET if parts.structure is None else f"structure = {quoted(parts.structure)}",
     )
     skin = "" if parts.ct is None else SKIN_OF_CT.format(ct=quoted(parts.ct))
     count = sum(row.kind != "ignore" for row in parts.rows) + (parts.ct is not None)

@@ -36,6 +36,7 @@ class Request:
         target: ``X,Y,Z`` in mm, or None for ``target_label``.
         target_label: The name of a structure.
         region: As a case states it, or None to be told by the structures.
+        space_stated: Whether the user said in which space the target is.
         wanted: What the user says of the files.
     """
 
@@ -44,6 +45,7 @@ class Request:
     target_label: str | None
     region: str | None
     wanted: Wanted
+    space_stated: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +100,7 @@ def start_case(request: Request, cache: Cache) -> Start:
 
 def _target(request: Request, point: Floats | None, segmentations: Sequence[Segmentation]) -> Target:
     if point is not None:
-        return typed_target(point, segmentations, request.wanted.space)
+        return typed_target(point, segmentations, request.wanted.space, space_stated=request.space_stated)
     return label_target(str(request.target_label), segmentations, request.wanted.space)
 
 

@@ -57,18 +57,29 @@ def shown(point_ct: Floats, space: Space) -> str:
     return ", ".join(f"{one:.1f}" for one in to_lps(point_ct[None], space)[0]) + f" mm {space}"
 
 
-def typed_target(point_ct: Floats, segmentations: Sequence[Segmentation], space: Space) -> Target:
+def typed_target(
+    point_ct: Floats, segmentations: Sequence[Segmentation], space: Space, *, space_stated: bool
+) -> Target:
     """A point that was typed, with the structures that hold it.
 
+    Args:
+        point_ct: Shape (3,), LPS mm.
+        segmentations: What may hold it.
+        space: In which it was typed.
+        space_stated: Whether the user said so.
+
     Raises:
-        InputError: No structure holds it; names the nearest, and those of the other space's reading.
+        InputError: No structure holds it, but one would if it was meant in the other space, and nobody said which.
     """
     names = _holders(point_ct, segmentations)
+    other = "" if names else _other_reading(point_ct, segmentations, space)
+    if not names and (space_stated or not other):
+        return Target(point_ct, Holding(None, frozenset()), (_in_nothing(point_ct, segmentations, other),))
     if not names:
         raise InputError(
-            f"target ({shown(point_ct, space)}) lies in no structure{_other_reading(point_ct, segmentations, space)}",
+            f"target ({shown(point_ct, space)}) lies in no structure{other}",
             where="--target",
-            allowed=f"a point inside a structure; the nearest is {_nearest(point_ct, segmentations)}",
+            allowed="--space LPS or --space RAS, whichever is meant",
         )
     chosen = chosen_target(names)
     holding = Holding(chosen, frozenset(names) - {chosen})
@@ -115,6 +126,11 @@ def _other_reading(point_ct: Floats, segmentations: Sequence[Segmentation], spac
     other = Space.RAS if space is Space.LPS else Space.LPS
     names = _holders(to_lps(point_ct[None], Space.RAS)[0], segmentations)
     return f" (read in {other} it lies in '{names[0]}': --space {other})" if names else ""
+
+
+def _in_nothing(point_ct: Floats, segmentations: Sequence[Segmentation], other: str) -> str:
+    near = _nearest(point_ct, segmentations)
+    return f"the target lies in no structure{other}; the nearest is {near}; what is hit is a ball of 5 mm about it"
 
 
 def _nearest(point_ct: Floats, segmentations: Sequence[Segmentation]) -> str:

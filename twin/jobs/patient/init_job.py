@@ -86,7 +86,7 @@ def init_text(run: InitRun) -> str:
         f"{run.path}",
         f"  skin           {parts.ct or 'a mesh'}",
         f"  structures     {roles}, of {', '.join(one.source for one, _ in parts.sources)}",
-        f"  target         {position} mm {parts.space}, in {parts.structure}",
+        f"  target         {position} mm {parts.space}, in {parts.structure or 'no structure'}",
         f"  region         {parts.region}",
         "  needle         200 mm, shaft 150 mm, diameter 1.2 mm",
         f"next: search {run.path.parent}",
