@@ -1,4 +1,4 @@
-"""The straight insertion as joint motion: the needle's flange pose, and the way of each branch along the needle."""
+"""The straight insertion as joint motion: the needle's flange pose, and the path of each branch along the needle."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FULL_MARGIN_RAD = math.pi / 2
 
 
 class InsertionStop(NamedTuple):
-    """Where a way along the needle ends, and why."""
+    """Where a path along the needle ends, and why."""
 
     depth_mm: float
     detail: str
@@ -73,7 +73,7 @@ def away_from_singularities(model: UrModel, q: Floats) -> NDArray[np.bool_]:
 
 
 def first_stop(model: UrModel, path: Floats, depths_mm: Floats) -> InsertionStop | None:
-    """Where a way stops being drivable: out of reach, at a singularity, or with a joint that jumps; None if nowhere.
+    """Where a path stops being feasible: out of reach, at a singularity, or with a joint that jumps; None if nowhere.
 
     Args:
         model: The arm.
@@ -108,21 +108,21 @@ def reach_margin(model: UrModel, q: Floats) -> float:
 
 def why_unreachable(model: UrModel, T_base_flange: Floats) -> str:
     """What keeps every branch from one flange pose (4, 4), in mm: one sentence for people."""
-    stands = (
+    place = (
         f"the flange would stand {np.linalg.norm(T_base_flange[:3, 3] - model.shoulder_base):.1f} mm from the shoulder"
     )
     missing = float(missing_reach_mm(model, T_base_flange)[0])
     if math.isinf(missing):
-        return f"{stands}, its wrist too close to the base's axis for any shoulder angle"
+        return f"{place}, its wrist too close to the base's axis for any shoulder angle"
     if missing > 0.0:
-        return f"{stands}, {missing:.1f} mm out of the arm's reach in this direction"
+        return f"{place}, {missing:.1f} mm out of the arm's reach in this direction"
     solutions = inverse(model, T_base_flange)[0]
     best = singularity(model, solutions[np.nanargmax(singularity(model, solutions).least())])
-    return f"{stands}, too near the {best.nearest} singularity ({best.least():.3f}, at least {MIN_SINGULARITY})"
+    return f"{place}, too near the {best.nearest} singularity ({best.least():.3f}, at least {MIN_SINGULARITY})"
 
 
 class NeedleLine(NamedTuple):
-    """A line to drive along, base frame."""
+    """A line to insert along, base frame."""
 
     R_base_flange: Floats
     """Shape (3, 3): the flange's axes at roll 0."""
@@ -144,28 +144,28 @@ def flange_at(line: NeedleLine, distance_mm: float) -> Floats:
 
 
 def every_branch(model: UrModel, line: NeedleLine, distance_mm: Floats) -> Floats:
-    """Every branch's way along the needle at roll 0. A roll adds to q6 and to nothing else.
+    """Every branch's path along the needle at roll 0. A roll adds to q6 and to nothing else.
 
     Args:
         model: The arm.
         line: The needle's line.
-        distance_mm: Shape (m,): target to flange along the way.
+        distance_mm: Shape (m,): target to flange along the path.
 
     Returns:
         Shape (8, m, 6), rad, without jumps of whole turns; NaN from where a branch first does not exist.
     """
     q = np.empty((N_BRANCHES, len(distance_mm), 6))
-    kernels.ways(model.lengths, *line, distance_mm, q)
+    kernels.every_branch(model.lengths, *line, distance_mm, q)
     return q
 
 
 def branch_path(model: UrModel, line: NeedleLine, distance_mm: Floats, branch: int, turn: Floats) -> Floats:
-    """The way of one branch along the needle.
+    """The path of one branch along the needle.
 
     Args:
         model: The arm.
         line: The needle's line.
-        distance_mm: Shape (m,): target to flange along the way.
+        distance_mm: Shape (m,): target to flange along the path.
         branch: Index among the eight of ``inverse``.
         turn: Shape (6,), rad: added to every row, such as a roll and whole turns.
 
@@ -173,7 +173,7 @@ def branch_path(model: UrModel, line: NeedleLine, distance_mm: Floats, branch: i
         Shape (m, 6), rad, without jumps of whole turns; NaN from where the branch first does not exist.
     """
     q = np.empty((len(distance_mm), 6))
-    kernels.way(model.lengths, *line, distance_mm, branch, turn, q)
+    kernels.branch_path(model.lengths, *line, distance_mm, branch, turn, q)
     return q
 
 
@@ -181,11 +181,11 @@ class Survey(NamedTuple):
     """What kinematics alone says of many directions, every branch and roll."""
 
     stop_at: NDArray[np.int64]
-    """Shape (n, 8): index of the sample at which the way ends, -1 where it reaches the target."""
+    """Shape (n, 8): index of the sample at which the path ends, -1 where it reaches the target."""
     margins: Floats
-    """Shape (n, 8, r): see :func:`reach_margin`; NaN where the way ends early or leaves the joint limits."""
+    """Shape (n, 8, r): see :func:`reach_margin`; NaN where the path ends early or leaves the joint limits."""
     turns: Floats
-    """Shape (n, 8, r, 6), rad: what to add to the way at roll 0, the roll and whole turns."""
+    """Shape (n, 8, r, 6), rad: what to add to the path at roll 0, the roll and whole turns."""
 
 
 def survey(
@@ -200,7 +200,7 @@ def survey(
     Args:
         model: The arm.
         lines: The n directions.
-        distances_mm: For each direction, shape (m,): target to flange at the samples of the way.
+        distances_mm: For each direction, shape (m,): target to flange at the samples of the path.
         depths_mm: The same as depths, rising, shape (m,).
         rolls: Shape (r,), rad.
     """
@@ -213,6 +213,6 @@ def survey(
     bounds = (MIN_SINGULARITY, MAX_JOINT_STEP_RAD_PER_MM, FULL_MARGIN_RAD)
     for i in range(count):
         filled = (found.stop_at[i], found.margins[i], found.turns[i])
-        way = (*lines[i], distances_mm[i], depths_mm[i])
-        kernels.survey(model.lengths, model.joint_limits, *way, rolls, *bounds, *filled)
+        path = (*lines[i], distances_mm[i], depths_mm[i])
+        kernels.survey(model.lengths, model.joint_limits, *path, rolls, *bounds, *filled)
     return found

@@ -1,4 +1,4 @@
-"""Compiled kinematics of the UR arms: poses, all inverse branches, and the way of a branch along a needle.
+"""Compiled kinematics of the UR arms: poses, all inverse branches, and the path of a branch along a needle.
 
 Plain loops over plain arrays, called by :mod:`planning.arm.kinematics` and :mod:`planning.arm.insertion`, which
 say what they compute and where it comes from. An arm is its lengths (d1, a2, a3, d4, d5, d6) in mm.
@@ -200,7 +200,7 @@ def missing_reach(lengths, T, missing):
 
 
 @nb.njit(cache=True)
-def ways(lengths, R, target, outward, distances, q):
+def every_branch(lengths, R, target, outward, distances, q):
     """Fill ``q`` (8, m, 6): every branch at each distance (m,) from the target, without jumps of whole turns.
 
     NaN from where a branch first does not exist.
@@ -220,8 +220,8 @@ def ways(lengths, R, target, outward, distances, q):
 
 
 @nb.njit(cache=True)
-def way(lengths, R, target, outward, distances, branch, turn, q):
-    """Fill ``q`` (m, 6) with the way of one branch, as :func:`ways` has it, and ``turn`` (6,) added to every row."""
+def branch_path(lengths, R, target, outward, distances, branch, turn, q):
+    """Fill ``q`` (m, 6) with the path of one branch of :func:`every_branch`, ``turn`` (6,) added to every row."""
     p, here = np.empty(3), np.empty((8, 6))
     for k in range(len(distances)):
         for i in range(3):
@@ -234,7 +234,7 @@ def way(lengths, R, target, outward, distances, branch, turn, q):
 
 @nb.njit(cache=True)
 def first_stop_at(lengths, path, depths, at_least, fastest):
-    """Index at which a way ends: no solution, too near a singularity, or a joint faster than it may; -1: nowhere.
+    """Index at which a path ends: no solution, too near a singularity, or a joint faster than it may; -1: nowhere.
 
     Args:
         lengths: The arm.
@@ -291,11 +291,11 @@ def survey(
         fastest: rad/mm.
         full: Distance from a limit that counts as 1, rad.
         stops: Shape (8,), filled: see :func:`first_stop_at`.
-        margins: Shape (8, r), filled: see :func:`path_margin`; NaN where the way stops or leaves the limits.
-        turns: Shape (8, r, 6), filled: what to add to the way at roll 0, rad: roll and whole turns.
+        margins: Shape (8, r), filled: see :func:`path_margin`; NaN where the path stops or leaves the limits.
+        turns: Shape (8, r, 6), filled: what to add to the path at roll 0, rad: roll and whole turns.
     """
     path = np.empty((8, len(distances), 6))
-    ways(lengths, R, target, outward, distances, path)
+    every_branch(lengths, R, target, outward, distances, path)
     margins[:] = math.nan
     turns[:] = 0.0
     for branch in range(8):

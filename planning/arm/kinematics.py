@@ -1,10 +1,10 @@
 """Forward and inverse kinematics of the UR arms, in closed form, for many poses at once.
 
-The base frame is the controller's (a URDF's ``base_link`` is turned by 180 deg about z against it). Frames follow
+The base frame is the controller's (a URDF's ``base_link`` is rotated by 180 deg about z against it). Frames follow
 Denavit and Hartenberg: T_{i-1}_{i} = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i). The inverse is the usual split of a wrist
 with parallel axes 2, 3, 4 (Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms", 2013),
 with the wrist solved by ``atan2`` from the orientation alone so that it stays exact next to its singularity. The
-loops stand in :mod:`puncture_twin.planning.arm.kernels`.
+loops are in :mod:`puncture_twin.planning.arm.kernels`.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def singularity(model: UrModel, q: Floats) -> Singularity:
 
 
 def inverse(model: UrModel, T_base_flange: Floats) -> Floats:
-    """All configurations that hold each flange pose.
+    """All configurations that reach each flange pose.
 
     Args:
         model: The arm.
@@ -127,7 +127,7 @@ def branch_of(model: UrModel, q: Floats) -> Ints:
 
 
 def missing_reach_mm(model: UrModel, T_base_flange: Floats) -> Floats:
-    """By how much upper arm and forearm are too short (or too long, folded) to hold each flange pose.
+    """By how much upper arm and forearm are too short (or too long, folded) to reach each flange pose.
 
     Args:
         model: The arm.

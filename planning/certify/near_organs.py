@@ -84,7 +84,7 @@ def organ_facts(
     found, rejected, largest = np.full(n, -1), np.zeros(n, bool), np.full(n, np.nan)
     zone = organs.zones.axis, organs.zones.cosine, organs.zones.sine, organs.zones.nearest
     shape = cones.centres, cones.corners, cones.radius, cones.bulge
-    start, items, measured = _judge(
+    start, items, measured = _checked(
         organs.corners, organs.group, organs.limits, zone, organs.lengths, lists.start, lists.items, parent, witness,
         shape, wide, pad, (found, rejected, largest),
     )  # fmt: skip
@@ -92,7 +92,7 @@ def organ_facts(
 
 
 @nb.njit(cache=True)
-def _judge(  # type: ignore[no-untyped-def]  # numba infers
+def _checked(  # type: ignore[no-untyped-def]  # numba infers
     corners, group, limits, zone, lengths, start, items, parent, witness, shape, wide, pad, out
 ):
     axis, cosine, sine, nearest = zone

@@ -37,16 +37,16 @@ TOO_WIDE = np.radians(80)
 """Cells with a larger radius are halved unasked."""
 
 SKIN_BELOW = np.radians(25)
-"""The skin is judged for cells with a smaller radius: no wider cone is ever all good."""
+"""The skin is checked for cells with a smaller radius: no wider cone is ever all good."""
 
 ASK_BELOW = np.radians(4)
-"""Organs are judged for cells with a smaller radius: wider ones are settled by the skin or not at all."""
+"""Organs are checked for cells with a smaller radius: wider ones are settled by the skin or not at all."""
 
 SMALLEST_SIZE = np.radians(0.01)
 """A finer map would need millions of cells, and the padding against rounding would begin to count."""
 
 REASONS = tuple(Reason)
-"""A reason as a number, while cells are judged."""
+"""A reason as a number, while cells are checked."""
 
 
 def certify(
@@ -73,12 +73,12 @@ def certify(
     if not SMALLEST_SIZE <= size <= np.pi:
         allowed = f"{np.degrees(SMALLEST_SIZE):g} to 180 degrees"
         raise InputError(f"size {np.degrees(size):g} degrees", where="certify", allowed=allowed)
-    judge = _Evaluator(question, anatomy, case.needle)
+    evaluator = _Evaluator(question, anatomy, case.needle)
     record = _Record()
-    cells, state = question.cap(), judge.start()
+    cells, state = question.cap(), evaluator.start()
     while len(cells):
         cones = cells.cones(question.R_ct_entry)
-        verdicts = judge.level(cells, cones, state)
+        verdicts = evaluator.level(cells, cones, state)
         letters = np.where(verdicts.letter != UNDECIDED, verdicts.letter, cells.splits(cones.radius, size))
         letters = np.where((verdicts.letter == UNDECIDED) & (2 * cones.radius <= size), UNDECIDED, letters)
         record.add(cells, letters, verdicts)
@@ -86,7 +86,7 @@ def certify(
         children = split(cells.take(inner), letters[inner])
         state = verdicts.state.of(inner[children.parent])
         cells = children.cells
-    return record.certificate(question, size, judge)
+    return record.certificate(question, size, evaluator)
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,15 +275,15 @@ class _Record:
         columns = cells.theta, cells.beta, letters, verdicts.reason, verdicts.triangle, verdicts.bound
         self.leaves.append(tuple(column[leaf] for column in columns))
 
-    def certificate(self, question: Question, size: float, judge: _Evaluator) -> Certificate:
+    def certificate(self, question: Question, size: float, evaluator: _Evaluator) -> Certificate:
         """All levels together."""
         theta, beta, verdict, code, triangle, bound = (
             np.concatenate(column) for column in zip(*self.leaves, strict=True)
         )
         reason = np.array([reason.value for reason in REASONS], dtype=np.str_)[code]
-        structure, face = judge.names(triangle)
+        structure, face = evaluator.names(triangle)
         leaves, tree = Cells(theta, beta), tuple(self.tree)
-        return Certificate(question, size, tree, leaves, verdict, reason, structure, face, bound, judge.queries)
+        return Certificate(question, size, tree, leaves, verdict, reason, structure, face, bound, evaluator.queries)
 
 
 def _spread(values: NDArray[np.generic], rows: Ints, count: int) -> NDArray[Any]:

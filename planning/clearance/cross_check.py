@@ -1,4 +1,4 @@
-"""A second opinion: some directions judged again by plain FCL, and every difference named."""
+"""A second opinion: some directions measured again by plain FCL, and every difference named."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class CrossCheckError(PlanningError):
 
 @dataclass(frozen=True)
 class CrossChecked:
-    """How many pairs of direction and structure were judged twice, and their largest difference."""
+    """How many pairs of direction and structure were measured twice, and their largest difference."""
 
     directions: int
     pairs: int
@@ -47,7 +47,7 @@ def cross_check(
         target_ct: Shape (3,).
         outward_ct: Shape (n, 3), unit vectors.
         length: Of the axes, one number or shape (k,), mm.
-        count: How many directions to judge again; all of them if there are fewer.
+        count: How many directions to measure again; all of them if there are fewer.
         rng: Chooses them.
 
     Raises:

@@ -57,7 +57,7 @@ class FastEngine:
     def __init__(self, meshes: Sequence[TriangleMesh], progress: Count | None = None) -> None:
         self._meshes = tuple(meshes)
         self._blocks = tuple(pack(mesh) for mesh in self._meshes)
-        self._judges: dict[int, FclEngine] = {}
+        self._references: dict[int, FclEngine] = {}
         self._seen: tuple[Floats, list[_Placed]] | None = None
         self._progress = progress
         self.counts = np.zeros(len(COUNTED), np.int64)
@@ -105,9 +105,9 @@ class FastEngine:
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
         """FCL collision of a capsule with one structure; see `ClearanceEngine`."""
-        if structure not in self._judges:
-            self._judges[structure] = FclEngine([self._meshes[structure]])
-        return self._judges[structure].collides(0, target_ct, outward_ct, length, radius)
+        if structure not in self._references:
+            self._references[structure] = FclEngine([self._meshes[structure]])
+        return self._references[structure].collides(0, target_ct, outward_ct, length, radius)
 
     def near(
         self, structure: int, origin_ct: Floats, outward_ct: Floats, length: float, reach: tuple[float, float]

@@ -1,4 +1,4 @@
-"""The reference engine: FCL, one query per direction and structure. Slow, plain, and the judge."""
+"""The reference engine: FCL, one query per direction and structure. Slow, plain, and right by definition."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ class FastChecker(CellChecker):
         return self.segment_checker()(start, end)
 
     def segment_checker(self) -> SegmentChecker:
-        """A judge of many segments, which remembers what touched last."""
+        """A check of many segments, which remembers what touched last."""
         return SegmentChecker(self.model, self._asked, self._proofs)
 
     def open_checks(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact]:

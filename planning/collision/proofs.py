@@ -64,7 +64,7 @@ class Around(NamedTuple):
     """What :meth:`Proofs.clear_about` leaves open."""
 
     touching: Bools
-    """Shape (m, k): at the state itself a judge must be asked, and is likely to find that something touches."""
+    """Shape (m, k): at the state itself the reference must be queried, and is likely to find that something touches."""
     unproven: Bools
     """Shape (m, k): the checks open about each state."""
 

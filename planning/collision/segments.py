@@ -1,4 +1,4 @@
-"""Straight joint segments, judged by compiled proofs; FCL has the word where they say nothing."""
+"""Straight joint segments, checked by compiled proofs; FCL has the word where they say nothing."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ LOOK_FIRST_RAD = 0.125
 """States of a segment so far apart are looked at before it is proven: what it touches is found soonest so."""
 
 FINE_MM = 1.0
-"""A state answers for a part of a segment within which no body moves farther from it. So states that were judged are no
-more than 2 mm of motion apart, which with 1 mm of padding proves the way between them (see :class:`CellChecker`)."""
+"""A state answers for a part of a segment within which no body moves farther from it. So states that were checked are
+no more than 2 mm of motion apart, which with 1 mm of padding proves the path between them; see :class:`CellChecker`."""
 
 QUESTIONS = 256
 """Room for what one segment leaves to FCL, at first."""
@@ -48,7 +48,7 @@ class SegmentChecker:
     def __call__(self, start: Floats, end: Floats) -> Contact | None:
         """A contact on the segment between two states (6,), rad, the needle being outside the patient; None if free.
 
-        The end, and states ``LOOK_FIRST_RAD`` apart from it on, are judged as they stand; all of the segment is proven
+        The end, and states ``LOOK_FIRST_RAD`` apart from it on, are checked as they are; all of the segment is proven
         clear but for parts within which no body moves farther than ``FINE_MM`` from a state where FCL finds nothing.
         The start itself is not looked at beyond that.
 

@@ -1,4 +1,4 @@
-"""What a judge of configurations answers, and the names behind which one judge takes another's place."""
+"""What a check of configurations answers, and the names behind which one checker takes another's place."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ DISTANCE_PAIRS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 
 class StateChecker(Protocol):
-    """Judges configurations of one arm in one scene. A faster judge takes this one's place behind these names."""
+    """Checks configurations of one arm in one scene. A faster checker takes this one's place behind these names."""
 
     @property
     def model(self) -> UrModel:

@@ -95,7 +95,7 @@ class CollisionItem(pytest.Item):
         name = self._check.case or self._default
         if name is None:
             raise InputError("no case", where=self.path, allowed="case = FILE, for the file or for the check")
-        compare(self._check, _judge(self.config, self.path.parent / name, self._check))
+        compare(self._check, _explained(self.config, self.path.parent / name, self._check))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """What ``check`` prints, after what differs."""
@@ -146,7 +146,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.stash[PREPARED] = {}
 
 
-def _judge(config: pytest.Config, path: Path, check: CheckSection) -> Explanation:
+def _explained(config: pytest.Config, path: Path, check: CheckSection) -> Explanation:
     cases, key = config.stash[PREPARED], (path.resolve(), check.arm)
     if key not in cases:
         cases[key] = prepare(path, arm=check.arm)  # True refuses a case that does not say where the base is
@@ -162,7 +162,7 @@ def collision_check(pytestconfig: pytest.Config) -> Callable[..., Explanation]:
 
     def run(case: Path | str, **keys: Any) -> Explanation:
         check = CheckSection(**keys)
-        found = _judge(pytestconfig, Path(case), check)
+        found = _explained(pytestconfig, Path(case), check)
         compare(check, found)
         return found
 

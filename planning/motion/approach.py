@@ -1,6 +1,6 @@
 """From home to a standoff pose: RRT-Connect to several goals, shortened, corners rounded, timed, and checked by FCL.
 
-A fast checker proves whole segments (:class:`SegmentChecker`). With FCL alone a segment is judged at
+A fast checker proves whole segments (:class:`SegmentChecker`). With FCL alone a segment is checked at
 samples, which can miss something thin; the check of the finished motion is closer, and plans anew what it refuses.
 """
 
@@ -45,7 +45,7 @@ __all__ = [
 
 
 RESOLUTION_RAD = 0.05
-"""Joint distance of the states at which FCL alone judges a segment: up to 50 mm at a metre, never the last word."""
+"""Joint distance of the states at which FCL alone checks a segment: up to 50 mm at a metre, never the last word."""
 
 FINER = 10
 """The check of the finished trajectory is this many times finer, and no body moves more than ``MAX_SWEEP_MM`` between
@@ -56,19 +56,19 @@ MAX_SAMPLES = 6000
 it one to two seconds."""
 
 PATIENCE, LEAST_SAMPLES = 4, 500
-"""A run for a shorter way gets so many times the samples that the first one took, or at least so many."""
+"""A run for a shorter path gets so many times the samples that the first one took, or at least so many."""
 
 RUNS = 3
-"""Of the planner, while it might find a way that is much shorter; see ``SHORT_ENOUGH``."""
+"""Of the planner, while it might find a path that is much shorter; see ``SHORT_ENOUGH``."""
 
 SHORT_ENOUGH = 1.3
-"""No run seeks a way shorter than one that is this many times as long as the straight line to the nearest goal."""
+"""No run seeks a path shorter than one that is this many times as long as the straight line to the nearest goal."""
 
 ATTEMPTS = 6
 """Ways that the finer check may refuse; for FCL alone each next one is planned at half the resolution."""
 
 APPROACH_SPEED = 0.5
-"""Share of the joints' speed limits on the way to the patient."""
+"""Fraction of the joints' speed limits on the way to the patient."""
 
 CUT_FRACTION = 0.5
 """A corner is rounded from the middle of its shorter segment on: the farther, the faster."""
@@ -92,7 +92,7 @@ class Approach:
         checked_q: Shape (m, 6), rad: the states that FCL found free, in order; no body moves more than
             ``MAX_SWEEP_MM`` between two of them. For :func:`least_clearance`.
         seed: The seed that gave it.
-        attempts: How many ways were planned.
+        attempts: How many paths were planned.
     """
 
     waypoints: Floats
@@ -108,7 +108,7 @@ class Approach:
             array.setflags(write=False)
 
 
-class _Way(NamedTuple):
+class _Path(NamedTuple):
     """Straight segments from home to a goal."""
 
     waypoints: Floats
@@ -127,10 +127,10 @@ def plan_approach(
     seed: int,
     max_samples: int = MAX_SAMPLES,
 ) -> Approach:
-    """Plan from home to the goal that the shortest way found leads to.
+    """Plan from home to the goal that the shortest path found leads to.
 
     Args:
-        checker: Judges contacts.
+        checker: Checks contacts.
         q_home: Shape (6,), rad, within the joint limits.
         q_goals: Shape (6,) or (g, 6), rad, within the joint limits.
         seed: Of OMPL's generator. Same seed, same motion.
@@ -138,7 +138,7 @@ def plan_approach(
 
     Raises:
         InputError: If home or a goal is not six finite angles within the limits, or the scale makes no sense.
-        NoAnswerError: If home or every goal is in collision, or no way was found; says what touches what, and what was
+        NoAnswerError: If home or every goal is in collision, or no path was found; says what touches what, and what was
             in the way.
     """
     home = _within_limits(checker, q_home, "home")[0]
@@ -146,25 +146,25 @@ def plan_approach(
     open_goals = _free_goals(checker, home, goals)
     refused = ""
     for attempt in range(ATTEMPTS):
-        judge = _judge(checker, RESOLUTION_RAD / 2**attempt)
-        way = _shortest(checker, judge, home, goals[open_goals], seed + RUNS * attempt, max_samples)
-        if isinstance(way, Connected):
-            raise NoAnswerError(_why_none(way, len(goals), len(open_goals), seed) + refused)
-        cuts = _cuts(judge, way.waypoints)
+        contact_of = _segment_check(checker, RESOLUTION_RAD / 2**attempt)
+        path = _shortest(checker, contact_of, home, goals[open_goals], seed + RUNS * attempt, max_samples)
+        if isinstance(path, Connected):
+            raise NoAnswerError(_why_none(path, len(goals), len(open_goals), seed) + refused)
+        cuts = _cuts(contact_of, path.waypoints)
         for rounding in (cuts, np.zeros_like(cuts)) if cuts.any() else (cuts,):
-            trajectory = follow(checker.model, way.waypoints, rounding, speed_scale=APPROACH_SPEED)
+            trajectory = follow(checker.model, path.waypoints, rounding, speed_scale=APPROACH_SPEED)
             checked = dense_states(checker, trajectory.q, RESOLUTION_RAD / FINER)
             contact = first_contact(checker, checked)
             if contact is None:
-                goal = int(open_goals[way.goal_index])
-                return Approach(way.waypoints, rounding, trajectory, goal, checked, seed, attempt + 1)
+                goal = int(open_goals[path.goal_index])
+                return Approach(path.waypoints, rounding, trajectory, goal, checked, seed, attempt + 1)
         assert contact is not None
         refused = f"; before that, on a closer look {contact.body} touched {contact.other} on the way"
-    raise NoAnswerError(f"approach not found: {ATTEMPTS} ways were refused (seed {seed}){refused}")
+    raise NoAnswerError(f"approach not found: {ATTEMPTS} paths were refused (seed {seed}){refused}")
 
 
-def _judge(checker: StateChecker, resolution_rad: float) -> SegmentContact:
-    """Who judges segments: the fast checker's proof, or FCL at samples."""
+def _segment_check(checker: StateChecker, resolution_rad: float) -> SegmentContact:
+    """What checks segments: the fast checker's proof, or FCL at samples."""
     if isinstance(checker, FastChecker):
         return checker.segment_checker()
 
@@ -177,47 +177,47 @@ def _judge(checker: StateChecker, resolution_rad: float) -> SegmentContact:
 
 
 def _shortest(
-    checker: StateChecker, judge: SegmentContact, home: Floats, goals: Floats, seed: int, max_samples: int
-) -> _Way | Connected:
-    """The shortest way found to any goal, or the run that found none.
+    checker: StateChecker, contact_of: SegmentContact, home: Floats, goals: Floats, seed: int, max_samples: int
+) -> _Path | Connected:
+    """The shortest path found to any goal, or the run that found none.
 
-    No way is shorter than the straight line to its goal, so once there is a way, only goals nearer than it is long are
+    No path is shorter than the straight line to its goal, so once there is one, only goals nearer than it is long are
     sought.
     """
     away = np.linalg.norm(goals - home, axis=1)
     nearest_first = np.argsort(away, kind="stable")
-    straight = (goal for goal in nearest_first.tolist() if judge(home, goals[goal]) is None)
+    straight = (goal for goal in nearest_first.tolist() if contact_of(home, goals[goal]) is None)
     goal = next(straight, None)
-    best = None if goal is None else _Way(np.stack([home, goals[goal]]), goal)
+    best = None if goal is None else _Path(np.stack([home, goals[goal]]), goal)
     for run in range(RUNS):
         sought = nearest_first if best is None else nearest_first[away[nearest_first] * SHORT_ENOUGH < best.length]
         if len(sought) == 0:
             break
         found = connect(
-            checker.model.joint_limits, judge, home, goals[sought], seed=seed + run, max_samples=max_samples
+            checker.model.joint_limits, contact_of, home, goals[sought], seed=seed + run, max_samples=max_samples
         )
         if found.waypoints is None:
             return found if best is None else best
         max_samples = min(max_samples, max(LEAST_SAMPLES, PATIENCE * found.samples))
-        way = _Way(found.waypoints, int(sought[found.goal_index]))
-        best = way if best is None or way.length < best.length else best
+        path = _Path(found.waypoints, int(sought[found.goal_index]))
+        best = path if best is None or path.length < best.length else best
     assert best is not None  # the first run has returned without one
     return best
 
 
-def _cuts(judge: SegmentContact, waypoints: Floats) -> Floats:
+def _cuts(contact_of: SegmentContact, waypoints: Floats) -> Floats:
     """How far from each waypoint between the ends its rounding may begin, shape (k - 2,), rad; 0 where none is free."""
     steps = np.diff(waypoints, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     if not lengths.all():
         return np.zeros(len(waypoints) - 2)
     directions, cuts = steps / lengths[:, None], np.zeros(len(waypoints) - 2)
-    share = np.linspace(0.0, 1.0, CURVE_PIECES + 1)
+    fraction = np.linspace(0.0, 1.0, CURVE_PIECES + 1)
     for at in range(len(cuts)):
         cut = CUT_FRACTION * float(lengths[at : at + 2].min())
         for _ in range(HALVINGS):
-            curve = rounded(waypoints[at + 1], directions[at], directions[at + 1], cut, share)
-            if all(judge(start, end) is None for start, end in pairwise(curve)):
+            curve = rounded(waypoints[at + 1], directions[at], directions[at + 1], cut, fraction)
+            if all(contact_of(start, end) is None for start, end in pairwise(curve)):
                 cuts[at] = cut
                 break
             cut /= 2.0
@@ -245,7 +245,7 @@ def _free_goals(checker: StateChecker, home: Floats, goals: Floats) -> NDArray[n
 
 
 def _why_none(found: Connected, n_goals: int, n_free: int, seed: int) -> str:
-    """Why a run found no way, in words: which tree stayed small, and what was in the way."""
+    """Why a run found no path, in words: which tree stayed small, and what was in the way."""
     where = "the goals lie" if found.goal_states <= found.home_states else "home lies"
     trees = f"{found.home_states} states joined home, {found.goal_states} the goals"
     total = sum(found.blocked.values())

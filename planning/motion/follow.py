@@ -75,7 +75,7 @@ class _Round(NamedTuple):
 _Stretch = _Straight | _Round
 
 
-def rounded(corner: Floats, before: Floats, after: Floats, cut: float, share: Floats) -> Floats:
+def rounded(corner: Floats, before: Floats, after: Floats, cut: float, fraction: Floats) -> Floats:
     """The curve past a corner.
 
     Args:
@@ -83,13 +83,13 @@ def rounded(corner: Floats, before: Floats, after: Floats, cut: float, share: Fl
         before: Shape (6,), unit direction of the segment that leads to it.
         after: Shape (6,), unit direction of the one that leads on.
         cut: How far from the corner the curve begins and ends, rad.
-        share: Shape (m,), 0..1: of the time on the curve.
+        fraction: Shape (m,), 0..1: of the time on the curve.
 
     Returns:
         Shape (m, 6), rad.
     """
-    turned = share**3 - share**4 / 2.0  # of f, from 0 to share
-    along, across = -1.0 + 2.0 * (share - turned), 2.0 * turned
+    covered = fraction**3 - fraction**4 / 2.0  # of f, from 0 to the fraction
+    along, across = -1.0 + 2.0 * (fraction - covered), 2.0 * covered
     return np.asarray(corner + cut * (along[:, None] * before + across[:, None] * after))
 
 
@@ -118,31 +118,31 @@ def follow(model: UrModel, waypoints: Floats, cuts: Floats | None = None, *, spe
         cuts = np.zeros(max(0, len(waypoints) - 2))
     if len(waypoints) == 1:
         return Trajectory(np.zeros(1), waypoints)
-    room = _room(waypoints, cuts)
-    return _sampled(waypoints, _runs(model, waypoints, cuts, room, speed_scale))
+    straight = _straight_lengths(waypoints, cuts)
+    return _sampled(waypoints, _runs(model, waypoints, cuts, straight, speed_scale))
 
 
-def _room(waypoints: Floats, cuts: Floats) -> Floats:
+def _straight_lengths(waypoints: Floats, cuts: Floats) -> Floats:
     """What the rounded corners leave of each segment, shape (k - 1,), rad."""
     lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
     fits = cuts.shape == (len(lengths) - 1,) and bool((cuts >= 0.0).all() and (lengths > 0.0).all())
-    room = lengths - np.append(cuts, 0.0) - np.append(0.0, cuts) if fits else lengths
-    if not (fits and (room >= -STANDSTILL_RAD).all()):
+    straight = lengths - np.append(cuts, 0.0) - np.append(0.0, cuts) if fits else lengths
+    if not (fits and (straight >= -STANDSTILL_RAD).all()):
         allowed = "one a corner, two of them no longer than the segment between"
         raise InputError(f"cuts {cuts.tolist()} of {len(lengths)} segments", where="trajectory", allowed=allowed)
-    return np.asarray(room.clip(0.0))
+    return np.asarray(straight.clip(0.0))
 
 
 def _runs(
-    model: UrModel, waypoints: Floats, cuts: Floats, room: Floats, speed_scale: float
+    model: UrModel, waypoints: Floats, cuts: Floats, straight: Floats, speed_scale: float
 ) -> Iterator[list[_Stretch]]:
-    """The ways from stop to stop: straight stretches (``room`` long, one a segment) and rounded corners in turn."""
+    """From stop to stop: straight stretches (``straight`` long, one a segment) and rounded corners in turn."""
     steps = np.diff(waypoints, axis=0)
     directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
     rates = [_segment_rates(model, direction, speed_scale) for direction in directions]
-    speeds = _corner_speeds(model, directions, cuts, room, rates)
+    speeds = _corner_speeds(model, directions, cuts, straight, rates)
     run: list[_Stretch] = []
-    for at, (direction, length) in enumerate(zip(directions, room, strict=True)):
+    for at, (direction, length) in enumerate(zip(directions, straight, strict=True)):
         start = waypoints[at] + (cuts[at - 1] if at else 0.0) * direction
         if length > STANDSTILL_RAD:
             run.append(_Straight(start, direction, time_law(float(length), rates[at], speeds[at], speeds[at + 1])))
@@ -155,12 +155,14 @@ def _runs(
 
 def _segment_rates(model: UrModel, direction: Floats, speed_scale: float) -> Rates:
     """What the joints' limits allow along a unit direction."""
-    share = np.maximum(np.abs(direction), TINY)
+    fraction = np.maximum(np.abs(direction), TINY)
     limits = (speed_scale * model.max_speeds, model.max_acceleration, MAX_JERK)
-    return Rates(*(float((limit / share).min()) for limit in limits))
+    return Rates(*(float((limit / fraction).min()) for limit in limits))
 
 
-def _corner_speeds(model: UrModel, directions: Floats, cuts: Floats, room: Floats, rates: list[Rates]) -> list[float]:
+def _corner_speeds(
+    model: UrModel, directions: Floats, cuts: Floats, straight: Floats, rates: list[Rates]
+) -> list[float]:
     """The speed at each waypoint, 0 at the ends: what the corner allows, and what the segments can change it to."""
     speeds = [0.0]
     for at, cut in enumerate(cuts.tolist()):
@@ -169,10 +171,12 @@ def _corner_speeds(model: UrModel, directions: Floats, cuts: Floats, room: Float
         by_jerk = (MAX_JERK * cut * cut / (1.5 * turn)) ** (1.0 / 3.0)
         speeds.append(min(by_acceleration, by_jerk, rates[at].speed, rates[at + 1].speed))
     speeds.append(0.0)
-    for at in range(len(room)):
-        speeds[at + 1] = min(speeds[at + 1], reachable_speed(speeds[at], speeds[at + 1], float(room[at]), rates[at]))
-    for at in range(len(room) - 1, -1, -1):
-        speeds[at] = min(speeds[at], reachable_speed(speeds[at + 1], speeds[at], float(room[at]), rates[at]))
+    for at in range(len(straight)):
+        speeds[at + 1] = min(
+            speeds[at + 1], reachable_speed(speeds[at], speeds[at + 1], float(straight[at]), rates[at])
+        )
+    for at in range(len(straight) - 1, -1, -1):
+        speeds[at] = min(speeds[at], reachable_speed(speeds[at + 1], speeds[at], float(straight[at]), rates[at]))
     return speeds
 
 
@@ -237,8 +241,8 @@ def drive_smoothly(model: UrModel, q: Floats, depths_mm: Floats, *, max_tip_spee
 def _tip_rates(model: UrModel, spline: CubicSpline, max_tip_speed_mm_s: float) -> Rates:
     """The tip's highest speed, acceleration and jerk for which every joint keeps its limits all along a spline."""
     depths = spline.x
-    share = np.linspace(0.0, 1.0, SPLINE_SAMPLES, endpoint=False)
-    dense = np.append((depths[:-1, None] + np.diff(depths)[:, None] * share).ravel(), depths[-1])
+    fraction = np.linspace(0.0, 1.0, SPLINE_SAMPLES, endpoint=False)
+    dense = np.append((depths[:-1, None] + np.diff(depths)[:, None] * fraction).ravel(), depths[-1])
     slope = np.abs(spline(dense, 1)).max(axis=0)
     bend, twist = (float(np.abs(spline(depths, order)).max()) for order in (2, 3))  # linear and constant between rows
     if not slope.any():

@@ -60,22 +60,22 @@ def dense_states(checker: StateChecker, waypoints: Floats, step_rad: float) -> F
 def _between(waypoints: Floats, counts: NDArray[np.int64]) -> Floats:
     """The waypoints (k, 6) and states between them, each segment in its count of equal steps."""
     segment = np.repeat(np.arange(len(counts)), counts)
-    share = (np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)) / np.repeat(counts, counts)
-    rows = waypoints[segment] + share[:, None] * (waypoints[segment + 1] - waypoints[segment])
+    fraction = (np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)) / np.repeat(counts, counts)
+    rows = waypoints[segment] + fraction[:, None] * (waypoints[segment + 1] - waypoints[segment])
     return np.concatenate([rows, waypoints[-1:]])
 
 
 def first_contact(checker: StateChecker, q_path: Floats) -> Contact | None:
     """The first contact along states (m, 6), the needle being outside the patient; None if all are free."""
-    met = checker.first_contact(q_path, needle_may_touch_patient=False)
-    return None if met is None else met.contact
+    first = checker.first_contact(q_path, needle_may_touch_patient=False)
+    return None if first is None else first.contact
 
 
 def least_clearance(checker: StateChecker, q_path: Floats) -> Distances:
     """The least of each distance over states along a path, to ``CLEARANCE_STEP_MM``.
 
     Args:
-        checker: Judges distances.
+        checker: Measures distances.
         q_path: Shape (m, 6), rad.
     """
     path = _Path(checker, np.asarray(q_path, dtype=np.float64))
@@ -83,7 +83,7 @@ def least_clearance(checker: StateChecker, q_path: Floats) -> Distances:
 
 
 class _Path:
-    """States whose distances are asked for. A body's distance changes by no more than the body moves."""
+    """States whose distances are measured. A body's distance changes by no more than the body moves."""
 
     def __init__(self, checker: StateChecker, q: Floats) -> None:
         self._checker, self._q = checker, q

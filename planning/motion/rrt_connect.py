@@ -1,4 +1,4 @@
-"""RRT-Connect and its shortcuts, by OMPL, over straight joint segments that somebody else judges.
+"""RRT-Connect and its shortcuts, by OMPL, over straight joint segments that somebody else checks.
 
 Source: Kuffner and LaValle 2000, "RRT-Connect: an efficient approach to single-query path planning".
 
@@ -23,7 +23,7 @@ from puncture_twin.planning.collision.checker import Contact
 
 SegmentContact = Callable[[Floats, Floats], Contact | None]
 """What the straight joint segment between two states (6,) meets; None when it is free, its end included. Of a segment
-that begins at a state known to be free the judge is told that state first."""
+that begins at a state known to be free the check gets that state first."""
 
 RANGE_RAD = 0.5
 """Longest branch of the planner's trees."""
@@ -46,9 +46,9 @@ class Connected(NamedTuple):
     """What one run of the planner came to."""
 
     waypoints: Floats | None
-    """Shape (k, 6), rad: from home exactly to a goal exactly; None if it found no way."""
+    """Shape (k, 6), rad: from home exactly to a goal exactly; None if it found no path."""
     goal_index: int
-    """Which goal; -1 without a way."""
+    """Which goal; -1 without a path."""
     home_states: int
     """How many states the tree from home has."""
     goal_states: int
@@ -56,17 +56,17 @@ class Connected(NamedTuple):
     samples: int
     """How many samples it took."""
     blocked: Counter[Contact]
-    """What its segments met, and how often."""
+    """What its segments touched, and how often."""
 
 
 def connect(
-    joint_limits: Floats, judge: SegmentContact, home: Floats, goals: Floats, *, seed: int, max_samples: int
+    joint_limits: Floats, contact_of: SegmentContact, home: Floats, goals: Floats, *, seed: int, max_samples: int
 ) -> Connected:
     """Plan from home to any of several goals, and shorten what was found.
 
     Args:
         joint_limits: Shape (6, 2), rad.
-        judge: Of segments.
+        contact_of: Checks a segment.
         home: Shape (6,), rad, free.
         goals: Shape (g, 6), rad, free.
         seed: Of OMPL's generator.
@@ -78,8 +78,8 @@ def connect(
     with _quiet_ompl():
         ou.RNG.setSeed(1 + seed % SEEDS)
         information = ob.SpaceInformation(_space(joint_limits))
-        validator = _Validator(information, judge, home, goals)
-        information.setStateValidityChecker(_everything)  # a segment is judged with its end
+        validator = _Validator(information, contact_of, home, goals)
+        information.setStateValidityChecker(_everything)  # a segment is checked with its end
         information.setMotionValidator(validator)
         information.setup()
         problem = ob.ProblemDefinition(information)
@@ -105,15 +105,17 @@ def connect(
 
 
 class _Validator(ob.MotionValidator):  # type: ignore[misc]  # compiled, without types
-    """Hands segments to a judge, and counts what they met and how the trees grow.
+    """Hands segments to a check, and counts the contacts and how the trees grow.
 
     A free segment from a state of a tree makes its other end a state of that tree. OMPL asks about a branch of the tree
     from the goals the other way round, toward that tree.
     """
 
-    def __init__(self, information: ob.SpaceInformation, judge: SegmentContact, home: Floats, goals: Floats) -> None:
+    def __init__(
+        self, information: ob.SpaceInformation, contact_of: SegmentContact, home: Floats, goals: Floats
+    ) -> None:
         super().__init__(information)
-        self._judge = judge
+        self._contact_of = contact_of
         self._tree_of = {tuple(goal): GOAL_TREE for goal in goals.tolist()} | {tuple(home.tolist()): HOME_TREE}
         self._grew_at = [0, 0]
         self.samples = 0
@@ -131,7 +133,7 @@ class _Validator(ob.MotionValidator):  # type: ignore[misc]  # compiled, without
         known, new = _angles(start), _angles(end)
         if known not in self._tree_of:
             known, new = (new, known) if new in self._tree_of else (known, new)
-        contact = self._judge(np.array(known), np.array(new))
+        contact = self._contact_of(np.array(known), np.array(new))
         if contact is not None:
             self.blocked[contact] += 1
             return False

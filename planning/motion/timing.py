@@ -1,4 +1,4 @@
-"""How fast along a way: from one speed to another within speed, acceleration and jerk, by ruckig.
+"""How fast along a path: from one speed to another within speed, acceleration and jerk, by ruckig.
 
 Source: Berscheid and Kroeger 2021, "Jerk-limited real-time trajectory generation with arbitrary target states".
 """
@@ -22,7 +22,7 @@ BISECTIONS = 60
 
 
 class Rates(NamedTuple):
-    """The highest speed, acceleration and jerk along a way, per s, s^2 and s^3 of whatever measures its length."""
+    """The highest speed, acceleration and jerk along a path, per s, s^2 and s^3 of whatever measures its length."""
 
     speed: float
     acceleration: float
@@ -30,7 +30,7 @@ class Rates(NamedTuple):
 
 
 class TimeLaw(NamedTuple):
-    """A way run in time."""
+    """A path run in time."""
 
     length: float
     duration_s: float
@@ -45,7 +45,7 @@ class TimeLaw(NamedTuple):
 
 
 def time_law(length: float, rates: Rates, start_speed: float = 0.0, end_speed: float = 0.0) -> TimeLaw:
-    """The fastest way over a length, without acceleration at either end.
+    """The fastest motion over a length, without acceleration at either end.
 
     Args:
         length: Above 0.
@@ -54,7 +54,7 @@ def time_law(length: float, rates: Rates, start_speed: float = 0.0, end_speed: f
         end_speed: The same, and reachable (:func:`reachable_speed`).
 
     Raises:
-        InputError: If ruckig finds no such way.
+        InputError: If ruckig finds no such motion.
     """
     task = InputParameter(1)
     task.current_position, task.current_velocity, task.current_acceleration = [0.0], [start_speed], [0.0]
@@ -62,7 +62,7 @@ def time_law(length: float, rates: Rates, start_speed: float = 0.0, end_speed: f
     task.max_velocity, task.max_acceleration, task.max_jerk = [rates.speed], [rates.acceleration], [rates.jerk]
     profile = Profile(1)
     if Ruckig(1).calculate(task, profile) not in (Result.Working, Result.Finished):
-        what = f"no way over {length:.6g} from speed {start_speed:.6g} to {end_speed:.6g}"
+        what = f"no motion over {length:.6g} from speed {start_speed:.6g} to {end_speed:.6g}"
         raise InputError(what, where="trajectory", allowed=f"within {rates}")
     return TimeLaw(length, profile.duration, profile)
 

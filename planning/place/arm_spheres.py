@@ -1,4 +1,4 @@
-"""The arm as balls, and whether they keep clear of the patient and the room: quick, and about right.
+"""The arm as balls, and whether they keep clear of the patient and the workcell: quick, and about right.
 
 Only for choosing where to look: what a placement is worth says :func:`planning.reach.reach.assess_reach_all`.
 """
@@ -81,35 +81,38 @@ class Surroundings:
     padding_mm: float
 
 
-def clear_branches(spheres: ArmSpheres, room: Surroundings, T_ct_base: Floats, frames: Floats) -> NDArray[np.bool_]:
-    """Which motions keep clear of the room at each of their states; the base is not asked about.
+def clear_branches(
+    spheres: ArmSpheres, surroundings: Surroundings, T_ct_base: Floats, frames: Floats
+) -> NDArray[np.bool_]:
+    """Which motions keep clear of the surroundings at each of their states; the base is not checked.
 
     Args:
         spheres: The arm.
-        room: What it must not meet.
+        surroundings: What it must not touch.
         T_ct_base: Shape (4, 4), mm.
         frames: Shape (k, m, 7, 4, 4), mm, base frame: ``link_poses`` of k motions of m states.
 
     Returns:
         Shape (k,).
     """
-    arm = (spheres.centres, spheres.radii + room.padding_mm, spheres.starts[1:], spheres.frames[1:])
+    arm = (spheres.centres, spheres.radii + surroundings.padding_mm, spheres.starts[1:], spheres.frames[1:])
     clear = np.empty(len(frames), np.bool_)
-    _clear(arm, _compiled(room), np.ascontiguousarray(T_ct_base), frames, clear)
+    _clear(arm, _compiled(surroundings), np.ascontiguousarray(T_ct_base), frames, clear)
     return clear
 
 
-def base_is_clear(spheres: ArmSpheres, room: Surroundings, T_ct_base: Floats) -> bool:
+def base_is_clear(spheres: ArmSpheres, surroundings: Surroundings, T_ct_base: Floats) -> bool:
     """Whether the base itself stands free of the patient and of what stands with him. A True is proven for boxes."""
-    base = (spheres.centres, spheres.radii + room.padding_mm, spheres.starts[:2], spheres.frames[:1])
-    alone = Surroundings(room.skin, room.fixed, Boxes.of([]), room.padding_mm)  # it is bolted to what it carries
+    base = (spheres.centres, spheres.radii + surroundings.padding_mm, spheres.starts[:2], spheres.frames[:1])
+    # the base is bolted to what it carries
+    alone = Surroundings(surroundings.skin, surroundings.fixed, Boxes.of([]), surroundings.padding_mm)
     clear = np.empty(1, np.bool_)
     _clear(base, _compiled(alone), np.ascontiguousarray(T_ct_base), np.tile(np.eye(4), (1, 1, 7, 1, 1)), clear)
     return bool(clear[0])
 
 
-def _compiled(room: Surroundings) -> tuple[tuple[Floats, Floats], ...]:
-    skin, fixed, carried = room.skin, room.fixed, room.carried
+def _compiled(surroundings: Surroundings) -> tuple[tuple[Floats, Floats], ...]:
+    skin, fixed, carried = surroundings.skin, surroundings.fixed, surroundings.carried
     return (
         (skin.origin, skin.values),
         (fixed.T_box_frame, fixed.halves),
@@ -128,7 +131,7 @@ def _moved(T, x, y, z):
 
 @nb.njit(cache=True)
 def skin_distance(origin, values, x, y, z):
-    """Signed distance to the skin, mm, linear between the nodes; beyond the grid at least the way to the grid."""
+    """Signed distance to the skin, mm, linear between the nodes; beyond the grid at least the distance to the grid."""
     u, v, w = (x - origin[0]) / CELL_MM, (y - origin[1]) / CELL_MM, (z - origin[2]) / CELL_MM
     a = min(max(u, 0.0), values.shape[0] - 1.000001)
     b = min(max(v, 0.0), values.shape[1] - 1.000001)
@@ -159,9 +162,9 @@ def _meets_box(boxes, x, y, z, radius):
 
 
 @nb.njit(cache=True)
-def _meets(room, T_ct_base, T_base_body, centre, radius):
+def _touches(surroundings, T_ct_base, T_base_body, centre, radius):
     """Whether one ball meets anything."""
-    skin, fixed, carried = room
+    skin, fixed, carried = surroundings
     x, y, z = _moved(T_base_body, centre[0], centre[1], centre[2])
     if _meets_box(carried, x, y, z, radius):
         return True
@@ -170,34 +173,34 @@ def _meets(room, T_ct_base, T_base_body, centre, radius):
 
 
 @nb.njit(cache=True)
-def _is_clear(arm, room, T_ct_base, frames, met):
-    """One state. First the ball ``met`` (body, ball) that met something last; then the far bodies before the near."""
+def _is_clear(arm, surroundings, T_ct_base, frames, last):
+    """One state. First the ball ``last`` (body, ball) that touched last time; then the far bodies before the near."""
     centres, radii, starts, body_frames = arm
-    body, ball = met
+    body, ball = last
     if ball >= 0:
         T, first = frames[body_frames[body]], starts[body]
-        if _meets(room, T_ct_base, T, centres[ball], radii[ball]) and _meets(
-            room, T_ct_base, T, centres[first], radii[first]
+        if _touches(surroundings, T_ct_base, T, centres[ball], radii[ball]) and _touches(
+            surroundings, T_ct_base, T, centres[first], radii[first]
         ):
             return False
     for body in range(len(body_frames) - 1, -1, -1):
         T = frames[body_frames[body]]
         first = starts[body]
-        if _meets(room, T_ct_base, T, centres[first], radii[first]):
+        if _touches(surroundings, T_ct_base, T, centres[first], radii[first]):
             for ball in range(first + 1, starts[body + 1]):
-                if _meets(room, T_ct_base, T, centres[ball], radii[ball]):
-                    met[0], met[1] = body, ball
+                if _touches(surroundings, T_ct_base, T, centres[ball], radii[ball]):
+                    last[0], last[1] = body, ball
                     return False
     return True
 
 
 @nb.njit(cache=True)
-def _clear(arm, room, T_ct_base, frames, clear):
+def _clear(arm, surroundings, T_ct_base, frames, clear):
     """Fill ``clear`` (k,) for motions ``frames`` (k, m, 7, 4, 4)."""
-    met = np.array([0, -1])
-    for way in range(len(frames)):
-        clear[way] = True
+    last = np.array([0, -1])
+    for branch in range(len(frames)):
+        clear[branch] = True
         for state in range(frames.shape[1] - 1, -1, -1):  # the last is the nearest to the patient
-            if not _is_clear(arm, room, T_ct_base, frames[way, state], met):
-                clear[way] = False
+            if not _is_clear(arm, surroundings, T_ct_base, frames[branch, state], last):
+                clear[branch] = False
                 break

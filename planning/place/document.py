@@ -25,7 +25,7 @@ COLUMNS = (
 
 
 def placement_rows(found: PlaceSearch) -> list[dict[str, Any]]:
-    """One row a judged placement, best first, rank 1; the case's own comes last, without a rank."""
+    """One row a checked placement, best first, rank 1; the case's own comes last, without a rank."""
     rows = [_row(rank, one) for rank, one in enumerate(found.rated, start=1)]
     return rows if found.own is None else [*rows, _row(None, found.own)]
 

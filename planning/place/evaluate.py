@@ -41,8 +41,8 @@ class Verdict:
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
-    """Judges placements. What it holds can be sent to another process.
+class PlacementCheck:
+    """Checks placements. Its values can be sent to another process.
 
     Attributes:
         model: Name of the arm.

@@ -27,7 +27,7 @@ from puncture_twin.planning.place.arm_spheres import Surroundings
 from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.place.directions import wanted_directions
 from puncture_twin.planning.place.estimate import Estimator, ReachEstimate
-from puncture_twin.planning.place.evaluate import Judge, Verdict
+from puncture_twin.planning.place.evaluate import PlacementCheck, Verdict
 from puncture_twin.planning.place.mount_lines import mount_section
 from puncture_twin.planning.place.mounts import Site, regions
 from puncture_twin.planning.place.needle_start import needle_can_start
@@ -50,7 +50,7 @@ HALVINGS = 3
 """The step is halved so often: 150 mm to 19 mm, about what a base is stood to."""
 
 FINALISTS = 6
-"""Sites that are judged exactly; each mount's best is among them."""
+"""Sites that are checked exactly; each mount's best is among them."""
 
 FRACTION_DIGITS = 3
 """Shares that agree to so many digits are equal; then the margin decides."""
@@ -87,8 +87,8 @@ class PlaceSearch:
         coarse: Every site of the first lattice with its estimate.
         refined: How many more were estimated.
         possible: Share of the directions, 0..1, in which the needle itself may stand at standoff; none can hold more.
-        judged: Best first; the case's own placement is not among them.
-        own: The case's own placement, judged; None where it has none.
+        rated: Best first; the case's own placement is not among them.
+        own: The case's own placement, checked; None where it has none.
     """
 
     T_ct_bed: Floats
@@ -115,7 +115,7 @@ def search_placements(
     Args:
         case: The validated case.
         anatomy: Its structures.
-        found: Its directions, judged against the organs alone.
+        found: Its directions, checked against the organs alone.
         placement: Where the case itself has the arm.
         jobs: Processes.
         progress: Called with (stage, done, total).
@@ -128,14 +128,18 @@ def search_placements(
         raise NoAnswerError("no direction is safe for the organs, so no placement can help", counts=found.counts())
     check_gantry(case, anatomy.skin.mesh)
     T_ct_bed = bed_frame(case)
-    judge = _judge(case, anatomy, found)
-    room = Surroundings(SkinField.of(judge.patient), Boxes.of(judge.fixed), Boxes.of(judge.carried), ARM_PADDING_MM)
-    startable = judge.wanted.only(
-        needle_can_start(judge.tool, judge.patient, case.target_ct, judge.wanted, ARM_PADDING_MM)
+    check = _placement_check(case, anatomy, found)
+    surroundings = Surroundings(
+        SkinField.of(check.patient), Boxes.of(check.fixed), Boxes.of(check.carried), ARM_PADDING_MM
+    )
+    startable = check.wanted.only(
+        needle_can_start(check.tool, check.patient, case.target_ct, check.wanted, ARM_PADDING_MM)
     )
     if not len(startable):
         raise NoAnswerError("in every organ-safe direction the needle would start too near the skin")
-    coarse = Estimator(judge.model, judge.tool, room, T_ct_bed, startable.spread(COARSE_DIRECTIONS), itself=False)
+    coarse = Estimator(
+        check.model, check.tool, surroundings, T_ct_bed, startable.spread(COARSE_DIRECTIONS), itself=False
+    )
     fine = replace(coarse, wanted=startable.spread(FINE_DIRECTIONS))
     sites = [
         Site(region, (float(x), float(y), float(z)))
@@ -147,13 +151,13 @@ def search_placements(
     seeds = [site for site, _ in _best_apart(first, 1.5 * case.place.step_mm, SEEDS)]
     refiner = _Refiner(fine, partial(progress, "refining"))
     finalists = _best_apart(refiner.refine(seeds, case.place.step_mm), case.place.step_mm / 2, FINALISTS)
-    rated, own = _judged(case, judge, T_ct_bed, finalists, placement, jobs, partial(progress, "judged"))
+    rated, own = _checked(case, check, T_ct_bed, finalists, placement, jobs, partial(progress, "checked"))
     return PlaceSearch(T_ct_bed, first, refiner.asked, float(startable.weight.sum()), rated, own)
 
 
-def _judged(
+def _checked(
     case: Case,
-    judge: Judge,
+    check: PlacementCheck,
     T_ct_bed: Floats,
     finalists: Sequence[tuple[Site, ReachEstimate]],
     placement: Placement | None,
@@ -165,7 +169,7 @@ def _judged(
     poses = [mount_pose(mount, case.space, case.path) for mount in mounts]
     if placement is not None:  # first: nobody chose it, and the directions that are not held take longest
         poses.insert(0, placement.T_base_ct)
-    verdicts = ask_all(judge.verdict, poses, jobs=jobs, progress=progress)
+    verdicts = ask_all(check.verdict, poses, jobs=jobs, progress=progress)
     own = None
     if placement is not None:
         T_ct_base = np.asarray(np.linalg.inv(placement.T_base_ct), dtype=np.float64)
@@ -175,11 +179,11 @@ def _judged(
     return tuple(rated), own
 
 
-def _judge(case: Case, anatomy: Anatomy, found: Candidates) -> Judge:
-    """The case's room, patient-fixed and arm-fixed apart, and its directions."""
+def _placement_check(case: Case, anatomy: Anatomy, found: Candidates) -> PlacementCheck:
+    """The case's workcell, patient-fixed and arm-fixed apart, and its directions."""
     carried = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"}
     boxes = case_boxes(case, np.eye(4))  # with the two frames in one place each box stands in its own
-    return Judge(
+    return PlacementCheck(
         model=case.robot.model,
         tool=case_tool(case),
         skin=anatomy.skin.mesh,

@@ -36,7 +36,7 @@ def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None
         seed: That the plan must state: the command ``plan`` takes the case's. None where code chose another.
 
     Returns:
-        The candidate of the plan, judged.
+        The candidate of the plan, checked.
 
     Raises:
         InputError: The inputs changed, the direction is not safe any more, or the motion touches something.

@@ -1,4 +1,4 @@
-"""What is asked of the arm for one direction, and what it answers."""
+"""What the arm has to reach for one direction, and whether it does."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from puncture_twin.planning.collision.checker import StateChecker
 from puncture_twin.planning.reach.reach import ReachAnswer, ReachRequest, every_reach
 
 MARGIN_FRACTION = 0.5
-"""A pose whose margin is below this share of the best one's is no goal: a shorter way is not worth a cramped arm."""
+"""A pose with less than this fraction of the best margin is no goal: a shorter path is not worth a cramped arm."""
 
 NEAREST = 4
 """Goals kept of each branch: those nearest to home."""
@@ -33,9 +33,9 @@ def approach_goals(checker: StateChecker, request: ReachRequest, q_home: Floats)
     Raises:
         InputError: See :func:`every_reach`.
     """
-    held = every_reach(checker, request)
-    least = MARGIN_FRACTION * max((answer.margin for answer in held), default=0.0)
-    every = [turned for answer in held for turned in _turned(checker, answer) if turned.margin >= least]
+    reached = every_reach(checker, request)
+    least = MARGIN_FRACTION * max((answer.margin for answer in reached), default=0.0)
+    every = [rotated for answer in reached for rotated in _rotated(checker, answer) if rotated.margin >= least]
     every.sort(key=lambda answer: float(np.linalg.norm(answer.insertion_q[0] - q_home)))
     kept: dict[int, list[ReachAnswer]] = {}
     for answer in every:
@@ -44,7 +44,7 @@ def approach_goals(checker: StateChecker, request: ReachRequest, q_home: Floats)
     return [answer for answer in every if id(answer) in chosen]
 
 
-def _turned(checker: StateChecker, answer: ReachAnswer) -> list[ReachAnswer]:
+def _rotated(checker: StateChecker, answer: ReachAnswer) -> list[ReachAnswer]:
     """An answer with every combination of whole turns that its limits allow; the bodies stand where they stood."""
     motions = [
         answer.insertion_q + (q - answer.insertion_q[0])

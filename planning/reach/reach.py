@@ -1,6 +1,6 @@
-"""Which directions the arm can hold and drive through: standoff pose, straight insertion, nothing touched on the way.
+"""Which directions the arm can reach and insert along: standoff pose, straight insertion, nothing touched on the path.
 
-Retraction is the same motion backwards, so what may be driven in may be driven out.
+Retraction is the same motion backwards, so what may be inserted may be withdrawn.
 """
 
 from __future__ import annotations
@@ -58,17 +58,17 @@ CHUNK = 64
 """Requests between two reports of progress."""
 
 ROLL_BODY = "wrist_3"
-"""The only body that turns with the roll and is not round about the needle: other contacts hold for every roll."""
+"""The only body that turns with the roll and is not round about the needle: other contacts are the same at any roll."""
 
 
-class _Drive(NamedTuple):
+class _Insertion(NamedTuple):
     """A motion from standoff to target on one branch at one roll."""
 
     line: NeedleLine
     branch: int
     roll: float
     turn: Floats
-    """Shape (6,), rad: what to add to the branch's way at roll 0, the roll and whole turns."""
+    """Shape (6,), rad: what to add to the branch's path at roll 0, the roll and whole turns."""
 
     def along(self, model: UrModel, request: ReachRequest, depths_mm: Floats) -> Floats:
         """The motion at some depths, shape (m, 6), rad."""
@@ -76,7 +76,7 @@ class _Drive(NamedTuple):
 
 
 class _Blocked(NamedTuple):
-    """Where a motion ends early, and whether another roll on the same branch would meet the same."""
+    """Where a motion ends early, and whether another roll on the same branch would touch the same."""
 
     depth_mm: float
     detail: str
@@ -94,10 +94,10 @@ class _Tried(NamedTuple):
 
 
 def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswer]:
-    """Every roll and branch that holds the standoff pose and drives straight in, untouched; the best margin first.
+    """Every roll and branch that reaches the standoff pose and inserts straight, untouched; the best margin first.
 
     Args:
-        checker: Judges contacts, in the base frame.
+        checker: Checks contacts, in the base frame.
         request: The direction.
 
     Returns:
@@ -107,8 +107,8 @@ def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswe
         InputError: See :func:`assess_reach_all`.
     """
     surveyed = next(_surveyed(checker, [request], ROLLS))
-    tries = ((drive, _try(checker, request, drive, surveyed.depths)) for drive in surveyed.drives())
-    return [_success(checker.model, drive, tried) for drive, tried in tries if tried.block is None]
+    tries = ((insertion, _try(checker, request, insertion, surveyed.depths)) for insertion in surveyed.insertions())
+    return [_success(checker.model, insertion, tried) for insertion, tried in tries if tried.block is None]
 
 
 def assess_reach_all(
@@ -118,13 +118,13 @@ def assess_reach_all(
     *,
     n_rolls: int = ROLLS,
 ) -> list[ReachAnswer]:
-    """Find, for each direction, a roll and a branch that hold the standoff pose and drive straight in, untouched.
+    """Find, for each direction, a roll and a branch that reach the standoff pose and insert straight, untouched.
 
     All (roll, branch) pairs are ordered by margin; the first that is clear is the answer, so it is the best of them.
     Kinematics comes first, for all requests; then contacts, one by one.
 
     Args:
-        checker: Judges contacts, in the base frame.
+        checker: Checks contacts, in the base frame.
         requests: The directions.
         progress: Called with (answered, to answer).
         n_rolls: How many rolls, evenly over the turn.
@@ -151,9 +151,9 @@ class _Surveyed(NamedTuple):
     margins: Floats
     turns: Floats
 
-    def drives(self) -> Iterator[_Drive]:
-        """The motions that kinematics allows, see :func:`_drives`."""
-        return _drives(self.line, self.margins, self.turns, self.rolls)
+    def insertions(self) -> Iterator[_Insertion]:
+        """The motions that kinematics allows, see :func:`_insertions`."""
+        return _insertions(self.line, self.margins, self.turns, self.rolls)
 
 
 def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> Iterator[_Surveyed]:
@@ -178,7 +178,7 @@ def _answers(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: i
     answers = []
     for found in _surveyed(checker, requests, n_rolls):
         if not np.isnan(found.margins).all():
-            answers.append(_first_clear(checker, found.request, found.depths, found.drives()))
+            answers.append(_first_clear(checker, found.request, found.depths, found.insertions()))
         else:
             answers.append(_why_none(checker.model, found.request, found.line, found.depths, found.stop_at))
     return answers
@@ -192,11 +192,11 @@ def _why_none(
         return _refusal(Reason.UNREACHABLE, None, "every roll and branch leaves the joint limits")
     distances = _distances(request, depths)
     paths = every_branch(model, line, distances)
-    holds = away_from_singularities(model, paths[:, 0])
-    if not holds.any():
+    reached = away_from_singularities(model, paths[:, 0])
+    if not reached.any():
         why = why_unreachable(model, flange_at(line, distances[0]))
         return _refusal(Reason.UNREACHABLE, None, why)
-    stops = [first_stop(model, path, depths) for path in paths[holds]]
+    stops = [first_stop(model, path, depths) for path in paths[reached]]
     deepest = max((stop for stop in stops if stop), key=lambda stop: stop.depth_mm)
     return _refusal(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail)
 
@@ -210,71 +210,77 @@ def _distances(request: ReachRequest, depths_mm: Floats) -> Floats:
     return request.needle_length_mm + request.standoff_mm - depths_mm
 
 
-def _drives(line: NeedleLine, margins: Floats, turns: Floats, rolls: Floats) -> Iterator[_Drive]:
+def _insertions(line: NeedleLine, margins: Floats, turns: Floats, rolls: Floats) -> Iterator[_Insertion]:
     """The motions that kinematics allows, the best margin first; of equals the first branch, then the first roll."""
     branches, rolled = np.nonzero(~np.isnan(margins))
     order = np.argsort(-np.round(margins[branches, rolled], MARGIN_DIGITS), kind="stable")
     for i in order:
         branch, roll = int(branches[i]), int(rolled[i])
-        yield _Drive(line, branch, float(rolls[roll]), turns[branch, roll])
+        yield _Insertion(line, branch, float(rolls[roll]), turns[branch, roll])
 
 
-def _first_clear(checker: StateChecker, request: ReachRequest, depths: Floats, drives: Iterable[_Drive]) -> ReachAnswer:
+def _first_clear(
+    checker: StateChecker, request: ReachRequest, depths: Floats, insertions: Iterable[_Insertion]
+) -> ReachAnswer:
     """The first of several motions that touches nothing; else a refusal with the one that came farthest."""
     blocks: list[_Blocked] = []
     hopeless: set[int] = set()
-    for drive in drives:
-        if drive.branch in hopeless:
+    for insertion in insertions:
+        if insertion.branch in hopeless:
             continue
-        tried = _try(checker, request, drive, depths)
+        tried = _try(checker, request, insertion, depths)
         if tried.block is None:
-            return _success(checker.model, drive, tried)
+            return _success(checker.model, insertion, tried)
         blocks.append(tried.block)
         if tried.block.at_any_roll:
-            hopeless.add(drive.branch)
+            hopeless.add(insertion.branch)
     deepest = max(blocks, key=lambda block: block.depth_mm)  # the first of equals: the best margin
     if deepest.at_standoff:
         return _refusal(Reason.ARM_COLLISION, None, deepest.detail, deepest.contact)
     return _refusal(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail, deepest.contact)
 
 
-def _try(checker: StateChecker, request: ReachRequest, drive: _Drive, depths: Floats) -> _Tried:
+def _try(checker: StateChecker, request: ReachRequest, insertion: _Insertion, depths: Floats) -> _Tried:
     """Check one motion for contacts, standoff first."""
     model = checker.model
-    standoff = drive.along(model, request, depths[:1])
+    standoff = insertion.along(model, request, depths[:1])
     contact = checker.contact(standoff[0], needle_may_touch_patient=False)
     if contact is not None:
         detail = f"{contact.body} touches {contact.other} at standoff"
         block = _Blocked(0.0, detail, ROLL_BODY not in contact, at_standoff=True, contact=contact)
         return _Tried(standoff, depths[:1], block)
-    q, depths = _refined(checker, request, drive, depths)
+    q, depths = _refined(checker, request, insertion, depths)
     stop = first_stop(model, q, depths)
     if stop is not None:
         return _Tried(q, depths, _Blocked(stop.depth_mm, stop.detail))
     if reach_margin(model, q) < 0.0:
         return _Tried(q, depths, _Blocked(0.0, "a joint leaves its limits on the way", at_any_roll=False))
-    met = checker.first_contact(q, needle_may_touch_patient=True)
-    if met is None:
+    first = checker.first_contact(q, needle_may_touch_patient=True)
+    if first is None:
         return _Tried(q, depths, None)
-    depth, contact = float(depths[met.at]), met.contact
+    depth, contact = float(depths[first.at]), first.contact
     detail = f"{contact.body} touches {contact.other} {depth:.1f} mm after the standoff"
     return _Tried(q, depths, _Blocked(depth, detail, ROLL_BODY not in contact, contact=contact))
 
 
-def _refined(checker: StateChecker, request: ReachRequest, drive: _Drive, depths: Floats) -> tuple[Floats, Floats]:
+def _refined(
+    checker: StateChecker, request: ReachRequest, insertion: _Insertion, depths: Floats
+) -> tuple[Floats, Floats]:
     """The motion sampled so that no body moves more than ``MAX_SWEEP_MM`` from sample to sample, and its depths."""
-    q = drive.along(checker.model, request, depths)
+    q = insertion.along(checker.model, request, depths)
     while (worst := checker.sweep_mm(q).max()) > MAX_SWEEP_MM:
         depths = np.linspace(0.0, request.standoff_mm, math.ceil((len(depths) - 1) * worst / MAX_SWEEP_MM) + 1)
-        q = drive.along(checker.model, request, depths)
+        q = insertion.along(checker.model, request, depths)
         if np.isnan(q).any():
             break  # the caller finds where
     return q, depths
 
 
-def _success(model: UrModel, drive: _Drive, tried: _Tried) -> ReachAnswer:
+def _success(model: UrModel, insertion: _Insertion, tried: _Tried) -> ReachAnswer:
     margin = reach_margin(model, tried.q)
-    return ReachAnswer(True, Reason.NONE, None, "", None, drive.roll, drive.branch, tried.q, tried.depths, margin)
+    return ReachAnswer(
+        True, Reason.NONE, None, "", None, insertion.roll, insertion.branch, tried.q, tried.depths, margin
+    )
 
 
 def _refusal(reason: Reason, depth_mm: float | None, detail: str, contact: Contact | None = None) -> ReachAnswer:

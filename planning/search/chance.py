@@ -119,7 +119,7 @@ def check_limits(case: Case, anatomy: Anatomy, model: ChanceModel | None) -> Non
     settings = case.search
     limited = settings.min_hit is not None or settings.max_touch is not None or bool(settings.max_touch_of)
     if limited and model is None:
-        message = "search.min_hit and max_touch cannot be judged: only markers and the arm give the needle's error"
+        message = "search.min_hit and max_touch cannot be checked: only markers and the arm give the needle's error"
         allowed = "[registration] with markers, and a search with the arm; or no such limit"
         raise InputError(message, where=case.path, allowed=allowed)
     names = [anatomy.checked[column].name for column in demanding(anatomy.checked)]

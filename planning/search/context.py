@@ -72,7 +72,7 @@ class CaseContext:
         return f"not checked: {NO_BASE if self.placement is None else 'switched off (--no-arm)'}"
 
     def search(self) -> Candidates:
-        """Judge the case's whole grid."""
+        """Check the case's whole grid."""
         with self.stages.time("search"):
             found = search(
                 self.case,
@@ -86,13 +86,13 @@ class CaseContext:
         return replace(found, arm_note=self.arm)
 
     def check(self, theta: float, beta: float) -> Candidates:
-        """Judge a single direction (rad)."""
+        """Check a single direction (rad)."""
         directions = one_direction(self.case, theta, beta)
         found = search(self.case, self.anatomy, self.engine, directions, reach=self.reach, chance=self.chance)
         return replace(found, arm_note=self.arm)
 
     def explain(self, theta: float, beta: float) -> Explanation:
-        """Judge a single direction (rad), and say what it was judged against and how sure it is."""
+        """Check a single direction (rad), and say what it was checked against and how sure it is."""
         found = self.check(theta, beta)
         return Explanation(self.case, self.anatomy, found, self._doubt(found))
 

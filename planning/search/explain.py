@@ -34,7 +34,7 @@ UNITS = {
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """A judged candidate with what it was judged against.
+    """A checked candidate with what it was checked against.
 
     Attributes:
         candidates: A search's result with this candidate alone.

@@ -210,11 +210,11 @@ def test_a_walled_in_goal_ends_in_a_bounded_number_of_samples(kind: type[CellChe
 def test_a_tree_that_never_grows_ends_the_search_early(shut_in: str) -> None:
     """Nothing leads in or out of a small ball about one end: the other tree grows, and the samples are not used up.
 
-    The judge is told of every segment that begins in a tree that known, free end first.
+    The check gets every segment that begins in a tree that known, free end first.
     """
     ends, known = {"home": LEFT, "goal": RIGHT}, {tuple(LEFT), tuple(RIGHT)}
 
-    def judge(start: np.ndarray, end: np.ndarray) -> Contact | None:
+    def contact_of(start: np.ndarray, end: np.ndarray) -> Contact | None:
         assert tuple(start) in known
         inside = [np.linalg.norm(q - ends[shut_in]) < 0.01 for q in (start, end)]
         if inside[0] != inside[1]:
@@ -222,7 +222,7 @@ def test_a_tree_that_never_grows_ends_the_search_early(shut_in: str) -> None:
         known.add(tuple(end))
         return None
 
-    found = connect(UR3.joint_limits, judge, LEFT, RIGHT[None], seed=1, max_samples=10 * STALLED)
+    found = connect(UR3.joint_limits, contact_of, LEFT, RIGHT[None], seed=1, max_samples=10 * STALLED)
     assert found.waypoints is None and found.samples == STALLED
     shut, open_ = (found.home_states, found.goal_states)[:: 1 if shut_in == "home" else -1]
     assert shut == 1 and open_ > 100 and shut + open_ == len(known)

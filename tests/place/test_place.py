@@ -33,7 +33,7 @@ from puncture_twin.planning.place.arm_spheres import (
 from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.place.directions import WantedDirections, ring_weights
 from puncture_twin.planning.place.estimate import Estimator, insertion_branches
-from puncture_twin.planning.place.evaluate import Judge
+from puncture_twin.planning.place.evaluate import PlacementCheck
 from puncture_twin.planning.place.mount_lines import mount_lines, mount_section
 from puncture_twin.planning.place.mounts import Region, Site, regions
 from puncture_twin.planning.place.needle_start import needle_can_start
@@ -268,12 +268,12 @@ def test_turning_the_base_about_its_own_axis_changes_no_share(ball):
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     wanted = WantedDirections(u, np.full(30, 110.0), np.full(30, 1 / 30))
     skin = ball(80.0, subdivisions=2)
-    judge = Judge("ur3", TOOL, skin, skin, (), (), 5.0, np.zeros(3), wanted, np.zeros(6))
+    check = PlacementCheck("ur3", TOOL, skin, skin, (), (), 5.0, np.zeros(3), wanted, np.zeros(6))
     T = Site(Region("floor", "", (0, 0, 1), ANYWHERE, ANYWHERE), (300.0, 0.0, -250.0)).T_bed_base()
     shares = set()
     for turn in (0.0, 2.5):
         R = trimesh.transformations.rotation_matrix(turn, [0, 0, 1])
-        shares.add(judge.verdict(np.linalg.inv(T @ R)).held)
+        shares.add(check.verdict(np.linalg.inv(T @ R)).held)
     assert len(shares) == 1 and 0 < shares.pop() < 30
 
 

@@ -84,16 +84,16 @@ def ball(folder, *, search="", errors="", base=MARKERS, noise=0.3, organ=None):
 def test_limits_without_the_arm_are_refused(tmp_path):
     """Without a configuration there is no error of the needle, so that no limit can be kept."""
     context = prepare(ball(tmp_path, search=LIMITS), arm=False)
-    with pytest.raises(InputError, match="cannot be judged"):
+    with pytest.raises(InputError, match="cannot be checked"):
         context.search()
-    with pytest.raises(InputError, match="cannot be judged"):
+    with pytest.raises(InputError, match="cannot be checked"):
         context.check(0.35, 0.0)
 
 
 @pytest.mark.parametrize("base", [MOUNT, ""])
 def test_limits_without_markers_are_refused(tmp_path, base):
     """A stated mount has no errors of its own, and no base at all has no arm."""
-    with pytest.raises(InputError, match="cannot be judged"):
+    with pytest.raises(InputError, match="cannot be checked"):
         prepare(ball(tmp_path, search=LIMITS, base=base)).search()
 
 

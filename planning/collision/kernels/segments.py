@@ -1,4 +1,4 @@
-"""Compiled judgement of one straight joint segment: what surely touches, what is surely clear, and what is left to ask.
+"""Compiled check of one straight joint segment: what surely touches, what is surely clear, and what is left to ask.
 
 It calls the kernels of :mod:`puncture_twin.planning.collision.kernels.proofs`, of those that they call and of
 :mod:`puncture_twin.planning.arm.kernels`.
@@ -125,7 +125,7 @@ def _look(scene, way, shares, near, begin, work, answer):
 def _prove(scene, movers, way, at, fine_mm, work, parts, answer):
     """Whether a check surely finds something; else it is clear, or what is left to ask joins the answer.
 
-    The middle of a part clears what lies nearer to it than its gap allows to move; the rest is judged in the same way,
+    The middle of a part clears what lies nearer to it than its gap allows to move; the rest is checked in the same way,
     by the middles of what is left on either side (after Schwarzer, Saha and Latombe 2005, "Adaptive dynamic collision
     checking for single and multiple articulated robots in complex environments").
     """

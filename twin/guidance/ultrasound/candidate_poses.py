@@ -105,7 +105,7 @@ def _lowest_corner(case: SelfcalCase, T_base1_image: Floats) -> Floats:
 
 
 def find_candidates(case: SelfcalCase, room: TwoArms, rng: np.random.Generator) -> CandidatePoses:
-    """Draw, solve, judge.
+    """Draw, solve, check.
 
     Args:
         case: The room.
@@ -126,7 +126,7 @@ def find_candidates(case: SelfcalCase, room: TwoArms, rng: np.random.Generator) 
     ]
     tips = np.einsum("nij,nj->ni", seen.T_base1_image[:, :3, :2], seen.tip_mm) + seen.T_base1_image[:, :3, 3]
     inside = inside_phantom(case.content.phantom, tips)
-    answers = [_judge(room, bool(inside[i]), branches[0][i], branches[1][i]) for i in range(n)]
+    answers = [_checked_pose(room, bool(inside[i]), branches[0][i], branches[1][i]) for i in range(n)]
     taken = np.array([i for i, answer in enumerate(answers) if not isinstance(answer, str)], dtype=np.int64)
     counted = Counter(answer if isinstance(answer, str) else "ok" for answer in answers)
     counts = {reason: counted.get(reason, 0) for reason in ("ok", *REASONS)}
@@ -182,7 +182,7 @@ def configurations(model: UrModel, T_base_flange: Floats, q_home: Floats) -> lis
     return [rows[near][~np.isnan(rows[near, 0])] for rows, near in zip(q, order, strict=True)]
 
 
-def _judge(room: TwoArms, inside: bool, probe: Floats, needle: Floats) -> str | tuple[Floats, Floats]:
+def _checked_pose(room: TwoArms, inside: bool, probe: Floats, needle: Floats) -> str | tuple[Floats, Floats]:
     """The first pair of configurations that stands free, or the reason why none does."""
     if not inside:
         return TIP_OUTSIDE

@@ -17,7 +17,7 @@ def place_text(run: PlaceRun) -> str:
     x, y, z = (direction_words(found.T_ct_bed[:3, axis], str(case.space)) for axis in range(3))
     lines = [
         f"case {case.name}: {asked} organ-safe directions; {len(found.coarse)} + {found.refined} placements estimated,"
-        f" {len(found.rated)} judged",
+        f" {len(found.rated)} checked",
         f"  from the target, mm: along = toward {x}, across = toward {y}, height = toward {z}",
         *needle_line(found.possible),
         "rank  share %   held  margin  along  across  height  mount",

@@ -65,7 +65,7 @@ def draw_map(candidates: Candidates, case: Any, path: Path) -> None:
     """Write the map of a search.
 
     Args:
-        candidates: The grid, judged.
+        candidates: The grid, checked.
         case: The case: ``name``, ``space``, ``T_ct_entry``, ``needle``, ``target_name``.
         path: The PNG to write; it appears whole or not at all.
     """

@@ -189,7 +189,7 @@ def _legend(axes: Axes, figure: Figure, found: PlaceSearch, case: Any, scale: No
         "of the base; its colour the best height's ESTIMATED share\n"
         "of the organ-safe directions that the arm can hold there.\n"
         "Grey: none, or the base would stand in something.\n\n"
-        "* best, o the others that were judged exactly: rank, share,\n"
+        "* best, o the others that were checked exactly: rank, share,\n"
         "height h of the base over the target, mm."
         + ("\nDiamond: where the case has the arm now." if found.own is not None else "")
         + "\n\nSolid line: the patient from above. Dashed: table, gantry,\nother boxes.\n\n"

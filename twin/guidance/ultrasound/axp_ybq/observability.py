@@ -88,7 +88,7 @@ def tips_centre(estimate: Estimate, recording: Recording) -> Floats:
 
 
 def observe(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> Observability:
-    """Judge the poses.
+    """Say what the poses show, and what not.
 
     Args:
         estimate: Where the Jacobian is taken; any solution will do, also one of many.

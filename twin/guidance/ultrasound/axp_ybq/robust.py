@@ -97,18 +97,18 @@ def robust_fit(problem: Problem, start: Estimate) -> RobustFit:
     fit = plain_fit(problem, start)
     if isinstance(problem.noise, Spread):
         problem = problem._replace(noise=_median_spread(problem, fit.estimate))
-    if all(part.all() for part in _judge(problem, fit, alarm=True)):
+    if all(part.all() for part in _agreeing(problem, fit, alarm=True)):
         return fit
     return settled(problem, _reweighted(problem, fit))
 
 
-def settled(problem: Problem, fit: RobustFit, *, judge: bool = True) -> RobustFit:
-    """Fit the poses that were kept, judge all poses by it, and so on until none changes sides.
+def settled(problem: Problem, fit: RobustFit, *, recheck: bool = True) -> RobustFit:
+    """Fit the poses that were kept, check all poses against it, and so on until none changes sides.
 
     Args:
         problem: It may have grown since the fit (directions, another spread).
         fit: Where to begin.
-        judge: Whether poses may change sides at all.
+        recheck: Whether poses may change sides at all.
 
     Raises:
         InputError: More than half of the poses disagree.
@@ -118,7 +118,7 @@ def settled(problem: Problem, fit: RobustFit, *, judge: bool = True) -> RobustFi
         _check_enough(problem, kept[0])
         again = refine(problem, fit.estimate, residual_weights(problem, kept[0], kept[1]))
         fit = RobustFit(again.estimate, *kept, fit.iterations + again.iterations)
-        kept = _judge(problem, fit) if judge else kept
+        kept = _agreeing(problem, fit) if recheck else kept
         if all(np.array_equal(new, old) for new, old in zip(kept, fit[1:3], strict=True)):
             break
     return fit
@@ -149,7 +149,7 @@ def _chi_squared(level: float, freedom: int) -> float:
     return float(2 * gammaincinv(freedom / 2, level))
 
 
-def _judge(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[Bools, Bools]:
+def _agreeing(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[Bools, Bools]:
     """Which tips and which directions agree with the fit, given how far each one pulled it.
 
     Args:

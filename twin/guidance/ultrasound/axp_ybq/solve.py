@@ -127,7 +127,7 @@ def _full_fit(problem: Problem, fit: RobustFit, seen: SeenDirection, *, robust: 
         tips = problem._replace(active=problem.active[problem.active < DIRECTION.start])
         problem = problem._replace(noise=found_spreads(tips, fit).spread._replace(direction_rad=seen.spread_rad))
     for _ in range(SPREAD_ROUNDS):
-        fit = settled(problem, fit, judge=robust)
+        fit = settled(problem, fit, recheck=robust)
         found = found_spreads(problem, fit)
         problem = problem._replace(noise=problem.noise if told else found.spread, lean_rad=found.lean_rad)
     return problem, fit
