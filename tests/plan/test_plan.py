@@ -31,21 +31,24 @@ def carton(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def planned(carton):
+def found(carton):
+    """Its candidates."""
+    return carton.search()
+
+
+@pytest.fixture(scope="module")
+def planned(carton, found):
     """Its plan, and the candidates it was chosen from."""
-    return make_plan(carton, carton.search(), seed=1)
+    return make_plan(carton, found, seed=1)
 
 
-def test_plan_case_and_candidates_show_themselves(carton, planned):
+def test_plan_case_and_candidates_show_themselves(carton, found, planned):
     """As whole HTML with what a person asks first; a name cannot become a tag."""
-    candidates = carton.search()
-    shown = {
-        name: one._repr_html_() for name, one in (("plan", planned.plan), ("case", carton.case), ("all", candidates))
-    }
+    shown = {name: one._repr_html_() for name, one in (("plan", planned.plan), ("case", carton.case), ("all", found))}
     assert "Plan of carton-m" in shown["plan"]
     assert f"θ {np.degrees(planned.plan.theta):g}°" in shown["plan"]
     assert "bolt_m" in shown["case"]
-    assert f"{len(candidates):,} candidates" in shown["all"]
+    assert f"{len(found):,} candidates" in shown["all"]
     assert "<svg" in shown["all"]
     hostile = replace(planned.plan, case_name="<script>")._repr_html_()
     assert "<script>" not in hostile
@@ -368,9 +371,8 @@ def test_a_motion_through_the_patient_is_refused_on_loading(carton, planned):
     assert "approach is not free" in motion_contact(dive, carton.reach.checker)
 
 
-def test_no_safe_candidate_means_no_plan(carton):
+def test_no_safe_candidate_means_no_plan(carton, found):
     """The error carries the counts of each reason."""
-    found = carton.search()
     none = replace(
         found,
         verdict=replace(found.verdict, reason=np.full(len(found), Reason.TOO_CLOSE.value)),
