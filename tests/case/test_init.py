@@ -129,6 +129,7 @@ def write_series(folder, number):
     for one in slices:
         one.SeriesInstanceUID = f"1.2.3.{number}"
     world.write_series(folder, slices)
+    return T
 
 
 def test_a_dicom_series_is_the_ct(tmp_path, capfd):
@@ -149,6 +150,34 @@ def test_a_dicom_series_is_the_ct(tmp_path, capfd):
     code, _, said = init(capfd, tmp_path, "--target", TARGET, "--force", "--ct", names[2])
     assert code == 0, said
     assert f'ct = "{names[2]}"' in (tmp_path / "case.toml").read_text()
+
+
+@pytest.mark.parametrize("kind", ["seg", "rtstruct"])
+def test_structures_in_dicom_are_found(tmp_path, capfd, kind):
+    """On the series that they were drawn on; one file, named by its content."""
+    T = write_series(tmp_path / "dicom", 1)
+    masks = {name: inside(middle, radius).transpose(2, 1, 0) for name, (middle, radius) in ORGANS.items()}
+    if kind == "seg":
+        data = world.segmentation(masks, T, step="4")
+    else:
+        data = world.structure_set({name: contours(middle, radius) for name, (middle, radius) in ORGANS.items()})
+    (tmp_path / "more").mkdir()
+    world.write(data, tmp_path / "more" / "drawn")
+    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+    assert code == 0, said
+    assert f'{kind} = "more/drawn"' in (tmp_path / "case.toml").read_text()
+    assert roles(tmp_path) == EXPECTED
+
+
+def contours(middle, radius):
+    """Circles of a ball on the slices of the CT, LPS mm."""
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    heights = [z for z in AT if abs(z - middle[2]) < radius - 1]
+    wide = [np.sqrt(radius**2 - (z - middle[2]) ** 2) for z in heights]
+    return [
+        np.stack([middle[0] + r * np.cos(angle), middle[1] + r * np.sin(angle), np.full(40, z)], axis=1)
+        for z, r in zip(heights, wide, strict=True)
+    ]
 
 
 def test_a_target_typed_in_ras_is_answered_in_ras(tmp_path, capfd):

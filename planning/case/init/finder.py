@@ -12,6 +12,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import is_folder, is_plain_file
+from puncture_twin.planning.case.init.dicom_masks import dicom_masks
 from puncture_twin.planning.case.init.label_files import Mask, Masks, label_file, mask_of
 from puncture_twin.planning.case.init.mesh_folder import is_mesh, mesh_folder
 from puncture_twin.planning.case.init.segmentation import Place, Segmentation
@@ -29,6 +30,7 @@ AIR_HU = -200
 """A CT of a body shows something less dense than fat: air or lung."""
 MOST_LABELS = 1000
 """A map with more different labels is an image."""
+DRAWN = (Kind.SEGMENTATION, Kind.STRUCTURE_SET)
 POINT_ENDINGS = (".csv", ".mrk.json", ".fcsv")
 MOST_ENTRIES = 5_000
 """Files and folders of a patient's folder; more are a disk, or a DICOM archive."""
@@ -88,6 +90,7 @@ class Found:
         markers: Lists of at least three points.
         problems: What could not be read or told, one line each.
         notes: What is neither.
+        drawn: DICOM files of structures, which are read once the CT is known.
     """
 
     cts: list[Ct] = field(default_factory=list)
@@ -95,6 +98,7 @@ class Found:
     markers: list[Markers] = field(default_factory=list)
     problems: list[InputError] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    drawn: list[tuple[str, Kind]] = field(default_factory=list)
 
 
 def find(place: Place, wanted: Wanted) -> Found:
@@ -110,6 +114,12 @@ def find(place: Place, wanted: Wanted) -> Found:
     found = Found()
     for folder, files in _folders(place.folder, DEPTH):
         _Looker(place, wanted, folder, files, found).look()
+    ct = found.cts[0].surfaces.source if found.cts else None
+    for name, kind in found.drawn:
+        try:
+            found.segmentations.append(dicom_masks(place, name, kind, ct))
+        except InputError as error:
+            found.problems.append(error)
     return found
 
 
@@ -171,7 +181,11 @@ class _Looker:
         except InputError as error:
             self._found.problems.append(error)
             return
-        others = Counter(one.sop_class for one in files if one.kind is not Kind.CT)
+        for one in files:
+            name = (PurePosixPath(self._source) / one.name).as_posix()
+            if one.kind in DRAWN and self._wanted.takes("labels", name):
+                self._found.drawn.append((name, one.kind))
+        others = Counter(one.sop_class for one in files if one.kind not in {Kind.CT, *DRAWN})
         for kind, count in sorted(others.items()):
             self._found.notes.append(f"{self._source}: {count} {kind} left out")
 

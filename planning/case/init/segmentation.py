@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, Protocol
 
@@ -79,14 +78,19 @@ class Place:
         Raises:
             InputError: It cannot be read.
         """
-        read = partial(_content, self.folder)
+        read = self.content
         if is_series(self.folder / name):
             return self._series(name, read)
         content = read(name)
         beside = data_file(content, self.folder / name)
         names = (name,) if beside is None else (name, str(PurePosixPath(name).with_name(beside)))
         hashes = [hashlib.sha256(content).hexdigest(), *(hashlib.sha256(read(one)).hexdigest() for one in names[1:])]
-        return VolumeSurfaces(VolumeFile(self.folder / name, names, read), tuple(hashes), self.cache)
+        source = VolumeFile(self.folder / name, names, read)
+        return VolumeSurfaces(source, (*hashes, *source.part), self.cache)
+
+    def content(self, name: str) -> bytes:
+        """The bytes of a file of the folder."""
+        return read_input(self.folder / name, max_bytes=MAX_FILE_BYTES, where=str(self.folder / name))
 
     def _series(self, name: str, read: Content) -> VolumeSurfaces:
         """A folder with one series, or the series of one file."""
@@ -96,10 +100,6 @@ class Place:
         files = [str(inside / file) for file in chosen.names]
         hashes = tuple(hashlib.sha256(read(file)).hexdigest() for file in files)
         return VolumeSurfaces(parse_series(path, files, read, chosen.notes), hashes, self.cache)
-
-
-def _content(folder: Path, name: str) -> bytes:
-    return read_input(folder / name, max_bytes=MAX_FILE_BYTES, where=str(folder / name))
 
 
 def quoted(text: str) -> str:
