@@ -15,9 +15,11 @@ from puncture_twin.planning.motion.follow import drive_smoothly
 from puncture_twin.planning.plan.motion import motion_contact, phase_clearances
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import INSERTION_MM_S
+from puncture_twin.planning.reach.answer import ReachAnswer
 from puncture_twin.planning.reach.goals import approach_goals
 from puncture_twin.planning.search.arm_reach import reach_request
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.chance import keeps_limits
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
@@ -81,7 +83,7 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
     case, checker = context.case, context.reach.checker
     request = reach_request(case, candidates, row, context.reach.T_base_ct)
     home = home_configuration(case)
-    goals = approach_goals(checker, request, home)
+    goals = _within_limits(context, candidates, row, approach_goals(checker, request, home))
     approach = plan_approach(checker, home, np.array([goal.insertion_q[0] for goal in goals]), seed=seed)
     answer = goals[approach.goal_index]
     error = (
@@ -114,3 +116,21 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
     if touched is not None:
         raise NoAnswerError(touched)
     return replace(plan, clearance_mm={**phase_clearances(plan, checker), **plan.clearance_mm})
+
+
+def _within_limits(
+    context: CaseContext, candidates: Candidates, row: int, goals: list[ReachAnswer]
+) -> list[ReachAnswer]:
+    """Of the configurations, those in which the case's limits of chances are kept: the search asked of one alone.
+
+    Raises:
+        NoAnswerError: None of them.
+    """
+    if context.chance is None or not goals:
+        return goals
+    q = np.array([goal.insertion_q[-1] for goal in goals])
+    outward = np.tile(candidates.outward_ct[row], (len(goals), 1))
+    kept = keeps_limits(context.case, context.anatomy, context.engine, context.chance, outward, q)
+    if not kept.any():
+        raise NoAnswerError("no configuration that an approach may end in keeps search.min_hit and max_touch")
+    return [goal for goal, keeps in zip(goals, kept, strict=True) if keeps]

@@ -306,6 +306,32 @@ def _limited(case: Case, found: Candidates) -> Candidates:
     return replace(found, verdict=found.verdict.rejected(rows, Reason.TOUCH_LIKELY, names, amounts))
 
 
+def keeps_limits(
+    case: Case, anatomy: Anatomy, engine: ClearanceEngine, model: ChanceModel, outward_ct: Floats, q: Floats
+) -> Bools:
+    """Whether needles keep the case's limits of chances, shape (n,), in any configurations that reach the target.
+
+    Args:
+        case: The case.
+        anatomy: Its structures.
+        engine: Prepared for the meshes of ``anatomy.checked``.
+        model: Of the case.
+        outward_ct: Shape (n, 3), unit.
+        q: Shape (n, 6), rad, the tip on the target.
+    """
+    asked, settings = (case, anatomy, engine, model), case.search
+    kept = np.ones(len(q), bool)
+    if settings.min_hit is not None:
+        kept &= model.hit.chance(model.error, model.error.covariance_ct(q)) >= settings.min_hit
+    limits = np.array([touch_limit(case, anatomy.checked[column].name) for column in demanding(anatomy.checked)])
+    if not np.isfinite(limits).any():
+        return kept
+    first = chances_of(*asked, outward_ct, q)
+    wanted = np.broadcast_to(np.isfinite(limits), first["touch"].shape)
+    touch = refined_chances(*asked, (outward_ct, q), (first["touch"], first["margin"]), wanted)["touch"]
+    return np.asarray(kept & (np.where(np.isnan(touch), np.inf, touch) <= limits).all(axis=1))
+
+
 def touch_limit(case: Case, name: str) -> float:
     """The greatest chance to touch a structure that a case allows."""
     allowed = case.search.max_touch_of.get(name, case.search.max_touch)

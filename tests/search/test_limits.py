@@ -10,7 +10,7 @@ from case_world import points_file
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.search import chance
-from puncture_twin.planning.search.chance import _limited
+from puncture_twin.planning.search.chance import _limited, keeps_limits
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.touch import proximity, touch_bound, touch_chance
@@ -124,6 +124,22 @@ def test_a_chance_that_is_not_known_keeps_no_limit(tmp_path):
     ):
         case = replace(context.case, search=replace(settings, **keys))
         assert _limited(case, found).safe.any() == left
+
+
+@pytest.mark.parametrize("limit", ["min_hit", "max_touch"])
+def test_limits_are_kept_in_a_configuration_or_not_as_the_search_says(tmp_path, limit):
+    """Asked of the configurations that the search had, with a limit between their chances."""
+    context = prepare(ball(tmp_path, errors="touch_mm = 3.0\n"))
+    found = context.search()
+    rows = np.flatnonzero(np.isfinite(found.chances.hit))
+    hit, touch = found.chances.hit[rows], found.chances.touch[rows, 0]
+    value = float(np.median(hit)) if limit == "min_hit" else float(np.sort(touch)[-2:].mean())
+    case = replace(context.case, search=replace(context.case.search, **{limit: value}))
+    said = _limited(case, found).safe[rows]
+    q = found.arm.q_insertion[rows]
+    kept = keeps_limits(case, context.anatomy, context.engine, context.chance, found.outward_ct[rows], q)
+    assert said.any() and not said.all()
+    np.testing.assert_array_equal(kept, said)
 
 
 @pytest.mark.parametrize("across", [0, 1])

@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from puncture_twin.planning.export.exporter import Exported
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.explain import needle_warnings, reason_text
 from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
@@ -15,6 +19,9 @@ from puncture_twin.twin.report.page.page import TRUTH_IS_BELIEF
 
 LEAST_SOURCE = 0.005
 """Of the variance: a smaller source is not named to people."""
+
+TELLS = 0.05
+"""Of an expected error: by as much two configurations' differ before people are told."""
 
 LEAST_SHOWN = 5e-5
 """A chance or share below it rounds to nothing in what people read."""
@@ -59,7 +66,19 @@ def _plan(run: Run) -> list[str]:
         f"plan: theta {plan['theta_deg']:g} deg, beta {plan['beta_deg']:g} deg, standoff {plan['standoff_mm']:.1f} mm",
         f"  approach {plan['approach_s']:.1f} s, insertion {plan['insertion_s']:.1f} s",
         "  expected error at the target: " + ("unknown (no markers)" if error is None else f"{error:.2f} mm (rms)"),
+        *_otherwise(run.candidates, run.plan),
     ]
+
+
+def _otherwise(found: Candidates, plan: Plan) -> list[str]:
+    """That the table's row of the plan's direction is of another configuration, where that tells."""
+    row = np.flatnonzero((found.theta == plan.theta) & (found.beta == plan.beta))
+    if found.chances is None or not len(row):
+        return []
+    other = float(np.hypot(found.chances.lateral_mm[row[0]], found.chances.depth_mm[row[0]]))
+    if not abs(other - plan.expected_target_error_mm) > TELLS * plan.expected_target_error_mm:
+        return []
+    return [f"    in the configuration of the table and of check {other:.2f} mm: an approach may end in another one"]
 
 
 def _rehearsal(run: Run) -> list[str]:
