@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case_file import StructuresSection
-from puncture_twin.planning.formats.dicom.choose_series import choose_series, is_series
-from puncture_twin.planning.formats.dicom.ct_series import CtSeries, parse_series
-from puncture_twin.planning.formats.dicom.named_masks import NamedMasks, check_frame_of_reference
-from puncture_twin.planning.formats.dicom.segmentation import parse_segmentation
-from puncture_twin.planning.formats.dicom.structure_set import parse_structure_set
+from puncture_twin.planning.formats.dicom.magic import is_series
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, data_file
 from puncture_twin.planning.formats.volumes.volume_source import VolumeFile, VolumeSource
+
+if TYPE_CHECKING:  # the library behind them is loaded where a case names DICOM
+    from puncture_twin.planning.formats.dicom.ct_series import CtSeries
+    from puncture_twin.planning.formats.dicom.named_masks import NamedMasks
 
 VOLUME_ROLES = ("labelmap", "ct")
 """What a volume is to a case; a file that it needs beside it is its ``data``."""
@@ -31,6 +32,7 @@ class CaseVolumes:
         self._files = files
         self._path = path
         self._sources: dict[str, VolumeSource] = {}
+        self._series: dict[str, CtSeries] = {}
         self._masks: dict[str, NamedMasks] = {}
 
     def read(self, role: str, name: str, *, key: str) -> None:
@@ -46,7 +48,7 @@ class CaseVolumes:
         """
         path = self._path.parent / name
         if role == "ct" and is_series(path):
-            self._sources[name] = self._series(path, name, key)
+            self._sources[name] = self._series[name] = self._read_series(path, name, key)
             return
         content = self._files.read(role, name, max_bytes=MAX_FILE_BYTES, key=key, where=self._path)
         beside = data_file(content, path)
@@ -69,11 +71,15 @@ class CaseVolumes:
         Raises:
             InputError: Structures that cannot be trusted, or that were drawn in other coordinates.
         """
-        name, series = section.seg or section.rtstruct, self._ct_series(section.ct or case_ct)
+        name = section.seg or section.rtstruct
         if name is None:
             return
+        from puncture_twin.planning.formats.dicom.named_masks import check_frame_of_reference
+        from puncture_twin.planning.formats.dicom.segmentation import parse_segmentation
+        from puncture_twin.planning.formats.dicom.structure_set import parse_structure_set
+
+        series, shown = self._series.get(section.ct or case_ct or ""), self._series.get(case_ct or "")
         path = self._path.parent / name
-        shown = self._ct_series(case_ct)
         if series is not None and shown is not None:
             check_frame_of_reference(series.frame_of_reference, shown, series.path)
         if section.rtstruct is None:
@@ -94,12 +100,11 @@ class CaseVolumes:
         """What to tell of the structures of a DICOM file."""
         return self._masks[name].notes if name in self._masks else ()
 
-    def _ct_series(self, name: str | None) -> CtSeries | None:
-        source = None if name is None else self._sources.get(name)
-        return source if isinstance(source, CtSeries) else None
-
-    def _series(self, path: Path, name: str, key: str) -> CtSeries:
+    def _read_series(self, path: Path, name: str, key: str) -> CtSeries:
         """A folder of slices, or the series of one: every slice is a file that decides."""
+        from puncture_twin.planning.formats.dicom.choose_series import choose_series
+        from puncture_twin.planning.formats.dicom.ct_series import parse_series
+
         chosen = choose_series(path)
         folder = PurePosixPath(name) if chosen.folder == path else PurePosixPath(name).parent
         files = [str(folder / file) for file in chosen.names]

@@ -3,13 +3,15 @@
 import hashlib
 import json
 import shutil
+import subprocess
+import sys
 
 import dicom_world as world
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
 from case_world import structure
-from places import REAL_CT, TESTS
+from places import REAL_CT, ROOT, TESTS
 
 from puncture_twin.planning.anatomy.anatomy import load_anatomy
 from puncture_twin.planning.base.errors import InputError
@@ -118,6 +120,16 @@ def test_a_file_of_the_series_names_it(scene):
     write_case(scene, "file", f"series/{sorted(path.name for path in (scene / 'series').iterdir())[5]}")
     file, folder = (load_case(scene / f"{name}.toml").inputs for name in ("file", "dicom"))
     assert [one for one in file if one.role == "ct"] == [one for one in folder if one.role == "ct"]
+
+
+def test_a_case_without_dicom_does_not_load_its_library(scene):
+    """A seventh of a second, and the native decoders that come with it."""
+    code = f"import sys; from {load_case.__module__} import load_case; load_case(sys.argv[1])"
+    code += "; print('pydicom' in sys.modules)"
+    for name in ("nifti", "dicom"):
+        command = [sys.executable, "-c", code, str(scene / f"{name}.toml")]
+        done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT)
+        assert done.stdout.strip() == str(name == "dicom")
 
 
 def test_a_folder_as_a_label_map_is_refused(scene):

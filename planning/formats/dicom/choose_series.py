@@ -8,10 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.files import is_folder, is_plain_file
-from puncture_twin.planning.formats.dicom.recognise import DicomFile, list_folder, recognise
+from puncture_twin.planning.formats.dicom.recognise import DicomFile, list_folder
 from puncture_twin.planning.formats.dicom.storage import Kind
-from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS
 
 SHOWN = 6
 """Series and left-out files that a message lists."""
@@ -32,15 +30,6 @@ class SeriesFiles:
     names: tuple[str, ...]
     series_uid: str
     notes: tuple[str, ...]
-
-
-def is_series(path: Path) -> bool:
-    """Whether a path is to be read as a CT series: a folder, or a DICOM file of any name but a volume's."""
-    if is_folder(path):
-        return True
-    if not is_plain_file(path) or path.name.lower().endswith(NIFTI_ENDINGS + NRRD_ENDINGS):
-        return False
-    return recognise(path) is not None
 
 
 def choose_series(path: Path) -> SeriesFiles:

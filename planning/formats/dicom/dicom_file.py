@@ -17,18 +17,12 @@ from pydicom.uid import UID
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.dicom.encoding_check import whole_length
+from puncture_twin.planning.formats.dicom.magic import META_START, is_dicom
 from puncture_twin.planning.formats.dicom.storage import BIG_ENDIAN, DEFLATED, IMPLICIT
 
-PREAMBLE_BYTES, MAGIC = 128, b"DICM"
-META_START = PREAMBLE_BYTES + len(MAGIC)
 MAX_INFLATED_BYTES = 1 << 26
 """Of one deflated file: two slices of the largest size, or 128 of the usual one; a bomb ends here."""
 ALLOWED = "a complete DICOM file"
-
-
-def is_dicom(start: bytes) -> bool:
-    """Whether a file that begins so is DICOM: ``DICM`` stands behind a preamble of 128 bytes."""
-    return start[PREAMBLE_BYTES:META_START] == MAGIC
 
 
 @contextmanager
