@@ -47,6 +47,9 @@ from puncture_twin.twin.report.scene.scene_picture import draw_scene
 PICTURES = ("map.png", "scene.png", "report.html")
 CERTIFICATE, FILM, ROOMS = "certificate.json", "rehearsal.mp4", "rooms.png"
 
+NO_PLAN = "no plan: "
+"""Before the reason, whoever gives it: the choice, or the planner."""
+
 DEMO_ROOMS = 1000
 """What a stranger sees first is a distribution, where the case declares what it may be off by."""
 
@@ -290,7 +293,7 @@ def _planned(run: Run, out: Path, choice: Choice) -> Run:
             chosen = choose(context, run.candidates, choice)
             plan, found, row = make_plan(context, chosen.candidates, seed=context.case.rehearsal.seed, rows=chosen.rows)
     except NoAnswerError as error:
-        return replace(run, refusal=str(error))
+        return replace(run, refusal=f"{NO_PLAN}{str(error).removeprefix(NO_PLAN)}")
     write_plan(plan, out / "plan.json")
     run = replace(run, plan=plan, pick=Pick(found, row), candidates=found if choice.of_grid else run.candidates)
     return _with(run, out / "plan.json")
