@@ -102,11 +102,29 @@ def test_points_of_no_patient_keep_their_coordinates(tmp_path: Path, space: Spac
 
 
 def test_a_missing_unit_may_be_declared(tmp_path: Path) -> None:
-    """Older Slicer files and plain x,y,z headers have no unit; the caller may then say it."""
-    plain = CSV.replace("_mm", "")
-    for ending, text in ((".csv", plain), (".mrk.json", markups(coordinateUnits=None))):
-        found = read(tmp_path, ending, text, default_unit=Unit.CM)
-        assert found.points == pytest.approx(np.array(POINTS) * 10, abs=1e-12)
+    """A plain x,y,z header has no unit; the caller may then say it."""
+    found = read(tmp_path, ".csv", CSV.replace("_mm", ""), default_unit=Unit.CM)
+    assert found.points == pytest.approx(np.array(POINTS) * 10, abs=1e-12)
+
+
+def test_markups_without_a_unit_are_in_mm_whatever_the_caller_says(tmp_path: Path) -> None:
+    """Version 1.0.0 of the schema knows no unit: Slicer works in mm, and the later versions' default is mm."""
+    found = read(tmp_path, ".mrk.json", markups(coordinateUnits=None), default_unit=Unit.CM)
+    assert found.points.tolist() == POINTS
+
+
+def test_a_line_names_its_two_ends(tmp_path: Path) -> None:
+    """A line as Slicer 5 saves it, in RAS: its ends have the labels of its control points."""
+    ends = [
+        {"id": "1", "label": "skin entry", "associatedNodeID": "", "position": [-1.0, -2.0, 3.0],
+         "orientation": [-1.0, 0, 0, 0, -1.0, 0, 0, 0, 1.0], "selected": True, "positionStatus": "defined"},
+        {"id": "2", "label": "target", "description": "", "position": [4.0, 5.0, 6.0], "positionStatus": "defined"},
+    ]  # fmt: skip
+    measured = [{"name": "length", "enabled": True, "value": 9.1, "units": "mm"}]
+    text = markups(type="Line", coordinateSystem="RAS", points=ends, measurements=measured, labelFormat="%N-%d")
+    found = read(tmp_path, ".mrk.json", text, default_space=Space.LPS)
+    assert found.names == ("skin entry", "target")
+    assert found.points.tolist() == [[1.0, 2.0, 3.0], [-4.0, -5.0, 6.0]]
 
 
 def test_kinds_are_kept(tmp_path: Path) -> None:
@@ -178,7 +196,9 @@ BROKEN: list[tuple[str, str, str | bytes, str]] = [
     ("markups-unknown-space", ".mrk.json", markups(coordinateSystem="IJK"), r"coordinate system 'IJK'"),
     ("markups-space-2", ".mrk.json", markups(coordinateSystem=2), r"coordinate system '2'"),
     ("markups-space-true", ".mrk.json", markups(coordinateSystem=True), r"coordinate system 'True'"),
-    ("markups-no-unit", ".mrk.json", markups(coordinateUnits=None), r"no unit of length"),
+    ("markups-in-um", ".mrk.json", markups(coordinateUnits="um"), r"unit of length 'um'; allowed: mm, cm, m"),
+    ("markups-line-of-one", ".mrk.json", markups(type="Line", points=[{}]), r"a line of 1 control points"),
+    ("markups-line-of-three", ".mrk.json", markups(type="Line", points=[{}] * 3), r"a line of 3 control points"),
     ("markups-unknown-unit", ".mrk.json", markups(coordinateUnits=["[in_i]", "UCUM"]), r"unit of length '\[in_i\]'"),
     ("markups-unit-of-numbers", ".mrk.json", markups(coordinateUnits=3), r"coordinateUnits '3'"),
     ("markups-no-label", ".mrk.json", one_point(label=None), r"control point 1: label 'None'"),

@@ -102,7 +102,7 @@ def parse_points(
     raw = _reader(path, name)(data, name)
     unit = raw.unit or default_unit
     if unit is None:
-        raise InputError("no unit of length", where=name, allowed="x_mm,y_mm,z_mm in the header, or coordinateUnits")
+        raise InputError("no unit of length", where=name, allowed="x_mm,y_mm,z_mm in the header")
     if raw.space is not None and default_space is Space.LOCAL:
         message = f"points in {raw.space}, but the case has a local frame"
         raise InputError(message, where=name, allowed="points in the case's own space, as CSV")

@@ -1,6 +1,7 @@
 """Points of 3D Slicer: markups as JSON (.mrk.json), and the older fiducial lists (.fcsv).
 
-Source: Slicer documentation, "Markups" module, file formats; in older files the coordinate system is a number.
+Source: Slicer documentation, "Markups" module, file formats, and its published schema of versions 1.0.0 to 1.0.3;
+in older files the coordinate system is a number. Version 1.0.0 knows no ``coordinateUnits``: Slicer works in mm.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from puncture_twin.planning.formats.points.raw_points import RawPoints, parse_co
 from puncture_twin.planning.formats.raw_mesh import decode_text, refuse
 from puncture_twin.planning.geometry.spaces import Space, Unit, parse_unit
 
-_MARKUPS_ALLOWED = "one Slicer markup of type Fiducial with labelled, defined control points"
+_MARKUPS_ALLOWED = "one Slicer markup of type Fiducial or Line with labelled, defined control points"
+_LINE_POINTS = 2
 _SPACES = {"LPS": Space.LPS, "RAS": Space.RAS, "0": Space.RAS, "1": Space.LPS}
 _FCSV_ALLOWED = "a Slicer fiducial list with '# CoordinateSystem = ' and '# columns = id,x,y,z,...,label,...'"
 _FCSV_SYSTEM = "# coordinatesystem"
@@ -22,7 +24,9 @@ _FCSV_COLUMNS = "# columns"
 
 
 def read_markups_points(data: bytes, where: str) -> RawPoints:
-    """The control points of a Slicer markups file.
+    """The control points of a Slicer markups file: a list of fiducials, or a line, each by its label.
+
+    Which end of a line is the target no file says: the case names it by its label.
 
     Args:
         data: The whole file.
@@ -36,11 +40,7 @@ def read_markups_points(data: bytes, where: str) -> RawPoints:
     if not isinstance(markups, list) or len(markups) != 1 or not isinstance(markups[0], dict):
         refuse("not exactly one entry in 'markups'", where, _MARKUPS_ALLOWED)
     markup = markups[0]
-    if markup.get("type", "Fiducial") != "Fiducial":
-        refuse(f"markup of type {str(markup['type'])[:40]!r}", where, _MARKUPS_ALLOWED)
-    points = markup.get("controlPoints")
-    if not isinstance(points, list) or not points:
-        refuse("no control point", where, _MARKUPS_ALLOWED)
+    points = _control_points(markup, where)
     places = [f"{where}, control point {number}" for number in range(1, len(points) + 1)]
     return RawPoints(
         names=[_label(point, place) for point, place in zip(points, places, strict=True)],
@@ -48,6 +48,17 @@ def read_markups_points(data: bytes, where: str) -> RawPoints:
         unit=_unit(markup.get("coordinateUnits"), where),
         space=_space(markup.get("coordinateSystem"), where),
     )
+
+
+def _control_points(markup: dict[str, Any], where: str) -> list[Any]:
+    kind, points = markup.get("type", "Fiducial"), markup.get("controlPoints")
+    if kind not in ("Fiducial", "Line"):
+        refuse(f"markup of type {str(kind)[:40]!r}", where, _MARKUPS_ALLOWED)
+    if not isinstance(points, list) or not points:
+        refuse("no control point", where, _MARKUPS_ALLOWED)
+    if kind == "Line" and len(points) != _LINE_POINTS:
+        refuse(f"a line of {len(points)} control points", where, "both ends of a line: 2 control points")
+    return points
 
 
 def read_fcsv_points(data: bytes, where: str) -> RawPoints:
@@ -86,10 +97,10 @@ def _space(value: object, where: str) -> Space:
     return _SPACES[key]
 
 
-def _unit(value: object, where: str) -> Unit | None:
-    """From "mm", or a coded entry such as ["mm", "UCUM", "millimeter"]; None if there is none."""
+def _unit(value: object, where: str) -> Unit:
+    """From "mm", or a coded entry such as ["mm", "UCUM", "millimeter"]; mm, the schema's default, if there is none."""
     if value is None:
-        return None
+        return Unit.MM
     text = value[0] if isinstance(value, list) and value else value
     if not isinstance(text, str):
         refuse(f"coordinateUnits {str(value)[:40]!r}", where, 'such as "mm" or ["mm", "UCUM", "millimeter"]')
