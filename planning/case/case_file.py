@@ -182,7 +182,7 @@ Patterns = Annotated[tuple[Text, ...], Field(max_length=MAX_STRUCTURES)]
 
 
 class StructuresSection(Section):
-    """Many structures of one label map, a folder of masks or a DICOM SEG or RTSTRUCT, by name pattern."""
+    """Many structures of one label map, a folder of masks, a SEG (DICOM or Slicer) or RTSTRUCT, by name pattern."""
 
     labelmap: str | None = None
     masks: str | None = None
@@ -201,10 +201,12 @@ class StructuresSection(Section):
         if len(sources) != 1:
             raise ValueError(
                 "needs either labelmap (a file) or masks (a folder with one file a structure), not both; "
-                f"or seg, or rtstruct (DICOM files); it has {' and '.join(sources) or 'none'}"
+                f"or seg (DICOM, or Slicer's .seg.nrrd), or rtstruct; it has {' and '.join(sources) or 'none'}"
             )
         if self.labelmap is None and self.naming is not None:
-            raise ValueError("naming belongs to labelmap; masks are named after their files, DICOM states its names")
+            raise ValueError(
+                "naming belongs to labelmap; masks are named after their files, SEG and RTSTRUCT state their names"
+            )
         if self.ct is not None and self.seg is None and self.rtstruct is None:
             raise ValueError("ct belongs to seg and rtstruct: the DICOM series on which they were drawn")
         return self

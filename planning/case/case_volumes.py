@@ -9,6 +9,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case_file import StructuresSection
 from puncture_twin.planning.formats.dicom.magic import is_series
+from puncture_twin.planning.formats.labels.slicer_segments import SEGMENT_ENDING, parse_segments
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, data_file
 from puncture_twin.planning.formats.volumes.volume_source import VolumeFile, VolumeSource
 
@@ -62,7 +63,9 @@ class CaseVolumes:
         return self._sources[name]
 
     def read_masks(self, section: StructuresSection, case_ct: str | None) -> None:
-        """The structures of a DICOM SEG or RTSTRUCT whose file has been read, and its CT; other sections have none.
+        """The structures of a SEG (DICOM, or Slicer's .seg.nrrd) or RTSTRUCT whose file has been read, and its CT.
+
+        Other sections have none.
 
         Args:
             section: Names the file, and the CT series on which it was drawn where that is not the case's.
@@ -73,6 +76,9 @@ class CaseVolumes:
         """
         name = section.seg or section.rtstruct
         if name is None:
+            return
+        if section.seg is not None and name.lower().endswith(SEGMENT_ENDING):
+            self._add_masks(name, parse_segments(self._path.parent / name, name, self._files.content))
             return
         from puncture_twin.planning.formats.dicom.named_masks import check_frame_of_reference
         from puncture_twin.planning.formats.dicom.segmentation import parse_segmentation
@@ -89,15 +95,18 @@ class CaseVolumes:
             raise InputError(what, where=self._path, allowed='ct = "FOLDER" beside it, or as the CT of the case')
         else:
             found = parse_structure_set(path, name, self._files.content, series)
+        self._add_masks(name, found)
+
+    def _add_masks(self, name: str, found: NamedMasks) -> None:
         self._masks[name] = found
         self._sources |= {_key(name, called): mask for called, mask in found.masks.items()}
 
     def masks(self, name: str) -> dict[str, str]:
-        """The structures of a DICOM file: each one's name to that of its volume; none of another file."""
+        """The structures of such a file: each one's name to that of its volume; none of another file."""
         return {called: _key(name, called) for called in self._masks[name].masks} if name in self._masks else {}
 
     def mask_notes(self, name: str) -> tuple[str, ...]:
-        """What to tell of the structures of a DICOM file."""
+        """What to tell of the structures of such a file."""
         return self._masks[name].notes if name in self._masks else ()
 
     def _read_series(self, path: Path, name: str, key: str) -> CtSeries:

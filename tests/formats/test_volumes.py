@@ -19,6 +19,7 @@ from puncture_twin.planning.formats.volumes.nifti_header import TYPES
 from puncture_twin.planning.formats.volumes.nrrd_header import TYPES as NRRD_TYPES
 from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
+from puncture_twin.planning.formats.volumes.volume_source import VolumeFile
 
 SHAPE = (4, 5, 6)
 VALUES = np.arange(120, dtype="<i2").reshape(SHAPE)
@@ -341,6 +342,7 @@ BAD_NIFTI: dict[str, tuple[str, bytes, str]] = {
 }
 SIZED = ("sizes", "sizes: 30000 30000 30000")
 FOUR_D = (("dimension", "dimension: 4"), ("sizes", "sizes: 2 4 5 3"))
+UNNAMED = nrrd_bytes(("space:", "space dimension: 3"))
 BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
     "empty": ("a.nrrd", b"", "file of 0 bytes"),
     "garbage": ("a.nrrd", b"\xff\xfe" * 600, "no NRRD header"),
@@ -368,6 +370,8 @@ BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
     "a pattern of files": ("a.nhdr", nrrd_bytes(("data", "data file: a%d.raw 1 6 1"), data=b""), "data file"),
     "an attached file that points": ("a.nrrd", nrrd_bytes(("data", "Data File: /etc/passwd")), "data file"),
     "layers of segments": ("a.seg.nrrd", nrrd_bytes(*FOUR_D), "overlap"),
+    "two spaces": ("a.nrrd", nrrd_bytes(("x", "space dimension: 3")), "both space and space dimension"),
+    "a plane": ("a.nrrd", nrrd_bytes(("space:", "space dimension: 2")), "space dimension '2'"),
     "no space": ("a.nrrd", nrrd_bytes(("space:", None)), "no field 'space'"),
     "scanner space": ("a.nrrd", nrrd_bytes(("space:", "space: scanner-xyz")), "not patient space"),
     "no origin": ("a.nrrd", nrrd_bytes(("space origin", None)), "no field 'spaceorigin'"),
@@ -458,3 +462,14 @@ def test_whatever_the_bytes_only_input_errors_come_out(
     assert np.isfinite(volume.T_ct_index).all()
     assert np.isfinite(volume.values).all()
     assert min(volume.values.shape) >= 2
+
+
+def test_axes_without_a_named_space_are_lps_as_to_itk_and_that_is_told(tmp_path: Path) -> None:
+    """``space dimension: 3`` counts the axes of a space that it does not name."""
+    path = write(tmp_path, "a.nrrd", UNNAMED)
+    image = sitk.ReadImage(str(path))
+    volume = read_volume(path)
+    assert volume.T_ct_index[:3, 3] == pytest.approx(image.GetOrigin())
+    assert volume.T_ct_index[:3] @ [1, 2, 3, 1] == pytest.approx(image.TransformIndexToPhysicalPoint((1, 2, 3)))
+    source = VolumeFile(path, ("a.nrrd",), lambda name: (tmp_path / name).read_bytes())
+    assert source.notes == ("a.nrrd: its header names no patient space; read as LPS, as ITK and Slicer do",)

@@ -1,18 +1,21 @@
-"""Structures of one DICOM file, which may overlap: a mask each, made one at a time on the grid that all share."""
+"""Structures of one file, which may overlap: a mask each, made one at a time on the grid that all share."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.dicom.ct_series import CtSeries
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
+
+if TYPE_CHECKING:  # Slicer's segmentations need no DICOM library
+    from puncture_twin.planning.formats.dicom.ct_series import CtSeries
 
 Mask = NDArray[np.uint8]
 

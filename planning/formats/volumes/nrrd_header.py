@@ -1,13 +1,12 @@
 """NRRD headers, checked before any voxel is looked at.
 
-Layout and meaning of the fields: "Definition of NRRD File Format" (Teem project). A NRRD header may name any
-file of the machine as its data; here it may only name one beside it.
+Layout and meaning of the fields: "Definition of NRRD File Format" (Teem project).
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,43 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.files import is_plain_file
+from puncture_twin.planning.formats.volumes.nrrd_text import NrrdText, split_header, stated_field, whole_number
 from puncture_twin.planning.formats.volumes.volume_header import VolumeHeader, VoxelLayout, check_affine, check_shape
 
-MAX_HEADER_BYTES = 4_000_000
-"""A .seg.nrrd with a thousand segments stays below 1 MB."""
-KNOWN_FIELDS = frozenset(
-    (
-        "type",
-        "dimension",
-        "space",
-        "sizes",
-        "spacedirections",
-        "spaceorigin",
-        "spaceunits",
-        "kinds",
-        "endian",
-        "encoding",
-        "datafile",
-        "centers",
-        "centerings",
-        "content",
-        "measurementframe",
-        "byteskip",
-        "lineskip",
-        "thicknesses",
-        "units",
-        "labels",
-        "min",
-        "max",
-        "oldmin",
-        "oldmax",
-        "number",
-        "axismins",
-        "axismaxs",
-        "sampleunits",
-    )
-)
 LPS_SIGNS = {
     "left-posterior-superior": (1.0, 1.0, 1.0),
     "lps": (1.0, 1.0, 1.0),
@@ -79,18 +44,15 @@ AXIS_KINDS = frozenset(("domain", "space", "time", "none", "???"))
 VECTOR = re.compile(r"\(([^()]*)\)")
 
 
-@dataclass(frozen=True)
-class _Raw:
-    """The header as text, and where the data lie."""
-
-    fields: dict[str, str]
-    remarks: dict[str, str]
-    data_path: Path
-    data_offset: int
+LAYER_KINDS = frozenset(("list", "vector"))
+"""What Slicer calls the axis of its layers: "list"; older versions "vector"."""
+MAX_LAYERS = 1000
+"""A layer more is needed only where another segment overlaps all the layers before."""
+UNNAMED_SPACE = "its header names no patient space; read as LPS, as ITK and Slicer do"
 
 
 def parse_nrrd_header(content: bytes, path: Path) -> VolumeHeader:
-    """What the header of a file says.
+    """What the header of a volume in three dimensions says.
 
     Args:
         content: The file that holds the header.
@@ -100,17 +62,74 @@ def parse_nrrd_header(content: bytes, path: Path) -> VolumeHeader:
         InputError: A damaged header, an unknown field, a space that is not patient space, or data elsewhere than in
             the file or beside it.
     """
-    raw = _split(content[:MAX_HEADER_BYTES], path)
+    raw = split_header(content, path)
+    if raw.fields.get("dimension") != "3":
+        raise _wrong_dimension(raw.fields, path)
+    return _header(raw, path)
+
+
+def parse_layered_header(content: bytes, path: Path) -> VolumeHeader:
+    """What the header of a segmentation says whose segments may overlap: one volume, or several as layers.
+
+    Layers are the first axis, which runs fastest in the file (Slicer, "Segmentations", file format).
+
+    Args:
+        content: The file that holds the header.
+        path: Its name.
+
+    Raises:
+        InputError: As `parse_nrrd_header`; a first axis of four that is none of layers.
+    """
+    raw = split_header(content, path)
+    return _header(_without_layers(raw, path), path, _layers(raw, path))
+
+
+def _wrong_dimension(fields: dict[str, str], path: Path) -> InputError:
+    stated = fields.get("dimension")
+    if stated == "4":
+        what = 'dimension 4: segments that overlap lie in layers; name such a file in [[structures]] seg = "FILE"'
+        return InputError(what, where=path, allowed="dimension: 3, or a .seg.nrrd as seg")
+    return InputError(f"dimension {stated}", where=path, allowed="dimension: 3")
+
+
+def _header(raw: NrrdText, path: Path, layers: int = 1) -> VolumeHeader:
     fields = raw.fields
-    if fields.get("dimension") != "3":
-        layers = " (segments that overlap are stored in layers: export them as separate label maps)"
-        what = f"dimension {fields.get('dimension')}{layers if fields.get('dimension') == '4' else ''}"
-        raise InputError(what, where=path, allowed="dimension: 3")
-    shape = check_shape(tuple(_whole(text, path) for text in _need(fields, "sizes", path).split()), where=path)
+    shape = check_shape(
+        tuple(whole_number(text, path) for text in stated_field(fields, "sizes", path).split()), where=path
+    )
     _check_units(fields, path)
     _check_axes(fields, path)
     T_ct_index = check_affine(_affine(fields, path), where=path)
-    return VolumeHeader(shape, T_ct_index, raw.remarks, _cells(raw, path), raw.data_path)
+    notes = () if "space" in fields else (f"{path.name}: {UNNAMED_SPACE}",)
+    return VolumeHeader(shape, T_ct_index, raw.remarks, _cells(raw, path), raw.data_path, layers, notes)
+
+
+def _layers(raw: NrrdText, path: Path) -> int:
+    if raw.fields.get("dimension") != "4":
+        return 1
+    sizes, kinds = raw.fields.get("sizes", "").split(), raw.fields.get("kinds", "").lower().split()
+    directions = raw.fields.get("spacedirections", "")
+    if not (kinds and kinds[0] in LAYER_KINDS and sizes and directions.startswith("none")):
+        what = "dimension 4 whose first axis is none of layers"
+        raise InputError(what, where=path, allowed="kinds: list domain domain domain, space directions: none (...)")
+    layers = whole_number(sizes[0], path)
+    if not 1 <= layers <= MAX_LAYERS:
+        raise InputError(f"{layers} layers", where=path, allowed=f"1 to {MAX_LAYERS}")
+    return layers
+
+
+def _without_layers(raw: NrrdText, path: Path) -> NrrdText:
+    """The header of one layer: its axes are the last three."""
+    if raw.fields.get("dimension") != "4":
+        if raw.fields.get("dimension") != "3":
+            raise _wrong_dimension(raw.fields, path)
+        return raw
+    fields = dict(raw.fields)
+    for key in ("sizes", "spacedirections", "kinds"):
+        fields[key] = stated_field(fields, key, path).partition(" ")[2].strip()
+    for key in ("spaceunits", "units"):
+        fields[key] = fields.get(key, "").replace('""', "").replace("???", "").strip()
+    return replace(raw, fields={key: value for key, value in fields.items() if value})
 
 
 def data_file(content: bytes, path: Path) -> str | None:
@@ -123,73 +142,8 @@ def data_file(content: bytes, path: Path) -> str | None:
     Raises:
         InputError: A damaged header, or data elsewhere than in the file or beside it.
     """
-    raw = _split(content[:MAX_HEADER_BYTES], path)
+    raw = split_header(content, path)
     return None if raw.data_path == path else raw.data_path.name
-
-
-def _split(head: bytes, path: Path) -> _Raw:
-    if re.match(rb"NRRD000[1-5]\r?\n", head) is None:
-        raise InputError("no NRRD header (magic NRRD0001 to NRRD0005)", where=path, allowed="a .nrrd or .nhdr file")
-    end = re.search(rb"\n\r?\n", head)
-    if end is None and len(head) == MAX_HEADER_BYTES:
-        raise InputError("the header has no end", where=path, allowed=f"at most {MAX_HEADER_BYTES} bytes")
-    try:
-        lines = head[: end.start() if end else None].decode("utf-8").split("\n")[1:]
-    except UnicodeDecodeError as error:
-        raise InputError(f"the header is not text ({error})", where=path, allowed="UTF-8") from error
-    fields, remarks = _lines(lines, path)
-    if "datafile" in fields:
-        return _Raw(fields, remarks, _beside(fields["datafile"], path), 0)
-    if end is None:
-        raise InputError("the file ends inside the header", where=path, allowed="a complete file")
-    return _Raw(fields, remarks, path, end.end())
-
-
-def _lines(lines: list[str], path: Path) -> tuple[dict[str, str], dict[str, str]]:
-    fields: dict[str, str] = {}
-    remarks: dict[str, str] = {}
-    for number, line in enumerate((text.rstrip("\r") for text in lines), start=2):
-        where = f"{path}, line {number}"
-        if line.startswith("#") or not line:
-            continue
-        field, mark, value = re.match(r"([^:]*)(:=|: |:|$)(.*)", line, re.DOTALL).groups()  # type: ignore[union-attr] # matches every line
-        if mark == ":=":
-            remarks[field.strip()] = value.strip()
-            continue
-        key = field.lower().replace(" ", "")
-        if not mark or key not in KNOWN_FIELDS:
-            raise InputError(f"unknown header line {line[:60]!r}", where=where, allowed=", ".join(sorted(KNOWN_FIELDS)))
-        if key in fields:
-            raise InputError(f"the field {field!r} stands twice", where=where, allowed="each field once")
-        fields[key] = value.strip()
-    return fields, remarks
-
-
-def _need(fields: dict[str, str], key: str, path: Path) -> str:
-    if not fields.get(key):
-        raise InputError(f"the header has no field {key!r}", where=path, allowed="a complete NRRD header")
-    return fields[key]
-
-
-def _whole(text: str, path: Path) -> int:
-    if not (text.isascii() and text.isdigit() and len(text) < 19):
-        raise InputError(f"size {text[:30]!r}", where=path, allowed="positive whole numbers")
-    return int(text)
-
-
-def _beside(name: str, path: Path) -> Path:
-    """The data file of a detached header: a plain name in the same folder, or nothing."""
-    allowed = "the name of one file in the same folder"
-    if not name or re.search(r"[/\\%\s\0]", name) or name in (".", "..") or name.upper().startswith("LIST"):
-        raise InputError(f"data file {name[:80]!r}", where=path, allowed=allowed)
-    data_path = path.parent / name
-    if not is_plain_file(data_path):
-        raise InputError(f"data file {name!r} does not exist", where=path, allowed=allowed)
-    if data_path.resolve().parent != path.parent.resolve():
-        raise InputError(f"data file {name!r} is a link to another folder", where=path, allowed=allowed)
-    if data_path.resolve() == path.resolve():
-        raise InputError("the data file is the header itself", where=path, allowed=allowed)
-    return data_path
 
 
 def _check_units(fields: dict[str, str], path: Path) -> None:
@@ -200,17 +154,28 @@ def _check_units(fields: dict[str, str], path: Path) -> None:
 
 
 def _affine(fields: dict[str, str], path: Path) -> NDArray[np.float64]:
-    space = _need(fields, "space", path).lower()
+    space = _space(fields, path)
     if space not in LPS_SIGNS:
         allowed = "left-posterior-superior, right-anterior-superior, left-anterior-superior"
         raise InputError(f"space {space!r} is not patient space", where=path, allowed=allowed)
-    directions = _vectors(_need(fields, "spacedirections", path), 3, path)
-    origin = _vectors(_need(fields, "spaceorigin", path), 1, path)
+    directions = _vectors(stated_field(fields, "spacedirections", path), 3, path)
+    origin = _vectors(stated_field(fields, "spaceorigin", path), 1, path)
     T = np.eye(4)
     T[:3, :3] = directions.T
     T[:3, 3] = origin[0]
     T[:3] *= np.array(LPS_SIGNS[space])[:, None]
     return T
+
+
+def _space(fields: dict[str, str], path: Path) -> str:
+    """The space that is stated; a header that counts its axes instead (``space dimension``) is LPS, as to ITK."""
+    if "spacedimension" not in fields:
+        return stated_field(fields, "space", path).lower()
+    if "space" in fields:
+        raise InputError("both space and space dimension", where=path, allowed="one of the two")
+    if fields["spacedimension"] != "3":
+        raise InputError(f"space dimension {fields['spacedimension'][:20]!r}", where=path, allowed="3")
+    return "lps"
 
 
 def _vectors(text: str, count: int, path: Path) -> NDArray[np.float64]:
@@ -237,11 +202,11 @@ def _check_axes(fields: dict[str, str], path: Path) -> None:
             raise InputError(f"{key} beside a space", where=path, allowed="space origin and space directions alone")
 
 
-def _cells(raw: _Raw, path: Path) -> VoxelLayout:
+def _cells(raw: NrrdText, path: Path) -> VoxelLayout:
     for key in ("byteskip", "lineskip"):
         if raw.fields.get(key, "0") != "0":
             raise InputError(f"{key} {raw.fields[key]!r}", where=path, allowed="0")
-    stated = _need(raw.fields, "encoding", path).lower()
+    stated = stated_field(raw.fields, "encoding", path).lower()
     encoding = "gzip" if stated in GZIP else "ascii" if stated in ASCII else stated
     if encoding not in {"raw", "gzip", "ascii"}:
         raise InputError(f"encoding {stated!r}", where=path, allowed="raw, gzip, ascii")
@@ -249,7 +214,7 @@ def _cells(raw: _Raw, path: Path) -> VoxelLayout:
 
 
 def _dtype(fields: dict[str, str], encoding: str, path: Path) -> np.dtype[Any]:
-    name = TYPES.get(_need(fields, "type", path).lower())
+    name = TYPES.get(stated_field(fields, "type", path).lower())
     if name is None:
         raise InputError(f"type {fields['type']!r}", where=path, allowed="an integer type, float or double")
     dtype = np.dtype(name)

@@ -76,10 +76,14 @@ class VolumeHeader(VolumeGrid):
     Attributes:
         cells: How the voxels are stored.
         data_path: The file that holds them: the header's own, or one beside it.
+        layers: How many values each voxel has, one for each layer of segments that overlap.
+        notes: What a person should be told of how it was read, one sentence each.
     """
 
     cells: VoxelLayout
     data_path: Path
+    layers: int = 1
+    notes: tuple[str, ...] = ()
 
 
 def check_shape(shape: tuple[int, ...], *, where: Path) -> tuple[int, int, int]:

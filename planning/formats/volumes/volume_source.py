@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from puncture_twin.planning.formats.volumes.volume_files import Volume, parse_header, parse_volume
-from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, VolumeHeader
 
 Content = Callable[[str], bytes]
 """The bytes of a file by its name: those that were hashed, each time."""
@@ -55,12 +55,16 @@ class VolumeFile:
     files: tuple[str, ...]
     content: Content
     part: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
 
     @cached_property
-    def grid(self) -> VolumeGrid:
+    def grid(self) -> VolumeHeader:
         """Where the voxels lie, LPS mm, as the checked header states it."""
         return parse_header(self.content(self.files[0]), self.path)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a person should be told of how the header was read."""
+        return self.grid.notes
 
     def volume(self) -> Volume:
         """The volume with its voxels."""

@@ -29,22 +29,23 @@ def decoded(content: memoryview, header: VolumeHeader) -> NDArray[Any]:
         header: What the header says of them.
 
     Returns:
-        Shape (ni, nj, nk), axis i running fastest in memory.
+        Shape (ni, nj, nk), axis i running fastest in memory; (layers, ni, nj, nk) where there are several layers.
 
     Raises:
         InputError: The data are damaged, or shorter or longer than the header says.
     """
     cells, where = header.cells, header.data_path
-    data = content[cells.start :]
+    data, count = content[cells.start :], header.count * header.layers
     if cells.encoding == "ascii":
-        flat = _numbers(bytes(data), header.count, cells.dtype, where)
+        flat = _numbers(bytes(data), count, cells.dtype, where)
     else:
-        promised = cells.offset + header.count * cells.dtype.itemsize
+        promised = cells.offset + count * cells.dtype.itemsize
         if cells.encoding == "raw":
             check_exact_size(len(data), promised, where=where)
         whole = data if cells.encoding == "raw" else inflated(data, promised, where=where)
-        flat = np.frombuffer(whole, cells.dtype, header.count, cells.offset)
-    return flat.astype(cells.dtype.newbyteorder("="), copy=False).reshape(header.shape, order="F")
+        flat = np.frombuffer(whole, cells.dtype, count, cells.offset)
+    shape = header.shape if header.layers == 1 else (header.layers, *header.shape)
+    return flat.astype(cells.dtype.newbyteorder("="), copy=False).reshape(shape, order="F")
 
 
 def _numbers(text: bytes, count: int, dtype: np.dtype[Any], where: Path) -> NDArray[Any]:

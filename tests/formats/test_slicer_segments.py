@@ -1,0 +1,148 @@
+"""Slicer's segmentations: every segment's voxels where Slicer put them, also those of segments that overlap."""
+
+import gzip
+
+import numpy as np
+import pytest
+import SimpleITK
+from case_world import ball, case_text, structure
+
+from puncture_twin.planning.anatomy.anatomy import load_anatomy
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.formats.labels.slicer_segments import parse_segments
+
+SHAPE = (24, 20, 16)
+AFFINE = np.array([[5.0, 0, 0, -60], [0, 0, 5.0, -40], [0, -5.0, 0, 50], [0, 0, 0, 1.0]])
+"""The second axis to the feet, the third to the back."""
+
+
+def segments():
+    """Three segments: the first two overlap, the third lies beside."""
+    i, j, k = np.indices(SHAPE)
+    lung = (i - 12) ** 2 + (j - 10) ** 2 + (k - 8) ** 2 < 36
+    return {"right lung": lung, "lesion 1": (i > 10) & (i < 14) & (abs(j - 10) < 2) & (abs(k - 8) < 2), "rib": i == 20}
+
+
+def seg_nrrd(*changes, layers=2):
+    """A segmentation as Slicer 5 writes it; changes are (old, new) of its header."""
+    lung, lesion, rib = segments().values()
+    stack = np.zeros((layers, *SHAPE), np.uint8)
+    stack[0][lung], stack[0][rib], stack[-1][lesion] = 1, 2, 1 if layers > 1 else 3
+    columns = " ".join("(" + ",".join(f"{x:g}" for x in AFFINE[:3, axis]) + ")" for axis in range(3))
+    four = layers > 1
+    lines = [
+        "NRRD0004",
+        "# Complete NRRD file format specification at:",
+        "# http://teem.sourceforge.net/nrrd/format.html",
+        "type: unsigned char",
+        f"dimension: {3 + four}",
+        "space: left-posterior-superior",
+        f"sizes: {f'{layers} ' * four}{' '.join(map(str, SHAPE))}",
+        f"space directions: {'none ' * four}{columns}",
+        f"kinds: {'list ' * four}domain domain domain",
+        "encoding: gzip",
+        "space origin: (-60,-40,50)",
+    ]
+    for number, (name, layer, label) in enumerate(
+        [("right lung", 0, 1), ("lesion 1", layers - 1, 1 if four else 3), ("rib", 0, 2)]
+    ):
+        lines += [
+            f"Segment{number}_ID:=Segment_{number + 1}",
+            f"Segment{number}_LabelValue:={label}",
+            f"Segment{number}_Layer:={layer}",
+            f"Segment{number}_Name:={name}",
+            f"Segment{number}_Extent:=0 23 0 19 0 15",
+            f"Segment{number}_Tags:=TerminologyEntry:Segmentation category and type - 3D Slicer General Anatomy list|",
+        ]
+    lines += ["Segmentation_MasterRepresentation:=Binary labelmap", "Segmentation_ReferenceImageExtentOffset:=0 0 0"]
+    text = "\n".join(lines) + "\n\n"
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new)
+    return text.encode() + gzip.compress(stack.tobytes(order="F"))
+
+
+def read(folder, data):
+    """The segments of these bytes, through a file."""
+    path = folder / "body.seg.nrrd"
+    path.write_bytes(data)
+    return parse_segments(path, path.name, lambda name: (folder / name).read_bytes())
+
+
+@pytest.mark.parametrize("layers", [2, 1])
+def test_every_segment_is_where_it_was_drawn(tmp_path, layers):
+    """Names with spaces; segments that overlap keep the voxels that they share where the file has layers."""
+    found = read(tmp_path, seg_nrrd(layers=layers))
+    truth = segments()
+    if layers == 1:  # one label for each voxel: what was drawn last holds
+        truth["right lung"] = truth["right lung"] & ~truth["lesion 1"]
+    assert list(found.masks) == list(truth)
+    for name, mask in found.masks.items():
+        assert np.array_equal(mask.volume().values, truth[name])
+        assert np.allclose(mask.grid.T_ct_index, AFFINE)
+
+
+def test_layers_are_those_that_itk_reads(tmp_path):
+    """ITK takes the layers for the components of a vector."""
+    found = read(tmp_path, seg_nrrd())
+    image = SimpleITK.ReadImage(str(tmp_path / "body.seg.nrrd"))
+    values = SimpleITK.GetArrayFromImage(image).transpose(2, 1, 0, 3)
+    for name, layer, label in (("right lung", 0, 1), ("lesion 1", 1, 1), ("rib", 0, 2)):
+        assert np.array_equal(found.masks[name].volume().values, values[..., layer] == label)
+    assert image.TransformIndexToPhysicalPoint((3, 5, 7)) == pytest.approx(AFFINE[:3] @ [3, 5, 7, 1])
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ([("_Layer:=1", "_Layer:=0")], "'right lung' shares label 1 of layer 0"),
+        ([("_Layer:=1", "_Layer:=2")], "label 1 in layer 2.*layers from 0 to 1"),
+        ([("Segment1_Layer:=1\n", "")], "Segment1_Layer is missing"),
+        ([("Segment2_LabelValue:=2", "Segment2_LabelValue:=two")], "Segment2_LabelValue is 'two'"),
+        ([("Segment2_LabelValue:=2", "Segment2_LabelValue:=0")], "label 0 in layer 0"),
+        ([("Name:=rib", "Name:=lesion 1")], "2 structures are called 'lesion 1'"),
+        ([("Segment2_Name:=rib\n", "")], "segment 2 has an empty name"),
+        ([("Segment", "Part")], "holds no structure"),
+        ([("kinds: list", "kinds: time")], "none of layers"),
+        ([("directions: none", "directions: (0,0,0)")], "none of layers"),
+        ([("sizes: 2", "sizes: 3")], "cut short"),
+        ([("sizes: 2", "sizes: 2000")], "2000 layers"),
+        ([("dimension: 4", "dimension: 5")], "dimension 5"),
+        ([("unsigned char", "float"), ("encoding", "endian: little\nencoding")], "type float32"),
+    ],
+)
+def test_a_segmentation_that_is_not_clear_is_refused(tmp_path, changes, says):
+    """A lost or mistaken segment would make a path free."""
+    with pytest.raises(InputError, match=says):
+        _ = [mask.volume() for mask in read(tmp_path, seg_nrrd(*changes)).masks.values()]
+
+
+def test_a_case_takes_segments_that_overlap_by_their_names(tmp_path):
+    """A target in "lesion 1", inside of "right lung": both are whole, each with its role."""
+    ball(tmp_path / "skin.stl", 150.0)
+    (tmp_path / "body.seg.nrrd").write_bytes(seg_nrrd())
+    rules = (
+        '[[structures]]\nseg = "body.seg.nrrd"\ntarget = ["lesion 1"]\ntraverse = ["right lung"]\navoid = { rib = 2 }\n'
+    )
+    target = 'position_mm = [0.0, 0.0, 0.0]\nstructure = "lesion 1"'
+    (tmp_path / "case.toml").write_text(case_text(structure("skin", "skin"), rules, target=target))
+    case = load_case(tmp_path)
+    assert ("seg", "body.seg.nrrd") in [(one.role, one.path) for one in case.inputs]
+    found = {one.name: one for one in load_anatomy(case).structures}
+    assert {name: str(one.role) for name, one in found.items() if name in segments()} == {
+        "right lung": "traverse", "lesion 1": "target", "rib": "avoid",
+    }  # fmt: skip
+    middle = found["right lung"].mesh.vertices.mean(axis=0)
+    assert middle == pytest.approx((AFFINE @ [12, 10, 8, 1])[:3], abs=0.5)
+
+
+def test_a_label_map_in_layers_says_how_it_is_read(tmp_path):
+    """As labelmap it is refused, and the line names the key that takes it."""
+    ball(tmp_path / "skin.stl", 150.0)
+    (tmp_path / "body.seg.nrrd").write_bytes(seg_nrrd())
+    rules = '[[structures]]\nlabelmap = "body.seg.nrrd"\nignore = ["*"]\n'
+    (tmp_path / "case.toml").write_text(case_text(structure("skin", "skin"), structure("organ", "target"), rules))
+    ball(tmp_path / "organ.stl", 10.0)
+    with pytest.raises(InputError, match=r'in layers; name such a file in \[\[structures\]\] seg = "FILE"'):
+        load_anatomy(load_case(tmp_path))
