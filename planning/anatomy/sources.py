@@ -163,7 +163,8 @@ class StructureSources:
             raise InputError("no mesh with a unit", where=where, allowed="mesh and unit")
         space = parse_space(section.space or self._case.space, where=where)
         unit = parse_unit(section.unit, where=where)
-        return parse_mesh(self._case.files.content(section.mesh), self._file(section.mesh), unit=unit, space=space)
+        content, file = self._case.files.content(section.mesh), self._file(section.mesh)
+        return parse_mesh(content, file, unit=unit, space=space, space_is_default=section.space is None)
 
     def _label(self, section: StructureSection) -> TriangleMesh:
         if section.labelmap is None or section.label is None:

@@ -1,4 +1,3 @@
-from .angle_grid import AngleGrid as AngleGrid
 from .case import (
     Axis as Axis,
     Case as Case,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.angle_grid import AngleGrid
 from puncture_twin.planning.case.case_file import EntryAxes
 from puncture_twin.planning.geometry.rigid import frame_of_axes, pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
@@ -42,13 +41,11 @@ class Directions:
         theta: Shape (n,), puncture angle from the entry frame's +z, rad.
         beta: Shape (n,), azimuth from +x in its xy plane, rad.
         outward_ct: Shape (n, 3), unit vectors in the CT frame, from the target outward.
-        grid: The regular grid that they are, row by row; None for any others.
     """
 
     theta: Floats
     beta: Floats
     outward_ct: Floats
-    grid: AngleGrid | None = None
 
     def __len__(self) -> int:
         return len(self.theta)
@@ -156,12 +153,10 @@ def grid(
         R_ct_entry: Rotation of the entry frame, shape (3, 3).
     """
     azimuths = _steps(beta, step)
-    full_circle = bool(len(azimuths) > 1 and azimuths[-1] - azimuths[0] >= 2 * np.pi - GRID_SLACK)
-    if full_circle:
+    if len(azimuths) > 1 and azimuths[-1] - azimuths[0] >= 2 * np.pi - GRID_SLACK:
         azimuths = azimuths[:-1]
     polar = _steps(theta, step)
-    found = _directions(np.repeat(polar, len(azimuths)), np.tile(azimuths, len(polar)), R_ct_entry)
-    return replace(found, grid=AngleGrid(polar, azimuths, step, full_circle))
+    return _directions(np.repeat(polar, len(azimuths)), np.tile(azimuths, len(polar)), R_ct_entry)
 
 
 def _steps(limits: tuple[float, float], step: float) -> Floats:

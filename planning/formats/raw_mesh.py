@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.guard import MAX_TRIANGLES
+from puncture_twin.planning.geometry.spaces import Space
 
 MAX_TOKEN_LENGTH = 64
 """Longer than a double with all of its digits and exponent (24)."""
@@ -22,10 +23,12 @@ class RawMesh(NamedTuple):
     Attributes:
         vertices: Shape (n, 3), in the file's unit and space.
         faces: Shape (m, 3), indices into ``vertices``.
+        space: What the file says of its axes, None if nothing.
     """
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
+    space: Space | None = None
 
 
 def refuse(what: str, where: str, allowed: str) -> NoReturn:

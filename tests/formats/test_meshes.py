@@ -14,6 +14,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings, strategies as st
 from places import DATA, TESTS
 from scipy.spatial import cKDTree
+from slicer_files import vtk_model
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.guard import guard_mesh
@@ -160,6 +161,10 @@ WHOLE: dict[str, tuple[str, bytes]] = {
     "vtp-raw-zlib": (".vtp", vtp(BALL.vertices, FACES, "raw", compressed=True)),
     "vtp-base64": (".vtp", vtp(BALL.vertices, FACES, "base64")),
     "vtp-base64-zlib": (".vtp", vtp(BALL.vertices, FACES, "base64", compressed=True)),
+    "vtk-binary": (".vtk", vtk_model(BALL.vertices, FACES)),
+    "vtk-ascii": (".vtk", vtk_model(BALL.vertices, FACES, binary=False)),
+    "vtk-9-binary": (".vtk", vtk_model(BALL.vertices, FACES, version="5.1")),
+    "vtk-9-ascii": (".vtk", vtk_model(BALL.vertices, FACES, version="5.1", binary=False)),
 }
 
 
@@ -203,6 +208,9 @@ FAN = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 1, 5], [1, 2, 3], [1, 3, 5]]
         pytest.param(".ply", ply_mixed(PENTAGON, POLYGONS), id="ply-little"),
         pytest.param(".ply", ply_mixed(PENTAGON, POLYGONS, ">"), id="ply-big"),
         pytest.param(".vtp", vtp(PENTAGON, POLYGONS, "raw"), id="vtp"),
+        pytest.param(".vtk", vtk_model(PENTAGON, POLYGONS), id="vtk"),
+        pytest.param(".vtk", vtk_model(PENTAGON, POLYGONS, binary=False), id="vtk-ascii"),
+        pytest.param(".vtk", vtk_model(PENTAGON, POLYGONS, version="5.1"), id="vtk-9"),
         pytest.param(
             ".obj",
             "".join(f"v {x} {y} {z}\n" for x, y, z in PENTAGON).encode()
@@ -298,6 +306,63 @@ def test_a_model_as_slicer_saves_it() -> None:
     assert mesh.vertices.max(axis=0) == pytest.approx([25, -10, 90], abs=1e-4)
 
 
+def stl_header(space: str) -> bytes:
+    """A binary STL with Slicer's title."""
+    return f"3D Slicer output. SPACE={space}".encode().ljust(80, b"\0") + WHOLE["stl-binary"][1][80:]
+
+
+def vtp_field(space: str) -> bytes:
+    """A VTP with the field that Slicer adds, as text."""
+    codes = " ".join(str(code) for code in (*space.encode(), 0))
+    field = (
+        f'<FieldData><Array type="String" Name="SPACE" NumberOfTuples="1" format="ascii">{codes}</Array></FieldData>'
+    )
+    return WHOLE["vtp-ascii"][1].replace(b"<PolyData>", b"<PolyData>" + field.encode(), 1)
+
+
+STATING = {
+    ".vtk": lambda space: vtk_model(BALL.vertices, FACES, space=space),
+    ".stl": stl_header,
+    ".obj": lambda space: f"# 3D Slicer output. SPACE={space}\n".encode() + WHOLE["obj"][1],
+    ".ply": lambda space: WHOLE["ply-ascii"][1].replace(
+        b"comment ", f"comment 3D Slicer output. SPACE={space}\ncomment ".encode(), 1
+    ),
+    ".vtp": vtp_field,
+}
+
+
+@pytest.mark.parametrize("suffix", STATING)
+def test_what_slicer_states_of_the_space_is_held(tmp_path: Path, suffix: str) -> None:
+    """A stated space that the caller contradicts is refused; where nobody declared one, the file's own holds."""
+    path = tmp_path / f"mesh{suffix}"
+    path.write_bytes(STATING[suffix]("RAS"))
+    turned = BALL.triangles * [-1, -1, 1]
+    assert same_triangles(read_mesh(path, unit=Unit.MM, space=Space.RAS), turned)
+    assert same_triangles(read_mesh(path, unit=Unit.MM, space=Space.LPS, space_is_default=True), turned)
+    assert same_triangles(read_mesh(path, unit=Unit.MM, space=Space.LOCAL), BALL.triangles)
+    with pytest.raises(InputError, match=r'states SPACE=RAS, the case LPS; allowed: space = "RAS"'):
+        read_mesh(path, unit=Unit.MM, space=Space.LPS)
+    with pytest.raises(InputError, match=r'states SPACE=RAS, the case local; allowed: space = "local"'):
+        read_mesh(path, unit=Unit.MM, space=Space.LOCAL, space_is_default=True)
+
+
+def test_the_field_of_a_file_that_vtk_wrote_is_its_space() -> None:
+    """The sphere below says LPS, compressed and appended."""
+    path = TESTS / "formats" / "slicer_model.vtp"
+    mesh = read_mesh(path, unit=Unit.MM, space=Space.RAS, space_is_default=True)
+    assert mesh.vertices.min(axis=0) == pytest.approx([-15, -50, 50], abs=1e-4)
+    with pytest.raises(InputError, match="states SPACE=LPS, the case RAS"):
+        read_mesh(path, unit=Unit.MM, space=Space.RAS)
+
+
+def test_fields_and_lines_beside_the_polygons_are_passed_over(tmp_path: Path) -> None:
+    """Arrays of other things, lone points and what VTK notes of arrays carry no surface."""
+    extra = "FIELD FieldData 2\nTime 1 1 double\n0.5 \nName 1 1 string\nliver%20left\n"
+    extra += "METADATA\nINFORMATION 0\n\nVERTICES 1 2\n1 0 \nLINES 1 3\n2 0 1 \n"
+    data = vtk_model(PENTAGON, POLYGONS, binary=False, extra=extra)
+    assert same_triangles(read(tmp_path, ".vtk", data), PENTAGON[FAN])
+
+
 def test_gltf_nodes_place_their_meshes(tmp_path: Path) -> None:
     """A mesh used twice: once moved by its parent, once turned, scaled and mirrored, where the winding turns too."""
     nodes = [
@@ -333,6 +398,7 @@ ASCII_PLY = WHOLE["ply-ascii"][1]
 GLB = WHOLE["glb"][1]
 VTP = WHOLE["vtp-ascii"][1]
 RAW_VTP = WHOLE["vtp-raw"][1]
+VTK = vtk_model(PENTAGON, POLYGONS, binary=False)
 NOISE = np.random.default_rng(7).integers(0, 256, 5000, dtype=np.uint8).tobytes()
 NAN, INF = struct.pack("<f", np.nan), struct.pack("<f", np.inf)
 
@@ -506,6 +572,25 @@ BROKEN = [
     ("vtp-lz4", ".vtp", replaced(WHOLE["vtp-raw-zlib"][1], b"vtkZLib", b"vtkLZ4"), r"compressor 'vtkLZ4Data"),
     ("vtp-base64-damaged", ".vtp", replaced(WHOLE["vtp-base64"][1], b" _", b" _@@"), r"base64 data is damaged"),
     ("vtp-zlib-damaged", ".vtp", WHOLE["vtp-raw-zlib"][1].replace(b"x\x9c", b"x\x9d"), r"block is damaged"),
+    ("vtp-space", ".vtp", replaced(VTP, b"<PolyData>", b'<PolyData><FieldData><Array type="String" Name="SPACE" '
+        b'NumberOfTuples="1" format="ascii">82 65 73 0</Array></FieldData>'), r"field SPACE is b'RAI"),
+    ("vtk-no-header", ".vtk", VTK[1:], r"no header of a legacy VTK file"),
+    ("vtk-grid", ".vtk", replaced(VTK, b"POLYDATA", b"UNSTRUCTURED_GRID"), r"no POLYDATA"),
+    ("vtk-other-form", ".vtk", replaced(VTK, b"ASCII", b"UTF-8"), r"no header"),
+    ("vtk-fewer-points", ".vtk", replaced(VTK, b"POINTS 6", b"POINTS 7"), r"no number.*POLYGONS"),
+    ("vtk-more-points", ".vtk", replaced(VTK, b"POINTS 6", b"POINTS 4"), r"18 numbers instead of 12"),
+    ("vtk-huge", ".vtk", replaced(VTK, b"POINTS 6", b"POINTS 999999999999"), r"count '999999999999'"),
+    ("vtk-points-of-int", ".vtk", replaced(VTK, b"6 float", b"6 int"), r"points of type 'int'"),
+    ("vtk-word", ".vtk", replaced(VTK, b"15 10", b"wide 1"), r"no number"),
+    ("vtk-nan", ".vtk", vtk_model(PENTAGON * np.nan, POLYGONS, binary=False), r"vertex 0 is not finite"),
+    ("vtk-index-too-high", ".vtk", vtk_model(PENTAGON, [[0, 1, 6]]), r"vertex indices 0 to 6"),
+    ("vtk-index-negative", ".vtk", vtk_model(PENTAGON, [[0, 1, -1]]), r"vertex indices -1 to 1"),
+    ("vtk-two-corners", ".vtk", vtk_model(PENTAGON, [[0, 1, 2], [0, 1]]), r"face 1 has 2 corners"),
+    ("vtk-cells-too-many", ".vtk", replaced(VTK, b"POLYGONS 3 15", b"POLYGONS 4 15"), r"cell 3 is cut"),
+    ("vtk-cells-too-few", ".vtk", replaced(VTK, b"POLYGONS 3 15", b"POLYGONS 2 15"), r"cells of 10 numbers instead"),
+    ("vtk-strips", ".vtk", replaced(VTK, b"POLYGONS", b"TRIANGLE_STRIPS"), r"triangle strips"),
+    ("vtk-9-offsets", ".vtk", vtk_model(PENTAGON, [[0, 1, 2], [], [3, 4, 5]], version="5.1"), r"offsets that do not"),
+    ("vtk-unknown-line", ".vtk", vtk_model(PENTAGON, POLYGONS, extra="SURPRISE 1\n"), r"unknown line 'SURPRISE 1'"),
     ("vtp-entities", ".vtp", replaced(VTP, b"<VTKFile", b'<!DOCTYPE x [<!ENTITY a "b">]><VTKFile'), r"document type"),
 ]  # fmt: skip
 
@@ -593,7 +678,7 @@ def test_changed_bytes_give_a_refusal_or_a_guarded_mesh(tmp_path: Path, kind: st
     mesh_or_refusal(tmp_path, suffix, whole)
 
 
-@pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".glb", ".vtp"])
+@pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".glb", ".vtp", ".vtk"])
 @ANY_BYTES
 @given(data=st.binary(max_size=200))
 def test_random_bytes_are_refused(tmp_path: Path, suffix: str, data: bytes) -> None:

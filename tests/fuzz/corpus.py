@@ -14,6 +14,7 @@ import trimesh
 from case_world import MARKERS, registration_section
 from hostile.makers import CASE, MOUNT, RIB, certificate, glb, recording, sound_case
 from pydicom.uid import ImplicitVRLittleEndian, RLELossless
+from slicer_files import vtk_model
 
 from puncture_twin.meshes import folder as embedded
 from puncture_twin.planning.arm.ur import ur_model
@@ -112,6 +113,8 @@ def make_meshes(folder):
         vtp(mesh, lambda array: ("ascii", " ".join(map(str, array.reshape(-1).tolist()))))
     )
     (folder / "base64.vtp").write_text(vtp(mesh, lambda array: ("binary", packed(array))))
+    (folder / "a.vtk").write_bytes(vtk_model(mesh.vertices, mesh.faces))
+    (folder / "ascii.vtk").write_bytes(vtk_model(mesh.vertices, mesh.faces, binary=False))
 
 
 def gltf(vertices, faces):

@@ -204,6 +204,8 @@ MESHES = {
     "a.glb": "glb",
     "ascii.vtp": "text",
     "base64.vtp": "text",
+    "a.vtk": "headed",
+    "ascii.vtk": "text",
 }
 LABELS = {
     "labels.nii.gz": "gzip",

@@ -31,7 +31,7 @@ class MeshFolder:
         source: The folder of the meshes.
         files: By number, relative to the case's folder.
         unit: Of all of them.
-        space: Of all of them.
+        space: Of all of them that do not state one.
     """
 
     place: Place
@@ -49,7 +49,10 @@ class MeshFolder:
     def meshes(self) -> Mapping[int, TriangleMesh]:
         """Each mesh in LPS mm."""
         files = {number: self.place.folder / file for number, file in self.files.items()}
-        return {number: read_mesh(file, unit=self.unit, space=self.space) for number, file in files.items()}
+        return {
+            number: read_mesh(file, unit=self.unit, space=self.space, space_is_default=True)
+            for number, file in files.items()
+        }
 
     @property
     def skin(self) -> int | None:

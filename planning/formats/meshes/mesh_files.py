@@ -1,4 +1,4 @@
-"""Mesh files of other programs, as guarded meshes in mm: STL, OBJ, PLY, GLB and VTP.
+"""Mesh files of other programs, as guarded meshes in mm: STL, OBJ, PLY, GLB, VTP and legacy VTK.
 
 Each format has its own strict reader beside this file, because a lost triangle makes a path "free": a file must hold
 what it promises to the byte. General loaders are made to show something. trimesh 5.2, measured on a box of 12
@@ -9,6 +9,7 @@ trimesh on whole files.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -23,6 +24,7 @@ from puncture_twin.planning.formats.meshes.glb import read_glb
 from puncture_twin.planning.formats.meshes.obj import read_obj
 from puncture_twin.planning.formats.meshes.ply import read_ply
 from puncture_twin.planning.formats.meshes.stl import read_stl
+from puncture_twin.planning.formats.meshes.vtk_legacy import read_vtk
 from puncture_twin.planning.formats.meshes.vtp import read_vtp
 from puncture_twin.planning.formats.raw_mesh import RawMesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -32,32 +34,38 @@ MAX_FILE_BYTES = 2_000_000_000
 """Twenty million triangles of binary STL are 1 GB; a file beyond twice that is refused before it is read."""
 
 _READERS: Mapping[str, Callable[[bytes, str], RawMesh]] = MappingProxyType(
-    {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".glb": read_glb, ".vtp": read_vtp}
+    {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".glb": read_glb, ".vtp": read_vtp, ".vtk": read_vtk}
 )
+_STATEMENT = re.compile(rb"3D Slicer output\. SPACE=(LPS|RAS)\b")
+_STATEMENT_BYTES = 1000
+"""Slicer writes what space a mesh is in into its header or first comment; a VTP has a field for it."""
 MESH_SUFFIXES: tuple[str, ...] = tuple(_READERS)
 """The file name endings that ``read_mesh`` takes, in lower case; upper case is the same."""
 
 
-def read_mesh(path: Path, *, unit: Unit, space: Space) -> TriangleMesh:
+def read_mesh(path: Path, *, unit: Unit, space: Space, space_is_default: bool = False) -> TriangleMesh:
     """One mesh file, checked against its own promises, in mm and LPS (or its own local frame).
 
-    Nothing about unit or space is taken from the file: the caller declares both, also for GLB, whose standard says
-    metres. All parts of a file become one surface, placed by their node transforms, in the file's order; nothing is
-    welded and no triangle dropped. The axes stay as in the file: GLB is y-up by its standard and is not turned.
+    The caller declares the unit, also for GLB, whose standard says metres, and the space. A file that Slicer wrote
+    states its space, which must be the declared one. All parts of a file become one surface, placed by their node
+    transforms, in the file's order; nothing is welded and no triangle dropped. The axes stay as in the file: GLB is
+    y-up by its standard and is not turned.
 
     Args:
-        path: An STL, OBJ, PLY, GLB or VTP file.
+        path: An STL, OBJ, PLY, GLB, VTP or VTK file.
         unit: The unit of its coordinates.
         space: Their space.
+        space_is_default: Whether a patient space that the file states holds instead of ``space``.
 
     Raises:
-        InputError: If it is missing, cut, contradicts itself, is empty, or fails the guard.
+        InputError: If it is missing, cut, contradicts itself or the caller, is empty, or fails the guard.
     """
     _reader(path)  # an unknown ending is refused before anything is read
-    return parse_mesh(read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path)), path, unit=unit, space=space)
+    data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
+    return parse_mesh(data, path, unit=unit, space=space, space_is_default=space_is_default)
 
 
-def parse_mesh(data: bytes, path: Path, *, unit: Unit, space: Space) -> TriangleMesh:
+def parse_mesh(data: bytes, path: Path, *, unit: Unit, space: Space, space_is_default: bool = False) -> TriangleMesh:
     """The same of a file that has been read; it is not opened again.
 
     Args:
@@ -65,6 +73,7 @@ def parse_mesh(data: bytes, path: Path, *, unit: Unit, space: Space) -> Triangle
         path: Its name, whose ending says the format.
         unit: The unit of its coordinates.
         space: Their space.
+        space_is_default: As in `read_mesh`.
 
     Raises:
         InputError: As `read_mesh`, but for reading.
@@ -73,8 +82,25 @@ def parse_mesh(data: bytes, path: Path, *, unit: Unit, space: Space) -> Triangle
     reader = _reader(path)
     with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite or NaN here, the guard refuses
         raw = reader(data, name)
-        vertices = to_lps(raw.vertices, space) * unit.mm
+        stated = raw.space or _stated_space(data)
+        held = space if stated is None else _held_space(stated, space, default=space_is_default, where=name)
+        vertices = to_lps(raw.vertices, held) * unit.mm
     return guard_mesh(vertices, raw.faces, where=name)
+
+
+def _stated_space(data: bytes) -> Space | None:
+    found = _STATEMENT.search(data[:_STATEMENT_BYTES])
+    return None if found is None else Space(found[1].decode())
+
+
+def _held_space(stated: Space, space: Space, *, default: bool, where: str) -> Space:
+    """The space of a file that states one; that of a frame of its own may be declared local."""
+    if stated is space or (space is Space.LOCAL and not default):
+        return space
+    if default and space is not Space.LOCAL:
+        return stated
+    allowed = 'space = "local" where that is meant' if space is Space.LOCAL else f'space = "{stated}"'
+    raise InputError(f"the file states SPACE={stated}, the case {space}", where=where, allowed=allowed)
 
 
 def mesh_extent(path: Path) -> NDArray[np.float64]:

@@ -17,12 +17,14 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.guard import MAX_TRIANGLES
 from puncture_twin.planning.formats.meshes.vtk_arrays import Encoding, array_values
 from puncture_twin.planning.formats.raw_mesh import MAX_VERTICES, RawMesh, join, refuse, triangulate
+from puncture_twin.planning.geometry.spaces import Space
 
 _ALLOWED = "a complete VTKFile of type PolyData whose arrays are as long as it states"
 _APPENDED = re.compile(rb"<AppendedData[^>]*>")
 _APPENDED_END = b"</AppendedData>"
 _COMPRESSORS = {None: False, "vtkZLibDataCompressor": True}
 _BYTE_ORDERS = {"LittleEndian": "<", "BigEndian": ">"}
+_SPACES = {b"LPS\0": Space.LPS, b"RAS\0": Space.RAS}
 _HEADER_TYPES = {"UInt32": "u4", "UInt64": "u8"}
 
 
@@ -56,7 +58,20 @@ def read_vtp(data: bytes, where: str) -> RawMesh:
     filled = [part for part in parts if part is not None]
     if not filled:
         refuse("no polygon in any piece", where, _ALLOWED)
-    return join(filled)
+    return join(filled)._replace(space=_space(root, encoding, where))
+
+
+def _space(root: ElementTree.Element, encoding: Encoding, where: str) -> Space | None:
+    """What Slicer writes of the axes: a field named SPACE with the letters LPS or RAS and the zero that ends them."""
+    fields = root.findall("PolyData/FieldData/Array[@Name='SPACE']")
+    if not fields:
+        return None
+    letters = ElementTree.Element("DataArray", {**fields[0].attrib, "type": "UInt8"})
+    letters.text = fields[0].text
+    text = array_values(letters, len(Space.LPS) + 1, encoding, f"{where}, field SPACE").tobytes()
+    if text not in _SPACES or len(fields) > 1:
+        refuse(f"field SPACE is {text!r}", where, "LPS or RAS, once")
+    return _SPACES[text]
 
 
 def _split_appended(data: bytes, where: str) -> _Split:

@@ -1,0 +1,230 @@
+"""Legacy VTK files (.vtk) of type POLYDATA, ASCII and binary: as many points and polygons as they state, or an error.
+
+Slicer saves models so (file version 4.2); VTK 9 writes version 5.1, whose cells are offsets and connectivity. Binary
+numbers are big endian. Source: VTK file formats (Kitware), "Simple legacy formats".
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.guard import MAX_TRIANGLES
+from puncture_twin.planning.formats.raw_mesh import MAX_TOKEN_LENGTH, MAX_VERTICES, RawMesh, refuse, triangulate
+
+_ALLOWED = "a legacy VTK file, ASCII or BINARY, of DATASET POLYDATA whose points and polygons are as many as it states"
+_VERSION = re.compile(rb"# vtk DataFile Version ([1-5])\.\d\s*")
+_TYPES = {
+    "unsigned_char": ">u1",
+    "char": ">i1",
+    "unsigned_short": ">u2",
+    "short": ">i2",
+    "unsigned_int": ">u4",
+    "int": ">i4",
+    "unsigned_long": ">u8",
+    "long": ">i8",
+    "vtkidtype": ">i8",
+    "vtktypeint64": ">i8",
+    "float": ">f4",
+    "double": ">f8",
+}
+"""By their names in lower case, as stored in a binary file."""
+_CELLS = ("VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS")
+_OFFSETS_SINCE = 5
+"""The major version from which on cells are offsets and connectivity."""
+_DATA = ("POINT_DATA", "CELL_DATA")
+"""What follows the surface: numbers about it, which are not read."""
+
+
+class _Polygons(NamedTuple):
+    """Corners of all polygons, one after the other, and how many each has."""
+
+    corners: NDArray[np.int64]
+    counts: NDArray[np.int64]
+
+
+def read_vtk(data: bytes, where: str) -> RawMesh:
+    """The polygons of a legacy VTK file; polygons are cut into fans; lines and lone points carry no surface.
+
+    Args:
+        data: The whole file.
+        where: Its name, for the error.
+
+    Raises:
+        InputError: If it is cut, of another kind, has fewer numbers than it states, or holds triangle strips.
+    """
+    cursor = _Cursor(data, where)
+    version = _VERSION.fullmatch(cursor.line())
+    cursor.line()  # the title, which anything may be
+    form = cursor.line().strip().upper()
+    if version is None or form not in (b"ASCII", b"BINARY"):
+        refuse("no header of a legacy VTK file", where, _ALLOWED)
+    cursor.is_ascii = form == b"ASCII"
+    if cursor.words() != ["DATASET", "POLYDATA"]:
+        refuse("the data set is no POLYDATA", where, _ALLOWED)
+    points, polygons = _sections(cursor, offsets=int(version[1]) >= _OFFSETS_SINCE, where=where)
+    if points is None or polygons is None:
+        refuse("no points or no polygons: the file is cut, or holds no surface", where, _ALLOWED)
+    if polygons.corners.min() < 0 or polygons.corners.max() >= len(points):
+        refuse(f"vertex indices {polygons.corners.min()} to {polygons.corners.max()}", where, f"0 to {len(points) - 1}")
+    return RawMesh(points, triangulate(polygons.corners, polygons.counts, where))
+
+
+def _sections(cursor: _Cursor, *, offsets: bool, where: str) -> tuple[NDArray[np.float64] | None, _Polygons | None]:
+    """The points and the polygons, whatever stands between; what comes after the surface is left."""
+    points: NDArray[np.float64] | None = None
+    polygons: _Polygons | None = None
+    while (words := cursor.words()) and words[0].upper() not in _DATA:
+        key = words[0].upper()
+        if key == "POINTS" and points is None:
+            points = _points(cursor, words, where)
+        elif key in _CELLS:
+            cells = _cells(cursor, words, offsets=offsets, where=where)
+            if key == "TRIANGLE_STRIPS" and len(cells.counts):
+                refuse("triangle strips", where, "polygons")
+            if key == "POLYGONS" and polygons is None:
+                polygons = cells
+        elif key in ("METADATA", "FIELD"):
+            _pass_over(cursor, words, where)
+        else:
+            refuse(f"unknown line {' '.join(words)[:60]!r}", where, _ALLOWED)
+    return points, polygons if polygons is not None and len(polygons.counts) else None
+
+
+def _points(cursor: _Cursor, words: list[str], where: str) -> NDArray[np.float64]:
+    count, kind = _count(words, 1, MAX_VERTICES, where), words[2].lower() if len(words) == 3 else ""
+    if kind not in ("float", "double"):
+        refuse(f"points of type {kind[:20]!r}", where, "float, double")
+    return cursor.numbers(3 * count, kind).astype(np.float64).reshape(-1, 3)
+
+
+def _cells(cursor: _Cursor, words: list[str], *, offsets: bool, where: str) -> _Polygons:
+    first, size = _count(words, 1, MAX_TRIANGLES, where), _count(words, 2, 4 * MAX_TRIANGLES, where)
+    if offsets:
+        return _offset_cells(cursor, first, size, where)
+    table = cursor.numbers(size, "int").astype(np.int64)
+    starts = np.empty(first, np.int64)
+    if size == 4 * first and (table[::4] == 3).all():
+        starts[:] = 4 * np.arange(first)
+    else:
+        _find_starts(table, starts, where)
+    counts = table[starts]
+    if int(counts.sum()) + first != size:
+        refuse(f"{first} cells that do not fill their {size} numbers", where, _ALLOWED)
+    keep = np.ones(size, bool)
+    keep[starts] = False
+    return _Polygons(table[keep], counts)
+
+
+def _find_starts(table: NDArray[np.int64], starts: NDArray[np.int64], where: str) -> None:
+    """Where each cell begins: with the count of its corners, which says where the next one does."""
+    at = 0
+    for cell in range(len(starts)):
+        if not 0 <= at < len(table) or table[at] < 1:
+            refuse(f"cell {cell} is cut, or has no corner", where, _ALLOWED)
+        starts[cell] = at
+        at += int(table[at]) + 1
+    if at != len(table):
+        refuse(f"cells of {at} numbers instead of {len(table)}", where, _ALLOWED)
+
+
+def _offset_cells(cursor: _Cursor, first: int, size: int, where: str) -> _Polygons:
+    """Cells since version 5: one offset more than there are cells, then the corners of all."""
+    ends = cursor.named_numbers("OFFSETS", first).astype(np.int64)
+    corners = cursor.named_numbers("CONNECTIVITY", size).astype(np.int64)
+    if first == 0:
+        return _Polygons(corners[:0], corners[:0])
+    if ends[0] != 0 or ends[-1] != size or (np.diff(ends) < 1).any():
+        refuse("offsets that do not rise from 0 to the number of corners", where, _ALLOWED)
+    return _Polygons(corners, np.diff(ends))
+
+
+def _pass_over(cursor: _Cursor, words: list[str], where: str) -> None:
+    """Information about arrays, which ends with an empty line, or a field of arrays."""
+    if words[0].upper() == "METADATA":
+        while cursor.line().strip():
+            pass
+        return
+    for _ in range(_count(words, 2, 1000, where)):
+        array = cursor.words()
+        if len(array) != 4:
+            refuse(f"field array {' '.join(array)[:60]!r}", where, _ALLOWED)
+        count = _count(array, 1, 1000, where) * _count(array, 2, 3 * MAX_VERTICES, where)
+        if array[3] == "string" and cursor.is_ascii:
+            _ = [cursor.words() for _line in range(min(count, 1000))]
+        else:
+            cursor.numbers(count, array[3])
+
+
+def _count(words: list[str], index: int, most: int, where: str) -> int:
+    text = words[index] if index < len(words) else ""
+    if not (text.isascii() and text.isdigit() and len(text) <= 12 and int(text) <= most):
+        refuse(f"count {text[:20]!r} in {' '.join(words)[:60]!r}", where, f"a whole number from 0 to {most}")
+    return int(text)
+
+
+class _Cursor:
+    """Reads lines and numbers, one after the other, and never beyond the end."""
+
+    def __init__(self, data: bytes, where: str) -> None:
+        self._data, self._where, self._at = data, where, 0
+        self.is_ascii = False
+
+    def line(self) -> bytes:
+        """The next line without its end; empty at the end of the file."""
+        end = self._data.find(b"\n", self._at)
+        end = len(self._data) if end < 0 else end
+        line = self._data[self._at : end]
+        self._at = end + 1
+        return line.rstrip(b"\r")
+
+    def words(self) -> list[str]:
+        """Those of the next line that is not empty; none at the end of the file."""
+        while self._at < len(self._data):
+            line = self.line().strip()
+            if line:
+                return line.decode("ascii", "replace").split()
+        return []
+
+    def numbers(self, count: int, kind: str) -> NDArray[Any]:
+        """The next numbers, of a type of the format."""
+        if kind.lower() not in _TYPES:
+            refuse(f"numbers of type {kind[:20]!r}", self._where, ", ".join(_TYPES))
+        dtype = np.dtype(_TYPES[kind.lower()])
+        if self.is_ascii:
+            return self._from_text(count, np.dtype(np.float64 if dtype.kind == "f" else np.int64))
+        return self._from_bytes(count, dtype)
+
+    def named_numbers(self, key: str, count: int) -> NDArray[Any]:
+        """The numbers of an array with a line of its own: its name and type."""
+        words = self.words()
+        if len(words) != 2 or words[0].upper() != key:
+            refuse(f"{' '.join(words)[:60]!r} instead of {key}", self._where, _ALLOWED)
+        if words[1].lower() in ("float", "double"):
+            refuse(f"{key} of type {words[1]}", self._where, "whole numbers")
+        return self.numbers(count, words[1])
+
+    def _from_bytes(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+        size = count * dtype.itemsize
+        if self._at + size > len(self._data):
+            refuse(f"{count} numbers of {size} bytes do not fit into the file: it is cut", self._where, _ALLOWED)
+        values = np.frombuffer(self._data, dtype, count, self._at)
+        self._at += size
+        return values
+
+    def _from_text(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+        words: list[bytes] = []
+        while len(words) < count and self._at < len(self._data):
+            words += self.line().split()
+        if len(words) != count or max(map(len, words), default=0) > MAX_TOKEN_LENGTH:
+            refuse(f"{len(words)} numbers instead of {count}", self._where, _ALLOWED)
+        if self._at > len(self._data):  # its last number may be the beginning of one
+            refuse("the last line has no end: the file is cut", self._where, _ALLOWED)
+        try:
+            return np.array(words, dtype=np.bytes_).astype(dtype)
+        except (ValueError, OverflowError) as error:
+            raise InputError(f"no number ({error})", where=self._where, allowed=_ALLOWED) from error
