@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydicom.sr.codedict import codes
 from pydicom.uid import RLELossless, generate_uid
+from scipy import ndimage
 from skimage.draw import polygon2mask
 
 from puncture_twin.planning.base.errors import InputError
@@ -260,9 +261,73 @@ def test_slices_that_were_left_out_are_filled_and_small_contours_are_kept(tmp_pa
     same(found, truth, T)
     notes = " | ".join(found.notes)
     assert "not closed (points, lines) were left out of isocentre" in notes
-    assert "filled where both overlap, in organ, nodes" in notes
-    assert "smaller than a pixel count for the pixels of their points, in vessel" in notes
+    assert "filled where both overlap, or all are evenly spaced, and else left empty, in organ, nodes" in notes
+    assert "smaller than a pixel count for the pixels along them, in vessel" in notes
     assert "beyond the CT's image end there, in couch" in notes
+
+
+def test_copies_and_overlaps_of_contours_erase_nothing(scanned, tmp_path):
+    """Paths through them were safe.
+
+    Counted by odd and even, a contour that stood twice in the file left no organ, two that overlap lost what they
+    share, and one traced twice was empty.
+    """
+    ct, T, _ = scanned
+    first, second = box((2, 2), (8, 8)), box((6, 5), (12, 11))
+    found = read_rt(
+        world.structure_set(
+            {
+                "copied": [outline(T, 3, first), outline(T, 3, first)],
+                "two": [outline(T, 3, first), outline(T, 3, second)],
+                "traced twice": [outline(T, 3, first + first)],
+                "hole at the edge": [outline(T, 3, first), outline(T, 3, box((2, 4), (5, 6)))],
+            }
+        ),
+        tmp_path,
+        ct,
+    )
+    truth = {name: np.zeros(SHAPE, bool) for name in found.masks}
+    for one in truth.values():
+        one[2:9, 2:9, 3] = True
+    truth["two"][6:13, 5:12, 3] = True
+    same(found, truth, T)
+
+
+def test_a_vessel_narrower_than_a_pixel_has_no_gaps(scanned, tmp_path):
+    """A lean strip of a third of a pixel encloses few centres: it came out as dots that a needle passes between."""
+    ct, T, _ = scanned
+    strip = [(1.0, 1.2), (16.0, 12.2), (16.0, 12.5), (1.0, 1.5)]
+    bulb = [(1.0, 1.2), (11.0, 8.5), (14.6, 8.5), (14.6, 12.6), (11.0, 12.6), (11.0, 8.9), (1.0, 1.5)]
+    found = read_rt(world.structure_set({"strip": [outline(T, 2, strip)], "bulb": [outline(T, 2, bulb)]}), tmp_path, ct)
+    for mask in found.masks.values():
+        pixels = mask.volume().values[:, :, 2]
+        assert ndimage.label(pixels, np.ones((3, 3)))[1] == 1
+    at = np.array(strip[0]) + np.linspace(0, 1, 200)[:, None] * (np.array(strip[1]) - strip[0])
+    centres = np.argwhere(found.masks["strip"].volume().values[:, :, 2])
+    assert np.linalg.norm(at[:, None] - centres, axis=2).min(axis=1).max() < 1.0
+
+
+def test_a_leaning_vessel_drawn_in_every_third_slice_has_no_gaps(scanned, tmp_path):
+    """Its contours do not overlap, and nothing was filled between them: paths between two were safe."""
+    ct, T, _ = scanned
+    contours = [outline(T, k, box((2 + 2 * k, 5), (4 + 2 * k, 7))) for k in (0, 3, 6)]
+    found = read_rt(world.structure_set({"vessel": contours}), tmp_path, ct)
+    values = found.masks["vessel"].volume().values
+    for k in range(7):
+        assert values[2 + 2 * k : 5 + 2 * k, 5:8, k].all(), k
+
+
+@pytest.mark.parametrize("thickness", ["0.5", "1.25", "2.5"])
+@pytest.mark.parametrize("with_ct", [True, False])
+def test_thin_slices_are_no_closer_than_they_lie(scanned, tmp_path, thickness, with_ct):
+    """Slices of 1.25 mm every 2.5 mm: a path between two plates of an organ was safe.
+
+    The thickness was taken for the step, and every other slice of each organ was empty.
+    """
+    ct, T, _ = scanned
+    data = world.segmentation(masks(), T, step="")
+    data.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0].SliceThickness = thickness
+    same(read_seg(data, tmp_path, ct if with_ct else None), masks(), T)
 
 
 def test_a_polygon_is_filled_as_by_the_slow_rule():
@@ -272,11 +337,11 @@ def test_a_polygon_is_filled_as_by_the_slow_rule():
         points = rng.uniform(-4, 24, (count, 2))
         filled = polygon_fill(points, (20, 17))
         for i, j in np.ndindex(filled.shape):
-            odd = False
+            turns = 0
             for (x0, y0), (x1, y1) in zip(points, np.roll(points, -1, axis=0), strict=True):
                 if (y0 > j) != (y1 > j) and i < x0 + (j - y0) * (x1 - x0) / (y1 - y0):
-                    odd = not odd
-            assert filled[i, j] == odd
+                    turns += 1 if y0 > j else -1
+            assert filled[i, j] == (turns != 0)
     angle = np.linspace(0, 2 * np.pi, 50, endpoint=False)
     circle = np.column_stack([9.3 + 6.1 * np.cos(angle), 8.2 + 7.7 * np.sin(angle)])
     assert np.array_equal(polygon_fill(circle, (20, 17)), polygon2mask((20, 17), circle))

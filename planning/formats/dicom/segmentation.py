@@ -84,7 +84,7 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
         check_frame_of_reference(text(data, "FrameOfReferenceUID", where=where), ct, path)
     names = _names(data, where)
     unique_names(list(names.values()), path)
-    frames = _frames(data, names, path)
+    frames = _frames(data, names, ct, path)
     placed = _placed(frames, ct, path)
     files = (file,) if ct is None else (file, *ct.files)
     masks = {
@@ -122,13 +122,13 @@ def _names(data: Dataset, where: str) -> dict[int, str]:
     return found
 
 
-def _frames(data: Dataset, names: dict[int, str], path: Path) -> _Frames:
+def _frames(data: Dataset, names: dict[int, str], ct: CtSeries | None, path: Path) -> _Frames:
     where = path.name
     rows, columns, count = sizes(data, where)
     groups = frame_groups(data, count, where=where)
     segments = np.array([_segment(one, f"{where}, frame {k + 1}", names) for k, one in enumerate(groups)])
     planes = [plane_of(one, f"{where}, frame {k + 1}") for k, one in enumerate(groups)]
-    T, slices = _regular(planes, _stated_step(groups[0], where), path)
+    T, slices = _regular(planes, _stated_step(groups[0], where, ct), path)
     pairs = set(zip(segments.tolist(), slices.tolist(), strict=True))
     if len(pairs) < count:
         raise InputError("two frames of one segment lie at one place", where=path, allowed="one frame a slice")
@@ -145,13 +145,18 @@ def _segment(groups: Groups, label: str, names: dict[int, str]) -> int:
     return segment
 
 
-def _stated_step(groups: Groups, where: str) -> float | None:
+def _stated_step(groups: Groups, where: str, ct: CtSeries | None) -> float | None:
+    """The distance of slices that header or CT state, mm. How thick a slice is says less: it may be thinner."""
     measures = groups.holder("PixelMeasuresSequence", where)
-    for keyword in ("SpacingBetweenSlices", "SliceThickness"):
-        if has(measures, keyword):
-            step = number(measures, keyword, where=where)
-            return step if MIN_SPACING_MM <= step <= MAX_SPACING_MM else None
-    return None
+    if has(measures, "SpacingBetweenSlices"):
+        step = number(measures, "SpacingBetweenSlices", where=where)
+    elif ct is not None:
+        step = float(ct.stack.step_ct @ ct.stack.plane.normal_ct)
+    elif has(measures, "SliceThickness"):
+        step = number(measures, "SliceThickness", where=where)
+    else:
+        return None
+    return step if MIN_SPACING_MM <= step <= MAX_SPACING_MM else None
 
 
 def _regular(planes: list[Plane], stated_mm: float | None, path: Path) -> tuple[Floats, NDArray[np.int64]]:
@@ -182,18 +187,26 @@ def _regular(planes: list[Plane], stated_mm: float | None, path: Path) -> tuple[
 
 
 def _least_step(gaps: Floats, stated_mm: float | None, path: Path) -> float:
-    """The distance of neighbouring slices, mm: the stated one where the frames keep to it, else their least."""
+    """The distance of neighbouring slices, mm: the least of the frames, where all keep to it, else the stated one.
+
+    A stated distance that no two frames have would leave an empty slice between any two, and an organ full of gaps.
+    """
     real = gaps[gaps > 1e-3]
     if not len(real):
         if stated_mm is None:
             raise InputError("one slice, and how thick it is is not stated", where=path, allowed="SliceThickness")
         return stated_mm
     least = float(real.min())
-    if stated_mm is not None and stated_mm <= least * (1 + PLACE_TOLERANCE):
+    if not _keep_to(real, least) and stated_mm is not None and stated_mm <= least * (1 + PLACE_TOLERANCE):
         times = round(least / stated_mm)
         if abs(least - times * stated_mm) <= PLACE_TOLERANCE * stated_mm:
             return least / times
     return least
+
+
+def _keep_to(gaps: Floats, step: float) -> bool:
+    """Whether distances are whole numbers of steps."""
+    return bool((np.abs(gaps - np.round(gaps / step) * step) <= PLACE_TOLERANCE * step).all())
 
 
 def _placed(frames: _Frames, ct: CtSeries | None, path: Path) -> _Placed:

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 from pydicom.dataelem import RawDataElement
 from pydicom.dataset import Dataset
+from scipy import ndimage
+from skimage.morphology import convex_hull_image
 
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
@@ -30,13 +32,13 @@ from puncture_twin.planning.formats.volumes.volume_source import Content
 from puncture_twin.planning.geometry.rigid import apply
 
 CLOSED = ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
-"""Contours that enclose an area; several in one slice leave out what an even number of them enclose."""
+"""Contours that enclose an area; one within another leaves it out."""
 ON_SLICE = 0.1
 """Of the step, by which a contour may miss its slice."""
 MAX_CONTOUR_POINTS = 100_000
 """In one contour: an image of 1000 pixels has 4000 around it."""
 MAX_LENGTH = 5_000_000
-"""Pixels along one contour's columns; the finest line through every pixel of an image has fewer."""
+"""Pixels along one contour; the finest line through every pixel of an image has fewer."""
 SHOWN = 8
 """Structures that a note names."""
 
@@ -66,8 +68,8 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
     """The regions of an RTSTRUCT, each by its name, on the slices of a CT.
 
     A slice between two contoured ones is filled with what either of them encloses, where they overlap: programs leave
-    slices out and interpolate, and a gap in an organ would count as free. A contour that encloses no pixel's centre
-    counts for the pixels of its points. Both are noted.
+    slices out and interpolate, and a gap in an organ would count as free. What encloses no pixel's centre counts for
+    the pixels along it. Both are noted.
 
     Args:
         path: Its name.
@@ -140,7 +142,7 @@ def _contour(item: Dataset, T_index_ct: Floats, grid: VolumeGrid, label: str) ->
     if not 0 <= slices[0] < grid.shape[2]:
         allowed = "contours within the CT on which they were drawn"
         raise InputError(f"the contour through {at} lies beyond the CT's slices", where=label, allowed=allowed)
-    length = float(np.abs(np.diff(index[:, 1])).sum())
+    length = float(np.abs(index[:, :2] - np.roll(index[:, :2], 1, axis=0)).sum())
     if length > MAX_LENGTH:
         raise InputError(f"the contour through {at} is {length:.3g} pixels long", where=label, allowed=f"{MAX_LENGTH}")
     return Contour(int(slices[0]), index[:, :2])
@@ -168,28 +170,71 @@ def _mask(contours: tuple[Contour, ...], shape: tuple[int, int, int]) -> Mask:
     for number in {one.slice for one in contours}:
         made[:, :, number] = _slice_mask([one for one in contours if one.slice == number], shape[:2])
     for below, above in _gaps(contours):
-        if (made[:, :, below] & made[:, :, above]).any():
-            made[:, :, below + 1 : above] = (made[:, :, below] | made[:, :, above])[:, :, None]
+        made[:, :, below + 1 : above] = _between(made[:, :, below] > 0, made[:, :, above] > 0, contours)[:, :, None]
     return made
 
 
+def _between(below: Bools, above: Bools, contours: tuple[Contour, ...]) -> Bools:
+    """What lies in slices that were left out: what either neighbour encloses, where the two overlap.
+
+    What is drawn in every so-many slices goes on between them too where it leans too much to overlap: within the
+    convex hull of both.
+    """
+    if (below & above).any():
+        return below | above
+    if _is_every_so_many(contours):
+        return np.asarray(convex_hull_image(below | above))
+    return np.zeros_like(below)
+
+
+def _is_every_so_many(contours: tuple[Contour, ...]) -> bool:
+    """Whether at least three slices have contours, all at one distance of several slices."""
+    steps = {above - below for below, above in itertools.pairwise(_slices(contours))}
+    return len(_slices(contours)) > 2 and len(steps) == 1 and steps != {1}
+
+
 def _slice_mask(contours: list[Contour], shape: tuple[int, int]) -> Bools:
-    """What an odd number of contours enclose; and the pixels of those too small to enclose a centre."""
-    inside, small = np.zeros(shape, bool), np.zeros(shape, bool)
-    for contour in contours:
-        filled = polygon_fill(contour.points, shape)
-        inside ^= filled
-        if not filled.any():
-            near = np.round(contour.points).astype(int)
-            near = near[((near >= 0) & (near < shape)).all(axis=1)]
-            small[near[:, 0], near[:, 1]] = True
-    return inside | small
+    """What contours enclose, and the pixels along what is too narrow to enclose a centre.
+
+    A contour within another is a hole if a pixel of the other is left all around it. Copies of a contour, and contours
+    that overlap in part, enclose what any of them does: by an odd count they would erase each other.
+    """
+    inside, narrow = np.zeros(shape, bool), np.zeros(shape, bool)
+    fills = [polygon_fill(contour.points, shape) for contour in contours]
+    for filled in sorted(fills, key=np.count_nonzero, reverse=True):
+        inside = inside & ~filled if not (grown(filled) & ~inside).any() else inside | filled
+    for contour, filled in zip(contours, fills, strict=True):
+        narrow |= _narrow_parts(contour.points, filled)
+    return inside | narrow
+
+
+def _narrow_parts(points: Floats, filled: Bools) -> Bools:
+    """The pixels along a contour off the parts that it fills at least two wide, and those that join them to it."""
+    start, end = points, np.roll(points, -1, axis=0)
+    count = 2 * np.ceil(np.abs(end - start).max(axis=1)).astype(int) + 1
+    edge = np.repeat(np.arange(len(points)), count)
+    along = (np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)) / count[edge]
+    at = np.round(start[edge] + along[:, None] * (end - start)[edge]).astype(int)
+    at = at[((at >= 0) & (at < filled.shape)).all(axis=1)]
+    passed = np.zeros_like(filled)
+    passed[at[:, 0], at[:, 1]] = True
+    wide = ndimage.binary_opening(filled, np.ones((2, 2)))
+    return passed & grown(passed & ~grown(wide))
+
+
+def grown(pixels: Bools) -> Bools:
+    """The same pixels and their eight neighbours."""
+    return np.asarray(ndimage.maximum_filter(pixels.view(np.uint8), 3, mode="constant").view(bool))
 
 
 def _gaps(contours: tuple[Contour, ...]) -> list[tuple[int, int]]:
     """Neighbouring slices with contours that leave slices without any between them."""
-    slices = sorted({one.slice for one in contours})
-    return [(below, above) for below, above in itertools.pairwise(slices) if above - below > 1]
+    return [(below, above) for below, above in itertools.pairwise(_slices(contours)) if above - below > 1]
+
+
+def _slices(contours: tuple[Contour, ...]) -> list[int]:
+    """The numbers of the slices that have contours, rising."""
+    return sorted({one.slice for one in contours})
 
 
 def _notes(regions: dict[str, _Region], grid: VolumeGrid, where: str) -> list[str]:
@@ -201,8 +246,12 @@ def _notes(regions: dict[str, _Region], grid: VolumeGrid, where: str) -> list[st
     others = [called for called, region in regions.items() if region.others]
     told = (
         (others, "contours that are not closed (points, lines) were left out of"),
-        (gaps, "slices without a contour between two with one were filled where both overlap, in"),
-        (small, "contours smaller than a pixel count for the pixels of their points, in"),
+        (
+            gaps,
+            "slices without a contour between two with one were filled where both overlap, or all are evenly "
+            "spaced, and else left empty, in",
+        ),
+        (small, "contours smaller than a pixel count for the pixels along them, in"),
         (cut, "contours that reach beyond the CT's image end there, in"),
     )
     return [f"{where}: {said} {_listed(some)}" for some, said in told if some]
