@@ -14,6 +14,7 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_angles, check_inputs
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.chance import keeps_limits
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
@@ -49,6 +50,7 @@ def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None
         raise InputError("outward_ct is not the direction of theta_deg, beta_deg", where=path, allowed="plan again")
     if not candidates.safe[0]:
         raise InputError(f"its direction is rejected: {reason_text(candidates, 0)}", where=path, allowed="plan again")
+    _check_limits(plan, context, path)
     if seed is not None:
         _check_same("seed", plan.seed, seed, path)
     _check_labels(plan, context, candidates, path)
@@ -59,6 +61,16 @@ def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None
     for phase, known in phase_clearances(plan, context.reach.checker).items():
         _check_same(f"clearance_mm.{phase}", plan.clearance_mm.get(phase, np.nan), known, path)
     return candidates
+
+
+def _check_limits(plan: Plan, context: CaseContext, path: Path) -> None:
+    """Refuse a plan that ends in a configuration beyond the case's limits of chances: the search's may be another."""
+    if context.chance is None:
+        return
+    asked = context.case, context.anatomy, context.engine, context.chance
+    if not keeps_limits(*asked, plan.outward_ct[None], plan.insertion.q[-1:]).all():
+        what = "the configuration in which it ends does not keep search.min_hit and max_touch"
+        raise InputError(what, where=path, allowed="plan again")
 
 
 def _check_labels(plan: Plan, context: CaseContext, candidates: Candidates, path: Path) -> None:

@@ -14,7 +14,7 @@ from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.plan.motion import motion_contact
 from puncture_twin.planning.plan.plan_document import read_plan, write_plan
 from puncture_twin.planning.plan.planner import make_plan
-from puncture_twin.planning.plan.recheck import check_plan
+from puncture_twin.planning.plan.recheck import _check_limits, check_plan
 from puncture_twin.planning.search.candidates import Ranking
 from puncture_twin.planning.search.context import prepare
 
@@ -40,6 +40,15 @@ def found(carton):
 def planned(carton, found):
     """Its plan, and the candidates it was chosen from."""
     return make_plan(carton, found, seed=1)
+
+
+@pytest.mark.parametrize("limit", [{"min_hit": 1.0}, {"max_touch": 0.0}])
+def test_a_plan_whose_own_configuration_breaks_a_limit_is_refused(carton, planned, limit):
+    """The search may have had another configuration: its verdict says nothing of the plan's."""
+    _check_limits(planned.plan, carton, "plan.json")
+    strict = replace(carton, case=replace(carton.case, search=replace(carton.case.search, **limit)))
+    with pytest.raises(InputError, match="does not keep search.min_hit and max_touch"):
+        _check_limits(planned.plan, strict, "plan.json")
 
 
 def test_plan_case_and_candidates_show_themselves(carton, found, planned):
