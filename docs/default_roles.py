@@ -7,7 +7,8 @@ from puncture_twin.planning.anatomy.default_roles import BY_REGION, GENERAL, UNK
 HEAD = """# Default roles and margins
 
 What `init` writes for a structure, by its name. Capitals, spaces and signs do not count: "Left Lung" is `left_lung`.
-Of several lines that match, the one with the longest pattern holds; a lesion is a lesion whatever organ it is of. The
+Of several lines that match, the one with the longest pattern holds; a lesion is a lesion whatever organ it is of, and a
+line that avoids holds before one that traverses: `thigh_artery` is no muscle, `intracranial_vessels` are no skull. The
 structure that holds the target gets the role `target`, others that hold it too `traverse`. Margins, in mm, are a start
 that a physician looks at for each patient, not a rule of any society; they are those of the cases in this repository.
 

@@ -1,8 +1,9 @@
 """What a structure means to a needle where nobody says: one line per class or group of classes, each with its reason.
 
 Names are those of TotalSegmentator's tasks and of Slicer's segments, in any spelling of capitals, spaces and signs:
-``lung_upper_lobe_left``, "Left Lung". Of several lines that match a name the most specific holds, as in a case. Margins
-are a start to be looked at for each patient, not a rule of any society.
+``lung_upper_lobe_left``, "Left Lung". Of several lines that match a name the most specific holds, as in a case; but
+what may be hurt is not crossed because its name holds a muscle's too, as in ``thigh_artery``. Margins are a start to be
+looked at for each patient, not a rule of any society.
 """
 
 from __future__ import annotations
@@ -180,7 +181,7 @@ GENERAL: tuple[DefaultRole, ...] = (
     ),
     _line(
         "heart",
-        "*heart* *cardi* *atri* *ventricle_left* *ventricle_right* *coronar*",
+        "*heart* *cardi* *papillary_muscle* *atri* *ventricle_left* *ventricle_right* *coronar*",
         "avoid",
         5.0,
         "it moves; tamponade",
@@ -320,7 +321,7 @@ BY_REGION: Mapping[str, tuple[DefaultRole, ...]] = MappingProxyType(
                 "the path to a target in the brain leads through it",
             ),
             _line(
-                "skull",
+                "skull and face",
                 "*skull* *crani*",
                 "traverse",
                 0.0,
@@ -370,11 +371,13 @@ def default_role(name: str, region: str) -> DefaultRole | None:
         region: As a case states it.
     """
     plain = plain_name(name)
-    for lines in ((LESION,), BY_REGION.get(region, ()), GENERAL):
-        found = list(_matching(plain, lines))
-        if found:
-            return max(found, key=lambda one: one[0])[1]
-    return None
+    own, general = (list(_matching(plain, lines)) for lines in (BY_REGION.get(region, ()), GENERAL))
+    found = list(_matching(plain, (LESION,))) or own or general
+    closest = max(found, key=lambda one: one[0], default=(0.0, None))[1]
+    if closest is None or closest.kind == "avoid":
+        return closest
+    hurt = [one for one in general if one[1].kind == "avoid" and one[1].group != closest.group]
+    return max(hurt, key=lambda one: one[0], default=(0.0, closest))[1]
 
 
 def plain_name(name: str) -> str:

@@ -61,6 +61,20 @@ def test_spellings_of_other_programs_are_known(names, group):
     assert {default_role(name, "abdomen").group for name in names} == {group}
 
 
+@pytest.mark.parametrize(
+    ("names", "region"),
+    [
+        (["heart_muscle", "cardiac muscle", "Papillary muscle", "thigh_artery", "Thigh nerve"], "chest"),
+        (["breast_artery", "muscle_artery", "masseteric nerve", "oblique vein", "subcutaneous veins"], "abdomen"),
+        (["intracranial_artery", "Cranial nerves", "vessels_brain", "White matter artery", "sinus_skull"], "brain"),
+        (["cerebral hemisphere vessels", "parenchyma_vessels"], "brain"),
+    ],
+)
+def test_what_may_be_hurt_is_not_crossed_for_its_place(names, region):
+    """The longer pattern was the place's, muscle or skull, and a new case crossed these vessels and nerves freely."""
+    assert {default_role(name, region).kind for name in names} == {"avoid"}
+
+
 def test_what_no_line_knows_is_not_guessed():
     """It is avoided by the largest margin of the table."""
     assert default_role("Segment_1", "abdomen") is None
