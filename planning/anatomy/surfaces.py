@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.skin import FieldOfView, Skin, skin_from_ct, skin_from_label
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
+from puncture_twin.planning.base.cache.source_stamp import source_stamp
 from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.formats.labels.label_surface import label_mesh
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap, labelmap_of, segment_names
@@ -21,6 +22,10 @@ from puncture_twin.planning.formats.volumes.volume_source import VolumeSource
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 LABELS_PRESENT = "labels present"
+
+READERS = "puncture_twin.planning.case.case_volumes"
+"""The module that knows every reader of volumes. A surface is made from what they read, and is made anew where one of
+them has changed; nothing here imports them, so that a case without DICOM does not load its library."""
 
 
 @dataclass(frozen=True)
@@ -94,11 +99,16 @@ class VolumeSurfaces:
         check: Callable[[Arrays], object] | None = None,
     ) -> Arrays:
         """Arrays that are made from this file and from what ``made_from`` says; see `Cache.arrays`."""
-        return self.cache.arrays({"files": self.sha256, **made_from}, make, by=by, check=check)
+        return self.cache.arrays({"files": self.sha256, "readers": _readers(), **made_from}, make, by=by, check=check)
 
     def _arrays(self, what: str, make: Callable[[], Arrays]) -> Arrays:
         check = _to_skin if what.startswith("skin") else _check_labels if what == LABELS_PRESENT else kept_mesh
         return self.kept({"what": what}, make, by=__name__, check=check)
+
+
+@cache
+def _readers() -> str:
+    return source_stamp(READERS)
 
 
 def _of_mesh(mesh: TriangleMesh) -> Arrays:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from puncture_twin.planning.anatomy import surfaces
 from puncture_twin.planning.base.cache import array_cache as cache_module
 from puncture_twin.planning.base.cache.array_cache import LIBRARIES, Cache, user_cache
 from puncture_twin.planning.base.cache.entry_file import packed
@@ -286,6 +287,22 @@ def test_the_code_that_makes_a_surface_is_in_its_stamp():
     volumes = (f"formats/volumes/{name}" for name in ("nifti_header", "inflate", "voxels"))
     wanted = ("anatomy/skin", "anatomy/body/body_mask", "formats/labels/label_surface", *volumes)
     assert {f"puncture_twin/planning/{name}.py" for name in wanted} <= names
+
+
+def test_the_code_that_reads_a_volume_decides_what_is_kept_of_it(tmp_path, monkeypatch):
+    """Readers of DICOM are handed in: the organ of the old one stayed when one was mended."""
+    files = {
+        str(path.relative_to(PROJECT)) for path in closure([PROJECT / (surfaces.READERS.replace(".", "/") + ".py")])
+    }
+    dicom = [f"dicom/{name}" for name in ("ct_series", "tilt", "segmentation", "structure_set", "polygon_fill")]
+    assert {f"puncture_twin/planning/formats/{name}.py" for name in (*dicom, "labels/slicer_segments")} <= files
+    assert {"pydicom", "python-gdcm"} <= set(LIBRARIES)
+    made = []
+    for stamp in ("old", "old", "mended"):
+        monkeypatch.setattr(surfaces, "_readers", lambda stamp=stamp: stamp)
+        volume = surfaces.VolumeSurfaces(None, ("abc",), Cache(tmp_path))
+        volume.kept({"what": "x"}, counted(made), by=BY)
+    assert len(made) == 2
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ MOST_BYTES = 2_000_000_000
 
 LIBRARIES = (
     *("puncture-twin", "numpy", "scipy", "scikit-image", "numba", "python-fcl", "trimesh", "fast-simplification"),
-    "pydantic",
+    *("pydantic", "pydicom", "python-gdcm"),
 )
 """Whose versions decide what is made."""
 
