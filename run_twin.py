@@ -28,6 +28,7 @@ from puncture_twin.planning.case.case_schema import Region
 from puncture_twin.planning.export.exporter import FORMATS
 from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.selection.choice import BEST, Choice, parse_choice
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, exit_code_of
 from puncture_twin.twin.jobs.patient import answers, main_job, text as words
 from puncture_twin.twin.jobs.patient.place_text import place_text
@@ -65,6 +66,15 @@ ArmOption = Annotated[
         help="Whether the arm must be able to reach a candidate.",
         show_default="where the case says where its base is",
     ),
+]
+
+
+ThetaOption = Annotated[float | None, typer.Option("--theta", min=0, max=180, help="Puncture angle, degrees.")]
+BetaOption = Annotated[float | None, typer.Option("--beta", min=0, max=360, help="Azimuth, degrees.")]
+RankOption = Annotated[int | None, typer.Option("--rank", min=1, help="Of the search: 1 is the best candidate.")]
+WindowOption = Annotated[int | None, typer.Option("--window", min=1, help="The best of this window of the search.")]
+EntryOption = Annotated[
+    str | None, typer.Option("--entry", metavar="X,Y,Z", help="Where the needle enters the skin, mm, case's space.")
 ]
 
 
@@ -172,24 +182,38 @@ def verify(
 @app.command()
 def check(
     case: CaseArgument,
-    theta: Annotated[float, typer.Option("--theta", min=0, max=180, help="Puncture angle, degrees.")],
-    beta: Annotated[float, typer.Option("--beta", min=0, max=360, help="Azimuth, degrees.")],
+    theta: ThetaOption = None,
+    beta: BetaOption = None,
+    rank: RankOption = None,
+    window: WindowOption = None,
+    entry: EntryOption = None,
     arm: ArmOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Explain one candidate in full."""
+    """Explain one candidate in full; the best, where none is named."""
+    choice = parse_choice(theta, beta, rank, window, entry)
     with progress_display() as progress:
-        explained = answers.check_candidate(prepare(case, arm=arm, watcher=progress), theta, beta)
+        explained = answers.check_candidate(prepare(case, arm=arm, watcher=progress), choice)
     _print(explained.summary(), explained.text(), as_json)
     if not explained.safe:
         raise typer.Exit(ANSWER_IS_NO)
 
 
 @app.command()
-def plan(case: CaseArgument, out_dir: OutOption = Path("out"), as_json: JsonOption = False) -> None:
-    """Search, choose the best candidate that the arm can come to, and write plan.json."""
+def plan(
+    case: CaseArgument,
+    out_dir: OutOption = Path("out"),
+    theta: ThetaOption = None,
+    beta: BetaOption = None,
+    rank: RankOption = None,
+    window: WindowOption = None,
+    entry: EntryOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Search, plan to the best candidate that the arm can come to, or to the one that is named; write plan.json."""
+    choice = parse_choice(theta, beta, rank, window, entry)
     with progress_display() as progress:
-        run = main_job.plan_case(prepare(case, watcher=progress), out_dir)
+        run = main_job.plan_case(prepare(case, watcher=progress), out_dir, choice)
     _print(run.summary(), words.plan_text(run), as_json)
 
 
@@ -198,6 +222,11 @@ def rehearse(
     source: Annotated[Path, typer.Argument(metavar="CASE_OR_PLAN", help="A case, or a plan.json beside --case.")],
     case: Annotated[Path | None, typer.Option("--case", help="The case of a plan.json.")] = None,
     out_dir: OutOption = Path("out"),
+    theta: ThetaOption = None,
+    beta: BetaOption = None,
+    rank: RankOption = None,
+    window: WindowOption = None,
+    entry: EntryOption = None,
     seeds: Annotated[
         int | None, typer.Option("--seeds", min=1, max=1_000_000, help="Rooms, each with a truth of its own.")
     ] = None,
@@ -207,13 +236,26 @@ def rehearse(
     """Execute a plan in the twin, where the truth differs from the belief, and say where the tip ended."""
     if physics and seeds is None:
         raise InputError("--physics runs some of the rooms", where="--physics", allowed="--seeds N --physics K, K <= N")
+    choice = parse_choice(theta, beta, rank, window, entry)
     rooms = None if seeds is None else main_job.RoomCount(seeds, physics)
-    if source.suffix == ".json":
-        if case is None:
-            raise InputError("a plan needs its case", where=source, allowed="rehearse plan.json --case CASE")
-        _rehearse(case, out_dir, as_json, plan_path=source, rooms=rooms)
-    else:
-        _rehearse(source, out_dir, as_json, rooms=rooms)
+    if source.suffix != ".json":
+        _refuse_second_case(case)
+        _rehearse(source, out_dir, as_json, rooms=rooms, choice=choice)
+        return
+    _refuse_choice(source, choice)
+    if case is None:
+        raise InputError("a plan needs its case", where=source, allowed="rehearse plan.json --case CASE")
+    _rehearse(case, out_dir, as_json, plan_path=source, rooms=rooms)
+
+
+def _refuse_choice(plan_path: Path, choice: Choice) -> None:
+    if choice != BEST:
+        raise InputError("a plan has its direction", where=plan_path, allowed="a case, where one is to be chosen")
+
+
+def _refuse_second_case(case: Path | None) -> None:
+    if case is not None:
+        raise InputError("two cases", where="--case", allowed="CASE alone, or plan.json --case CASE")
 
 
 @app.command()
@@ -267,21 +309,33 @@ def mirror(
 
 @app.command()
 def export(
-    plan: Annotated[Path, typer.Argument(metavar="PLAN", help="A plan.json.")],
+    source: Annotated[Path, typer.Argument(metavar="CASE_OR_PLAN", help="A plan.json, or a case to be planned first.")],
     format_name: Annotated[str, typer.Option("--format", metavar="urscript|ros2|csv", help="For which robot.")],
     case: Annotated[Path | None, typer.Option("--case", help="The plan's case: check the plan again.")] = None,
     out_dir: OutOption = Path("out"),
+    theta: ThetaOption = None,
+    beta: BetaOption = None,
+    rank: RankOption = None,
+    window: WindowOption = None,
+    entry: EntryOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write a plan for a robot, read back and within the arm's limits. Research software, not a medical device."""
     if format_name not in FORMATS:
         raise InputError(f"format '{format_name}' is not known", where="--format", allowed=", ".join(FORMATS))
+    choice = parse_choice(theta, beta, rank, window, entry)
+    of_plan = source.suffix == ".json"
+    _refuse_choice(source, choice) if of_plan else _refuse_second_case(case)
+    checked = case if of_plan else source
     with progress_display() as progress:
-        context = None if case is None else prepare(case, watcher=progress)
-        done = main_job.export(plan, format_name, out_dir, context, progress.note)
-    summary = {"format": format_name, "notes": list(done.notes), "case_checked": case is not None}
+        context = None if checked is None else prepare(checked, watcher=progress)
+        if of_plan or context is None:
+            done = main_job.export(source, format_name, out_dir, context, progress.note)
+        else:
+            done = main_job.export_case(context, format_name, out_dir, choice)
+    summary = {"format": format_name, "notes": list(done.notes), "case_checked": context is not None}
     summary |= {"inputs": inputs_document(done.inputs), "files": [str(done.path)]}
-    _print(summary, words.export_text(done, case is not None), as_json)
+    _print(summary, words.export_text(done, context is not None), as_json)
 
 
 @app.command()
@@ -384,11 +438,12 @@ def _rehearse(
     as_json: bool,
     plan_path: Path | None = None,
     rooms: main_job.RoomCount | None = None,
+    choice: Choice = BEST,
 ) -> None:
     with progress_display() as progress:
         context = prepare(case, watcher=progress)
         if plan_path is None:
-            run = main_job.rehearse_case(context, out_dir, rooms)
+            run = main_job.rehearse_case(context, out_dir, rooms, choice)
         else:
             run = main_job.rehearse_plan(context, plan_path, out_dir, rooms)
     _print(run.summary(), words.rehearsal_text(run), as_json)

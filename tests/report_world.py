@@ -41,6 +41,12 @@ def make_case(*, space="LPS", frame=None, name="ball"):
     )
 
 
+def make_grid(case, *, step_deg=5.0, theta_deg=(0, 90), beta_deg=(0, 360)):
+    """The grid of `make_candidates`."""
+    limits = [tuple(np.radians(pair)) for pair in (theta_deg, beta_deg)]
+    return grid(*limits, np.radians(step_deg), case.T_ct_entry[:3, :3]).grid
+
+
 def make_candidates(case, *, step_deg=5.0, theta_deg=(0, 90), beta_deg=(0, 360), safe=True):
     """β 30-90: ``too_close`` (rib); θ from 70 on: ``too_long``; else safe, clearance growing with θ."""
     limits = [tuple(np.radians(pair)) for pair in (theta_deg, beta_deg)]

@@ -1,3 +1,4 @@
+from .angle_grid import AngleGrid as AngleGrid
 from .case import (
     Axis as Axis,
     Case as Case,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.angle_grid import AngleGrid
 from puncture_twin.planning.case.case_file import EntryAxes
 from puncture_twin.planning.geometry.rigid import frame_of_axes, pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
@@ -41,11 +42,13 @@ class Directions:
         theta: Shape (n,), puncture angle from the entry frame's +z, rad.
         beta: Shape (n,), azimuth from +x in its xy plane, rad.
         outward_ct: Shape (n, 3), unit vectors in the CT frame, from the target outward.
+        grid: The regular grid that they are, row by row; None for any others.
     """
 
     theta: Floats
     beta: Floats
     outward_ct: Floats
+    grid: AngleGrid | None = None
 
     def __len__(self) -> int:
         return len(self.theta)
@@ -153,10 +156,12 @@ def grid(
         R_ct_entry: Rotation of the entry frame, shape (3, 3).
     """
     azimuths = _steps(beta, step)
-    if len(azimuths) > 1 and azimuths[-1] - azimuths[0] >= 2 * np.pi - GRID_SLACK:
+    full_circle = bool(len(azimuths) > 1 and azimuths[-1] - azimuths[0] >= 2 * np.pi - GRID_SLACK)
+    if full_circle:
         azimuths = azimuths[:-1]
     polar = _steps(theta, step)
-    return _directions(np.repeat(polar, len(azimuths)), np.tile(azimuths, len(polar)), R_ct_entry)
+    found = _directions(np.repeat(polar, len(azimuths)), np.tile(azimuths, len(polar)), R_ct_entry)
+    return replace(found, grid=AngleGrid(polar, azimuths, step, full_circle))
 
 
 def _steps(limits: tuple[float, float], step: float) -> Floats:

@@ -8,7 +8,7 @@ import numpy as np
 
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.certify.certificate import Certificate
-from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.candidates import CONE_CERTIFIED, Candidates
 from puncture_twin.planning.search.ranking import ranked
 
 
@@ -22,4 +22,4 @@ def with_safe_cone(case: Case, found: Candidates, certificate: Certificate) -> C
     """
     cone, rows = np.full(len(found), np.nan), np.flatnonzero(found.safe)
     cone[rows] = certificate.safe_cone(found.outward_ct[rows])
-    return ranked(case, replace(found, safe_cone=cone))
+    return ranked(case, replace(found, safe_cone=cone, cone_source=CONE_CERTIFIED))

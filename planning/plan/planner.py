@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from puncture_twin.planning.base.arrays import Ints
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.workcell import home_configuration
@@ -29,19 +30,21 @@ MAX_TRIES = 20
 
 
 class Planned(NamedTuple):
-    """A plan, and the candidates with those that no approach was found for marked."""
+    """A plan, the candidates with those that no approach was found for marked, and the row of the planned one."""
 
     plan: Plan
     candidates: Candidates
+    row: int
 
 
-def make_plan(context: CaseContext, candidates: Candidates, *, seed: int) -> Planned:
+def make_plan(context: CaseContext, candidates: Candidates, *, seed: int, rows: Ints | None = None) -> Planned:
     """Plan to the best candidate for which an approach is found.
 
     Args:
         context: The case.
         candidates: Its search result, with reach.
         seed: Of the approach's planner.
+        rows: Those that are wanted, the most wanted first; None takes all in the order of their ranks.
 
     Raises:
         InputError: The case does not say where the arm stands.
@@ -54,14 +57,14 @@ def make_plan(context: CaseContext, candidates: Candidates, *, seed: int) -> Pla
             allowed="[registration] with markers, or [robot.mount]",
         )
     last = "no candidate is safe"
-    for row in candidates.ranked[:MAX_TRIES]:
+    for row in (candidates.ranked if rows is None else rows)[:MAX_TRIES]:
         try:
             plan = _plan(context, candidates, int(row), seed)
         except NoAnswerError as error:
             last = str(error)
             candidates = _without(context, candidates, int(row), last)
             continue
-        return Planned(plan, candidates)
+        return Planned(plan, candidates, int(row))
     raise NoAnswerError(f"no plan: {last}", counts=candidates.counts())
 
 

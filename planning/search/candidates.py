@@ -10,11 +10,16 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Ints32, Texts
 from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.case.angle_grid import AngleGrid
 from puncture_twin.planning.search.html import candidates_html
 from puncture_twin.planning.uncertainty.chances import Chances
 
 ARM_CHECKED = "checked"
 """What ``Candidates.arm_note`` says where a safe candidate is one that the arm can reach and insert along."""
+
+
+CONE_OF_GRID, CONE_CERTIFIED = "grid", "certificate"
+"""Where a safe cone comes from: the directions of the search, or the proof of all between them."""
 
 
 class Columns:
@@ -141,9 +146,11 @@ class Candidates(Columns):
         arm: Whether the arm reaches it.
         ranking: Which of the safe ones to prefer.
         safe_cone: Shape (n,), by how much one may be off in any direction and still be safe for the organs, rad; NaN
-            without a certificate.
+            for rejected candidates, and where neither a grid nor a certificate says.
         arm_note: `ARM_CHECKED`, or "not checked: " and why: then a safe candidate is safe for the organs alone.
         chances: To hit and to touch; None where the case declares no errors.
+        grid: The regular grid that the rows are; None for any others.
+        cone_source: `CONE_OF_GRID` or `CONE_CERTIFIED`; "" where there are no safe cones.
     """
 
     theta: Floats
@@ -157,6 +164,8 @@ class Candidates(Columns):
     safe_cone: Floats
     arm_note: str = "not checked"
     chances: Chances | None = None
+    grid: AngleGrid | None = None
+    cone_source: str = ""
 
     def __len__(self) -> int:
         return len(self.theta)

@@ -46,4 +46,5 @@ def organ_candidates(case: Case, anatomy: Anatomy, engine: ClearanceEngine, dire
         arm=ArmColumns.unknown(count),
         ranking=Ranking.none(count),
         safe_cone=np.full(count, np.nan),
+        grid=directions.grid,
     )

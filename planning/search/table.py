@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.selection.windows import find_windows
 from puncture_twin.planning.uncertainty.chances import Chances
 
 
@@ -51,11 +52,13 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
         "cost": candidates.ranking.cost,
         "rank": candidates.ranking.rank,
         "pareto": candidates.ranking.pareto,
+        "window": find_windows(candidates).of_row,
     }
     if candidates.chances is not None:
         columns |= chance_columns(candidates.chances)
+    run = {**provenance, "safe_cone_from": candidates.cone_source}
     table = pa.table({name: _array(value) for name, value in columns.items()})
-    return table.replace_schema_metadata({"run": json.dumps(dict(provenance), sort_keys=True)})
+    return table.replace_schema_metadata({"run": json.dumps(run, sort_keys=True)})
 
 
 def chance_columns(chances: Chances) -> dict[str, Floats]:

@@ -199,7 +199,11 @@ BREAKS = {
     "case: unknown arm": (replace("case.toml", "[registration]", '[robot]\nmodel = "ur99"\n[registration]'), "ur99"),
     "case: affine": (replace("case.toml", "[registration]", '[registration]\nmethod = "affine"'), "affine"),
     # the target
-    "target outside the skin": (replace("case.toml", "[0.0, 0.0, 0.0]", "[0.0, 0.0, 300.0]"), "outside the skin"),
+    "target outside the skin": (replace("case.toml", "[0.0, 0.0, 0.0]", "[0.0, 0.0, 95.0]"), "outside the skin"),
+    "target outside the label map": (
+        replace("case.toml", "[0.0, 0.0, 0.0]", "[0.0, 0.0, 300.0]"),
+        "ends before the target",
+    ),
     "target outside its structure": (
         replace("case.toml", "[0.0, 0.0, 0.0]", "[0.0, 0.0, 50.0]"),
         "outside its structure",

@@ -3,7 +3,6 @@ from .map_view import MapCells as MapCells, MapView as MapView, body_directions 
 from .mount_text import direction_words as direction_words, mount_words as mount_words
 from .numbers import (
     arm_words as arm_words,
-    chosen_row as chosen_row,
     demanding as demanding,
     nearest_structure as nearest_structure,
     needle_words as needle_words,

@@ -53,12 +53,6 @@ def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
     return tuple(sorted(lines, key=lambda line: (line.code != "safe", -line.count)))
 
 
-def chosen_row(candidates: Candidates) -> int | None:
-    """The row of rank 1, None when nothing is ranked."""
-    ranked = candidates.ranked
-    return int(ranked[0]) if len(ranked) else None
-
-
 def nearest_structure(candidates: Candidates, row: int) -> tuple[str, float]:
     """The structure with a margin that lies nearest to a candidate's needle, and its clearance in mm."""
     demanding = np.flatnonzero(np.isfinite(candidates.clearance.margins))

@@ -17,6 +17,7 @@ from puncture_twin.planning.base.reasons import REASON_COLOURS
 from puncture_twin.planning.case.case_file import EntryAxes
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.place.directions import ring_weights
+from puncture_twin.planning.search.selection.choice import best_pick
 from puncture_twin.twin.report import annotate
 from puncture_twin.twin.report.map.map_picture import FIGURE_INCHES, MAP_BOX, RIM, draw_map
 from puncture_twin.twin.report.map.map_raster import map_raster
@@ -571,7 +572,7 @@ def test_names_from_files_cannot_become_markup(case, candidates, tmp_path):
 
 def test_the_page_s_map_knows_its_rows(case, candidates):
     """The run lengths that the script unpacks give back the row under every pixel; numbers are JSON."""
-    data = map_data(case, candidates)
+    data = map_data(case, candidates, best_pick(candidates))
     json.dumps(data, allow_nan=False)
     runs = np.array(data["runs"]).reshape(-1, 2)
     table = np.repeat(runs[:, 0], runs[:, 1]).reshape(data["size"], data["size"])

@@ -10,7 +10,7 @@ from puncture_twin.twin.report.page.page_tables import listed, pairs, table
 from puncture_twin.twin.report.page.template import Card, script_json, write_html
 
 EVIL = "</script><script>alert('1')</script>{{ title }}"
-SERVO = ("setup", "paper", "targets", "convergence", "statistics", "calibration", "inputs")
+SERVO = ("setup", "paper", "targets", "needle", "convergence", "statistics", "calibration", "inputs")
 
 
 def servo_parts(text):

@@ -30,12 +30,21 @@ from puncture_twin.planning.registration.registration import Registration, match
 from puncture_twin.planning.registration.touching import touchable_points
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
+from puncture_twin.planning.search.selection.choice import Choice, choose, chosen_angles
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
 
 
-def check_candidate(context: CaseContext, theta_deg: float, beta_deg: float) -> Explanation:
-    """Judge one direction and explain it."""
-    return context.explain(float(np.radians(theta_deg)), float(np.radians(beta_deg)))
+def check_candidate(context: CaseContext, choice: Choice) -> Explanation:
+    """Evaluate one direction and explain it; one of a rank or window is searched for first.
+
+    Raises:
+        InputError: See `chosen_angles`, `choose`.
+        NoAnswerError: Nothing is safe, so that there are no ranks.
+    """
+    if not choice.of_grid:
+        return context.explain(*chosen_angles(context.case, choice))
+    found, rows = choose(context, context.search(), choice)
+    return context.explain(found.theta[rows[0]], found.beta[rows[0]])
 
 
 def registration_report(path: Path) -> dict[str, Any]:

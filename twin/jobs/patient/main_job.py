@@ -30,6 +30,7 @@ from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
 from puncture_twin.planning.plan.planner import make_plan
 from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.selection.choice import BEST, Choice, Pick, choose
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.twin.jobs.patient.run import Run
 from puncture_twin.twin.jobs.patient.summaries import registration_summary, rehearsal_summary
@@ -45,6 +46,9 @@ from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
 PICTURES = ("map.png", "scene.png", "report.html")
 CERTIFICATE, FILM, ROOMS = "certificate.json", "rehearsal.mp4", "rooms.png"
+
+NO_PLAN = "no plan: "
+"""Before the reason, whoever gives it: the choice, or the planner."""
 
 DEMO_ROOMS = 1000
 """What a stranger sees first is a distribution, where the case declares what it may be off by."""
@@ -76,30 +80,30 @@ def search_case(
     return _final(run, draft)
 
 
-def plan_case(context: CaseContext, out: Path) -> Run:
-    """Search and plan; write ``plan.json`` too.
+def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
+    """Search and plan the best candidate, or the chosen one; write ``plan.json`` too.
 
     Raises:
-        InputError: The case does not say where the arm stands.
+        InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
         NoAnswerError: No plan; the search's files are written all the same.
     """
     _refuse_without_arm(context)
     with _writing(out, "plan", context, ("candidates.parquet", "plan.json", *PICTURES)) as draft:
-        run = _with_pictures(_searched_and_planned(context, draft.folder), draft.folder)
+        run = _with_pictures(_searched_and_planned(context, draft.folder, choice), draft.folder)
     return _answered(_final(run, draft), out)
 
 
-def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = None) -> Run:
+def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = None, choice: Choice = BEST) -> Run:
     """Plan, rehearse the plan, in many rooms too where a number is given, and write everything.
 
     Raises:
-        InputError: The case does not say where the arm stands.
+        InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
         NoAnswerError: No plan; the search's files are written all the same.
     """
     _refuse_without_arm(context)
     names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
     with _writing(out, "plan", context, names) as draft:
-        run = _searched_and_planned(context, draft.folder)
+        run = _searched_and_planned(context, draft.folder, choice)
         planned = run.files
         run = run if run.plan is None else _rehearsed(run, draft.folder, rooms)
         run = _with_pictures(run, draft.folder)
@@ -159,8 +163,8 @@ def _answered(run: Run, out: Path) -> Run:
     return run
 
 
-def _searched_and_planned(context: CaseContext, out: Path) -> Run:
-    return _with_table(_planned(Run(context, context.search(), ()), out), out)
+def _searched_and_planned(context: CaseContext, out: Path, choice: Choice) -> Run:
+    return _with_table(_planned(Run(context, context.search(), ()), out, choice), out)
 
 
 def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomCount | None = None) -> Run:
@@ -240,6 +244,17 @@ def _distribution(run: Run, count: RoomCount) -> Distribution:
         return replace(found, physics=physics_rooms(context, run.plan, found, count.physics, again))
 
 
+def export_case(context: CaseContext, format_name: str, out: Path, choice: Choice) -> Exported:
+    """Plan what is chosen, write everything that `plan_case` writes, and the plan for a robot beside it.
+
+    Raises:
+        InputError: See `plan_case`, `export`.
+        NoAnswerError: No plan.
+    """
+    plan_case(context, out, choice)
+    return export(out / "plan.json", format_name, out, context, context.watcher.note)
+
+
 def export(
     plan_path: Path, format_name: str, out: Path, context: CaseContext | None, note: Callable[[str], None]
 ) -> Exported:
@@ -270,15 +285,18 @@ def _certified(run: Run, size_deg: float, out: Path) -> Run:
     return _with(replace(run, candidates=found, certificate=certificate), out / CERTIFICATE)
 
 
-def _planned(run: Run, out: Path) -> Run:
+def _planned(run: Run, out: Path, choice: Choice) -> Run:
+    """Plan what is chosen; where an approach fails to a candidate of the grid, the grid says so."""
     context = run.context
     try:
         with context.stages.time("plan"):
-            plan, candidates = make_plan(context, run.candidates, seed=context.case.rehearsal.seed)
+            chosen = choose(context, run.candidates, choice)
+            plan, found, row = make_plan(context, chosen.candidates, seed=context.case.rehearsal.seed, rows=chosen.rows)
     except NoAnswerError as error:
-        return replace(run, refusal=str(error))
+        return replace(run, refusal=f"{NO_PLAN}{str(error).removeprefix(NO_PLAN)}")
     write_plan(plan, out / "plan.json")
-    return _with(replace(run, plan=plan, candidates=candidates), out / "plan.json")
+    run = replace(run, plan=plan, pick=Pick(found, row), candidates=found if choice.of_grid else run.candidates)
+    return _with(run, out / "plan.json")
 
 
 def _with_table(run: Run, out: Path) -> Run:
@@ -293,15 +311,17 @@ def _with_pictures(run: Run, out: Path) -> Run:
     context, found = run.context, run.candidates
     case, anatomy, stages = context.case, context.anatomy, context.stages
     with stages.time("map"):
-        draw_map(found, case, out / "map.png")
+        draw_map(found, case, out / "map.png", run.pick)
     with stages.time("scene"):
-        draw_scene(case, anatomy, found, run.plan, out / "scene.png")
+        draw_scene(case, anatomy, found, run.plan, out / "scene.png", run.pick)
     registration = context.placement.registration if context.placement is not None else None
     shown = None if registration is None else registration_summary(registration)
     film = next((path.name for path in run.files if path.stem == Path(FILM).stem and path.suffix != ".json"), None)
     with stages.time("page"):
         page, told = out / "report.html", _uncertainty(run)
-        write_page(case, anatomy, found, run.plan, run.rehearsal, shown, page, film=film, uncertainty=told)
+        write_page(
+            case, anatomy, found, run.plan, run.rehearsal, shown, page, film=film, uncertainty=told, pick=run.pick
+        )
     return _with(run, out / "map.png", out / "scene.png", out / "report.html")
 
 

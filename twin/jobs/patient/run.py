@@ -13,7 +13,9 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import needle_warnings
-from puncture_twin.twin.jobs.patient.summaries import candidate_summary, plan_summary, rehearsal_summary
+from puncture_twin.planning.search.selection.choice import Pick
+from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
+from puncture_twin.twin.jobs.patient.summaries import plan_summary, rehearsal_summary, window_summary
 from puncture_twin.twin.rehearsal.distribution import Distribution
 from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
 
@@ -32,6 +34,7 @@ class Run:
     certificate: Certificate | None = None
     read: tuple[Input, ...] = ()
     distribution: Distribution | None = None
+    pick: Pick | None = None
 
     @property
     def inputs(self) -> tuple[Input, ...]:
@@ -41,13 +44,16 @@ class Run:
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees."""
         found, provenance = self.candidates, self.context.provenance()
+        windows = find_windows(found).windows
         return {
             **provenance,
             "warnings": [*provenance["warnings"], *needle_warnings(self.context.case, found)],
             "inputs": inputs_document(self.inputs),
             "directions": len(found),
             "counts": found.counts(),
-            "best": [candidate_summary(found, int(row)) for row in found.ranked[:10]],
+            "best": [window_summary(found, window) for window in windows[:MOST_WINDOWS]],
+            "windows": len(windows),
+            "safe_cone_from": found.cone_source,
             "plan": None if self.plan is None else plan_summary(self.plan),
             "rehearsal": None if self.rehearsal is None else rehearsal_summary(self.rehearsal),
             **({} if self.distribution is None else {"distribution": self.distribution.summary()}),

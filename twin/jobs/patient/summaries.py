@@ -10,6 +10,7 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.explain import finite
+from puncture_twin.planning.search.selection.windows import Window
 from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
 
 
@@ -53,8 +54,9 @@ def _declared(registration: Registration) -> dict[str, Any]:
     }
 
 
-def candidate_summary(found: Candidates, row: int) -> dict[str, Any]:
-    """One ranked candidate as plain values: mm and degrees."""
+def window_summary(found: Candidates, window: Window) -> dict[str, Any]:
+    """A window by its best candidate, as plain values: mm and degrees."""
+    row = window.best
     return {
         "rank": int(found.ranking.rank[row]),
         "theta_deg": float(np.degrees(found.theta[row])),
@@ -67,6 +69,11 @@ def candidate_summary(found: Candidates, row: int) -> dict[str, Any]:
         "reach_margin": finite(found.arm.margin[row]),
         "safe_cone_deg": finite(np.degrees(found.safe_cone[row])),
         "pareto": bool(found.ranking.pareto[row]),
+        "window": window.number,
+        "window_directions": window.directions,
+        "window_square_deg": window.square_deg,
+        "window_entry_cm2": window.entry_cm2,
+        "window_widest_cone_deg": finite(np.degrees(window.widest_cone)),
     }
 
 

@@ -27,6 +27,9 @@ LEAST_SHOWN = 5e-5
 """A chance or share below it rounds to nothing in what people read."""
 
 
+CONE_WORDS = {"grid": "as far as the grid tells", "certificate": "proven by the certificate", "": "not known"}
+
+
 def search_text(run: Run) -> str:
     """Counts, the best ten, or what came closest; then the files."""
     return "\n".join([*_search(run), *_footer(run)])
@@ -229,15 +232,25 @@ def batch_text(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _best(run: Run) -> list[str]:
-    lines = ["rank  theta   beta   cost  clearance  path  angle  reach  (deg, mm)"]
-    for best in run.summary()["best"]:
-        cone = "" if best["safe_cone_deg"] is None else f"  safe cone {best['safe_cone_deg']:.1f}"
+    """The best candidate of each window."""
+    summary = run.summary()
+    head = "the best of each window"
+    if summary["windows"] > len(summary["best"]):
+        head += f" (the first {len(summary['best'])} of {summary['windows']})"
+    cones = CONE_WORDS[summary["safe_cone_from"]]
+    lines = [
+        f"{head}; cone: off by so much in any direction a needle stays safe for the organs, {cones}",
+        "window  rank  theta   beta   cost  clearance  path  angle  reach   cone   window's area   on the skin",
+        "                 deg    deg               mm    mm    deg            deg           deg2           cm2",
+    ]
+    for best in summary["best"]:
         reach = "    -" if best["reach_margin"] is None else f"{best['reach_margin']:5.2f}"
+        cone = "    -" if best["safe_cone_deg"] is None else f"{best['safe_cone_deg']:5.1f}"
         lines.append(
-            f"{best['rank']:4d} {best['theta_deg']:6.1f} {best['beta_deg']:6.1f} {best['cost']:6.3f} "
+            f"{best['window']:6d}{best['rank']:6d} {best['theta_deg']:6.1f} {best['beta_deg']:6.1f} "
+            f"{best['cost']:6.3f} "
             f"{best['min_clearance_mm']:10.2f} {best['path_length_mm']:5.0f} {best['skin_angle_deg']:6.1f}  {reach}"
-            + cone
-            + ("  Pareto" if best["pareto"] else "")
+            f"  {cone}  {best['window_square_deg']:14.0f} {best['window_entry_cm2']:13.1f}"
         )
     return lines
 

@@ -19,12 +19,13 @@ from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.doubt import chance_words
+from puncture_twin.planning.search.selection.choice import Pick, best_pick
+from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.report.map.chance_layer import chance_legend, draw_chances
 from puncture_twin.twin.report.map.map_raster import MapRaster, clearance_range, map_raster
 from puncture_twin.twin.report.map_view import MapView, map_view, step_of
 from puncture_twin.twin.report.numbers import (
     arm_words,
-    chosen_row,
     nearest_structure,
     needle_words,
     number,
@@ -61,14 +62,16 @@ BEYOND = np.radians(92.0)
 HALO = (withStroke(linewidth=3.2, foreground="white"),)
 
 
-def draw_map(candidates: Candidates, case: Any, path: Path) -> None:
+def draw_map(candidates: Candidates, case: Any, path: Path, pick: Pick | None = None) -> None:
     """Write the map of a search.
 
     Args:
         candidates: The grid, checked.
         case: The case: ``name``, ``space``, ``T_ct_entry``, ``needle``, ``target_name``.
         path: The PNG to write; it appears whole or not at all.
+        pick: The planned candidate, or the one to be shown; None shows the best.
     """
+    pick = pick or best_pick(candidates)
     view = map_view(case, candidates)
     raster = map_raster(candidates, view, PIXELS)
     figure = Figure(figsize=FIGURE_INCHES, dpi=DPI, facecolor="white")
@@ -78,9 +81,9 @@ def draw_map(candidates: Candidates, case: Any, path: Path) -> None:
     draw_chances(axes, candidates, raster.rows)
     _outline(axes, raster, candidates)
     _names(axes, raster, candidates)
-    _marks(axes, view, candidates)
+    _marks(axes, view, candidates, pick)
     _title(figure, case, candidates)
-    _side(figure.add_axes(SIDE_BOX), case, candidates, view)
+    _side(figure.add_axes(SIDE_BOX), case, candidates, view, pick)
     with atomic(Path(path)) as temporary:
         FigureCanvasAgg(figure)
         figure.savefig(temporary, format="png", pil_kwargs={"compress_level": PNG_LEVEL})
@@ -163,9 +166,9 @@ def _size(words: str) -> tuple[float, float]:
     return 0.7 * NAME_POINTS / radius_points, 0.29 * NAME_POINTS * len(words) / radius_points
 
 
-def _marks(axes: Axes, view: MapView, candidates: Candidates) -> None:
-    def put(rows: Any, **look: Any) -> None:
-        points = view.place(candidates.theta[rows], candidates.beta[rows])
+def _marks(axes: Axes, view: MapView, candidates: Candidates, pick: Pick | None) -> None:
+    def put(rows: Any, of: Candidates = candidates, **look: Any) -> None:
+        points = view.place(of.theta[rows], of.beta[rows])
         axes.scatter(points[:, 0], points[:, 1], **look)
 
     axes.plot([0], [0], marker="+", color="black", ms=9, mew=1.2, zorder=5)
@@ -177,9 +180,10 @@ def _marks(axes: Axes, view: MapView, candidates: Candidates) -> None:
         linewidths=0.5,
         zorder=6,
     )
-    put(candidates.ranked[1:10], s=46, facecolors="none", edgecolors="black", linewidths=1.2, zorder=7)
-    chosen = candidates.ranked[:1]
-    put(chosen, s=330, marker="*", c="white", edgecolors="black", linewidths=1.6, zorder=8)
+    bests = [window.best for window in find_windows(candidates).windows[:MOST_WINDOWS]]
+    put(bests, s=46, facecolors="none", edgecolors="black", linewidths=1.2, zorder=7)
+    if pick is not None:
+        put([pick.row], pick.candidates, s=330, marker="*", c="white", edgecolors="black", linewidths=1.6, zorder=8)
 
 
 def _title(figure: Figure, case: Any, candidates: Candidates) -> None:
@@ -191,7 +195,7 @@ def _title(figure: Figure, case: Any, candidates: Candidates) -> None:
     figure.text(0.985, 0.012, "research software, not a medical device", fontsize=9, color="0.4", ha="right")
 
 
-def _side(axes: Axes, case: Any, candidates: Candidates, view: MapView) -> None:
+def _side(axes: Axes, case: Any, candidates: Candidates, view: MapView, pick: Pick | None) -> None:
     axes.set_xlim(0, 1)
     axes.set_ylim(1, 0)
     axes.set_axis_off()
@@ -199,7 +203,7 @@ def _side(axes: Axes, case: Any, candidates: Candidates, view: MapView) -> None:
     y = _scale(axes, candidates, y + 0.03)
     y = chance_legend(axes, candidates, y)
     y = _mark_legend(axes, candidates, y + 0.05)
-    y = _chosen(axes, candidates, y + 0.035)
+    y = _chosen(axes, candidates, pick, y + 0.035)
     toward = f"Centre (+), θ = 0: {view.centre}.\n" if view.centre else ""
     if view.theta_max > BEYOND:
         toward += "Beyond the thick ring (θ 90°) it comes from the far side.\n"
@@ -263,26 +267,27 @@ def _mark_legend(axes: Axes, candidates: Candidates, y: float) -> float:
     if not candidates.safe.any():
         return y
     axes.scatter([0.03], [y], s=240, marker="*", c="white", edgecolors="black", linewidths=1.5, clip_on=False)
-    axes.text(0.075, y, "best", fontsize=10.5, va="center")
-    axes.scatter([0.32], [y], s=46, facecolors="none", edgecolors="black", linewidths=1.2)
-    axes.text(0.36, y, "ten best", fontsize=10.5, va="center")
+    axes.text(0.075, y, "chosen", fontsize=10.5, va="center")
+    axes.scatter([0.27], [y], s=46, facecolors="none", edgecolors="black", linewidths=1.2)
+    axes.text(0.3, y, "best of a window", fontsize=10.5, va="center")
     if candidates.ranking.pareto.any():
-        axes.scatter([0.63], [y], s=9, c="white", edgecolors="black", linewidths=0.5)
-        axes.text(0.66, y, "Pareto front", fontsize=10.5, va="center")
+        axes.scatter([0.72], [y], s=9, c="white", edgecolors="black", linewidths=0.5)
+        axes.text(0.75, y, "Pareto front", fontsize=10.5, va="center")
     return y
 
 
-def _chosen(axes: Axes, candidates: Candidates, y: float) -> float:
-    row = chosen_row(candidates)
-    if row is None:
+def _chosen(axes: Axes, candidates: Candidates, pick: Pick | None, y: float) -> float:
+    if pick is None:
         words = "NOTHING IS SAFE\nEvery direction of the grid is refused."
         box = {"facecolor": "#ffe9e0", "edgecolor": "#b03000", "boxstyle": "round,pad=0.5"}
         axes.text(0.02, y + 0.03, words, fontsize=13, fontweight="bold", color="#a02000", va="top", bbox=box)
         return y + 0.12
+    word = "Best" if pick == best_pick(candidates) else "Chosen"
+    candidates, row = pick
     name, clearance = nearest_structure(candidates, row)
     theta, beta = np.degrees(candidates.theta[row]), np.degrees(candidates.beta[row])
     lines = (
-        f"Best: θ {theta:g}°, β {beta:g}°{_chances(candidates, row)}",
+        f"{word}: θ {theta:.4g}°, β {beta:.4g}°{_chances(candidates, row)}",
         f"path in the body {number(candidates.path.length[row], 1, 'mm')}, "
         f"skin angle {number(float(np.degrees(candidates.path.skin_angle[row])), 0)}°",
         f"nearest: {name.replace('_', ' ') or 'none'}, {number(clearance, 1, 'mm')}",

@@ -11,8 +11,8 @@ import numpy as np
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.doubt import Doubt
+from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.twin.report.numbers import (
-    chosen_row,
     demanding,
     nearest_structure,
     needle_words,
@@ -57,6 +57,7 @@ def write_page(
     *,
     film: str | None = None,
     uncertainty: Uncertainty | None = None,
+    pick: Pick | None = None,
 ) -> None:
     """Write the page.
 
@@ -70,10 +71,12 @@ def write_page(
         path: The HTML to write; it appears whole or not at all.
         film: Name of the rehearsal's film, which lies beside the page and is linked; None without one.
         uncertainty: What there is to say of chances and rooms; None where the case declares no errors.
+        pick: The planned candidate, or the one to be shown; None shows the best.
     """
+    pick = pick or best_pick(candidates)
     data = {
-        "map": map_data(case, candidates),
-        "scene": scene_figure(case, anatomy, candidates, plan, user_cache()),
+        "map": map_data(case, candidates, pick),
+        "scene": scene_figure(case, anatomy, candidates, plan, user_cache(), pick),
         "charts": None if rehearsal is None else rehearsal_charts(rehearsal, demanding(anatomy)),
         "target": [float(v) for v in case.target_ct],
         "probe_mm": float(case.needle.length_mm),
@@ -86,7 +89,7 @@ def write_page(
         needle=needle_words(case),
         notice=TRUTH_IS_BELIEF if rehearsal is not None and rehearsal.truth_is_belief else "",
         refused=_refused(candidates),
-        cards=_cards(candidates, plan, rehearsal, None if uncertainty is None else uncertainty.doubt),
+        cards=_cards(candidates, pick, plan, rehearsal, None if uncertainty is None else uncertainty.doubt),
         chances=None if uncertainty is None else chances_section(uncertainty.doubt, registration),
         rooms=None if uncertainty is None else rooms_section(uncertainty.rooms, uncertainty.picture),
         counts=tables.counts_table(candidates),
@@ -110,8 +113,9 @@ def _refused(candidates: Candidates) -> str:
     return f"All {len(candidates):,} directions are refused ({counts})."
 
 
-def _cards(candidates: Candidates, plan: Any | None, rehearsal: Any | None, doubt: Doubt | None) -> list[Card]:
-    row = chosen_row(candidates)
+def _cards(
+    candidates: Candidates, pick: Pick | None, plan: Any | None, rehearsal: Any | None, doubt: Doubt | None
+) -> list[Card]:
     safe = int(candidates.safe.sum())
     if safe == 0:
         return []
@@ -122,13 +126,8 @@ def _cards(candidates: Candidates, plan: Any | None, rehearsal: Any | None, doub
             f"{100 * safe / len(candidates):.1f} % of the grid",
         )
     ]
-    if row is not None:
-        name, clearance = nearest_structure(candidates, row)
-        where = f"θ {np.degrees(candidates.theta[row]):g}°, β {np.degrees(candidates.beta[row]):g}°"
-        detail = f"{number(float(candidates.path.length[row]), 1, 'mm')} in the body"
-        if name:
-            detail += f"; nearest {name.replace('_', ' ')}, {number(clearance, 1, 'mm')}"
-        cards.append(Card("best direction", where, detail))
+    if pick is not None:
+        cards.append(_direction_card(*pick, best=pick == best_pick(candidates)))
     if doubt is not None:
         cards.append(chance_card(doubt))
     if not candidates.arm_checked:
@@ -143,3 +142,12 @@ def _cards(candidates: Candidates, plan: Any | None, rehearsal: Any | None, doub
             expected = f"{rehearsal.standing.words}; {expected}"
         cards.append(Card("rehearsed tip error", number(rehearsal.tip_error_mm, 2, "mm"), expected))
     return cards
+
+
+def _direction_card(candidates: Candidates, row: int, *, best: bool) -> Card:
+    name, clearance = nearest_structure(candidates, row)
+    where = f"θ {np.degrees(candidates.theta[row]):.4g}°, β {np.degrees(candidates.beta[row]):.4g}°"
+    detail = f"{number(float(candidates.path.length[row]), 1, 'mm')} in the body"
+    if name:
+        detail += f"; nearest {name.replace('_', ' ')}, {number(clearance, 1, 'mm')}"
+    return Card("best direction" if best else "chosen direction", where, detail)

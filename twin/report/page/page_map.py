@@ -11,6 +11,8 @@ from PIL import Image
 
 from puncture_twin.planning.base.reasons import REASON_WORDS, Reason
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.selection.choice import Pick
+from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.report.map.map_raster import map_raster
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.palette import PNG_LEVEL, reason_of
@@ -29,13 +31,13 @@ DETAIL_UNITS = {
 """What ``Candidates.verdict.amount`` is, by reason."""
 
 
-def map_data(case: Any, candidates: Candidates) -> dict[str, Any]:
+def map_data(case: Any, candidates: Candidates, pick: Pick | None) -> dict[str, Any]:
     """What the page's script needs to draw the map and answer the pointer; plain values, degrees and mm.
 
     The pixel-to-row table is stored run by run, row after row of the picture: ``runs`` is [candidate, length, ...],
     candidate -1 outside the grid.
     """
-    view = map_view(case, candidates)
+    view, windows = map_view(case, candidates), find_windows(candidates)
     raster = map_raster(candidates, view, 2 * PIXELS)
     rows = map_raster_rows(raster.rows[::2, ::2])
     structures = sorted({*map(str, candidates.verdict.structure), *candidates.clearance.structures})
@@ -72,7 +74,10 @@ def map_data(case: Any, candidates: Candidates) -> dict[str, Any]:
         "rank": candidates.ranking.rank.tolist(),
         "reachable": candidates.arm.reachable.tolist(),
         "outward": _rounded(candidates.outward_ct.ravel(), 5),
-        "best": candidates.ranked[:10].tolist(),
+        "best": [window.best for window in windows.windows[:MOST_WINDOWS]],
+        "window": windows.of_row.tolist(),
+        "safe_cone": _rounded(np.degrees(candidates.safe_cone), 1),
+        "chosen": None if pick is None else pick.candidates.at(pick.row),
         "pareto": np.flatnonzero(candidates.ranking.pareto & candidates.safe).tolist(),
         **_chances(candidates),
     }

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.selection.choice import Pick
 from puncture_twin.twin.report.map_view import body_directions
 from puncture_twin.twin.report.raster.render import Layer
 from puncture_twin.twin.report.scene.lighter_mesh import lighter_mesh
@@ -48,7 +49,12 @@ GROUP_NAMES = {"safe": "safe region", "arm": "arm", "room": "room", "needle": "n
 
 
 def scene_figure(
-    case: Any, anatomy: Any, candidates: Candidates, plan: Any | None, cache: Cache = NO_CACHE
+    case: Any,
+    anatomy: Any,
+    candidates: Candidates,
+    plan: Any | None,
+    cache: Cache = NO_CACHE,
+    pick: Pick | None = None,
 ) -> dict[str, Any]:
     """A plotly figure as plain values, meshes in base64.
 
@@ -58,8 +64,9 @@ def scene_figure(
         candidates: The search's rows.
         plan: The plan, or None: then there is no arm.
         cache: Where lightened meshes are kept.
+        pick: Whose needle is shown where there is no plan; None shows none.
     """
-    bodies, standoff = _bodies(case, anatomy, candidates, plan)
+    bodies, standoff = _bodies(case, anatomy, candidates, plan, pick)
     light = lightened([*bodies, *standoff], TRIANGLES, cache)
     hidden = set(range(len(bodies), len(light)))
     first = {_legend_name(body): i for i, body in reversed(list(enumerate(light))) if i not in hidden}
@@ -78,12 +85,12 @@ def lightened(bodies: Sequence[SceneBody], triangles: int, cache: Cache = NO_CAC
 
 
 def _bodies(
-    case: Any, anatomy: Any, candidates: Candidates, plan: Any | None
+    case: Any, anatomy: Any, candidates: Candidates, plan: Any | None, pick: Pick | None
 ) -> tuple[list[SceneBody], list[SceneBody]]:
     """What is shown at first (the needle on the target), and what the standoff pose adds."""
     T_base_ct = None if plan is None else plan.T_base_ct
     bodies = [*patient(anatomy, case), *room(case, T_base_ct), *safe_region(candidates, case)]
-    direction = chosen_direction(candidates, case, plan)
+    direction = chosen_direction(pick, plan)
     if direction is not None:
         bodies += needle_bodies(case.needle, case.target_ct, direction).all
     if plan is None or direction is None:

@@ -15,11 +15,13 @@ from markupsafe import Markup
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.report.numbers import arm_words, nearest_structure, number, percent, reason_counts
 
 PROJECT = "puncture-twin"
 
 BEST_COLUMNS = (
+    "window",
     "rank",
     "θ °",
     "β °",
@@ -30,8 +32,16 @@ BEST_COLUMNS = (
     "skin angle °",
     "crossed tissue mm",
     "reach margin",
-    "Pareto",
+    "safe cone °",
+    "window's area deg²",
+    "on the skin cm²",
 )
+
+CONE_WORDS = {
+    "grid": "by the directions of the search, to one step; a certificate proves it",
+    "certificate": "proven by the certificate",
+}
+"""Where the safe cone comes from."""
 
 
 def joined(template: str, items: Iterable[Sequence[str]]) -> Markup:
@@ -69,18 +79,20 @@ def two(left: str, right: str) -> Markup:
 
 
 def best_table(candidates: Candidates) -> Markup:
-    """The ten best candidates."""
-    rows = candidates.ranked[:10]
-    if len(rows) == 0:
+    """The best candidate of each window, with the window's size."""
+    windows = find_windows(candidates).windows
+    if not windows:
         return Markup("<p>No direction is safe, so there is nothing to rank.</p>")
     lines = []
-    for row in rows:
-        name, clearance = nearest_structure(candidates, int(row))
+    for window in windows[:MOST_WINDOWS]:
+        row = window.best
+        name, clearance = nearest_structure(candidates, row)
         lines.append(
             (
+                str(window.number),
                 str(candidates.ranking.rank[row]),
-                f"{np.degrees(candidates.theta[row]):g}",
-                f"{np.degrees(candidates.beta[row]):g}",
+                f"{np.degrees(candidates.theta[row]):.4g}",
+                f"{np.degrees(candidates.beta[row]):.4g}",
                 number(float(candidates.ranking.cost[row]), 3),
                 number(clearance, 1),
                 name.replace("_", " ") or "–",
@@ -88,10 +100,21 @@ def best_table(candidates: Candidates) -> Markup:
                 number(float(np.degrees(candidates.path.skin_angle[row])), 1),
                 number(float(candidates.path.tissue[row]), 1),
                 number(float(candidates.arm.margin[row]), 2),
-                "yes" if candidates.ranking.pareto[row] else "",
+                number(float(np.degrees(candidates.safe_cone[row])), 1),
+                number(window.square_deg, 0),
+                number(window.entry_cm2, 1),
             )
         )
-    return table(BEST_COLUMNS, lines, kind="numbers")
+    return table(BEST_COLUMNS, lines, kind="numbers") + faint(_windows_words(candidates, len(windows)))
+
+
+def _windows_words(candidates: Candidates, count: int) -> str:
+    shown = f"{MOST_WINDOWS} of {count}" if count > MOST_WINDOWS else f"All {count}"
+    words = f"{shown} windows (connected sets of safe directions)."
+    if candidates.cone_source:
+        source = CONE_WORDS[candidates.cone_source]
+        words += f" Safe cone: off by so much in any direction a needle stays safe for the organs, {source}."
+    return words
 
 
 def counts_table(candidates: Candidates) -> Markup:

@@ -16,8 +16,8 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.winding import winding_number
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.selection.choice import Pick
 from puncture_twin.twin.report import palette
-from puncture_twin.twin.report.numbers import chosen_row
 from puncture_twin.twin.report.raster.render import Layer, Surface
 from puncture_twin.twin.report.scene.shapes import ball, bar, box, corridor_mouth, corridor_walls, ring
 
@@ -139,13 +139,12 @@ def needle_bodies(needle: Any, tip_ct: Floats, outward_ct: Floats) -> NeedleBodi
     return NeedleBodies(body, SceneBody("needle holder", "needle", holder, palette.HOLDER))
 
 
-def chosen_direction(candidates: Candidates, case: Any, plan: Any | None) -> Floats | None:
-    """The outward direction of the plan, else of the best candidate, else None; shape (3,), CT frame."""
+def chosen_direction(pick: Pick | None, plan: Any | None) -> Floats | None:
+    """The outward direction of the plan, else of the picked candidate, else None; shape (3,), CT frame."""
     if plan is not None:
         way = np.asarray(plan.entry_ct, dtype=float) - np.asarray(plan.target_ct, dtype=float)
         return np.asarray(way / np.linalg.norm(way))
-    row = chosen_row(candidates)
-    return None if row is None else candidates.outward_ct[row]
+    return None if pick is None else pick.candidates.outward_ct[pick.row]
 
 
 def needle_words(needle: Any) -> str:

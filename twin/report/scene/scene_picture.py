@@ -13,8 +13,9 @@ from PIL import Image, ImageDraw
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import SAFE, Rgb
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.twin.report import annotate, palette
-from puncture_twin.twin.report.numbers import chosen_row, nearest_structure, number, target_words
+from puncture_twin.twin.report.numbers import nearest_structure, number, target_words
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import BACKGROUND, Layer, picture
 from puncture_twin.twin.report.scene.scene_parts import (
@@ -51,7 +52,9 @@ NOTHING_RADIUS_MM = 90.0
 """Around the target, when there is no path to show."""
 
 
-def draw_scene(case: Any, anatomy: Any, candidates: Candidates, plan: Any | None, path: Path) -> None:
+def draw_scene(
+    case: Any, anatomy: Any, candidates: Candidates, plan: Any | None, path: Path, pick: Pick | None = None
+) -> None:
     """Write the picture of the scene.
 
     Args:
@@ -60,16 +63,18 @@ def draw_scene(case: Any, anatomy: Any, candidates: Candidates, plan: Any | None
         candidates: The search's rows; the safe ones make the corridor.
         plan: The plan, or None: then there is no arm, and the needle is that of the best candidate.
         path: The PNG to write; it appears whole or not at all.
+        pick: The planned candidate, or the one to be shown; None shows the best.
     """
+    pick = pick or best_pick(candidates)
     T_base_ct = None if plan is None else plan.T_base_ct
     bodies = [*patient(anatomy, case), *safe_region(candidates, case), *room(case, T_base_ct)]
-    direction = chosen_direction(candidates, case, plan)
+    direction = chosen_direction(pick, plan)
     if direction is not None:
         bodies.extend(needle_bodies(case.needle, case.target_ct, direction).all)
     arm = [] if plan is None else list(ArmPicture(plan.model, plan.T_base_ct).bodies(plan.insertion.q[-1]))
     image = Image.new("RGB", (WIDTH, HEIGHT), annotate.WHITE)
     draw = ImageDraw.Draw(image)
-    path_ct = _path(case, candidates, plan, direction)
+    path_ct = _path(case, pick, plan)
     with_arm = [*bodies, *arm]
     far = _overview_camera(case, with_arm, path_ct)
     needle = None if path_ct is None else _needle_line(case, path_ct)
@@ -78,7 +83,7 @@ def draw_scene(case: Any, anatomy: Any, candidates: Candidates, plan: Any | None
     near = _close_camera(case, bodies, path_ct)
     few = [body for body in bodies if body.name != "needle holder" and body.group not in HIDDEN_NEARBY]
     _view(image, draw, few, near, RIGHT_BOX, case, "Close-up of the path", needle)
-    bottom = _words(draw, case, candidates, plan, bool(arm), bodies)
+    bottom = _words(draw, case, candidates, plan, bool(arm), bodies, pick)
     image = image.crop((0, 0, WIDTH, min(HEIGHT, round(bottom) + 8)))
     with atomic(Path(path)) as temporary:
         image.save(temporary, format="PNG", compress_level=palette.PNG_LEVEL)
@@ -90,14 +95,11 @@ def render_bodies(bodies: Sequence[SceneBody], camera: ViewCamera) -> NDArray[np
     return picture(opaque, Layer([b.surface for b in bodies if b.alpha < 1]), camera)
 
 
-def _path(case: Any, candidates: Candidates, plan: Any | None, direction: Any) -> NDArray[np.float64] | None:
+def _path(case: Any, pick: Pick | None, plan: Any | None) -> NDArray[np.float64] | None:
     """Target and entry, shape (2, 3), or None."""
     if plan is not None:
         return np.stack([plan.target_ct, plan.entry_ct])
-    row = chosen_row(candidates)
-    if row is None or direction is None:
-        return None
-    return np.stack([case.target_ct, case.target_ct + candidates.path.length[row] * direction])
+    return None if pick is None else np.stack([case.target_ct, pick.candidates.path.entry_ct[pick.row]])
 
 
 def _overview_camera(case: Any, bodies: Sequence[SceneBody], path_ct: Any) -> ViewCamera:
@@ -172,15 +174,16 @@ def _words(
     plan: Any | None,
     arm: bool,
     bodies: Sequence[SceneBody],
+    pick: Pick | None,
 ) -> float:
     """Everything around the views; returns the row below the legend."""
     annotate.write(draw, (18, 12), f"{case.name}: needle path to {target_words(case)}", size=28, bold=True)
-    row = chosen_row(candidates)
-    if row is None and plan is None:
+    nothing = pick is None and plan is None
+    if nothing:
         words, colour = "NOTHING IS SAFE: every direction is refused; no needle is shown", annotate.RED
     else:
-        words, colour = _path_words(candidates, plan, row), annotate.FAINT
-    annotate.write(draw, (18, 50), words, size=18, bold=row is None and plan is None, colour=colour)
+        words, colour = _path_words(plan, pick), annotate.FAINT
+    annotate.write(draw, (18, 50), words, size=18, bold=nothing, colour=colour)
     items = [("target", palette.TARGET_POINT), (needle_words(case.needle), palette.NEEDLE)]
     if candidates.safe.any():
         items.append((f"{candidates.safe_text}: where a needle may enter, and its corridor (overview)", SAFE))
@@ -202,16 +205,17 @@ def _see_through(body: SceneBody) -> str:
     return body.name + (" (see-through)" if body.alpha < 1 else "")
 
 
-def _path_words(candidates: Candidates, plan: Any | None, row: int | None) -> str:
+def _path_words(plan: Any | None, pick: Pick | None) -> str:
     if plan is not None:
         theta, beta = np.degrees(plan.theta), np.degrees(plan.beta)
         length = float(np.linalg.norm(plan.entry_ct - plan.target_ct))
     else:
-        theta, beta = np.degrees(candidates.theta[row]), np.degrees(candidates.beta[row])
-        length = float(candidates.path.length[row])
+        assert pick is not None
+        theta, beta = np.degrees(pick.candidates.theta[pick.row]), np.degrees(pick.candidates.beta[pick.row])
+        length = float(pick.candidates.path.length[pick.row])
     words = f"θ {theta:g}°, β {beta:g}°, {number(length, 1, 'mm')} in the body"
-    if row is not None:
-        name, clearance = nearest_structure(candidates, row)
+    if pick is not None:
+        name, clearance = nearest_structure(*pick)
         words += f", nearest {name.replace('_', ' ')} {number(clearance, 1, 'mm')}" if name else ""
     return words + ("" if plan is not None else "  (no plan: the arm is not shown)")
 

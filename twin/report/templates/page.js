@@ -29,10 +29,11 @@
       stroke: "#fff", "stroke-width": 3, "font-size": 11, ...attributes,
     }, text);
   }
-  function place(row) {
-    const angle = (map.beta[row] + map.turn_deg) * RAD, radius = map.theta[row] / map.theta_max_deg * half;
+  function placeAt(theta, beta) {
+    const angle = (beta + map.turn_deg) * RAD, radius = theta / map.theta_max_deg * half;
     return [cx + radius * Math.cos(angle), cy - radius * Math.sin(angle)];
   }
+  const place = (row) => placeAt(map.theta[row], map.beta[row]);
   draw("circle", { cx, cy, r: half, fill: "none", stroke: "#000", "stroke-width": 1.2 });
   const spacing = map.theta_max_deg <= 100 ? 15 : 30;
   for (let beta = 0; beta < 360; beta += 30) {
@@ -56,12 +57,12 @@
     const [x, y] = place(row);
     draw("circle", { cx: x, cy: y, r: 1.8, fill: "#fff", stroke: "#000", "stroke-width": 0.6 });
   }
-  for (const row of map.best.slice(1)) {
+  for (const row of map.best) {
     const [x, y] = place(row);
     draw("circle", { cx: x, cy: y, r: 4.5, fill: "none", stroke: "#000", "stroke-width": 1.2 });
   }
-  if (map.best.length > 0) {
-    const [x, y] = place(map.best[0]);
+  if (map.chosen) {
+    const [x, y] = placeAt(map.chosen.theta_deg, map.chosen.beta_deg);
     label(x, y, "★", { "font-size": 26, fill: "#fff", stroke: "#000", "stroke-width": 2.5 });
   }
   const marker = draw("circle", { cx: -9, cy: -9, r: 7, fill: "none", stroke: "#d6001e", "stroke-width": 2.5 });
@@ -98,6 +99,10 @@
       add("div", parts.join("; "));
       const sentence = map.sentences[map.sentence[row]];
       if (sentence) add("div", sentence);
+    }
+    if (safe && map.window[row] > 0) {
+      const cone = map.safe_cone[row] === null ? "" : `; safe cone ${shown(map.safe_cone[row], 1, "°")}`;
+      add("div", `window ${map.window[row]}${cone}`);
     }
     if (map.nearest[row] >= 0)
       add("div", `least clearance ${shown(map.clearance[row], 1, "mm")} (${words(map.structures[map.nearest[row]])})`);

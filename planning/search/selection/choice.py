@@ -1,0 +1,173 @@
+"""Which candidate a person wants: the best, one of a rank or window, of two angles, or of an entry into the skin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.entry import angles
+from puncture_twin.planning.formats.points.raw_points import parse_coordinate
+from puncture_twin.planning.geometry.spaces import to_lps
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.explain import reason_text
+from puncture_twin.planning.search.selection.windows import find_windows
+
+NEAR_ENTRY_MM = 10.0
+"""How far from the skin entry of its path a point may be that is to be that entry: a hand's precision on a screen."""
+
+LEAST_LEVER_MM = 1.0
+"""A point nearer to the target than this gives no direction."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a person asked for; with nothing stated the best candidate that the arm can approach.
+
+    Attributes:
+        angles: θ and β, rad.
+        rank: 1 is the best candidate.
+        window: 1 is the window of the best candidate: then the best of this window.
+        entry_mm: Where the needle is to enter the skin, in the case's space, as it is typed.
+    """
+
+    angles: tuple[float, float] | None = None
+    rank: int | None = None
+    window: int | None = None
+    entry_mm: tuple[float, float, float] | None = None
+
+    @property
+    def of_grid(self) -> bool:
+        """Whether a search's result has to be looked at."""
+        return self.angles is None and self.entry_mm is None
+
+
+BEST = Choice()
+"""Nothing stated."""
+
+
+class Pick(NamedTuple):
+    """One candidate: a row of a search, or of a check of it alone."""
+
+    candidates: Candidates
+    row: int
+
+
+class Chosen(NamedTuple):
+    """Candidates, and those of their rows that are wanted, the most wanted first."""
+
+    candidates: Candidates
+    rows: Ints
+
+
+def best_pick(found: Candidates) -> Pick | None:
+    """The best candidate of a search; None where nothing is safe."""
+    return Pick(found, int(found.ranked[0])) if len(found.ranked) else None
+
+
+def choose(context: CaseContext, found: Candidates, choice: Choice) -> Chosen:
+    """The candidates that a choice leaves, in the order of preference.
+
+    Args:
+        context: Of the case.
+        found: The search of its grid.
+        choice: What a person asked for.
+
+    Raises:
+        InputError: A rank or window that there is not, or a point that is no skin entry.
+        NoAnswerError: Nothing is safe, or what was asked for is rejected: says why.
+    """
+    if not choice.of_grid:
+        checked = context.check(*chosen_angles(context.case, choice))
+        _refuse_other_entry(context.case, checked, choice)
+        if not checked.safe[0]:
+            at = checked.at(0)
+            where = f"theta {at['theta_deg']:.4g} deg, beta {at['beta_deg']:.4g} deg"
+            raise NoAnswerError(f"{where} is rejected: {reason_text(checked, 0)}", counts=checked.counts())
+        return Chosen(checked, np.zeros(1, np.int64))
+    rows = found.ranked
+    if not len(rows):
+        raise NoAnswerError("no candidate is safe", counts=found.counts())
+    if choice.rank is not None:
+        _refuse_beyond(choice.rank, len(rows), "--rank", "safe candidates")
+        return Chosen(found, rows[choice.rank - 1 : choice.rank])
+    if choice.window is not None:
+        windows = find_windows(found)
+        _refuse_beyond(choice.window, len(windows.windows), "--window", "windows")
+        return Chosen(found, rows[windows.of_row[rows] == choice.window])
+    return Chosen(found, rows)
+
+
+def chosen_angles(case: Case, choice: Choice) -> tuple[float, float]:
+    """θ and β (rad) of a choice by angles or by entry.
+
+    Raises:
+        InputError: An entry on the target itself.
+    """
+    if choice.angles is not None:
+        return choice.angles
+    lever = _entry_ct(case, choice) - case.target_ct
+    reach = float(np.linalg.norm(lever))
+    if not reach >= LEAST_LEVER_MM:
+        raise InputError(f"{reach:.2g} mm from the target", where="--entry", allowed="a point on the skin")
+    theta, beta = angles((lever / reach) @ case.T_ct_entry[:3, :3])
+    return float(theta), float(beta)
+
+
+def parse_choice(
+    theta_deg: float | None, beta_deg: float | None, rank: int | None, window: int | None, entry: str | None
+) -> Choice:
+    """A choice from what a person typed.
+
+    Raises:
+        InputError: Two choices at once, one angle alone, or an entry that is not X,Y,Z.
+    """
+    if (theta_deg is None) != (beta_deg is None):
+        raise InputError("one angle alone gives no direction", where="--theta, --beta", allowed="both")
+    stated = {"--theta and --beta": theta_deg, "--rank": rank, "--window": window, "--entry": entry}
+    names = [name for name, value in stated.items() if value is not None]
+    if len(names) > 1:
+        raise InputError(f"{', '.join(names)} at once", where="choice", allowed="one of them")
+    angles = None if theta_deg is None or beta_deg is None else (np.radians(theta_deg), np.radians(beta_deg))
+    return Choice(angles, rank, window, None if entry is None else _parse_point(entry))
+
+
+def _parse_point(text: str) -> tuple[float, float, float]:
+    where = "--entry"
+    numbers = [parse_coordinate(part.strip(), where) for part in text.split(",")]
+    if len(numbers) != 3:
+        raise InputError(f"{len(numbers)} numbers", where=where, allowed="X,Y,Z in mm, in the case's space")
+    return numbers[0], numbers[1], numbers[2]
+
+
+def _entry_ct(case: Case, choice: Choice) -> Floats:
+    return np.asarray(to_lps(np.array([choice.entry_mm]), case.space)[0])
+
+
+def _refuse_beyond(number: int, count: int, where: str, what: str) -> None:
+    if not 1 <= number <= count:
+        raise InputError(f"{number}: there are {count} {what}", where=where, allowed=f"1 to {count}")
+
+
+def _refuse_other_entry(case: Case, checked: Candidates, choice: Choice) -> None:
+    """Refuse a point from which a straight path enters the skin somewhere else.
+
+    Raises:
+        InputError: Says where it does.
+    """
+    real = checked.path.entry_ct[0]
+    if choice.entry_mm is None or not np.isfinite(real).all():
+        return
+    apart = float(np.linalg.norm(real - _entry_ct(case, choice)))
+    if apart > NEAR_ENTRY_MM:
+        place = ", ".join(f"{mm:.1f}" for mm in to_lps(real[None], case.space)[0])
+        raise InputError(
+            f"the path from there to the target enters the skin {apart:.1f} mm away, at ({place}) mm {case.space}",
+            where="--entry",
+            allowed=f"a point on the skin, to {NEAR_ENTRY_MM:g} mm",
+        )

@@ -1,0 +1,50 @@
+"""How far a needle may be off and still be safe for the organs, as far as the grid tells."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.case.angle_grid import AngleGrid
+from puncture_twin.planning.case.entry import outward
+from puncture_twin.planning.search.candidates import CONE_OF_GRID, Candidates
+
+DIAGONAL = np.sqrt(2.0)
+"""Of a cell, in steps, at the equator; nearer to the poles cells are narrower."""
+
+
+def with_grid_cone(found: Candidates) -> Candidates:
+    """The candidates with the safe cone of each safe one; those of no regular grid as they are.
+
+    Args:
+        found: Candidates with their verdicts by the organs alone: what an arm reaches makes no path safer.
+    """
+    if found.grid is None:
+        return found
+    cone = np.full(len(found), np.nan)
+    cone[found.safe] = grid_cone(found.grid, found.safe)
+    return replace(found, safe_cone=cone, cone_source=CONE_OF_GRID)
+
+
+def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:
+    """By how much each safe direction may be off, in any direction, shape (number of safe ones,), rad.
+
+    The angle to the nearest direction of the grid that is not safe, or to the nearest beyond the grid, less a cell's
+    diagonal. A disc as wide as that diagonal holds a direction of the grid; so where such a disc fits into what is not
+    safe, beside its border, the cone ends before it. What is thinner may pass between the directions: only a
+    certificate excludes that.
+
+    Args:
+        grid: The directions.
+        safe: Shape (n,), row by row.
+    """
+    theta, beta = np.repeat(grid.theta, len(grid.beta)), np.tile(grid.beta, len(grid.theta))
+    vectors = outward(theta, beta)
+    barred = np.concatenate([vectors[~safe], outward(*grid.beyond())])
+    if not len(barred):
+        return np.full(int(safe.sum()), np.pi)
+    chord, _ = cKDTree(barred).query(vectors[safe])
+    return np.maximum(2 * np.arcsin(np.clip(chord / 2, 0.0, 1.0)) - DIAGONAL * grid.step, 0.0)

@@ -1,0 +1,105 @@
+"""Choosing a candidate: by rank, window, angles or entry; and what is refused."""
+
+import numpy as np
+import pytest
+
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.selection.choice import BEST, Choice, choose, chosen_angles, parse_choice
+from puncture_twin.planning.search.selection.windows import find_windows
+from tests.case_world import write_case
+
+CHANGES = (('space = "LPS"', 'space = "RAS"'), ("theta_deg = [0, 10]", 'frame = "ct"\ntheta_deg = [0, 60]'))
+
+
+@pytest.fixture(scope="module")
+def context(tmp_path_factory):
+    """Balls about a target, without an arm."""
+    return prepare(write_case(tmp_path_factory.mktemp("choice"), *CHANGES), arm=False)
+
+
+@pytest.fixture(scope="module")
+def found(context):
+    """The search of its grid."""
+    return context.search()
+
+
+def test_nothing_chosen_is_every_safe_candidate_in_the_order_of_ranks(context, found):
+    """What the planner tries one after the other."""
+    chosen = choose(context, found, BEST)
+    np.testing.assert_array_equal(chosen.rows, found.ranked)
+
+
+def test_a_rank_is_one_row(context, found):
+    """That of the rank."""
+    chosen = choose(context, found, Choice(rank=5))
+    assert chosen.candidates.ranking.rank[chosen.rows].tolist() == [5]
+
+
+def test_a_window_is_its_rows_the_best_first(context, found):
+    """None of another window."""
+    windows = find_windows(found)
+    chosen = choose(context, found, Choice(window=len(windows.windows)))
+    assert set(windows.of_row[chosen.rows]) == {len(windows.windows)}
+    assert (np.diff(found.ranking.rank[chosen.rows]) > 0).all()
+
+
+def test_an_entry_is_in_the_space_of_the_case_and_gives_its_own_direction_back(context, found):
+    """Typed in RAS: x and y are turned; between the grid's directions too."""
+    row = int(found.ranked[0])
+    typed = tuple((found.path.entry_ct[row] * [-1, -1, 1]).tolist())
+    theta, beta = chosen_angles(context.case, Choice(entry_mm=typed))
+    np.testing.assert_allclose((theta, beta), (found.theta[row], found.beta[row]), atol=1e-9)
+    chosen = choose(context, found, Choice(entry_mm=typed))
+    np.testing.assert_allclose(chosen.candidates.path.entry_ct[0], found.path.entry_ct[row], atol=1e-6)
+
+
+def test_a_point_off_the_skin_is_refused_with_the_place_of_the_skin(context, found):
+    """Half way in: the needle would enter somewhere else than where the person points."""
+    row = int(found.ranked[0])
+    off = context.case.target_ct + 0.5 * (found.path.entry_ct[row] - context.case.target_ct)
+    with pytest.raises(InputError, match=r"enters the skin .* mm away, at \(.*\) mm RAS"):
+        choose(context, found, Choice(entry_mm=tuple((off * [-1, -1, 1]).tolist())))
+
+
+def test_the_target_itself_gives_no_direction(context, found):
+    """It is refused rather than turned into some direction."""
+    typed = tuple((context.case.target_ct * [-1, -1, 1]).tolist())
+    with pytest.raises(InputError, match="from the target"):
+        choose(context, found, Choice(entry_mm=typed))
+
+
+def test_a_rejected_direction_is_refused_with_its_reason(context, found):
+    """A wrong "safe" by choice: what the search rejects no choice brings back."""
+    row = int(np.flatnonzero(~found.safe)[0])
+    with pytest.raises(NoAnswerError, match=f"is rejected: .*{found.verdict.reason[np.flatnonzero(~found.safe)[0]]}"):
+        choose(context, found, Choice(angles=(found.theta[row], found.beta[row])))
+
+
+@pytest.mark.parametrize(("choice", "allowed"), [(Choice(rank=10**6), "1 to"), (Choice(window=500), "1 to")])
+def test_what_there_is_not_is_refused_with_what_there_is(context, found, choice, allowed):
+    """A rank and a window beyond the last."""
+    with pytest.raises(InputError, match=allowed):
+        choose(context, found, choice)
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ((1.0, None, None, None, None), "both"),
+        ((1.0, 2.0, 3, None, None), "--theta and --beta, --rank at once"),
+        ((None, None, 1, 2, None), "one of them"),
+        ((None, None, None, None, "1,2"), "2 numbers"),
+        ((None, None, None, None, "1,2,nan"), "number"),
+        ((None, None, None, None, "left"), "number"),
+    ],
+)
+def test_choices_that_are_none_are_refused(typed, said):
+    """One line that says what is allowed."""
+    with pytest.raises(InputError, match=said):
+        parse_choice(*typed)
+
+
+def test_nothing_stated_is_the_best():
+    """Which is the default of every command."""
+    assert parse_choice(None, None, None, None, None) == BEST

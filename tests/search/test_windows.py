@@ -1,0 +1,111 @@
+"""Windows of safe directions and safe cones by the grid, on grids whose verdicts are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from puncture_twin.planning.case.entry import outward
+from puncture_twin.planning.search.selection.safe_cone import grid_cone, with_grid_cone
+from puncture_twin.planning.search.selection.windows import SQUARE_DEGREES, find_windows
+from tests import report_world as world
+
+
+def candidates(*, step_deg=2.0, **ranges):
+    """The small patient's candidates, with their grid."""
+    case = world.make_case()
+    found = world.make_candidates(case, step_deg=step_deg, **ranges)
+    return replace(found, grid=world.make_grid(case, step_deg=step_deg, **ranges))
+
+
+def with_safe(found, safe):
+    """The same candidates, safe where told, ranked in their order."""
+    reason = np.where(safe, "", "too_close")
+    rank = np.where(safe, np.cumsum(safe), 0).astype(np.int32)
+    verdict, ranking = replace(found.verdict, reason=reason), replace(found.ranking, rank=rank)
+    return replace(found, verdict=verdict, ranking=ranking)
+
+
+def test_a_cone_is_the_angle_to_what_is_not_safe_less_a_diagonal():
+    """One barred direction: every other one's cone is its angle to it, found by comparing all."""
+    found = candidates()
+    barred = 1234
+    safe = np.arange(len(found)) != barred
+    cone = grid_cone(found.grid, safe)
+    vectors = outward(found.theta, found.beta)
+    to_rim = np.pi / 2 + np.radians(2.0) - found.theta  # the first ring that nobody asked about
+    apart = np.arccos(np.clip(vectors @ vectors[barred], -1, 1))
+    expected = np.maximum(np.minimum(apart, to_rim) - np.sqrt(2) * np.radians(2.0), 0.0)
+    np.testing.assert_allclose(cone, expected[safe], atol=2e-5)
+
+
+@settings(max_examples=40)
+@given(theta=st.floats(0, np.pi / 2), beta=st.floats(0, 2 * np.pi), radius_deg=st.floats(2 / np.sqrt(2) + 1e-6, 30))
+def test_no_cone_enters_a_cap_that_is_as_wide_as_a_cell(theta, beta, radius_deg):
+    """Whatever lies between the grid's directions: a barred disc of at least a cell's diagonal is never entered."""
+    found = candidates()
+    apart = np.arccos(np.clip(outward(found.theta, found.beta) @ outward(theta, beta), -1, 1))
+    safe = apart > np.radians(radius_deg)
+    cone = grid_cone(found.grid, safe)
+    assert (cone <= apart[safe] - np.radians(radius_deg) + 1e-9).all()
+
+
+def test_a_cone_never_reaches_over_the_ends_of_the_search():
+    """The outermost ring has none, however safe all is; on a whole sphere there is no end."""
+    found = candidates(theta_deg=(0, 60))
+    cone = grid_cone(found.grid, np.ones(len(found), bool))
+    assert cone[found.theta > np.radians(59.9)].max() == pytest.approx(0.0, abs=1e-12)
+    assert cone[0] == pytest.approx(np.radians(62.0) - np.sqrt(2) * np.radians(2.0), abs=1e-9)
+    whole = candidates(theta_deg=(0, 180))
+    np.testing.assert_allclose(grid_cone(whole.grid, np.ones(len(whole), bool)), np.pi)
+
+
+def test_rejected_candidates_have_no_cone_and_other_directions_stay_as_they_are():
+    """Only the safe rows of a grid get one."""
+    found = with_grid_cone(candidates())
+    assert np.isnan(found.safe_cone[~found.safe]).all() and np.isfinite(found.safe_cone[found.safe]).all()
+    free = replace(found, grid=None, safe_cone=np.full(len(found), np.nan), cone_source="")
+    assert with_grid_cone(free) is free
+
+
+def test_windows_are_the_connected_sets():
+    """Two caps apart: two windows, the first that of rank 1; each has its cap's solid angle and entry area."""
+    found = candidates(step_deg=1.0)
+    u = outward(found.theta, found.beta)
+    centres = outward(np.radians([30.0, 60.0]), np.radians([10.0, 200.0]))
+    near = np.degrees(np.arccos(np.clip(u @ centres.T, -1, 1))) < [10.0, 15.0]
+    windows = find_windows(with_safe(found, near.any(axis=1)))
+    assert [window.number for window in windows.windows] == [1, 2]
+    for window, inside, half in zip(windows.windows, near.T, np.radians([10.0, 15.0]), strict=True):
+        np.testing.assert_array_equal(windows.of_row == window.number, inside)
+        cap = 2 * np.pi * (1 - np.cos(half))
+        assert window.square_deg == pytest.approx(cap * SQUARE_DEGREES, rel=0.05)
+        assert window.entry_cm2 == pytest.approx(cap * world.SKIN_RADIUS**2 / 100, rel=0.05)
+        assert window.directions == inside.sum()
+        assert windows.of_row[window.best] == window.number
+    assert (windows.of_row[~near.any(axis=1)] == 0).all()
+
+
+def test_a_window_goes_over_the_pole_and_over_azimuth_zero():
+    """A cap about θ = 0, and one about β = 0, are one window each."""
+    found = candidates(step_deg=2.0)
+    u = outward(found.theta, found.beta)
+    for centre in (outward(0.0, 0.0), outward(np.radians(45.0), 0.0)):
+        safe = np.degrees(np.arccos(np.clip(u @ centre, -1, 1))) < 12.0
+        assert len(find_windows(with_safe(found, safe)).windows) == 1
+
+
+def test_the_skin_covers_more_where_the_path_enters_obliquely():
+    """Through a plane at 60 degrees each path covers twice what it does straight in."""
+    found = with_safe(candidates(), np.ones(len(candidates()), bool))
+    straight = find_windows(found).windows[0].entry_cm2
+    oblique = replace(found, path=replace(found.path, skin_angle=np.full(len(found), np.radians(60.0))))
+    assert find_windows(oblique).windows[0].entry_cm2 == pytest.approx(2 * straight)
+
+
+def test_nothing_safe_has_no_window():
+    """No window, and every row is in none."""
+    found = candidates()
+    windows = find_windows(with_safe(found, np.zeros(len(found), bool)))
+    assert windows.windows == () and (windows.of_row == 0).all()
