@@ -31,6 +31,7 @@ from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.selection.choice import BEST, Choice, parse_choice
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, exit_code_of
 from puncture_twin.twin.jobs.patient import answers, main_job, text as words
+from puncture_twin.twin.jobs.patient.pictures import write_check_picture
 from puncture_twin.twin.jobs.patient.place_text import place_text
 from puncture_twin.twin.jobs.robot.mirror import (
     Mirror,
@@ -188,12 +189,18 @@ def check(
     window: WindowOption = None,
     entry: EntryOption = None,
     arm: ArmOption = None,
+    picture: Annotated[
+        Path | None, typer.Option("--picture", metavar="FILE.png", help="Draw the CT's slices about it.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Explain one candidate in full; the best, where none is named."""
     choice = parse_choice(theta, beta, rank, window, entry)
     with progress_display() as progress:
-        explained = answers.check_candidate(prepare(case, arm=arm, watcher=progress), choice)
+        context = prepare(case, arm=arm, watcher=progress)
+        explained = answers.check_candidate(context, choice)
+        if picture is not None:
+            write_check_picture(context, explained, picture)
     _print(explained.summary(), explained.text(), as_json)
     if not explained.safe:
         raise typer.Exit(ANSWER_IS_NO)

@@ -18,6 +18,7 @@ OUTPUT_NAMES = (
     "certificate.json",
     "map.png",
     "scene.png",
+    "slices.png",
     "report.html",
     "plan.json",
     "rehearsal.json",

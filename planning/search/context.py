@@ -116,6 +116,20 @@ class CaseContext:
         chances = Chances(names, **values, touch_joint=np.full(1, np.nan))
         return doubt_of(self.case, model, near, chances, outward_ct, q)
 
+    def region_ct(self, q: Floats) -> Floats | None:
+        """Within x' inv(region) x <= 1 about the target the tip is expected in 95 of 100, shape (3, 3), mm^2, CT axes.
+
+        Args:
+            q: Shape (6,), rad, the tip on the target; NaN where the arm does not reach it.
+
+        Returns:
+            None there, and without declared errors.
+        """
+        if self.chance is None or not np.isfinite(q).all():
+            return None
+        error = self.chance.error
+        return np.asarray(error.fit.test.region_factor**2 * error.tip_covariance_ct(q[None])[0])
+
     def cross_check(self, count: int) -> CrossChecked:
         """Measure random directions of the grid again with FCL.
 

@@ -18,6 +18,7 @@ OPTIONS = {
     "--from": "path",
     "--recording": "path",
     "--out": "out",
+    "--picture": "out",
     "--jobs": "number",
     "--seeds": "number",
     "--seconds": "number",

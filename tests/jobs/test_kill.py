@@ -39,8 +39,8 @@ TRIES = 3
 needs_time = pytest.mark.skipif(not ALL, reason="make kill")
 
 WRITTEN = {
-    "search": ("certificate.json", "candidates.parquet", "map.png", "scene.png", "report.html"),
-    "plan": ("plan.json", "candidates.parquet", "map.png", "scene.png", "report.html"),
+    "search": ("certificate.json", "candidates.parquet", "map.png", "scene.png", "slices.png", "report.html"),
+    "plan": ("plan.json", "candidates.parquet", "map.png", "scene.png", "slices.png", "report.html"),
     "rehearse": ("rehearsal.json", "rehearsal.mp4", "scene.png"),
     "export plan.csv": ("plan.csv",),
     "place": ("placements.csv", "place.json", "placements.png", "map_best_place.png"),

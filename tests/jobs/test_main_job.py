@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.files import sha256
-from puncture_twin.planning.base.output.manifest import problems
+from puncture_twin.planning.base.output.manifest import problems, read_manifest
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, INTERRUPTED, OK, PROGRAM_FAILED
 from puncture_twin.twin.report.progress import BarDisplay, LineDisplay, progress_display
@@ -48,6 +49,7 @@ def test_a_rehearsal_writes_every_file(rehearsed):
         "candidates.parquet",
         "map.png",
         "scene.png",
+        "slices.png",
         "plan.json",
         "rehearsal.json",
         "rehearsal.mp4",
@@ -177,7 +179,7 @@ def test_a_rehearsal_beside_its_plan_keeps_the_plan(carton, rehearsed, tmp_path,
     copy = tmp_path / "copy"
     shutil.copytree(rehearsed, copy)
     assert main(["rehearse", str(copy / "plan.json"), "--case", str(carton), "--out", str(copy)]) == OK
-    names = {"candidates.parquet", "plan.json", "map.png", "scene.png", "rehearsal.json", "rehearsal.mp4"}
+    names = {"candidates.parquet", "plan.json", "map.png", "scene.png", "slices.png", "rehearsal.json", "rehearsal.mp4"}
     assert {path.name for path in copy.iterdir()} == {*names, "manifest.json", "timings.json"}
     assert problems(copy) == ()
 
@@ -211,6 +213,17 @@ def test_nothing_safe_is_exit_code_1_with_the_closest_miss(carton, tmp_path, cap
     assert main(["plan", str(other / "case_m.toml"), "--out", str(tmp_path / "plan")]) == ANSWER_IS_NO
     assert "no plan: no candidate is safe" in capfd.readouterr().err
     assert not (tmp_path / "plan" / "plan.json").exists()
+
+
+def test_check_draws_slices(carton, tmp_path, capfd):
+    """Of a refused direction too, as an entry of the folder's set; what is no PNG is refused."""
+    arguments = ["check", carton, "--theta", 45, "--beta", 270, "--no-arm", "--picture"]
+    code, found = run(capfd, *arguments, tmp_path / "one.png")
+    assert (code, found["verdict"]) == (ANSWER_IS_NO, "rejected")
+    assert Image.open(tmp_path / "one.png").format == "PNG"
+    assert list(read_manifest(tmp_path).entries) == ["check one.png"] and problems(tmp_path) == ()
+    assert main([*map(str, arguments), str(tmp_path / "one.jpg")]) == BAD_INPUT
+    assert not (tmp_path / "one.jpg").exists()
 
 
 def test_check_explains_a_refusal(carton, capfd):

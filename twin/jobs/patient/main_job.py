@@ -32,20 +32,18 @@ from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.selection.choice import BEST, Choice, Pick, choose
 from puncture_twin.planning.search.table import write_table
+from puncture_twin.twin.jobs.patient.pictures import FILM, PAGE, PICTURES, ROOMS, with_pictures
 from puncture_twin.twin.jobs.patient.run import Run
-from puncture_twin.twin.jobs.patient.summaries import registration_summary, rehearsal_summary
+from puncture_twin.twin.jobs.patient.summaries import rehearsal_summary
 from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_rooms
 from puncture_twin.twin.rehearsal.physics import physics_rooms
 from puncture_twin.twin.rehearsal.plan_truth import median_truth, plan_truth, standing
 from puncture_twin.twin.rehearsal.rehearsal import Rehearsal, rehearse
-from puncture_twin.twin.report.map.map_picture import draw_map
-from puncture_twin.twin.report.page.page import Uncertainty, write_page
 from puncture_twin.twin.report.rooms_picture import draw_rooms_picture
 from puncture_twin.twin.report.scene.film import draw_film
 from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
-PICTURES = ("map.png", "scene.png", "report.html")
-CERTIFICATE, FILM, ROOMS = "certificate.json", "rehearsal.mp4", "rooms.png"
+CERTIFICATE = "certificate.json"
 
 NO_PLAN = "no plan: "
 """Before the reason, whoever gives it: the choice, or the planner."""
@@ -76,7 +74,7 @@ def search_case(
         if certify_deg is not None:
             run = _certified(run, certify_deg, draft.folder)
         run = _with_table(run, draft.folder)
-        run = _with_pictures(run, draft.folder) if pictures else run
+        run = with_pictures(run, draft.folder) if pictures else run
     return _final(run, draft)
 
 
@@ -89,7 +87,7 @@ def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
     """
     _refuse_without_arm(context)
     with _writing(out, "plan", context, ("candidates.parquet", "plan.json", *PICTURES)) as draft:
-        run = _with_pictures(_searched_and_planned(context, draft.folder, choice), draft.folder)
+        run = with_pictures(_searched_and_planned(context, draft.folder, choice), draft.folder)
     return _answered(_final(run, draft), out)
 
 
@@ -106,9 +104,9 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
         run = _searched_and_planned(context, draft.folder, choice)
         planned = run.files
         run = run if run.plan is None else _rehearsed(run, draft.folder, rooms)
-        run = _with_pictures(run, draft.folder)
+        run = with_pictures(run, draft.folder)
         if run.rehearsal is not None:  # the page shows it: it goes with it
-            shown = {draft.folder / "map.png", draft.folder / "scene.png"}
+            shown = {draft.folder / name for name in PICTURES if name != PAGE}
             draft.split("rehearse", *(path for path in run.files if path not in {*planned, *shown}))
     return _answered(_final(run, draft), out)
 
@@ -183,7 +181,7 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
         if not draft.source_has("scene.png"):
             with context.stages.time("scene"):
                 draw_scene(context.case, context.anatomy, candidates, plan, draft.folder / "scene.png")
-            run = _with(run, draft.folder / "scene.png")
+            run = run.with_files(draft.folder / "scene.png")
     return _final(run, draft)
 
 
@@ -204,7 +202,7 @@ def _rehearsed(run: Run, out: Path, rooms: RoomCount | None) -> Run:
     rehearsal = _executed(run, plan)
     shown = {} if run.distribution is None else {"distribution": run.distribution.summary()}
     document = {**rehearsal_summary(rehearsal), **shown, "inputs": inputs_document(run.inputs)}
-    run = _with(replace(run, rehearsal=rehearsal), _write_json(document, out / "rehearsal.json"))
+    run = replace(run, rehearsal=rehearsal).with_files(_write_json(document, out / "rehearsal.json"))
     with context.stages.time("film"):
         film = draw_film(
             rehearsal,
@@ -214,12 +212,12 @@ def _rehearsed(run: Run, out: Path, rooms: RoomCount | None) -> Run:
             out / FILM,
             progress=partial(context.watcher.count, "film"),
         )
-    run = _with(run, film)
+    run = run.with_files(film)
     if run.distribution is None:
         return run
     with context.stages.time("rooms.png"):
         draw_rooms_picture(run.distribution, out / ROOMS)
-    return _with(run, out / ROOMS)
+    return run.with_files(out / ROOMS)
 
 
 def _executed(run: Run, plan: Plan) -> Rehearsal:
@@ -282,7 +280,7 @@ def _certified(run: Run, size_deg: float, out: Path) -> Run:
     with context.stages.time("safe cones"):
         found = with_safe_cone(context.case, run.candidates, certificate)
     write_certificate(certificate, out / CERTIFICATE)
-    return _with(replace(run, candidates=found, certificate=certificate), out / CERTIFICATE)
+    return replace(run, candidates=found, certificate=certificate).with_files(out / CERTIFICATE)
 
 
 def _planned(run: Run, out: Path, choice: Choice) -> Run:
@@ -296,55 +294,17 @@ def _planned(run: Run, out: Path, choice: Choice) -> Run:
         return replace(run, refusal=f"{NO_PLAN}{str(error).removeprefix(NO_PLAN)}")
     write_plan(plan, out / "plan.json")
     run = replace(run, plan=plan, pick=Pick(found, row), candidates=found if choice.of_grid else run.candidates)
-    return _with(run, out / "plan.json")
+    return run.with_files(out / "plan.json")
 
 
 def _with_table(run: Run, out: Path) -> Run:
     path = out / "candidates.parquet"
     with run.context.stages.time("table"):
         write_table(run.candidates, run.context.provenance(), path)
-    return _with(run, path)
-
-
-def _with_pictures(run: Run, out: Path) -> Run:
-    """Draw the map, the scene and the page of what is known."""
-    context, found = run.context, run.candidates
-    case, anatomy, stages = context.case, context.anatomy, context.stages
-    with stages.time("map"):
-        draw_map(found, case, out / "map.png", run.pick)
-    with stages.time("scene"):
-        draw_scene(case, anatomy, found, run.plan, out / "scene.png", run.pick)
-    registration = context.placement.registration if context.placement is not None else None
-    shown = None if registration is None else registration_summary(registration)
-    film = next((path.name for path in run.files if path.stem == Path(FILM).stem and path.suffix != ".json"), None)
-    with stages.time("page"):
-        page, told = out / "report.html", _uncertainty(run)
-        write_page(
-            case, anatomy, found, run.plan, run.rehearsal, shown, page, film=film, uncertainty=told, pick=run.pick
-        )
-    return _with(run, out / "map.png", out / "scene.png", out / "report.html")
-
-
-def _uncertainty(run: Run) -> Uncertainty | None:
-    """What the page says of chances: of the plan as it is driven, or without one of the best direction."""
-    context, found = run.context, run.candidates
-    if context.case.errors is None:
-        return None
-    picture = next((path for path in run.files if path.name == ROOMS), None)
-    rooms = None if run.distribution is None else run.distribution.summary()
-    if run.plan is not None:
-        return Uncertainty(context.doubt_at(run.plan.outward_ct, run.plan.insertion.q[-1]), rooms, picture)
-    if not len(found.ranked):
-        return Uncertainty(None, rooms, picture)
-    row = found.ranked[0]
-    return Uncertainty(context.explain(found.theta[row], found.beta[row]).doubt, rooms, picture)
+    return run.with_files(path)
 
 
 def _write_json(summary: dict[str, Any], path: Path) -> Path:
     with atomic(path) as temporary:
         temporary.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return path
-
-
-def _with(run: Run, *files: Path) -> Run:
-    return replace(run, files=(*run.files, *files))

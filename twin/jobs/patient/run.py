@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,10 @@ class Run:
     def inputs(self) -> tuple[Input, ...]:
         """The files that the command read beside the case's, then the case's."""
         return (*self.read, *self.context.case.inputs)
+
+    def with_files(self, *files: Path) -> Run:
+        """The run with files more."""
+        return replace(self, files=(*self.files, *files))
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees."""

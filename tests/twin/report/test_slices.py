@@ -1,0 +1,159 @@
+"""Slices about a path: where the planes lie, what is cut, and what is drawn where."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import report_world as world
+import trimesh
+from hypothesis import given, strategies as st
+from PIL import Image
+
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.search.selection.choice import Pick
+from puncture_twin.twin.report.slices.cuts import ellipse, outline
+from puncture_twin.twin.report.slices.panel import PIXELS, draw_panel
+from puncture_twin.twin.report.slices.planes import letters, needle_planes
+from puncture_twin.twin.report.slices.sheet import NO_CT, draw_slices, write_sheet
+from puncture_twin.twin.report.slices.subject import Subject
+from puncture_twin.twin.report.slices.tones import KNOTS_HU, TONES, stored, table
+
+UNITS = st.tuples(*[st.floats(-1, 1) for _ in range(3)]).filter(lambda v: np.linalg.norm(v) > 0.1)
+CYAN = np.array([0, 229, 255])
+
+
+@given(UNITS, st.floats(5, 200))
+def test_planes_hold_target_and_needle(direction, path):
+    """All pass the target with square axes; two hold the needle, one is across it; target and entry are in view."""
+    target, outward = np.array([3.0, -4.0, 5.0]), np.array(direction) / np.linalg.norm(direction)
+    axial, first, second, across = planes = needle_planes(target, outward, path)
+    for plane in planes:
+        assert np.allclose([plane.right @ plane.right, plane.up @ plane.up, plane.right @ plane.up], [1, 1, 0])
+        assert np.allclose(plane.place(target), 0)
+    assert np.allclose(abs(axial.normal), [0, 0, 1])
+    assert np.allclose([first.normal @ outward, second.normal @ outward, first.normal @ second.normal], 0, atol=1e-9)
+    assert np.isclose(across.normal @ outward, 1)
+    for plane in (first, second):
+        seen = plane.place(np.stack([target, target + path * outward])) - plane.centre
+        assert (np.abs(seen) < plane.half_mm).all()
+
+
+def test_the_patients_right_is_on_the_left():
+    """An axial slice is seen from the feet; who looks along a needle from the front sees the same side on the left."""
+    axial, first, _, across = needle_planes(np.zeros(3), np.array([0.0, -1.0, 0.0]), 50.0)
+    for plane, up in ((axial, "A"), (first, "A"), (across, "H")):
+        assert letters("LPS", plane.right) == "L" and letters("LPS", -plane.right) == "R"
+        assert letters("LPS", plane.up) == up
+    assert letters("LPS", np.array([0.6, -0.8, 0.0])) == "A L"
+    assert letters("local", np.array([0.0, 1.0, 0.0])) == "+y"
+
+
+def test_pixels_lie_where_the_plane_says():
+    """The middle of the picture is its centre, rows go down, columns to the right."""
+    plane = needle_planes(np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0]), 40.0)[0]
+    points = plane.points_ct(4).reshape(4, 4, 3)
+    assert np.allclose(plane.place(points).mean(axis=(0, 1)), plane.centre)
+    assert points[0, 0] @ plane.up > points[1, 0] @ plane.up
+    assert points[0, 0] @ plane.right < points[0, 1] @ plane.right
+
+
+def test_a_ball_is_cut_in_a_circle():
+    """A plane at 3 mm from the middle of a ball of 5 mm cuts a circle of 4 mm; one beyond it cuts nothing."""
+    ball = trimesh.creation.icosphere(5, 5.0)
+    mesh = TriangleMesh(np.asarray(ball.vertices), np.asarray(ball.faces))
+    plane = needle_planes(np.array([0.0, 0.0, 3.0]), np.array([0.0, -1.0, 0.0]), 50.0)[0]
+    cut = outline(mesh, plane)
+    assert np.allclose(np.linalg.norm(cut, axis=2), 4.0, atol=0.01)
+    assert np.isclose(np.linalg.norm(np.diff(cut, axis=1), axis=2).sum(), 8 * np.pi, rtol=1e-3)
+    beyond = needle_planes(np.array([0.0, 0.0, 5.1]), np.array([0.0, -1.0, 0.0]), 50.0)[0]
+    assert outline(mesh, beyond).shape == (0, 2, 2)
+
+
+@given(UNITS, st.integers(0, 9))
+def test_the_region_is_cut_on_its_surface(direction, seed):
+    """Every point of the line lies in the plane and on the ellipsoid x' inv(R) x = 1."""
+    spread = np.random.default_rng(seed).normal(size=(3, 3))
+    region = spread @ spread.T + 0.1 * np.eye(3)
+    outward = np.array(direction) / np.linalg.norm(direction)
+    for plane in needle_planes(np.zeros(3), outward, 50.0):
+        x, y = ellipse(region, plane).T
+        points = x[:, None] * plane.right + y[:, None] * plane.up
+        assert np.allclose(np.einsum("ni,ij,nj->n", points, np.linalg.inv(region), points), 1.0)
+
+
+@pytest.mark.parametrize("name", TONES)
+def test_stored_bytes_give_every_window(name):
+    """What a page makes of the stored bytes differs from the window itself by what a byte holds, at most."""
+    hu = np.linspace(KNOTS_HU[0], KNOTS_HU[-1], 5000)
+    shown = np.array(table(TONES[name]))[stored(hu)]
+    step = np.diff(np.interp(np.arange(256), [0, 48, 96, 152, 208, 255], KNOTS_HU)).max() / TONES[name].width
+    assert np.abs(shown - TONES[name].grey(hu) / 255).max() < step / 2 + 0.004
+
+
+def subject(*, scan=None, region=None, row=None):
+    """The best direction of the small patient."""
+    case, anatomy = world.make_case(), world.make_anatomy()
+    candidates = world.make_candidates(case)
+    anatomy.scan = scan
+    anatomy.structures[0].role = "target"
+    return Subject(case, anatomy, Pick(candidates, int(candidates.ranked[0]) if row is None else row), region)
+
+
+def ball_ct(points_ct):
+    """Soft tissue in the skin, air outside, nothing beyond 130 mm."""
+    far = np.linalg.norm(points_ct - world.TARGET, axis=1)
+    return np.where(far > 130, np.nan, np.where(far < world.SKIN_RADIUS, 40.0, -1000.0))
+
+
+def test_the_needle_is_drawn_as_thick_as_it_is():
+    """Between organ and skin the cyan pixels across the needle are its diameter; its tip ends on the target."""
+    one = subject(row=100)
+    plane = needle_planes(one.case.target_ct, one.outward_ct, one.path_mm)[1]
+    pixels = np.asarray(draw_panel(one, plane).overlay).astype(float)
+    per_mm = PIXELS / (2 * plane.half_mm)
+    along = plane.place(one.case.target_ct + one.outward_ct)
+    aside = np.array([-along[1], along[0]])
+    steps = np.arange(-2.0, 2.0, 0.02)
+    at = (60 * along + steps[:, None] * aside - plane.centre) * per_mm
+    column, row = PIXELS / 2 + at[:, 0], PIXELS / 2 - at[:, 1]
+    seen = pixels[row.astype(int), column.astype(int)]
+    cyan = (np.abs(seen[:, :3] - CYAN) < 40).all(axis=1) * seen[:, 3] / 255
+    assert cyan.sum() * 0.02 == pytest.approx(one.case.needle.diameter_mm, abs=0.35)
+
+
+def test_without_a_ct_the_sheet_says_so(tmp_path):
+    """Outlines alone, without a plot of units."""
+    slices = draw_slices(subject())
+    assert slices.units is None and all(panel.hu is None for panel in slices.panels)
+    assert NO_CT in slices.notes
+    write_sheet(slices, tmp_path / "slices.png")
+    assert [path.name for path in tmp_path.iterdir()] == ["slices.png"]
+
+
+def test_with_a_ct_and_errors(tmp_path):
+    """Grey is tissue, black is air and where the image ends; the region and the names are in the legend."""
+    scan = SimpleNamespace(hu_at=ball_ct)
+    slices = draw_slices(subject(scan=scan, region=np.diag([4.0, 9.0, 16.0])))
+    assert slices.units is not None
+    names = [name for name, _ in slices.legend]
+    assert "95 % region" in names and names[-1].startswith("rib right 9: ")
+    hu = slices.panels[0].hu
+    assert np.nanmax(hu) == 40.0 and TONES["abdomen"].grey(np.array([40.0, -1000.0, np.nan])).tolist() == [128, 0, 0]
+    write_sheet(slices, tmp_path / "one.png")
+    write_sheet(draw_slices(subject(scan=scan, region=np.diag([4.0, 9.0, 16.0]))), tmp_path / "two.png")
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+    assert Image.open(tmp_path / "one.png").width > 2 * PIXELS
+
+
+def test_unknown_structures_are_beads_and_a_refused_direction_is_drawn_too():
+    """Beads leave gaps where a line has none; a direction without an entry is drawn without units."""
+    one = subject(scan=SimpleNamespace(hu_at=ball_ct))
+    plane = needle_planes(one.case.target_ct, one.outward_ct, one.path_mm)[0]
+    line = np.asarray(draw_panel(one, plane).overlay)[..., 3]
+    for structure in one.anatomy.structures:
+        structure.role = "unknown"
+    beads = np.asarray(draw_panel(one, plane).overlay)[..., 3]
+    assert 0.2 * (line > 0).sum() < (beads > 0).sum() < (line > 0).sum()
+    one.pick.candidates.path.length.setflags(write=True)
+    one.pick.candidates.path.length[:] = np.nan
+    assert draw_slices(one).units is None

@@ -1,0 +1,92 @@
+"""The pictures and the page of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.explain import Explanation
+from puncture_twin.planning.search.selection.choice import Pick, best_pick
+from puncture_twin.twin.jobs.patient.run import Run
+from puncture_twin.twin.jobs.patient.summaries import registration_summary
+from puncture_twin.twin.report.map.map_picture import draw_map
+from puncture_twin.twin.report.page.page import Uncertainty, write_page
+from puncture_twin.twin.report.scene.scene_picture import draw_scene
+from puncture_twin.twin.report.slices.sheet import Slices, draw_slices, write_sheet
+from puncture_twin.twin.report.slices.subject import Subject
+
+PAGE, SLICES = "report.html", "slices.png"
+PICTURES = ("map.png", "scene.png", SLICES, PAGE)
+"""What a search writes beside its table; slices only where there is a direction to show."""
+
+FILM, ROOMS = "rehearsal.mp4", "rooms.png"
+
+
+def with_pictures(run: Run, out: Path) -> Run:
+    """Draw the map, the scene, the slices and the page of what is known."""
+    context, found = run.context, run.candidates
+    case, anatomy, stages = context.case, context.anatomy, context.stages
+    with stages.time("map"):
+        draw_map(found, case, out / "map.png", run.pick)
+    with stages.time("scene"):
+        draw_scene(case, anatomy, found, run.plan, out / "scene.png", run.pick)
+    with stages.time("slices"):
+        slices = _slices(run)
+        if slices is not None:
+            write_sheet(slices, out / SLICES)
+            run = run.with_files(out / SLICES)
+    registration = context.placement.registration if context.placement is not None else None
+    shown = None if registration is None else registration_summary(registration)
+    film = next((path.name for path in run.files if path.stem == Path(FILM).stem and path.suffix != ".json"), None)
+    with stages.time("page"):
+        page, told = out / PAGE, _uncertainty(run)
+        write_page(
+            case, anatomy, found, run.plan, run.rehearsal, shown, page, film=film, uncertainty=told, pick=run.pick
+        )
+    return run.with_files(out / "map.png", out / "scene.png", out / PAGE)
+
+
+def write_check_picture(context: CaseContext, explained: Explanation, path: Path) -> Path:
+    """Write the slices of one explained direction, as an entry of its folder's set; safe or not.
+
+    Raises:
+        InputError: Not a PNG's name, or a folder or file that cannot be written.
+    """
+    if path.suffix.lower() != ".png":
+        raise InputError(f"'{path.name}' is no PNG's name", where="--picture", allowed="FILE.png")
+    inputs, note = context.case.inputs, context.watcher.note
+    with writing(path.parent, f"check {path.name}", inputs=inputs, names=(path.name,), note=note) as draft:
+        write_sheet(draw_slices(_subject(context, Pick(explained.candidates, 0))), draft.folder / path.name)
+    return path
+
+
+def _slices(run: Run) -> Slices | None:
+    """Of the plan, else of the best direction; None where nothing is safe."""
+    pick = run.pick or best_pick(run.candidates)
+    if pick is None:
+        return None
+    return draw_slices(_subject(run.context, pick, run.plan))
+
+
+def _subject(context: CaseContext, pick: Pick, plan: Plan | None = None) -> Subject:
+    """A direction, with the region of its tip as planned or as the search reaches it."""
+    q = pick.candidates.arm.q_insertion[pick.row] if plan is None else plan.insertion.q[-1]
+    return Subject(context.case, context.anatomy, pick, context.region_ct(q))
+
+
+def _uncertainty(run: Run) -> Uncertainty | None:
+    """What the page says of chances: of the plan as it is driven, or without one of the best direction."""
+    context, found = run.context, run.candidates
+    if context.case.errors is None:
+        return None
+    picture = next((path for path in run.files if path.name == ROOMS), None)
+    rooms = None if run.distribution is None else run.distribution.summary()
+    if run.plan is not None:
+        return Uncertainty(context.doubt_at(run.plan.outward_ct, run.plan.insertion.q[-1]), rooms, picture)
+    if not len(found.ranked):
+        return Uncertainty(None, rooms, picture)
+    row = found.ranked[0]
+    return Uncertainty(context.explain(found.theta[row], found.beta[row]).doubt, rooms, picture)

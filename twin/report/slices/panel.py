@@ -1,0 +1,176 @@
+"""One slice: the CT in its plane, and over it outlines, needle, margin, region, target, directions and a scale."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib import patheffects
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from PIL import Image
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.reasons import css
+from puncture_twin.twin.report.annotate import SCALE_BARS_MM
+from puncture_twin.twin.report.palette import SKIN, TARGET_POINT
+from puncture_twin.twin.report.slices.cuts import ellipse, outline
+from puncture_twin.twin.report.slices.planes import Plane, letters
+from puncture_twin.twin.report.slices.subject import Subject
+
+PIXELS, DPI = 480, 96
+NEEDLE_COLOUR, REGION_COLOUR = "#00e5ff", "#ff4df0"
+"""On grey neither is near a structure's colour."""
+
+HALO = (patheffects.withStroke(linewidth=2.4, foreground="black"),)
+"""Behind letters and thin lines, so that they show on bright tissue too."""
+
+IN_PLANE = 1e-3
+"""A needle whose direction has less than this along a plane's normal lies in it."""
+
+STEEP = 0.05
+"""A cut is drawn at most twenty times as long as it is wide."""
+
+DASHED: Any = {"colors": NEEDLE_COLOUR, "linewidths": 1.0, "linestyles": "--"}
+"""The needle with the greatest margin."""
+
+BEADS = 0.025
+"""Between two beads, of half a picture's side."""
+
+SCALE_ROOM = 0.34
+"""Of a picture's side, the scale bar at most."""
+
+
+class Panel(NamedTuple):
+    """One slice.
+
+    Attributes:
+        plane: Where it lies.
+        hu: Shape (PIXELS, PIXELS), NaN where the image ends; None in a case without CT.
+        overlay: RGBA, transparent where nothing is drawn.
+    """
+
+    plane: Plane
+    hu: Floats | None
+    overlay: Image.Image
+
+
+def draw_panel(subject: Subject, plane: Plane) -> Panel:
+    """Draw one plane of a direction."""
+    scan = subject.anatomy.scan
+    hu = None if scan is None else scan.hu_at(plane.points_ct(PIXELS)).reshape(PIXELS, PIXELS)
+    figure = Figure(figsize=(PIXELS / DPI, PIXELS / DPI), dpi=DPI, facecolor="none")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), facecolor="none", frameon=False)
+    axes.set_axis_off()
+    (x, y), half = plane.centre, plane.half_mm
+    axes.set_xlim(x - half, x + half)
+    axes.set_ylim(y - half, y + half)
+    _outlines(axes, subject, plane)
+    _needle(axes, subject, plane)
+    _target(axes, subject, plane)
+    _directions(axes, subject, plane)
+    _scale(axes, plane)
+    return Panel(plane, hu, drawn(canvas))
+
+
+def drawn(canvas: FigureCanvasAgg) -> Image.Image:
+    """The canvas as it looks, RGBA."""
+    pixels, size = canvas.print_to_buffer()  # type: ignore[no-untyped-call]  # matplotlib states no types there
+    return Image.frombytes("RGBA", size, bytes(pixels))
+
+
+def _outlines(axes: Axes, subject: Subject, plane: Plane) -> None:
+    """Every structure that the plane cuts: the near ones and the target's strongly, unknown ones as beads."""
+    strong = {one.name for one in subject.near} | {subject.case.target_structure}
+    for one in subject.anatomy.checked:
+        segments, colour = outline(one.mesh, plane), css(subject.colours[one.name])
+        if str(one.role) == "unknown":
+            axes.plot(*_beads(segments, plane).T, ls="none", marker=".", ms=4, mec=colour, mfc=colour)
+        else:
+            width = 1.9 if one.name in strong else 0.8
+            axes.add_collection(LineCollection(list(segments), colors=colour, linewidths=width), autolim=False)
+    skin = LineCollection(list(outline(subject.anatomy.skin.mesh, plane)), colors=css(SKIN), linewidths=1.2)
+    axes.add_collection(skin, autolim=False)
+
+
+def _beads(segments: Floats, plane: Plane) -> Floats:
+    """Points along segments (n, 2, 2), about evenly apart, shape (m, 2)."""
+    if not len(segments):
+        return np.zeros((0, 2))
+    cell = BEADS * plane.half_mm
+    length = float(np.linalg.norm(np.diff(segments, axis=1), axis=2).max())
+    share = np.linspace(0, 1, 2 + int(length / cell))[:, None, None]
+    points = (segments[:, 0] * (1 - share) + segments[:, 1] * share).reshape(-1, 2)
+    return np.asarray(points[np.unique(np.round(points / cell), axis=0, return_index=True)[1]])
+
+
+def _needle(axes: Axes, subject: Subject, plane: Plane) -> None:
+    """The needle as thick as it is where the plane holds it, else its cut and, dotted, its shadow."""
+    outward = subject.outward_ct
+    along = float(outward @ plane.normal)
+    if abs(along) > 1 - IN_PLANE:
+        return _cut(axes, subject, 1.0, 0.0)
+    end = plane.place(plane.at_ct + subject.case.needle.shaft_mm * outward)
+    if abs(along) > IN_PLANE:
+        axes.plot([0, end[0]], [0, end[1]], color=NEEDLE_COLOUR, lw=1.1, ls=":", path_effects=HALO)
+        return _cut(axes, subject, abs(along), float(np.degrees(np.arctan2(end[1], end[0]))))
+    aside = np.array([-end[1], end[0]]) / np.linalg.norm(end)
+    body = subject.needle_radius_mm * aside
+    axes.fill(*np.array([-body, end - body, end + body, body]).T, facecolor=NEEDLE_COLOUR, lw=0, zorder=3)
+    if subject.margin_mm > 0:
+        wide = (subject.needle_radius_mm + subject.margin_mm) * aside
+        axes.add_collection(LineCollection([(wide, end + wide), (-wide, end - wide)], **DASHED), autolim=False)
+    return None
+
+
+def _cut(axes: Axes, subject: Subject, cosine: float, turn_deg: float) -> None:
+    """The needle's cut at the target, an ellipse, and dashed the same with the greatest margin."""
+    radius = subject.needle_radius_mm
+    turned: Any = {"angle": turn_deg, "lw": 1.0}
+    long = 1 / max(cosine, STEEP)
+    axes.add_patch(Ellipse((0, 0), 2 * radius * long, 2 * radius, color=NEEDLE_COLOUR, zorder=3, **turned))
+    if subject.margin_mm > 0:
+        wide = 2 * (radius + subject.margin_mm)
+        look: Any = {"fill": False, "linestyle": "--", "edgecolor": NEEDLE_COLOUR}
+        axes.add_patch(Ellipse((0, 0), wide * long, wide, **turned, **look))
+
+
+def _target(axes: Axes, subject: Subject, plane: Plane) -> None:
+    """A cross at the target, and the region of the tip where errors are declared."""
+    near, far = 0.03 * plane.half_mm, 0.09 * plane.half_mm
+    arms = [((near, 0), (far, 0)), ((-near, 0), (-far, 0)), ((0, near), (0, far)), ((0, -near), (0, -far))]
+    axes.add_collection(LineCollection(arms, colors=css(TARGET_POINT), linewidths=1.8, zorder=4), autolim=False)
+    if subject.region_ct is not None:
+        axes.plot(*ellipse(subject.region_ct, plane).T, color=REGION_COLOUR, lw=1.3, path_effects=HALO)
+
+
+def _directions(axes: Axes, subject: Subject, plane: Plane) -> None:
+    """What lies beyond each edge of the picture."""
+    edges = ((0.985, 0.5, plane.right), (0.015, 0.5, -plane.right), (0.5, 0.985, plane.up), (0.5, 0.015, -plane.up))
+    for x, y, direction in edges:
+        axes.text(
+            x,
+            y,
+            letters(subject.case.space, direction),
+            transform=axes.transAxes,
+            ha="right" if x > 0.9 else "left" if x < 0.1 else "center",
+            va="top" if y > 0.9 else "bottom" if y < 0.1 else "center",
+            color="white",
+            fontsize=12,
+            fontweight="bold",
+            path_effects=HALO,
+        )
+
+
+def _scale(axes: Axes, plane: Plane) -> None:
+    """A bar of a round length in the lower left corner."""
+    side = 2 * plane.half_mm
+    length = max((mm for mm in SCALE_BARS_MM if mm <= SCALE_ROOM * side), default=SCALE_BARS_MM[0])
+    left, low = plane.centre - plane.half_mm * np.array([0.94, 0.93])
+    axes.plot([left, left + length], [low, low], color="white", lw=3, solid_capstyle="butt", path_effects=HALO)
+    words = f"{length} mm"
+    axes.text(left, low + 0.022 * side, words, color="white", fontsize=9, va="bottom", path_effects=HALO)

@@ -1,0 +1,127 @@
+"""The four planes in which a needle's path is looked at: where each lies, and what is right and up in its picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.entry import ANATOMICAL_LPS
+from puncture_twin.twin.report.map_view import body_directions
+
+LEFT, BACK, HEAD = (np.array(ANATOMICAL_LPS[name]) for name in ("left", "posterior", "head"))
+
+ALONG_LEFT = 0.95
+"""A needle within 18 degrees of the left-right axis spans no plane with it: its plane then rises to the front."""
+
+LEAST_HALF_MM, BESIDE_MM, PROBE_HALF_MM = 60.0, 35.0, 40.0
+"""Half a picture's side at least, what it shows beyond target and entry, and half of the probe's-eye view."""
+
+OBLIQUE = 0.38
+"""A direction within 22 degrees of an axis is named by that axis alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """One square picture.
+
+    Attributes:
+        name: What it is called.
+        at_ct: Shape (3,), a point of the plane, the target.
+        right: Shape (3,), unit, CT frame: what lies to the right in the picture.
+        up: Shape (3,), unit.
+        centre: Shape (2,), the picture's middle from the target, mm to the right and up.
+        half_mm: Half its side.
+    """
+
+    name: str
+    at_ct: Floats
+    right: Floats
+    up: Floats
+    centre: Floats
+    half_mm: float
+
+    @property
+    def normal(self) -> Floats:
+        """Toward the viewer, unit, shape (3,)."""
+        return np.cross(self.right, self.up)
+
+    def place(self, points_ct: Floats) -> Floats:
+        """Shadows of points (..., 3) on the plane: mm to the right and up of the target, shape (..., 2)."""
+        return np.asarray((points_ct - self.at_ct) @ np.stack([self.right, self.up], axis=1))
+
+    def points_ct(self, size: int) -> Floats:
+        """The middles of the pixels of a picture, row after row from its top, shape (size * size, 3)."""
+        steps = ((np.arange(size) + 0.5) / size * 2 - 1) * self.half_mm
+        x, y = self.centre[0] + steps, self.centre[1] - steps
+        across = x[None, :, None] * self.right + y[:, None, None] * self.up
+        return np.asarray((self.at_ct + across).reshape(-1, 3))
+
+
+def needle_planes(target_ct: Floats, outward_ct: Floats, path_mm: float) -> tuple[Plane, ...]:
+    """The axial slice of the target, two planes that hold the needle, and the one across it at the target.
+
+    In the first two the patient's right is on the left, as on every axial CT; the third shows the back to the right;
+    the last is what one sees who looks along the needle from outside.
+
+    Args:
+        target_ct: Shape (3,), LPS mm.
+        outward_ct: Shape (3,), unit, from the target to the entry.
+        path_mm: Target to skin; not finite without an entry.
+    """
+    far = path_mm if np.isfinite(path_mm) else 0.0
+    entry = target_ct + far * outward_ct
+    half = max(LEAST_HALF_MM, far / 2 + BESIDE_MM)
+
+    def plane(name: str, right: Floats, up: Floats, half_mm: float = half) -> Plane:
+        centre = np.array([right @ (entry - target_ct), up @ (entry - target_ct)]) / 2
+        return Plane(name, target_ct, right, up, centre, half_mm)
+
+    side, up, across = _oblique_axes(outward_ct)
+    along = outward_ct if outward_ct @ BACK > 0 else -outward_ct
+    return (
+        plane("axial, through the target", LEFT, -BACK),
+        plane(f"along the needle, {_tilt_deg(side, up):.0f}° from axial", side, up),
+        plane(f"along the needle, {_tilt_deg(along, across):.0f}° from axial", along, across),
+        plane("across the needle at the target", *_seen_along(-outward_ct), PROBE_HALF_MM),
+    )
+
+
+def _oblique_axes(outward_ct: Floats) -> tuple[Floats, Floats, Floats]:
+    """Right and up of the plane that holds the needle and the left-right axis, and its normal, toward the head."""
+    if abs(outward_ct @ LEFT) < ALONG_LEFT:
+        side, up = LEFT, _unit(outward_ct - (outward_ct @ LEFT) * LEFT)
+        up = up if up @ (HEAD - 1.2 * BACK) > 0 else -up
+    else:
+        side = outward_ct if outward_ct @ LEFT > 0 else -outward_ct
+        up = _unit(-BACK - (-BACK @ side) * side)
+    return side, up, _toward_head(np.cross(side, up))
+
+
+def _toward_head(normal: Floats) -> Floats:
+    return normal if normal @ (HEAD - 0.8 * BACK) > 0 else -normal
+
+
+def _seen_along(toward: Floats) -> tuple[Floats, Floats]:
+    """Right and up of who looks along a unit vector (3,), with the head, or else the front, at the top."""
+    top = HEAD if abs(toward @ HEAD) < ALONG_LEFT else -BACK
+    up = _unit(top - (top @ toward) * toward)
+    return np.cross(toward, up), up
+
+
+def _tilt_deg(right: Floats, up: Floats) -> float:
+    """Between a plane and the axial ones, degrees, 0..90."""
+    return float(np.degrees(np.arccos(min(1.0, abs(np.cross(right, up) @ HEAD)))))
+
+
+def _unit(vector: Floats) -> Floats:
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def letters(space: str, direction: Floats) -> str:
+    """What lies in a direction (3,), unit: R, L, A, P, H, F, two of them where it is oblique; axes of a local frame."""
+    found = sorted(body_directions(space).items(), key=lambda item: -float(item[1] @ direction))
+    names = {"patient's left": "L", "patient's right": "R", "back": "P", "front": "A", "head": "H", "feet": "F"}
+    shown = [name for name, vector in found[:2] if vector @ direction > OBLIQUE]
+    return " ".join(names.get(name, name) for name in shown)

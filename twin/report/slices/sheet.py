@@ -1,0 +1,109 @@
+"""``slices.png``: the four slices of a direction, the units along its needle, and a legend, on one sheet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image, ImageDraw
+
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.reasons import Rgb
+from puncture_twin.twin.report.annotate import FAINT, legend, write
+from puncture_twin.twin.report.numbers import number, target_words
+from puncture_twin.twin.report.palette import PNG_LEVEL, TARGET_POINT
+from puncture_twin.twin.report.slices.hu_plot import draw_hu_plot
+from puncture_twin.twin.report.slices.panel import NEEDLE_COLOUR, PIXELS, REGION_COLOUR, Panel, draw_panel
+from puncture_twin.twin.report.slices.planes import needle_planes
+from puncture_twin.twin.report.slices.subject import Subject
+from puncture_twin.twin.report.slices.tones import TONES, Tone
+
+WITHOUT_CT: Rgb = (44, 47, 54)
+"""Behind the outlines of a case without CT."""
+
+NO_CT = "The case has no CT: outlines of the structures alone."
+RADIOLOGICAL = "The patient's right is on the left. A cut shows only what lies in it: look at all four."
+GAP, TOP, CAPTION = 16, 92, 30
+
+
+@dataclass(frozen=True, eq=False)
+class Slices:
+    """What was drawn of one direction.
+
+    Attributes:
+        subject: The direction.
+        panels: Its four slices.
+        units: Hounsfield units along the needle; None without a CT or an entry.
+    """
+
+    subject: Subject
+    panels: tuple[Panel, ...]
+    units: Image.Image | None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the lines mean, and what is missing."""
+        subject = self.subject
+        dashed = f"; dashed: with the greatest margin near it, {number(subject.margin_mm, 1, 'mm')}"
+        needle = subject.case.needle
+        shown = f"Needle ⌀ {needle.diameter_mm:g} mm as thick as it is{dashed if subject.margin_mm > 0 else ''}"
+        region = "" if subject.region_ct is None else "; pink: cut of the 95 % region of the tip"
+        ct = NO_CT if subject.anatomy.scan is None else "The CT's nearest voxels, not smoothed."
+        dotted = (
+            "Thin and dotted: the needle's shadow, where it is not in the plane. Beads: the edge of what is unknown."
+        )
+        return tuple(filter(None, (ct, f"{shown}{region}.", dotted)))
+
+    @property
+    def legend(self) -> list[tuple[str, Rgb]]:
+        """Names with colours."""
+        subject = self.subject
+        holds = subject.case.target_structure
+        first = [("needle", _rgb(NEEDLE_COLOUR)), ("target", TARGET_POINT)]
+        region = [] if subject.region_ct is None else [("95 % region", _rgb(REGION_COLOUR))]
+        return [*first, *region, (holds, subject.colours[holds]), *((one.text, one.colour) for one in subject.near)]
+
+
+def draw_slices(subject: Subject) -> Slices:
+    """Draw all of one direction."""
+    planes = needle_planes(subject.case.target_ct, subject.outward_ct, subject.path_mm)
+    return Slices(subject, tuple(draw_panel(subject, plane) for plane in planes), draw_hu_plot(subject))
+
+
+def flat(panel: Panel, tone: Tone) -> Image.Image:
+    """The slice with its overlay in one window, RGB."""
+    ground = Image.new("RGBA", (PIXELS, PIXELS), (*WITHOUT_CT, 255))
+    if panel.hu is not None:
+        ground = Image.fromarray(tone.grey(panel.hu)).convert("RGBA")
+    return Image.alpha_composite(ground, panel.overlay).convert("RGB")
+
+
+def write_sheet(slices: Slices, path: Path, tone: str = "abdomen") -> None:
+    """Write the sheet; it appears whole or not at all."""
+    subject, bottom = slices.subject, TOP + 2 * (PIXELS + CAPTION + GAP)
+    units = 0 if slices.units is None else slices.units.height + GAP
+    size = (3 * GAP + 2 * PIXELS, bottom + units + 150)
+    sheet = Image.new("RGB", size, (255, 255, 255))
+    draw = ImageDraw.Draw(sheet)
+    write(draw, (GAP, 12), f"{subject.case.name}: {target_words(subject.case)}, {subject.title}", size=20, bold=True)
+    level, width = TONES[tone]
+    window = "" if subject.anatomy.scan is None else f"CT window {tone}: level {level:g}, width {width:g} HU. "
+    write(draw, (GAP, 40), f"{window}{RADIOLOGICAL}", size=14, colour=FAINT)
+    write(draw, (GAP, 62), "Research software, not a medical device.", size=14, colour=FAINT)
+    for i, panel in enumerate(slices.panels):
+        left, top = GAP + (i % 2) * (PIXELS + GAP), TOP + (i // 2) * (PIXELS + CAPTION + GAP)
+        write(draw, (left, top), panel.plane.name, size=16, bold=True)
+        sheet.paste(flat(panel, TONES[tone]), (left, top + CAPTION - 6))
+    if slices.units is not None:
+        sheet.paste(slices.units, (GAP, bottom))
+    row = legend(draw, slices.legend, GAP, bottom + units, size[0] - GAP)
+    for line in slices.notes:
+        write(draw, (GAP, row), line, size=14, colour=FAINT)
+        row += 20
+    sheet = sheet.crop((0, 0, size[0], min(size[1], int(row) + GAP)))
+    with atomic(Path(path)) as temporary:
+        sheet.save(temporary, format="PNG", compress_level=PNG_LEVEL)
+
+
+def _rgb(css: str) -> Rgb:
+    return int(css[1:3], 16), int(css[3:5], 16), int(css[5:7], 16)

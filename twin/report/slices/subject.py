@@ -1,0 +1,97 @@
+"""What the slices show of one direction: its needle, the structures near it, and where its tip is expected."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.reasons import Rgb
+from puncture_twin.planning.search.selection.choice import Pick
+from puncture_twin.twin.report.numbers import number
+from puncture_twin.twin.report.palette import OUTSIDE, organ_colours
+
+NEAR_MM = 30.0
+"""A structure with a margin that lies nearer to the needle is drawn strongly and named."""
+MOST_NEAR = 8
+"""So many of them at most, the nearest."""
+
+
+class Near(NamedTuple):
+    """A structure near the needle."""
+
+    name: str
+    colour: Rgb
+    clearance_mm: float
+    margin_mm: float
+
+    @property
+    def text(self) -> str:
+        """For a legend."""
+        margin = f", margin {number(self.margin_mm, 0)}" if np.isfinite(self.margin_mm) else ""
+        return f"{self.name.replace('_', ' ')}: {number(self.clearance_mm, 1, 'mm')}{margin}"
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """One direction, as the slices show it.
+
+    Attributes:
+        case: The case.
+        anatomy: Structures, skin, and the CT where there is one.
+        pick: The candidate.
+        region_ct: Shape (3, 3), mm^2: the tip is expected within x' inv(region) x <= 1 in 95 of 100; None without
+            declared errors.
+    """
+
+    case: Any
+    anatomy: Any
+    pick: Pick
+    region_ct: Floats | None = None
+
+    @property
+    def outward_ct(self) -> Floats:
+        """From the target along the needle, unit, shape (3,)."""
+        return np.asarray(self.pick.candidates.outward_ct[self.pick.row])
+
+    @property
+    def path_mm(self) -> float:
+        """Target to skin, NaN without an entry."""
+        return float(self.pick.candidates.path.length[self.pick.row])
+
+    @cached_property
+    def colours(self) -> dict[str, Rgb]:
+        """Of every structure, as in the other pictures; what is outside of the body is grey."""
+        inside = organ_colours(tuple(s.name for s in self.anatomy.structures))
+        return {**{s.name: OUTSIDE for s in self.anatomy.surroundings}, **inside}
+
+    @cached_property
+    def near(self) -> tuple[Near, ...]:
+        """The structures with a margin that lie nearest to the needle, nearest first."""
+        found, row = self.pick.candidates.clearance, self.pick.row
+        rows = zip(found.structures, found.distance[row], found.margins, strict=True)
+        demanding = [
+            Near(name, self.colours.get(name, OUTSIDE), float(mm), float(margin))
+            for name, mm, margin in rows
+            if np.isfinite(margin) and mm < NEAR_MM
+        ]
+        return tuple(sorted(demanding, key=lambda one: one.clearance_mm)[:MOST_NEAR])
+
+    @property
+    def margin_mm(self) -> float:
+        """The greatest margin of the structures near, 0 without any."""
+        return max((one.margin_mm for one in self.near), default=0.0)
+
+    @property
+    def needle_radius_mm(self) -> float:
+        """Half the needle's diameter."""
+        return float(self.case.needle.radius_mm)
+
+    @property
+    def title(self) -> str:
+        """The direction."""
+        angles = self.pick.candidates.at(self.pick.row)
+        return f"θ {angles['theta_deg']:.4g}°, β {angles['beta_deg']:.4g}°"
