@@ -14,7 +14,6 @@ from .case_file import (
     MountName as MountName,
     MountSection as MountSection,
     RankingSection as RankingSection,
-    RegistrationSection as RegistrationSection,
     StructureSection as StructureSection,
     StructuresSection as StructuresSection,
 )

@@ -25,7 +25,6 @@ from puncture_twin.planning.case.case_file import (
     MountSection,
     PlaceSection,
     RankingSection,
-    RegistrationSection,
     RehearsalSection,
     StructureSection,
     StructuresSection,
@@ -35,8 +34,15 @@ from puncture_twin.planning.case.entry import entry_frame, view_frame
 from puncture_twin.planning.case.errors import Cells, ErrorModel, error_model
 from puncture_twin.planning.case.errors_section import ErrorsSection
 from puncture_twin.planning.case.html import case_html
+from puncture_twin.planning.case.registration_section import (
+    NO_RESIDUALS,
+    MarkerSection,
+    RegistrationSection,
+    stated_base_ct,
+)
 from puncture_twin.planning.case.toml_types import Anatomical
 from puncture_twin.planning.case.whole_case import wholeness_warnings
+from puncture_twin.planning.formats import itk_transform
 from puncture_twin.planning.formats.labels import naming
 from puncture_twin.planning.formats.labels.mask_folder import mask_files, structure_name
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
@@ -144,11 +150,19 @@ class Gantry:
 
 @dataclass(frozen=True, eq=False)
 class RobotSettings:
-    """The arm: model name, home configuration (rad) or None for the model's own, mount or None."""
+    """The arm.
+
+    Attributes:
+        model: Its name.
+        home: Shape (6,), rad, or None for the model's own.
+        T_base_ct_mount: Shape (4, 4), mm, where a mount or a transform is stated, or None.
+        transform: The file that states it, or None.
+    """
 
     model: str
     home: Floats | None
     T_base_ct_mount: Floats | None
+    transform: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +196,7 @@ class Case:
     T_ct_entry: Floats
     structure: tuple[StructureSection, ...]
     structures: tuple[StructuresSection, ...]
-    registration: RegistrationSection | None
+    registration: MarkerSection | None
     robot: RobotSettings
     obstacles: tuple[Obstacle, ...]
     rehearsal: RehearsalSection
@@ -265,8 +279,8 @@ def load_case(path: Path | str) -> Case:
         T_ct_entry=view_frame(entry_frame(settings.frame, space, where=path), target),
         structure=content.structure,
         structures=content.structures,
-        registration=content.registration,
-        robot=_robot(content, space, path),
+        registration=_markers(content.registration),
+        robot=_robot(content, space, path, files),
         obstacles=tuple(
             Obstacle(
                 o.name,
@@ -284,7 +298,7 @@ def load_case(path: Path | str) -> Case:
         place=content.place,
         stated_structures=content.stated_structures,
         region=content.region,
-        warnings=wholeness_warnings(content, files, path),
+        warnings=(*wholeness_warnings(content, files, path), *_of_transform(content)),
         hit_radius_mm=content.target.hit_radius_mm,
         errors=_errors(content, content.errors, case_volumes, path),
         truth_errors=_errors(content, content.rehearsal.errors, case_volumes, path, truth=True),
@@ -334,10 +348,27 @@ def _target(content: CaseFile, path: Path, space: Space, files: InputFiles) -> F
     return _read_only(listed.points[listed.names.index(target.name)].copy())
 
 
-def _robot(content: CaseFile, space: Space, path: Path) -> RobotSettings:
-    robot = content.robot
+def _of_transform(content: CaseFile) -> tuple[str, ...]:
+    """What a registration lacks that only states its result."""
+    stated = content.registration
+    if stated is None or stated.transform is None:
+        return ()
+    return (f"registration: {NO_RESIDUALS.format(file=stated.transform)}",)
+
+
+def _markers(section: RegistrationSection | None) -> MarkerSection | None:
+    """The registration by markers; None where the case states a transform instead, or nothing."""
+    return None if section is None or section.transform else MarkerSection(**section.model_dump())
+
+
+def _robot(content: CaseFile, space: Space, path: Path, files: InputFiles) -> RobotSettings:
+    robot, stated = content.robot, content.registration
     home = None if robot.home_deg is None else _read_only(np.radians(np.asarray(robot.home_deg)))
     mount = None if robot.mount is None else mount_pose(robot.mount, space, path)
+    if stated is not None and stated.transform is not None:
+        T_file = itk_transform.parse_transform(files.content(stated.transform), path.parent / stated.transform)
+        mount = _read_only(stated_base_ct(stated, T_file))
+        return RobotSettings(ur_model(robot.model).name, home, mount, stated.transform)
     return RobotSettings(ur_model(robot.model).name, home, mount)
 
 
@@ -413,9 +444,11 @@ def _named_files(content: CaseFile, path: Path) -> Iterator[_Named]:
             yield _Named("naming", many.naming, f"structures.{number}.naming", naming.MAX_CSV_BYTES)
     if content.ct.file is not None:
         yield _Named("ct", content.ct.file, "ct.file", volumes.MAX_FILE_BYTES)
-    if content.registration is not None:
-        for side in ("markers_ct", "markers_base"):
-            yield _Named(side, getattr(content.registration, side), f"registration.{side}", points.MAX_FILE_BYTES)
+    for side in ("markers_ct", "markers_base", "transform"):
+        file = getattr(content.registration, side, None)
+        most = itk_transform.MAX_FILE_BYTES if side == "transform" else points.MAX_FILE_BYTES
+        if file is not None:
+            yield _Named(side, file, f"registration.{side}", most)
     if content.rehearsal.truth_base is not None:
         yield _Named("truth_base", content.rehearsal.truth_base, "rehearsal.truth_base", points.MAX_FILE_BYTES)
 

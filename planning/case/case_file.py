@@ -10,6 +10,7 @@ from pydantic import Field, Strict, model_validator
 from puncture_twin.planning.base.text_names import unprintable_texts
 from puncture_twin.planning.case.case_schema import CaseSchema, Region, check_statement, count_difference, with_count
 from puncture_twin.planning.case.errors_section import ErrorsSection
+from puncture_twin.planning.case.registration_section import RegistrationSection
 from puncture_twin.planning.case.toml_types import (
     Anatomical,
     Coordinate,
@@ -21,14 +22,12 @@ from puncture_twin.planning.case.toml_types import (
     Name,
     NotNegative,
     Number,
-    Positive,
     Section,
     Sextuple,
     StructureName,
     Text,
     Vector,
     Weight,
-    Yes,
 )
 
 MAX_STRUCTURES = 1000
@@ -231,18 +230,6 @@ class CtSection(Section):
     margin_mm: Margin = 2.0
 
 
-class RegistrationSection(Section):
-    """Markers seen in the CT and touched by the robot."""
-
-    method: Literal["triad", "rigid", "weighted", "affine"] | None = None
-    markers_ct: str
-    markers_base: str
-    use: tuple[Text, ...] | None = None
-    fle_mm: Positive | None = None
-    accept_residuals: Yes = False
-    accept_symmetry: Yes = False
-
-
 class MountSection(Section):
     """Where the robot's base stands in the CT, when no markers say it."""
 
@@ -400,6 +387,8 @@ class CaseFile(Section):
         chances = (self.search.min_hit, self.search.max_touch, self.search.max_touch_of or None)
         if self.errors is None and any(chance is not None for chance in chances):
             raise ValueError("search.min_hit and max_touch need [errors]: without declared errors there is no chance")
+        if self.space == "local" and self.registration is not None and self.registration.transform is not None:
+            raise ValueError('registration.transform: a transform file speaks of patient space; space "local" has none')
         if self.space == "local" and self.ct.file is not None:
             raise ValueError('ct.file: a CT says its own patient space; space "local" has none')
         if self.space == "local" and any(s.cut for s in self.structure):

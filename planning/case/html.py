@@ -36,4 +36,6 @@ def _facts(case: Any) -> Facts:
 def _base(case: Any) -> str:
     if case.registration is not None:
         return f"by registration of markers ({case.registration.method})"
+    if case.robot.transform is not None:
+        return f"by the stated transform {case.robot.transform}: no residuals"
     return "not stated" if case.robot.T_base_ct_mount is None else "by a stated mount"

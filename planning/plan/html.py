@@ -22,7 +22,10 @@ def _facts(plan: Any) -> Facts:
     yield "depth, skin to target", f"{np.linalg.norm(plan.entry_ct - plan.target_ct):.1f} mm"
     yield "standoff", f"{plan.standoff_mm:g} mm, tip to target"
     error = plan.expected_target_error_mm
-    yield "expected target error", f"{error:.2f} mm (rms)" if np.isfinite(error) else "not known: a stated mount"
+    yield (
+        "expected target error",
+        f"{error:.2f} mm (rms)" if np.isfinite(error) else "not known: a stated base",
+    )
     yield "robot", plan.model
     for name in ("approach", "insertion"):
         phase = getattr(plan, name)

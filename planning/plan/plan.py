@@ -21,7 +21,7 @@ class Plan:
         seed: Of the approach's planner.
         model: The arm.
         T_base_ct: Shape (4, 4), the belief of where the patient is.
-        expected_target_error_mm: rms, from the registration; NaN for a stated mount.
+        expected_target_error_mm: rms, from the registration; NaN for a stated mount or transform.
         theta: Puncture angle.
         beta: Azimuth.
         entry_ct: Shape (3,), skin entry.

@@ -41,7 +41,7 @@ ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast"
 """Who measures clearance: the fast exact engine, or FCL alone as the plain reference."""
 
 NO_BASE = "the case does not say where the robot's base is"
-ALLOWED_BASE = "[registration] with markers_ct and markers_base, or [robot.mount]; or a check without the arm"
+ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]; or a check without the arm"
 
 
 @dataclass(frozen=True, eq=False)

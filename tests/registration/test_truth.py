@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case import Case, Needle, RobotSettings, SearchSettings, load_case
-from puncture_twin.planning.case.case_file import RankingSection, RegistrationSection, RehearsalSection
+from puncture_twin.planning.case.case_file import RankingSection, RehearsalSection
 from puncture_twin.planning.case.case_volumes import CaseVolumes
 from puncture_twin.planning.case.entry import view_frame
+from puncture_twin.planning.case.registration_section import MarkerSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.placement import load_placement
@@ -57,7 +58,7 @@ def case(folder: Path, *, markers: bool = True, method: str = "rigid", **rehears
         write_points(folder / "ct.csv", NAMES, MARKERS)
         write_points(folder / "base.csv", NAMES, apply(pose(0), MARKERS))
         use = ("A", "B", "C") if method == "triad" else None
-        registration = RegistrationSection(method=method, markers_ct="ct.csv", markers_base="base.csv", use=use)
+        registration = MarkerSection(method=method, markers_ct="ct.csv", markers_base="base.csv", use=use)
     return Case(
         path=folder / "case.toml",
         name="box",

@@ -11,7 +11,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.case_file import RegistrationSection
+from puncture_twin.planning.case.registration_section import MarkerSection
 from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
@@ -108,7 +108,7 @@ def registration_error(
     return np.asarray(np.linalg.inv(T_base_ct) @ fit(read_ct, touched_base))
 
 
-def _drawn(case: Case, registration: RegistrationSection, T_base_ct: Floats, rng: np.random.Generator) -> Floats:
+def _drawn(case: Case, registration: MarkerSection, T_base_ct: Floats, rng: np.random.Generator) -> Floats:
     markers = match(
         _read(case, registration.markers_ct, case.space),
         _read(case, registration.markers_base, None),

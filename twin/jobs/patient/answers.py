@@ -18,6 +18,7 @@ from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.case.case import Case, load_case
+from puncture_twin.planning.case.registration_section import NO_RESIDUALS
 from puncture_twin.planning.certify.certificate import MAX_CERTIFICATE_BYTES, parse_certificate
 from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.formats.points.point_files import MAX_FILE_BYTES, parse_points
@@ -56,7 +57,9 @@ def registration_report(path: Path) -> dict[str, Any]:
     case = load_case(path)
     checked = checked_placement(case, user_cache())
     if checked is None or checked.placement.registration is None:
-        raise InputError("the case has no [registration]", where=case.path, allowed="markers_ct and markers_base")
+        file = case.robot.transform
+        what = "no [registration] with markers" if file is None else NO_RESIDUALS.format(file=file)
+        raise InputError(what, where=case.path, allowed="markers_ct and markers_base")
     placement, registration = checked.placement, checked.placement.registration
     report = registration_summary(registration)
     pose = case.target_ct + case.needle.shaft_mm * case.T_ct_entry[:3, 2]

@@ -1,0 +1,153 @@
+"""CT to robot from a transform file of ITK or Slicer in place of markers: which way it goes is never guessed."""
+
+import numpy as np
+import pytest
+import SimpleITK
+from case_world import CASE, MARKERS, changed, registration_section, write_case
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.geometry.rigid import apply, exp_twist, inverse
+from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.twin.jobs.patient.answers import registration_report
+
+T_BASE_CT = exp_twist(np.array([310.0, -120.0, 240.0, 0.4, -1.1, 2.0]))
+FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
+POINTS = np.array([[0.0, 0.0, 80.0], [50.0, 0.0, 75.0], [0.0, 60.0, 70.0], [-40.0, -30.0, 72.0]])
+TOLERANCE_MM = 1e-9
+
+
+def itk_file(folder, T, center=(0.0, 0.0, 0.0), name="ct_to_robot.tfm"):
+    """A file that SimpleITK writes of what T does to a point."""
+    affine = SimpleITK.AffineTransform(3)
+    affine.SetCenter(center)
+    affine.SetMatrix(T[:3, :3].ravel().tolist())
+    affine.SetTranslation((T[:3, 3] - center + T[:3, :3] @ center).tolist())
+    SimpleITK.WriteTransform(affine, str(folder / name))
+    return affine
+
+
+def slicer_file(folder, T_parent_node_ras):
+    """A file as Slicer writes a transform node: the way from its parent, between coordinates in LPS."""
+    return itk_file(folder, FLIP @ inverse(T_parent_node_ras) @ FLIP)
+
+
+def stating(folder, maps="ct_to_base", axes="LPS", file="ct_to_robot.tfm", *more):
+    """The usual patient's case with a stated transform."""
+    keys = [f'transform = "{file}"', maps and f'transform_maps = "{maps}"', axes and f'base_axes = "{axes}"', *more]
+    section = "\n".join(["[registration]", *filter(None, keys), ""])
+    write_case(folder, text=changed(CASE, (registration_section(), section)))
+    return folder
+
+
+@pytest.mark.parametrize("maps", ["ct_to_base", "base_to_ct"])
+@pytest.mark.parametrize("center", [(0.0, 0.0, 0.0), (10.0, -20.0, 30.0)])
+def test_a_file_does_to_points_what_itk_does(tmp_path, maps, center):
+    """Whichever way it goes, base coordinates are those that SimpleITK's TransformPoint goes to or comes from."""
+    affine = itk_file(tmp_path, T_BASE_CT if maps == "ct_to_base" else inverse(T_BASE_CT), center)
+    found = load_placement(load_case(stating(tmp_path, maps)))
+    in_base = apply(found.T_base_ct, POINTS)
+    pairs = zip(POINTS, in_base, strict=True) if maps == "ct_to_base" else zip(in_base, POINTS, strict=True)
+    for start, end in pairs:
+        assert affine.TransformPoint(start.tolist()) == pytest.approx(end, abs=TOLERANCE_MM)
+    assert in_base == pytest.approx(apply(T_BASE_CT, POINTS), abs=TOLERANCE_MM)
+
+
+def test_a_transform_that_slicer_registered(tmp_path):
+    """Markers of the CT onto points that were typed as the robot shows them, in Slicer's RAS: saved from its parent."""
+    T_base_ras = T_BASE_CT @ FLIP
+    slicer_file(tmp_path, T_base_ras)
+    found = load_placement(load_case(stating(tmp_path, "base_to_ct", "RAS")))
+    assert found.T_base_ct == pytest.approx(T_BASE_CT, abs=TOLERANCE_MM)
+
+
+def test_it_is_an_input_and_says_that_nothing_is_known_of_its_error(tmp_path):
+    """Hashed; no residuals, no expected error; told in every result and by register, which has nothing to show."""
+    itk_file(tmp_path, T_BASE_CT)
+    case = load_case(stating(tmp_path))
+    assert ("transform", "ct_to_robot.tfm") in [(one.role, one.path) for one in case.inputs]
+    said = "stated transform ct_to_robot.tfm: no residuals, expected error unknown"
+    assert f"registration: {said}" in case.warnings
+    placement = load_placement(case)
+    assert placement.registration is None and np.isnan(placement.target_error_mm)
+    with pytest.raises(InputError, match=said):
+        registration_report(tmp_path)
+
+
+def transform_text(T):
+    """The text of a transform file."""
+    numbers = " ".join(map(repr, [*T[:3, :3].ravel().tolist(), *T[:3, 3].tolist()]))
+    head = "#Insight Transform File V1.0\n#Transform 0\nTransform: AffineTransform_double_3_3\n"
+    return f"{head}Parameters: {numbers}\nFixedParameters: 0 0 0\n"
+
+
+GOOD = transform_text(T_BASE_CT)
+MIRRORED = transform_text(T_BASE_CT @ np.diag([-1.0, 1.0, 1.0, 1.0]))
+BENT = transform_text(T_BASE_CT @ np.diag([1.001, 1.0, 1.0, 1.0]))
+TWICE = GOOD + "\n".join(GOOD.splitlines()[1:]) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        ("a.tfm", MIRRORED, "mirrored"),
+        ("a.tfm", BENT, "not a rotation"),
+        ("a.tfm", TWICE, "several transforms"),
+        ("a.tfm", GOOD.replace("#Insight", "#Insight Out"), "no ITK transform file"),
+        ("a.tfm", GOOD.replace("AffineTransform", "BSplineTransform"), "transform of type 'BSpline"),
+        ("a.tfm", GOOD.replace("_3_3", "_2_2"), "transform of type 'AffineTransform_double_2_2'"),
+        ("a.tfm", GOOD.replace("FixedParameters: 0 0 0", "FixedParameters: 0 0"), "2 FixedParameters"),
+        ("a.tfm", GOOD.replace("\nParameters: ", "\nParameters: 1 "), "13 Parameters"),
+        ("a.tfm", GOOD.replace("\nParameters: ", "\nParameters: a"), "no numbers"),
+        ("a.tfm", GOOD.replace("FixedParameters: 0", "FixedParameters: nan"), "not finite|NaN|nan"),
+        ("a.tfm", GOOD.splitlines()[0], "transform of type ''"),
+        ("a.h5", "\x89HDF", r"kind '\.h5'; allowed: the same transform as text: in Slicer, Save .* \.tfm"),
+        ("a.mat", GOOD, r"kind '\.mat'"),
+    ],
+)
+def test_a_file_that_cannot_be_trusted_is_refused(tmp_path, name, text, says):
+    """Mirrored, stretched, several, of another kind, cut: one line, and nothing is repaired."""
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=says):
+        load_case(stating(tmp_path, file=name))
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        ((None, "LPS"), 'transform needs transform_maps = "base_to_ct"'),
+        (("ct_to_base", None), 'transform needs base_axes = "RAS"'),
+        (("inward", "LPS"), "transform_maps"),
+        (("ct_to_base", "LPS", "ct_to_robot.tfm", 'markers_ct = "markers_ct.csv"'), "markers_ct belongs to markers"),
+        (("ct_to_base", "LPS", "ct_to_robot.tfm", "fle_mm = 1.0"), "fle_mm belongs to markers"),
+    ],
+)
+def test_silence_and_contradiction_are_refused(tmp_path, keys, says):
+    """Which way a transform goes, and what the robot's axes are, the case says; markers do not stand beside it."""
+    itk_file(tmp_path, T_BASE_CT)
+    with pytest.raises(InputError, match=says):
+        load_case(stating(tmp_path, *keys))
+
+
+def test_markers_need_both_lists_as_before(tmp_path):
+    """One list alone is refused, and transform_maps without a transform."""
+    alone = '[registration]\nmarkers_ct = "markers_ct.csv"\n'
+    write_case(tmp_path, text=changed(CASE, (registration_section(), alone)))
+    with pytest.raises(InputError, match=r"markers_base: missing"):
+        load_case(tmp_path)
+    write_case(tmp_path, text=changed(CASE, (registration_section(), registration_section('base_axes = "LPS"'))))
+    with pytest.raises(InputError, match="belong to transform"):
+        load_case(tmp_path)
+
+
+def test_the_same_place_gives_the_same_answers(tmp_path):
+    """By markers without error and by the transform between both, the search says the same of every direction."""
+    base = apply(T_BASE_CT, POINTS)
+    rows = [f"{name},{x!r},{y!r},{z!r}" for name, (x, y, z) in zip("ABCD", base.tolist(), strict=True)]
+    write_case(tmp_path)
+    (tmp_path / "touch.csv").write_text("\n".join(["name,x_mm,y_mm,z_mm", *rows, ""]))
+    assert MARKERS.count("\n") == len(rows) + 1
+    by_markers = load_placement(load_case(tmp_path)).T_base_ct
+    itk_file(tmp_path, T_BASE_CT)
+    stated = load_placement(load_case(stating(tmp_path))).T_base_ct
+    assert by_markers == pytest.approx(stated, abs=1e-9)
