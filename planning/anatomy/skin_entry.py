@@ -80,9 +80,9 @@ def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) ->
     found = crossings(mesh, origin, directions)
     odd = found.count % 2 == 1
     if mesh.closed and not odd.all():
-        turned = directions.copy()
-        turned[~odd] = _turned(directions[~odd])
-        found = crossings(mesh, origin, turned)
+        rotated = directions.copy()
+        rotated[~odd] = _turned(directions[~odd])
+        found = crossings(mesh, origin, rotated)
         odd = found.count % 2 == 1
     return found, odd
 
@@ -90,8 +90,8 @@ def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) ->
 def _turned(directions: Floats) -> Floats:
     helper = np.eye(3)[np.argmin(np.abs(directions), axis=1)]
     aside = np.cross(directions, helper)
-    turned = directions + NUDGE * aside / np.linalg.norm(aside, axis=1, keepdims=True)
-    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
+    rotated = directions + NUDGE * aside / np.linalg.norm(aside, axis=1, keepdims=True)
+    return np.asarray(rotated / np.linalg.norm(rotated, axis=1, keepdims=True))
 
 
 def _view_depth(skin: Skin, target_ct: Floats, outward_ct: Floats) -> Floats:

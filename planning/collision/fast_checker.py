@@ -130,7 +130,7 @@ class FastChecker(CellChecker):
         """States (m, 6) with what the bounds need of them."""
         if len(path) <= 1:
             return Motion(link_poses(self.model, path), *self._still)
-        moved, turned = np.zeros((len(path), 7)), np.zeros((len(path), 6))
+        moved, rotated = np.zeros((len(path), 7)), np.zeros((len(path), 6))
         np.cumsum(self._swept_full.bounds_mm(path), axis=0, out=moved[1:, 1:])
-        np.cumsum(np.abs(np.diff(path, axis=0)), axis=0, out=turned[1:])
-        return Motion(link_poses(self.model, path), moved, turned)
+        np.cumsum(np.abs(np.diff(path, axis=0)), axis=0, out=rotated[1:])
+        return Motion(link_poses(self.model, path), moved, rotated)

@@ -56,9 +56,11 @@ class SegmentChecker:
             InputError: If a state is not finite.
         """
         start, end = np.array(start, dtype=np.float64), np.array(end, dtype=np.float64)
-        shares, begin = looks(math.ceil(_length(end - start) / LOOK_FIRST_RAD)), 0
+        fractions, begin = looks(math.ceil(_length(end - start) / LOOK_FIRST_RAD)), 0
         while True:
-            segment_kernels.check_segment(*self._packed, start, end, shares, begin, FINE_MM, self._order, self._answer)
+            segment_kernels.check_segment(
+                *self._packed, start, end, fractions, begin, FINE_MM, self._order, self._answer
+            )
             status, check, begin, asked = self._answer.status.tolist()
             if status == NOT_FINITE:
                 require_finite(np.stack([start, end]))
@@ -68,8 +70,8 @@ class SegmentChecker:
                 self._answer, begin = _room_for(2 * asked), 0
                 continue
             questions = self._answer.shares[:asked].tolist(), self._answer.checks[:asked].tolist()
-            for share, at in zip(*questions, strict=True):
-                if ask_fcl(self._checks[at], link_poses(self._model, start + share * (end - start))):
+            for fraction, at in zip(*questions, strict=True):
+                if ask_fcl(self._checks[at], link_poses(self._model, start + fraction * (end - start))):
                     return self._met(at)
             if status != ASK:
                 return None

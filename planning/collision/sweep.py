@@ -75,9 +75,9 @@ def _motion_bounds(frames, q, corners, lever, bounds):  # type: ignore[no-untype
     A NaN anywhere gives a NaN.
     """
     for k in range(len(q) - 1):
-        turned = 0.0
+        rotated = 0.0
         for link in range(6):
-            turned += abs(q[k + 1, link] - q[k, link])
+            rotated += abs(q[k + 1, link] - q[k, link])
             here, there = frames[k, link + 1], frames[k + 1, link + 1]
             farthest = 0.0
             for c in range(8):
@@ -89,4 +89,4 @@ def _motion_bounds(frames, q, corners, lever, bounds):  # type: ignore[no-untype
                     squared += moved * moved
                 if not squared <= farthest:
                     farthest = squared
-            bounds[k, link] = math.sqrt(farthest) + 2.0 * turned * turned * lever / 8.0
+            bounds[k, link] = math.sqrt(farthest) + 2.0 * rotated * rotated * lever / 8.0

@@ -67,10 +67,10 @@ def _to_segment(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]  # numb
     """Squared distance of the origin to the segment a b."""
     ux, uy, uz = bx - ax, by - ay, bz - az
     squared = ux * ux + uy * uy + uz * uz
-    share = 0.0
+    fraction = 0.0
     if squared > ROUNDS_TO_ZERO:
-        share = min(1.0, max(0.0, -(ax * ux + ay * uy + az * uz) / squared))
-    x, y, z = ax + share * ux, ay + share * uy, az + share * uz
+        fraction = min(1.0, max(0.0, -(ax * ux + ay * uy + az * uz) / squared))
+    x, y, z = ax + fraction * ux, ay + fraction * uy, az + fraction * uz
     return x * x + y * y + z * z
 
 

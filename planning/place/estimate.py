@@ -100,9 +100,11 @@ class Estimator:
         found = insertion_branches(model, target, self.wanted.outward_ct @ T_base_ct[:3, :3].T, distances)
         open_margin = self._open_margins(found, T_ct_base)
         best = self._clear_of_itself(found.q, open_margin) if self.itself else open_margin.max(axis=1)
-        share = self._share(best)
-        margin = float(best @ self.wanted.weight) / share if share > 0.0 else 0.0
-        return ReachEstimate(self._share(found.margin.max(axis=1)), self._share(open_margin.max(axis=1)), share, margin)
+        fraction = self._share(best)
+        margin = float(best @ self.wanted.weight) / fraction if fraction > 0.0 else 0.0
+        return ReachEstimate(
+            self._share(found.margin.max(axis=1)), self._share(open_margin.max(axis=1)), fraction, margin
+        )
 
     def _open_margins(self, ways: Branches, T_ct_base: Floats) -> Floats:
         """The margins of the ways that keep clear of the room, shape (n, 8); 0 for the others.

@@ -249,8 +249,8 @@ def _score(estimate: ReachEstimate) -> tuple[float, float]:
 
 
 def _order(estimate: ReachEstimate) -> tuple[float, float]:
-    share, margin = _score(estimate)
-    return -share, -margin
+    fraction, margin = _score(estimate)
+    return -fraction, -margin
 
 
 def _best_apart(

@@ -115,8 +115,8 @@ class Doubt:
 
     def sources(self) -> list[tuple[str, float]]:
         """Sources worth naming with their share of the error's variance, the largest first."""
-        shares = sorted(self.budget.share.items(), key=lambda item: -item[1])
-        return [(source, share) for source, share in shares if share >= LEAST_SHARE]
+        fractions = sorted(self.budget.share.items(), key=lambda item: -item[1])
+        return [(source, fraction) for source, fraction in fractions if fraction >= LEAST_SHARE]
 
     def sentence(self) -> str:
         """The whole in one line."""
@@ -124,19 +124,19 @@ class Doubt:
         parts = [f"{chance_words(self.p_hit)} to hit"]
         parts += [f"{chance_words(chance)} to touch {name}"] if name else []
         parts += [
-            f"{100 * share:.0f} % of the doubt is {SOURCES[source].words}" for source, share in self.sources()[:1]
+            f"{100 * fraction:.0f} % of the doubt is {SOURCES[source].words}" for source, fraction in self.sources()[:1]
         ]
         return "; ".join([*parts, *(goal.text() for goal in self.goals)])
 
     def lines(self) -> list[str]:
         """For a person, below the sentence."""
         budget, axes = self.budget, ", ".join(f"{mm:.2f}" for mm in self.budget.half_axes_mm)
-        shares = ", ".join(f"{SOURCES[source].words} {100 * share:.0f} %" for source, share in self.sources())
+        fractions = ", ".join(f"{SOURCES[source].words} {100 * fraction:.0f} %" for source, fraction in self.sources())
         return [
             self.sentence(),
             f"  expected error {budget.rms_mm:8.2f} mm (rms): {budget.lateral_mm:.2f} across the needle, "
             f"{budget.depth_mm:.2f} along it; half axes of the 95 % ellipsoid {axes} mm",
-            f"  of its variance: {shares}",
+            f"  of its variance: {fractions}",
             f"  {self.declaration}",
             f"  touches anything: {chance_words(self.p_touch_any)} at most, to first order",
             f"  not modelled: {NOT_MODELLED}",

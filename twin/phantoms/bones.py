@@ -87,9 +87,9 @@ def rib_path(number: int) -> Floats:
     """Middle line of a right rib, head to front end, shape (n, 3), mm."""
     head_z = torso.VERTEBRA_Z[18 - number] + 6.0
     angle = np.radians(np.linspace(_RIB_START_DEG, _RIB_END_DEG[number], 14))
-    share = (angle - angle[0]) / (np.radians(150.0) - angle[0])
+    fraction = (angle - angle[0]) / (np.radians(150.0) - angle[0])
     full = (angle[-1] - angle[0]) / (np.radians(150.0) - angle[0])
-    fall = _RIB_FALL_MM[number] * share * (0.6 + 0.4 * share) / (full * (0.6 + 0.4 * full))
+    fall = _RIB_FALL_MM[number] * fraction * (0.6 + 0.4 * fraction) / (full * (0.6 + 0.4 * full))
     shaft = torso.on_cage(angle, head_z - 6.0 - fall)
     at = np.array([head_z])
     y, wide = float(torso.spine_y(at)[0]), float(torso.body_half_width(at)[0])
@@ -146,10 +146,10 @@ def _cartilage_path(number: int) -> Floats:
         goal = np.array([np.radians(170.0), _CARTILAGE_GOAL[number]])
     else:
         goal = _angle_and_height(_cartilage_path(number - 1)[4])
-    share = np.linspace(0.0, 1.0, 9)
-    angle = start[0] + share * (goal[0] - start[0])
-    sag = -14.0 * np.sin(np.pi * share) * (1.0 - share)
-    return torso.on_cage(angle, start[1] + (goal[1] - start[1]) * share**1.3 + sag)
+    fraction = np.linspace(0.0, 1.0, 9)
+    angle = start[0] + fraction * (goal[0] - start[0])
+    sag = -14.0 * np.sin(np.pi * fraction) * (1.0 - fraction)
+    return torso.on_cage(angle, start[1] + (goal[1] - start[1]) * fraction**1.3 + sag)
 
 
 def _angle_and_height(point: Floats) -> Floats:

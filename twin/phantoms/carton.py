@@ -52,9 +52,9 @@ def _box() -> TriangleMesh:
                 corners.append(index.setdefault(tuple(node), len(index)))
             a, b, c, d = corners if side else corners[::-1]
             faces += [(a, b, c), (a, c, d)]
-    share = np.array(list(index)) / np.array(_BOX_CELLS)
+    fraction = np.array(list(index)) / np.array(_BOX_CELLS)
     low, high = np.array(BOX_LOW_MM), np.array(BOX_HIGH_MM)
-    return TriangleMesh(low + share * (high - low), np.array(faces, dtype=np.int32))
+    return TriangleMesh(low + fraction * (high - low), np.array(faces, dtype=np.int32))
 
 
 def _bolt(end: Floats) -> TriangleMesh:

@@ -109,10 +109,10 @@ def _shifted(mask: Bools, by: NDArray[np.int_]) -> Bools:
 
 def _blocks(mask: Bools, stride: NDArray[np.int_]) -> Bools:
     """A mask sampled: True where an eighth of a block is, which noise is not."""
-    share = mask.astype(np.float32)
+    fraction = mask.astype(np.float32)
     for axis, times in enumerate(stride):
-        share = np.add.reduceat(share, np.arange(0, mask.shape[axis], times), axis=axis)
-    return np.asarray(share >= np.prod(stride) / 8.0)
+        fraction = np.add.reduceat(fraction, np.arange(0, mask.shape[axis], times), axis=axis)
+    return np.asarray(fraction >= np.prod(stride) / 8.0)
 
 
 def _holds_whole(limbs: Bools, bone: LimbBone) -> bool:

@@ -57,13 +57,13 @@ def exposed_bones(bone: Bools, body: Bools, spacing_mm: Floats) -> list[Exposed]
     depth = ndimage.distance_transform_edt(padded, sampling=spacing_mm)[1:-1, 1:-1, 1:-1]
     near = bone & body & (depth <= min(DEEPEST_MM, DEEPEST_SHARE * float(depth.max())))
     index = np.argwhere(near)
-    share = np.zeros(body.shape)
-    share[near] = _air_about(index, depth[near], body, spacing_mm)
-    groups = _groups(share >= PARTLY, spacing_mm)
+    fraction = np.zeros(body.shape)
+    fraction[near] = _air_about(index, depth[near], body, spacing_mm)
+    groups = _groups(fraction >= PARTLY, spacing_mm)
     voxel_ml = float(np.prod(spacing_mm)) / 1000.0
     found = []
-    for number in np.unique(groups[share >= EXPOSED]):
-        at = np.argwhere((groups == number) & (share >= EXPOSED))
+    for number in np.unique(groups[fraction >= EXPOSED]):
+        at = np.argwhere((groups == number) & (fraction >= EXPOSED))
         if len(at) * voxel_ml >= MIN_BONE_ML and np.linalg.norm(np.ptp(at, axis=0) * spacing_mm) >= LEAST_LENGTH_MM:
             whole = groups == number
             found.append(Exposed(np.argwhere(whole), depth[whole]))

@@ -49,9 +49,9 @@ def measure_beside(pairs, count, length):  # type: ignore[no-untyped-def]  # num
         wa, wb, wc = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
         around = ((wa >= 0.0) & (wb >= 0.0) & (wc >= 0.0)) | ((wa <= 0.0) & (wb <= 0.0) & (wc <= 0.0))
         outside = (ta < 0.0) | (tb < 0.0) | (tc < 0.0) | (ta > length) | (tb > length) | (tc > length)
-        share = 1.0 / (wa + wb + wc)
-        x, y = (wa * ax + wb * bx + wc * cx) * share, (wa * ay + wb * by + wc * cy) * share
-        pierced = (wa * ta + wb * tb + wc * tc) * share
+        fraction = 1.0 / (wa + wb + wc)
+        x, y = (wa * ax + wb * bx + wc * cx) * fraction, (wa * ay + wb * by + wc * cy) * fraction
+        pierced = (wa * ta + wb * tb + wc * tc) * fraction
         met = around & (x * x + y * y < CONTACT_MM * CONTACT_MM) & (pierced >= 0.0) & (pierced <= length)
         met &= best >= CONTACT_MM  # else the axis may run along the triangle's plane and meet it earlier
         best = ASK if around | outside | (best < CONTACT_MM) else best

@@ -99,14 +99,14 @@ def picture_detector(room: StereoWorkcell, rng: np.random.Generator) -> Detector
 
 def ball_scene(plan: CamerasSection, ball: LocatedPair, hidden: float, rng: np.random.Generator) -> BallScene:
     """The ball for the picture; an occluder that the case asks for comes from any side."""
-    share = min(max(plan.occlusion if ball.rod_c is not None else 0.0, hidden), 0.99)
+    fraction = min(max(plan.occlusion if ball.rod_c is not None else 0.0, hidden), 0.99)
     return BallScene(
         ball.center_c,
         radius_mm=ball.radius_mm,
         rod_c=(0.0, -1.0, 0.0) if ball.rod_c is None else ball.rod_c,
         rod=ball.rod_c is not None,
         diffuse=DIFFUSE[plan.light],
-        hidden_fraction=share,
+        hidden_fraction=fraction,
         hidden_from=float(rng.uniform(-np.pi, np.pi)),
     )
 

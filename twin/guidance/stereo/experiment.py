@@ -183,10 +183,10 @@ def run_trials(case: ServoCase, seeds: Sequence[int], *, jobs: int = 1, done: Co
             found.append(run_trial(case, seed, empty))
             tell(len(found), len(seeds))
         return found
-    shares = [seeds[i : i + SHARE] for i in range(0, len(seeds), SHARE)]
-    with process_pool(jobs, len(shares)) as pool:
-        for share in pool.map(partial(run_trials, case), shares):
-            found += share
+    fractions = [seeds[i : i + SHARE] for i in range(0, len(seeds), SHARE)]
+    with process_pool(jobs, len(fractions)) as pool:
+        for fraction in pool.map(partial(run_trials, case), fractions):
+            found += fraction
             tell(len(found), len(seeds))
     return found
 

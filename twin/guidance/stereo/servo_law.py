@@ -118,14 +118,14 @@ def servo_step(held: HeldRod, q: Floats, move_base: Floats, limits: StepLimits) 
         here = path[-1]
         turn, blind = _piece(held, here, start + move * (piece / count) - ball_base(held, here))
         room = limits.joint_step_rad - np.abs(here - q).max()
-        share = min(1.0, max(room, 0.0) / max(float(np.abs(turn).max()), 1e-12))
-        there = here + share * turn
+        fraction = min(1.0, max(room, 0.0) / max(float(np.abs(turn).max()), 1e-12))
+        there = here + fraction * turn
         stop = _refusal(held, there, blind, limits)
         if stop is not None:
             return Step(np.array(path[:1]), stop, only_position or blind)
         only_position = only_position or blind
         path.append(there)
-        if share < 1.0:
+        if fraction < 1.0:
             break
     return Step(np.array(path), None, only_position)
 

@@ -138,7 +138,7 @@ class Liu2007Tables:
             self.tilted.trials, [[row.after_mm - row.mapping_mm for row in one.rows] for one in self.tilted.trials]
         )
         most = MOST_OVER_MAPPING * ours.mapping_mean + CHANCE * over.error
-        share = MOST_NOT_CONFIRMED + CHANCE * np.sqrt(MOST_NOT_CONFIRMED * (1 - MOST_NOT_CONFIRMED) / ours.targets)
+        fraction = MOST_NOT_CONFIRMED + CHANCE * np.sqrt(MOST_NOT_CONFIRMED * (1 - MOST_NOT_CONFIRMED) / ours.targets)
         return (
             Condition(
                 f"the error falls by more than chance: {gain.mean:.2f} mm, standard error {gain.error:.2f}",
@@ -149,8 +149,8 @@ class Liu2007Tables:
                 bool(ours.after_mean <= most),
             ),
             Condition(
-                f"not confirmed, {100 * ours.not_confirmed:.1f} %, is at most {100 * share:.0f} % of the targets",
-                bool(ours.not_confirmed <= share),
+                f"not confirmed, {100 * ours.not_confirmed:.1f} %, is at most {100 * fraction:.0f} % of the targets",
+                bool(ours.not_confirmed <= fraction),
             ),
         )
 

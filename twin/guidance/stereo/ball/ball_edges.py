@@ -83,8 +83,8 @@ def find_edges(grey: Grey, camera: Camera, spokes: Spokes) -> Edges:
     half = min(spokes.reach_px, 0.8 * spokes.half_angle * float(scales.min()))
     steps = np.arange(-half, half + STEP_PX / 2, STEP_PX)
     angles = spokes.half_angle + steps[None] / scales[:, None]
-    turned = (tangent_axes(spokes.direction) @ across).T
-    rays = np.cos(angles)[..., None] * spokes.direction + np.sin(angles)[..., None] * turned[:, None]
+    rotated = (tangent_axes(spokes.direction) @ across).T
+    rays = np.cos(angles)[..., None] * spokes.direction + np.sin(angles)[..., None] * rotated[:, None]
     places = camera.project(camera.center_c + rays) - grey.offset
     seen = np.all((places >= 0) & (places <= np.array(grey.pixels.shape[::-1]) - 1), axis=-1)
     read = map_coordinates(grey.spline, [places[..., 1], places[..., 0]], order=3, prefilter=False, mode="nearest")
@@ -109,9 +109,9 @@ def visible_fraction(
         contrast: Between ball and surroundings, grey levels.
     """
     around = 2 * np.pi * np.arange(spokes.number) / spokes.number
-    turned = (tangent_axes(spokes.direction) @ np.stack([np.cos(around), np.sin(around)])).T
+    rotated = (tangent_axes(spokes.direction) @ np.stack([np.cos(around), np.sin(around)])).T
     angles = spokes.half_angle * DISC_RINGS
-    rays = np.cos(angles)[:, None, None] * spokes.direction + np.sin(angles)[:, None, None] * turned
+    rays = np.cos(angles)[:, None, None] * spokes.direction + np.sin(angles)[:, None, None] * rotated
     places = camera.project(camera.center_c + rays) - grey.offset
     read = map_coordinates(grey.spline, [places[..., 1], places[..., 0]], order=3, prefilter=False, mode="nearest")
     ball = float(np.median(read[-1][on_circle]))

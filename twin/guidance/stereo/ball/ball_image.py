@@ -244,7 +244,7 @@ def _occluder(rays: Floats, center: Floats, camera: Camera, scene: BallScene) ->
     return _Layer(_cover(gap), np.zeros_like(gap), np.full_like(gap, scene.occluder_grey))
 
 
-def disc_distance(share: float) -> float:
+def disc_distance(fraction: float) -> float:
     """How far off the centre of the occluder must be to hide a share of the disc; lengths in radii of the ball."""
 
     def hidden(distance: float) -> float:
@@ -252,7 +252,7 @@ def disc_distance(share: float) -> float:
         a = r * r * np.arccos(np.clip((d * d + r * r - R * R) / (2 * d * r), -1, 1))
         b = R * R * np.arccos(np.clip((d * d + R * R - r * r) / (2 * d * R), -1, 1))
         kite = (-d + r + R) * (d + r - R) * (d - r + R) * (d + r + R)
-        return float((a + b - np.sqrt(max(kite, 0.0)) / 2) / np.pi - share)
+        return float((a + b - np.sqrt(max(kite, 0.0)) / 2) / np.pi - fraction)
 
     return float(brentq(hidden, OCCLUDER_SIZE - 1, OCCLUDER_SIZE + 1))
 

@@ -221,8 +221,8 @@ class _Problem:
             T = state.T_c_bodies[body]
             first = self.first_body + 6 * int(body)
             w, t = every[first : first + 3], every[first + 3 : first + 6]
-            turned = state.points[seen.point[rows[own]]] @ T[:3, :3].T + T[:3, 3] - t
-            slope[rows[own], :, first : first + 3] = by_point_c[own] @ _turn_slope(turned, w)
+            rotated = state.points[seen.point[rows[own]]] @ T[:3, :3].T + T[:3, 3] - t
+            slope[rows[own], :, first : first + 3] = by_point_c[own] @ _turn_slope(rotated, w)
             slope[rows[own], :, first + 3 : first + 6] = by_point_c[own]
             by_point = by_point_c[own] @ T[:3, :3]
             for axis in range(3):
@@ -253,9 +253,9 @@ def _camera_slope(camera: Camera, points_c: Floats, turn: tuple[Floats, Floats])
     return slope
 
 
-def _turn_slope(turned: Floats, w: Floats) -> Floats:
+def _turn_slope(rotated: Floats, w: Floats) -> Floats:
     """The slope d Exp(w) p / dw = -[Exp(w) p]x J_l(w), for Exp(w) p of shape (n, 3); shape (n, 3, 3)."""
-    return np.asarray(-skew(turned) @ left_jacobian(w))
+    return np.asarray(-skew(rotated) @ left_jacobian(w))
 
 
 def _moved_camera(camera: Camera, change: Floats) -> Camera:

@@ -182,9 +182,9 @@ class _Anatomy:
         """The needle against this target; ``again`` (6, 6), C, is what errs beside the unknowns."""
         errors, R = found.model.observed.errors, self.T_c_m[:3, :3]
         rows = rows - self.rows
-        turned = np.kron(np.eye(2), R_c_flange)
+        rotated = np.kron(np.eye(2), R_c_flange)
         tool = np.repeat([errors.tip_offset_mm, errors.needle_direction, 0.0], [3, 2, 1]) ** 2
-        cov_c = rows @ found.covariance @ rows.T + again + (turned * tool) @ turned.T
+        cov_c = rows @ found.covariance @ rows.T + again + (rotated * tool) @ rotated.T
         turn = np.kron(np.eye(2), R)
         covariance = turn.T @ cov_c @ turn + self._moved(found)
         offset = R.T @ (ball_c - apply(self.T_c_m, self.target_m))
