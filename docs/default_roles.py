@@ -9,7 +9,8 @@ HEAD = """# Default roles and margins
 What `init` writes for a structure, by its name. Capitals, spaces and signs do not count: "Left Lung" is `left_lung`.
 Of several lines that match, the one with the longest pattern holds; a lesion is a lesion whatever organ it is of, and a
 line that avoids holds before one that traverses: `thigh_artery` is no muscle, `intracranial_vessels` are no skull. The
-structure that holds the target gets the role `target`, others that hold it too `traverse`. Margins, in mm, are a start
+structure that holds the target gets the role `target`, others that hold it too `traverse`, but for vessels, nerves,
+spinal cord, brainstem and heart, which stay avoided. Margins, in mm, are a start
 that a physician looks at for each patient, not a rule of any society; they are those of the cases in this repository.
 
 *Written by `python docs/default_roles.py`.*

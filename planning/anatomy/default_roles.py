@@ -363,6 +363,22 @@ BY_REGION: Mapping[str, tuple[DefaultRole, ...]] = MappingProxyType(
 """Lines that hold in a region before the general ones; other regions have none of their own."""
 
 
+NEVER_CROSSED = frozenset(
+    (
+        *(
+            "spinal cord",
+            "nerves",
+            "brainstem",
+            "heart",
+            "aorta and venae cavae",
+            "great vessels of the chest and neck",
+        ),
+        *("portal vein", "iliac vessels", "other vessels"),
+    )
+)
+"""Groups that no path crosses because they hold the target too: masks overlap, and a lesion may lie on a vessel."""
+
+
 def default_role(name: str, region: str) -> DefaultRole | None:
     """The line of the table that a name belongs to, or None.
 

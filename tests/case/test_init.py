@@ -9,6 +9,7 @@ import pytest
 import SimpleITK as sitk  # noqa: N813
 from case_world import MARKERS, ball, image_of
 
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.toml_file import read_toml
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.search.context import prepare
@@ -224,6 +225,77 @@ def test_a_lesion_in_an_organ_is_the_target_and_the_organ_is_crossed(tmp_path, c
     assert roles(tmp_path)["lung tumor"] == ("target", 0.0)
     assert roles(tmp_path)["right lung"] == ("traverse", 0.0)
     assert any("paths cross them (traverse): right lung" in line for line in said)
+
+
+def test_a_vessel_that_holds_the_target_too_is_not_crossed(tmp_path, capfd):
+    """Masks overlap: the artery beside a tumour became `traverse`, and every path through it was safe."""
+    write_ct(tmp_path / "scan.nii.gz")
+    for name, radius in (("lung tumor", 6.0), ("pulmonary_artery", 9.0)):
+        sitk.WriteImage(
+            image_of(inside((-40, 0, 10), radius).astype(np.uint8), SPACING), str(tmp_path / f"{name}.nii.gz")
+        )
+    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+    assert code == 2 and "lies inside 'pulmonary_artery', which is to be avoided" in said[-1]
+
+
+def test_a_lesion_of_the_other_space_is_asked_about(tmp_path, capfd):
+    """Typed in RAS without saying so, the target lay in a lung on the other side, which became its structure."""
+    write_ct(tmp_path / "scan.nii.gz")
+    write_masks(tmp_path / "seg")
+    lesion = image_of(inside((40, 0, 10), 12.0).astype(np.uint8), SPACING)
+    sitk.WriteImage(lesion, str(tmp_path / "seg" / "liver_lesion.nii.gz"))
+    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+    assert code == 2 and "lies in 'right lung' (read in RAS it lies in 'liver_lesion': --space RAS)" in said[0]
+    assert init(capfd, tmp_path, "--target", TARGET, "--space", "LPS")[0] == 0
+
+
+SPOILED = {
+    "a probability": lambda: np.clip(2.0 - np.sqrt((X - 30) ** 2 + Y**2 + Z**2) / 10, 0, 1).astype(np.float32),
+    "-1 for not known": lambda: np.where(Z < -90, -1, inside((30, 0, 0), 9.0)).astype(np.int16),
+    "no background": lambda: np.ones(X.shape, np.uint8),
+}
+
+
+@pytest.mark.parametrize("kind", sorted(SPOILED))
+def test_a_mask_that_is_none_is_no_structure_left_out(tmp_path, capfd, kind):
+    """It was left out with a note, and its vessel was free."""
+    write_ct(tmp_path / "scan.nii.gz")
+    write_masks(tmp_path / "seg")
+    sitk.WriteImage(image_of(SPOILED[kind](), SPACING), str(tmp_path / "seg" / "vein.nii.gz"))
+    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+    assert code == 2 and "seg/vein.nii.gz: values from " in said[0]
+
+
+@pytest.mark.parametrize("ending", ["mha", "nhdr"])
+def test_a_mask_in_another_format_is_not_passed_over(tmp_path, capfd, ending):
+    """Neither by `init` nor by a case that names the folder: its organ would be free."""
+    write_ct(tmp_path / "scan.nii.gz")
+    write_masks(tmp_path / "seg")
+    assert init(capfd, tmp_path, "--target", TARGET)[0] == 0
+    vein = image_of(inside((30, 0, 0), 9.0).astype(np.uint8), SPACING)
+    sitk.WriteImage(vein, str(tmp_path / "seg" / f"vein.{ending}"))
+    with pytest.raises(InputError, match=rf"vein.{ending}: is a volume of a kind that is not read"):
+        prepare(tmp_path, arm=False)
+    code, _, said = init(capfd, tmp_path, "--target", TARGET, "--force")
+    if ending == "mha":
+        assert code == 2 and "seg/vein.mha: is a volume" in said[0]
+    else:
+        assert code == 0 and roles(tmp_path)["vein.nhdr"] == ("avoid", 3.0)
+
+
+def test_tables_that_contradict_each_other_or_the_body_are_not_guessed(tmp_path, capfd):
+    """The first by name was taken: its aorta was fat, or its liver lay on the left."""
+    write_ct(tmp_path / "scan.nii.gz")
+    sitk.WriteImage(image_of(labels(), SPACING), str(tmp_path / "map.nii.gz"))
+    (tmp_path / "a.csv").write_text("id,name\n1,muscle\n2,torso_fat\n3,rib_left_7\n")
+    (tmp_path / "b.csv").write_text("id,name\n1,right lung\n2,aorta\n3,odd thing\n")
+    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+    assert code == 2 and "map.nii.gz: several tables name its labels in other ways: a.csv, b.csv" in said[0]
+    assert init(capfd, tmp_path, "--target", TARGET, "--naming", "b.csv")[0] == 0
+    (tmp_path / "a.csv").unlink()
+    (tmp_path / "b.csv").write_text("id,name\n1,spleen\n2,liver\n3,aorta\n")
+    code, _, said = init(capfd, tmp_path, "--target", TARGET, "--force")
+    assert code == 2 and "its organs do not lie where b.csv names them" in said[0]
 
 
 def test_a_target_in_no_structure_is_a_ball_of_its_own(tmp_path, capfd):

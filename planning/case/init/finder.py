@@ -19,7 +19,7 @@ from puncture_twin.planning.case.init.segmentation import Place, Segmentation
 from puncture_twin.planning.formats.dicom.recognise import list_folder
 from puncture_twin.planning.formats.dicom.storage import Kind
 from puncture_twin.planning.formats.labels.labelmaps import labelmap_of
-from puncture_twin.planning.formats.labels.mask_folder import MASK_ENDINGS
+from puncture_twin.planning.formats.labels.mask_folder import MASK_ENDINGS, UNREAD, UNREAD_VOLUMES
 from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points
 from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS, Volume
 from puncture_twin.planning.geometry.spaces import Space, Unit
@@ -163,8 +163,11 @@ class _Looker:
     def look(self) -> None:
         """DICOM, volumes, meshes, points."""
         self._dicom()
+        labels = [name for name in self._names if self._wanted.takes("labels", name)]
+        unread = [name for name in labels if name.lower().endswith(UNREAD_VOLUMES)]
+        self._found.problems += [InputError(UNREAD, where=self._place.folder / name, allowed="") for name in unread]
         self._volumes([name for name in self._names if name.lower().endswith(NIFTI_ENDINGS + NRRD_ENDINGS)])
-        self._meshes([name for name in self._names if is_mesh(name) and self._wanted.takes("labels", name)])
+        self._meshes([name for name in labels if is_mesh(name)])
         for name in self._names:
             if name.lower().endswith(POINT_ENDINGS):
                 self._points(name)
@@ -225,7 +228,15 @@ class _Looker:
         elif kind == "labels":
             self._label_file(name, surfaces)
         else:
+            self._refuse_spoiled_mask(surfaces.volume, name)
             self._found.notes.append(f"{name}: neither a CT in Hounsfield units nor labels; left out")
+
+    def _refuse_spoiled_mask(self, volume: Volume, name: str) -> None:
+        """A probability, or a mask with -1 or without background: an organ that would be left out."""
+        low, high = float(volume.values.min()), float(volume.values.max())
+        if low >= -1 and high <= 1 and self._wanted.takes("labels", name):
+            what = f"values from {low:.3g} to {high:.3g} are neither a mask nor a CT"
+            raise InputError(what, where=self._place.folder / name, allowed="0 and one other whole number in a mask")
 
     def _label_file(self, name: str, surfaces: VolumeSurfaces) -> None:
         self._found.segmentations.append(label_file(self._place, name, surfaces, self._wanted.naming))

@@ -17,7 +17,7 @@ from puncture_twin.planning.formats.labels.labelmaps import Box, LabelMap
 from puncture_twin.planning.formats.labels.mask_folder import structure_name
 from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS, parse_names
 from puncture_twin.planning.formats.labels.naming import BUILT_IN, MAX_CSV_BYTES, names_for
-from puncture_twin.planning.formats.labels.numbering import told_numbering
+from puncture_twin.planning.formats.labels.numbering import label_centres, plausibility, told_numbering
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 
@@ -167,13 +167,13 @@ def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str 
 
 
 def _found_naming(place: Place, source: str, labels: LabelMap, present: Sequence[int]) -> tuple[str, tuple[str, ...]]:
-    for table in _tables_beside(place.folder, source):
-        try:
-            names = parse_names(_table(place.folder / table), place.folder / table)
-        except InputError:
-            continue
-        if set(present) <= names.keys():
-            return table, (f"{source}: names from {table}",)
+    table = _one_table(place, source, present)
+    if table is not None:
+        name, names = table
+        if plausibility(names, label_centres(labels)).fails:
+            what = f"its organs do not lie where {name} names them"
+            raise InputError(what, where=place.folder / source, allowed="--naming with the table that is right")
+        return name, (f"{source}: names from {name}",)
     naming = told_numbering(labels)
     if naming is None:
         allowed = f"--naming with {', '.join(BUILT_IN)} or a table"
@@ -181,12 +181,38 @@ def _found_naming(place: Place, source: str, labels: LabelMap, present: Sequence
     return naming, (NUMBERING_TOLD.format(source=source, naming=naming),)
 
 
+def _one_table(place: Place, source: str, present: Sequence[int]) -> tuple[str, dict[int, str]] | None:
+    """The table beside a map that names all of its labels: the one named like the map, else the only one.
+
+    Raises:
+        InputError: Several tables name them in other ways.
+    """
+    found = []
+    for table in _tables_beside(place.folder, source):
+        try:
+            names = parse_names(_table(place.folder / table), place.folder / table)
+        except InputError:
+            continue
+        if set(present) <= names.keys():
+            found.append((table, names))
+    if not found or _is_named_like(found[0][0], source):
+        return found[0] if found else None
+    if any([other[label] for label in present] != [found[0][1][label] for label in present] for _, other in found[1:]):
+        what = f"several tables name its labels in other ways: {', '.join(table for table, _ in found)}"
+        raise InputError(what, where=place.folder / source, allowed="--naming with the table that is right")
+    return found[0]
+
+
+def _is_named_like(table: str, source: str) -> bool:
+    """Whether a table is called like a map, up to the first dot."""
+    return table.rpartition("/")[2].split(".")[0] == structure_name(source).split(".")[0]
+
+
 def _tables_beside(folder: Path, source: str) -> Iterator[str]:
     """Files that may be tables of names, those first that are named like the map."""
     parent = (folder / source).parent
     files = [one for one in parent.iterdir() if one.name.lower().endswith(NAME_ENDINGS) and one.is_file()]
-    stem = structure_name(source)
-    for one in sorted(files, key=lambda file: (file.name.split(".")[0] != stem.split(".")[0], file.name)):
+    for one in sorted(files, key=lambda file: (not _is_named_like(file.name, source), file.name)):
         yield one.relative_to(folder).as_posix()
 
 

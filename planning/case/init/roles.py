@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from puncture_twin.planning.anatomy.default_roles import BODY, LESION, UNKNOWN_NAME, default_role
+from puncture_twin.planning.anatomy.default_roles import BODY, LESION, NEVER_CROSSED, UNKNOWN_NAME, default_role
 from puncture_twin.planning.anatomy.regions import USUAL, absent_organs
 from puncture_twin.planning.case.init.segmentation import Assigned
 
@@ -40,7 +40,7 @@ def _assigned(label: int, name: str, region: str, holding: Holding) -> Assigned:
     line = default_role(name, region) or UNKNOWN_NAME
     if name == holding.target:
         return Assigned(label, name, "target", 0.0, line)
-    if name in holding.others and line != BODY:
+    if name in holding.others and line != BODY and line.group not in NEVER_CROSSED:
         return Assigned(label, name, "traverse", 0.0, line)
     return Assigned(label, name, line.kind, line.margin_mm, line)
 
@@ -53,6 +53,9 @@ def role_notes(rows: Sequence[Assigned], holding: Holding) -> Iterator[str]:
     crossed = [row.name for row in rows if row.name in holding.others and row.kind == "traverse"]
     if crossed:
         yield f"they hold the target too, so paths cross them (traverse): {_list(crossed)}"
+    outlines = [row.name for row in rows if row.kind == "ignore"]
+    if outlines:
+        yield f"taken for the outline of the body, so not checked (ignore): {_list(outlines)}"
 
 
 def _list(names: Sequence[str]) -> str:

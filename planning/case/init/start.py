@@ -181,6 +181,9 @@ def _markers_of_ct(markers: Sequence[Markers], ct: Ct | None) -> list[Markers]:
 
 def _notes(request: Request, found: Found, target: Target, parts: CaseParts) -> Iterator[str]:
     yield from found.notes
+    others = [one.source for one in found.cts if one.source != parts.ct]
+    if others and parts.ct is not None:
+        yield f"the CT is {parts.ct}, which holds the target; left out: {', '.join(others)}"
     for one in found.segmentations:
         yield from one.notes
     yield from target.notes

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from puncture_twin.planning.anatomy.default_roles import BODY, default_role
+from puncture_twin.planning.anatomy.default_roles import BODY, LESION, NEVER_CROSSED, default_role
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.init.roles import Holding, chosen_target
@@ -69,15 +69,17 @@ def typed_target(
         space_stated: Whether the user said so.
 
     Raises:
-        InputError: No structure holds it, but one would if it was meant in the other space, and nobody said which.
+        InputError: It would lie in a structure, or a likelier one, if it was meant in the other space, and nobody said
+            which.
     """
     names = _holders(point_ct, segmentations)
-    other = "" if names else _other_reading(point_ct, segmentations, space)
+    other = "" if names and space_stated else _other_reading(point_ct, segmentations, space, names)
     if not names and (space_stated or not other):
         return Target(point_ct, Holding(None, frozenset()), (_in_nothing(point_ct, segmentations, other),))
-    if not names:
+    if not names or other:
+        held = f"in '{chosen_target(names)}'" if names else "in no structure"
         raise InputError(
-            f"target ({shown(point_ct, space)}) lies in no structure{other}",
+            f"target ({shown(point_ct, space)}) lies {held}{other}",
             where="--target",
             allowed="--space LPS or --space RAS, whichever is meant",
         )
@@ -119,13 +121,23 @@ def _holders(point_ct: Floats, segmentations: Sequence[Segmentation]) -> list[st
     return [name for _, name in sorted(found)]
 
 
-def _other_reading(point_ct: Floats, segmentations: Sequence[Segmentation], space: Space) -> str:
-    """What the same numbers would mean in the other space, where that is inside of something."""
+def _other_reading(point_ct: Floats, segmentations: Sequence[Segmentation], space: Space, here: Sequence[str]) -> str:
+    """What the same numbers mean in the other space, where that is a likelier target than what holds them here."""
     if space is Space.LOCAL:
         return ""
     other = Space.RAS if space is Space.LPS else Space.LPS
     names = _holders(to_lps(point_ct[None], Space.RAS)[0], segmentations)
-    return f" (read in {other} it lies in '{names[0]}': --space {other})" if names else ""
+    if _likeliness(names) <= _likeliness(here):
+        return ""
+    return f" (read in {other} it lies in '{chosen_target(names)}': --space {other})"
+
+
+def _likeliness(names: Sequence[str]) -> int:
+    """Of structures that hold a point to be a target: a lesion, an organ, something never crossed, nothing."""
+    if not names:
+        return 0
+    line = default_role(chosen_target(names), "other")
+    return 3 if line == LESION else 1 if line is not None and line.group in NEVER_CROSSED else 2
 
 
 def _in_nothing(point_ct: Floats, segmentations: Sequence[Segmentation], other: str) -> str:

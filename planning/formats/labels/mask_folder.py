@@ -12,6 +12,9 @@ from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, cor
 
 MASK_ENDINGS = (".nii.gz", ".nii", ".seg.nrrd", ".nrrd")
 """Endings of files that are masks; other files of the folder (statistics, previews) are passed over."""
+UNREAD_VOLUMES = (".mha", ".mhd", ".hdr", ".img", ".mgz", ".mgh", ".mnc", ".nii.bz2")
+"""Endings of volumes that other programs write and this one does not read: a structure in one would count as free."""
+UNREAD = "is a volume of a kind that is not read (convert it to NIfTI or NRRD)"
 MAX_MASKS = 1000
 """TotalSegmentator has 117 classes."""
 SAME_PLACE_MM = 0.1
@@ -37,11 +40,12 @@ def mask_files(folder: Path, *, where: str | Path) -> tuple[str, ...]:
         where: The file and key that name the folder, for errors.
 
     Raises:
-        InputError: No folder, no mask in it, too many, or two of one structure.
+        InputError: No folder, no mask in it, too many, two of one structure, or a volume that would be passed over.
     """
     allowed = f"a folder of 1 to {MAX_MASKS} masks ({', '.join(MASK_ENDINGS)}), one a structure"
     if not is_folder(folder):
         raise InputError(f"'{folder.name[:200]}' is no folder", where=where, allowed=allowed)
+    _refuse_unread(folder, allowed)
     files = sorted(one.name for one in folder.iterdir() if one.name.lower().endswith(MASK_ENDINGS) and one.is_file())
     if not 1 <= len(files) <= MAX_MASKS:
         raise InputError(f"'{folder.name}' holds {len(files)} masks", where=where, allowed=allowed)
@@ -50,6 +54,13 @@ def mask_files(folder: Path, *, where: str | Path) -> tuple[str, ...]:
         if (other := names.setdefault(structure_name(file), file)) is not file:
             raise InputError(f"'{other}' and '{file}' are masks of one name", where=where, allowed=allowed)
     return tuple(files)
+
+
+def _refuse_unread(folder: Path, allowed: str) -> None:
+    """A mask in another format, or a header with its voxels beside it, would be passed over and its organ lost."""
+    for one in sorted(folder.iterdir()):
+        if one.name.lower().endswith((*UNREAD_VOLUMES, ".nhdr")) and one.is_file():
+            raise InputError(UNREAD, where=one, allowed=allowed)
 
 
 def mask_label(mask: LabelMap) -> int | None:
