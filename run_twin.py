@@ -26,6 +26,7 @@ from puncture_twin.planning.batch.batch import run_batch
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.case_schema import Region
 from puncture_twin.planning.export.exporter import FORMATS
+from puncture_twin.planning.export.slicer.slicer_files import SLICER
 from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.selection.choice import BEST, Choice, parse_choice
@@ -317,7 +318,9 @@ def mirror(
 @app.command()
 def export(
     source: Annotated[Path, typer.Argument(metavar="CASE_OR_PLAN", help="A plan.json, or a case to be planned first.")],
-    format_name: Annotated[str, typer.Option("--format", metavar="urscript|ros2|csv", help="For which robot.")],
+    format_name: Annotated[
+        str, typer.Option("--format", metavar="urscript|ros2|csv|slicer", help="For which robot, or 3D Slicer.")
+    ],
     case: Annotated[Path | None, typer.Option("--case", help="The plan's case: check the plan again.")] = None,
     out_dir: OutOption = Path("out"),
     theta: ThetaOption = None,
@@ -328,11 +331,16 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write a plan for a robot, read back and within the arm's limits. Research software, not a medical device."""
-    if format_name not in FORMATS:
-        raise InputError(f"format '{format_name}' is not known", where="--format", allowed=", ".join(FORMATS))
+    if format_name not in (*FORMATS, SLICER):
+        raise InputError(
+            f"format '{format_name}' is not known", where="--format", allowed=", ".join((*FORMATS, SLICER))
+        )
     choice = parse_choice(theta, beta, rank, window, entry)
     of_plan = source.suffix == ".json"
     _refuse_choice(source, choice) if of_plan else _refuse_second_case(case)
+    if format_name == SLICER:
+        _export_to_slicer(source, out_dir, choice, as_json)
+        return
     checked = case if of_plan else source
     with progress_display() as progress:
         context = None if checked is None else prepare(checked, watcher=progress)
@@ -343,6 +351,18 @@ def export(
     summary = {"format": format_name, "notes": list(done.notes), "case_checked": context is not None}
     summary |= {"inputs": inputs_document(done.inputs), "files": [str(done.path)]}
     _print(summary, words.export_text(done, context is not None), as_json)
+
+
+def _export_to_slicer(source: Path, out_dir: Path, choice: Choice, as_json: bool) -> None:
+    from puncture_twin.twin.jobs.patient.slicer_job import export_to_slicer
+
+    if source.suffix == ".json":
+        raise InputError(
+            "slicer shows a case", where=source, allowed="a case, with --rank, --window, --theta or --entry"
+        )
+    with progress_display() as progress:
+        done = export_to_slicer(prepare(source, watcher=progress), out_dir, choice)
+    _print(done.summary(), done.text(), as_json)
 
 
 @app.command()

@@ -82,3 +82,16 @@ def _numbers(stated: dict[str, str], key: str, count: int, where: str) -> Floats
         return np.array([float(word) for word in words])
     except ValueError as error:
         raise InputError(f"{key} are no numbers ({error})", where=where, allowed=_ALLOWED) from error
+
+
+def transform_text(T: Floats) -> str:
+    """The file of a motion that does this to a point, shape (4, 4), mm; it reads back to the same numbers.
+
+    >>> print(transform_text(np.eye(4)).splitlines()[2])
+    Transform: AffineTransform_double_3_3
+    """
+    numbers = " ".join(map(repr, [*T[:3, :3].ravel().tolist(), *T[:3, 3].tolist()]))
+    return (
+        f"{_HEADER}\n#Transform 0\nTransform: AffineTransform_double_3_3\nParameters: {numbers}\n"
+        "FixedParameters: 0 0 0\n"
+    )

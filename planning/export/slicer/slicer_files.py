@@ -1,0 +1,117 @@
+"""Everything of a case and a chosen path that Slicer can show, as texts that were read back and found equal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.export.slicer.entry_area import EntryArea, area_scalars, area_vtp
+from puncture_twin.planning.export.slicer.markups import markups_text
+from puncture_twin.planning.export.slicer.scene import SceneNode, scene_references, scene_text
+from puncture_twin.planning.formats.itk_transform import parse_transform, transform_text
+from puncture_twin.planning.formats.meshes.vtp import read_vtp
+from puncture_twin.planning.formats.points.point_files import parse_points
+from puncture_twin.planning.geometry.rigid import inverse
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.placement import Placement
+
+SLICER = "slicer"
+"""The format's name."""
+PATH, MARKERS, AREA = "path.mrk.json", "markers.mrk.json", "safe_entry.vtp"
+TRANSFORM, SCENE = "ct_to_robot.tfm", "scene.mrml"
+NAMES = (PATH, MARKERS, AREA, TRANSFORM, SCENE)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """What is to be shown.
+
+    Attributes:
+        name: Of the path, as Slicer lists it.
+        entry_ct: Shape (3,), where the path enters the skin, mm.
+        area: Through which safe paths enter.
+        placement: Where the patient lies for the robot, or None.
+    """
+
+    name: str
+    entry_ct: Floats
+    area: EntryArea
+    placement: Placement | None
+
+
+@dataclass(frozen=True, eq=False)
+class SlicerFiles:
+    """The files by their names, and what whoever opens them should know."""
+
+    texts: Mapping[str, str]
+    notes: tuple[str, ...]
+
+
+def slicer_files(case: Case, drawn: Drawn) -> SlicerFiles:
+    """The files of a case and a path.
+
+    Args:
+        case: Its target and space.
+        drawn: The path, and what stands beside it.
+
+    Raises:
+        InputError: A case in a frame of its own, which Slicer has no name for.
+    """
+    if case.space is Space.LOCAL:
+        raise InputError('space "local": Slicer knows LPS and RAS', where=case.path, allowed="a case of a patient")
+    ends = np.stack([drawn.entry_ct, case.target_ct])
+    texts = {PATH: markups_text("Line", drawn.name, ("entry", "target"), ends)}
+    nodes, notes = [SceneNode("MarkupsLine", drawn.name, PATH)], []
+    _read_points(texts[PATH], PATH, ("entry", "target"), ends)
+    if drawn.placement is None:
+        notes.append("the case does not say where the robot stands: no transform, no markers")
+    else:
+        T_ct_base = inverse(drawn.placement.T_base_ct)
+        texts[TRANSFORM] = transform_text(T_ct_base)
+        nodes.append(SceneNode("LinearTransform", "ct_to_robot", TRANSFORM))
+        notes.append(f"{TRANSFORM}: from base to CT in LPS, as Slicer saves what moves the CT to the robot")
+        _same(parse_transform(texts[TRANSFORM].encode(), Path(TRANSFORM)), T_ct_base, TRANSFORM)
+    if drawn.placement is not None and drawn.placement.registration is not None:
+        markers = drawn.placement.registration.markers
+        texts[MARKERS] = markups_text("Fiducial", "markers", markers.names, markers.points_ct)
+        nodes.append(SceneNode("MarkupsFiducial", "markers", MARKERS))
+        _read_points(texts[MARKERS], MARKERS, markers.names, markers.points_ct)
+    if len(drawn.area.faces):
+        texts[AREA] = _area(drawn.area)
+        nodes.append(SceneNode("Model", "safe entry", AREA))
+    else:
+        notes.append("no four neighbouring directions are safe: no entry area")
+    texts[SCENE] = scene_text(nodes)
+    files, missing = scene_references(texts[SCENE])
+    if missing or not files <= texts.keys():
+        raise RuntimeError(f"{SCENE} refers to {sorted(missing | files - texts.keys())}")
+    return SlicerFiles(texts, tuple(notes))
+
+
+def _area(area: EntryArea) -> str:
+    text = area_vtp(area)
+    read, (window, cone) = read_vtp(text.encode(), AREA), area_scalars(text)
+    if read.space is not Space.LPS:
+        raise RuntimeError(f"{AREA} does not read back as LPS")
+    written = (area.points_ct, area.faces, area.window, area.safe_cone_deg)
+    for one, other in zip((read.vertices, read.faces, window, cone), written, strict=True):
+        _same(one, other, AREA)
+    return text
+
+
+def _read_points(text: str, name: str, labels: tuple[str, ...], points_ct: Floats) -> None:
+    read = parse_points(text.encode(), Path(name), default_space=Space.LPS)
+    if read.names != labels or read.space is not Space.LPS:
+        raise RuntimeError(f"{name} reads back as {read.names}")
+    _same(read.points, points_ct, name)
+
+
+def _same(read: object, written: object, name: str) -> None:
+    if not np.array_equal(np.asarray(read), np.asarray(written)):
+        raise RuntimeError(f"{name} does not read back as it was written")
