@@ -29,6 +29,7 @@ from puncture_twin.planning.export.exporter import FORMATS
 from puncture_twin.planning.export.slicer.slicer_files import SLICER
 from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.explain import NEAREST
 from puncture_twin.planning.search.selection.choice import BEST, Choice, parse_choice
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, exit_code_of
 from puncture_twin.twin.jobs.patient import answers, main_job, text as words
@@ -193,6 +194,7 @@ def check(
     picture: Annotated[
         Path | None, typer.Option("--picture", metavar="FILE.png", help="Draw the CT's slices about it.")
     ] = None,
+    every: Annotated[bool, typer.Option("--all", help="List every structure, not only the nearest.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Explain one candidate in full; the best, where none is named."""
@@ -202,7 +204,7 @@ def check(
         explained = answers.check_candidate(context, choice)
         if picture is not None:
             write_check_picture(context, explained, picture)
-    _print(explained.summary(), explained.text(), as_json)
+    _print(explained.summary(), explained.text(None if every else NEAREST), as_json)
     if not explained.safe:
         raise typer.Exit(ANSWER_IS_NO)
 

@@ -21,6 +21,9 @@ from puncture_twin.planning.search.doubt import Doubt
 MOST = 0.5
 """Of all directions: a needle that is too short for more of them was likely not meant for this target."""
 
+NEAREST = 8
+"""Structures that are listed where nobody asks for all: a case has a hundred, and those far away decide nothing."""
+
 NO_CHANCES = "no chances to hit and to touch: they need markers, the arm, and a direction that organs and arm allow"
 
 UNITS = {
@@ -116,21 +119,28 @@ class Explanation:
         row = self.candidates
         return stretches(self.anatomy, self.case.target_ct, row.outward_ct[0], float(row.path.length[0]))
 
-    def text(self) -> str:
-        """The same for a person."""
+    def head(self) -> list[str]:
+        """The direction, its verdict, and why."""
         row = self.candidates
         verdict = row.safe_text if self.safe else self.verdict
         head = f"theta {np.degrees(row.theta[0]):g} deg, beta {np.degrees(row.beta[0]):g} deg: {verdict}"
+        return [head, *self._reason()]
+
+    def text(self, most: int | None = NEAREST) -> str:
+        """The same for a person.
+
+        Args:
+            most: How many structures are listed, the nearest first; None lists all.
+        """
         return "\n".join(
             [
                 f"case {self.case.name}",
-                head,
-                *self._reason(),
+                *self.head(),
                 *self._doubt(),
                 *self._path(),
                 self._target(),
                 *self._scan(),
-                *self._table(),
+                *self.structure_lines(most),
                 *self._rest(),
             ]
         )
@@ -174,18 +184,32 @@ class Explanation:
             )
         return lines
 
-    def _table(self) -> list[str]:
+    def structure_lines(self, most: int | None = NEAREST) -> list[str]:
+        """Clearance and margin of each structure, the nearest first; beyond ``most``, only of those that are too close.
+
+        Args:
+            most: None lists all.
+        """
+        structures, clearances = self.anatomy.checked, self.candidates.clearance.distance[0]
+        order = np.argsort(clearances, kind="stable")
+        short = np.array([s.demands_margin and c < s.margin_mm for s, c in zip(structures, clearances, strict=True)])
+        shown = [at for rank, at in enumerate(order) if most is None or rank < most or short[at]]
         lines = ["  structure                        role       clearance mm   margin mm"]
-        clearances = self.candidates.clearance.distance[0]
-        for column in np.argsort(clearances, kind="stable"):
-            structure = self.anatomy.checked[column]
+        for column in shown:
+            structure = structures[column]
             margin = f"{structure.margin_mm:11.2f}" if structure.demands_margin else "          -"
-            short = structure.demands_margin and clearances[column] < structure.margin_mm
             lines.append(
                 f"  {structure.name:32s} {structure.role:8s} {clearances[column]:14.3f} {margin}"
-                + ("  too close" if short else "")
+                + ("  too close" if short[column] else "")
             )
-        return lines
+        left = len(order) - len(shown)
+        return [*lines, f"  and {left} more, farther away"] if left else lines
+
+    def nearest_demanding(self) -> str:
+        """The structure with the least clearance among those that demand a margin; "" without any."""
+        clearance = self.candidates.clearance
+        demanded = np.where(np.isnan(clearance.margins), np.inf, clearance.distance[0])
+        return clearance.structures[int(np.argmin(demanded))] if np.isfinite(demanded).any() else ""
 
     def _rest(self) -> list[str]:
         return [f"  {self._arm()}", *(f"  warning: {warning}" for warning in self.anatomy.warnings)]
