@@ -39,7 +39,6 @@ from .toml_file import (
     SchemaOne as SchemaOne,
     find_toml as find_toml,
     parse_toml as parse_toml,
-    read_toml as read_toml,
     read_toml_bytes as read_toml_bytes,
 )
 from .whole_lines import unfinished_warnings as unfinished_warnings

@@ -44,21 +44,6 @@ def find_toml(path: Path | str, usual_name: str) -> Path:
     return path
 
 
-def read_toml(path: Path, model: type[Model], *, allowed: str, keys: str) -> Model:
-    """Read a file and validate it.
-
-    Args:
-        path: The file.
-        model: Its schema.
-        allowed: What would have been accepted in its place.
-        keys: Where its keys are described.
-
-    Raises:
-        InputError: Unreadable, too large, not TOML, or not of the schema: names the first key that is wrong.
-    """
-    return parse_toml(read_toml_bytes(path, allowed), path, model, allowed=allowed, keys=keys)
-
-
 def read_toml_bytes(path: Path, allowed: str) -> bytes:
     """The bytes of such a file.
 
@@ -74,7 +59,14 @@ def read_toml_bytes(path: Path, allowed: str) -> bytes:
 
 
 def parse_toml(content: bytes, path: Path, model: type[Model], *, allowed: str, keys: str) -> Model:
-    """The same of a file that has been read; it is not opened again.
+    """Validate the bytes of such a file; it is not opened again.
+
+    Args:
+        content: What was read.
+        path: The file, for errors.
+        model: Its schema.
+        allowed: What would have been accepted in its place.
+        keys: Where its keys are described.
 
     Raises:
         InputError: Not TOML, or not of the schema: names the first key that is wrong.

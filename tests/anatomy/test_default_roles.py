@@ -4,7 +4,7 @@ import pytest
 from places import ROOT
 
 from puncture_twin.planning.anatomy.default_roles import BODY, BY_REGION, GENERAL, UNKNOWN_NAME, default_role
-from puncture_twin.planning.base.toml_file import read_toml
+from puncture_twin.planning.base.toml_file import parse_toml
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.formats.labels.naming import RuleKind, select
 from puncture_twin.planning.formats.labels.totalsegmentator import V1, V2
@@ -23,7 +23,13 @@ def test_every_class_of_totalsegmentator_is_known(region):
 
 def test_the_cases_written_by_hand_are_met():
     """Whatever the case of the real CT avoids, the table avoids by as much; what it crosses is crossed."""
-    case = read_toml(ROOT / "tests" / "real" / "case_v2.toml", CaseFile, allowed="", keys="")
+    case = parse_toml(
+        (ROOT / "tests" / "real" / "case_v2.toml").read_bytes(),
+        ROOT / "tests" / "real" / "case_v2.toml",
+        CaseFile,
+        allowed="",
+        keys="",
+    )
     (section,) = case.structures
     rules = select(
         V2, V2, avoid={**section.avoid, "*": 0.0}, traverse=section.traverse, target=section.target, where="case"

@@ -10,7 +10,7 @@ import SimpleITK as sitk  # noqa: N813
 from case_world import MARKERS, ball, image_of
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.toml_file import read_toml
+from puncture_twin.planning.base.toml_file import parse_toml
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
@@ -186,7 +186,7 @@ def test_a_target_typed_in_ras_is_answered_in_ras(tmp_path, capfd):
     write_ct(tmp_path / "scan.nii.gz")
     write_seg_nrrd(tmp_path / "a.seg.nrrd")
     assert init(capfd, tmp_path, "--target", "40,0,10", "--space", "RAS")[0] == 0
-    written = read_toml(tmp_path / "case.toml", CaseFile, allowed="", keys="")
+    written = parse_toml((tmp_path / "case.toml").read_bytes(), tmp_path / "case.toml", CaseFile, allowed="", keys="")
     assert (written.space, written.target.position_mm, written.schema_) == ("RAS", (40.0, 0.0, 10.0), 2)
     ras = prepare(tmp_path, arm=False).search()
     assert init(capfd, tmp_path, "--target", TARGET, "--force")[0] == 0

@@ -1,8 +1,11 @@
 """Collision cases as pytest cases: collected, judged, and explained when they fail."""
 
 import shutil
+import subprocess
+import sys
 
 import pytest
+from places import ROOT
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.search.context import prepare
@@ -48,36 +51,38 @@ def test_a_check_that_holds_passes(pytester):
         ('verdict = "safe"', 'verdict = "safe"\nstructure = "bolt_l"', "*structure: expected 'bolt_l', found ''*"),
     ],
 )
-def test_a_failing_check_prints_what_check_prints(pytester, old, new, message):
-    """What differs comes first, then the candidate in full."""
+def test_a_failing_check_prints_the_nearest_structures(pytester, old, new, message):
+    """What differs comes first, then verdict and structures, then the command that shows all."""
     result = run(pytester, GOOD.replace(old, new))
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(
-        [message, "*theta 0 deg, beta 0 deg: safe*", "*path length*84.00 mm*", "*bolt_h*avoid*"]
+        [
+            message,
+            "*theta 0 deg, beta 0 deg: safe*",
+            "*bolt_h*avoid*",
+            "all of it: run_twin.py check *case_m.toml*--all",
+        ]
     )
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[[check]", "*some.collision.toml: is not TOML*"),
-        (GOOD.replace("theta_deg", "theta"), "*unknown key 'theta'; did you mean 'theta_deg'*"),
-        (GOOD.replace('"safe"', '"free"'), "*check.0.verdict*"),
-        (f'case = "{CARTON}"', "*check: Field required*"),
+        ("[[check]", "*some.collision.toml: is not TOML*line 1*"),
+        (GOOD.replace("theta_deg", "theta"), "*toml:3: check.0: unknown key 'theta'; did you mean 'theta_deg'*"),
+        (GOOD + GOOD[GOOD.index("[[") :].replace('"safe"', '"free"'), "*toml:12: check.1.verdict*"),
+        (f'case = "{CARTON}"', "*nothing is expected; there are no*"),
+        (GOOD.replace(f'case = "{CARTON}"', ""), "*toml:3: no case; allowed: case = FILE*"),
+        (GOOD + "tolerance = 1", "*toml:3: check.0: unknown key 'tolerance'*"),
+        (GOOD + 'name = "a::b"', "*toml:9: check.0.name*"),
     ],
 )
 def test_a_broken_file_says_what_is_allowed(pytester, text, message):
-    """A file that cannot be read is an error of collection, in one line."""
+    """A file that cannot be read is an error of collection, in one line, with the line of the file."""
     result = run(pytester, text)
-    assert result.ret != 0
+    result.assert_outcomes(errors=1)
     result.stdout.fnmatch_lines([message])
-
-
-def test_a_check_without_a_case_is_an_error(pytester):
-    """No case for the file and none for the check."""
-    result = run(pytester, GOOD.replace(f'case = "{CARTON}"', ""))
-    result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["*no case; allowed: case = FILE*"])
+    result.stdout.no_fnmatch_line("*Traceback*")
 
 
 @pytest.fixture
@@ -106,3 +111,59 @@ def test_the_fixture_judges_in_python(collision_check):
     assert found.clearances()["bolt_h"] == pytest.approx(5, abs=0.02)
     with pytest.raises(AssertionError, match=r"(?s)expected 'rejected'.*bolt_h"):
         collision_check(CARTON, theta_deg=0, beta_deg=0, verdict="rejected")
+
+
+WINDOW = f"""
+case = "{CARTON}"
+[[check]]
+name = "straight in"
+theta_deg = 0
+beta_deg = 0
+verdict = "rejected"
+why = "the plan of Monday"
+marks = ["thorough"]
+[[window]]
+theta_deg = 0
+beta_deg = 0
+min_square_deg = 100
+[[plan]]
+file = "no.json"
+"""
+
+
+def test_names_marks_and_reasons(pytester):
+    """Tests are called by name or by what they expect, are selected by mark, and say why when they fail."""
+    pytester.makeini("[pytest]\nmarkers = thorough: takes long\naddopts = --strict-markers")
+    result = run(pytester, WINDOW)
+    result.assert_outcomes(failed=2, passed=1)
+    result.stdout.fnmatch_lines(["why: the plan of Monday"])
+    result.stdout.fnmatch_lines(["*some.collision.toml::straight in*", "*some.collision.toml::plan-no.json*"])
+    listed = pytester.runpytest_inprocess("-p", "no:cacheprovider", "--collect-only", "-q", "-m", "not thorough")
+    listed.stdout.fnmatch_lines(["some.collision.toml::window-theta0-beta0", "some.collision.toml::plan-no.json"])
+    listed.stdout.no_fnmatch_line("*straight in*")
+
+
+def test_a_mark_that_nobody_registered_is_an_error_where_marks_are_strict(pytester):
+    """With file and line."""
+    pytester.makeini("[pytest]\naddopts = --strict-markers")
+    result = run(pytester, WINDOW.replace("thorough", "nightly"))
+    result.assert_outcomes(errors=1)
+    result.stdout.fnmatch_lines(["*some.collision.toml:3: marks: 'nightly' not found in `markers`*"])
+
+
+def test_loading_the_plugin_loads_nothing_heavy():
+    """Every run of pytest in that environment pays for it."""
+    heavy = {"numpy", "pydantic", "numba", "scipy", "trimesh", "tomlkit"}
+    code = "import sys, puncture_twin.planning.collision_cases.pytest_plugin\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT)
+    assert "puncture_twin.planning.collision_cases.pytest_plugin" in done.stdout.split()
+    assert heavy.isdisjoint(done.stdout.split())
+
+
+def test_a_users_own_package_named_planning_is_theirs(pytester):
+    """It is imported by their tests, while the collision file beside it is checked."""
+    pytester.mkpydir("planning").joinpath("own.py").write_text("ANSWER = 42\n")
+    pytester.makepyfile(test_own="from planning.own import ANSWER\n\ndef test_own():\n    assert ANSWER == 42\n")
+    pytester.path.joinpath("some.collision.toml").write_text(GOOD)
+    result = pytester.runpytest_subprocess("-p", "no:cacheprovider", "-p", "no:xdist")
+    result.assert_outcomes(passed=2)

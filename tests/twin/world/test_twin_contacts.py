@@ -17,7 +17,7 @@ from places import TESTS
 from puncture_twin.planning.anatomy.anatomy import Structure
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.collision_cases.pytest_plugin import read_checks
+from puncture_twin.planning.collision_cases.checks_file import read_checks
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.twin.world.bodies import load_surface, remove
@@ -68,7 +68,7 @@ class Card:
 def card(request: pytest.FixtureRequest) -> Card:
     """The case of one card."""
     path = CARDS / f"{request.param}.collision.toml"
-    checks = read_checks(path)
+    checks = read_checks(path).content
     assert checks.case is not None
     context = prepare(path.parent / checks.case, arm=False)
     theta, beta = np.radians([[check.theta_deg, check.beta_deg] for check in checks.check]).T

@@ -1,0 +1,150 @@
+"""The schema of a ``*.collision.toml`` file: what people expect of directions, windows and plans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+from pydantic import Field, StringConstraints, ValidationError, model_validator
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.base.toml_file import parse_toml, read_toml_bytes
+from puncture_twin.planning.case.toml_types import (
+    Degrees180,
+    Degrees360,
+    NotNegative,
+    Number,
+    Positive,
+    Section,
+    Text,
+    Yes,
+)
+from puncture_twin.planning.collision_cases.table_lines import line_of
+
+ALLOWED = "[[check]], [[window]] or [[plan]] tables"
+KEYS = "docs/how-to/collision-cases.md"
+DEFAULT_TOLERANCE_MM = 0.01
+"""A tenth of the 0.1 mm to which a robot repeats itself."""
+
+TestName = Annotated[str, StringConstraints(pattern=r"^[^\s:\[\]/\\]([^:\[\]/\\]*[^\s:\[\]/\\])?$", max_length=80)]
+"""What pytest can select a test by: without the signs of its own names."""
+
+Mark = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=80)]
+Chance = Annotated[Number, Field(ge=0, le=1)]
+
+
+class Expectation(Section):
+    """What every table may hold: which case, and what people call the test."""
+
+    case: Text | None = None
+    name: TestName | None = None
+    why: str = ""
+    marks: tuple[Mark, ...] = ()
+
+    @property
+    def usual_name(self) -> str:
+        """Of a test that has no name of its own; does not depend on where in the file it stands."""
+        raise NotImplementedError
+
+
+class CheckSection(Expectation):
+    """What is expected of one direction."""
+
+    theta_deg: Degrees180
+    beta_deg: Degrees360
+    verdict: str = Field(pattern="^(safe|rejected)$")
+    reason: Reason | None = None
+    structure: str | None = None
+    clearance_mm: dict[str, Number] = Field(default_factory=dict)
+    tolerance_mm: NotNegative = DEFAULT_TOLERANCE_MM
+    min_clearance_mm: Number | None = None
+    max_touch: Chance | None = None
+    arm: Yes = False
+
+    @property
+    def usual_name(self) -> str:
+        """Angles and verdict."""
+        return f"theta{self.theta_deg:g}-beta{self.beta_deg:g}-{self.verdict}"
+
+
+class WindowSection(Expectation):
+    """What is expected of the window that holds one direction."""
+
+    theta_deg: Degrees180
+    beta_deg: Degrees360
+    min_square_deg: Positive
+    arm: Yes = False
+
+    @property
+    def usual_name(self) -> str:
+        """The direction."""
+        return f"window-theta{self.theta_deg:g}-beta{self.beta_deg:g}"
+
+
+class PlanSection(Expectation):
+    """A plan that must still hold."""
+
+    file: Text
+
+    @property
+    def usual_name(self) -> str:
+        """The file."""
+        return "plan-" + "-".join(Path(self.file).parts[-2:])
+
+
+class ChecksFile(Section):
+    """The whole file."""
+
+    case: Text | None = None
+    check: tuple[CheckSection, ...] = ()
+    window: tuple[WindowSection, ...] = ()
+    plan: tuple[PlanSection, ...] = ()
+
+    @model_validator(mode="after")
+    def _refuse_nothing(self) -> ChecksFile:
+        if not (self.check or self.window or self.plan):
+            raise ValueError(f"nothing is expected; there are no {ALLOWED}")
+        return self
+
+    def tables(self) -> dict[str, tuple[Expectation, ...]]:
+        """Kind of table to the tables, in the file's order."""
+        return {"check": self.check, "window": self.window, "plan": self.plan}
+
+
+class CheckedFile(NamedTuple):
+    """A file of expectations that was read: what it says, and its bytes."""
+
+    content: ChecksFile
+    data: bytes
+
+
+def read_checks(path: Path) -> CheckedFile:
+    """Read and validate a file of expectations.
+
+    Raises:
+        InputError: Unreadable, not TOML, not this schema, or a table without a case; names the line.
+    """
+    data = read_toml_bytes(path, ALLOWED)
+    return CheckedFile(_parse(data, path), data)
+
+
+def _parse(data: bytes, path: Path) -> ChecksFile:
+    try:
+        content = parse_toml(data, path, ChecksFile, allowed=ALLOWED, keys=KEYS)
+    except InputError as error:
+        if not isinstance(error.__cause__, ValidationError):
+            raise
+        place = error.__cause__.errors(include_url=False)[0]["loc"]
+        raise InputError(error.what, where=_where(data, path, place), allowed=error.allowed) from error
+    for kind, tables in content.tables().items():
+        for at, table in enumerate(tables):
+            if (table.case or content.case) is None:
+                where = _where(data, path, (kind, at))
+                raise InputError("no case", where=where, allowed="case = FILE, for the file or for the table")
+    return content
+
+
+def _where(data: bytes, path: Path, place: tuple[Any, ...]) -> str:
+    line = line_of(data.decode("utf-8"), place)
+    return str(path) if line is None else f"{path}:{line}"

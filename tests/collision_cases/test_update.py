@@ -1,0 +1,119 @@
+"""Rewriting expected numbers: the file says what was found, and nothing else in it changes."""
+
+import tomllib
+from decimal import ROUND_CEILING, ROUND_FLOOR
+
+import pytest
+from hypothesis import given, strategies as st
+
+from puncture_twin.meshes import folder
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.collision_cases.new_number import NewNumber
+from puncture_twin.planning.collision_cases.rewrite import Change, rewrite
+from puncture_twin.planning.search.context import prepare
+
+pytest_plugins = ["pytester"]
+
+CARTON = folder() / "carton" / "case_m.toml"
+FILE = f"""\
+# What holds of the carton.
+case = "{CARTON}"   # five lesions
+
+[[check]]
+name = "straight"
+theta_deg = 0
+beta_deg   = 0   # odd spaces
+verdict = "safe"
+clearance_mm = {{ bolt_h = 5.100, bolt_l = 27.84 }} # measured on Monday
+min_clearance_mm = 6
+tolerance_mm = 0.02
+why = \"\"\"
+[[check]]
+is no table here\"\"\"
+
+[[check]]
+theta_deg = 0
+beta_deg = 0
+verdict = "rejected"
+clearance_mm = {{ bolt_h = 5.2 }}
+"""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def kernels_loaded():
+    """Run compiled code once: pytester forgets modules that it saw imported, and numba's register only once."""
+    prepare(CARTON, arm=False).check(0.0, 0.0)
+
+
+def test_numbers_are_rewritten_and_verdicts_never(pytester):
+    """Afterwards the first check passes, the second fails as before, and the file differs in two numbers."""
+    file = pytester.path / "some.collision.toml"
+    file.write_text(FILE)
+    result = pytester.runpytest_inprocess("-p", "no:cacheprovider", "-p", "no:xdist", "--collision-update")
+    result.assert_outcomes(passed=1, failed=1)
+    result.stdout.fnmatch_lines(
+        [
+            "verdict: expected 'rejected', found 'safe'",
+            "--collision-update rewrites numbers alone*",
+            "some.collision.toml: straight: clearance_mm.bolt_h 5.100 -> 5.000",
+            "some.collision.toml: straight: min_clearance_mm 6 -> * (a weaker demand)",
+        ]
+    )
+    text = file.read_text()
+    weaker = tomllib.loads(text)["check"][0]["min_clearance_mm"]
+    assert 4.99 < weaker <= 5.0001
+    assert text == FILE.replace("5.100", "5.000").replace("= 6", f"= {weaker:g}")
+    again = pytester.runpytest_inprocess("-p", "no:cacheprovider", "-p", "no:xdist")
+    again.assert_outcomes(passed=1, failed=1)
+    assert file.read_text() == text
+
+
+CHANGE = Change("check", 0, "straight", NewNumber(("clearance_mm", "bolt_h"), 4.0, 0.01))
+
+
+def test_a_file_that_changed_meanwhile_is_left_alone(tmp_path):
+    """Nobody's edit is lost."""
+    file = tmp_path / "some.collision.toml"
+    file.write_text(FILE + "# edited\n")
+    with pytest.raises(InputError, match="changed while the tests ran"):
+        rewrite(file, FILE.encode(), [CHANGE])
+    assert file.read_text() == FILE + "# edited\n"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("[[check]]\nclearance_mm.bolt_h = 5 # a\n", "[[check]]\nclearance_mm.bolt_h = 4 # a\n"),
+        (
+            "[[check]]\r\n[check.clearance_mm]\r\n bolt_h=5.00\r\n",
+            "[[check]]\r\n[check.clearance_mm]\r\n bolt_h=4.00\r\n",
+        ),
+        ("check = [{ clearance_mm = {bolt_h=5e0} }]", "check = [{ clearance_mm = {bolt_h=4} }]"),
+    ],
+)
+def test_every_way_of_writing_a_table_stays(tmp_path, old, new):
+    """Dotted keys, sub-tables with Windows' line ends, tables on one line."""
+    file = tmp_path / "some.collision.toml"
+    file.write_bytes(old.encode())
+    rewrite(file, old.encode(), [CHANGE])
+    assert file.read_bytes() == new.encode()
+
+
+def test_two_processes_do_not_rewrite_one_file(pytester):
+    """With -n the flag is refused."""
+    result = pytester.runpytest_inprocess("-p", "no:cacheprovider", "-n", "2", "--collision-update")
+    assert result.ret == pytest.ExitCode.USAGE_ERROR
+    result.stderr.fnmatch_lines(["*run it in one process, without -n*"])
+
+
+NUMBERS = st.floats(-1e4, 1e4, allow_nan=False)
+
+
+@given(NUMBERS, st.sampled_from([1.0, 0.01, 1e-3, 1e-9]), st.sampled_from(["5", "5.000", "-1e-3"]))
+def test_what_is_written_is_near_and_on_the_right_side(value, within, old):
+    """A least value is never above what was found, a largest one never below; both within what is asked."""
+    near = float(NewNumber(("x",), value, within).written(old))
+    least = float(NewNumber(("x",), value, within, ROUND_FLOOR).written(old))
+    most = float(NewNumber(("x",), value, within, ROUND_CEILING).written(old))
+    assert least <= value <= most
+    assert max(abs(near - value), value - least, most - value) <= within
