@@ -391,6 +391,15 @@ def test_a_numbering_that_is_not_told_is_asked_for(tmp_path, capfd):
     assert set(roles(tmp_path)) == {"spleen", "kidney_right", "kidney_left"}
 
 
+def test_a_unit_that_may_be_mm_or_cm_is_asked_for(tmp_path, capfd):
+    """A body of 1.6 m in cm was taken for one of 16 cm in mm: every margin was a tenth of what was asked for."""
+    (tmp_path / "meshes").mkdir()
+    for name, (middle, radius) in {"skin": ((0.0, 0.0, 0.0), 45.0), "liver": ((0.0, 0.0, 0.0), 9.0)}.items():
+        ball(tmp_path / "meshes" / f"{name}.stl", radius, np.array(middle))
+    code, _, said = init(capfd, tmp_path, "--target-label", "liver")
+    assert code == 2 and "a small body in mm, or a large one in cm" in said[0]
+
+
 @pytest.mark.parametrize(("unit", "scale"), [("mm", 1.0), ("cm", 0.1), ("m", 0.001)])
 def test_the_unit_of_meshes_is_guessed_and_told(tmp_path, capfd, unit, scale):
     """By the extent of all of them; the surfaces are the same in mm. Lists of points are named in comments."""

@@ -21,6 +21,9 @@ LEAST_EXTENT = ((Unit.MM, 130.0), (Unit.CM, 5.0), (Unit.M, 0.0))
 """From which diagonal of all meshes together on a unit is guessed. A body in mm, with its skin, is seldom smaller than
 130 mm, and in cm (13 to 130) seldom larger; in metres it is smaller than 5."""
 
+BOTH_MM_AND_CM = (130.0, 250.0)
+"""A diagonal between these is a child's or a limb's in mm, or an adult's in cm, ten times as wide."""
+
 
 @dataclass(frozen=True, eq=False)
 class MeshFolder:
@@ -103,12 +106,15 @@ def mesh_folder(place: Place, source: str, names: Sequence[str], space: Space, s
         stated: Their unit where the user says it, or None.
 
     Raises:
-        InputError: A mesh that cannot be read, or two of one name.
+        InputError: A mesh that cannot be read, two of one name, or a unit that is not told by their extent.
     """
     if len({mesh_name(one) for one in names}) < len(names):
         raise InputError("two meshes have one name", where=place.folder / source, allowed="one mesh a structure")
     boxes = np.stack([mesh_extent(place.folder / name) for name in names])
     diagonal = float(np.linalg.norm(boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0)))
+    if stated is None and BOTH_MM_AND_CM[0] <= diagonal < BOTH_MM_AND_CM[1]:
+        what = f"{diagonal:.0f} units from corner to corner: a small body in mm, or a large one in cm"
+        raise InputError(what, where=place.folder / source, allowed="--unit mm or --unit cm")
     unit = stated or next(one for one, least in LEAST_EXTENT if diagonal >= least)
     guess = "as stated" if stated else "guessed by their extent (--unit says otherwise)"
     said = (
