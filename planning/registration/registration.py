@@ -17,7 +17,7 @@ from puncture_twin.planning.registration.conditioning import Conditioning, condi
 from puncture_twin.planning.registration.fit_map import fit_weighted
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, fit_uncertainty
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
-from puncture_twin.planning.registration.residual_test import Interval, ResidualTest
+from puncture_twin.planning.registration.residual_test import Interval, OddMarker, ResidualTest, odd_marker
 
 MIN_MARKERS = 3
 """Two points leave a rotation free."""
@@ -110,8 +110,9 @@ class Registration:
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """What weakens this registration, in words: the conditioning, and residuals that were accepted."""
-        return (*self.conditioning.flags, *self._doubts())
+        """What weakens it, in words: the conditioning, residuals that were accepted, a marker that does not fit."""
+        odd = _odd_marker(self.markers, self.residual_test.declared_fle_mm)
+        return (*self.conditioning.flags, *self._doubts(), *(() if odd is None else (odd.text(),)))
 
     def _doubts(self) -> tuple[str, ...]:
         if self.uncertainty is None:
@@ -244,9 +245,15 @@ def register(
     test = ResidualTest(len(markers), _rigid_fre(markers), fle_mm)
     told = test if uncertainty is None else uncertainty.test
     if not (told.explained or accept_residuals):
-        raise InputError(told.text(), where=where, allowed=ALLOWED_RESIDUALS)
+        odd = _odd_marker(markers, fle_mm)
+        what = told.text() if odd is None else f"{told.text()}; {odd.text()}"
+        raise InputError(what, where=where, allowed=ALLOWED_RESIDUALS)
     weak = conditioning(markers.points_ct, target_ct)
     return Registration(method, T_base_ct, markers, residuals, test, weak, uncertainty)
+
+
+def _odd_marker(markers: MarkerPairs, fle_mm: float | None) -> OddMarker | None:
+    return odd_marker(fit_rigid, markers.names, markers.points_ct, markers.points_base, fle_mm)
 
 
 def _check_method(method: Method, noise: ReadingNoise | None, where: str | Path) -> None:

@@ -1,4 +1,4 @@
-"""Do the markers' residuals fit the noise? The chi-squared test of a rigid fit, and the noise that follows from it.
+"""Do the markers' residuals fit the noise, and which marker does not? The chi-squared test of a rigid fit, its noise.
 
 With normal errors of standard deviation fle/sqrt(3) in each axis, both sides together, N markers of a rigid fit leave
 nu s^2 = 3 sum |r_i|^2 / fle^2, distributed as chi-squared with nu = 3 N - 6 degrees of freedom.
@@ -6,11 +6,16 @@ nu s^2 = 3 sum |r_i|^2 / fle^2, distributed as chi-squared with nu = 3 N - 6 deg
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, chdtri, fdtri
+from scipy.special import chdtrc, chdtri, fdtrc, fdtri
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.conditioning import leverage
 
 DOUBT = 0.001
 """Residuals that honest noise exceeds once in 1,000 registrations contradict the declared noise."""
@@ -26,6 +31,14 @@ ALIKE_MM = 1.0
 
 INTERVAL = 0.95
 """Of the noise that is estimated."""
+
+
+FALSE_ALARM = 0.01
+"""One honest set of markers in a hundred is said to have an odd one: it is a warning, and a look at it is cheap."""
+LEAST_MARKERS = 4
+"""The others must fit each other with something left over: three points leave three degrees of freedom."""
+LEAST_SPREAD = 0.01
+"""Second over first singular value of the others below which they are one line, and place nothing."""
 
 
 class Interval(NamedTuple):
@@ -160,3 +173,79 @@ class ResidualTest:
     def _f_ratio(self) -> float:
         """The ratio of two FRE of the same noise that is exceeded once in 1,000."""
         return float(np.sqrt(fdtri(self.freedom, self.freedom, 1 - DOUBT)))
+
+
+class OddMarker(NamedTuple):
+    """A marker that the others contradict.
+
+    Attributes:
+        name: Its name.
+        miss_mm: How far off its reading the others place it.
+        others: How many they are.
+        others_fre_mm: How well they fit each other, root mean square.
+    """
+
+    name: str
+    miss_mm: float
+    others: int
+    others_fre_mm: float
+
+    def text(self) -> str:
+        """What is to be told."""
+        return (
+            f"marker {self.name} does not fit: the other {self.others} place it {self.miss_mm:.1f} mm from its "
+            f"reading, and fit each other to {self.others_fre_mm:.1f} mm; check its name, touch and place in the CT"
+        )
+
+
+def odd_marker(
+    fit: Callable[[Floats, Floats], Floats],
+    names: tuple[str, ...],
+    points_ct: Floats,
+    points_base: Floats,
+    fle_mm: float | None,
+) -> OddMarker | None:
+    """The marker that least fits the others, if chance does not explain it.
+
+    A residual of the common fit hides it, since the odd marker pulls the fit. Marker i left out, the others fit with
+    residuals r_j and nu = 3 (n-1) - 6 degrees of freedom; they place it d_i off its reading, whose expected square is
+    FLE^2 (1 + l_i^2) with l_i the leverage at its place (Fitzpatrick 1998). Where all markers err alike,
+    F_i = (d_i^2 / 3) / ((1 + l_i^2) s^2) with s^2 = sum |r_j|^2 / nu follows F(3, nu).
+
+    Args:
+        fit: Makes T_base_ct of two sets of points by least squares.
+        names: Of the markers.
+        points_ct: Shape (n, 3), mm.
+        points_base: Shape (n, 3), the same as they were touched.
+        fle_mm: Their noise (rms length, both sides together) where it is declared: no less is taken.
+    """
+    count = len(names)
+    if count < LEAST_MARKERS:
+        return None
+    least = MIN_FLE_MM if fle_mm is None else fle_mm
+    found = [_left_out(fit, row, names, points_ct, points_base, least) for row in range(count)]
+    chance, odd = min((one for one in found if one is not None), key=lambda one: one[0], default=(1.0, None))
+    return odd if chance < FALSE_ALARM / count else None
+
+
+def _left_out(
+    fit: Callable[[Floats, Floats], Floats],
+    row: int,
+    names: tuple[str, ...],
+    points_ct: Floats,
+    points_base: Floats,
+    least_fle_mm: float,
+) -> tuple[float, OddMarker] | None:
+    """How likely one marker's miss is by chance, and the marker; None where the others lie on a line."""
+    ct, base = np.delete(points_ct, row, axis=0), np.delete(points_base, row, axis=0)
+    spread = np.linalg.svd(ct - ct.mean(axis=0), compute_uv=False)
+    if spread[1] < LEAST_SPREAD * spread[0]:
+        return None
+    T = fit(ct, base)
+    squares = float(np.sum((apply(T, ct) - base) ** 2))
+    freedom = 3 * len(ct) - 6
+    variance = max(squares / freedom, least_fle_mm**2 / 3)
+    miss = float(np.linalg.norm(apply(T, points_ct[row : row + 1]) - points_base[row]))
+    lever = float(leverage(ct, points_ct[row : row + 1])[0])
+    chance = float(fdtrc(3, freedom, miss**2 / 3 / ((1 + lever**2) * variance)))
+    return chance, OddMarker(names[row], miss, len(ct), float(np.sqrt(squares / len(ct))))
