@@ -117,20 +117,23 @@ def _measured_again(
         raise AssertionError(f"the engine says {whole} mm, the faces near the needle {distance[row]} mm")
 
 
-def cost(scene: Scene, model: ChanceModel) -> tuple[float, float, float]:
-    """Microseconds a direction: search of the structures, chances to touch, chances to hit."""
+def cost(scene: Scene, model: ChanceModel) -> tuple[float, float, float, float]:
+    """Microseconds a direction: search of the structures, chances to touch on top and without it, chances to hit."""
     case, anatomy, engine = scene.context.case, scene.context.anatomy, scene.context.engine
     many = 4000 // len(scene.q)
     outward, q = np.tile(scene.outward_ct, (many, 1)), np.tile(scene.q, (many, 1))
-    lengths = axis_lengths(case, anatomy.checked)
+    lengths, rows = axis_lengths(case, anatomy.checked), np.arange(len(q))
+    axes = engine.measure(case.target_ct, outward, lengths, shown=False)
     works = (
         lambda: engine.measure(case.target_ct, outward, lengths, shown=False),
+        lambda: chances_of(case, anatomy, engine, model, outward, q, axes.at(rows)),
         lambda: chances_of(case, anatomy, engine, model, outward, q),
         lambda: model.hit.chance(model.error, model.error.covariance_ct(q)),
         lambda: model.error.covariance_ct(q),
     )
-    search, whole, hit, covariance = (_least(work) / len(q) * 1e6 for work in works)
-    return search, whole - (hit - covariance), hit - covariance
+    search, on_top, alone, hit, covariance = (_least(work) / len(q) * 1e6 for work in works)
+    hit -= covariance
+    return search, on_top - hit, alone - hit, hit
 
 
 def _least(work) -> float:  # type: ignore[no-untyped-def]
@@ -163,10 +166,9 @@ def main() -> None:
                 print(f"  {name}: {figures}, too low by at most {-error.min():.4f}")
             took = rows[:, -1] * 1e6
             print(f"  lines: {np.median(took):.0f} us a pair, mean {took.mean():.0f}")
-            search, touch, hit = cost(scene, model)
-            print(
-                f"  a direction: search {search:.1f} us, touch {touch:.1f} us (target 20), hit {hit:.1f} us", flush=True
-            )
+            search, on_top, alone, hit = cost(scene, model)
+            touch = f"on top of it touch {on_top:.1f} us and hit {hit:.1f} us (target 20 together)"
+            print(f"  a direction: search {search:.1f} us, {touch}; touch without it {alone:.1f} us", flush=True)
 
 
 if __name__ == "__main__":

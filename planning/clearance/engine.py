@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, Ints, Ints32
 from puncture_twin.planning.clearance.near_faces import NearFaces
 
 
@@ -17,13 +17,16 @@ class AxisDistances:
         distance: Shape (n, k), least distance of axis i from the surface of structure j; 0 where they meet.
         depth: Shape (n, k), distance from the target, along the axis, of the axis point nearest to the structure;
             where they meet, of the first meeting point.
-        normal: Shape (n, k, 3), unit, from the structure's nearest point to that axis point; NaN where they meet; None
-            where it was not asked for.
+        nearest: Shape (n, k), a triangle of the structure that is as near, by the engine's own count.
     """
 
     distance: Floats
     depth: Floats
-    normal: Floats | None = None
+    nearest: Ints32
+
+    def at(self, rows: Ints) -> AxisDistances:
+        """Those of some axes."""
+        return AxisDistances(self.distance[rows], self.depth[rows], self.nearest[rows])
 
 
 class ClearanceEngine(Protocol):
@@ -34,18 +37,20 @@ class ClearanceEngine(Protocol):
     """
 
     def measure(
-        self,
-        target_ct: Floats,
-        outward_ct: Floats,
-        length: Floats | float,
-        *,
-        normals: bool = False,
-        shown: bool = True,
+        self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, shown: bool = True
     ) -> AxisDistances:
         """Exact distances of the axes from ``target_ct`` (3,) along ``outward_ct`` (n, 3).
 
-        ``length`` is one number or shape (k,), mm: as long is an axis for each structure. With ``normals`` each answer
-        says from where it is nearest. Without ``shown`` no progress is told: the same axes are asked again.
+        ``length`` is one number or shape (k,), mm: as long is an axis for each structure. Without ``shown`` no progress
+        is told: the same axes are asked again.
+        """
+        ...
+
+    def normals(self, target_ct: Floats, outward_ct: Floats, axes: AxisDistances) -> Floats:
+        """From where measured axes are nearest, shape (n, k, 3): unit, from the structure to the axis; NaN on contact.
+
+        ``axes`` are what this engine measured from ``target_ct`` along ``outward_ct``; nothing is searched again. Where
+        several points of a structure are equally near, it is any one of them.
         """
         ...
 

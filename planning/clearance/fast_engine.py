@@ -8,19 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.direction_tiles import Tiles, bundle
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.clearance.kernels.axis_normals import axis_normals
 from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
 from puncture_twin.planning.clearance.kernels.lanes import LANES
 from puncture_twin.planning.clearance.kernels.nearest_triangle import nearest_triangle
 from puncture_twin.planning.clearance.kernels.scratch import Found, scratch_for
 from puncture_twin.planning.clearance.kernels.tile_search import COUNTED, search_tiles
 from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
+from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 COORDINATE_SLACK = 1e-6
@@ -63,13 +63,7 @@ class FastEngine:
         self.counts = np.zeros(len(COUNTED), np.int64)
 
     def measure(
-        self,
-        target_ct: Floats,
-        outward_ct: Floats,
-        length: Floats | float,
-        *,
-        normals: bool = False,
-        shown: bool = True,
+        self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, shown: bool = True
     ) -> AxisDistances:
         """Exact distances of n axes from all k structures; see `ClearanceEngine`."""
         target = np.ascontiguousarray(target_ct, dtype=np.float64)
@@ -79,19 +73,19 @@ class FastEngine:
         sound = np.isfinite(target).all() and np.isfinite(outward).all()
         if not (sound and np.all((lengths >= 0.0) & (lengths <= LONGEST_MM))):
             raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
-        distance, depth = np.empty(shape), np.empty(shape)
-        normal = np.empty((*shape, 3)) if normals else None
+        distance, depth, nearest = np.empty(shape), np.empty(shape), np.empty(shape, np.int32)
         tiles, seen = bundle(outward), self._seen_from(target)
         for row, blocks in enumerate(self._blocks):
-            placed = next(seen)
-            nearest = _one_structure(
-                blocks, placed, tiles, target, lengths[row], distance[row], depth[row], self.counts
-            )
-            if normal is not None:
-                axis_normals(blocks.triangles, nearest, target, outward, distance[row], depth[row], normal[row])
+            answer = AxisDistances(distance[row], depth[row], nearest[row])
+            _one_structure(blocks, next(seen), tiles, target, lengths[row], answer, self.counts)
             if shown and self._progress is not None:
                 self._progress((row + 1) * len(outward), len(self._blocks) * len(outward))
-        return AxisDistances(distance.T, depth.T, None if normal is None else normal.transpose(1, 0, 2))
+        return AxisDistances(distance.T, depth.T, nearest.T)
+
+    def normals(self, target_ct: Floats, outward_ct: Floats, axes: AxisDistances) -> Floats:
+        """From where measured axes are nearest; see `ClearanceEngine`."""
+        triangles = [blocks.triangles for blocks in self._blocks]
+        return normals_of(triangles, target_ct, outward_ct, axes)
 
     def _seen_from(self, target: Floats) -> Iterator[_Placed]:
         """The surfaces as seen from a target, one by one; those of the last target are kept."""
@@ -122,15 +116,14 @@ def _one_structure(
     tiles: Tiles,
     target: Floats,
     length: float,
-    distance: Floats,
-    depth: Floats,
+    answer: AxisDistances,
     counts: NDArray[np.int64],
-) -> Ints:
-    """Fill one structure's distances and depths, in the caller's order; the rows of the nearest triangles."""
-    nearest = np.empty(len(distance), np.int64)
+) -> None:
+    """Fill one structure's answer, arrays of shape (n,) in the caller's order."""
+    distance, depth, nearest = answer.distance, answer.depth, answer.nearest
     if placed.distance == 0.0:
         distance[:], depth[:], nearest[:] = 0.0, 0.0, placed.nearest
-        return nearest
+        return
     found = Found(np.empty(len(distance)), np.empty(len(distance)), np.empty(len(distance), np.int64), counts)
     surface = (blocks.triangles, blocks.local, blocks.base)
     bundles = (tiles.outward, tiles.starts, tiles.middle, tiles.chord)
@@ -139,7 +132,6 @@ def _one_structure(
         bundles, scratch_for(len(placed.nodes)), found, LANES,
     )  # fmt: skip
     distance[tiles.order], depth[tiles.order], nearest[tiles.order] = np.sqrt(found.square), found.depth, found.triangle
-    return nearest
 
 
 def _placed(blocks: Blocks, target: Floats) -> _Placed:

@@ -12,6 +12,7 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.kernels.blocks import pack
 from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
+from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.geometry.crossings import first_crossing
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import frame_about
@@ -37,21 +38,14 @@ class FclEngine:
         self._progress = progress
 
     def measure(
-        self,
-        target_ct: Floats,
-        outward_ct: Floats,
-        length: Floats | float,
-        *,
-        normals: bool = False,
-        shown: bool = True,
+        self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, shown: bool = True
     ) -> AxisDistances:
         """Exact distances of n axes from all k structures; see `ClearanceEngine`."""
         shape = (len(outward_ct), len(self._objects))
-        distance, depth, normal = np.empty(shape), np.empty(shape), np.empty((*shape, 3))
+        distance, depth, nearest = np.empty(shape), np.empty(shape), np.empty(shape, np.int32)
         lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), shape[1:])
         for row, outward in enumerate(outward_ct):
-            distance[row], depth[row], away = self._one_direction(target_ct, outward, lengths)
-            normal[row] = np.reshape(away, shape[1:] + (3,))
+            distance[row], depth[row], nearest[row] = self._one_direction(target_ct, outward, lengths)
             if shown and self._progress is not None:
                 self._progress(row + 1, len(outward_ct))
         for column, mesh in enumerate(self._meshes):
@@ -59,25 +53,28 @@ class FclEngine:
             distance[met, column] = 0.0
             if met.any():
                 depth[met, column] = first_crossing(mesh, target_ct, outward_ct[met], float(lengths[column]))
-                normal[met, column] = np.nan
-        return AxisDistances(distance, depth, normal if normals else None)
+        return AxisDistances(distance, depth, nearest)
+
+    def normals(self, target_ct: Floats, outward_ct: Floats, axes: AxisDistances) -> Floats:
+        """From where measured axes are nearest; see `ClearanceEngine`."""
+        triangles = [mesh.vertices[mesh.faces].reshape(-1, 9) for mesh in self._meshes]
+        return normals_of(triangles, target_ct, outward_ct, axes)
 
     def _one_direction(
         self, tip: Floats, outward: Floats, lengths: Floats
-    ) -> tuple[list[float], list[float], list[Floats]]:
+    ) -> tuple[list[float], list[float], list[int]]:
         axes = {
             length: fcl.CollisionObject(_tree(np.stack([tip, tip + length * outward]), _SEGMENT_FACE))
             for length in set(lengths.tolist())
         }
-        distances, depths, normals = [], [], []
+        distances, depths, nearest = [], [], []
         for structure, length in zip(self._objects, lengths.tolist(), strict=True):
             result = fcl.DistanceResult()  # a reused result keeps its old minimum
             request = fcl.DistanceRequest(enable_nearest_points=True)
             distances.append(fcl.distance(axes[length], structure, request, result))
             depths.append(float(np.linalg.norm(result.nearest_points[0] - tip)))
-            away = result.nearest_points[0] - result.nearest_points[1]
-            normals.append(away / max(float(np.linalg.norm(away)), np.finfo(float).tiny))
-        return distances, depths, normals
+            nearest.append(result.b2)
+        return distances, depths, nearest
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
         """FCL collision of a capsule with one structure; see `ClearanceEngine`."""

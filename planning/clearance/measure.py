@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Structure
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.clearance.engine import ClearanceEngine
+from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
 from puncture_twin.planning.geometry.containment import Side, side_of
 
 NEAR_THRESHOLD_MM = 1e-4
@@ -43,6 +43,7 @@ def measure(
     *,
     length: Floats | float,
     radius: float,
+    axes: AxisDistances | None = None,
 ) -> Clearances:
     """Measure all candidates.
 
@@ -56,9 +57,10 @@ def measure(
         outward_ct: Shape (n, 3), unit vectors.
         length: How far the needle's axis goes from the target, one number or shape (k,), mm.
         radius: Needle radius, mm.
+        axes: What the engine has measured of them already; None measures them.
     """
     lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), len(structures))
-    axes = engine.measure(target_ct, outward_ct, lengths)
+    axes = engine.measure(target_ct, outward_ct, lengths) if axes is None else axes
     distance, depth = axes.distance.copy(), axes.depth.copy()
     violated = np.zeros(distance.shape, bool)
     for column, structure in enumerate(structures):

@@ -14,7 +14,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.clearance.engine import ClearanceEngine
+from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
 from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.ranking import ranked
@@ -76,7 +76,12 @@ def demanding(structures: tuple[Structure, ...]) -> Ints:
 
 
 def with_chances(
-    case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates, model: ChanceModel | None
+    case: Case,
+    anatomy: Anatomy,
+    engine: ClearanceEngine,
+    found: Candidates,
+    model: ChanceModel | None,
+    axes: AxisDistances,
 ) -> Candidates:
     """Compute the chances of all candidates that geometry and reach left, and reject those beyond the case's limits.
 
@@ -86,6 +91,7 @@ def with_chances(
         engine: Prepared for the meshes of ``anatomy.checked``.
         found: Checked against organs and arm.
         model: None where the pose's error is not known: the chances are blank.
+        axes: What ``engine`` measured of the candidates.
 
     Raises:
         InputError: A limit that nothing can be held against.
@@ -101,7 +107,7 @@ def with_chances(
         return replace(found, chances=blank)
     parts = [rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)]
     outward, q = found.outward_ct, found.arm.q_insertion
-    arrays = [chances_of(case, anatomy, engine, model, outward[part], q[part]) for part in parts]
+    arrays = [chances_of(case, anatomy, engine, model, outward[part], q[part], axes.at(part)) for part in parts]
     values = {name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]}
     filled = {name: getattr(blank, name).copy() for name in values}
     for name, value in values.items():
@@ -130,22 +136,35 @@ def check_limits(case: Case, anatomy: Anatomy, model: ChanceModel | None) -> Non
 
 
 def passing(
-    case: Case, anatomy: Anatomy, engine: ClearanceEngine, model: ChanceModel, outward_ct: Floats, cov_ct: Floats
+    case: Case,
+    anatomy: Anatomy,
+    engine: ClearanceEngine,
+    model: ChanceModel,
+    outward_ct: Floats,
+    cov_ct: Floats,
+    axes: AxisDistances | None = None,
 ) -> Proximity:
-    """How some needles pass what must not be touched."""
-    columns, lengths = demanding(anatomy.checked), axis_lengths(case, anatomy.checked)
-    axes = engine.measure(case.target_ct, outward_ct, lengths, normals=True, shown=False)
-    assert axes.normal is not None
-    distance, depth, normal = axes.distance[:, columns], axes.depth[:, columns], axes.normal[:, columns]
+    """How some needles pass what must not be touched; ``axes`` as in `chances_of`."""
+    columns = demanding(anatomy.checked)
+    if axes is None:
+        axes = engine.measure(case.target_ct, outward_ct, axis_lengths(case, anatomy.checked), shown=False)
+    normal = engine.normals(case.target_ct, outward_ct, axes)[:, columns]
+    distance, depth = axes.distance[:, columns], axes.depth[:, columns]
     return proximity(distance, depth, normal, outward_ct, cov_ct, model.error.surface_mm)
 
 
 def _needles(
-    case: Case, anatomy: Anatomy, engine: ClearanceEngine, model: ChanceModel, outward_ct: Floats, q: Floats
+    case: Case,
+    anatomy: Anatomy,
+    engine: ClearanceEngine,
+    model: ChanceModel,
+    outward_ct: Floats,
+    q: Floats,
+    axes: AxisDistances | None = None,
 ) -> Needles:
-    """Some needles and the doubt about them."""
+    """Some needles and the doubt about them; ``axes`` as in `chances_of`."""
     cov_ct = model.error.covariance_ct(q)
-    near = passing(case, anatomy, engine, model, outward_ct, cov_ct)
+    near = passing(case, anatomy, engine, model, outward_ct, cov_ct, axes)
     return Needles(outward_ct, cov_ct, near, model.error.surface_mm, model.error.freedom)
 
 
@@ -156,7 +175,13 @@ def _thresholds(case: Case, anatomy: Anatomy) -> tuple[Floats, Floats]:
 
 
 def chances_of(
-    case: Case, anatomy: Anatomy, engine: ClearanceEngine, model: ChanceModel, outward_ct: Floats, q: Floats
+    case: Case,
+    anatomy: Anatomy,
+    engine: ClearanceEngine,
+    model: ChanceModel,
+    outward_ct: Floats,
+    q: Floats,
+    axes: AxisDistances | None = None,
 ) -> dict[str, Floats]:
     """The columns of `Chances`, but for the joint one, of any needles that reach the target.
 
@@ -167,8 +192,10 @@ def chances_of(
         model: Of the case.
         outward_ct: Shape (n, 3), unit.
         q: Shape (n, 6), rad, the tip on the target.
+        axes: What the engine has measured of the needles already; None measures them.
     """
-    needles, (touching, breaking) = _needles(case, anatomy, engine, model, outward_ct, q), _thresholds(case, anatomy)
+    needles = _needles(case, anatomy, engine, model, outward_ct, q, axes)
+    touching, breaking = _thresholds(case, anatomy)
     touch = touch_chance(needles.near, touching, model.error.freedom)
     tip = needles.cov_ct[:, :3, :3] + model.error.target_covariance_ct
     along = np.einsum("na,nab,nb->n", outward_ct, tip, outward_ct)

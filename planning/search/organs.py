@@ -8,7 +8,7 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import Directions
-from puncture_twin.planning.clearance.engine import ClearanceEngine
+from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
 from puncture_twin.planning.clearance.measure import measure
 from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking
@@ -16,13 +16,32 @@ from puncture_twin.planning.search.constraints import first_broken
 from puncture_twin.planning.search.tissue import tissue_crossed
 
 
-def organ_candidates(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> Candidates:
-    """Check every direction against skin and organs alone; nothing is ranked yet."""
+def organ_distances(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> AxisDistances:
+    """How far the needle's axis is from every structure in every direction."""
+    return engine.measure(case.target_ct, directions.outward_ct, axis_lengths(case, anatomy.checked))
+
+
+def organ_candidates(
+    case: Case,
+    anatomy: Anatomy,
+    engine: ClearanceEngine,
+    directions: Directions,
+    axes: AxisDistances | None = None,
+) -> Candidates:
+    """Check every direction against skin and organs alone; nothing is ranked yet.
+
+    Args:
+        case: The validated case.
+        anatomy: Its structures.
+        engine: Prepared for the meshes of ``anatomy.checked``, in that order.
+        directions: What to check.
+        axes: What `organ_distances` says of them; None measures them here.
+    """
     needle, outward = case.needle, directions.outward_ct
     checked, farthest = anatomy.checked, farthest_flange(needle, case.search.max_skin_angle)
     paths = skin_paths(anatomy.skin, case.target_ct, outward, needle.length_mm, farthest)
     lengths = axis_lengths(case, checked)
-    clearances = measure(engine, checked, case.target_ct, outward, length=lengths, radius=needle.radius_mm)
+    clearances = measure(engine, checked, case.target_ct, outward, length=lengths, radius=needle.radius_mm, axes=axes)
     verdicts = first_broken(paths, clearances, checked, needle=needle, max_skin_angle=case.search.max_skin_angle)
     demanding = np.array([s.demands_margin for s in checked], bool)
     count = len(directions)

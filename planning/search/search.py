@@ -10,7 +10,7 @@ from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.chance import ChanceModel, with_best_refined, with_chances, with_joint_chances
-from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.organs import organ_candidates, organ_distances
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.search.selection.safe_cone import with_grid_cone
 
@@ -47,9 +47,10 @@ def search(
         chance: Of the case's declared errors; None leaves the chances blank.
         progress: Called with (candidates checked, candidates to check) while the arm is checked.
     """
-    found = with_grid_cone(organ_candidates(case, anatomy, engine, directions))
+    axes = organ_distances(case, anatomy, engine, directions)
+    found = with_grid_cone(organ_candidates(case, anatomy, engine, directions, axes))
     if reach is not None:
         found = with_reach(case, found, reach, progress)
-    found = ranked(case, with_chances(case, anatomy, engine, found, chance))
+    found = ranked(case, with_chances(case, anatomy, engine, found, chance, axes))
     found = with_best_refined(case, anatomy, engine, found, chance)
     return with_joint_chances(case, anatomy, engine, found, chance)

@@ -16,7 +16,6 @@ from puncture_twin.planning.batch.batch import search_one
 from puncture_twin.planning.case.case_file import RankingSection
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.clearance.cross_check import CrossCheckError
-from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.organs import organ_candidates
@@ -183,7 +182,7 @@ def test_the_cross_check_sees_a_wrong_engine(carton):
     class Wrong:
         def measure(self, *arguments):
             found = carton.engine.measure(*arguments)
-            return AxisDistances(found.distance + np.array([0, 0, 1e-3, 0]), found.depth)
+            return replace(found, distance=found.distance + np.array([0, 0, 1e-3, 0]))
 
     with pytest.raises(CrossCheckError, match="structure 2: the engine says"):
         replace(carton, engine=Wrong()).cross_check(40)

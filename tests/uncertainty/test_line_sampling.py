@@ -34,8 +34,9 @@ def box(*sizes):
 def chances(mesh, cov, surface=0.0, freedom=None, threshold=RADIUS):
     """First order and refined, of one needle along z from the origin."""
     engine = FastEngine([mesh])
-    axes = engine.measure(np.zeros(3), UP[None], LENGTH, normals=True)
-    near = proximity(axes.distance, axes.depth, axes.normal, UP[None], cov[None], surface)
+    axes = engine.measure(np.zeros(3), UP[None], LENGTH)
+    normal = engine.normals(np.zeros(3), UP[None], axes)
+    near = proximity(axes.distance, axes.depth, normal, UP[None], cov[None], surface)
     first = touch_chance(near, threshold, freedom)
     around = Surroundings(engine, np.array([0]), np.array([LENGTH]), np.zeros(3))
     needles = Needles(UP[None], cov[None], near, surface, freedom)

@@ -36,8 +36,10 @@ def ball(radius, at):
 
 def near(meshes, cov, surface=0.0):
     """One needle along z from the origin past some meshes."""
-    axes = FastEngine(meshes).measure(np.zeros(3), UP[None], LENGTH, normals=True)
-    return proximity(axes.distance, axes.depth, axes.normal, UP[None], cov[None], surface)
+    engine = FastEngine(meshes)
+    axes = engine.measure(np.zeros(3), UP[None], LENGTH)
+    normal = engine.normals(np.zeros(3), UP[None], axes)
+    return proximity(axes.distance, axes.depth, normal, UP[None], cov[None], surface)
 
 
 def drawn(meshes, cov, count, threshold, seed=0):
@@ -118,6 +120,39 @@ def test_both_engines_say_from_where_an_axis_is_nearest(rng):
         meshes += scene(mesh)
     outward = rng.normal(size=(200, 3))
     outward /= np.linalg.norm(outward, axis=1)[:, None]
-    fast, fcl = (kind(meshes).measure(np.zeros(3), outward, LENGTH, normals=True) for kind in (FastEngine, FclEngine))
-    np.testing.assert_allclose(fast.normal, fcl.normal, atol=1e-9)
-    assert np.isnan(fast.normal).any(axis=2).sum() == (fast.distance == 0).sum() > 0
+    fast, fcl = (kind(meshes) for kind in (FastEngine, FclEngine))
+    axes = fast.measure(np.zeros(3), outward, LENGTH)
+    normals = fast.normals(np.zeros(3), outward, axes)
+    np.testing.assert_allclose(
+        normals, fcl.normals(np.zeros(3), outward, fcl.measure(np.zeros(3), outward, LENGTH)), atol=1e-9
+    )
+    assert np.isnan(normals).any(axis=2).sum() == (axes.distance == 0).sum() > 0
+    for column, mesh in enumerate(meshes):
+        for row in np.flatnonzero(axes.distance[:, column] > 0)[::4]:
+            point = outward[row] * axes.depth[row, column]
+            away = point - trimesh.triangles.closest_point(mesh.vertices[mesh.faces], [point] * len(mesh.faces))
+            away = away[np.linalg.norm(away, axis=1).argmin()]
+            np.testing.assert_allclose(normals[row, column] * axes.distance[row, column], away, atol=1e-9)
+
+
+def test_normals_of_some_measured_axes_are_those_of_all(rng):
+    """Rows of an answer say the same alone: nothing is searched again."""
+    engine = FastEngine(scene(ball(10.0, [30.0, 0.0, 40.0]), slab(25.0)))
+    outward = rng.normal(size=(60, 3))
+    outward /= np.linalg.norm(outward, axis=1)[:, None]
+    axes, rows = engine.measure(np.zeros(3), outward, LENGTH), rng.permutation(60)[:17]
+    every = engine.normals(np.zeros(3), outward, axes)
+    np.testing.assert_array_equal(engine.normals(np.zeros(3), outward[rows], axes.at(rows)), every[rows])
+
+
+@pytest.mark.parametrize("kind", [FastEngine, FclEngine])
+def test_of_two_points_as_near_either_is_named(kind):
+    """Midway between two faces of one structure the normal is that of one of them."""
+    left, right = slab(2.0), slab(2.0)
+    left.apply_transform(np.diag([-1.0, 1, 1, 1]))
+    left.invert()
+    engine = kind(scene(left + right))
+    axes = engine.measure(np.zeros(3), UP[None], LENGTH)
+    normal = engine.normals(np.zeros(3), UP[None], axes)[0, 0]
+    assert axes.distance[0, 0] == pytest.approx(2.0)
+    np.testing.assert_allclose(np.abs(normal), [1.0, 0.0, 0.0], atol=1e-12)

@@ -9,16 +9,16 @@ from puncture_twin.planning.geometry.triangle_distance import nearest_point
 
 
 @nb.njit(cache=True)
-def axis_normals(triangles, nearest, target, outward, distance, depth, normal):  # type: ignore[no-untyped-def]  # numba infers
+def axis_normals(triangles, nearest, distance, depth, target, outward, normal):  # type: ignore[no-untyped-def]  # numba infers
     """Fill ``normal`` (n, 3): unit, from the nearest point of each axis' nearest triangle to the axis; NaN on contact.
 
     Args:
         triangles: Shape (m, 9), corners in rows, mm.
         nearest: Shape (n,), row of each axis' nearest triangle.
-        target: Shape (3,), where the axes start.
-        outward: Shape (n, 3), unit.
         distance: Shape (n,), mm.
         depth: Shape (n,), of the nearest axis point, mm.
+        target: Shape (3,), where the axes start.
+        outward: Shape (n, 3), unit.
         normal: Filled.
     """
     for i in range(len(outward)):
