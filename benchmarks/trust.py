@@ -42,12 +42,13 @@ from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.registration.registration import MarkerPairs, fit_rigid, register
 from puncture_twin.planning.registration.touch_poses import touching_configuration
-from puncture_twin.planning.search.chance import ChanceModel, chances_of, demanding, refined_chances
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.organs import organ_candidates
 from puncture_twin.planning.search.search import case_directions
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel, demanding
 from puncture_twin.planning.uncertainty.chances import HitModel, hit_model
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
+from puncture_twin.planning.uncertainty.needle_chances import chances_of, refined_chances
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
 

@@ -20,9 +20,9 @@ from puncture_twin.planning.reach.answer import ReachAnswer
 from puncture_twin.planning.reach.goals import approach_goals
 from puncture_twin.planning.search.arm_reach import reach_request
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.chance import keeps_limits
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.ranking import ranked
+from puncture_twin.planning.uncertainty.needle_chances import keeps_limits
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
 
 MAX_TRIES = 20

@@ -14,9 +14,9 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_angles, check_inputs
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.chance import keeps_limits
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
+from puncture_twin.planning.uncertainty.needle_chances import keeps_limits
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
 
 SAME_DIRECTION = 1e-6

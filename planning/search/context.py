@@ -29,12 +29,13 @@ from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.registration.placement import Placement, load_placement
 from puncture_twin.planning.search.arm_reach import ArmReach
 from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
-from puncture_twin.planning.search.chance import ChanceModel, chance_model, chances_of, demanding, passing
 from puncture_twin.planning.search.consistency import check_consistency
 from puncture_twin.planning.search.doubt import Doubt, doubt_of
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.search import case_directions, one_direction, search
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding
 from puncture_twin.planning.uncertainty.chances import Chances
+from puncture_twin.planning.uncertainty.needle_chances import chances_of, passing
 from puncture_twin.planning.uncertainty.pose_error import pose_error
 
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})

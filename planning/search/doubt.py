@@ -15,7 +15,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.search.chance import ChanceModel, touch_limit
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel, touch_limit
 from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.hit import hit_in_ball, hit_in_mesh
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget, error_budget

@@ -9,10 +9,11 @@ from puncture_twin.planning.case.entry import Directions, direction, grid
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.chance import ChanceModel, with_best_refined, with_chances, with_joint_chances
+from puncture_twin.planning.search.chance import with_best_refined, with_chances, with_joint_chances
 from puncture_twin.planning.search.organs import organ_candidates, organ_distances
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.search.selection.safe_cone import with_grid_cone
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 
 
 def case_directions(case: Case) -> Directions:

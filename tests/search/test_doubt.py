@@ -6,9 +6,9 @@ from places import ROOT
 from uncertainty_world import declared, world
 
 from puncture_twin.planning.case.case import load_case
-from puncture_twin.planning.search.chance import ChanceModel
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.doubt import WISHED_HIT, chance_words, goals_of, shrinkable
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.chances import HitModel
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.sources import SOURCES, deviation, reading_parts

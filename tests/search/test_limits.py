@@ -10,9 +10,10 @@ from case_world import points_file
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.search import chance
-from puncture_twin.planning.search.chance import _limited, keeps_limits
+from puncture_twin.planning.search.chance import _limited
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.uncertainty.chances import Chances
+from puncture_twin.planning.uncertainty.needle_chances import keeps_limits
 from puncture_twin.planning.uncertainty.touch import proximity, touch_bound, touch_chance
 
 CASE = """schema = 2

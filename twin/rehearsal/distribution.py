@@ -17,10 +17,11 @@ from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
 from puncture_twin.planning.registration.noise_test import NoiseTest
 from puncture_twin.planning.registration.placement import touches
 from puncture_twin.planning.registration.reading_noise import reading_noise
-from puncture_twin.planning.search.chance import chance_model, chances_of, demanding, refined_chances
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
+from puncture_twin.planning.uncertainty.chance_model import chance_model, demanding
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE
+from puncture_twin.planning.uncertainty.needle_chances import chances_of, refined_chances
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget, PoseError, error_budget, pose_error
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
 
