@@ -1,6 +1,7 @@
 """The bodies of the arm's links, in the link frames of :mod:`puncture_twin.planning.arm.kinematics`, in mm.
 
-Source: the URDF and meshes of example-robot-data (BSD), which ships the UR3, UR5 and UR10.
+Source: the URDF and meshes of example-robot-data (BSD) for the UR3, UR5 and UR10; those in ``meshes/ur``, whose LICENSE
+says whence, for the UR3e, UR5e and UR10e.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from puncture_twin import meshes
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
@@ -42,6 +44,9 @@ JOINT_NAMES = (
 PACKAGE = "example-robot-data"
 DESCRIPTION = f"share/{PACKAGE}/robots/ur_description"
 
+OWN = "ur/"
+"""Where the shapes of the e-Series lie below our meshes, and how their URDFs' addresses begin."""
+
 T_BASE_URDFBASE = np.diag([-1.0, -1.0, 1.0, 1.0])
 """The URDF's ``base_link`` against the controller's base: half a turn about z."""
 
@@ -56,6 +61,9 @@ the mesh itself never does; with these slabs 73.3 % of them are free against 73.
 
 PIN_RADIUS_MM = 10.0
 """Of the pin that stands for a joint where the meshes leave a gap: well inside every link."""
+
+FLUSH_MM = 1e-4
+"""Meshes that overlap along their joint's axis by less than this end in one plane: rounding says whether they touch."""
 
 PIN_ROOT_MM = 5.0
 """How far such a pin reaches into the links at both sides."""
@@ -118,22 +126,31 @@ def visual_links(model: UrModel) -> tuple[Link, ...]:
 
 
 def urdf_path(model: UrModel) -> Path:
-    """The URDF of a model, as example-robot-data installed it.
+    """The URDF of a model: our own, or as example-robot-data installed it.
 
     Raises:
-        InputError: If the package is not installed or has no such model.
+        InputError: If the package is not installed, or nobody has such a model.
     """
+    own = meshes.folder() / f"{OWN}{model.name}.urdf"
+    if own.is_file():
+        return own
     path = _share() / DESCRIPTION / "urdf" / f"{model.name}_robot.urdf"
     if not path.is_file():
-        shipped = sorted(p.name.removesuffix("_robot.urdf") for p in path.parent.glob("ur?*_robot.urdf"))
-        arms = ", ".join(name for name in shipped if "joint_limited" not in name)
-        raise InputError(f"no link meshes for robot {model.name!r}", where=PACKAGE, allowed=arms)
+        raise InputError(f"no link meshes for robot {model.name!r}", where=PACKAGE, allowed=", ".join(_with_meshes()))
     return path
+
+
+def _with_meshes() -> list[str]:
+    """Names of the arms whose shapes are there."""
+    shipped = [p.name.removesuffix("_robot.urdf") for p in (_share() / DESCRIPTION / "urdf").glob("ur?*_robot.urdf")]
+    own = [p.stem for p in (meshes.folder() / OWN).glob("*.urdf")]
+    return sorted(name for name in shipped + own if "joint_limited" not in name)
 
 
 def resolve_package(address: str) -> Path:
     """The file behind a URDF's ``package://`` address."""
-    return _share() / "share" / address.removeprefix("package://")
+    name = address.removeprefix("package://")
+    return meshes.folder() / name if name.startswith(OWN) else _share() / "share" / name
 
 
 def urdf_link_poses(model: UrModel, q: Floats) -> Floats:
@@ -219,7 +236,7 @@ def _joint_pins(model: UrModel, meshes: Sequence[TriangleMesh]) -> list[tuple[Tr
         T_link_next = np.linalg.inv(poses[link]) @ poses[link + 1]
         low, high = mesh.bounds[:, 2]  # the joint turns about this frame's z: heights are the same at every angle
         next_low, next_high = following.transformed(T_link_next).bounds[:, 2]
-        gaps = [(a, b) for a, b in ((high, next_low), (next_high, low)) if b >= a]
+        gaps = [(a, b) for a, b in ((high, next_low), (next_high, low)) if b >= a - FLUSH_MM]
         pins.append(tuple(_pin(a - PIN_ROOT_MM, b + PIN_ROOT_MM) for a, b in gaps))
     return [*pins, ()]
 

@@ -67,7 +67,9 @@ def scene(kind: type[CellChecker], padding_mm: float = 5.0) -> CellChecker:
     return kind(UR3, TOOL, boxes, patient, padding_mm=padding_mm)
 
 
-@pytest.mark.parametrize(("name", "padding"), [("ur3", 0.0), ("ur3", 5.0), ("ur5", 5.0), ("ur10", 5.0)])
+@pytest.mark.parametrize(
+    ("name", "padding"), [("ur3", 0.0), ("ur3", 5.0), ("ur5", 5.0), ("ur10", 5.0), ("ur3e", 5.0), ("ur10e", 0.0)]
+)
 def test_leaf_balls_cover_every_body(name: str, padding: float) -> None:
     """Every corner and many points inside every padded piece lie in a leaf's ball, and in the root's."""
     rng = np.random.default_rng(0)
@@ -105,7 +107,7 @@ def test_the_prism_encloses_the_cylinder() -> None:
     assert ((prism(15.0, 80.0) @ u.T).max(axis=0) >= cylinder).all()
 
 
-@pytest.mark.parametrize("name", ["ur3", "ur5"])
+@pytest.mark.parametrize("name", ["ur3", "ur5", "ur3e", "ur5e", "ur10e"])
 def test_no_corner_stands_out_of_the_coarse_hull_by_more_than_its_slack(name: str) -> None:
     """In every direction the hull reaches no farther than the coarse one and its slack."""
     u = np.random.default_rng(3).normal(size=(3000, 3))

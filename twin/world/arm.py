@@ -25,11 +25,14 @@ FLANGE = "tool0"
 MAX_TORQUE_NM = MappingProxyType(
     {
         "ur3": (56.0, 56.0, 28.0, 12.0, 12.0, 12.0),
+        "ur3e": (56.0, 56.0, 28.0, 12.0, 12.0, 12.0),
         "ur5": (150.0, 150.0, 150.0, 28.0, 28.0, 28.0),
+        "ur5e": (150.0, 150.0, 150.0, 28.0, 28.0, 28.0),
         "ur10": (330.0, 330.0, 150.0, 56.0, 56.0, 56.0),
+        "ur10e": (330.0, 330.0, 150.0, 56.0, 56.0, 56.0),
     }
 )
-"""The manufacturer's joint torques; the URDF of the UR3 carries those of a UR10."""
+"""The manufacturer's joint torques; the URDF of the UR3 carries those of a UR10. The e-Series': of its URDFs."""
 
 POSITION_GAIN = 0.1
 """Share of a joint's position error that its motor takes back per step, Bullet's default: an error falls to 1/e

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -85,7 +86,7 @@ def test_gravity_points_where_it_is_told_and_is_earths():
     np.testing.assert_allclose(to_mm(velocity), [0.0, STANDARD_GRAVITY_MM_S2 * 0.1, 0.0], atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["ur3", "ur5", "ur10"])
+@pytest.mark.parametrize("name", ["ur3", "ur3e", "ur5", "ur5e", "ur10", "ur10e"])
 def test_arm_stands_where_the_closed_form_says(name):
     """Bullet's chain of URDF joints and the DH table give the same flange, base turned by half a turn and all."""
     model, rng = ur_model(name), np.random.default_rng(2)
@@ -131,9 +132,10 @@ def test_links_have_the_planners_names():
 
 
 def test_arm_without_a_body_is_refused():
-    """The e-series has kinematics but no meshes; the error lists what there is."""
-    with physics_client() as client, pytest.raises(InputError, match="ur3, ur5, ur10"):
-        load_arm(client, ur_model("ur3e"), TOOL)
+    """A model that nobody has shapes of; the error lists what there is."""
+    nobody = replace(ur_model("ur3e"), name="ur16e")
+    with physics_client() as client, pytest.raises(InputError, match="ur3, ur3e, ur5"):
+        load_arm(client, nobody, TOOL)
 
 
 def test_arm_sinks_without_motors_and_stays_with_them():
