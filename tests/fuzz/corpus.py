@@ -171,12 +171,12 @@ def packed(array):
 
 def make_volumes(folder):
     """A label map and a CT, in every format and encoding."""
-    labels = np.zeros((14, 12, 10), np.uint8)
-    labels[3:8, 3:8, 3:8] = 1
-    labels[9:12, 4:9, 4:8] = 2
+    labels = np.zeros((26, 12, 10), np.uint8)
+    labels[15:20, 3:8, 3:8] = 1
+    labels[21:24, 4:9, 4:8] = 2
     image = SimpleITK.GetImageFromArray(labels)
     image.SetSpacing((2.0, 2.5, 3.0))
-    image.SetOrigin((-10.0, -15.0, 30.0))
+    image.SetOrigin((-10.0, -15.0, -6.0))  # the map holds the target, its labels lie in front of it
     SimpleITK.WriteImage(image, folder / "labels.nii.gz")
     (folder / "labels.nii").write_bytes(gzip.decompress((folder / "labels.nii.gz").read_bytes()))
     SimpleITK.WriteImage(image, folder / "raw.nrrd", useCompression=False)

@@ -6,6 +6,7 @@ import numpy as np
 
 from fuzz.output_sets import rewritten_set, whole_set
 from puncture_twin.planning.anatomy.anatomy import load_anatomy
+from puncture_twin.planning.anatomy.beyond_labels import BEYOND_LABELS
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.case_schema import SCHEMA_ONE_NOTE
 from puncture_twin.planning.certify.certificate import read_certificate
@@ -65,7 +66,7 @@ def whole_volume(volume):
 
 def whole_labelmap(labelmap):
     """Whole labels from 0 on, one of them at least above."""
-    assert labelmap.labels.dtype.kind == "i" and labelmap.labels.min() >= 0 and labelmap.labels.max() > 0
+    assert labelmap.labels.dtype.kind in "iu" and labelmap.labels.min() >= 0 and labelmap.labels.max() > 0
 
 
 def whole_points(points):
@@ -120,7 +121,8 @@ def whole_case(read):
     And nothing is lost: there are as many structures as the file states, or a note says that it states none.
     """
     case, anatomy = read
-    assert case.stated_structures == len(anatomy.structures) + 1 or SCHEMA_ONE_NOTE in case.warnings
+    stated = sum(structure.name != BEYOND_LABELS for structure in anatomy.structures) + 1  # the skin is one
+    assert case.stated_structures == stated or SCHEMA_ONE_NOTE in case.warnings
     assert np.isfinite(case.target_ct).all() and np.isfinite(case.T_ct_entry).all()
     names = [structure.name for structure in anatomy.structures]
     assert len(set(names)) == len(names) and any(s.demands_margin for s in anatomy.structures)
