@@ -1,6 +1,6 @@
 """The command line: parses, calls, prints.
 
-Exit codes: 0 done, 1 done and the answer is no, 2 bad input, 3 the program failed, 130 interrupted.
+Exit codes: 0 done, 1 done and the answer is no, 2 bad input, 3 the program failed, 130 interrupted, 141 not read.
 
 Commands that stand apart from the main job import what they need themselves: it would cost all others a second.
 """
@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
-from rich.console import Console
 
 from puncture_twin.meshes import folder as meshes_folder
 from puncture_twin.planning.base.errors import InputError
@@ -42,17 +41,23 @@ from puncture_twin.twin.jobs.robot.mirror import (
     live_states,
     mirror_text,
 )
+from puncture_twin.twin.jobs.terminal import default_out
 from puncture_twin.twin.report.progress import progress_display
 
 MOST_SEEDS = 10_000
 """Rooms or draws of one command; each takes seconds."""
 
 app = typer.Typer(add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False)
-out = Console(soft_wrap=True)
 
 CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case file, or the folder that holds case.toml.")]
 OutOption = Annotated[
     Path, typer.Option("--out", help="Folder for the files that are written.", callback=check_writable)
+]
+OutOfCaseOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--out", help="Folder for the files that are written.", show_default="out/, then the case's and command's names"
+    ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, and nothing else there.")]
 JobsOption = Annotated[
@@ -83,7 +88,7 @@ EntryOption = Annotated[
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        out.print(f"puncture-twin {version('puncture-twin')}", highlight=False)
+        print(f"puncture-twin {version('puncture-twin')}")
         raise typer.Exit
 
 
@@ -92,12 +97,12 @@ VersionOption = Annotated[
 ]
 
 
-@app.callback(invoke_without_command=True)
+@app.callback(invoke_without_command=True, epilog="What the words of the output mean: docs/words.md.")
 def _without_command(context: typer.Context, version: VersionOption = False) -> None:
     """Plan a needle puncture and rehearse it. Research software, not a medical device."""
     del version  # its callback has printed it
     if context.invoked_subcommand is None:
-        demo()
+        print(context.get_help())
 
 
 @app.command()
@@ -149,7 +154,7 @@ def init(
 @app.command()
 def search(
     case: CaseArgument,
-    out_dir: OutOption = Path("out"),
+    out_dir: OutOfCaseOption = None,
     arm: ArmOption = None,
     pictures: PicturesOption = True,
     engine: EngineOption = "fast",
@@ -159,11 +164,12 @@ def search(
     as_json: JsonOption = False,
 ) -> None:
     """Judge every entry direction of a case; write the table, the map, the scene and the page."""
+    folder = _out(out_dir, case, "search")
     with progress_display() as progress:
         context = prepare(case, arm=arm, engine=engine, watcher=progress)
         checked = context.cross_check(check_again) if check_again else None
         run = main_job.search_case(
-            context, out_dir, pictures=pictures, checked=checked, certify_deg=certify_size if certified else None
+            context, folder, pictures=pictures, checked=checked, certify_deg=certify_size if certified else None
         )
     _print(run.summary(), words.search_text(run), as_json)
     if not run.candidates.safe.any():
@@ -212,7 +218,7 @@ def check(
 @app.command()
 def plan(
     case: CaseArgument,
-    out_dir: OutOption = Path("out"),
+    out_dir: OutOfCaseOption = None,
     theta: ThetaOption = None,
     beta: BetaOption = None,
     rank: RankOption = None,
@@ -222,8 +228,9 @@ def plan(
 ) -> None:
     """Search, plan to the best candidate that the arm can come to, or to the one that is named; write plan.json."""
     choice = parse_choice(theta, beta, rank, window, entry)
+    folder = _out(out_dir, case, "plan")
     with progress_display() as progress:
-        run = main_job.plan_case(prepare(case, watcher=progress), out_dir, choice)
+        run = main_job.plan_case(prepare(case, watcher=progress), folder, choice)
     _print(run.summary(), words.plan_text(run), as_json)
 
 
@@ -231,7 +238,7 @@ def plan(
 def rehearse(
     source: Annotated[Path, typer.Argument(metavar="CASE_OR_PLAN", help="A case, or a plan.json beside --case.")],
     case: Annotated[Path | None, typer.Option("--case", help="The case of a plan.json.")] = None,
-    out_dir: OutOption = Path("out"),
+    out_dir: OutOfCaseOption = None,
     theta: ThetaOption = None,
     beta: BetaOption = None,
     rank: RankOption = None,
@@ -248,14 +255,15 @@ def rehearse(
         raise InputError("--physics runs some of the rooms", where="--physics", allowed="--seeds N --physics K, K <= N")
     choice = parse_choice(theta, beta, rank, window, entry)
     rooms = None if seeds is None else main_job.RoomCount(seeds, physics)
+    folder = _out(out_dir, source, "rehearse")
     if source.suffix != ".json":
         _refuse_second_case(case)
-        _rehearse(source, out_dir, as_json, rooms=rooms, choice=choice)
+        _rehearse(source, folder, as_json, rooms=rooms, choice=choice)
         return
     _refuse_choice(source, choice)
     if case is None:
         raise InputError("a plan needs its case", where=source, allowed="rehearse plan.json --case CASE")
-    _rehearse(case, out_dir, as_json, plan_path=source, rooms=rooms)
+    _rehearse(case, folder, as_json, plan_path=source, rooms=rooms)
 
 
 def _refuse_choice(plan_path: Path, choice: Choice) -> None:
@@ -271,7 +279,7 @@ def _refuse_second_case(case: Path | None) -> None:
 @app.command()
 def place(
     case: CaseArgument,
-    out_dir: OutOption = Path("out"),
+    out_dir: OutOfCaseOption = None,
     jobs: JobsOption = 2,
     pictures: PicturesOption = True,
     as_json: JsonOption = False,
@@ -279,8 +287,9 @@ def place(
     """Find where the arm should stand to hold most of the organ-safe directions; write the placements and their map."""
     from puncture_twin.twin.jobs.patient.place_job import place_case
 
+    folder = _out(out_dir, case, "place")
     with progress_display() as progress:
-        run = place_case(prepare(case, arm=False, watcher=progress), out_dir, jobs=jobs, pictures=pictures)
+        run = place_case(prepare(case, arm=False, watcher=progress), folder, jobs=jobs, pictures=pictures)
     _print(run.summary(), place_text(run), as_json)
 
 
@@ -312,7 +321,7 @@ def mirror(
     shown = []
     with suppress(KeyboardInterrupt):
         for one in mirrored.follow(states):
-            shown.append(one.summary()) if as_json else out.print(mirror_text(one), highlight=False, markup=False)
+            shown.append(one.summary()) if as_json else print(mirror_text(one), flush=True)
     if as_json:
         _print({"case": str(case), "inputs": inputs_document(inputs), "states": shown}, "", as_json)
 
@@ -324,7 +333,7 @@ def export(
         str, typer.Option("--format", metavar="urscript|ros2|csv|slicer", help="For which robot, or 3D Slicer.")
     ],
     case: Annotated[Path | None, typer.Option("--case", help="The plan's case: check the plan again.")] = None,
-    out_dir: OutOption = Path("out"),
+    out_dir: OutOfCaseOption = None,
     theta: ThetaOption = None,
     beta: BetaOption = None,
     rank: RankOption = None,
@@ -340,16 +349,17 @@ def export(
     choice = parse_choice(theta, beta, rank, window, entry)
     of_plan = source.suffix == ".json"
     _refuse_choice(source, choice) if of_plan else _refuse_second_case(case)
+    folder = _out(out_dir, source, "export")
     if format_name == SLICER:
-        _export_to_slicer(source, out_dir, choice, as_json)
+        _export_to_slicer(source, folder, choice, as_json)
         return
     checked = case if of_plan else source
     with progress_display() as progress:
         context = None if checked is None else prepare(checked, watcher=progress)
         if of_plan or context is None:
-            done = main_job.export(source, format_name, out_dir, context, progress.note)
+            done = main_job.export(source, format_name, folder, context, progress.note)
         else:
-            done = main_job.export_case(context, format_name, out_dir, choice)
+            done = main_job.export_case(context, format_name, folder, choice)
     summary = {"format": format_name, "notes": list(done.notes), "case_checked": context is not None}
     summary |= {"inputs": inputs_document(done.inputs), "files": [str(done.path)]}
     _print(summary, words.export_text(done, context is not None), as_json)
@@ -429,7 +439,7 @@ def selfcal(
 @app.command()
 def servo(
     case: Annotated[Path, typer.Argument(metavar="CASE", help="Servo case, or the folder that holds servo.toml.")],
-    out_dir: OutOption = Path("out"),
+    out_dir: OutOfCaseOption = None,
     seeds: Annotated[int, typer.Option("--seeds", min=1, max=MOST_SEEDS, help="How many rooms to draw.")] = 1,
     as_json: JsonOption = False,
 ) -> None:
@@ -437,7 +447,7 @@ def servo(
     from puncture_twin.twin.jobs.servo.job import run_servo
 
     with progress_display() as progress:
-        job = run_servo(case, out_dir, seeds, partial(progress.count, "seeds"), progress.note)
+        job = run_servo(case, _out(out_dir, case, "servo"), seeds, partial(progress.count, "seeds"), progress.note)
     _print(job.summary, job.text, as_json)
     if not job.holds:
         raise typer.Exit(ANSWER_IS_NO)
@@ -446,7 +456,7 @@ def servo(
 @app.command()
 def reproduce(
     paper: Annotated[str, typer.Argument(metavar="chen2019|liu2007|axp-ybq", help="Which paper.")],
-    out_dir: OutOption = Path("out"),
+    out_dir: OutOfCaseOption = None,
     seeds: Annotated[int | None, typer.Option("--seeds", min=1, max=MOST_SEEDS, help="How many draws, if any.")] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -455,10 +465,14 @@ def reproduce(
 
     if paper not in PAPERS:
         raise InputError(f"paper '{paper}' is not known", where="reproduce", allowed=", ".join(PAPERS))
-    result = PAPERS[paper](out_dir, seeds)
+    result = PAPERS[paper](_out(out_dir, Path(paper), "reproduce"), seeds)
     _print(result.summary, result.text, as_json)
     if not result.holds:
         raise typer.Exit(ANSWER_IS_NO)
+
+
+def _out(named: Path | None, source: Path, command: str) -> Path:
+    return check_writable(named or default_out(source, command))
 
 
 def _rehearse(
@@ -482,7 +496,7 @@ def _print(summary: dict[str, Any], text: str, as_json: bool) -> None:
     if as_json:
         print(json.dumps(summary, allow_nan=False))
     else:
-        out.print(text, highlight=False, markup=False)
+        print(text)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -9,9 +9,11 @@ from puncture_twin.run_twin import app
 HEAD = """# Command line
 
 `run-twin COMMAND` where the package is installed, `python run_twin.py COMMAND` from a checkout; without a command it
-runs `demo`, and `--version` prints the version. Exit codes: 0 done; 1 done, and the answer is no; 2 bad input, one line
-that says what, where and what is allowed; 3 the program failed; 130 interrupted. With `--json` stdout holds one JSON
-object and nothing else; progress goes to stderr. What is written: [outputs.md](outputs.md).
+prints its help, and `--version` prints the version. Exit codes: 0 done; 1 done, and the answer is no; 2 bad input, one
+line that says what, where and what is allowed; 3 the program failed; 130 interrupted; 141 nobody reads what it prints
+(as after `| head -1`). With `--json` stdout holds one JSON object and nothing else; progress goes to stderr. Without
+`--out` files go to `out/`, into a folder named after case and command (`out/abdomen-search`). What is written:
+[outputs.md](outputs.md).
 
 *Written by `python docs/command_line.py` from the help of each command (`run-twin COMMAND --help`).*
 """
@@ -23,6 +25,7 @@ def option_row(parameter):
     shown = parameter.metavar if parameter.param_type_name == "argument" else ", ".join(names)
     silent = parameter.default is None or isinstance(parameter.default, bool)
     default = "required" if parameter.required else "" if silent else f"`{parameter.default}`"
+    default = "`out/CASE-COMMAND`" if names == ["--out"] and silent else default
     return f"| `{shown}` | {(parameter.help or '').replace('|', ' or ')} | {default} |"
 
 

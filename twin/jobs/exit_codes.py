@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import traceback
 import warnings
 from collections.abc import Callable
@@ -18,9 +19,10 @@ from puncture_twin.planning.base.errors import (
     PlanningError,
     one_line,
 )
+from puncture_twin.twin.jobs.terminal import flush_output, leave_unread, reader_is_gone
 
-OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, INTERRUPTED = 0, 1, 2, 3, 130
-
+OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, INTERRUPTED, UNREAD = 0, 1, 2, 3, 130, 141
+"""The last two as the shell gives them for a program that Ctrl-C, or a closed pipe, has ended."""
 
 Tell = Callable[[str], None]
 """Shows one line, on stderr."""
@@ -37,18 +39,31 @@ def exit_code_of(command: Callable[[], object], tell: Tell) -> int:
         warnings.showwarning = _notes(warnings.showwarning, tell)
         try:
             result = command()
+            flush_output()
         except (KeyboardInterrupt, typer.Abort):
             result = INTERRUPTED
         except (PlanningError, ClickException) as error:
             line, code = _line_and_code(error)
             tell(line)
             return code
+        except (BrokenPipeError, SystemExit) as error:  # click and rich end the program at any broken pipe
+            return _unread(error)
         except Exception:  # the last line of defence: the user gets exit code 3 and the traceback, whatever broke
             traceback.print_exc()
             return PROGRAM_FAILED
     if result == INTERRUPTED:  # typer itself turns Ctrl-C into this, and says nothing
         tell("interrupted")
     return result if isinstance(result, int) else OK
+
+
+def _unread(error: BaseException) -> int:
+    """The code where nobody reads stdout; a pipe that broke elsewhere, such as a worker's, is a failure."""
+    in_help = traceback.extract_tb(error.__traceback__)[-1].name == "on_broken_pipe"  # rich; stdout goes nowhere then
+    if not (in_help or reader_is_gone(sys.stdout)):
+        traceback.print_exc()
+        return PROGRAM_FAILED
+    leave_unread(sys.stdout)
+    return UNREAD
 
 
 def _line_and_code(error: PlanningError | ClickException) -> tuple[str, int]:

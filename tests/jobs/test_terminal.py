@@ -1,0 +1,104 @@
+"""At the terminal: help, a reader who goes away, folders that name themselves, widths and colours."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from places import ROOT
+
+from puncture_twin.meshes import folder
+from puncture_twin.run_twin import main
+from puncture_twin.twin.jobs.exit_codes import PROGRAM_FAILED, exit_code_of
+from puncture_twin.twin.jobs.terminal import default_out
+
+CARTON = folder() / "carton" / "case_m.toml"
+ONE = ["check", str(CARTON), "--theta", "0", "--beta", "0", "--no-arm"]
+
+
+def test_without_a_command_the_help_is_printed(capsys):
+    """All commands, where the words are explained, exit code 0; nothing is run."""
+    assert main([]) == 0
+    shown = capsys.readouterr().out
+    assert {"demo", "search", "reproduce"} <= set(re.findall(r"\w+", shown))
+    assert "docs/words.md" in shown
+
+
+def run_unread(code, *arguments):
+    """Run Python whose stdout is a pipe that nobody reads: exit code and stderr."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code, *arguments], stdout=writer, stderr=subprocess.PIPE, text=True, cwd=ROOT
+        )
+    finally:
+        os.close(writer)
+    return done.returncode, done.stderr
+
+
+MAIN = "import sys\nfrom puncture_twin.run_twin import main\nsys.exit(main(sys.argv[1:]))"
+
+
+@pytest.mark.parametrize("arguments", [[], ["search", "--help"], ["--version"], ONE, [*ONE, "--json"]])
+def test_an_output_that_nobody_reads_ends_as_the_shell_has_it(arguments):
+    """141, never 1 (which is an answer), and no traceback."""
+    code, said = run_unread(MAIN, *arguments)
+    assert (code, "Traceback" in said, "BrokenPipe" in said) == (141, False, False)
+
+
+def test_a_pipe_that_broke_elsewhere_is_a_failure(capsys):
+    """A worker or a robot that went away is not the reader of stdout."""
+
+    def broken():
+        raise BrokenPipeError(32, "Broken pipe")
+
+    assert exit_code_of(broken, print) == PROGRAM_FAILED
+    assert "BrokenPipeError" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("source", "name"),
+    [
+        ("liver", "liver-search"),
+        ("liver/", "liver-search"),
+        ("liver/case.toml", "liver-search"),
+        ("carton/case_m.toml", "carton-case_m-search"),
+        ("out/liver-plan/plan.json", "liver-plan-search"),
+        ("chen2019", "chen2019-search"),
+    ],
+)
+def test_a_folder_is_named_after_case_and_command(source, name):
+    """Two cases never share one."""
+    assert default_out(Path(source), "search") == Path("out") / name
+
+
+def test_a_search_writes_there_without_out(tmp_path, monkeypatch, capsys):
+    """And nothing beside it."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "carton").symlink_to(CARTON.parent)
+    case = tmp_path / "coarse.toml"
+    text = CARTON.read_text().replace("step_deg = 2.0", "step_deg = 15.0")
+    case.write_text(re.sub(r'"([\w.]+\.(?:ply|csv))"', r'"carton/\1"', text))
+    assert main(["search", str(case), "--no-arm", "--no-pictures"]) == 0
+    assert [one.name for one in (tmp_path / "out").iterdir()] == [f"{tmp_path.name}-coarse-search"]
+    capsys.readouterr()
+
+
+def test_neither_width_nor_colour_changes_what_is_printed():
+    """A narrow terminal wraps; no line is broken by us, and nothing is coloured."""
+    shown = [
+        subprocess.run(
+            [sys.executable, "-c", MAIN, *ONE],
+            env={**os.environ, **extra},
+            capture_output=True,
+            check=True,
+            text=True,
+            cwd=ROOT,
+        ).stdout
+        for extra in ({"COLUMNS": "200", "FORCE_COLOR": "1"}, {"COLUMNS": "60", "NO_COLOR": "1"})
+    ]
+    assert shown[0] == shown[1]
+    assert "\x1b" not in shown[0]
