@@ -21,7 +21,10 @@ def read_input(path: Path, *, max_bytes: int, where: str) -> bytes:
     allowed = f"a readable file of 1 to {max_bytes} bytes"
     try:
         if not path.exists():
-            raise InputError("no such file", where=where, allowed=allowed)
+            other = _other_case(path)
+            raise InputError(
+                f"no such file; there is '{other}'" if other else "no such file", where=where, allowed=allowed
+            )
         if not path.is_file():
             raise InputError("not a file but a directory or device", where=where, allowed=allowed)
         size = path.stat().st_size
@@ -30,3 +33,28 @@ def read_input(path: Path, *, max_bytes: int, where: str) -> bytes:
         return path.read_bytes()
     except (OSError, ValueError) as error:  # unreadable, or a path with a NUL in it
         raise InputError(f"cannot be read ({error})", where=where, allowed=allowed) from error
+
+
+def absence(path: Path) -> str:
+    """Why there is no plain file at a path, as it is: "is a folder", or "is not there", and what is there instead."""
+    try:
+        if path.is_dir():
+            return "is a folder"
+        if path.exists():
+            return "is no plain file"
+        if path.is_symlink():
+            return "is a link to a file that is not there"
+        other = _other_case(path)
+    except PermissionError as error:
+        return f"cannot be looked up ({error.strerror})"
+    except (OSError, ValueError):  # a name that no file system takes
+        return "is not there"
+    return f"is not there; there is '{other}'" if other else "is not there"
+
+
+def _other_case(path: Path) -> str:
+    """A name beside it that differs in upper and lower case alone; "" without one."""
+    if not path.parent.is_dir():
+        return ""
+    names = sorted(one.name for one in path.parent.iterdir() if one.name.lower() == path.name.lower())
+    return names[0] if names and names[0].isprintable() else ""

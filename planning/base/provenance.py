@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.files import is_plain_file
+from puncture_twin.planning.base.input_file import absence, read_input
 from puncture_twin.planning.base.strict_json import text
 
 CASE_ROLE = "case"
@@ -155,12 +156,7 @@ class InputFiles:
 
     def _existing(self, name: str, key: str, where: Path) -> Path:
         file = self._folder / name
-        try:
-            there = file.is_file()
-        except (OSError, ValueError):  # a name that no file system takes
-            there = False
-        if not there:
-            raise InputError(
-                f"{key}: file '{name[:200]}' is not there", where=where, allowed=f"a file in {self._folder}"
-            )
+        if not is_plain_file(file):
+            what = f"{key}: file '{name[:200]}' {absence(file)}"
+            raise InputError(what, where=where, allowed=f"a file in {self._folder}")
         return file

@@ -364,7 +364,7 @@ BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
     ),
     "points at another folder": ("a.nhdr", nrrd_bytes(("data", "data file: ../a.raw"), data=b""), "data file"),
     "points at the host": ("a.nhdr", nrrd_bytes(("data", "data file: /etc/passwd"), data=b""), "data file"),
-    "points nowhere": ("a.nhdr", nrrd_bytes(("data", "data file: b.raw"), data=b""), "does not exist"),
+    "points nowhere": ("a.nhdr", nrrd_bytes(("data", "data file: b.raw"), data=b""), "is not there"),
     "points at itself": ("a.nhdr", nrrd_bytes(("data", "datafile: a.nhdr"), data=b""), "header itself"),
     "a list of files": ("a.nhdr", nrrd_bytes(("data", "data file: LIST"), data=b"/etc/passwd\n"), "data file"),
     "a pattern of files": ("a.nhdr", nrrd_bytes(("data", "data file: a%d.raw 1 6 1"), data=b""), "data file"),
@@ -417,7 +417,7 @@ def test_paths_that_are_no_volume_files(tmp_path: Path) -> None:
     (tmp_path / "folder.nii").mkdir()
     with pytest.raises(InputError, match="is a folder"):
         read_volume(tmp_path / "folder.nii")
-    with pytest.raises(InputError, match="does not exist"):
+    with pytest.raises(InputError, match="is not there"):
         read_volume(tmp_path / "none.nii.gz")
     with pytest.raises(InputError, match="unknown file ending"):
         read_volume(write(tmp_path, "a.img", WHOLE))

@@ -136,7 +136,7 @@ def test_a_folder_as_a_label_map_is_refused(scene):
     """Only a CT may be a folder."""
     text = (scene / "dicom.toml").read_text()
     (scene / "wrong.toml").write_text(text.replace(json.dumps("labels.nii.gz"), json.dumps("series"), 1))
-    with pytest.raises(InputError, match="file 'series' is not there"):
+    with pytest.raises(InputError, match="file 'series' is a folder"):
         load_case(scene / "wrong.toml")
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import is_plain_file
+from puncture_twin.planning.base.input_file import absence
 
 MAX_HEADER_BYTES = 4_000_000
 """A .seg.nrrd with a thousand segments stays below 1 MB."""
@@ -133,7 +134,7 @@ def _beside(name: str, path: Path) -> Path:
         raise InputError(f"data file {name[:80]!r}", where=path, allowed=allowed)
     data_path = path.parent / name
     if not is_plain_file(data_path):
-        raise InputError(f"data file {name!r} does not exist", where=path, allowed=allowed)
+        raise InputError(f"data file {name!r} {absence(data_path)}", where=path, allowed=allowed)
     if data_path.resolve().parent != path.parent.resolve():
         raise InputError(f"data file {name!r} is a link to another folder", where=path, allowed=allowed)
     if data_path.resolve() == path.resolve():

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.files import is_plain_file
+from puncture_twin.planning.base.input_file import absence, read_input
 from puncture_twin.planning.formats.volumes import nrrd_header
 from puncture_twin.planning.formats.volumes.nifti_header import parse_nifti_header
 from puncture_twin.planning.formats.volumes.nrrd_header import parse_nrrd_header
@@ -85,9 +86,8 @@ def read_volume(path: Path) -> Volume:
     Raises:
         InputError: Anything wrong with the file; nothing else comes out, whatever its bytes.
     """
-    if not path.is_file():
-        kind = "is a folder" if path.is_dir() else "does not exist"
-        raise InputError(f"the file {kind}", where=path, allowed="a volume file")
+    if not is_plain_file(path):
+        raise InputError(f"the file {absence(path)}", where=path, allowed="a volume file")
     _parser(path)  # an unknown ending is refused before anything is read
     content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     beside = data_file(content, path)

@@ -1,0 +1,51 @@
+"""What an error says of a file that cannot be used is so."""
+
+from pathlib import Path
+
+import pytest
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.input_file import absence, read_input
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A folder, a file in upper case, a link to nothing."""
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "Liver.STL").write_bytes(b"x")
+    (tmp_path / "link.stl").symlink_to("gone.stl")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("folder", "is a folder"),
+        ("link.stl", "is a link to a file that is not there"),
+        ("liver.stl", "is not there; there is 'Liver.STL'"),
+        ("spleen.stl", "is not there"),
+        ("folder/spleen.stl", "is not there"),
+        ("none/spleen.stl", "is not there"),
+        ("a" * 5000, "is not there"),
+        ("nul\0", "is not there"),
+    ],
+)
+def test_what_is_in_the_place_is_said(place, name, said):
+    """A folder, a link, another case, or nothing."""
+    assert absence(place / name) == said
+
+
+def test_what_may_not_be_looked_at_is_not_missing(place, monkeypatch):
+    """Permission is another thing than absence."""
+
+    def refused(path, **_):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "stat", refused)
+    assert absence(place / "Liver.STL") == "cannot be looked up (Permission denied)"
+
+
+def test_a_file_in_another_case_is_named_by_its_reader(place):
+    """As systems that fold cases would have found it."""
+    with pytest.raises(InputError, match="no such file; there is 'Liver.STL'"):
+        read_input(place / "liver.stl", max_bytes=10, where="liver.stl")
