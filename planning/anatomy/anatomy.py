@@ -140,7 +140,7 @@ def _outside(case: Case, scan: Scan, warnings: list[str]) -> tuple[Structure, ..
     warnings.extend(support_warnings(outside.supported, outside.open_faces))
     found = ((OUTSIDE_BODY, outside.mesh), (ATTACHED_LIMB, scan.attached_limbs(case.target_ct)))
     return tuple(
-        Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: {name}", outside=True)
+        Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: {name}", True, scan.source.voxel_mm)
         for name, mesh in found
         if mesh is not None
     )
@@ -154,7 +154,8 @@ def _unnamed(case: Case, scan: Scan, structures: Sequence[Structure]) -> Iterato
     unnamed = scan.unnamed(named, case.ct.dense_hu)
     for name, mesh in ((UNNAMED_DENSE, unnamed.dense), (UNNAMED_GAS, unnamed.gas)):
         if mesh is not None:
-            yield Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: {name}")
+            source, voxel_mm = f"{scan.name}: {name}", scan.source.voxel_mm
+            yield Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, source, voxel_mm=voxel_mm)
 
 
 def _beyond(case: Case, skin: Skin, structures: Sequence[Structure], warnings: list[str]) -> Iterator[Structure]:

@@ -44,10 +44,12 @@ class StructureSources:
         """One structure from a mesh or a label."""
         self._progress(section.name)
         if section.mesh is not None:
-            mesh, source = self._mesh(section), section.mesh
+            mesh, source, voxel_mm = self._mesh(section), section.mesh, 0.0
         else:
             mesh, source = self._label(section), f"{section.labelmap}:{section.label}"
-        return Structure(section.name, Role(section.role), section.margin_mm or 0.0, mesh, source)
+            voxel_mm = self._labels(str(section.labelmap)).voxel_mm
+        role, margin_mm = Role(section.role), section.margin_mm or 0.0
+        return Structure(section.name, role, margin_mm, mesh, source, voxel_mm=voxel_mm)
 
     def many(self, section: StructuresSection) -> list[Structure]:
         """All labels of one map, or masks of one folder, that the rules do not ignore."""
@@ -60,7 +62,7 @@ class StructureSources:
         for rule in self._kept_rules(section, names, volume.labels_present()):
             self._progress(rule.name)
             mesh = volume.label(rule.label)
-            structures.append(_ruled(rule, mesh, f"{name}:{rule.label}"))
+            structures.append(_ruled(rule, mesh, f"{name}:{rule.label}", volume.voxel_mm))
         return structures
 
     def _masks(self, section: StructuresSection, folder: str) -> list[Structure]:
@@ -78,8 +80,8 @@ class StructureSources:
         for rule in self._kept_rules(section, names, present):
             self._progress(rule.name)
             label = labels[rule.label] or 0
-            mesh = self._open(files[rule.name]).label(label)
-            structures.append(_ruled(rule, mesh, f"{files[rule.name]}:{label}"))
+            volume = self._open(files[rule.name])
+            structures.append(_ruled(rule, volume.label(label), f"{files[rule.name]}:{label}", volume.voxel_mm))
         return structures
 
     def _kept_rules(
@@ -197,8 +199,8 @@ class StructureSources:
         return self._case.folder / name
 
 
-def _ruled(rule: LabelRule, mesh: TriangleMesh, source: str) -> Structure:
-    return Structure(rule.name, Role(rule.kind.value), rule.margin_mm, mesh, source)
+def _ruled(rule: LabelRule, mesh: TriangleMesh, source: str, voxel_mm: float) -> Structure:
+    return Structure(rule.name, Role(rule.kind.value), rule.margin_mm, mesh, source, voxel_mm=voxel_mm)
 
 
 def _shown(names: Sequence[str]) -> str:

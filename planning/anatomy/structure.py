@@ -30,6 +30,7 @@ class Structure:
         source: The file it comes from, and the label in it.
         outside: Whether it is outside of the body, where the needle waits at its standoff: it is then checked
             against the needle's axis up to where the flange waits, not only to where the flange ends.
+        voxel_mm: The longest side of the voxels that it was made of, mm; 0 for one that no volume shows.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Structure:
     mesh: TriangleMesh
     source: str
     outside: bool = False
+    voxel_mm: float = 0.0
 
     @property
     def demands_margin(self) -> bool:

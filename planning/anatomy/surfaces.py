@@ -47,6 +47,11 @@ class VolumeSurfaces:
         """The volume's name."""
         return self.source.path
 
+    @property
+    def voxel_mm(self) -> float:
+        """The longest side of its voxels, mm."""
+        return float(self.source.grid.spacing_mm.max())
+
     @cached_property
     def volume(self) -> Volume:
         """The volume itself."""

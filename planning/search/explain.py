@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.anatomy import Anatomy, surface_distance
+from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure, surface_distance
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
@@ -23,6 +23,9 @@ MOST = 0.5
 
 NEAREST = 8
 """Structures that are listed where nobody asks for all: a case has a hundred, and those far away decide nothing."""
+
+COARSE_VOXEL_MM = 1.0
+"""A surface drawn around voxels of this size is somewhere within half of it."""
 
 NO_CHANCES = "no chances to hit and to touch: they need markers, the arm, and a direction that organs and arm allow"
 
@@ -199,7 +202,7 @@ class Explanation:
             structure = structures[column]
             margin = f"{structure.margin_mm:11.2f}" if structure.demands_margin else "          -"
             lines.append(
-                f"  {structure.name:32s} {structure.role:8s} {clearances[column]:14.3f} {margin}"
+                f"  {structure.name:32s} {structure.role:8s} {clearances[column]:14.{decimals(structure)}f} {margin}"
                 + ("  too close" if short[column] else "")
             )
         left = len(order) - len(shown)
@@ -221,6 +224,11 @@ class Explanation:
         no_need = "not computed, the organs reject the direction"
         reached = {-1: no_need, 0: "no", 1: f"yes, margin {row.arm.margin[0]:.2f}"}
         return f"arm reaches it: {reached[int(row.arm.reachable[0])]}"
+
+
+def decimals(structure: Structure) -> int:
+    """Of a clearance, in mm, as people read it: a surface drawn around coarse voxels has no hundredths."""
+    return 1 if structure.voxel_mm >= COARSE_VOXEL_MM else 2
 
 
 def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
