@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -52,7 +53,9 @@ class Kind(NamedTuple):
     rendered: bool = False
     """Whether tips are detected in pictures."""
     play_deg: float = 0.0
-    """Of every joint, in truth and declared."""
+    """Of every joint, as declared."""
+    true_play: float = 1.0
+    """The true play over the declared one."""
     uniform: bool = False
     """Whether all errors are uniform instead of normal, of the same deviation."""
     outliers: int = 0
@@ -88,6 +91,8 @@ ROWS = {
     "uniform errors, noise found": Kind(uniform=True, told=False),
     "play .02 deg, noise told": Kind(play_deg=0.02),
     "play .02 deg, noise found": Kind(play_deg=0.02, told=False),
+    "play .02 deg, a quarter more, noise told": Kind(play_deg=0.02, true_play=1.25),
+    "play .02 deg, a quarter less, noise found": Kind(play_deg=0.02, true_play=0.75, told=False),
     "3 tips 5 mm off, noise told": Kind(outliers=3),
     "3 tips 5 mm off, noise found": Kind(outliers=3, told=False),
     "rendered, arms not declared, noise told": Kind(arms=0.0, rendered=True),
@@ -127,7 +132,7 @@ def outcome(kind: Kind, seed: int) -> Outcome:
     case, room, candidates, chosen = room_of(kind.play_deg)
     bits = np.random.PCG64(np.random.SeedSequence([SEED, seed]))
     rng = UniformErrors(bits) if kind.uniform else np.random.Generator(bits)
-    truth = draw_workcell(case, rng)
+    truth = with_play(draw_workcell(case, rng), kind.true_play)
     if kind.rendered:
         taken = acquire(case, room, candidates, truth, rng)
         recording, others = taken.recording, taken.left
@@ -145,6 +150,12 @@ def outcome(kind: Kind, seed: int) -> Outcome:
     return compared(found, truth, standing, seen)
 
 
+def with_play(truth: WorkcellTruth, factor: float) -> WorkcellTruth:
+    """The room with another play."""
+    arms = (arm._replace(backlash_rad=factor * arm.backlash_rad) for arm in (truth.probe_arm, truth.needle_arm))
+    return WorkcellTruth(*arms, *truth[2:])
+
+
 def recorded(
     case: SelfcalCase,
     candidates: CandidatePoses,
@@ -160,8 +171,9 @@ def recorded(
     """
     q_probe, q_needle = candidates.q_probe[rows], np.array(candidates.q_needle[rows])
     rest = [q_probe[0], q_needle[0]]
-    seen = []
+    seen, turns = [], np.zeros((2, len(rows), 6))
     for i, row in enumerate(rows):
+        turns[0, i] = np.sign(q_probe[i] - rest[0])
         rest[0] = truth.probe_arm.settle(q_probe[i], rest[0], rng)
         if noise:
             lean = rng.normal(0.0, np.radians(case.content.truth.lean_deg))
@@ -170,6 +182,7 @@ def recorded(
             wanted = NeedleInImage(tip, np.array([*(np.cos(lean) * v), np.sin(lean)]))
             jogged = jog_into_slice(truth, rest[0], q_needle[i], wanted, float(candidates.roll[row]))
             q_needle[i] = np.where(np.isnan(jogged), q_needle[i], jogged)
+        turns[1, i] = np.sign(q_needle[i] - rest[1])
         rest[1] = truth.needle_arm.settle(q_needle[i], rest[1], rng)
         seen.append(truth.needle_in_image(*rest))
     tips = np.array([one.tip_image for one in seen])
@@ -180,7 +193,8 @@ def recorded(
         angle = angle + rng.normal(0.0, DIRECTION_RAD, len(P))
     A, B = flange_pose(truth.probe_arm.nominal, q_probe), flange_pose(truth.needle_arm.nominal, q_needle)
     v = np.column_stack([np.cos(angle), np.sin(angle)])
-    return Recording(A, B, P, v, q_probe=q_probe, q_needle=q_needle), tips
+    way = dict(zip(("turn_probe", "turn_needle"), turns, strict=True)) if truth.probe_arm.backlash_rad else {}
+    return Recording(A, B, P, v, q_probe=q_probe, q_needle=q_needle, **way), tips
 
 
 def with_outliers(recording: Recording, count: int, rng: np.random.Generator) -> Recording:
@@ -190,8 +204,7 @@ def with_outliers(recording: Recording, count: int, rng: np.random.Generator) ->
     P, rows = np.array(recording.P), rng.choice(len(recording), count, replace=False)
     angle = rng.uniform(0.0, 2.0 * np.pi, count)
     P[rows] += OUTLIER_MM * np.column_stack([np.cos(angle), np.sin(angle)])
-    r = recording
-    return Recording(r.A, r.B, P, r.v, r.names, r.pixels, r.q_probe, r.q_needle)
+    return replace(recording, P=P)
 
 
 def compared(found: Calibration, truth: WorkcellTruth, standing: Recording, tips: Floats) -> Outcome:

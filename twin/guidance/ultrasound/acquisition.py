@@ -35,6 +35,10 @@ class ProbeShot(NamedTuple):
     """What the probe's arm was told, shape (6,), rad."""
     q_needle: Floats
     """The same of the needle's arm, after the jog."""
+    turn_probe: Floats
+    """Which way each of its joints last turned, shape (6,): 1, -1, or 0."""
+    turn_needle: Floats
+    """The same of the needle's arm."""
     picture: Pixels
     found: Detection | Missed
     true_needle: NeedleInImage
@@ -73,12 +77,15 @@ class _Motion:
         self._truth, self._rng = truth, rng
         self.between = BetweenArms(case, truth.X, truth.Y, 0.0)
         self._before: list[Floats | None] = [None, None]
+        self.turns = [np.zeros(6), np.zeros(6)]
 
     def settle(self, which: int, q: Floats) -> Floats:
         """Where the joints of arm 0 (probe) or 1 (needle) come to rest, shape (6,), rad."""
         arm = (self._truth.probe_arm, self._truth.needle_arm)[which]
         before = self._before[which]
-        rest = arm.settle(q, q if before is None else before, self._rng)
+        before = q if before is None else before
+        rest = arm.settle(q, before, self._rng)
+        self.turns[which] = np.sign(q - before)
         self._before[which] = rest
         return rest
 
@@ -124,8 +131,9 @@ def acquire(
                 shots.append(taken)
             tried = len(missed) + given_up.total()
             count(len(shots) + tried, wanted + tried)
+    play = any(arm.backlash_rad > 0.0 for arm in (truth.probe_arm, truth.needle_arm))
     reasons = Counter(shot.found.value for shot in missed if isinstance(shot.found, Missed)) + given_up
-    return Acquisition(_recording(room, shots), tuple(shots), dict(reasons), tuple(missed), left)
+    return Acquisition(_recording(room, shots, play=play), tuple(shots), dict(reasons), tuple(missed), left)
 
 
 def choose(
@@ -172,7 +180,9 @@ def _shot(
     imager = case.content.image.imager()
     picture = render(imager, needle, rng, echo=case.content.image.echo())
     touched = not motion.between.apart(rest_probe, rest_needle)
-    return ProbeShot(row, q_probe, q_needle, picture, detect(picture, imager), needle, touched)
+    return ProbeShot(
+        row, q_probe, q_needle, motion.turns[0], motion.turns[1], picture, detect(picture, imager), needle, touched
+    )
 
 
 def _after_jog(case: SelfcalCase, poses: Recording, row: int, rng: np.random.Generator) -> NeedleInImage:
@@ -184,9 +194,12 @@ def _after_jog(case: SelfcalCase, poses: Recording, row: int, rng: np.random.Gen
     return NeedleInImage(tip, np.array([*(np.cos(lean) * poses.v[row]), np.sin(lean)]))
 
 
-def _recording(room: TwoArms, shots: list[ProbeShot]) -> Recording:
+def _recording(room: TwoArms, shots: list[ProbeShot], *, play: bool) -> Recording:
+    """What the controllers print and the pictures show; which way the joints turned, where that decides anything."""
     found = [shot.found for shot in shots if isinstance(shot.found, Detection)]
     q_probe, q_needle = (np.array([getattr(shot, key) for shot in shots]) for key in ("q_probe", "q_needle"))
+    turns = (np.array([getattr(shot, key) for shot in shots]) for key in ("turn_probe", "turn_needle"))
+    turn_probe, turn_needle = turns if play else (None, None)
     return Recording(
         flange_pose(room.probe_model, q_probe),
         flange_pose(room.needle_model, q_needle),
@@ -194,6 +207,8 @@ def _recording(room: TwoArms, shots: list[ProbeShot]) -> Recording:
         np.array([one.direction_image for one in found]),
         q_probe=q_probe,
         q_needle=q_needle,
+        turn_probe=turn_probe,
+        turn_needle=turn_needle,
     )
 
 

@@ -55,11 +55,11 @@ class ErrorsSection(Section):
         return ArmErrors(self.link_mm, *(float(angle) for angle in angles))
 
     def declared(self, model: UrModel) -> DeclaredArm:
-        """What a calibration is told of the arm. Play leaves a joint at either edge: half of it is its deviation."""
+        """What a calibration is told of the arm."""
         twist, joint, play, repeated = np.radians(
             [self.twist_deg, self.joint_deg, self.backlash_deg, self.repeatability_deg]
         )
-        return DeclaredArm(model, self.link_mm, twist, joint, float(np.hypot(repeated, play / 2)))
+        return DeclaredArm(model, self.link_mm, twist, joint, repeated, play / 2)
 
 
 class ArmSection(Section):

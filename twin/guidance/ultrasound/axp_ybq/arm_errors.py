@@ -3,11 +3,20 @@
 An arm's flange stands where its nominal numbers say, moved by J eta (Mooring, Roth, Driels 1991): eta are the errors of
 its 23 parameters, which stay, and J follows from the joints. A calibration does not ask for eta. It takes eta as normal
 with the declared deviations, and lets what the recording says of it correct the aim. Beside eta the joints stop a
-little differently at each arrival: repeatability, and play, which leaves a joint at either edge of it.
+little differently at each arrival: repeatability.
+
+Play leaves a joint half of its width b short of where it was sent. Which way the joint turned says the sign (the play
+operator: Visintin, Differential Models of Hysteresis, 1994, chapter III):
+
+    q = q_sent - s b (1 + c z) / 2,   s = 1 or -1,   z normal, c = PLAY_KNOWN.
+
+b / 2 moves the recorded flanges beforehand, and c z is one more error per joint that stays. Where nobody knows s, play
+is an arrival's noise of variance (b / 2)^2.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +32,8 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 N_ARM = PARAMETERS["joint"].stop
 """Parameters of one arm that move its flange: 23. Those of the tip are unknowns of the calibration itself."""
 
-N_BOTH = 2 * N_ARM
+PLAY_KNOWN = 0.25
+"""Standard deviation of each joint's play, over the declared one."""
 
 FAR_MM, FAR_RAD = 20.0, float(np.radians(3.0))
 """A recorded flange that is farther from what the joints give belongs to another arm, or is no flange."""
@@ -41,6 +51,8 @@ class DeclaredArm(NamedTuple):
     """Of every joint's zero."""
     arrival_rad: float
     """Of every joint, anew at each arrival."""
+    play_rad: float = 0.0
+    """Half the width of every joint's play: how far it stops short of where it was sent; no deviation."""
 
     def deviations(self) -> Floats:
         """Of the 23 parameters, shape (23,)."""
@@ -49,14 +61,34 @@ class DeclaredArm(NamedTuple):
             sigma[PARAMETERS[kind]] = value
         return sigma
 
-    def flange_slopes(self, q: Floats) -> Floats:
-        """Shift (mm) and turn (rad) of the flange per standard deviation of each parameter, shape (n, 6, 23), base."""
-        return np.asarray(error_jacobian(self.model, q, 0.0)[..., :N_ARM] * self.deviations())
+    def flange_slopes(self, q: Floats, turn: Floats) -> Floats:
+        """Shift (mm) and turn (rad) of the flange per standard deviation of each parameter, shape (n, 6, 23), base.
 
-    def arrival_covariance(self, q: Floats) -> Floats:
-        """Of the flange's shift and turn between arrivals at one pose, shape (n, 6, 6)."""
+        With play (n, 6, 29): six more parameters are by how much each joint's play differs from the declared one.
+
+        Args:
+            q: Joints, shape (n, 6), rad.
+            turn: Which way each last turned, shape (n, 6): 1, -1, or 0 where nobody knows.
+        """
+        slopes = error_jacobian(self.model, q, 0.0)[..., :N_ARM] * self.deviations()
+        if self.play_rad:
+            slopes = np.concatenate([slopes, PLAY_KNOWN * self._play_slopes(q, turn)], axis=2)
+        return np.asarray(slopes)
+
+    def play_motion(self, q: Floats, turn: Floats) -> Floats:
+        """How the declared play moves the flange from where its joints say, shape (n, 6); arguments as above."""
+        return np.asarray(self._play_slopes(q, turn).sum(axis=2))
+
+    def _play_slopes(self, q: Floats, turn: Floats) -> Floats:
+        """Of each joint: its play leaves it short of where it was sent, -half the width times the way it turned."""
         J = error_jacobian(self.model, q, 0.0)[..., PARAMETERS["joint"]]
-        return np.asarray(self.arrival_rad**2 * J @ np.swapaxes(J, -1, -2))
+        return np.asarray(-self.play_rad * J * turn[:, None, :])
+
+    def arrival_covariance(self, q: Floats, turn: Floats) -> Floats:
+        """Of the flange's shift and turn between arrivals at one pose, shape (n, 6, 6); arguments as above."""
+        J = error_jacobian(self.model, q, 0.0)[..., PARAMETERS["joint"]]
+        variance = self.arrival_rad**2 + self.play_rad**2 * (turn == 0.0)
+        return np.asarray((J * variance[:, None, :]) @ np.swapaxes(J, -1, -2))
 
 
 class DeclaredArms(NamedTuple):
@@ -74,9 +106,13 @@ class ArmErrors(NamedTuple):
     """How both arms' errors move the flanges of a recording."""
 
     probe: Floats
-    """Shape (n, 6, 23), per standard deviation."""
+    """Shape (n, 6, 23), per standard deviation; (n, 6, 29) where play is declared."""
     needle: Floats
-    """Shape (n, 6, 23), per standard deviation."""
+    """The same."""
+    probe_play: Floats
+    """How the declared play moves the flange, shape (n, 6)."""
+    needle_play: Floats
+    """The same."""
     probe_arrival: Floats
     """Covariance, shape (n, 6, 6)."""
     needle_arrival: Floats
@@ -94,11 +130,16 @@ def arm_errors(declared: DeclaredArms, recording: Recording) -> ArmErrors:
         raise InputError("the arms' errors need the joints", where="recording", allowed="columns A_q1_deg to B_q6_deg")
     _check_joints(declared.probe.model, q_probe, recording.A, "A", recording.names)
     _check_joints(declared.needle.model, q_needle, recording.B, "B", recording.names)
+    unknown = np.zeros(q_probe.shape)
+    turn_probe = unknown if recording.turn_probe is None else recording.turn_probe
+    turn_needle = unknown if recording.turn_needle is None else recording.turn_needle
     return ArmErrors(
-        declared.probe.flange_slopes(q_probe),
-        declared.needle.flange_slopes(q_needle),
-        declared.probe.arrival_covariance(q_probe),
-        declared.needle.arrival_covariance(q_needle),
+        declared.probe.flange_slopes(q_probe, turn_probe),
+        declared.needle.flange_slopes(q_needle, turn_needle),
+        declared.probe.play_motion(q_probe, turn_probe),
+        declared.needle.play_motion(q_needle, turn_needle),
+        declared.probe.arrival_covariance(q_probe, turn_probe),
+        declared.needle.arrival_covariance(q_needle, turn_needle),
     )
 
 
@@ -108,6 +149,11 @@ def corrected(T_base_flange: Floats, motion: Floats) -> Floats:
     T[..., :3, :3] = exp_rotation(motion[..., 3:]) @ T[..., :3, :3]
     T[..., :3, 3] += motion[..., :3]
     return T
+
+
+def without_play(recording: Recording, errors: ArmErrors) -> Recording:
+    """The recording with its flanges where the declared play leaves them."""
+    return replace(recording, A=corrected(recording.A, errors.probe_play), B=corrected(recording.B, errors.needle_play))
 
 
 def _check_joints(model: UrModel, q: Floats, T: Floats, name: str, poses: tuple[str, ...]) -> None:

@@ -33,6 +33,10 @@ ARMS_TAKEN = (
     "errors of the arms that repeat from pose to pose (lengths, joint zeros): none were declared with the joints, so "
     "the stated errors count noise alone and are too small"
 )
+PLAY_SIGN = (
+    "on which side of their play the joints stood: the recording does not say which way they turned, so play counts as "
+    "noise, and the region is too narrow beside a noise that was found"
+)
 DIRECTION_SIGN = (
     "no directions were measured: the needle's axis comes from the image plane alone, pointing from flange to tip"
 )
@@ -66,8 +70,9 @@ class Calibration:
         orientations: M, rotation from end2 to image, shape (n, 3, 3): how the needle stood in the image.
         cannot_show: What the data cannot tell, in words.
         arms: Both arms' declared errors, which ``covariance`` then counts; None where they were not declared.
-        arm_errors: Posterior mean of their 46 parameters, in declared standard deviations; shape (0,) without.
-        joint_covariance: Of parameters and arms' errors together, shape (p + 46, p + 46); ``covariance`` without.
+        arm_errors: Posterior mean of their parameters, in declared standard deviations; shape (46,), or (52,) and
+            (58,) with the play of one arm and of both; (0,) without.
+        joint_covariance: Of parameters and arms' errors together, shape (p + m, p + m); ``covariance`` without.
         small_sample: What the doubt of a noise that was found makes of the region, where arms are declared.
     """
 
@@ -118,8 +123,9 @@ class Calibration:
         if self.arms is None:
             return poses.A, poses.B
         errors = arm_errors(self.arms, poses)
-        probe, needle = np.split(self.arm_errors, 2)
-        return corrected(poses.A, errors.probe @ probe), corrected(poses.B, errors.needle @ needle)
+        probe, needle = np.split(self.arm_errors, [errors.probe.shape[2]])
+        motions = errors.probe_play + errors.probe @ probe, errors.needle_play + errors.needle @ needle
+        return corrected(poses.A, motions[0]), corrected(poses.B, motions[1])
 
     def tip_covariances(self, poses: Recording) -> Floats:
         """Covariance of where the tip is against where the image has it, shape (n, 3, 3), mm^2, base1.
@@ -271,6 +277,8 @@ def calibrate(
         solution = _with_length(solution, bias)
     cannot = [SHAFT_BIAS] * (needle_length_mm is None and known_tip is None) + [SCALE_TAKEN] * (not scale)
     cannot += [DIRECTION_SIGN] * (recording.v is None) + [ARMS_TAKEN] * (arms is None)
+    if arms is not None and recording.turn_probe is None and any(arm.play_rad > 0.0 for arm in arms):
+        cannot.append(PLAY_SIGN)
     return _assembled(recording, solution, bias, tuple(cannot), arms)
 
 

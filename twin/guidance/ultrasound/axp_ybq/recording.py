@@ -11,7 +11,7 @@ import io
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,9 @@ FILE_NAME = "recording.csv"
 
 MAX_BYTES = 50_000_000
 """More than 50,000 poses: no calibration needs so many, and a larger file is likely something else."""
+
+OPTIONAL = ("v", "q_probe", "q_needle", "turn_probe", "turn_needle")
+"""What a recording may hold beside both flanges and the tip: arrays with one row per pose."""
 
 LEAST_IN_PLANE = 0.5
 """Least share of a needle direction that must lie in the image: a needle that leans more does not show as a line."""
@@ -65,6 +68,9 @@ class Recording:
         q_probe: Joints of the probe's arm, shape (n, 6), rad, as its controller prints them; None where they were not
             recorded. Without them errors of the arms cannot be told from noise.
         q_needle: Joints of the needle's arm, shape (n, 6), rad; given if and only if the probe's are.
+        turn_probe: Which way each joint of the probe's arm last turned before it stopped, shape (n, 6): 1, -1, or 0
+            where nobody knows. None where it was not recorded: the play's sign is then unknown.
+        turn_needle: The same of the needle's arm; both only beside joints.
 
     Raises:
         InputError: Shapes that do not match, values that are not finite, matrices that are not rigid motions.
@@ -78,6 +84,8 @@ class Recording:
     pixels: bool = False
     q_probe: Floats | None = None
     q_needle: Floats | None = None
+    turn_probe: Floats | None = None
+    turn_needle: Floats | None = None
 
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(self.A))
@@ -97,6 +105,16 @@ class Recording:
         for key in ("q_probe", "q_needle"):
             if getattr(self, key) is not None:
                 object.__setattr__(self, key, _finite(getattr(self, key), key, names, widths=(6,)))
+        if (self.turn_probe is None) != (self.turn_needle is None) or (self.turn_probe is not None and not self.joints):
+            raise InputError("turns without joints, or of one arm only", where="recording", allowed="both, with joints")
+        for key in ("turn_probe", "turn_needle"):
+            if getattr(self, key) is not None:
+                object.__setattr__(self, key, _signs(getattr(self, key), key, names))
+
+    @property
+    def joints(self) -> bool:
+        """Whether the joints of both arms were recorded."""
+        return self.q_probe is not None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -104,8 +122,10 @@ class Recording:
     def subset(self, rows: NDArray[np.int_] | NDArray[np.bool_] | slice) -> Recording:
         """The same recording with these poses only."""
         names = tuple(np.array(self.names)[rows].tolist())
-        v, q_probe, q_needle = (None if part is None else part[rows] for part in (self.v, self.q_probe, self.q_needle))
-        return Recording(self.A[rows], self.B[rows], self.P[rows], v, names, self.pixels, q_probe, q_needle)
+        parts: dict[str, Any] = {
+            key: None if getattr(self, key) is None else getattr(self, key)[rows] for key in OPTIONAL
+        }
+        return Recording(self.A[rows], self.B[rows], self.P[rows], names=names, pixels=self.pixels, **parts)
 
     def joined(self, other: Recording) -> Recording:
         """Both, one after the other, numbered anew.
@@ -117,9 +137,8 @@ class Recording:
         if widths[0] != widths[1] or self.pixels != other.pixels:
             raise InputError("two recordings that hold different things", where="recording", allowed="the same columns")
         A, B, P = (np.concatenate([getattr(r, key) for r in (self, other)]) for key in "ABP")
-        optional = ("v", "q_probe", "q_needle")
-        v, q_probe, q_needle = (_both(getattr(self, key), getattr(other, key)) for key in optional)
-        return Recording(A, B, P, v, (), self.pixels, q_probe, q_needle)
+        parts: dict[str, Any] = {key: _both(getattr(self, key), getattr(other, key)) for key in OPTIONAL}
+        return Recording(A, B, P, pixels=self.pixels, **parts)
 
 
 def recording_file(path: Path) -> Path:
@@ -132,7 +151,8 @@ def read_recording(path: Path) -> Recording:
 
     Columns: ``name``; ``A_r11 .. A_r33, A_x_mm, A_y_mm, A_z_mm``; the same for B; ``P_u_mm, P_v_mm`` (or ``_px``); and,
     where directions were measured, ``v_x, v_y`` or ``v_x, v_y, v_z``; and, where the joints were recorded,
-    ``A_q1_deg .. A_q6_deg, B_q1_deg .. B_q6_deg``. Lines that start with # are passed over.
+    ``A_q1_deg .. A_q6_deg, B_q1_deg .. B_q6_deg``; and, behind these, which way each joint last turned (1, -1; 0 where
+    nobody knows), ``A_turn1 .. B_turn6``. Lines that start with # are passed over.
 
     Raises:
         InputError: Another header, a field that is no finite number, or a matrix that is no rigid motion.
@@ -153,22 +173,24 @@ def parse_recording(content: bytes, file: Path) -> Recording:
     except csv.Error as error:
         raise InputError(f"is no CSV ({error})", where=file, allowed="one line per pose, fields of numbers") from error
     header = tuple(cell.strip() for cell in rows[0]) if rows else ()
-    choices = product((False, True), (0, 2, 3), (False, True))
+    choices = product((False, True), (0, 2, 3), (0, 12, 24))
     kinds = {_columns(*choice): choice for choice in choices}
     if header not in kinds:
         raise InputError(
-            f"columns {', '.join(header)[:200]}", where=f"{file}, header", allowed=", ".join(_columns(False, 3, True))
+            f"columns {', '.join(header)[:200]}", where=f"{file}, header", allowed=", ".join(_columns(False, 3, 24))
         )
-    pixels, width, joints = kinds[header]
+    pixels, width, behind = kinds[header]
     values = np.array([_numbers(row, header, f"{file}, row {i}") for i, row in enumerate(rows[1:], start=2)])
     if values.size == 0:
         raise InputError("no pose", where=file, allowed="one row per pose")
     names = tuple(row[0].strip() for row in rows[1:])
     try:
-        v = values[:, 26 : 26 + width] if width else None
-        q_probe, q_needle = np.radians(np.split(values[:, -12:], 2, axis=1)) if joints else (None, None)
+        first = 26 + width
+        v = values[:, 26:first] if width else None
+        q_probe, q_needle = np.radians(np.split(values[:, first : first + 12], 2, axis=1)) if behind else (None, None)
+        turn_probe, turn_needle = np.split(values[:, first + 12 :], 2, axis=1) if behind == 24 else (None, None)
         A, B = _matrices(values[:, :12]), _matrices(values[:, 12:24])
-        return Recording(A, B, values[:, 24:26], v, names, pixels, q_probe, q_needle)
+        return Recording(A, B, values[:, 24:26], v, names, pixels, q_probe, q_needle, turn_probe, turn_needle)
     except InputError as error:
         raise InputError(error.what, where=f"{file}: {error.where}", allowed=error.allowed) from error
 
@@ -181,22 +203,25 @@ def write_recording(recording: Recording, path: Path) -> None:
     """
     width = 0 if recording.v is None else recording.v.shape[1]
     joints = [np.degrees(q) for q in (recording.q_probe, recording.q_needle) if q is not None]
+    turns = [turn for turn in (recording.turn_probe, recording.turn_needle) if turn is not None]
     parts = [_row_major(recording.A), _row_major(recording.B), recording.P]
-    values = np.column_stack([*parts, *([] if recording.v is None else [recording.v]), *joints])
+    values = np.column_stack([*parts, *([] if recording.v is None else [recording.v]), *joints, *turns])
     with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(_columns(recording.pixels, width, bool(joints)))
+        writer.writerow(_columns(recording.pixels, width, 6 * len(joints + turns)))
         writer.writerows([name, *map(repr, row)] for name, row in zip(recording.names, values.tolist(), strict=True))
 
 
-def _columns(pixels: bool, width: int, joints: bool) -> tuple[str, ...]:
+def _columns(pixels: bool, width: int, behind: int) -> tuple[str, ...]:
+    """The header: how many columns the direction has, and how many of joints and turns stand behind it."""
     unit = "px" if pixels else "mm"
     poses = [
         [f"{arm}_r{i}{j}" for i in "123" for j in "123"] + [f"{arm}_{axis}_mm" for axis in "xyz"] for arm in ("A", "B")
     ]
-    joint_names = [f"{arm}_q{i}_deg" for arm in "AB" for i in "123456"] if joints else []
+    joints = [f"{arm}_q{i}_deg" for arm in "AB" for i in "123456"]
+    turns = [f"{arm}_turn{i}" for arm in "AB" for i in "123456"]
     seen = (f"P_u_{unit}", f"P_v_{unit}", *("v_x", "v_y", "v_z")[:width])
-    return ("name", *poses[0], *poses[1], *seen, *joint_names)
+    return ("name", *poses[0], *poses[1], *seen, *(joints + turns)[:behind])
 
 
 def _both(first: Floats | None, second: Floats | None) -> Floats | None:
@@ -226,6 +251,13 @@ def _finite(values: Floats, what: str, names: tuple[str, ...], *, widths: tuple[
     bad = np.asarray(~(np.isfinite(array) & (np.abs(array) <= MAX_COORDINATE_MM)).all(axis=1))
     _refuse_first(bad, names, what, "is not finite or out of range", f"numbers within {MAX_COORDINATE_MM:g}")
     array.setflags(write=False)
+    return array
+
+
+def _signs(values: Floats, what: str, names: tuple[str, ...]) -> Floats:
+    array = _finite(values, what, names, widths=(6,))
+    bad = np.asarray(~np.isin(array, (-1.0, 0.0, 1.0)).all(axis=1))
+    _refuse_first(bad, names, what, "is no way to turn", "1, -1, or 0 where nobody knows")
     return array
 
 

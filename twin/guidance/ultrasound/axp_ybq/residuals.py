@@ -88,7 +88,7 @@ class LinearModel(NamedTuple):
     sigma: Floats
     """Expected covariance of each pose's own noise, shape (n, k, k)."""
     shared: Floats | None
-    """Derivative by the arms' lasting errors, each in its standard deviation, shape (n, k, 46); None undeclared."""
+    """Derivative by the arms' lasting errors, each in its standard deviation, shape (n, k, m); None undeclared."""
 
 
 def linear_model(problem: Problem, estimate: Estimate) -> LinearModel:
@@ -120,7 +120,7 @@ def _pose_covariances(problem: Problem, estimate: Estimate) -> Floats:
 
 
 def _shared_slopes(problem: Problem, estimate: Estimate) -> Floats | None:
-    """The residuals' derivative by the arms' lasting errors, each in its standard deviation, shape (n, k, 46)."""
+    """The residuals' derivative by the arms' lasting errors, each in its standard deviation, shape (n, k, m)."""
     if problem.arms is None:
         return None
     v_image = directions_image(problem.recording, estimate) if problem.with_direction else None

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, without_play
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import LEAST_POSES, LEAST_POSES_KNOWN_TIP, closed_form
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import SeenDirection, needle_direction
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, Estimate, active_columns
@@ -57,9 +57,10 @@ class Solution(NamedTuple):
     iterations: int
     noise: Noise | Spread
     covariance: Floats
-    """Of the free parameters, then of the arms' lasting errors where they are declared, shape (p + 46, p + 46)."""
+    """Of the free parameters, then of the arms' lasting errors where they are declared, shape (p + m, p + m)."""
     arm_errors: Floats
-    """Posterior mean of the arms' lasting errors, in standard deviations, shape (46,) or (0,)."""
+    """Posterior mean of the arms' lasting errors, in standard deviations, shape (m,): 46, with
+    play in both arms 58, and 0 where none are declared."""
     small_sample: SmallSample | None
     residuals: Floats
     noise_ratio: float
@@ -86,11 +87,13 @@ def solve(
         Degenerate: The poses cannot show every unknown.
     """
     _check(recording, known_tip, scale, start)
+    errors = None if arms is None else arm_errors(arms, recording)
+    if errors is not None:
+        recording = without_play(recording, errors)
     estimate = start or closed_form(recording, known_tip=known_tip, scale=scale)
     if start is not None and known_tip is not None:
         estimate = estimate._replace(t_Q=np.asarray(known_tip, dtype=np.float64))
     active = active_columns(tip=known_tip is None, scale=scale, direction=False)
-    errors = None if arms is None else arm_errors(arms, recording)
     problem = Problem(recording, noise or UNWEIGHTED, active, arms=errors)
     fit = (robust_fit if robust else plain_fit)(problem, estimate)
     seen = needle_direction(fit.estimate, recording, fit.tip_kept)
