@@ -1,5 +1,6 @@
 """A small patient for the tests of what a person looks at: every verdict is known from θ and β alone."""
 
+from pathlib import Path as FilePath
 from types import SimpleNamespace
 
 import numpy as np
@@ -27,6 +28,7 @@ def make_case(*, space="LPS", frame=None, name="ball"):
     )
     return SimpleNamespace(
         name=name,
+        path=FilePath("ball.toml"),
         space=Space(space),
         target_ct=TARGET,
         target_name="lesion",

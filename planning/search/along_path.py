@@ -66,6 +66,10 @@ def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_leng
 
 def _holds(structure: Structure, target_ct: Floats, outward_ct: Floats, depths: Floats) -> NDArray[np.bool_]:
     """At which depths the path is inside a closed structure: the parity of the crossings before."""
+    points = target_ct + depths[:, None] * outward_ct
+    low, high = structure.mesh.bounds
+    if not np.any(np.all((low <= points) & (points <= high), axis=1)):
+        return np.zeros(len(depths), bool)
     crossed = np.sort(crossings(structure.mesh, target_ct, outward_ct[None]).depth)
     inside = side_of(structure.mesh, target_ct) is Side.INSIDE
     return np.asarray((np.searchsorted(crossed, depths) % 2 == 1) != inside)

@@ -17,6 +17,7 @@ from puncture_twin.twin.report.map.map_raster import map_raster
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.page import Uncertainty, write_page
 from puncture_twin.twin.report.page.page_chances import rooms_section
+from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.rooms_picture import draw_rooms_picture, needle_frame
 
 BUDGET = ErrorBudget(1.0, 0.8, 0.6, np.array([1.9, 1.5, 1.2]), {"touch": 0.75, "ct_slice": 0.25})
@@ -89,8 +90,10 @@ def test_the_page_says_how_sure_it_is(shown, tmp_path):
     text = told.read_text()
     for words in TOLD:
         assert words in text
-    for words in ("How sure it is", "In many rooms", "p_touch_any"):
+    for words in ("How sure it is", "In many rooms"):
         assert words not in plain.read_text()
+    known, unknown = (map_data(case, one, None) for one in (found, replace(found, chances=None)))
+    assert "p_touch_any" in known and "p_touch_any" not in unknown
 
 
 def test_a_truth_that_equals_the_belief_is_said_above_all(shown, tmp_path):

@@ -8,13 +8,17 @@ import shutil
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import report_world as world
 
+from puncture_twin.planning.search.selection.choice import best_pick
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.page import write_page
+from puncture_twin.twin.report.slices.sheet import draw_slices
+from puncture_twin.twin.report.slices.subject import Subject
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
@@ -152,9 +156,14 @@ def browser(case, candidates, tmp_path_factory):
     path = folder / "report.html"
     plan = world.make_plan(case, candidates)
     registration = world.make_registration()
-    write_page(case, world.make_anatomy(), candidates, plan, world.make_rehearsal(plan), registration, path)
+    anatomy = world.make_anatomy()
+    anatomy.scan = SimpleNamespace(hu_at=lambda points: np.where(np.abs(points).max(axis=1) < 150, 40.0, np.nan))
+    slices = (draw_slices(Subject(case, anatomy, best_pick(candidates))),)
+    rehearsal = world.make_rehearsal(plan)
+    write_page(case, anatomy, candidates, plan, rehearsal, registration, path, slices=slices)
     with Browser(folder / "profile") as browser:
         browser.open(path)
+        browser.until("document.body.dataset.ready === 'true'")
         yield browser
 
 
@@ -196,9 +205,68 @@ def test_hover_shows_a_safe_direction(browser, case, candidates):
     assert "least clearance 9.0 mm (rib right 9)" in words and "100.0 mm" in words
 
 
-def test_hover_outside_the_cap_says_nothing(browser, case, candidates):
-    """Beyond the rim there is no verdict."""
-    assert point_at(browser, case, candidates, 120, 45) == "Point at the map."
+def test_hover_outside_the_cap_says_what_is_chosen(browser, case, candidates):
+    """Beyond the rim there is no verdict: the panel goes back to the chosen direction, at first the best."""
+    point_at(browser, case, candidates, 40, 60)
+    words = point_at(browser, case, candidates, 120, 45)
+    assert "rank 1" in words and "θ 0°, β 0°" in words
+
+
+def test_choosing_moves_everything(browser, case, candidates):
+    """Table, sliders and map all set panel, sliders, command and slices, which say whose they are."""
+    point_at(browser, case, candidates, 30, 200, click=True)
+    assert browser.evaluate("document.getElementById('command').textContent") == (
+        "run-twin plan ball.toml --theta 30 --beta 200"
+    )
+    assert browser.evaluate("[document.getElementById('theta').value, document.getElementById('beta').value]") == [
+        "30",
+        "200",
+    ]
+    assert "Not of the direction that you chose" in browser.evaluate("document.getElementById('slices-of').innerText")
+    browser.evaluate("document.querySelector('button.pick').click()")
+    assert browser.evaluate("document.querySelector('button.pick').getAttribute('aria-pressed')") == "true"
+    assert "Not of" not in browser.evaluate("document.getElementById('slices-of').innerText")
+    slide = (
+        "(() => { const s = document.getElementById('theta'); s.value = 80; s.dispatchEvent(new Event('input')); })()"
+    )
+    browser.evaluate(slide)
+    assert browser.evaluate("document.getElementById('command').textContent").startswith("run-twin check ball.toml")
+    assert "rejected" in browser.evaluate("document.getElementById('hover').innerText")
+
+
+def test_slices_are_shown_in_every_window(browser):
+    """Four slices with their CT, and a filter for each window, of which one is used."""
+    shown = "document.querySelectorAll('#slices-panels .ct')"
+    assert browser.evaluate(f"{shown}.length") == 4
+    browser.until(f"[...{shown}].every(image => image.complete && image.naturalWidth === 480)")
+    for tone in ("lung", "bone", "abdomen"):
+        browser.evaluate(f"document.querySelector('#tones [data-tone={tone}]').click()")
+        assert tone in browser.evaluate(f"getComputedStyle({shown}[0]).filter")
+        assert (
+            browser.evaluate(
+                f"document.querySelector('#tone-{tone} feFuncR').getAttribute('tableValues').split(' ').length"
+            )
+            == 256
+        )
+
+
+@pytest.mark.parametrize("width", [390, 768, 1280])
+def test_no_width_needs_sideways_scrolling(browser, width):
+    """A phone, a tablet and a desk: the page is as wide as the window; wide tables scroll in themselves."""
+    browser.call("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=width < 600)
+    assert browser.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    browser.call("Emulation.clearDeviceMetricsOverride")
+
+
+def test_every_control_has_a_name_and_a_visible_focus(browser):
+    """What the keyboard reaches: buttons and sliders with names, and an outline where the focus is."""
+    named = "(e.getAttribute('aria-label') || e.textContent).trim().length > 0"
+    assert browser.evaluate(f"[...document.querySelectorAll('main button, button, input')].every(e => {named})")
+    assert browser.evaluate("[...document.images].every(e => e.hasAttribute('alt'))")
+    assert browser.evaluate("[...document.querySelectorAll('nav a')].every(a => document.querySelector(a.hash))")
+    for kind in ("keyDown", "keyUp"):
+        browser.call("Input.dispatchKeyEvent", type=kind, key="Tab", code="Tab", windowsVirtualKeyCode=9)
+    assert browser.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
 
 
 def test_the_scene_is_drawn_and_answers_the_map(browser, case, candidates):
@@ -217,12 +285,29 @@ def test_the_scene_is_drawn_and_answers_the_map(browser, case, candidates):
     )
     assert np.allclose(line[0], world.TARGET)
     assert np.allclose(line[1], world.TARGET + 210 * candidates.outward_ct[row], atol=0.01)
-    browser.evaluate("document.getElementById('pose-standoff').click()")
     visible = (
-        "document.getElementById('scene').data.filter(t => t.meta && t.meta.pose === '{}').every(t => t.visible === {})"
+        "document.getElementById('scene').data.filter(t => t.meta && t.meta.pose === '{}' && (!{} || t.meta.arm))"
+        ".every(t => t.visible === {})"
     )
-    browser.until(visible.format("standoff", "true"))
-    browser.until(visible.format("target", "false"))
+    browser.until(visible.format("target", "true", "false"))  # the arm is hidden at first
+    browser.evaluate("document.getElementById('pose-standoff').click()")
+    browser.until(visible.format("standoff", "false", "true"))
+    browser.until(visible.format("target", "false", "false"))
+
+
+def test_views_look_where_they_say(browser, case, candidates):
+    """Along the needle the camera looks along the chosen direction; axial looks to the head."""
+    if browser.evaluate("document.getElementById('scene').hidden"):
+        pytest.skip("this browser has no WebGL")
+    point_at(browser, case, candidates, 30, 200, click=True)
+    row = int(
+        np.flatnonzero(np.isclose(candidates.theta, np.radians(30)) & np.isclose(candidates.beta, np.radians(200)))[0]
+    )
+    for view, expected in (("along", candidates.outward_ct[row]), ("axial", [0, 0, -1]), ("coronal", [0, -1, 0])):
+        browser.evaluate(f"document.querySelector('[data-view={view}]').click()")
+        camera = browser.evaluate("JSON.stringify(document.getElementById('scene').layout.scene.camera)")
+        eye, centre = (np.array([json.loads(camera)[key][axis] for axis in "xyz"]) for key in ("eye", "center"))
+        assert np.allclose((eye - centre) / np.linalg.norm(eye - centre), expected, atol=1e-3), view
 
 
 def test_the_charts_are_drawn(browser):

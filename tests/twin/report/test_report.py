@@ -17,15 +17,17 @@ from puncture_twin.planning.base.reasons import REASON_COLOURS
 from puncture_twin.planning.case.case_file import EntryAxes
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.place.directions import ring_weights
-from puncture_twin.planning.search.selection.choice import best_pick
+from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.twin.report import annotate
 from puncture_twin.twin.report.map.map_picture import FIGURE_INCHES, MAP_BOX, RIM, draw_map
-from puncture_twin.twin.report.map.map_raster import map_raster
+from puncture_twin.twin.report.map.map_raster import HATCH, map_raster
 from puncture_twin.twin.report.map_view import MapCells, map_view, step_of
 from puncture_twin.twin.report.numbers import reason_counts
+from puncture_twin.twin.report.page import page_slices
 from puncture_twin.twin.report.page.page import write_page
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import TRIANGLES, lightened
+from puncture_twin.twin.report.page.page_slices import slices_data
 from puncture_twin.twin.report.palette import SAFE_HIGH, SAFE_LOW
 from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
 from puncture_twin.twin.report.raster.compositing import RasterShot, compose, empty_translucent
@@ -36,6 +38,8 @@ from puncture_twin.twin.report.scene.scene_parts import SceneBody, needle_bodies
 from puncture_twin.twin.report.scene.scene_picture import draw_scene, families, render_bodies
 from puncture_twin.twin.report.scene.shapes import LIFT_MM, corridor_mouth, corridor_walls
 from puncture_twin.twin.report.scene.views import overview, up_ct
+from puncture_twin.twin.report.slices.sheet import draw_slices
+from puncture_twin.twin.report.slices.subject import Subject
 
 FRAMES = {
     "bed": ("LPS", None),
@@ -538,12 +542,46 @@ def test_the_page_holds_the_numbers(report):
 
 def test_the_page_needs_no_network(report):
     """No element loads anything from an address, the page forbids it to itself, and it is small enough to mail."""
-    own = re.sub(r"<script>/\*\*.*?plotly\.js.*?</script>", "", report, count=1, flags=re.DOTALL)
-    loads = re.findall(r"""(?:src|href)\s*=\s*["']([^"']*)["']""", visible(own))
+    own = re.sub(r'<script type="text/plain".*?</script>', "", report, flags=re.DOTALL)
+    loads = re.findall(r"""(?:src|href)\s*=\s*["']([^"'#]+)["']""", visible(own))
     assert loads == ["data:,", "timings.json"]  # the second is a link to a file beside it, which loads nothing
     assert "default-src 'none'" in report
     assert "@import" not in own and not re.search(r"url\(\s*['\"]?http", own)
-    assert len(report) < 20e6
+    assert len(report) < 3e6
+
+
+def test_verdict_and_doubt_come_first(report):
+    """Cards, warnings, windows, then map, slices, scene and the rest; every line of the contents leads somewhere."""
+    text = visible(report)
+    order = ["doubt", "windows", "directions", "slices", "scene-part", "plan", "registration", "rehearsal"]
+    assert re.findall(r'<h2 id="([^"]+)"', text) == [*order, "methods", "inputs"]
+    assert text.index("safe directions") < text.index('<h2 id="doubt"')
+    assert set(re.findall(r'<a href="#([^"]+)"', text)) <= set(re.findall(r'id="([^"]+)"', text))
+    assert "of the solid angle" in text and "at (10.0, -20.0, 30.0) mm LPS" in text
+
+
+def test_the_target_stands_in_the_case_s_space(anatomy, candidates, tmp_path):
+    """A case in RAS names its target as it was typed."""
+    write_page(world.make_case(space="RAS"), anatomy, candidates, None, None, None, tmp_path / "page.html")
+    assert "at (-10.0, 20.0, 30.0) mm RAS" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+def test_slices_beyond_the_page_s_size_are_left_out(anatomy, case, candidates, monkeypatch):
+    """The first direction always comes; each knows its angles."""
+    drawn = [draw_slices(Subject(case, anatomy, Pick(candidates, int(row)))) for row in candidates.ranked[:2]]
+    assert [one["theta_deg"] for one in slices_data(drawn)["directions"]] == [0.0, 0.0]
+    monkeypatch.setattr(page_slices, "MOST_BYTES", 1)
+    assert len(slices_data(drawn)["directions"]) == 1
+
+
+def test_what_is_unknown_is_hatched(case, candidates):
+    """By a second colour, in lines: the grey alone is near the green of safe for the colour-blind."""
+    reason = np.where(candidates.verdict.reason == "too_close", "unknown_region", candidates.verdict.reason)
+    unknown = replace(candidates, verdict=replace(candidates.verdict, reason=reason))
+    raster = map_raster(unknown, map_view(case, unknown), 200)
+    inside = np.append(reason == "unknown_region", False)[raster.rows]
+    lines = (raster.rgba[..., :3] == HATCH).all(axis=-1)
+    assert 0.15 < lines[inside].mean() < 0.35 and not lines[~inside].any()
 
 
 def test_nothing_safe_is_said_first(anatomy, case, tmp_path):

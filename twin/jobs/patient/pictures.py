@@ -10,6 +10,7 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
+from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.jobs.patient.run import Run
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
 from puncture_twin.twin.report.map.map_picture import draw_map
@@ -35,8 +36,8 @@ def with_pictures(run: Run, out: Path) -> Run:
         draw_scene(case, anatomy, found, run.plan, out / "scene.png", run.pick)
     with stages.time("slices"):
         slices = _slices(run)
-        if slices is not None:
-            write_sheet(slices, out / SLICES)
+        if slices:
+            write_sheet(slices[0], out / SLICES)
             run = run.with_files(out / SLICES)
     registration = context.placement.registration if context.placement is not None else None
     shown = None if registration is None else registration_summary(registration)
@@ -44,7 +45,17 @@ def with_pictures(run: Run, out: Path) -> Run:
     with stages.time("page"):
         page, told = out / PAGE, _uncertainty(run)
         write_page(
-            case, anatomy, found, run.plan, run.rehearsal, shown, page, film=film, uncertainty=told, pick=run.pick
+            case,
+            anatomy,
+            found,
+            run.plan,
+            run.rehearsal,
+            shown,
+            page,
+            film=film,
+            uncertainty=told,
+            pick=run.pick,
+            slices=slices,
         )
     return run.with_files(out / "map.png", out / "scene.png", out / PAGE)
 
@@ -63,12 +74,16 @@ def write_check_picture(context: CaseContext, explained: Explanation, path: Path
     return path
 
 
-def _slices(run: Run) -> Slices | None:
-    """Of the plan, else of the best direction; None where nothing is safe."""
-    pick = run.pick or best_pick(run.candidates)
+def _slices(run: Run) -> tuple[Slices, ...]:
+    """Of the plan, else of the best direction, then of the best of each other window; none where nothing is safe."""
+    found = run.candidates
+    pick = run.pick or best_pick(found)
     if pick is None:
-        return None
-    return draw_slices(_subject(run.context, pick, run.plan))
+        return ()
+    bests = [window.best for window in find_windows(found).windows[:MOST_WINDOWS]]
+    others = [Pick(found, row) for row in bests if found.at(row) != pick.candidates.at(pick.row)]
+    subjects = [_subject(run.context, pick, run.plan), *(_subject(run.context, other) for other in others)]
+    return tuple(map(draw_slices, subjects))
 
 
 def _subject(context: CaseContext, pick: Pick, plan: Plan | None = None) -> Subject:

@@ -10,13 +10,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.reasons import REASON_COLOURS
+from puncture_twin.planning.base.reasons import REASON_COLOURS, Reason, Rgb
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import MapCells, MapView
 from puncture_twin.twin.report.palette import reason_of, safe_shades
 
 OVERSAMPLING = 2
 """Samples per pixel side at the cells' borders, which they smooth."""
+
+
+HATCH: Rgb = (235, 235, 235)
+HATCHES, HATCH_LEAST = 80, 5
+"""Lines across the picture, and pixels between two of them at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +82,16 @@ def map_raster(candidates: Candidates, view: MapView, size: int) -> MapRaster:
     opaque = fine[..., 3:] / 255.0
     mean = (fine[..., :3] * opaque).mean(axis=0) / np.maximum(opaque.mean(axis=0), 1.0 / 255.0)
     rgba[line, column] = np.round(np.concatenate([mean, 255.0 * opaque.mean(axis=0)], axis=-1))
+    _hatch_unknown(rgba, rows, candidates)
     return MapRaster(rgba, rows)
+
+
+def _hatch_unknown(rgba: NDArray[np.uint8], rows: NDArray[np.int64], candidates: Candidates) -> None:
+    """White lines over what is unknown, in place: its grey alone is near the green of safe for the colour-blind."""
+    unknown = np.append(candidates.verdict.reason == Reason.UNKNOWN_REGION.value, False)[rows]  # outside
+    line, column = np.arange(len(rows))[:, None], np.arange(len(rows))
+    period = max(HATCH_LEAST, len(rows) // HATCHES)
+    rgba[unknown & ((line + column) % period < max(1, period // 5)), :3] = HATCH
 
 
 def _to_disc(pixels: NDArray[np.float64], size: int) -> NDArray[np.float64]:

@@ -2,29 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.geometry.spaces import to_lps
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.doubt import Doubt
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
+from puncture_twin.planning.search.selection.windows import find_windows
 from puncture_twin.twin.report.numbers import (
     demanding,
     nearest_structure,
     needle_words,
     number,
+    percent,
+    reason_counts,
     target_words,
 )
 from puncture_twin.twin.report.page import page_tables as tables
 from puncture_twin.twin.report.page.page_chances import chance_card, chances_section, rooms_section
 from puncture_twin.twin.report.page.page_charts import rehearsal_charts
 from puncture_twin.twin.report.page.page_map import map_data
+from puncture_twin.twin.report.page.page_methods import methods_text
 from puncture_twin.twin.report.page.page_scene import scene_figure
+from puncture_twin.twin.report.page.page_slices import SHOWN_TONES, slices_data
 from puncture_twin.twin.report.page.template import Card, plotly_script, script_json, write_html
+from puncture_twin.twin.report.slices.sheet import Slices
 
 TRUTH_IS_BELIEF = (
     "in this rehearsal the patient lies exactly where they are believed to lie: what the tip misses is the joints' "
@@ -58,6 +65,7 @@ def write_page(
     film: str | None = None,
     uncertainty: Uncertainty | None = None,
     pick: Pick | None = None,
+    slices: Sequence[Slices] = (),
 ) -> None:
     """Write the page.
 
@@ -72,12 +80,14 @@ def write_page(
         film: Name of the rehearsal's film, which lies beside the page and is linked; None without one.
         uncertainty: What there is to say of chances and rooms; None where the case declares no errors.
         pick: The planned candidate, or the one to be shown; None shows the best.
+        slices: What is shown in the CT, the first at once, the others where they are chosen.
     """
     pick = pick or best_pick(candidates)
     data = {
         "map": map_data(case, candidates, pick),
         "scene": scene_figure(case, anatomy, candidates, plan, user_cache(), pick),
         "charts": None if rehearsal is None else rehearsal_charts(rehearsal, demanding(anatomy)),
+        "slices": slices_data(slices),
         "target": [float(v) for v in case.target_ct],
         "probe_mm": float(case.needle.length_mm),
     }
@@ -86,7 +96,11 @@ def write_page(
         "report.html",
         path,
         title=f"{case.name}: puncture of {target_words(case)}",
+        stands=_stands(case),
         needle=needle_words(case),
+        sliced=bool(slices),
+        tones=SHOWN_TONES if slices and slices[0].panels[0].hu is not None else (),
+        methods=methods_text(case, anatomy, candidates),
         notice=TRUTH_IS_BELIEF if rehearsal is not None and rehearsal.truth_is_belief else "",
         refused=_refused(candidates),
         cards=_cards(candidates, pick, plan, rehearsal, None if uncertainty is None else uncertainty.doubt),
@@ -119,17 +133,16 @@ def _cards(
     safe = int(candidates.safe.sum())
     if safe == 0:
         return []
-    cards = [
+    cards = [] if doubt is None else [chance_card(doubt)]
+    cards.append(
         Card(
             "safe directions" if candidates.arm_checked else f"directions {candidates.safe_text}",
-            f"{safe:,} of {len(candidates):,}",
-            f"{100 * safe / len(candidates):.1f} % of the grid",
+            percent(next(line.solid_angle for line in reason_counts(candidates) if line.code == "safe")),
+            f"of the solid angle, in {_counted(len(find_windows(candidates).windows), 'window')}",
         )
-    ]
+    )
     if pick is not None:
         cards.append(_direction_card(*pick, best=pick == best_pick(candidates)))
-    if doubt is not None:
-        cards.append(chance_card(doubt))
     if not candidates.arm_checked:
         cards.append(Card("arm", "not checked", candidates.arm_note.removeprefix("not checked: ")))
     if plan is None:
@@ -142,6 +155,16 @@ def _cards(
             expected = f"{rehearsal.standing.words}; {expected}"
         cards.append(Card("rehearsed tip error", number(rehearsal.tip_error_mm, 2, "mm"), expected))
     return cards
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def _stands(case: Any) -> str:
+    """Case, space and target in the coordinates that the case is written in."""
+    point = ", ".join(f"{mm:.1f}" for mm in to_lps(np.asarray(case.target_ct)[None], case.space)[0])
+    return f"Case {case.name}; target {target_words(case)} at ({point}) mm {case.space};"
 
 
 def _direction_card(candidates: Candidates, row: int, *, best: bool) -> Card:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import shlex
 from typing import Any
 
 import numpy as np
@@ -74,6 +75,9 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None) -> dict[str, 
         "rank": candidates.ranking.rank.tolist(),
         "reachable": candidates.arm.reachable.tolist(),
         "outward": _rounded(candidates.outward_ct.ravel(), 5),
+        "outcome": "plan" if candidates.arm_checked else "check",
+        "file": shlex.quote(case.path.name),
+        "picked": -1 if pick is None or pick.candidates is not candidates else pick.row,
         "best": [window.best for window in windows.windows[:MOST_WINDOWS]],
         "window": windows.of_row.tolist(),
         "safe_cone": _rounded(np.degrees(candidates.safe_cone), 1),
@@ -88,7 +92,7 @@ def _chances(candidates: Candidates) -> dict[str, Any]:
     found = candidates.chances
     if found is None:
         return {}
-    return {"p_hit": _rounded(found.hit, 6), "p_touch_any": _rounded(found.touch_any, 6)}
+    return {"p_hit": _rounded(found.hit, 9), "p_touch_any": _rounded(found.touch_any, 9)}
 
 
 def map_raster_rows(rows: Any) -> list[int]:

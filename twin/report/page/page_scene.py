@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.search.candidates import Candidates
@@ -28,8 +29,11 @@ from puncture_twin.twin.report.scene.scene_parts import (
 )
 from puncture_twin.twin.report.scene.views import overview, up_ct
 
-TRIANGLES = 100_000
-"""For the whole scene; a laptop turns that smoothly."""
+TRIANGLES = 40_000
+"""For the whole scene: a phone turns that smoothly, and the page stays near 3 MB."""
+
+GRAIN_MM = 0.25
+"""Vertices are shown to so much, a power of two: it packs well."""
 
 VIEW = (1200, 640)
 """Width and height of the scene on the page, CSS pixels."""
@@ -38,6 +42,8 @@ LEAST_TRIANGLES = 300
 """A body is never cut below this."""
 
 LABEL_OUT_MM = 45.0
+BORDER = 0.02
+"""Of the scene's box, around it."""
 LEGEND_FRACTION = 0.14
 """Of the width; the legend stands left of the scene."""
 
@@ -74,7 +80,15 @@ def scene_figure(
         _trace(body, hidden=i in hidden, in_legend=first.get(_legend_name(body)) == i) for i, body in enumerate(light)
     ]
     traces.append(_labels(case, anatomy))
-    return {"data": [*traces, _probe()], "layout": _layout(case, bodies)}
+    shown = np.concatenate([one.mesh.vertices for one in light if one.group != "room"])
+    layout = _layout(case, bodies, box_of(np.concatenate([shown, _label_places(case, anatomy)])))
+    return {"data": [*traces, _probe()], "layout": layout}
+
+
+def box_of(points_ct: Floats) -> Floats:
+    """What the scene shows, shape (2, 3): the points' box with a little around it."""
+    low, high = points_ct.min(axis=0), points_ct.max(axis=0)
+    return np.stack([low, high]) + BORDER * (high - low) * np.array([[-1.0], [1.0]])
 
 
 def lightened(bodies: Sequence[SceneBody], triangles: int, cache: Cache = NO_CACHE) -> list[SceneBody]:
@@ -110,20 +124,22 @@ def _legend_name(body: SceneBody) -> str:
 def _trace(body: SceneBody, *, hidden: bool, in_legend: bool) -> dict[str, Any]:
     base, group = body.group.removesuffix("-standoff"), _legend_name(body)
     moving = base in {"arm", "needle"}
+    vertices = np.round(body.mesh.vertices / GRAIN_MM) * GRAIN_MM
+    index = np.uint16 if len(vertices) <= np.iinfo(np.uint16).max else np.int32
     return {
         "type": "mesh3d",
-        **{axis: _packed(values, np.float32) for axis, values in zip("xyz", body.mesh.vertices.T, strict=True)},
-        **{corner: _packed(values, np.int32) for corner, values in zip("ijk", body.mesh.faces.T, strict=True)},
+        **{axis: _packed(values, np.float32) for axis, values in zip("xyz", vertices.T, strict=True)},
+        **{corner: _packed(values, index) for corner, values in zip("ijk", body.mesh.faces.T, strict=True)},
         "color": css(body.colour),
         "opacity": body.alpha,
         "name": group,
         "legendgroup": group,
         "showlegend": in_legend,
-        "visible": not hidden,
+        "visible": not hidden and base != "arm",
         "hoverinfo": "name" if base == "organ" else "skip",
         "flatshading": False,
         "lighting": {"ambient": 0.5, "diffuse": 0.7, "specular": 0.15, "roughness": 0.6, "fresnel": 0.1},
-        "meta": {"pose": "standoff" if hidden else "target" if moving else ""},
+        "meta": {"pose": "standoff" if hidden else "target" if moving else "", "arm": base == "arm"},
     }
 
 
@@ -135,10 +151,7 @@ def _packed(values: NDArray[Any], dtype: type) -> dict[str, str]:
 
 def _labels(case: Any, anatomy: Any) -> dict[str, Any]:
     """The body's directions, written around it."""
-    low, high = anatomy.skin.mesh.bounds
-    centre, half = (low + high) / 2, (high - low) / 2
-    names = body_directions(case.space)
-    places = np.array([centre + v * (np.abs(v) @ half + LABEL_OUT_MM) for v in names.values()])
+    names, places = body_directions(case.space), _label_places(case, anatomy)
     return {
         "type": "scatter3d",
         **{axis: values.tolist() for axis, values in zip("xyz", places.T, strict=True)},
@@ -149,6 +162,12 @@ def _labels(case: Any, anatomy: Any) -> dict[str, Any]:
         "showlegend": False,
         "name": "directions",
     }
+
+
+def _label_places(case: Any, anatomy: Any) -> Floats:
+    low, high = anatomy.skin.mesh.bounds
+    centre, half = (low + high) / 2, (high - low) / 2
+    return np.array([centre + v * (np.abs(v) @ half + LABEL_OUT_MM) for v in body_directions(case.space).values()])
 
 
 def _probe() -> dict[str, Any]:
@@ -164,8 +183,8 @@ def _probe() -> dict[str, Any]:
     }
 
 
-def _layout(case: Any, bodies: Sequence[SceneBody]) -> dict[str, Any]:
-    axis = {"visible": False, "showspikes": False}
+def _layout(case: Any, bodies: Sequence[SceneBody], box: Floats) -> dict[str, Any]:
+    axes = {f"{name}axis": _axis(*box[:, i].tolist()) for i, name in enumerate("xyz")}
     content = np.concatenate([b.mesh.vertices for b in bodies if b.group != "room"])
     blockers = Layer([b.surface for b in bodies if b.group in {"arm", "room", "target"}])
     seen = overview(case, content, case.target_ct[None], blockers, VIEW)
@@ -175,14 +194,16 @@ def _layout(case: Any, bodies: Sequence[SceneBody]) -> dict[str, Any]:
         "scene": {
             "domain": {"x": [LEGEND_FRACTION, 1.0]},
             "aspectmode": "data",
-            "xaxis": axis,
-            "yaxis": axis,
-            "zaxis": axis,
+            **axes,
             "camera": camera,
         },
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
         "legend": {"itemsizing": "constant", "font": {"size": 12}, "x": 0.0, "y": 1.0},
         "paper_bgcolor": "#f6f7f9",
-        "height": VIEW[1],
         "uirevision": "keep",
     }
+
+
+def _axis(low: float, high: float) -> dict[str, Any]:
+    """Unseen, and with a fixed range, so that the page's script can place its camera."""
+    return {"visible": False, "showspikes": False, "range": [low, high]}

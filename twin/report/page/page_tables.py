@@ -13,7 +13,7 @@ import numpy as np
 from markupsafe import Markup
 
 from puncture_twin.planning.base.provenance import Input
-from puncture_twin.planning.base.reasons import css
+from puncture_twin.planning.base.reasons import Reason, css
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.report.numbers import arm_words, nearest_structure, number, percent, reason_counts
@@ -53,7 +53,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, kind: str = "")
     """A table; cells are text or `Markup`."""
     top = joined("<th>{}</th>", zip(head, strict=True))
     body = joined("<tr>{}</tr>", ((joined("<td>{}</td>", zip(row, strict=True)),) for row in rows))
-    form = '<div class="wide"><table class="{}"><thead><tr>{}</tr></thead><tbody>{}</tbody></table></div>'
+    form = '<div class="wide" tabindex="0"><table class="{}"><thead><tr>{}</tr></thead><tbody>{}</tbody></table></div>'
     return Markup(form).format(kind, top, body)
 
 
@@ -89,7 +89,7 @@ def best_table(candidates: Candidates) -> Markup:
         name, clearance = nearest_structure(candidates, row)
         lines.append(
             (
-                str(window.number),
+                Markup('<button type="button" class="pick" data-row="{}">{}</button>').format(row, window.number),
                 str(candidates.ranking.rank[row]),
                 f"{np.degrees(candidates.theta[row]):.4g}",
                 f"{np.degrees(candidates.beta[row]):.4g}",
@@ -110,7 +110,7 @@ def best_table(candidates: Candidates) -> Markup:
 
 def _windows_words(candidates: Candidates, count: int) -> str:
     shown = f"{MOST_WINDOWS} of {count}" if count > MOST_WINDOWS else f"All {count}"
-    words = f"{shown} windows (connected sets of safe directions)."
+    words = f"{shown} windows (connected sets of safe directions); a number chooses the window's best below."
     if candidates.cone_source:
         source = CONE_WORDS[candidates.cone_source]
         words += f" Safe cone: off by so much in any direction a needle stays safe for the organs, {source}."
@@ -121,7 +121,9 @@ def counts_table(candidates: Candidates) -> Markup:
     """How many directions fell to which reason; also the map's legend."""
     rows = [
         (
-            Markup('<span class="patch" style="background:{}"></span>{}').format(css(line.colour), line.words),
+            Markup('<span class="patch {}" style="background-color:{}"></span>{}').format(
+                "hatched" if line.code == Reason.UNKNOWN_REGION.value else "", css(line.colour), line.words
+            ),
             Markup("<code>{}</code>").format(line.code),
             f"{line.count:,}",
             percent(line.share),

@@ -39,6 +39,8 @@ DASHED: Any = {"colors": NEEDLE_COLOUR, "linewidths": 1.0, "linestyles": "--"}
 
 BEADS = 0.025
 """Between two beads, of half a picture's side."""
+MOST_BEADS = 1 << 20
+"""More than beads side by side; numbers their rows and columns as one."""
 
 SCALE_ROOM = 0.34
 """Of a picture's side, the scale bar at most."""
@@ -99,13 +101,17 @@ def _outlines(axes: Axes, subject: Subject, plane: Plane) -> None:
 
 def _beads(segments: Floats, plane: Plane) -> Floats:
     """Points along segments (n, 2, 2), about evenly apart, shape (m, 2)."""
+    cell = BEADS * plane.half_mm
+    beyond = np.all(np.abs(segments - plane.centre) > plane.half_mm, axis=1)
+    segments = segments[~np.any(beyond, axis=1)]
     if not len(segments):
         return np.zeros((0, 2))
-    cell = BEADS * plane.half_mm
     length = float(np.linalg.norm(np.diff(segments, axis=1), axis=2).max())
     share = np.linspace(0, 1, 2 + int(length / cell))[:, None, None]
     points = (segments[:, 0] * (1 - share) + segments[:, 1] * share).reshape(-1, 2)
-    return np.asarray(points[np.unique(np.round(points / cell), axis=0, return_index=True)[1]])
+    points = points[(np.abs(points - plane.centre) <= plane.half_mm).all(axis=1)]
+    column, row = np.round(points / cell).astype(np.int64).T
+    return np.asarray(points[np.unique(column * MOST_BEADS + row, return_index=True)[1]])
 
 
 def _needle(axes: Axes, subject: Subject, plane: Plane) -> None:

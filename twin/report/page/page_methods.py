@@ -1,0 +1,39 @@
+"""A paragraph that says how a result was found, to be cited."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.twin.report.map_view import step_of
+from puncture_twin.twin.report.numbers import needle_words
+from puncture_twin.twin.report.page.page_tables import PROJECT
+
+
+def methods_text(case: Any, anatomy: Any, candidates: Candidates) -> str:
+    """What was checked, by what, and what was not."""
+    theta, step = np.degrees(candidates.theta), np.degrees(step_of(candidates))
+    checked = sum(1 for one in anatomy.checked if str(one.role) in {"avoid", "unknown"})
+    arm = (
+        f"For each remaining direction it was checked whether a {case.robot.model.upper()} reaches it and inserts the "
+        "needle without contact."
+        if candidates.arm_checked
+        else "The arm was not checked."
+    )
+    chances = (
+        "Chances to hit and to touch were propagated from the declared errors of markers, touches and arm."
+        if candidates.chances is not None
+        else "No errors were declared, so that no chances were computed."
+    )
+    return (
+        f"Straight needle paths to the target were searched with {PROJECT} {version(PROJECT)} over {len(candidates):,} "
+        f"entry directions, θ {theta.min():g}° to {theta.max():g}° and every azimuth β of the case, in steps of "
+        f"{step:g}° (angles as in Chen et al. 2019, Eq. 10-15; {needle_words(case)}). For each direction the distance "
+        f"between the needle and each of {checked} structures to keep away from was computed exactly on their triangle "
+        f"meshes and compared with the structure's margin; a direction through a region that the images or labels do "
+        f"not show was refused as unknown. {arm} {chances} Every input is listed below with its SHA-256. "
+        "Breathing, needle bending and tissue motion were not modelled."
+    )
