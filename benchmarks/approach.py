@@ -20,6 +20,8 @@ import numpy as np
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.gantry import gantry_boxes
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, slowed
+from puncture_twin.planning.arm.tip_speed import TipLimit
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import NoAnswerError
@@ -180,7 +182,8 @@ def measure(scene: Scene, seed: int) -> tuple[Tally, Tally]:
         model, rates = scene.fast.model, path.trajectory.peaks()
         limits = (model.max_speeds, np.full(6, model.max_acceleration), np.full(6, MAX_JERK))
         peaks.append([float((rate / limit).max()) for rate, limit in zip(rates, limits, strict=True)])
-        stops.append(follow(model, path.waypoints, speed_scale=approach.APPROACH_SPEED).duration_s)
+        tip = TipLimit(scene.fast.tool.needle_length_mm, DEFAULT_SPEEDS.tip_speed_mm_s)
+        stops.append(follow(slowed(model, DEFAULT_SPEEDS), path.waypoints, tip=tip).duration_s)
     report(scene, tallies, invalid)
     room = np.percentile(clearances, [0, 50])
     print(f"  clearance least {room[0]:.1f}, median {room[1]:.1f} mm (in {1e3 * np.median(clearance_s):.0f} ms)")

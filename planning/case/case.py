@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
@@ -157,12 +158,14 @@ class RobotSettings:
         home: Shape (6,), rad, or None for the model's own.
         T_base_ct_mount: Shape (4, 4), mm, where a mount or a transform is stated, or None.
         transform: The file that states it, or None.
+        speeds: How fast its plans may move.
     """
 
     model: str
     home: Floats | None
     T_base_ct_mount: Floats | None
     transform: str | None = None
+    speeds: SpeedLimits = DEFAULT_SPEEDS
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,11 +368,12 @@ def _robot(content: CaseFile, space: Space, path: Path, files: InputFiles) -> Ro
     robot, stated = content.robot, content.registration
     home = None if robot.home_deg is None else _read_only(np.radians(np.asarray(robot.home_deg)))
     mount = None if robot.mount is None else mount_pose(robot.mount, space, path)
+    speeds = SpeedLimits(*(getattr(robot, name) for name in SpeedLimits._fields))
     if stated is not None and stated.transform is not None:
         T_file = itk_transform.parse_transform(files.content(stated.transform), path.parent / stated.transform)
         mount = _read_only(stated_base_ct(stated, T_file))
-        return RobotSettings(ur_model(robot.model).name, home, mount, stated.transform)
-    return RobotSettings(ur_model(robot.model).name, home, mount)
+        return RobotSettings(ur_model(robot.model).name, home, mount, stated.transform, speeds)
+    return RobotSettings(ur_model(robot.model).name, home, mount, speeds=speeds)
 
 
 def mount_pose(mount: MountSection, space: Space, path: Path) -> Floats:

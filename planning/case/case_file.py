@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, Strict, model_validator
 
+from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, HIGHEST
 from puncture_twin.planning.base.text_names import unprintable_texts
 from puncture_twin.planning.case.case_schema import CaseSchema, Region, check_statement, count_difference, with_count
 from puncture_twin.planning.case.errors_section import ErrorsSection
@@ -244,6 +245,20 @@ class RobotSection(Section):
     model: str = "ur3"
     home_deg: Sextuple | None = None
     mount: MountSection | None = None
+    tip_speed_mm_s: Annotated[Number, Field(ge=1, le=HIGHEST.tip_speed_mm_s)] = DEFAULT_SPEEDS.tip_speed_mm_s
+    insertion_speed_mm_s: Annotated[Number, Field(ge=0.1, le=HIGHEST.insertion_speed_mm_s)] = (
+        DEFAULT_SPEEDS.insertion_speed_mm_s
+    )
+    joint_speed_fraction: Annotated[Number, Field(ge=0.01, le=1)] = DEFAULT_SPEEDS.joint_speed_fraction
+    joint_acceleration_fraction: Annotated[Number, Field(ge=0.01, le=1)] = DEFAULT_SPEEDS.joint_acceleration_fraction
+
+    @model_validator(mode="after")
+    def _insertion_is_the_slower(self) -> Self:
+        if self.insertion_speed_mm_s > self.tip_speed_mm_s:
+            raise ValueError(
+                f"insertion_speed_mm_s {self.insertion_speed_mm_s:g} is above tip_speed_mm_s {self.tip_speed_mm_s:g}"
+            )
+        return self
 
 
 class ObstacleSection(Section):

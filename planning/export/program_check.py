@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.tip_speed import tip_rates
 from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
@@ -22,9 +23,10 @@ from puncture_twin.planning.export.program import (
     tip_poses,
     waypoint_rows,
 )
+from puncture_twin.planning.motion.follow import TIP_STEP_RAD
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.plan.plan_check import POSE_TOLERANCE_MM, STRAIGHT_TOLERANCE_MM
+from puncture_twin.planning.plan.plan_check import POSE_TOLERANCE_MM, SPEED_ROUNDING, STRAIGHT_TOLERANCE_MM
 
 SAME_BRANCH_RAD = 0.01
 """How far the joints of the straight move may end from the plan's: a hundredth of the way to another branch."""
@@ -87,8 +89,19 @@ def _check_approach(program: Program, plan: Plan, model: UrModel, where: Path) -
         share = np.abs(end - start) / np.abs(end - start).max()
         rates = share[None] * move.speed, share[None] * move.acceleration
         check_rates(model, *rates, what="approach", where=where)
+        _check_tip(model, start, end, share * move.speed * np.sign(end - start), plan, where)
     if program.moves and program.moves[-1].blend_mm != 0.0:
         raise InputError("the approach does not stop at its end", where=where, allowed="a last blend of 0")
+
+
+def _check_tip(model: UrModel, start: Floats, end: Floats, speeds: Floats, plan: Plan, where: Path) -> None:
+    """Refuse a joint move at whose peak joint speeds (6,) the tip would be too fast somewhere."""
+    steps = math.ceil(float(np.linalg.norm(end - start)) / TIP_STEP_RAD)
+    q = start + np.linspace(0.0, 1.0, steps + 1)[:, None] * (end - start)
+    fastest = float(tip_rates(model, q, speeds, plan.needle_length_mm).max())
+    if not fastest <= plan.speeds.tip_speed_mm_s * (1.0 + SPEED_ROUNDING):
+        allowed = f"at most {plan.speeds.tip_speed_mm_s:g} mm/s"
+        raise InputError(f"a joint move takes the tip to {fastest:.4g} mm/s", where=where, allowed=allowed)
 
 
 def _check_insertion(program: Program, plan: Plan, model: UrModel, where: Path) -> None:
@@ -100,6 +113,9 @@ def _check_insertion(program: Program, plan: Plan, model: UrModel, where: Path) 
         off, turned = _pose_difference(read, planned)
         if not (off <= POSE_TOLERANCE_MM and turned <= TURN_TOLERANCE_RAD):
             raise InputError(f"the {name} pose is {off:.3g} mm off", where=where, allowed=f"{POSE_TOLERANCE_MM} mm")
+    if not program.insertion_mm_s <= plan.speeds.insertion_speed_mm_s * (1.0 + SPEED_ROUNDING):
+        allowed = f"at most {plan.speeds.insertion_speed_mm_s:g} mm/s"
+        raise InputError(f"the insertion at {program.insertion_mm_s:.4g} mm/s", where=where, allowed=allowed)
     turned = _pose_difference(program.T_base_standoff, program.T_base_target)[1]
     if not turned <= TURN_TOLERANCE_RAD:
         raise InputError(f"the needle turns by {turned:.3g} rad on its way", where=where, allowed="a straight way")

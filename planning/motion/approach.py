@@ -15,6 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits, slowed
+from puncture_twin.planning.arm.tip_speed import TipLimit
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.collision.checker import Contact, StateChecker
@@ -66,9 +68,6 @@ SHORT_ENOUGH = 1.3
 
 ATTEMPTS = 6
 """Ways that the finer check may refuse; for FCL alone each next one is planned at half the resolution."""
-
-APPROACH_SPEED = 0.5
-"""Fraction of the joints' speed limits on the way to the patient."""
 
 CUT_FRACTION = 0.5
 """A corner is rounded from the middle of its shorter segment on: the farther, the faster."""
@@ -126,6 +125,7 @@ def plan_approach(
     *,
     seed: int,
     max_samples: int = MAX_SAMPLES,
+    speeds: SpeedLimits = DEFAULT_SPEEDS,
 ) -> Approach:
     """Plan from home to the goal that the shortest path found leads to.
 
@@ -135,6 +135,7 @@ def plan_approach(
         q_goals: Shape (6,) or (g, 6), rad, within the joint limits.
         seed: Of OMPL's generator. Same seed, same motion.
         max_samples: Of the planner, in each of its runs.
+        speeds: How fast joints and the needle's tip may move.
 
     Raises:
         InputError: If home or a goal is not six finite angles within the limits, or the scale makes no sense.
@@ -152,7 +153,7 @@ def plan_approach(
             raise NoAnswerError(_why_none(path, len(goals), len(open_goals), seed) + refused)
         cuts = _cuts(contact_of, path.waypoints)
         for rounding in (cuts, np.zeros_like(cuts)) if cuts.any() else (cuts,):
-            trajectory = follow(checker.model, path.waypoints, rounding, speed_scale=APPROACH_SPEED)
+            trajectory = _timed(checker, path.waypoints, rounding, speeds)
             checked = dense_states(checker, trajectory.q, RESOLUTION_RAD / FINER)
             contact = first_contact(checker, checked)
             if contact is None:
@@ -161,6 +162,12 @@ def plan_approach(
         assert contact is not None
         refused = f"; before that, on a closer look {contact.body} touched {contact.other} on the way"
     raise NoAnswerError(f"approach not found: {ATTEMPTS} paths were refused (seed {seed}){refused}")
+
+
+def _timed(checker: StateChecker, waypoints: Floats, cuts: Floats, speeds: SpeedLimits) -> Trajectory:
+    """The motion in time, as fast as the limits allow."""
+    tip = TipLimit(checker.tool.needle_length_mm, speeds.tip_speed_mm_s)
+    return follow(slowed(checker.model, speeds), waypoints, cuts, tip=tip)
 
 
 def _segment_check(checker: StateChecker, resolution_rad: float) -> SegmentContact:

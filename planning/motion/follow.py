@@ -12,11 +12,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from puncture_twin.planning.arm.tip_speed import TipLimit, tip_rates
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
@@ -32,6 +34,13 @@ STANDSTILL_RAD = 1e-12
 
 SAME_STEP = 1e-9
 """Of a sample: a duration that is a whole number of samples but for this is one."""
+
+TIP_STEP_RAD = 0.005
+"""Of the samples at which the tip's speed along a path is looked at; between two of them it rises by at most 5e-5 of
+what the arm's whole reach would have: h^2 / 8 times the second derivative."""
+
+TIP_SHARE = 0.999
+"""Of the tip's speed limit that is used: what samples may miss."""
 
 TINY = 1e-30
 """Below every rate that means anything: keeps divisions finite."""
@@ -75,6 +84,20 @@ class _Round(NamedTuple):
 _Stretch = _Straight | _Round
 
 
+class _Slow(NamedTuple):
+    """What slows an arm down beside its own limits."""
+
+    speed_scale: float
+    tip: TipLimit | None
+
+    def by_tip(self, model: UrModel, q: Floats, directions: Floats) -> float:
+        """The highest speed along a path through q (m, 6) that keeps the tip's limit, per unit of ``directions``."""
+        if self.tip is None:
+            return math.inf
+        fastest = float(tip_rates(model, q, directions, self.tip.tip_mm).max())
+        return TIP_SHARE * self.tip.speed_mm_s / max(fastest, TINY)
+
+
 def rounded(corner: Floats, before: Floats, after: Floats, cut: float, fraction: Floats) -> Floats:
     """The curve past a corner.
 
@@ -93,7 +116,14 @@ def rounded(corner: Floats, before: Floats, after: Floats, cut: float, fraction:
     return np.asarray(corner + cut * (along[:, None] * before + across[:, None] * after))
 
 
-def follow(model: UrModel, waypoints: Floats, cuts: Floats | None = None, *, speed_scale: float = 1.0) -> Trajectory:
+def follow(
+    model: UrModel,
+    waypoints: Floats,
+    cuts: Floats | None = None,
+    *,
+    speed_scale: float = 1.0,
+    tip: TipLimit | None = None,
+) -> Trajectory:
     """Run straight joint segments as fast as the limits allow, past rounded corners, from rest to rest.
 
     Args:
@@ -102,6 +132,7 @@ def follow(model: UrModel, waypoints: Floats, cuts: Floats | None = None, *, spe
         cuts: Shape (k - 2,), rad: how far from each waypoint between the ends its rounding begins; 0 stops there. None
             stops at all of them.
         speed_scale: Share of the speed limits to use, above 0, at most 1.
+        tip: How fast the needle's tip may move; None for as fast as the joints take it.
 
     Returns:
         Samples every ``SAMPLE_S``, every stop among them.
@@ -119,7 +150,7 @@ def follow(model: UrModel, waypoints: Floats, cuts: Floats | None = None, *, spe
     if len(waypoints) == 1:
         return Trajectory(np.zeros(1), waypoints)
     straight = _straight_lengths(waypoints, cuts)
-    return _sampled(waypoints, _runs(model, waypoints, cuts, straight, speed_scale))
+    return _sampled(waypoints, _runs(model, waypoints, cuts, straight, _Slow(speed_scale, tip)))
 
 
 def _straight_lengths(waypoints: Floats, cuts: Floats) -> Floats:
@@ -133,14 +164,16 @@ def _straight_lengths(waypoints: Floats, cuts: Floats) -> Floats:
     return np.asarray(straight.clip(0.0))
 
 
-def _runs(
-    model: UrModel, waypoints: Floats, cuts: Floats, straight: Floats, speed_scale: float
-) -> Iterator[list[_Stretch]]:
+def _runs(model: UrModel, waypoints: Floats, cuts: Floats, straight: Floats, slow: _Slow) -> Iterator[list[_Stretch]]:
     """From stop to stop: straight stretches (``straight`` long, one a segment) and rounded corners in turn."""
     steps = np.diff(waypoints, axis=0)
     directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
-    rates = [_segment_rates(model, direction, speed_scale) for direction in directions]
-    speeds = _corner_speeds(model, directions, cuts, straight, rates)
+    rates = [_segment_rates(model, *ends, slow) for ends in pairwise(waypoints)]
+    round_speeds = [
+        _round_speed(model, waypoints[at + 1], directions[at], directions[at + 1], cut, slow)
+        for at, cut in enumerate(cuts.tolist())
+    ]
+    speeds = _corner_speeds(round_speeds, straight, rates)
     run: list[_Stretch] = []
     for at, (direction, length) in enumerate(zip(directions, straight, strict=True)):
         start = waypoints[at] + (cuts[at - 1] if at else 0.0) * direction
@@ -153,24 +186,34 @@ def _runs(
             run.append(_Round(waypoints[at + 1], direction, directions[at + 1], float(cuts[at]), speeds[at + 1]))
 
 
-def _segment_rates(model: UrModel, direction: Floats, speed_scale: float) -> Rates:
-    """What the joints' limits allow along a unit direction."""
+def _segment_rates(model: UrModel, start: Floats, end: Floats, slow: _Slow) -> Rates:
+    """What the limits of joints and tip allow along a segment."""
+    length = float(np.linalg.norm(end - start))
+    direction = (end - start) / length
     fraction = np.maximum(np.abs(direction), TINY)
-    limits = (speed_scale * model.max_speeds, model.max_acceleration, MAX_JERK)
-    return Rates(*(float((limit / fraction).min()) for limit in limits))
+    limits = (slow.speed_scale * model.max_speeds, model.max_acceleration, MAX_JERK)
+    rates = Rates(*(float((limit / fraction).min()) for limit in limits))
+    along = np.linspace(0.0, 1.0, math.ceil(length / TIP_STEP_RAD) + 1)[:, None]
+    return rates._replace(speed=min(rates.speed, slow.by_tip(model, start + along * (end - start), direction)))
 
 
-def _corner_speeds(
-    model: UrModel, directions: Floats, cuts: Floats, straight: Floats, rates: list[Rates]
-) -> list[float]:
+def _round_speed(model: UrModel, corner: Floats, before: Floats, after: Floats, cut: float, slow: _Slow) -> float:
+    """What acceleration, jerk and tip allow past a corner; 0 where the arm stops."""
+    if cut == 0.0:
+        return 0.0
+    turn = max(TINY, float(np.abs(after - before).max()))
+    by_acceleration = math.sqrt(model.max_acceleration * cut / (0.75 * turn))
+    by_jerk = (MAX_JERK * cut * cut / (1.5 * turn)) ** (1.0 / 3.0)
+    x = np.linspace(0.0, 1.0, math.ceil(2.0 * cut / TIP_STEP_RAD) + 2)
+    f = (3.0 * x**2 - 2.0 * x**3)[:, None]
+    by_tip = slow.by_tip(model, rounded(corner, before, after, cut, x), (1.0 - f) * before + f * after)
+    return min(by_acceleration, by_jerk, by_tip)
+
+
+def _corner_speeds(round_speeds: list[float], straight: Floats, rates: list[Rates]) -> list[float]:
     """The speed at each waypoint, 0 at the ends: what the corner allows, and what the segments can change it to."""
-    speeds = [0.0]
-    for at, cut in enumerate(cuts.tolist()):
-        turn = max(TINY, float(np.abs(directions[at + 1] - directions[at]).max()))
-        by_acceleration = math.sqrt(model.max_acceleration * cut / (0.75 * turn))
-        by_jerk = (MAX_JERK * cut * cut / (1.5 * turn)) ** (1.0 / 3.0)
-        speeds.append(min(by_acceleration, by_jerk, rates[at].speed, rates[at + 1].speed))
-    speeds.append(0.0)
+    beside = [min(before.speed, after.speed) for before, after in pairwise(rates)]
+    speeds = [0.0, *(min(pair) for pair in zip(round_speeds, beside, strict=True)), 0.0]
     for at in range(len(straight)):
         speeds[at + 1] = min(
             speeds[at + 1], reachable_speed(speeds[at], speeds[at + 1], float(straight[at]), rates[at])

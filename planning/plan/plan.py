@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.motion.trajectory import Trajectory
@@ -34,6 +35,7 @@ class Plan:
         insertion: From standoff to the target.
         clearance_mm: Per phase, the least distance that was found: ``approach`` and ``insertion`` of arm and holder
             to patient and room, ``needle`` to the nearest structure with a margin.
+        speeds: What it keeps: the case's. A file that does not say so keeps the default.
     """
 
     case_name: str
@@ -53,6 +55,7 @@ class Plan:
     approach: Trajectory
     insertion: Trajectory
     clearance_mm: Mapping[str, float]
+    speeds: SpeedLimits = DEFAULT_SPEEDS
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""

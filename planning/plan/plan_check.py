@@ -8,7 +8,9 @@ import numpy as np
 
 from puncture_twin.planning.arm.insertion import flange_at, needle_lines
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.arm.speed_limits import slowed
+from puncture_twin.planning.arm.tip_speed import tip_speeds
+from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import differing_input
@@ -39,9 +41,6 @@ ROLL_TOLERANCE_RAD = 1e-4
 ANGLE_ROUNDING = 1e-12
 """Share of a turn by which degrees and radians round."""
 
-INSERTION_MM_S = 10.0
-"""Tip speed of the insertion: a needle is driven slowly, and an operator must be able to stop it."""
-
 SPEED_ROUNDING = 1e-3
 """A time law that just keeps a speed may exceed it by its sampling."""
 
@@ -50,7 +49,10 @@ AGREE = "T_base_ct, target_ct_mm, outward_ct, needle_length_mm, standoff_mm and 
 
 def rate_limits(model_name: str) -> Peaks:
     """The highest rates of an arm's joints in a plan, rad and s."""
-    model = ur_model(model_name)
+    return _rates(ur_model(model_name))
+
+
+def _rates(model: UrModel) -> Peaks:
     return Peaks(model.max_speeds, np.full(6, model.max_acceleration), np.full(6, MAX_JERK))
 
 
@@ -154,21 +156,21 @@ def _between(q: Floats, path: Path) -> Floats:
 def _check_speeds(plan: Plan, path: Path) -> None:
     """Refuse joints beyond their limits, rates beyond the plan's own limits, or a tip that is too fast."""
     model = ur_model(plan.model)
-    poses = flange_pose(model, plan.insertion.q)
-    tips = poses[:, :3, 3] + plan.needle_length_mm * poses[:, :3, 2]
-    speed = float((np.linalg.norm(np.diff(tips, axis=0), axis=1) / np.diff(plan.insertion.times_s)).max(initial=0.0))
-    if not speed <= INSERTION_MM_S * (1 + SPEED_ROUNDING):
-        raise InputError(
-            f"the insertion drives the tip at {speed:.3g} mm/s", where=path, allowed=f"at most {INSERTION_MM_S:g} mm/s"
-        )
-    for phase, part in (("approach", plan.approach), ("insertion", plan.insertion)):
+    for phase, part, limit in (
+        ("approach", plan.approach, plan.speeds.tip_speed_mm_s),
+        ("insertion", plan.insertion, plan.speeds.insertion_speed_mm_s),
+    ):
+        speed = float(tip_speeds(model, part.q, part.times_s, plan.needle_length_mm).max(initial=0.0))
+        if not speed <= limit * (1 + SPEED_ROUNDING):
+            what = f"the {phase} drives the tip at {speed:.3g} mm/s"
+            raise InputError(what, where=path, allowed=f"at most {limit:g} mm/s; plan again")
         if not model.within_limits(part.q).all():
             raise InputError(
                 f"the {phase} leaves the joint limits", where=path, allowed="angles within the arm's limits"
             )
-        peaks, limits = part.peaks(), rate_limits(plan.model)
+        peaks, limits = part.peaks(), _rates(slowed(model, plan.speeds))
         for rate in ("speed", "acceleration"):  # a jerk wears the arm, and does not stop it
             most = float((getattr(peaks, rate) / getattr(limits, rate)).max())
             if not most <= 1 + SPEED_ROUNDING:
                 what = f"the {phase} has {most:.3g} times the {rate} that a joint may have"
-                raise InputError(what, where=path, allowed="the arm's limits of speed and acceleration")
+                raise InputError(what, where=path, allowed="the limits of the arm and of [robot]; plan again")

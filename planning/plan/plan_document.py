@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, HIGHEST, SpeedLimits
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
@@ -40,7 +41,7 @@ PLAN_ALLOWED = f"a plan.json of version {PLAN_VERSION}; plan again"
 NAMES = (
     *("version", "case", "inputs", "seed", "robot", "T_base_ct", "expected_target_error_mm", "theta_deg", "beta_deg"),
     *("entry_ct_mm", "target_ct_mm", "outward_ct", "roll_deg", "standoff_mm", "needle_length_mm", "limits"),
-    *("approach", "insertion", "clearance_mm"),
+    *("speed_limits", "approach", "insertion", "clearance_mm"),
 )
 PHASE_NAMES = ("times_s", "q_rad", "peaks")
 CLEARANCE_NAMES = ("approach", "insertion", "needle")
@@ -76,6 +77,7 @@ def write_plan(plan: Plan, path: Path) -> None:
         "standoff_mm": plan.standoff_mm,
         "needle_length_mm": plan.needle_length_mm,
         "limits": _rates_document(rate_limits(plan.model)),
+        "speed_limits": plan.speeds._asdict(),
         "approach": _trajectory_document(plan.approach),
         "insertion": _trajectory_document(plan.insertion),
         "clearance_mm": {phase: or_null(value) for phase, value in plan.clearance_mm.items()},
@@ -148,7 +150,8 @@ def _check_names(document: dict[str, Any], path: Path) -> None:
         *((f"inputs.{at}.", one, INPUT_NAMES) for at, one in enumerate(document["inputs"])),
     ):
         # a phase whose clearance is not stated is for whoever has the case to miss
-        for name in sorted(set(part) - set(known) if part is document["clearance_mm"] else set(part) ^ set(known)):
+        optional = set(known) if part is document["clearance_mm"] else {"speed_limits"}
+        for name in sorted(set(part) ^ set(known) - (optional - set(part))):
             what = "is not known" if name in part else "is missing"
             raise InputError(f"key '{where}{name}' {what}", where=path, allowed=", ".join(known))
 
@@ -177,7 +180,20 @@ def _plan(document: dict[str, Any], path: Path) -> Plan:
         approach=field(document, "approach", _trajectory),
         insertion=field(document, "insertion", _trajectory),
         clearance_mm=field(document, "clearance_mm", _clearances),
+        speeds=field({"speed_limits": None, **document}, "speed_limits", _speed_limits),
     )
+
+
+def _speed_limits(value: Any) -> SpeedLimits:
+    """What a plan says that it keeps; plans from before it was said keep the default, or are refused."""
+    if value is None:
+        return DEFAULT_SPEEDS
+    if set(value) != set(SpeedLimits._fields):
+        raise ValueError(f"speed_limits are {', '.join(SpeedLimits._fields)}")
+    speeds = SpeedLimits(*(number(value[name]) for name in SpeedLimits._fields))
+    if not all(0.0 < speed <= most for speed, most in zip(speeds, HIGHEST, strict=True)):
+        raise ValueError(f"speed_limits are above 0 and at most {', '.join(f'{most:g}' for most in HIGHEST)}")
+    return speeds
 
 
 def _clearances(value: Any) -> Mapping[str, float]:

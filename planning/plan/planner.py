@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from puncture_twin.planning.arm.speed_limits import slowed
 from puncture_twin.planning.base.arrays import Ints
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.reasons import Reason
@@ -15,7 +16,6 @@ from puncture_twin.planning.motion.approach import plan_approach
 from puncture_twin.planning.motion.follow import drive_smoothly
 from puncture_twin.planning.plan.motion import motion_contact, phase_clearances
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.plan.plan_check import INSERTION_MM_S
 from puncture_twin.planning.reach.answer import ReachAnswer
 from puncture_twin.planning.reach.goals import approach_goals
 from puncture_twin.planning.search.arm_reach import reach_request
@@ -85,9 +85,9 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
     assert context.reach is not None and context.placement is not None  # the caller has refused this
     case, checker = context.case, context.reach.checker
     request = reach_request(case, candidates, row, context.reach.T_base_ct)
-    home = home_configuration(case)
+    home, speeds = home_configuration(case), case.robot.speeds
     goals = _within_limits(context, candidates, row, approach_goals(checker, request, home))
-    approach = plan_approach(checker, home, np.array([goal.insertion_q[0] for goal in goals]), seed=seed)
+    approach = plan_approach(checker, home, np.array([goal.insertion_q[0] for goal in goals]), seed=seed, speeds=speeds)
     answer = goals[approach.goal_index]
     error = (
         context.placement.target_error_mm
@@ -111,9 +111,13 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
         needle_length_mm=case.needle.length_mm,
         approach=approach.trajectory,
         insertion=drive_smoothly(
-            checker.model, answer.insertion_q, answer.insertion_depth_mm, max_tip_speed_mm_s=INSERTION_MM_S
+            slowed(checker.model, speeds),
+            answer.insertion_q,
+            answer.insertion_depth_mm,
+            max_tip_speed_mm_s=speeds.insertion_speed_mm_s,
         ),
         clearance_mm={"needle": float(candidates.clearance.least[row])},
+        speeds=speeds,
     )
     touched = motion_contact(plan, checker)
     if touched is not None:

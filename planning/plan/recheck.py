@@ -92,6 +92,7 @@ def _check_labels(plan: Plan, context: CaseContext, candidates: Candidates, path
         ),
         ("expected_target_error_mm", plan.expected_target_error_mm, error),
         ("clearance_mm.needle", plan.clearance_mm.get("needle", np.nan), candidates.clearance.least[0]),
+        ("speed_limits", plan.speeds, case.robot.speeds),
         ("the approach's first row", plan.approach.q[0], home_configuration(case)),
     )
     for name, said, known in stated:

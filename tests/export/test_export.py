@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from puncture_twin.planning.arm.insertion import every_branch, needle_lines
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, jacobian, nearest_within_limits
 from puncture_twin.planning.arm.links import JOINT_NAMES
+from puncture_twin.planning.arm.speed_limits import SpeedLimits
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import Input
@@ -51,6 +52,10 @@ def tip_poses(model, q, length):
     return poses
 
 
+FAST = SpeedLimits(1000.0, 10.0, 1.0, 1.0)
+"""What these plans keep: the joints' own limits are what is tested."""
+
+
 def plan_to(waypoints, *, speed_scale=0.5, tip_mm_s=10.0, model=UR3):
     """A plan over some waypoints to the standoff at BENT, and 60 mm straight in."""
     tip = tip_poses(model, BENT, TOOL.needle_length_mm)
@@ -80,6 +85,7 @@ def plan_to(waypoints, *, speed_scale=0.5, tip_mm_s=10.0, model=UR3):
         approach=follow(model, np.concatenate([waypoints, way[:1]]), speed_scale=speed_scale),
         insertion=drive_smoothly(model, way, depths, max_tip_speed_mm_s=tip_mm_s),
         clearance_mm={"approach": 12.0},
+        speeds=FAST if speed_scale <= 0.5 else FAST._replace(tip_speed_mm_s=5000.0),
     )
 
 

@@ -10,12 +10,14 @@ import trimesh
 from hypothesis import given, settings, strategies as st
 
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits, slowed
+from puncture_twin.planning.arm.tip_speed import TipLimit, tip_rates, tip_speeds
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.collision.checker import Box, CellChecker, Contact, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.motion.approach import APPROACH_SPEED, FINER, RESOLUTION_RAD, Approach, plan_approach
+from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, Approach, plan_approach
 from puncture_twin.planning.motion.follow import MAX_JERK, drive_smoothly, follow, rounded
 from puncture_twin.planning.motion.path_check import (
     CLEARANCE_STEP_MM,
@@ -67,7 +69,9 @@ def assert_sound(checker: CellChecker, path: Approach, home: np.ndarray, goals: 
     assert np.linalg.norm(np.diff(path.checked_q, axis=0), axis=1).max() <= RESOLUTION_RAD / FINER + 1e-12
     assert np.abs(path.checked_q[:, None] - q[::7]).max(axis=2).min(axis=0).max() < 1e-12
     peaks = path.trajectory.peaks()
-    assert (peaks.speed <= APPROACH_SPEED * UR3.max_speeds * (1 + 1e-6)).all()
+    tips = tip_speeds(UR3, q, times, TOOL.needle_length_mm)
+    assert tips.max(initial=0.0) <= DEFAULT_SPEEDS.tip_speed_mm_s * (1 + 1e-9)
+    assert (peaks.speed <= DEFAULT_SPEEDS.joint_speed_fraction * UR3.max_speeds * (1 + 1e-6)).all()
     assert (peaks.acceleration <= UR3.max_acceleration * (1 + 1e-6)).all() and (peaks.jerk <= MAX_JERK * 1.001).all()
     for moment in np.random.default_rng(0).uniform(0.0, times[-1], 150):
         state = path.trajectory.at(moment)
@@ -95,7 +99,8 @@ def test_a_wall_is_gone_around(kind: type[CellChecker]) -> None:
     path = plan_approach(checker, LEFT, RIGHT, seed=1)
     assert path_length(path.waypoints) > np.linalg.norm(RIGHT - LEFT)
     assert len(path.cuts) == len(path.waypoints) - 2 and path.cuts.max() > 0.0
-    assert path.trajectory.duration_s < follow(UR3, path.waypoints, speed_scale=APPROACH_SPEED).duration_s
+    slow_arm, tip = slowed(UR3, DEFAULT_SPEEDS), TipLimit(TOOL.needle_length_mm, DEFAULT_SPEEDS.tip_speed_mm_s)
+    assert path.trajectory.duration_s < follow(slow_arm, path.waypoints, tip=tip).duration_s
     clearance = least_clearance(checker, path.checked_q)
     assert clearance.boxes.mm > 0.0 and np.isinf(clearance.patient.mm)
     assert_sound(checker, path, LEFT, RIGHT)
@@ -410,3 +415,44 @@ def test_time_laws_refuse_bad_numbers() -> None:
         drive_smoothly(UR3, two, np.array([1.0, 0.0]), max_tip_speed_mm_s=1.0)
     with pytest.raises(InputError, match="no joint moves"):
         drive_smoothly(UR3, np.stack([LEFT, LEFT]), np.array([0.0, 1.0]), max_tip_speed_mm_s=1.0)
+
+
+@given(waypoints=rows, share=st.floats(0.0, 0.5), limit=st.floats(20.0, 1000.0), tip_mm=st.floats(0.0, 400.0))
+@settings(max_examples=25, deadline=None)
+def test_the_tip_never_exceeds_its_limit(waypoints: np.ndarray, share: float, limit: float, tip_mm: float) -> None:
+    """By forward kinematics of the samples, whatever the corners."""
+    lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
+    if not lengths.all():
+        return
+    cuts = share * np.minimum(lengths[:-1], lengths[1:])
+    slow = follow(UR3, waypoints, cuts, tip=TipLimit(tip_mm, limit))
+    assert tip_speeds(UR3, slow.q, slow.times_s, tip_mm).max() <= limit * (1 + 1e-9)
+    assert_within(slow, 1.0)
+
+
+def test_a_joint_alone_takes_the_tip_to_the_limit() -> None:
+    """The pan joint of a stretched arm: the limit is reached to a thousandth, so it is no more careful than it says."""
+    two = np.array([[0.0] * 6, [1.5, 0, 0, 0, 0, 0]])
+    slow = follow(UR3, two, tip=TipLimit(200.0, 250.0))
+    assert tip_speeds(UR3, slow.q, slow.times_s, 200.0).max() == pytest.approx(250.0, rel=3e-3)
+    assert np.array_equal(follow(UR3, two, tip=TipLimit(200.0, 5000.0)).q, follow(UR3, two).q)
+
+
+def test_the_tips_speed_is_that_of_the_samples() -> None:
+    """By the Jacobian and by differences."""
+    q, u = np.random.default_rng(3).uniform(-3.0, 3.0, (2, 20, 6))
+    step = 1e-6
+    pairs = [np.stack([a - step * b, a + step * b]) for a, b in zip(q, u, strict=True)]
+    by_differences = [tip_speeds(UR3, pair, np.array([0.0, 2.0 * step]), 150.0)[0] for pair in pairs]
+    assert tip_rates(UR3, q, u, 150.0) == pytest.approx(by_differences, rel=1e-6)
+
+
+def test_slower_limits_make_a_slower_approach() -> None:
+    """Less of the tip's speed, or of the joints', takes longer and is kept."""
+    checker = FastChecker(UR3, TOOL, [floor(), wall()])
+    usual = plan_approach(checker, LEFT, RIGHT, seed=1).trajectory
+    for speeds in (SpeedLimits(tip_speed_mm_s=100.0), SpeedLimits(joint_speed_fraction=0.05)):
+        path = plan_approach(checker, LEFT, RIGHT, seed=1, speeds=speeds).trajectory
+        assert path.duration_s > usual.duration_s
+        assert tip_speeds(UR3, path.q, path.times_s, TOOL.needle_length_mm).max() <= speeds.tip_speed_mm_s
+        assert (path.peaks().speed <= speeds.joint_speed_fraction * UR3.max_speeds * (1 + 1e-6)).all()
