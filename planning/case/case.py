@@ -62,6 +62,9 @@ MASK_ROLE = "mask "
 AXES_PARALLEL = 0.999
 """|cos| above which a mount's x and z axes do not span a frame (2.6 degrees)."""
 
+LIKE_METRES = 5.0
+"""A base that stands nearer to the CT's origin than this, and not on it, is one in metres: no arm reaches farther."""
+
 AXES_SQUARE_DEG = 1.0
 """A mount's x and z axes may differ from a right angle by this much: what rounding to two digits leaves. More is
 another rotation than was meant, and 1 degree moves the needle's tip by 9 mm at the arm's reach of half a metre."""
@@ -380,7 +383,7 @@ def mount_pose(mount: MountSection, space: Space, path: Path) -> Floats:
     """T_base_ct, shape (4, 4), from the base's origin and axes, as a case states them in its own space.
 
     Raises:
-        InputError: The axes are parallel or zero, or not at a right angle.
+        InputError: The axes are parallel or zero, or not at a right angle, or the position looks like metres.
     """
     x, z = (to_lps(np.asarray([v], dtype=float), space)[0] for v in (mount.x_axis, mount.z_axis))
     lengths = np.linalg.norm(x), np.linalg.norm(z)
@@ -392,6 +395,13 @@ def mount_pose(mount: MountSection, space: Space, path: Path) -> Floats:
             f"robot.mount: x_axis and z_axis are {angle:.1f} degrees apart",
             where=path,
             allowed=f"a right angle, to {AXES_SQUARE_DEG:g} degree",
+        )
+    far = float(np.linalg.norm(mount.position_mm))
+    if 0.0 < far < LIKE_METRES:
+        raise InputError(
+            f"robot.mount: position_mm is {far:g} mm from the origin, which would be a base within the patient",
+            where=path,
+            allowed="millimetres (these look like metres)",
         )
     T_ct_base = pose(frame_of_axes(z, x), to_lps(np.asarray([mount.position_mm]), space)[0])
     return _read_only(np.linalg.inv(T_ct_base))
