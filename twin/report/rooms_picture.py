@@ -1,4 +1,4 @@
-"""``rooms.png``: where the tips of many rooms ended, in the needle's own frame, over what was predicted."""
+"""``rooms.png``: where the tips of many rooms ended, and how often, beside what was predicted."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.twin.report.palette import PNG_LEVEL
 
-FIGURE_INCHES, DPI = (13.2, 4.7), 110
+FIGURE_INCHES, DPI = (17.2, 4.7), 110
 MOST_POINTS = 4000
 """Of a cloud: more hide one another."""
 
@@ -27,6 +27,12 @@ BINS = 40
 REGION = 0.95
 CROWDED = 0.6
 """Radii of the ellipse that stay free around it."""
+
+LEVELS = np.linspace(0.05, 0.95, 19)
+"""Predicted chances at which the rooms are counted: so far from the target the tip should be within this often."""
+
+TWO_SIDED = 1.96
+"""Standard errors that hold 95 % of what chance alone does."""
 
 
 def needle_frame(outward_ct: Floats) -> Floats:
@@ -48,13 +54,14 @@ def draw_rooms_picture(found: Any, path: Path) -> None:
     R = needle_frame(found.puncture.outward_ct)
     error, cov = found.error_ct @ R.T, R @ found.cov_ct @ R.T
     figure = Figure(figsize=FIGURE_INCHES, dpi=DPI, facecolor="white", layout="constrained")
-    side, along, sizes = figure.subplots(1, 3)
+    side, along, sizes, chances = figure.subplots(1, 4)
     _cloud(side, error, cov, found.in_region, (0, 1), ("lateral x, mm", "lateral y, mm"))
     side.set_title("tip in the patient, seen along the needle", fontsize=10)
     _cloud(along, error, cov, found.in_region, (0, 2), ("lateral x, mm", "depth, mm (down: too deep)"))
     along.invert_yaxis()
     along.set_title("seen from the side", fontsize=10)
     _histogram(sizes, found)
+    _reliability(chances, found)
     figure.suptitle(
         f"{len(found):,} rooms, seed {found.seed}: {100 * found.in_region.mean():.1f} % inside of the predicted 95 % "
         f"ellipsoid; rms {found.realised_rms_mm:.2f} mm, predicted {found.predicted_rms_mm:.2f} mm",
@@ -108,3 +115,27 @@ def _histogram(axes: Axes, found: Any) -> None:
     axes.set_ylabel("rooms")
     axes.set_title("tip error", fontsize=10)
     axes.legend(fontsize=8)
+
+
+def _reliability(axes: Axes, found: Any) -> None:
+    """How often it happened over how often it was predicted: the tip within a radius, the target hit, each touch."""
+    sizes = np.sort(found.tip_error_mm)
+    radii = np.geomspace(0.02, 5.0, 400) * found.predicted_rms_mm
+    predicted = np.array([hit_in_ball(found.cov_ct[None], radius)[0] for radius in radii.tolist()])
+    within = np.searchsorted(sizes, np.interp(LEVELS, predicted, radii), side="right") / len(found)
+    fine = np.linspace(0, 1, 101)
+    spread = TWO_SIDED * np.sqrt(fine * (1 - fine) / len(found))
+    axes.fill_between(fine, fine - spread, fine + spread, color="0.85", lw=0, label="what chance alone does, 95 %")
+    axes.plot([0, 1], [0, 1], color=PREDICTED, lw=1.0)
+    axes.scatter(LEVELS, within, s=16, c=WITHIN, label="tip within a radius", zorder=3)
+    axes.scatter([found.p_hit], [found.hit.mean()], s=60, c=BEYOND, marker="*", label="target hit", zorder=4)
+    axes.scatter(
+        found.p_touch, found.touched.mean(axis=0), s=26, c=BEYOND, marker="x", label="a structure touched", zorder=4
+    )
+    axes.set_xlim(-0.02, 1.02)
+    axes.set_ylim(-0.02, 1.02)
+    axes.set_aspect("equal")
+    axes.set_xlabel("predicted chance")
+    axes.set_ylabel("share of rooms in which it happened")
+    axes.set_title("does it come true?", fontsize=10)
+    axes.legend(fontsize=7.5, loc="upper left")

@@ -122,6 +122,7 @@ def test_the_cloud_is_drawn_in_the_needles_frame(tmp_path):
         puncture=SimpleNamespace(outward_ct=outward), error_ct=error, cov_ct=np.diag([1.0, 4.0, 0.25]), seed=0,
         in_region=np.arange(300) < 285, realised_rms_mm=2.3, predicted_rms_mm=2.29,
         tip_error_mm=np.linalg.norm(error, axis=1), __len__=lambda: 300,
+        hit=np.arange(300) < 210, p_hit=0.71, touched=np.zeros((300, 2), bool), p_touch=np.array([0.01, 0.0]),
     )  # fmt: skip
 
     class Found(SimpleNamespace):
