@@ -293,7 +293,7 @@ def _chosen(axes: Axes, candidates: Candidates, pick: Pick | None, y: float) -> 
         f"nearest: {name.replace('_', ' ') or 'none'}, {number(clearance, 1, 'mm')}",
     )
     box = {"facecolor": "#eef7f2", "edgecolor": "#00684a", "boxstyle": "round,pad=0.5"}
-    axes.text(0.02, y + 0.02, "\n".join(lines), fontsize=11, va="top", linespacing=1.4, bbox=box)
+    axes.text(0.02, y + 0.02, "\n".join(lines), fontsize=10, va="top", linespacing=1.4, bbox=box)
     return y + 0.12
 
 
