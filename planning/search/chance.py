@@ -39,7 +39,7 @@ def with_chances(
     engine: ClearanceEngine,
     found: Candidates,
     model: ChanceModel | None,
-    axes: AxisDistances,
+    axes: AxisDistances | None = None,
 ) -> Candidates:
     """Compute the chances of all candidates that geometry and reach left, and reject those beyond the case's limits.
 
@@ -49,7 +49,7 @@ def with_chances(
         engine: Prepared for the meshes of ``anatomy.checked``.
         found: Checked against organs and arm.
         model: None where the pose's error is not known: the chances are blank.
-        axes: What ``engine`` measured of the candidates.
+        axes: What ``engine`` measured of the candidates; None measures those that are left again.
 
     Raises:
         InputError: A limit that nothing can be held against.
@@ -65,7 +65,9 @@ def with_chances(
         return replace(found, chances=blank)
     parts = [rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)]
     outward, q = found.outward_ct, found.arm.q_insertion
-    arrays = [chances_of(case, anatomy, engine, model, outward[part], q[part], axes.at(part)) for part in parts]
+    measured = (None if axes is None else axes.at(part) for part in parts)
+    asked = zip(parts, measured, strict=True)
+    arrays = [chances_of(case, anatomy, engine, model, outward[part], q[part], known) for part, known in asked]
     values = {name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]}
     filled = {name: getattr(blank, name).copy() for name in values}
     for name, value in values.items():

@@ -48,7 +48,7 @@ def search(
         chance: Of the case's declared errors; None leaves the chances blank.
         progress: Called with (candidates checked, candidates to check) while the arm is checked.
     """
-    axes = organ_distances(case, anatomy, engine, directions)
+    axes = None if chance is None else organ_distances(case, anatomy, engine, directions)
     found = with_grid_cone(organ_candidates(case, anatomy, engine, directions, axes))
     if reach is not None:
         found = with_reach(case, found, reach, progress)
