@@ -1,14 +1,5 @@
 from .angle_grid import AngleGrid as AngleGrid
-from .case import (
-    Axis as Axis,
-    Case as Case,
-    Gantry as Gantry,
-    Needle as Needle,
-    Obstacle as Obstacle,
-    axes_frame as axes_frame,
-    load_case as load_case,
-    mount_pose as mount_pose,
-)
+from .case import Case as Case, load_case as load_case
 from .case_file import (
     MountBounds as MountBounds,
     MountName as MountName,
@@ -29,6 +20,8 @@ from .entry import (
     view_frame as view_frame,
 )
 from .errors import ArmUncertainty as ArmUncertainty, ErrorModel as ErrorModel
+from .mount import Axis as Axis, axes_frame as axes_frame, mount_pose as mount_pose
+from .settings import Gantry as Gantry, Needle as Needle, Obstacle as Obstacle
 from .toml_types import (
     Coordinate as Coordinate,
     Degrees180 as Degrees180,

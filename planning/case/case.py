@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits
+from puncture_twin.planning.arm.speed_limits import SpeedLimits
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
 from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.case.case_file import (
-    AIR_HU,
-    DENSE_HU,
     CaseFile,
-    EntryAxes,
     GantrySection,
-    MountSection,
     PlaceSection,
     RankingSection,
     RehearsalSection,
@@ -35,140 +29,30 @@ from puncture_twin.planning.case.entry import entry_frame, view_frame
 from puncture_twin.planning.case.errors import Cells, ErrorModel, error_model
 from puncture_twin.planning.case.errors_section import ErrorsSection
 from puncture_twin.planning.case.html import case_html
+from puncture_twin.planning.case.mount import axes_frame, mount_pose
+from puncture_twin.planning.case.named_files import MASK_ROLE, named_files
 from puncture_twin.planning.case.registration_section import (
     NO_RESIDUALS,
     MarkerSection,
     RegistrationSection,
     stated_base_ct,
 )
-from puncture_twin.planning.case.toml_types import Anatomical
+from puncture_twin.planning.case.settings import (
+    CtSettings,
+    Gantry,
+    Needle,
+    Obstacle,
+    RobotSettings,
+    SearchSettings,
+)
 from puncture_twin.planning.case.whole_case import wholeness_warnings
 from puncture_twin.planning.formats import itk_transform
-from puncture_twin.planning.formats.labels import naming
-from puncture_twin.planning.formats.labels.mask_folder import mask_files, structure_name
-from puncture_twin.planning.formats.meshes import mesh_files as meshes
-from puncture_twin.planning.formats.points import point_files as points
+from puncture_twin.planning.formats.labels.mask_folder import structure_name
 from puncture_twin.planning.formats.points.point_files import parse_points
-from puncture_twin.planning.formats.volumes import volume_files as volumes
-from puncture_twin.planning.geometry.rigid import frame_of_axes, pose
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 ALLOWED_CASE = "a TOML case file with schema = 1 or 2, or a folder with case.toml"
-
-
-MASK_ROLE = "mask "
-"""How the role of a mask begins; its structure's name follows."""
-
-AXES_PARALLEL = 0.999
-"""|cos| above which a mount's x and z axes do not span a frame (2.6 degrees)."""
-
-LIKE_METRES = 5.0
-"""A base that stands nearer to the CT's origin than this, and not on it, is one in metres: no arm reaches farther."""
-
-AXES_SQUARE_DEG = 1.0
-"""A mount's x and z axes may differ from a right angle by this much: what rounding to two digits leaves. More is
-another rotation than was meant, and 1 degree moves the needle's tip by 9 mm at the arm's reach of half a metre."""
-
-
-@dataclass(frozen=True)
-class Needle:
-    """The needle on the flange; lengths in mm, from the tip."""
-
-    length_mm: float
-    shaft_mm: float
-    diameter_mm: float
-    standoff_mm: float | None
-    skin_gap_mm: float
-    holder_diameter_mm: float
-
-    @property
-    def radius_mm(self) -> float:
-        """Half the diameter."""
-        return self.diameter_mm / 2
-
-
-@dataclass(frozen=True)
-class SearchSettings:
-    """The grid of directions, the limit at the skin and those of the chances; radians.
-
-    Attributes:
-        min_hit: Least chance to hit the target; None sets no limit.
-        max_touch: Greatest chance to touch any one structure; None sets no limit.
-        max_touch_of: The same for single structures, by name, instead.
-    """
-
-    theta: tuple[float, float]
-    beta: tuple[float, float]
-    step: float
-    max_skin_angle: float
-    min_hit: float | None = None
-    max_touch: float | None = None
-    max_touch_of: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
-
-
-@dataclass(frozen=True)
-class CtSettings:
-    """The CT beside the structures.
-
-    Attributes:
-        file: Where the skin does not come from a CT, the CT's file, or None.
-        air_hu: Outside of the body, what is denser is not air.
-        dense_hu: Inside the body, what is at least so dense must belong to a structure.
-        margin_mm: Clearance that these structures demand.
-        trust_labels: Whether the inside is left to the structures alone.
-    """
-
-    file: str | None = None
-    air_hu: float = AIR_HU
-    dense_hu: float = DENSE_HU
-    margin_mm: float = 2.0
-    trust_labels: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Obstacle:
-    """A box in the room, axes parallel to its frame's."""
-
-    name: str
-    frame: str
-    center_mm: Floats
-    size_mm: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class Gantry:
-    """A wall with a round bore.
-
-    Attributes:
-        T_ct_gantry: Shape (4, 4), mm: the bore's centre; its axis is z, its top x.
-        bore_diameter_mm: Of the bore.
-        wall_mm: How far the wall reaches outward from the bore.
-        thickness_mm: Along the bore.
-    """
-
-    T_ct_gantry: Floats
-    bore_diameter_mm: float
-    wall_mm: float
-    thickness_mm: float
-
-
-@dataclass(frozen=True, eq=False)
-class RobotSettings:
-    """The arm.
-
-    Attributes:
-        model: Its name.
-        home: Shape (6,), rad, or None for the model's own.
-        T_base_ct_mount: Shape (4, 4), mm, where a mount or a transform is stated, or None.
-        transform: The file that states it, or None.
-        speeds: How fast its plans may move.
-    """
-
-    model: str
-    home: Floats | None
-    T_base_ct_mount: Floats | None
-    transform: str | None = None
-    speeds: SpeedLimits = DEFAULT_SPEEDS
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +92,7 @@ class Case:
     rehearsal: RehearsalSection
     files: InputFiles
     volumes: CaseVolumes
-    ct: CtSettings = CtSettings()
+    ct: CtSettings = field(default_factory=CtSettings)
     gantry: Gantry | None = None
     place: PlaceSection = field(default_factory=PlaceSection)
     stated_structures: int | None = None
@@ -253,7 +137,7 @@ def load_case(path: Path | str) -> Case:
     case_volumes = CaseVolumes(files, path)
     stated = files.add(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE))
     content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md")
-    for one in _named_files(content, path):
+    for one in named_files(content, path):
         if one.role in VOLUME_ROLES or one.role.startswith(MASK_ROLE):
             case_volumes.read(one.role, one.name, key=one.key)
         else:
@@ -379,34 +263,6 @@ def _robot(content: CaseFile, space: Space, path: Path, files: InputFiles) -> Ro
     return RobotSettings(ur_model(robot.model).name, home, mount, speeds=speeds)
 
 
-def mount_pose(mount: MountSection, space: Space, path: Path) -> Floats:
-    """T_base_ct, shape (4, 4), from the base's origin and axes, as a case states them in its own space.
-
-    Raises:
-        InputError: The axes are parallel or zero, or not at a right angle, or the position looks like metres.
-    """
-    x, z = (to_lps(np.asarray([v], dtype=float), space)[0] for v in (mount.x_axis, mount.z_axis))
-    lengths = np.linalg.norm(x), np.linalg.norm(z)
-    if min(lengths) == 0 or abs(x @ z) > AXES_PARALLEL * lengths[0] * lengths[1]:
-        raise InputError("robot.mount: x_axis and z_axis are parallel or zero", where=path, allowed="two axes")
-    angle = float(np.degrees(np.arccos(x @ z / (lengths[0] * lengths[1]))))
-    if abs(angle - 90.0) > AXES_SQUARE_DEG:
-        raise InputError(
-            f"robot.mount: x_axis and z_axis are {angle:.1f} degrees apart",
-            where=path,
-            allowed=f"a right angle, to {AXES_SQUARE_DEG:g} degree",
-        )
-    far = float(np.linalg.norm(mount.position_mm))
-    if 0.0 < far < LIKE_METRES:
-        raise InputError(
-            f"robot.mount: position_mm is {far:g} mm from the origin, which would be a base within the patient",
-            where=path,
-            allowed="millimetres (these look like metres)",
-        )
-    T_ct_base = pose(frame_of_axes(z, x), to_lps(np.asarray([mount.position_mm]), space)[0])
-    return _read_only(np.linalg.inv(T_ct_base))
-
-
 def _gantry(gantry: GantrySection, space: Space, path: Path) -> Gantry:
     """The bore's pose: z along the axis, x to the top, and turned so that a positive tilt leans the top against z."""
     axes = axes_frame(gantry.axis or "head", gantry.up or "anterior", space, path, "gantry: axis and up")
@@ -414,72 +270,6 @@ def _gantry(gantry: GantrySection, space: Space, path: Path) -> Gantry:
     c, s = np.cos(np.radians(gantry.tilt_deg)), np.sin(np.radians(gantry.tilt_deg))
     tilt = pose([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]], np.zeros(3))
     return Gantry(_read_only(T @ tilt), gantry.bore_diameter_mm, gantry.wall_mm, gantry.thickness_mm)
-
-
-Axis = Anatomical | tuple[float, float, float]
-
-
-def axes_frame(z: Axis, x: Axis, space: Space, path: Path, key: str) -> Floats:
-    """R_ct_frame, shape (3, 3), of a frame whose z axis is given and whose x axis is what of ``x`` is square to it.
-
-    Raises:
-        InputError: The two are parallel or zero; names ``key``.
-    """
-    try:
-        return entry_frame(EntryAxes(z=z, x=x), space, where=path)
-    except InputError as error:
-        raise InputError(f"{key} are parallel or zero", where=path, allowed="two axes") from error
-
-
-class _Named(NamedTuple):
-    """A file that a case names."""
-
-    role: str
-    name: str
-    key: str
-    max_bytes: int
-
-
-def _named_files(content: CaseFile, path: Path) -> Iterator[_Named]:
-    """Every file that a case names, in the order of its sections; of a folder of masks every mask."""
-    if content.target.points is not None:
-        yield _Named("target", content.target.points, "target.points", points.MAX_FILE_BYTES)
-    for one in content.structure:
-        key = f"structure '{one.name}'"
-        if one.mesh is not None:
-            yield _Named(f"mesh {one.name}", one.mesh, key, meshes.MAX_FILE_BYTES)
-        if one.labelmap is not None:
-            yield _Named("labelmap", one.labelmap, key, volumes.MAX_FILE_BYTES)
-        if one.ct is not None:
-            yield _Named("ct", one.ct, key, volumes.MAX_FILE_BYTES)
-    for number, many in enumerate(content.structures):
-        yield from _many_files(many, f"structures.{number}", path)
-        if many.naming is not None and naming.is_naming_file(many.naming):
-            yield _Named("naming", many.naming, f"structures.{number}.naming", naming.MAX_CSV_BYTES)
-    if content.ct.file is not None:
-        yield _Named("ct", content.ct.file, "ct.file", volumes.MAX_FILE_BYTES)
-    for side in ("markers_ct", "markers_base", "transform"):
-        file = getattr(content.registration, side, None)
-        most = itk_transform.MAX_FILE_BYTES if side == "transform" else points.MAX_FILE_BYTES
-        if file is not None:
-            yield _Named(side, file, f"registration.{side}", most)
-    if content.rehearsal.truth_base is not None:
-        yield _Named("truth_base", content.rehearsal.truth_base, "rehearsal.truth_base", points.MAX_FILE_BYTES)
-
-
-def _many_files(many: StructuresSection, key: str, path: Path) -> Iterator[_Named]:
-    """A label map, or every file of a folder of masks: also empty ones decide what is there."""
-    if many.labelmap is not None:
-        yield _Named("labelmap", many.labelmap, f"{key}.labelmap", volumes.MAX_FILE_BYTES)
-    for role in ("seg", "rtstruct"):
-        if (file := getattr(many, role)) is not None:
-            yield _Named(role, file, f"{key}.{role}", volumes.MAX_FILE_BYTES)
-    if many.ct is not None:
-        yield _Named("ct", many.ct, f"{key}.ct", volumes.MAX_FILE_BYTES)
-    if many.masks is not None:
-        for file in mask_files(path.parent / many.masks, where=f"{path}: {key}.masks"):
-            name = str(PurePosixPath(many.masks) / file)
-            yield _Named(f"{MASK_ROLE}{structure_name(file)}", name, f"{key}.masks", volumes.MAX_FILE_BYTES)
 
 
 def _read_only(array: ArrayLike) -> Floats:

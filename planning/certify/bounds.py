@@ -11,7 +11,7 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.skin import FieldOfView
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.case.case import Needle
+from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.certify.question import Question
 from puncture_twin.planning.certify.skin_cones import SkinBounds
 from puncture_twin.planning.reach.standoff import waiting_flange

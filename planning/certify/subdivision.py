@@ -13,7 +13,8 @@ from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.case.case import Case, Needle
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.certify.bounds import (
     ANGLE_PAD_RAD,
     CLEARANCE_PAD_MM,

@@ -12,7 +12,8 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.case import Case, Gantry, Obstacle
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.settings import Gantry, Obstacle
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, pose

@@ -13,8 +13,9 @@ import numpy as np
 from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.case import Case, Obstacle
+from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import MountBounds, MountName
+from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.geometry.rigid import frame_xz, pose
 
 Range = tuple[float, float]

@@ -13,8 +13,9 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import ask_all
 from puncture_twin.planning.base.progress import Count
-from puncture_twin.planning.case.case import Case, mount_pose
+from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import MountSection
+from puncture_twin.planning.case.mount import mount_pose
 from puncture_twin.planning.collision.workcell import (
     ARM_PADDING_MM,
     case_boxes,

@@ -8,7 +8,8 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Structure
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.case.case import Case, Needle
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM
 
 UNEVEN_SKIN_MM = 1.0

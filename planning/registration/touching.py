@@ -9,7 +9,8 @@ from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.kinematics import inverse
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.case.case import Case, Obstacle
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply

@@ -11,7 +11,7 @@ from puncture_twin.planning.anatomy.anatomy import Role, Structure
 from puncture_twin.planning.anatomy.skin_entry import SkinPaths
 from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.case.case import Needle
+from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.clearance.measure import Clearances
 from puncture_twin.planning.reach.standoff import waiting_flange
 from puncture_twin.planning.search.candidates import Candidates, Verdict

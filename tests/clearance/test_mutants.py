@@ -9,7 +9,7 @@ import pytest
 from places import ROOT
 
 import puncture_twin.planning.reach.standoff
-from puncture_twin.planning.case.case import Needle
+from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.reach.standoff import skin_gaps
 
 sys.path.insert(0, str(ROOT))

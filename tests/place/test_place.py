@@ -20,7 +20,8 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.processes import ask_all
 from puncture_twin.planning.base.provenance import inputs_document
-from puncture_twin.planning.case.case import load_case, mount_pose
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.mount import mount_pose
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.arm_spheres import (

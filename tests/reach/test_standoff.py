@@ -13,7 +13,7 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.kinematics import inverse
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.case.case import Needle
+from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.collision.checker import CellChecker, Tool
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh

@@ -7,7 +7,7 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
 from puncture_twin.planning.anatomy.skin import FieldOfView, Skin, skin_from_mesh
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.case.case import Needle, SearchSettings
+from puncture_twin.planning.case.settings import Needle, SearchSettings
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.clearance.measure import measure
 from puncture_twin.planning.geometry.mesh import TriangleMesh

@@ -8,7 +8,7 @@ import pytest
 from puncture_twin.planning.anatomy.anatomy import Role, Structure
 from puncture_twin.planning.anatomy.skin_entry import SkinPaths
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.case.case import Needle
+from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.clearance.measure import Clearances
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.constraints import first_broken, longest_path, worst_violation

@@ -16,10 +16,11 @@ from puncture_twin.planning.anatomy.skin import skin_from_mesh
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, jacobian, nearest_within_limits
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.case.case import Case, Needle, Obstacle, RobotSettings, SearchSettings
+from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import RankingSection, RehearsalSection
 from puncture_twin.planning.case.case_volumes import CaseVolumes
 from puncture_twin.planning.case.entry import view_frame
+from puncture_twin.planning.case.settings import Needle, Obstacle, RobotSettings, SearchSettings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space

@@ -10,7 +10,7 @@ import numpy as np
 
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.output.output_set import withdraw, writing
-from puncture_twin.planning.case.case import mount_pose
+from puncture_twin.planning.case.mount import mount_pose
 from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.place.document import place_document, write_place_document, write_placements
 from puncture_twin.planning.place.search import PlaceSearch, search_placements

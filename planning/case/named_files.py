@@ -1,0 +1,69 @@
+"""The files that a case names: each with its role, the key that names it, and how large it may be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+from puncture_twin.planning.case.case_file import CaseFile, StructuresSection
+from puncture_twin.planning.formats import itk_transform
+from puncture_twin.planning.formats.labels import naming
+from puncture_twin.planning.formats.labels.mask_folder import mask_files, structure_name
+from puncture_twin.planning.formats.meshes import mesh_files as meshes
+from puncture_twin.planning.formats.points import point_files as points
+from puncture_twin.planning.formats.volumes import volume_files as volumes
+
+MASK_ROLE = "mask "
+"""How the role of a mask begins; its structure's name follows."""
+
+
+class NamedFile(NamedTuple):
+    """A file that a case names."""
+
+    role: str
+    name: str
+    key: str
+    max_bytes: int
+
+
+def named_files(content: CaseFile, path: Path) -> Iterator[NamedFile]:
+    """Every file that a case names, in the order of its sections; of a folder of masks every mask."""
+    if content.target.points is not None:
+        yield NamedFile("target", content.target.points, "target.points", points.MAX_FILE_BYTES)
+    for one in content.structure:
+        key = f"structure '{one.name}'"
+        if one.mesh is not None:
+            yield NamedFile(f"mesh {one.name}", one.mesh, key, meshes.MAX_FILE_BYTES)
+        if one.labelmap is not None:
+            yield NamedFile("labelmap", one.labelmap, key, volumes.MAX_FILE_BYTES)
+        if one.ct is not None:
+            yield NamedFile("ct", one.ct, key, volumes.MAX_FILE_BYTES)
+    for number, many in enumerate(content.structures):
+        yield from _many_files(many, f"structures.{number}", path)
+        if many.naming is not None and naming.is_naming_file(many.naming):
+            yield NamedFile("naming", many.naming, f"structures.{number}.naming", naming.MAX_CSV_BYTES)
+    if content.ct.file is not None:
+        yield NamedFile("ct", content.ct.file, "ct.file", volumes.MAX_FILE_BYTES)
+    for side in ("markers_ct", "markers_base", "transform"):
+        file = getattr(content.registration, side, None)
+        most = itk_transform.MAX_FILE_BYTES if side == "transform" else points.MAX_FILE_BYTES
+        if file is not None:
+            yield NamedFile(side, file, f"registration.{side}", most)
+    if content.rehearsal.truth_base is not None:
+        yield NamedFile("truth_base", content.rehearsal.truth_base, "rehearsal.truth_base", points.MAX_FILE_BYTES)
+
+
+def _many_files(many: StructuresSection, key: str, path: Path) -> Iterator[NamedFile]:
+    """A label map, or every file of a folder of masks: also empty ones decide what is there."""
+    if many.labelmap is not None:
+        yield NamedFile("labelmap", many.labelmap, f"{key}.labelmap", volumes.MAX_FILE_BYTES)
+    for role in ("seg", "rtstruct"):
+        if (file := getattr(many, role)) is not None:
+            yield NamedFile(role, file, f"{key}.{role}", volumes.MAX_FILE_BYTES)
+    if many.ct is not None:
+        yield NamedFile("ct", many.ct, f"{key}.ct", volumes.MAX_FILE_BYTES)
+    if many.masks is not None:
+        for file in mask_files(path.parent / many.masks, where=f"{path}: {key}.masks"):
+            name = str(PurePosixPath(many.masks) / file)
+            yield NamedFile(f"{MASK_ROLE}{structure_name(file)}", name, f"{key}.masks", volumes.MAX_FILE_BYTES)

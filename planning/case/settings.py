@@ -1,0 +1,112 @@
+"""What a validated case holds beside its structures: needle, search, CT, obstacles, gantry and arm; mm and radians."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.case_file import AIR_HU, DENSE_HU
+
+
+@dataclass(frozen=True)
+class Needle:
+    """The needle on the flange; lengths in mm, from the tip."""
+
+    length_mm: float
+    shaft_mm: float
+    diameter_mm: float
+    standoff_mm: float | None
+    skin_gap_mm: float
+    holder_diameter_mm: float
+
+    @property
+    def radius_mm(self) -> float:
+        """Half the diameter."""
+        return self.diameter_mm / 2
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """The grid of directions, the limit at the skin and those of the chances; radians.
+
+    Attributes:
+        min_hit: Least chance to hit the target; None sets no limit.
+        max_touch: Greatest chance to touch any one structure; None sets no limit.
+        max_touch_of: The same for single structures, by name, instead.
+    """
+
+    theta: tuple[float, float]
+    beta: tuple[float, float]
+    step: float
+    max_skin_angle: float
+    min_hit: float | None = None
+    max_touch: float | None = None
+    max_touch_of: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+
+
+@dataclass(frozen=True)
+class CtSettings:
+    """The CT beside the structures.
+
+    Attributes:
+        file: Where the skin does not come from a CT, the CT's file, or None.
+        air_hu: Outside of the body, what is denser is not air.
+        dense_hu: Inside the body, what is at least so dense must belong to a structure.
+        margin_mm: Clearance that these structures demand.
+        trust_labels: Whether the inside is left to the structures alone.
+    """
+
+    file: str | None = None
+    air_hu: float = AIR_HU
+    dense_hu: float = DENSE_HU
+    margin_mm: float = 2.0
+    trust_labels: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacle:
+    """A box in the room, axes parallel to its frame's."""
+
+    name: str
+    frame: str
+    center_mm: Floats
+    size_mm: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Gantry:
+    """A wall with a round bore.
+
+    Attributes:
+        T_ct_gantry: Shape (4, 4), mm: the bore's centre; its axis is z, its top x.
+        bore_diameter_mm: Of the bore.
+        wall_mm: How far the wall reaches outward from the bore.
+        thickness_mm: Along the bore.
+    """
+
+    T_ct_gantry: Floats
+    bore_diameter_mm: float
+    wall_mm: float
+    thickness_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class RobotSettings:
+    """The arm.
+
+    Attributes:
+        model: Its name.
+        home: Shape (6,), rad, or None for the model's own.
+        T_base_ct_mount: Shape (4, 4), mm, where a mount or a transform is stated, or None.
+        transform: The file that states it, or None.
+        speeds: How fast its plans may move.
+    """
+
+    model: str
+    home: Floats | None
+    T_base_ct_mount: Floats | None
+    transform: str | None = None
+    speeds: SpeedLimits = DEFAULT_SPEEDS
