@@ -134,8 +134,8 @@ def init(
     as_json: JsonOption = False,
 ) -> None:
     """Write FOLDER/case.toml from what is in the folder: roles and margins from the table of default roles."""
-    from puncture_twin.planning.case.init.finder import Wanted
-    from puncture_twin.planning.case.init.start import Request
+    from puncture_twin.planning.init.finder import Wanted
+    from puncture_twin.planning.init.start import Request
     from puncture_twin.twin.jobs.patient.init_job import init_case, init_text
 
     if region is not None and region not in get_args(Region):

@@ -25,7 +25,7 @@ COLUMNS = {
     "meshes": -4.7, "twin/phantoms": -3.7, "twin/guidance/ultrasound": -2.7, "twin/guidance/stereo": -1.7,
     "twin/rehearsal": -0.7, "twin/report": 0.3, "planning/export": 2.0,
     "twin/plant": -1.7, "twin/world": -0.5, "planning/place": 0.6, "planning/plan": 1.6, "planning/certify": 2.6,
-    "planning/batch": 3.6, "planning/case/init": 4.6, "planning/collision_cases": 4.6, "planning/search": 2.6,
+    "planning/batch": 3.6, "planning/init": 4.6, "planning/collision_cases": 4.6, "planning/search": 2.6,
     "planning/motion": 0.1, "planning/reach": 2.1, "planning/uncertainty": 3.6,
     "planning/registration": -0.9, "planning/collision": 1.4, "planning/clearance": 3.2,
     "planning/anatomy": 1.4, "planning/case": 1.4, "planning/formats": 2.1, "planning/arm": 0.7,
@@ -38,7 +38,7 @@ def room_of(name):
     parts = name.split(".")[1:]
     if not parts or parts[0] not in ("planning", "twin"):
         return parts[0] if parts else None
-    apart = parts[:2] == ["twin", "guidance"] or parts[:3] == ["planning", "case", "init"]
+    apart = parts[:2] == ["twin", "guidance"]
     depth = 3 if apart else 2
     return "/".join(parts[:depth]) if len(parts) >= depth else None
 

@@ -12,8 +12,8 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic, is_folder, is_plain_file
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import inputs_document
-from puncture_twin.planning.case.init.start import ALLOWED, Request, Start, start_case
 from puncture_twin.planning.geometry.spaces import to_lps
+from puncture_twin.planning.init.start import ALLOWED, Request, Start, start_case
 from puncture_twin.planning.search.context import CaseContext, prepare
 
 CASE = "case.toml"

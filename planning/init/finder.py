@@ -12,10 +12,6 @@ import numpy as np
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import is_folder, is_plain_file
-from puncture_twin.planning.case.init.dicom_masks import dicom_masks
-from puncture_twin.planning.case.init.label_files import Mask, Masks, label_file, mask_of
-from puncture_twin.planning.case.init.mesh_folder import is_mesh, mesh_folder
-from puncture_twin.planning.case.init.segmentation import Place, Segmentation
 from puncture_twin.planning.formats.dicom.recognise import list_folder
 from puncture_twin.planning.formats.dicom.storage import Kind
 from puncture_twin.planning.formats.labels.labelmaps import labelmap_of
@@ -23,6 +19,10 @@ from puncture_twin.planning.formats.labels.mask_folder import MASK_ENDINGS, UNRE
 from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points
 from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS, Volume
 from puncture_twin.planning.geometry.spaces import Space, Unit
+from puncture_twin.planning.init.dicom_masks import dicom_masks
+from puncture_twin.planning.init.label_files import Mask, Masks, label_file, mask_of
+from puncture_twin.planning.init.mesh_folder import is_mesh, mesh_folder
+from puncture_twin.planning.init.segmentation import Place, Segmentation
 
 DEPTH = 2
 """Levels of folders below the one that is given."""

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.case.init.finder import Markers
-from puncture_twin.planning.case.init.segmentation import Assigned, Segmentation, quoted
 from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.init.finder import Markers
+from puncture_twin.planning.init.segmentation import Assigned, Segmentation, quoted
 
 HEAD = """# Written by `init`: a start. Look at the roles and margins below before any result is trusted.
 # Every key: docs/reference/case.md; where roles and margins come from: docs/reference/default-roles.md.

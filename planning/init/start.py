@@ -13,16 +13,16 @@ from puncture_twin.planning.anatomy.default_roles import BODY
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError, InputListError
-from puncture_twin.planning.case.init.case_text import CaseParts, case_text
-from puncture_twin.planning.case.init.finder import Ct, Found, Markers, Wanted, find
-from puncture_twin.planning.case.init.mesh_folder import MeshFolder
-from puncture_twin.planning.case.init.roles import assign, role_notes, told_region
-from puncture_twin.planning.case.init.segmentation import Assigned, Place, Segmentation
-from puncture_twin.planning.case.init.target import Target, label_target, parse_point, shown, typed_target
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.init.case_text import CaseParts, case_text
+from puncture_twin.planning.init.finder import Ct, Found, Markers, Wanted, find
+from puncture_twin.planning.init.mesh_folder import MeshFolder
+from puncture_twin.planning.init.roles import assign, role_notes, told_region
+from puncture_twin.planning.init.segmentation import Assigned, Place, Segmentation
+from puncture_twin.planning.init.target import Target, label_target, parse_point, shown, typed_target
 
 ALLOWED = "a folder with a CT (NIfTI or NRRD) and a segmentation, see docs/how-to/your-own-ct.md"
 

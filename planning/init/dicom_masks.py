@@ -11,13 +11,13 @@ import numpy as np
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.init.segmentation import Assigned, Place, quoted, rules_text
 from puncture_twin.planning.formats.dicom.ct_series import CtSeries
 from puncture_twin.planning.formats.dicom.segmentation import parse_segmentation
 from puncture_twin.planning.formats.dicom.storage import Kind
 from puncture_twin.planning.formats.dicom.structure_set import parse_structure_set
 from puncture_twin.planning.formats.volumes.volume_source import VolumeSource
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.init.segmentation import Assigned, Place, quoted, rules_text
 
 NEEDS_SERIES = "an RTSTRUCT needs the CT on which it was drawn, as a DICOM series"
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from puncture_twin.planning.anatomy.default_roles import BODY, LESION, NEVER_CROSSED, UNKNOWN_NAME, default_role
 from puncture_twin.planning.anatomy.regions import USUAL, absent_organs
-from puncture_twin.planning.case.init.segmentation import Assigned
+from puncture_twin.planning.init.segmentation import Assigned
 
 LEAST_SHOWN = 0.3
 """Of a region's usual organs; with fewer the region is told by nothing."""

@@ -12,7 +12,6 @@ from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
-from puncture_twin.planning.case.init.segmentation import Assigned, Place, margin_line, quoted, rules_text
 from puncture_twin.planning.formats.labels.labelmaps import Box, LabelMap
 from puncture_twin.planning.formats.labels.mask_folder import structure_name
 from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS, parse_names
@@ -20,6 +19,7 @@ from puncture_twin.planning.formats.labels.naming import BUILT_IN, MAX_CSV_BYTES
 from puncture_twin.planning.formats.labels.numbering import label_centres, plausibility, told_numbering
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.init.segmentation import Assigned, Place, margin_line, quoted, rules_text
 
 NUMBERING_TOLD = "{source}: numbered as {naming}, told by where its organs lie"
 NUMBERING_NOT_TOLD = (

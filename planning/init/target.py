@@ -11,8 +11,6 @@ from scipy import ndimage
 from puncture_twin.planning.anatomy.default_roles import BODY, LESION, NEVER_CROSSED, default_role
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.init.roles import Holding, chosen_target
-from puncture_twin.planning.case.init.segmentation import Segmentation
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -20,6 +18,8 @@ from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 from puncture_twin.planning.geometry.voxelize import voxels_inside
+from puncture_twin.planning.init.roles import Holding, chosen_target
+from puncture_twin.planning.init.segmentation import Segmentation
 
 CELLS = 64
 """Along the longest edge of a structure's box, to find its deepest point."""
