@@ -20,7 +20,7 @@ demo: install
 test: install lint
 	$(BIN)/pytest -q -n auto --dist loadfile
 
-# While one works: what takes under 0.2 s a test, without real data.
+# While one works: what takes under 0.07 s a test, without real data.
 quick: install
 	$(BIN)/pytest -q -n auto --dist loadfile -m "not slow and not real"
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 LIST = Path(__file__).with_name("slow_tests.txt")
-SLOW_S = 0.2
+SLOW_S = 0.07
 """Of one case, without the fixtures that it shares."""
 
 SLOW_FIXTURE_S = 1.5
