@@ -18,9 +18,11 @@ from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_to
 from puncture_twin.planning.case.case_file import (
     CaseFile,
     GantrySection,
+    ObstacleSection,
     PlaceSection,
     RankingSection,
     RehearsalSection,
+    SearchSection,
     StructureSection,
     StructuresSection,
 )
@@ -137,13 +139,7 @@ def load_case(path: Path | str) -> Case:
     case_volumes = CaseVolumes(files, path)
     stated = files.add(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE))
     content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md")
-    for one in named_files(content, path):
-        if one.role in VOLUME_ROLES or one.role.startswith(MASK_ROLE):
-            case_volumes.read(one.role, one.name, key=one.key)
-        else:
-            files.read(one.role, one.name, max_bytes=one.max_bytes, key=one.key, where=path)
-    for many in content.structures:
-        case_volumes.read_masks(many, _ct_name(content))
+    _read_files(content, path, files, case_volumes)
     space = Space(content.space)
     target = _target(content, path, space, files)
     settings = content.search
@@ -156,30 +152,14 @@ def load_case(path: Path | str) -> Case:
         target_structure=content.target.structure or content.target.name,
         own_target=content.target.structure is None,
         needle=Needle(**content.needle.model_dump()),
-        search=SearchSettings(
-            theta=(np.radians(settings.theta_deg[0]), np.radians(settings.theta_deg[1])),
-            beta=(np.radians(settings.beta_deg[0]), np.radians(settings.beta_deg[1])),
-            step=np.radians(settings.step_deg),
-            max_skin_angle=np.radians(settings.max_skin_angle_deg),
-            min_hit=settings.min_hit,
-            max_touch=settings.max_touch,
-            max_touch_of=MappingProxyType(dict(settings.max_touch_of)),
-        ),
+        search=_search(content.search),
         ranking=content.ranking,
         T_ct_entry=view_frame(entry_frame(settings.frame, space, where=path), target),
         structure=content.structure,
         structures=content.structures,
         registration=_markers(content.registration),
         robot=_robot(content, space, path, files),
-        obstacles=tuple(
-            Obstacle(
-                o.name,
-                o.frame,
-                np.asarray(o.center_mm) if o.frame == "base" else to_lps(np.asarray([o.center_mm]), space)[0],
-                np.asarray(o.size_mm),
-            )
-            for o in content.obstacle
-        ),
+        obstacles=tuple(_obstacle(one, space) for one in content.obstacle),
         rehearsal=content.rehearsal,
         files=files,
         volumes=case_volumes,
@@ -193,6 +173,36 @@ def load_case(path: Path | str) -> Case:
         errors=_errors(content, content.errors, case_volumes, path),
         truth_errors=_errors(content, content.rehearsal.errors, case_volumes, path, truth=True),
     )
+
+
+def _read_files(content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes) -> None:
+    """Read and hash whatever the case names, each file once."""
+    for one in named_files(content, path):
+        if one.role in VOLUME_ROLES or one.role.startswith(MASK_ROLE):
+            case_volumes.read(one.role, one.name, key=one.key)
+        else:
+            files.read(one.role, one.name, max_bytes=one.max_bytes, key=one.key, where=path)
+    for many in content.structures:
+        case_volumes.read_masks(many, _ct_name(content))
+
+
+def _search(section: SearchSection) -> SearchSettings:
+    return SearchSettings(
+        theta=(np.radians(section.theta_deg[0]), np.radians(section.theta_deg[1])),
+        beta=(np.radians(section.beta_deg[0]), np.radians(section.beta_deg[1])),
+        step=np.radians(section.step_deg),
+        max_skin_angle=np.radians(section.max_skin_angle_deg),
+        min_hit=section.min_hit,
+        max_touch=section.max_touch,
+        max_touch_of=MappingProxyType(dict(section.max_touch_of)),
+    )
+
+
+def _obstacle(section: ObstacleSection, space: Space) -> Obstacle:
+    """A box; its centre is in the case's space where its frame is the CT's."""
+    center = np.asarray(section.center_mm)
+    center = center if section.frame == "base" else to_lps(center[None], space)[0]
+    return Obstacle(section.name, section.frame, center, np.asarray(section.size_mm))
 
 
 def _errors(
