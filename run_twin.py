@@ -2,7 +2,7 @@
 
 Exit codes: 0 done, 1 done and the answer is no, 2 bad input, 3 the program failed, 130 interrupted, 141 not read.
 
-Commands that stand apart from the main job import what they need themselves: it would cost all others a second.
+A command imports what it needs itself: the help and a wrong argument answer at once.
 """
 
 from __future__ import annotations
@@ -11,83 +11,44 @@ import json
 import sys
 from contextlib import suppress
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
 from puncture_twin.meshes import folder as meshes_folder
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import check_writable
-from puncture_twin.planning.base.provenance import inputs_document
-from puncture_twin.planning.batch.batch import run_batch
-from puncture_twin.planning.case.case import load_case
-from puncture_twin.planning.case.case_schema import Region
-from puncture_twin.planning.export.exporter import FORMATS
-from puncture_twin.planning.export.slicer.slicer_files import SLICER
 from puncture_twin.planning.geometry.spaces import Space, Unit
-from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.explain import NEAREST
-from puncture_twin.planning.search.selection.choice import BEST, Choice, parse_choice
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, exit_code_of
-from puncture_twin.twin.jobs.patient import answers, main_job, text as words
-from puncture_twin.twin.jobs.patient.pictures import write_check_picture
-from puncture_twin.twin.jobs.patient.place_text import place_text
-from puncture_twin.twin.jobs.robot.mirror import (
-    Mirror,
-    RecordedJoints,
-    connect,
-    live_states,
-    mirror_text,
+from puncture_twin.twin.jobs.options import (
+    ArmOption,
+    CaseArgument,
+    EngineOption,
+    JobsOption,
+    JsonOption,
+    OutOfCaseOption,
+    OutOption,
+    PicturesOption,
+    SourceArgument,
+    with_choice,
 )
 from puncture_twin.twin.jobs.terminal import default_out
 from puncture_twin.twin.report.progress import progress_display
+
+if TYPE_CHECKING:
+    from puncture_twin.planning.search.selection.choice import Choice
 
 MOST_SEEDS = 10_000
 """Rooms or draws of one command; each takes seconds."""
 
 app = typer.Typer(add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False)
 
-CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case file, or the folder that holds case.toml.")]
-OutOption = Annotated[
-    Path, typer.Option("--out", help="Folder for the files that are written.", callback=check_writable)
-]
-OutOfCaseOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--out", help="Folder for the files that are written.", show_default="out/, then the case's and command's names"
-    ),
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, and nothing else there.")]
-JobsOption = Annotated[
-    int, typer.Option("--jobs", min=1, help="Processes, at most one a core; the answer is the same.")
-]
-EngineOption = Annotated[str, typer.Option("--engine", help="Who measures clearance: fast, or fcl, the reference.")]
-PicturesOption = Annotated[
-    bool, typer.Option("--pictures/--no-pictures", help="Whether to draw the map, the scene and the page.")
-]
-ArmOption = Annotated[
-    bool | None,
-    typer.Option(
-        "--arm/--no-arm",
-        help="Whether the arm must be able to reach a candidate.",
-        show_default="where the case says where its base is",
-    ),
-]
-
-
-ThetaOption = Annotated[float | None, typer.Option("--theta", min=0, max=180, help="Puncture angle, degrees.")]
-BetaOption = Annotated[float | None, typer.Option("--beta", min=0, max=360, help="Azimuth, degrees.")]
-RankOption = Annotated[int | None, typer.Option("--rank", min=1, help="Of the search: 1 is the best candidate.")]
-WindowOption = Annotated[int | None, typer.Option("--window", min=1, help="The best of this window of the search.")]
-EntryOption = Annotated[
-    str | None, typer.Option("--entry", metavar="X,Y,Z", help="Where the needle enters the skin, mm, case's space.")
-]
-
 
 def _print_version(wanted: bool) -> None:
     if wanted:
+        from importlib.metadata import version
+
         print(f"puncture-twin {version('puncture-twin')}")
         raise typer.Exit
 
@@ -108,9 +69,12 @@ def _without_command(context: typer.Context, version: VersionOption = False) -> 
 @app.command()
 def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> None:
     """The main job on the embedded abdomen: search, plan, rehearse, report."""
+    from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.patient import main_job, text
+
     with progress_display() as progress:
         run = main_job.demo_case(prepare(meshes_folder() / "abdomen", watcher=progress), out_dir)
-    _print(run.summary(), words.rehearsal_text(run), as_json)
+    _print(run.summary(), text.rehearsal_text(run), as_json)
 
 
 @app.command()
@@ -134,6 +98,7 @@ def init(
     as_json: JsonOption = False,
 ) -> None:
     """Write FOLDER/case.toml from what is in the folder: roles and margins from the table of default roles."""
+    from puncture_twin.planning.case.case_schema import Region
     from puncture_twin.planning.init.finder import Wanted
     from puncture_twin.planning.init.start import Request
     from puncture_twin.twin.jobs.patient.init_job import init_case, init_text
@@ -164,6 +129,9 @@ def search(
     as_json: JsonOption = False,
 ) -> None:
     """Judge every entry direction of a case; write the table, the map, the scene and the page."""
+    from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.patient import main_job, text
+
     folder = _out(out_dir, case, "search")
     with progress_display() as progress:
         context = prepare(case, arm=arm, engine=engine, watcher=progress)
@@ -171,7 +139,7 @@ def search(
         run = main_job.search_case(
             context, folder, pictures=pictures, checked=checked, certify_deg=certify_size if certified else None
         )
-    _print(run.summary(), words.search_text(run), as_json)
+    _print(run.summary(), text.search_text(run), as_json)
     if not run.candidates.safe.any():
         raise typer.Exit(ANSWER_IS_NO)
 
@@ -183,19 +151,19 @@ def verify(
     as_json: JsonOption = False,
 ) -> None:
     """Prove every cell of a certificate again, with a plain checker that shares none of the fast code."""
+    from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.patient import answers, text
+
     with progress_display() as progress:
         report = answers.verify_certificate(certificate, prepare(case, arm=False, watcher=progress))
-    _print(report, words.certificate_text(report), as_json)
+    _print(report, text.certificate_text(report), as_json)
 
 
 @app.command()
+@with_choice
 def check(
     case: CaseArgument,
-    theta: ThetaOption = None,
-    beta: BetaOption = None,
-    rank: RankOption = None,
-    window: WindowOption = None,
-    entry: EntryOption = None,
+    choice: Choice,
     arm: ArmOption = None,
     picture: Annotated[
         Path | None, typer.Option("--picture", metavar="FILE.png", help="Draw the CT's slices about it.")
@@ -204,10 +172,14 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Explain one candidate in full; the best, where none is named."""
-    choice = parse_choice(theta, beta, rank, window, entry)
+    from puncture_twin.planning.search.context import prepare
+    from puncture_twin.planning.search.explain import NEAREST
+    from puncture_twin.twin.jobs.patient.answers import check_candidate
+    from puncture_twin.twin.jobs.patient.pictures import write_check_picture
+
     with progress_display() as progress:
         context = prepare(case, arm=arm, watcher=progress)
-        explained = answers.check_candidate(context, choice)
+        explained = check_candidate(context, choice)
         if picture is not None:
             write_check_picture(context, explained, picture)
     _print(explained.summary(), explained.text(None if every else NEAREST), as_json)
@@ -216,34 +188,30 @@ def check(
 
 
 @app.command()
+@with_choice
 def plan(
     case: CaseArgument,
+    choice: Choice,
     out_dir: OutOfCaseOption = None,
-    theta: ThetaOption = None,
-    beta: BetaOption = None,
-    rank: RankOption = None,
-    window: WindowOption = None,
-    entry: EntryOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Search, plan to the best candidate that the arm can come to, or to the one that is named; write plan.json."""
-    choice = parse_choice(theta, beta, rank, window, entry)
+    from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.patient import main_job, text
+
     folder = _out(out_dir, case, "plan")
     with progress_display() as progress:
         run = main_job.plan_case(prepare(case, watcher=progress), folder, choice)
-    _print(run.summary(), words.plan_text(run), as_json)
+    _print(run.summary(), text.plan_text(run), as_json)
 
 
 @app.command()
+@with_choice
 def rehearse(
-    source: Annotated[Path, typer.Argument(metavar="CASE_OR_PLAN", help="A case, or a plan.json beside --case.")],
+    source: SourceArgument,
+    choice: Choice,
     case: Annotated[Path | None, typer.Option("--case", help="The case of a plan.json.")] = None,
     out_dir: OutOfCaseOption = None,
-    theta: ThetaOption = None,
-    beta: BetaOption = None,
-    rank: RankOption = None,
-    window: WindowOption = None,
-    entry: EntryOption = None,
     seeds: Annotated[
         int | None, typer.Option("--seeds", min=1, max=1_000_000, help="Rooms, each with a truth of its own.")
     ] = None,
@@ -251,29 +219,24 @@ def rehearse(
     as_json: JsonOption = False,
 ) -> None:
     """Execute a plan in the twin, where the truth differs from the belief, and say where the tip ended."""
+    from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.patient import main_job, text
+    from puncture_twin.twin.jobs.patient.case_or_plan import case_of, is_plan
+
     if physics and seeds is None:
         raise InputError("--physics runs some of the rooms", where="--physics", allowed="--seeds N --physics K, K <= N")
-    choice = parse_choice(theta, beta, rank, window, entry)
     rooms = None if seeds is None else main_job.RoomCount(seeds, physics)
     folder = _out(out_dir, source, "rehearse")
-    if source.suffix != ".json":
-        _refuse_second_case(case)
-        _rehearse(source, folder, as_json, rooms=rooms, choice=choice)
-        return
-    _refuse_choice(source, choice)
-    if case is None:
+    planned_case = case_of(source, case, choice)
+    if planned_case is None:
         raise InputError("a plan needs its case", where=source, allowed="rehearse plan.json --case CASE")
-    _rehearse(case, folder, as_json, plan_path=source, rooms=rooms)
-
-
-def _refuse_choice(plan_path: Path, choice: Choice) -> None:
-    if choice != BEST:
-        raise InputError("a plan has its direction", where=plan_path, allowed="a case, where one is to be chosen")
-
-
-def _refuse_second_case(case: Path | None) -> None:
-    if case is not None:
-        raise InputError("two cases", where="--case", allowed="CASE alone, or plan.json --case CASE")
+    with progress_display() as progress:
+        context = prepare(planned_case, watcher=progress)
+        if is_plan(source):
+            run = main_job.rehearse_plan(context, source, folder, rooms)
+        else:
+            run = main_job.rehearse_case(context, folder, rooms, choice)
+    _print(run.summary(), text.rehearsal_text(run), as_json)
 
 
 @app.command()
@@ -285,7 +248,9 @@ def place(
     as_json: JsonOption = False,
 ) -> None:
     """Find where the arm should stand to hold most of the organ-safe directions; write the placements and their map."""
+    from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.patient.place_job import place_case
+    from puncture_twin.twin.jobs.patient.place_text import place_text
 
     folder = _out(out_dir, case, "place")
     with progress_display() as progress:
@@ -307,6 +272,10 @@ def mirror(
     as_json: JsonOption = False,
 ) -> None:
     """Show a running arm's needle in the CT: tip, distance to the target. Writes nothing to the robot."""
+    from puncture_twin.planning.base.provenance import inputs_document
+    from puncture_twin.planning.case.case import load_case
+    from puncture_twin.twin.jobs.robot.mirror import Mirror, RecordedJoints, connect, live_states, mirror_text
+
     if (host is None) == (recorded is None):
         raise InputError("one arm at a time", where="mirror", allowed="either HOST or --from joints.csv")
     followed = load_case(case)
@@ -327,51 +296,51 @@ def mirror(
 
 
 @app.command()
+@with_choice
 def export(
-    source: Annotated[Path, typer.Argument(metavar="CASE_OR_PLAN", help="A plan.json, or a case to be planned first.")],
+    source: SourceArgument,
+    choice: Choice,
     format_name: Annotated[
         str, typer.Option("--format", metavar="urscript|ros2|csv|slicer", help="For which robot, or 3D Slicer.")
     ],
     case: Annotated[Path | None, typer.Option("--case", help="The plan's case: check the plan again.")] = None,
     out_dir: OutOfCaseOption = None,
-    theta: ThetaOption = None,
-    beta: BetaOption = None,
-    rank: RankOption = None,
-    window: WindowOption = None,
-    entry: EntryOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write a plan for a robot, read back and within the arm's limits. Research software, not a medical device."""
-    if format_name not in (*FORMATS, SLICER):
-        raise InputError(
-            f"format '{format_name}' is not known", where="--format", allowed=", ".join((*FORMATS, SLICER))
-        )
-    choice = parse_choice(theta, beta, rank, window, entry)
-    of_plan = source.suffix == ".json"
-    _refuse_choice(source, choice) if of_plan else _refuse_second_case(case)
+    from puncture_twin.planning.export.exporter import FORMATS
+    from puncture_twin.planning.export.slicer.slicer_files import SLICER
+    from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.patient import main_job, text
+    from puncture_twin.twin.jobs.patient.case_or_plan import case_of, is_plan
+    from puncture_twin.twin.jobs.patient.summaries import export_summary
+
+    formats = (*FORMATS, SLICER)
+    if format_name not in formats:
+        raise InputError(f"format '{format_name}' is not known", where="--format", allowed=", ".join(formats))
+    planned_case = case_of(source, case, choice)
     folder = _out(out_dir, source, "export")
     if format_name == SLICER:
         _export_to_slicer(source, folder, choice, as_json)
         return
-    checked = case if of_plan else source
     with progress_display() as progress:
-        context = None if checked is None else prepare(checked, watcher=progress)
-        if of_plan or context is None:
+        context = None if planned_case is None else prepare(planned_case, watcher=progress)
+        if context is None or is_plan(source):
             done = main_job.export(source, format_name, folder, context, progress.note)
         else:
             done = main_job.export_case(context, format_name, folder, choice)
-    summary = {"format": format_name, "notes": list(done.notes), "case_checked": context is not None}
-    summary |= {"inputs": inputs_document(done.inputs), "files": [str(done.path)]}
-    _print(summary, words.export_text(done, context is not None), as_json)
+    checked = context is not None
+    _print(export_summary(done, checked), text.export_text(done, checked), as_json)
 
 
 def _export_to_slicer(source: Path, out_dir: Path, choice: Choice, as_json: bool) -> None:
+    from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.patient.case_or_plan import is_plan
     from puncture_twin.twin.jobs.patient.slicer_job import export_to_slicer
 
-    if source.suffix == ".json":
-        raise InputError(
-            "slicer shows a case", where=source, allowed="a case, with --rank, --window, --theta or --entry"
-        )
+    if is_plan(source):
+        allowed = "a case, with --rank, --window, --theta or --entry"
+        raise InputError("slicer shows a case", where=source, allowed=allowed)
     with progress_display() as progress:
         done = export_to_slicer(prepare(source, watcher=progress), out_dir, choice)
     _print(done.summary(), done.text(), as_json)
@@ -391,13 +360,15 @@ def register(
     as_json: JsonOption = False,
 ) -> None:
     """Register a case's markers, or two lists of markers; print residuals, FRE, expected TRE and weak points."""
+    from puncture_twin.twin.jobs.patient import answers, text
+
     if markers_base is None:
         report = answers.registration_report(source)
     elif target is None:
         raise InputError("two lists of markers need a target", where="register", allowed="--target X,Y,Z in mm")
     else:
         report = answers.lists_report(source, markers_base, target, space, fle)
-    _print(report, words.registration_text(report), as_json)
+    _print(report, text.registration_text(report), as_json)
 
 
 @app.command()
@@ -409,9 +380,12 @@ def batch(
     as_json: JsonOption = False,
 ) -> None:
     """Search many cases; one that fails does not stop the others."""
+    from puncture_twin.planning.batch.batch import run_batch
+    from puncture_twin.twin.jobs.patient import text
+
     with progress_display() as progress:
         rows = run_batch(cases, out_dir, jobs=jobs, arm=arm, watcher=progress)
-    _print({"cases": rows}, words.batch_text(rows), as_json)
+    _print({"cases": rows}, text.batch_text(rows), as_json)
     for code in (PROGRAM_FAILED, BAD_INPUT, ANSWER_IS_NO):
         if any(row["exit_code"] == code for row in rows):
             raise typer.Exit(code)
@@ -473,23 +447,6 @@ def reproduce(
 
 def _out(named: Path | None, source: Path, command: str) -> Path:
     return check_writable(named or default_out(source, command))
-
-
-def _rehearse(
-    case: Path,
-    out_dir: Path,
-    as_json: bool,
-    plan_path: Path | None = None,
-    rooms: main_job.RoomCount | None = None,
-    choice: Choice = BEST,
-) -> None:
-    with progress_display() as progress:
-        context = prepare(case, watcher=progress)
-        if plan_path is None:
-            run = main_job.rehearse_case(context, out_dir, rooms, choice)
-        else:
-            run = main_job.rehearse_plan(context, plan_path, out_dir, rooms)
-    _print(run.summary(), words.rehearsal_text(run), as_json)
 
 
 def _print(summary: dict[str, Any], text: str, as_json: bool) -> None:

@@ -1,17 +1,20 @@
 """In which space and unit a file speaks, and the way from there to mm and LPS.
 
 Patient spaces differ in the sign of two axes: LPS counts toward the patient's left and posterior, RAS toward
-right and anterior; both count toward superior. Neither is guessed: a file says its space, or the case does.
+right and anterior; both count toward superior. Neither is guessed: a file states its space, or the case does.
+
+The command line reads the names of spaces and units from here, so numpy is not imported.
 """
 
 from __future__ import annotations
 
 from enum import StrEnum
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from puncture_twin.planning.base.errors import InputError
+
+if TYPE_CHECKING:
+    from puncture_twin.planning.base.arrays import Floats
 
 
 class Space(StrEnum):
@@ -35,7 +38,7 @@ class Unit(StrEnum):
         return {Unit.MM: 1.0, Unit.CM: 10.0, Unit.M: 1000.0}[self]
 
 
-def to_lps(points: NDArray[np.float64], space: Space) -> NDArray[np.float64]:
+def to_lps(points: Floats, space: Space) -> Floats:
     """Coordinates in LPS; those of a local frame stay as they are, since such a frame is its own.
 
     Args:
@@ -46,8 +49,8 @@ def to_lps(points: NDArray[np.float64], space: Space) -> NDArray[np.float64]:
         Shape (n, 3), same unit. RAS has x and y negated, which is its own inverse.
     """
     if space is Space.RAS:
-        return np.multiply(points, [-1.0, -1.0, 1.0], dtype=np.float64)
-    return np.array(points, dtype=np.float64)
+        return points.astype(float) * (-1.0, -1.0, 1.0)
+    return points.astype(float)
 
 
 def parse_space(text: str, *, where: str) -> Space:

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.export.exporter import Exported
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.candidates import Candidates
@@ -104,4 +106,15 @@ def rehearsal_summary(rehearsal: Rehearsal) -> dict[str, Any]:
         "max_joint_speed_deg_s": np.degrees(rehearsal.max_joint_speed).tolist(),
         "joint_speed_limit_deg_s": np.degrees(rehearsal.speed_limits).tolist(),
         **({} if rehearsal.standing is None else rehearsal.standing.summary()),
+    }
+
+
+def export_summary(done: Exported, case_checked: bool) -> dict[str, Any]:
+    """A plan that was written for a robot, as plain values; and whether its case was checked again."""
+    return {
+        "format": done.format_name,
+        "notes": list(done.notes),
+        "case_checked": case_checked,
+        "inputs": inputs_document(done.inputs),
+        "files": [str(done.path)],
     }

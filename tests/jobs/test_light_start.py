@@ -1,0 +1,43 @@
+"""What the command line loads before a command starts."""
+
+import subprocess
+import sys
+
+import pytest
+from places import ROOT
+
+HEAVY = {"numba", "trimesh", "matplotlib", "scipy", "numpy", "pybullet", "pyarrow", "fcl", "ompl"}
+
+CODE = f"""
+import sys
+from puncture_twin.run_twin import main
+code = main(sys.argv[1:])
+print(sorted({HEAVY!r} & set(sys.modules)), code)
+"""
+
+
+def loaded(*arguments):
+    """The heavy libraries that a command line loads, and its exit code."""
+    done = subprocess.run(
+        [sys.executable, "-c", CODE, *arguments], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return done.stdout.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["--help"], 0),
+        (["--version"], 0),
+        (["rehearse", "--help"], 0),
+        (["search", "case.toml", "--setp", "1"], 2),
+        (["search", "case.toml", "--certify-size", "0"], 2),
+        (["register", "a.csv", "--space", "XYZ"], 2),
+        (["demo", "--out", "run_twin.py"], 2),
+        (["movie"], 2),
+    ],
+    ids=lambda value: "_".join(value) if isinstance(value, list) else None,
+)
+def test_help_and_a_wrong_argument_load_no_library_of_numbers(arguments, code):
+    """They answer at once."""
+    assert loaded(*arguments) == f"[] {code}"

@@ -1,0 +1,85 @@
+"""The options that several commands share, and how a command takes its choice of a candidate."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from puncture_twin.planning.base.files import check_writable
+
+CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case file, or the folder that holds case.toml.")]
+SourceArgument = Annotated[Path, typer.Argument(metavar="CASE_OR_PLAN", help="A case, or a plan.json.")]
+OutOption = Annotated[
+    Path, typer.Option("--out", help="Folder for the files that are written.", callback=check_writable)
+]
+OutOfCaseOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--out", help="Folder for the files that are written.", show_default="out/, then the case's and command's names"
+    ),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, and nothing else there.")]
+JobsOption = Annotated[
+    int, typer.Option("--jobs", min=1, help="Processes, at most one a core; the answer is the same.")
+]
+EngineOption = Annotated[str, typer.Option("--engine", help="Who measures clearance: fast, or fcl, the reference.")]
+PicturesOption = Annotated[
+    bool, typer.Option("--pictures/--no-pictures", help="Whether to draw the map, the scene and the page.")
+]
+ArmOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--arm/--no-arm",
+        help="Whether the arm must be able to reach a candidate.",
+        show_default="where the case says where its base is",
+    ),
+]
+
+CHOICE_OPTIONS = {
+    "theta": Annotated[float | None, typer.Option("--theta", min=0, max=180, help="Puncture angle, degrees.")],
+    "beta": Annotated[float | None, typer.Option("--beta", min=0, max=360, help="Azimuth, degrees.")],
+    "rank": Annotated[int | None, typer.Option("--rank", min=1, help="Of the search: 1 is the best candidate.")],
+    "window": Annotated[int | None, typer.Option("--window", min=1, help="The best of this window of the search.")],
+    "entry": Annotated[
+        str | None,
+        typer.Option("--entry", metavar="X,Y,Z", help="Where the needle enters the skin, mm, case's space."),
+    ],
+}
+"""What names a candidate, in the order in which `parse_choice` takes it."""
+
+
+def with_choice(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of `CHOICE_OPTIONS` where it has a parameter ``choice``.
+
+    typer reads a command's options from its signature and knows no groups of them. What the options say is parsed, and
+    refused where it is contradictory, before the command starts.
+    """
+    signature = inspect.signature(command, eval_str=True, locals={"Choice": object})
+    parameters: list[inspect.Parameter] = []
+    for parameter in signature.parameters.values():
+        parameters += _choice_parameters() if parameter.name == "choice" else [parameter.replace(kind=_KEYWORD)]
+
+    @functools.wraps(command)
+    def chosen(**values: Any) -> None:
+        from puncture_twin.planning.search.selection.choice import parse_choice
+
+        choice = parse_choice(*(values.pop(name) for name in CHOICE_OPTIONS))
+        command(**values, choice=choice)
+
+    chosen.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    chosen.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]  # inspect reads it
+    return chosen
+
+
+_KEYWORD = inspect.Parameter.KEYWORD_ONLY
+
+
+def _choice_parameters() -> list[inspect.Parameter]:
+    return [
+        inspect.Parameter(name, _KEYWORD, default=None, annotation=option) for name, option in CHOICE_OPTIONS.items()
+    ]
