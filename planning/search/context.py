@@ -28,6 +28,8 @@ from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.registration.placement import Placement, load_placement
 from puncture_twin.planning.search.arm_reach import ArmReach
+from puncture_twin.planning.search.bedside.entry_facts import EntryFacts, entry_facts
+from puncture_twin.planning.search.bedside.entry_place import Landmark
 from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
 from puncture_twin.planning.search.consistency import check_consistency
 from puncture_twin.planning.search.doubt import Doubt, doubt_of
@@ -95,7 +97,17 @@ class CaseContext:
     def explain(self, theta: float, beta: float) -> Explanation:
         """Check a single direction (rad), and say what it was checked against and how sure it is."""
         found = self.check(theta, beta)
-        return Explanation(self.case, self.anatomy, found, self._doubt(found))
+        facts = self.entry_facts(found.path.entry_ct[0], found.outward_ct[0])
+        return Explanation(self.case, self.anatomy, found, facts, self._doubt(found))
+
+    def entry_facts(self, entry_ct: Floats, outward_ct: Floats) -> EntryFacts:
+        """A path for whoever stands at the patient: its skin entry (3,), mm, and its direction outward (3,), unit."""
+        registration = None if self.placement is None else self.placement.registration
+        if registration is None:
+            return entry_facts(self.case, (), entry_ct, outward_ct)
+        named = zip(registration.markers.names, registration.markers.points_ct, strict=True)
+        markers = tuple(Landmark(f"marker {name}", point) for name, point in named)
+        return entry_facts(self.case, markers, entry_ct, outward_ct)
 
     def _doubt(self, found: Candidates) -> Doubt | None:
         if self.chance is None or found.chances is None or not np.isfinite(found.chances.hit[0]):

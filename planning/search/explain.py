@@ -14,6 +14,7 @@ from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.along_path import Stretch, stretches
+from puncture_twin.planning.search.bedside.entry_facts import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.constraints import longest_path
 from puncture_twin.planning.search.doubt import Doubt
@@ -44,12 +45,14 @@ class Explanation:
 
     Attributes:
         candidates: A search's result with this candidate alone.
+        facts: The same path for whoever stands at the patient.
         doubt: How sure it is; None where the case declares no errors, or the candidate was rejected before.
     """
 
     case: Case
     anatomy: Anatomy
     candidates: Candidates
+    facts: EntryFacts
     doubt: Doubt | None = None
 
     @property
@@ -88,6 +91,7 @@ class Explanation:
             "reason_amount": finite(row.verdict.amount[0]),
             "reason_detail": str(row.verdict.detail[0]),
             "entry_ct_mm": [finite(x) for x in row.path.entry_ct[0]],
+            **self.facts.summary(),
             "target_depth_mm": self.target_depth_mm,
             "path_length_mm": finite(row.path.length[0]),
             "skin_angle_deg": finite(np.degrees(row.path.skin_angle[0])),
@@ -161,14 +165,14 @@ class Explanation:
 
     def _path(self) -> list[str]:
         row, needle = self.candidates, self.case.needle
+        described = [f"  {label:18s} {told}" for label, told in self.facts.rows()]
         if np.isnan(row.path.length[0]):
-            return ["  no skin entry on this path"]
-        entry = ", ".join(f"{x:.1f}" for x in row.path.entry_ct[0])
+            return ["  no skin entry on this path", *described]
         limit = np.degrees(self.case.search.max_skin_angle)
         standoff = float(standoffs(needle, row.path.length[0], row.path.skin_angle[0]))
         before, flange = standoff - row.path.length[0], standoff + needle.length_mm
         return [
-            f"  skin entry     ({entry}) mm in the CT frame",
+            *described,
             f"  path length    {row.path.length[0]:8.2f} mm, allowed {longest_path(needle):g}",
             f"  skin angle     {np.degrees(row.path.skin_angle[0]):8.2f} deg, allowed {limit:g}",
             f"  standoff       {standoff:8.2f} mm, its tip {before:.1f} mm before the skin, the flange at {flange:.1f}",

@@ -16,7 +16,6 @@ from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.labels.naming import names_for
 from puncture_twin.planning.formats.points.point_files import read_points
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.table import to_table, write_table
 
 HOSTILE = {
@@ -45,7 +44,7 @@ def test_a_long_name_is_whole_in_the_verdict_and_in_the_table(long_named, tmp_pa
     found = long_named.check(np.radians(50), np.radians(270))
     name = 199 * "v" + "h"
     assert found.verdict.structure[0] == name
-    explained = Explanation(long_named.case, long_named.anatomy, found)
+    explained = long_named.explain(np.radians(50), np.radians(270))
     assert f"too_close ({name})" in explained.text()
     assert f"  {name} avoid" in explained.text()
     assert explained.summary()["reason_structure"] == name

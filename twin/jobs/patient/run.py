@@ -10,6 +10,7 @@ from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.clearance.cross_check import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.search.bedside.entry_facts import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import needle_warnings
@@ -41,6 +42,12 @@ class Run:
         """The files that the command read beside the case's, then the case's."""
         return (*self.read, *self.context.case.inputs)
 
+    @property
+    def facts(self) -> EntryFacts:
+        """The plan's path for whoever stands at the patient."""
+        assert self.plan is not None
+        return self.context.entry_facts(self.plan.entry_ct, self.plan.outward_ct)
+
     def with_files(self, *files: Path) -> Run:
         """The run with files more."""
         return replace(self, files=(*self.files, *files))
@@ -58,7 +65,7 @@ class Run:
             "best": [window_summary(found, window) for window in windows[:MOST_WINDOWS]],
             "windows": len(windows),
             "safe_cone_from": found.cone_source,
-            "plan": None if self.plan is None else plan_summary(self.plan),
+            "plan": None if self.plan is None else plan_summary(self.plan, self.facts),
             "rehearsal": None if self.rehearsal is None else rehearsal_summary(self.rehearsal),
             **({} if self.distribution is None else {"distribution": self.distribution.summary()}),
             "cross_check": None if self.checked is None else asdict(self.checked),

@@ -1,0 +1,8 @@
+"""Where a needle enters, and how it leans, in words that can be measured on the skin and set at the scanner.
+
+It reads a direction and the markers, and decides nothing.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
