@@ -61,6 +61,15 @@ def test_a_rehearsal_writes_every_file(rehearsed):
     assert all(path.stat().st_size > 0 for path in rehearsed.iterdir())
 
 
+def test_the_page_says_where_the_needle_enters_as_check_does(carton, rehearsed, capfd):
+    """The same words, from the nearest marker."""
+    plan = json.loads((rehearsed / "plan.json").read_text())
+    code, told = run(capfd, "check", carton, "--theta", plan["theta_deg"], "--beta", plan["beta_deg"], "--no-arm")
+    words = told["entry_from"]["text"]
+    assert code == OK and "from marker " in words
+    assert f"<td>{words}</td>" in (rehearsed / "report.html").read_text()
+
+
 def test_the_carton_errs_like_the_paper(rehearsed):
     """The truth is where the robot really touched the lesion: 2-3 mm off, as Chen 2019 measured (Table 3: 2.94 mm).
 

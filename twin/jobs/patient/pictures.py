@@ -56,6 +56,7 @@ def with_pictures(run: Run, out: Path) -> Run:
             uncertainty=told,
             pick=run.pick,
             slices=slices,
+            facts=run.facts,
         )
     return run.with_files(out / "map.png", out / "scene.png", out / PAGE)
 

@@ -14,7 +14,7 @@ from puncture_twin.planning.search.bedside.entry_facts import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import needle_warnings
-from puncture_twin.planning.search.selection.choice import Pick
+from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.jobs.patient.summaries import plan_summary, rehearsal_summary, window_summary
 from puncture_twin.twin.rehearsal.distribution import Distribution
@@ -43,10 +43,15 @@ class Run:
         return (*self.read, *self.context.case.inputs)
 
     @property
-    def facts(self) -> EntryFacts:
-        """The plan's path for whoever stands at the patient."""
-        assert self.plan is not None
-        return self.context.entry_facts(self.plan.entry_ct, self.plan.outward_ct)
+    def facts(self) -> EntryFacts | None:
+        """The path of the plan, else of the best direction, for whoever stands at the patient; None without either."""
+        if self.plan is not None:
+            return self.context.entry_facts(self.plan.entry_ct, self.plan.outward_ct)
+        pick = self.pick or best_pick(self.candidates)
+        if pick is None:
+            return None
+        found, row = pick
+        return self.context.entry_facts(found.path.entry_ct[row], found.outward_ct[row])
 
     def with_files(self, *files: Path) -> Run:
         """The run with files more."""
@@ -56,6 +61,7 @@ class Run:
         """Plain values for JSON: mm and degrees."""
         found, provenance = self.candidates, self.context.provenance()
         windows = find_windows(found).windows
+        at_patient = {} if self.facts is None else self.facts.summary()
         return {
             **provenance,
             "warnings": [*provenance["warnings"], *needle_warnings(self.context.case, found)],
@@ -65,7 +71,7 @@ class Run:
             "best": [window_summary(found, window) for window in windows[:MOST_WINDOWS]],
             "windows": len(windows),
             "safe_cone_from": found.cone_source,
-            "plan": None if self.plan is None else plan_summary(self.plan, self.facts),
+            "plan": None if self.plan is None else plan_summary(self.plan) | at_patient,
             "rehearsal": None if self.rehearsal is None else rehearsal_summary(self.rehearsal),
             **({} if self.distribution is None else {"distribution": self.distribution.summary()}),
             "cross_check": None if self.checked is None else asdict(self.checked),

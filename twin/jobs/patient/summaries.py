@@ -10,7 +10,6 @@ from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.export.exporter import Exported
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.registration.registration import Registration
-from puncture_twin.planning.search.bedside.entry_facts import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.explain import finite
 from puncture_twin.planning.search.selection.windows import Window
@@ -80,13 +79,12 @@ def window_summary(found: Candidates, window: Window) -> dict[str, Any]:
     }
 
 
-def plan_summary(plan: Plan, facts: EntryFacts) -> dict[str, Any]:
-    """A plan's main numbers as plain values, with its path as it is found at the patient."""
+def plan_summary(plan: Plan) -> dict[str, Any]:
+    """A plan's main numbers as plain values."""
     return {
         "theta_deg": float(np.degrees(plan.theta)),
         "beta_deg": float(np.degrees(plan.beta)),
         "entry_ct_mm": plan.entry_ct.tolist(),
-        **facts.summary(),
         "standoff_mm": plan.standoff_mm,
         "expected_target_error_mm": finite(plan.expected_target_error_mm),
         "approach_s": float(plan.approach.times_s[-1]),

@@ -63,11 +63,11 @@ def _search(run: Run) -> list[str]:
 
 def _plan(run: Run) -> list[str]:
     assert run.plan is not None
-    plan = plan_summary(run.plan, run.facts)
+    plan = plan_summary(run.plan)
     error = plan["expected_target_error_mm"]
     return [
         f"plan: theta {plan['theta_deg']:g} deg, beta {plan['beta_deg']:g} deg, standoff {plan['standoff_mm']:.1f} mm",
-        *(f"  {label:18s} {told}" for label, told in run.facts.rows()),
+        *(f"  {label:18s} {told}" for label, told in (() if run.facts is None else run.facts.rows())),
         f"  approach {plan['approach_s']:.1f} s, insertion {plan['insertion_s']:.1f} s",
         "  expected error at the target: " + ("unknown (no markers)" if error is None else f"{error:.2f} mm (rms)"),
         *_otherwise(run.candidates, run.plan),

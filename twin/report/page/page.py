@@ -10,6 +10,7 @@ import numpy as np
 
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.geometry.spaces import to_lps
+from puncture_twin.planning.search.bedside.entry_facts import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.doubt import Doubt
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
@@ -66,6 +67,7 @@ def write_page(
     uncertainty: Uncertainty | None = None,
     pick: Pick | None = None,
     slices: Sequence[Slices] = (),
+    facts: EntryFacts | None = None,
 ) -> None:
     """Write the page.
 
@@ -81,6 +83,7 @@ def write_page(
         uncertainty: What there is to say of chances and rooms; None where the case declares no errors.
         pick: The planned candidate, or the one to be shown; None shows the best.
         slices: What is shown in the CT, the first at once, the others where they are chosen.
+        facts: How the planned or shown path is found at the patient.
     """
     pick = pick or best_pick(candidates)
     data = {
@@ -108,7 +111,7 @@ def write_page(
         rooms=None if uncertainty is None else rooms_section(uncertainty.rooms, uncertainty.picture),
         counts=tables.counts_table(candidates),
         best=tables.best_table(candidates),
-        plan=tables.plan_section(plan),
+        plan=tables.plan_section(plan, () if facts is None else facts.rows()),
         registration=tables.registration_section(registration, plan),
         rehearsal=tables.rehearsal_section(rehearsal, demanding(anatomy), film),
         warnings=tables.warnings_section(anatomy.warnings),

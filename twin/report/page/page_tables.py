@@ -183,15 +183,17 @@ def _value(value: Any, unit: str, digits: int) -> str:
     return str(value)
 
 
-def plan_section(plan: Any | None) -> Markup:
-    """The plan's numbers."""
+def plan_section(plan: Any | None, at_patient: Iterable[tuple[str, str]] = ()) -> Markup:
+    """The plan's numbers, and how its path, or that of the best direction, is found at the patient."""
     if plan is None:
-        return Markup("<p>No plan was made.</p>")
+        best = (("path of the best direction", ""), *at_patient)
+        return Markup("<p>No plan was made.</p>{}").format(pairs(best) if len(best) > 1 else "")
     rows = [
         ("direction", f"θ {np.degrees(plan.theta):g}°, β {np.degrees(plan.beta):g}°"),
         ("arm", str(plan.model)),
         ("roll about the needle", f"{np.degrees(plan.roll):.1f}°"),
         ("standoff (tip to target)", number(plan.standoff_mm, 1, "mm")),
+        *at_patient,
         ("entry point, CT frame", _point(plan.entry_ct)),
         ("target, CT frame", _point(plan.target_ct)),
         ("approach", f"{plan.approach.times_s[-1]:.1f} s, {len(plan.approach.q)} waypoints"),
