@@ -1,5 +1,5 @@
+from .checks.marker_check import check_markers as check_markers, checked_placement as checked_placement
 from .conditioning import Conditioning as Conditioning
-from .marker_check import check_markers as check_markers, checked_placement as checked_placement
 from .placement import Placement as Placement, load_placement as load_placement
 from .registration import (
     MIN_MARKERS as MIN_MARKERS,

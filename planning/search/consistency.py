@@ -17,7 +17,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 from puncture_twin.planning.geometry.winding import odd_fraction, winding_number
-from puncture_twin.planning.registration.marker_check import check_markers
+from puncture_twin.planning.registration.checks.marker_check import check_markers
 from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.constraints import longest_path
 from puncture_twin.planning.search.resolution import resolution_warnings

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration import marker_ambiguity
-from puncture_twin.planning.registration.marker_ambiguity import HARMLESS_MM, renamings
+from puncture_twin.planning.registration.checks import marker_ambiguity
+from puncture_twin.planning.registration.checks.marker_ambiguity import HARMLESS_MM, renamings
 from puncture_twin.planning.registration.registration import MarkerPairs, fit_rigid
 
 TARGET = np.array([10.0, -20.0, -90.0])

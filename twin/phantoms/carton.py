@@ -15,9 +15,16 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_2
+from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_2, TABLE_4
 
-__all__ = ["LESIONS_CT_MM", "MARKERS_CT_MM", "TOUCHED_BASE_MM", "carton_meshes"]
+__all__ = [
+    "LESIONS_CT_MM",
+    "MARKERS_CT_MM",
+    "SETUP_2_MARKERS",
+    "TOUCHED_BASE_MM",
+    "TOUCHED_SETUP_2_BASE_MM",
+    "carton_meshes",
+]
 
 LESIONS_CT_MM = MappingProxyType({name: TABLE_1[name] for name in "LMH"})
 """Table 1: the lesions, the middles of the bolts' upper ends."""
@@ -25,6 +32,10 @@ MARKERS_CT_MM = MappingProxyType({name: TABLE_1[name] for name in "ABC"})
 """Table 1: the markers used in the first setup."""
 TOUCHED_BASE_MM = TABLE_2
 """Table 2: markers and lesions touched with the needle tip, in the robot's base frame."""
+SETUP_2_MARKERS = MappingProxyType({name: TABLE_1[name] for name in "ABCDE"})
+"""Table 1: the markers used in the second setup."""
+TOUCHED_SETUP_2_BASE_MM = TABLE_4
+"""Table 4: the same box elsewhere, five markers and lesion M, base frame."""
 BOX_LOW_MM, BOX_HIGH_MM = (-10.0, -10.0, -10.0), (160.0, 210.0, 147.0)
 _BOX_CELLS = (17, 22, 16)
 _BOLT_RADIUS_MM = 4.0

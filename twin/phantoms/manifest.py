@@ -95,10 +95,15 @@ def _carton_files() -> list[tuple[dict[str, Any], bytes]]:
         files.append(({**entry, "triangles": len(mesh.faces)}, ply_bytes(mesh)))
     touched = carton.TOUCHED_BASE_MM
     markers = {name: touched[name] for name in carton.MARKERS_CT_MM}
+    again = carton.TOUCHED_SETUP_2_BASE_MM
+    markers_again = {name: again[name] for name in carton.SETUP_2_MARKERS}
     for name, space, points, source in (
         ("markers_ct.csv", "local", carton.MARKERS_CT_MM, "Table 1"),
         ("touch.csv", "base", markers, "Table 2"),
         ("truth.csv", "base", touched, "Table 2"),
+        ("setup2_markers_ct.csv", "local", carton.SETUP_2_MARKERS, "Table 1"),
+        ("setup2_touch.csv", "base", markers_again, "Table 4"),
+        ("setup2_truth.csv", "base", again, "Table 4"),
     ):
         entry = _entry(f"carton/{name}", space, "puncture_twin.twin.phantoms.carton", {"source": f"{_PAPER}, {source}"})
         files.append((entry, points_csv({key: np.array(value) for key, value in points.items()}, 2)))

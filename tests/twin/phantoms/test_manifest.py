@@ -97,4 +97,4 @@ def test_points_are_written_with_names_and_fixed_decimals():
 def test_package_folder_is_where_the_cases_are():
     """The package knows its own folder, however it was installed."""
     assert isinstance(FOLDER, Path)
-    assert [path.stem for path in CASES] == ["case", "case_h", "case_l", "case_m"]
+    assert [path.stem for path in CASES] == ["case", "case_h", "case_l", "case_m", "case_m_setup2"]

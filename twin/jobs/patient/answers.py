@@ -26,7 +26,8 @@ from puncture_twin.planning.formats.points.raw_points import parse_coordinate
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.registration.advice import odd_branches, one_more, without_each
-from puncture_twin.planning.registration.marker_check import checked_placement
+from puncture_twin.planning.registration.checks.marker_check import checked_placement
+from puncture_twin.planning.registration.checks.squareness import Squareness, check_squareness
 from puncture_twin.planning.registration.registration import Registration, match, register
 from puncture_twin.planning.registration.touching import touchable_points
 from puncture_twin.planning.search.context import CaseContext
@@ -70,6 +71,7 @@ def registration_report(path: Path) -> dict[str, Any]:
     report["expected_tre_target_interval_mm"] = list(registration.expected_tre_interval_mm(case.target_ct))
     report["expected_tre_along_shaft_mm"] = registration.expected_tre_mm(along).tolist()
     report["warnings"] = [*case.warnings, *checked.findings.warnings, *_branch_warning(case, registration)]
+    report["squareness"] = _squareness(check_squareness(registration, case.target_ct))
     report |= _advice(case, registration)
     report["notes"] = list(checked.findings.notes)
     return report
@@ -101,9 +103,24 @@ def lists_report(
     report["expected_tre_target_mm"] = float(registration.expected_tre_mm(target_ct[None])[0])
     report["expected_tre_target_interval_mm"] = list(registration.expected_tre_interval_mm(target_ct))
     report["expected_tre_along_shaft_mm"] = []
+    report["squareness"] = _squareness(check_squareness(registration, target_ct))
     report["warnings"] = []
     report["notes"] = ["two lists alone: neither skin nor couch was asked whether axes or names have slipped"]
     return report
+
+
+def _squareness(found: Squareness | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    return {
+        "axes": list(found.axes),
+        "angle_deg": float(np.degrees(found.angle)),
+        "probability": found.probability,
+        "expected_mm": found.rms_mm,
+        "expected_if_square_mm": found.rms_square_mm,
+        "doubted": found.doubted,
+        "text": found.text(),
+    }
 
 
 def _branch_warning(case: Case, registration: Registration) -> tuple[str, ...]:

@@ -17,8 +17,8 @@ from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.checks.skin_fit import SkinFit, skin_fit
 from puncture_twin.planning.registration.registration import Registration, fit_rigid
-from puncture_twin.planning.registration.skin_fit import SkinFit, skin_fit
 from puncture_twin.planning.registration.touching import place_excluded, untouchable
 
 Signs = tuple[float, float, float]

@@ -11,11 +11,11 @@ from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.axis_slips import MarkerList, check_axes, marker_list
-from puncture_twin.planning.registration.name_slips import check_names
+from puncture_twin.planning.registration.checks.axis_slips import MarkerList, check_axes, marker_list
+from puncture_twin.planning.registration.checks.name_slips import check_names
+from puncture_twin.planning.registration.checks.skin_fit import MARKER_ON_SKIN_MM
 from puncture_twin.planning.registration.placement import Placement, load_placement
 from puncture_twin.planning.registration.registration import Registration
-from puncture_twin.planning.registration.skin_fit import MARKER_ON_SKIN_MM
 
 LOCAL_AXES = 'space "local": nothing tells whether the axes of markers_ct have slipped by a half turn'
 BASE_AXES = (

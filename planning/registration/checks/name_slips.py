@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.registration.marker_ambiguity import Renaming, renamings
+from puncture_twin.planning.registration.checks.marker_ambiguity import Renaming, renamings
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.registration.touching import place_excluded
 

@@ -1,0 +1,2 @@
+from .marker_check import check_markers as check_markers, checked_placement as checked_placement
+from .squareness import Squareness as Squareness, check_squareness as check_squareness
