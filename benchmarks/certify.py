@@ -65,14 +65,14 @@ def _row(name: str, context: CaseContext, size_deg: float, step_deg: float, repe
     trees = _best(lambda: FastEngine(meshes), repeats)
     dense = _best(lambda: engine.measure(case.target_ct, coarse.outward_ct, length), repeats)
     fewer, triangles = 100 * (1 - found.queries / len(fine)), sum(len(mesh.faces) for mesh in meshes)
-    shares = 100 * (found.share("S") or 0), 100 * (found.share("U") or 0), 100 * _mixed(context, found)
+    shares = 100 * (found.fraction("S") or 0), 100 * (found.fraction("U") or 0), 100 * _mixed(context, found)
     cells = " | ".join(
         [
             f"{name} ({triangles:,})",
             f"{size_deg:g}",
             f"{own / dense:.2f} ({own / (dense + trees):.2f})",
             f"{fewer:.1f} %",
-            *(f"{share:.2f} %" for share in shares),
+            *(f"{fraction:.2f} %" for fraction in shares),
             f"{own:.3f}",
             f"{dense:.3f} ({dense + trees:.3f})",
             f"{found.queries:,}",
@@ -91,8 +91,8 @@ def _mixed(context: CaseContext, found: Certificate, across: int = 6) -> float:
     angles = [np.ascontiguousarray(a).ravel() for a in np.broadcast_arrays(theta, beta)]
     outward_ct = outward(*angles) @ case.T_ct_entry[:3, :3].T
     safe = organ_candidates(case, context.anatomy, context.engine, Directions(*angles, outward_ct)).safe
-    share = safe.reshape(len(cells), -1).mean(axis=1)
-    mixed = cells.take((share > 0) & (share < 1)).solid_angle().sum()
+    fraction = safe.reshape(len(cells), -1).mean(axis=1)
+    mixed = cells.take((fraction > 0) & (fraction < 1)).solid_angle().sum()
     return float(mixed / found.question.cap().solid_angle()[0])
 
 

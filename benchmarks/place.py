@@ -90,8 +90,8 @@ def best_positions() -> None:
                     region = Region("ceiling", "", (0, 0, -1), (0.0,) * 3, (0.0,) * 3)
                     T = np.linalg.inv(Site(region, (rho, 0.0, z)).T_bed_base())
                     found.append((held_share(T[:3, 3], directions @ T[:3, :3].T, distance), rho, z))
-            share, rho, z = max(found)
-            print(f"{distance:5.0f}  {AXIS_WORDS[axis]:13s}  {100 * share:5.1f} %  at {rho:.0f}, {z:.0f}")
+            fraction, rho, z = max(found)
+            print(f"{distance:5.0f}  {AXIS_WORDS[axis]:13s}  {100 * fraction:5.1f} %  at {rho:.0f}, {z:.0f}")
 
 
 def search(path: Path, jobs: int) -> None:
@@ -107,7 +107,7 @@ def search(path: Path, jobs: int) -> None:
     )
     print(f"possible {100 * done.possible:.1f} %; share % estimated and judged:")
     for one in done.rated:
-        print(f"  {one.name:18s} {100 * one.estimate.share:5.1f}  {100 * one.verdict.share:5.1f}")
+        print(f"  {one.name:18s} {100 * one.estimate.fraction:5.1f}  {100 * one.verdict.fraction:5.1f}")
 
 
 def _cpu() -> float:

@@ -15,7 +15,7 @@ from .files import (
 from .html import Facts as Facts, card as card, escape as escape, never_raises as never_raises
 from .input_file import read_input as read_input
 from .polar_map import Sectors as Sectors, polar_map as polar_map
-from .processes import ask_all as ask_all, process_pool as process_pool, worker_count as worker_count
+from .processes import map_all as map_all, process_pool as process_pool, worker_count as worker_count
 from .progress import Count as Count, Silent as Silent, Stages as Stages, Watcher as Watcher, uncounted as uncounted
 from .provenance import (
     CASE_ROLE as CASE_ROLE,

@@ -38,7 +38,7 @@ def process_pool(jobs: int, pieces: int) -> Iterator[ProcessPoolExecutor]:
     """A pool of `worker_count` spawned processes; where the block ends early, as by Ctrl-C, nothing more begins.
 
     Args:
-        jobs: What the caller asks for; any number.
+        jobs: What the caller wants; any number.
         pieces: Of the work.
     """
     context = multiprocessing.get_context("spawn")
@@ -49,20 +49,20 @@ def process_pool(jobs: int, pieces: int) -> Iterator[ProcessPoolExecutor]:
         pool.shutdown(cancel_futures=True)
 
 
-def ask_all(
-    ask: Callable[[Thing], Answer],
+def map_all(
+    function: Callable[[Thing], Answer],
     things: Sequence[Thing],
     *,
     jobs: int,
     progress: Count,
 ) -> list[Answer]:
-    """The answers in the order of the things.
+    """The results in the order of the things.
 
     Args:
-        ask: The question; with several jobs it and its answers must be such as can be pickled.
-        things: What is asked about.
-        jobs: Processes, at most one a core; 1 asks in this one.
-        progress: Called with (answered, to answer).
+        function: What is computed of each; with several jobs it and its results must be such as can be pickled.
+        things: Its arguments.
+        jobs: Processes, at most one a core; 1 computes in this one.
+        progress: Called with (done, all).
     """
     jobs = worker_count(jobs, len(things))
     size = max(1, min(BATCH, len(things) // (4 * jobs)))
@@ -70,15 +70,15 @@ def ask_all(
     answers: list[Answer] = []
     if jobs == 1 or len(batches) < 2:
         for batch in batches:
-            answers += _batch(ask, batch)
+            answers += _batch(function, batch)
             progress(len(answers), len(things))
         return answers
     with process_pool(jobs, len(batches)) as pool:
-        for some in pool.map(partial(_batch, ask), batches):
+        for some in pool.map(partial(_batch, function), batches):
             answers += some
             progress(len(answers), len(things))
     return answers
 
 
-def _batch(ask: Callable[[Thing], Answer], things: Sequence[Thing]) -> list[Answer]:
-    return [ask(thing) for thing in things]
+def _batch(function: Callable[[Thing], Answer], things: Sequence[Thing]) -> list[Answer]:
+    return [function(thing) for thing in things]

@@ -75,7 +75,7 @@ class Certificate:
     """Which directions are proven safe, which are proven not to be, and which cells are too small to say.
 
     Attributes:
-        question: What was asked.
+        question: What it answers.
         size: No undecided cell has a larger angular diameter, rad.
         tree: Level by level, a letter for each cell of the level: a split, or a leaf's verdict. The parts of a level's
             split cells, in order, are the next level.
@@ -111,7 +111,7 @@ class Certificate:
         area = self.leaves.solid_angle() * SQUARE_DEGREES
         return {letter: float(area[self.verdict == letter].sum()) for letter in (SAFE, REJECTED, UNDECIDED)}
 
-    def share(self, letter: str) -> float | None:
+    def fraction(self, letter: str) -> float | None:
         """Part of the cap's area with a verdict, 0..1; None for a cap without area."""
         total = float(self.question.cap().solid_angle()[0]) * SQUARE_DEGREES
         return self.areas[letter] / total if total > 0 else None
@@ -165,8 +165,8 @@ class Certificate:
             "safe_square_deg": areas[SAFE],
             "rejected_square_deg": areas[REJECTED],
             "undecided_square_deg": areas[UNDECIDED],
-            "safe_share": self.share(SAFE),
-            "undecided_share": self.share(UNDECIDED),
+            "safe_share": self.fraction(SAFE),
+            "undecided_share": self.fraction(UNDECIDED),
             "safe_cells": cells[SAFE],
             "rejected_cells": cells[REJECTED],
             "undecided_cells": cells[UNDECIDED],

@@ -30,14 +30,14 @@ DEPTH_PAD_MM = 5e-5
 """Kept from limits on depths; the certifier keeps twice as much."""
 ANGLE_PAD_RAD = 5e-8
 """Kept from the largest skin angle; the certifier keeps twice as much."""
-MET_MM = 0.01
-"""A triangle of the skin that keeps so far from an axis is not met, also where the search turns a ray a little."""
+CONTACT_MM = 0.01
+"""A triangle of the skin that keeps so far from an axis is not crossed, also where the search tilts a ray a little."""
 WIDEST = np.radians(80)
 """Nothing is proven over a wider cone."""
 NEAR_BELOW = np.radians(4)
 """Planes by the feet on the edges, which tell something of near triangles, are tried for smaller cones."""
 SKIN_BELOW = np.radians(25)
-"""The skin is looked at for cones of at most this half-angle: over a wider one nothing holds."""
+"""The skin is looked at for cones of at most this half-angle: over a wider one nothing is proven."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class _Cell:
         self.bulge = np.sin(np.clip(np.pi / 2, *theta)) * (1 - np.cos(wide / 2)) + 1e-12
 
     def ray(self, i: float, j: float) -> Floats:
-        """The direction at a part of the way from the lowest to the highest θ and β."""
+        """The direction at a fraction of the range from the lowest to the highest θ and β."""
         t, b = self.theta[0] + i * (self.theta[1] - self.theta[0]), self.beta[0] + j * (self.beta[1] - self.beta[0])
         return np.asarray(self._R @ np.array([np.sin(t) * np.cos(b), np.sin(t) * np.sin(b), np.cos(t)]))
 
@@ -112,13 +112,13 @@ def _check_question(certificate: Certificate, case: Case, anatomy: Anatomy) -> N
     stated = certificate.question
     if not (np.all(np.isfinite(stated.theta)) and 0 <= stated.theta[0] <= stated.theta[1] <= np.pi + 1e-12):
         raise InputError(f"theta {stated.theta} is no range", where="certificate", allowed="0 to pi")
-    asked = question_of(case, anatomy, theta=stated.theta, beta=stated.beta)
-    changed = differing_input(stated.inputs, asked.inputs)
+    derived = question_of(case, anatomy, theta=stated.theta, beta=stated.beta)
+    changed = differing_input(stated.inputs, derived.inputs)
     if changed is not None:
         what = f"input '{changed}' is not the one that the certificate was made from"
         raise InputError(what, where="certificate", allowed=f"a certificate of {case.path}, unchanged since")
-    for name in vars(asked):
-        if name != "inputs" and not np.array_equal(getattr(stated, name), getattr(asked, name)):
+    for name in vars(derived):
+        if name != "inputs" and not np.array_equal(getattr(stated, name), getattr(derived, name)):
             what = f"its {name} is not that of the case: the certificate was made for something else"
             raise InputError(what, where="certificate", allowed=f"a certificate of {case.path}, unchanged since")
 
@@ -170,7 +170,7 @@ class _Checker:
         if leaves is None:
             leaves = self._leaves(cell, None)
         if not good or leaves is None:
-            everywhere = np.full(len(skin), MET_MM), cell, np.full(len(skin), question.farthest)
+            everywhere = np.full(len(skin), CONTACT_MM), cell, np.full(len(skin), question.farthest)
             skin = skin[~_apart(self._skin.corners[skin], *everywhere)]
             if cell.rho <= SKIN_BELOW:
                 lengths = {"length": question.farthest, "longest": question.longest}
@@ -194,14 +194,14 @@ class _Checker:
     def _check_leaf(self, cell: _Cell, whole: _Known, letter: str, row: int) -> None:
         reason, structure = str(self._certificate.reason[row]), str(self._certificate.structure[row])
         if letter == "U":
-            holds = 2 * cell.rho <= self._certificate.size + 1e-9
+            proven = 2 * cell.rho <= self._certificate.size + 1e-9
         elif letter == "S":
-            holds = not reason and self._safe(self._learn(cell, whole))
+            proven = not reason and self._safe(self._learn(cell, whole))
         elif reason == "too_close":
-            holds = self._too_close(cell, structure, int(self._certificate.triangle[row]))
+            proven = self._too_close(cell, structure, int(self._certificate.triangle[row]))
         else:
-            holds = self._skin_rejects(self._learn(cell, whole), reason)
-        if not holds:
+            proven = self._skin_rejects(self._learn(cell, whole), reason)
+        if not proven:
             theta, beta = (f"{np.degrees(low):.4f}..{np.degrees(high):.4f}" for low, high in (cell.theta, cell.beta))
             claim = {"S": "safe", "R": f"rejected ({reason})", "U": "small"}[letter]
             what = f"cell {row} (theta {theta}, beta {beta} degrees) is not proven {claim}"

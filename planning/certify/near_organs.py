@@ -102,13 +102,13 @@ def _checked(  # type: ignore[no-untyped-def]  # numba infers
     filled, measured = 0, 0
     for i in range(len(parent)):
         u, four = (centres[i, 0], centres[i, 1], centres[i, 2]), ends[i]
-        cos_radius, sin_radius, ask = np.cos(radius[i]), np.sin(radius[i]), radius[i] <= wide
+        cos_radius, sin_radius, narrow = np.cos(radius[i]), np.sin(radius[i]), radius[i] <= wide
         first, last = start[parent[i]], start[parent[i] + 1]
         filled = out_start[i]
         out_start[i + 1] = filled
         if filled + last - first > len(kept):
             kept = _grown(kept, filled, 2 * (filled + last - first))
-        if ask and witness[i] >= 0:
+        if narrow and witness[i] >= 0:
             length = lengths[group[witness[i]]]
             more, limit = BULGES * length * bulge[i], limits[group[witness[i]]] - pad
             hit, worst = _corners(corners[witness[i]], four, length, limit - more)
@@ -116,9 +116,9 @@ def _checked(  # type: ignore[no-untyped-def]  # numba infers
                 rejected[i], largest[i], found[i] = True, worst + more, witness[i]
                 continue
             if hit > 0 and radius[i] <= SURELY_MIXED:
-                ask = False
+                narrow = False
                 found[i] = witness[i]
-        best, asked = np.inf, False
+        best, looked = np.inf, False
         for k in range(first, last):
             t = items[k]
             if sin_radius * cosine[t] + cos_radius * sine[t] > 0.0:
@@ -126,8 +126,8 @@ def _checked(  # type: ignore[no-untyped-def]  # numba infers
                 toward = axis[t, 0] * u[0] + axis[t, 1] * u[1] + axis[t, 2] * u[2]
                 if toward < cos_radius * cosine[t] - sin_radius * sine[t]:
                     continue
-            if ask:
-                asked = True
+            if narrow:
+                looked = True
                 limit, length = limits[group[t]], lengths[group[t]]
                 width, side = _beside(u, corners[t])
                 if _apart(corners[t], side, u, four, bulge[i], limit + pad, length):
@@ -141,7 +141,7 @@ def _checked(  # type: ignore[no-untyped-def]  # numba infers
                     best, found[i] = width - limit, t
             kept[filled] = t
             filled += 1
-        measured += asked
+        measured += looked
         out_start[i + 1] = out_start[i] if rejected[i] else filled
     return out_start, kept[: out_start[-1]].copy(), measured
 
@@ -181,7 +181,7 @@ def _beside(u, t):  # type: ignore[no-untyped-def]  # numba infers
     a = (t[0] - ta * u[0], t[1] - ta * u[1], t[2] - ta * u[2])
     b = (t[3] - tb * u[0], t[4] - tb * u[1], t[5] - tb * u[2])
     c = (t[6] - tc * u[0], t[7] - tc * u[1], t[8] - tc * u[2])
-    wa, wb, wc = _turn(u, b, c), _turn(u, c, a), _turn(u, a, b)
+    wa, wb, wc = _normal(u, b, c), _normal(u, c, a), _normal(u, a, b)
     around = (wa >= 0.0 and wb >= 0.0 and wc >= 0.0) or (wa <= 0.0 and wb <= 0.0 and wc <= 0.0)
     if around and wa + wb + wc != 0.0:
         return 0.0, (0.0, 0.0, 0.0)
@@ -197,7 +197,7 @@ def _beside(u, t):  # type: ignore[no-untyped-def]  # numba infers
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _turn(u, p, q):  # type: ignore[no-untyped-def]  # numba infers
+def _normal(u, p, q):  # type: ignore[no-untyped-def]  # numba infers
     return (
         u[0] * (p[1] * q[2] - p[2] * q[1])
         + u[1] * (p[2] * q[0] - p[0] * q[2])

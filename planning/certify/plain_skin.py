@@ -61,8 +61,8 @@ class PlainSkin:
         rho = rho + CONE_PAD_RAD
         near, far = _depths(self.corners[rows], u, rho)
         edges = np.stack([_edge_angle(self.corners[rows, i], self.corners[rows, (i + 1) % 3], u) for i in range(3)])
-        met = ((edges.min(axis=0) <= rho) | (_pierced(self.corners[rows], u) == 1)) & (near <= length)
-        rows, near, far, edges = rows[met], near[met], far[met], edges[:, met]
+        hit = ((edges.min(axis=0) <= rho) | (_pierced(self.corners[rows], u) == 1)) & (near <= length)
+        rows, near, far, edges = rows[hit], near[hit], far[hit], edges[:, hit]
         pierced = _pierced(self.corners[rows], ray)
         touched = np.less_equal(edges, rho).T  # which edges the cone meets
         changes = (far >= length) | (self._folds[rows] & touched).any(axis=1) | (pierced < 0)

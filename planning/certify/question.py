@@ -18,7 +18,7 @@ from puncture_twin.planning.search.constraints import longest_path
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """What was asked: everything but the surfaces that a verdict depends on; mm and rad.
+    """The question of a certificate: everything but the surfaces that a verdict depends on; mm and rad.
 
     Attributes:
         case_name: The case.
@@ -67,7 +67,7 @@ def question_of(
     theta: tuple[float, float] | None = None,
     beta: tuple[float, float] | None = None,
 ) -> Question:
-    """What a case asks of its certificate; see `certify`."""
+    """The question that a certificate of a case answers; see `certify`."""
     theta, beta = theta or case.search.theta, beta or case.search.beta
     if not (0 <= theta[0] <= theta[1] <= np.pi + 1e-12 and beta[0] <= beta[1] <= beta[0] + 2 * np.pi + 1e-12):
         raise InputError("the cap is no range of angles", where="certify", allowed="theta 0 to 180, beta 0 to 360")

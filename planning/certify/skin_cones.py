@@ -27,12 +27,12 @@ IN_DOUBT = 1e-11
 
 @dataclass(frozen=True, eq=False)
 class SkinBounds:
-    """What holds for every ray of n cells; mm and rad.
+    """Bounds that are true of every ray of n cells; mm and rad.
 
     Attributes:
         count: Shape (n,), crossings within the needle's length, the same for all rays; -1 where that is not proven.
         cut: Shape (n,), whether a triangle that is not skin may be met within the needle's length.
-        least_skin: Shape (n,), no skin is met at a smaller depth; inf where none is met within the range asked.
+        least_skin: Shape (n,), no skin is met at a smaller depth; inf where none is met within the range.
         farthest: Shape (n,), no crossing within the needle's length is deeper.
         least_angle, largest_angle: Shape (n,), bounds of the angle to the normal at every skin crossing that is no
             deeper than the longest path.

@@ -35,12 +35,12 @@ from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 TOO_WIDE = np.radians(80)
-"""Cells with a larger radius are halved unasked."""
+"""Cells with a larger radius are halved at once."""
 
 SKIN_BELOW = np.radians(25)
 """The skin is checked for cells with a smaller radius: no wider cone is ever all good."""
 
-ASK_BELOW = np.radians(4)
+MEASURE_BELOW = np.radians(4)
 """Organs are checked for cells with a smaller radius: wider ones are settled by the skin or not at all."""
 
 SMALLEST_SIZE = np.radians(0.01)
@@ -166,7 +166,7 @@ class _Evaluator:
             return _Verdicts.none(state)
         skin = narrowed(self._skin.zones, state.skin, state.parent, cones.centres, cones.radius)
         organs = organ_facts(
-            self._organs, state.organs, state.parent, state.witness, cones, wide=ASK_BELOW, pad=CLEARANCE_PAD_MM
+            self._organs, state.organs, state.parent, state.witness, cones, wide=MEASURE_BELOW, pad=CLEARANCE_PAD_MM
         )
         self.queries += organs.measured
         rows, good = np.arange(len(cells)), (state.skin_good.copy(), state.view_good.copy())

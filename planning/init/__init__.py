@@ -1,7 +1,7 @@
 """The start: a folder with a CT and a segmentation in, the text of a case that runs out.
 
-What a file is, is told by its content. Each kind of segmentation has a recogniser, and gives what `Segmentation` asks
-of it; the finder asks them all.
+What a file is, is found by its content. Each kind of segmentation has a recogniser, and gives what `Segmentation`
+demands; the finder tries them all.
 """
 
 import lazy_loader

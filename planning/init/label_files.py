@@ -16,13 +16,13 @@ from puncture_twin.planning.formats.labels.labelmaps import Box, LabelMap
 from puncture_twin.planning.formats.labels.mask_folder import structure_name
 from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS, parse_names
 from puncture_twin.planning.formats.labels.naming import BUILT_IN, MAX_CSV_BYTES, names_for
-from puncture_twin.planning.formats.labels.numbering import label_centres, plausibility, told_numbering
+from puncture_twin.planning.formats.labels.numbering import label_centres, likely_numbering, plausibility
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.init.segmentation import Assigned, Place, margin_line, quoted, rules_text
 
-NUMBERING_TOLD = "{source}: numbered as {naming}, told by where its organs lie"
-NUMBERING_NOT_TOLD = (
+NUMBERING_FOUND = "{source}: numbered as {naming}, told by where its organs lie"
+NUMBERING_UNSURE = (
     "whether totalsegmentator-v1 or -v2 numbered its labels is not told by where its organs lie, and no table of names "
     "is beside it: --naming totalsegmentator-v1, totalsegmentator-v2 or a table (CSV, JSON) decides"
 )
@@ -174,11 +174,11 @@ def _found_naming(place: Place, source: str, labels: LabelMap, present: Sequence
             what = f"its organs do not lie where {name} names them"
             raise InputError(what, where=place.folder / source, allowed="--naming with the table that is right")
         return name, (f"{source}: names from {name}",)
-    naming = told_numbering(labels)
+    naming = likely_numbering(labels)
     if naming is None:
         allowed = f"--naming with {', '.join(BUILT_IN)} or a table"
-        raise InputError(NUMBERING_NOT_TOLD, where=place.folder / source, allowed=allowed)
-    return naming, (NUMBERING_TOLD.format(source=source, naming=naming),)
+        raise InputError(NUMBERING_UNSURE, where=place.folder / source, allowed=allowed)
+    return naming, (NUMBERING_FOUND.format(source=source, naming=naming),)
 
 
 def _one_table(place: Place, source: str, present: Sequence[int]) -> tuple[str, dict[int, str]] | None:

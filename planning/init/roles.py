@@ -73,10 +73,10 @@ def chosen_target(names: Collection[str]) -> str:
     return next(iter([*lesions, *names]))
 
 
-def told_region(names: Collection[str], target: str | None) -> str:
+def likely_region(names: Collection[str], target: str | None) -> str:
     """The region of which most usual organs are there, the target's own among them; ``other`` where few are."""
     own = [] if target is None else [target]
-    shown = {region: _shown(region, names) + _holds(region, own) for region, organs in USUAL.items() if organs}
+    shown = {region: _shown(region, names) + _owns(region, own) for region, organs in USUAL.items() if organs}
     region = max(shown, key=lambda one: shown[one])
     return region if _shown(region, names) >= LEAST_SHOWN else "other"
 
@@ -87,7 +87,7 @@ def _shown(region: str, names: Collection[str]) -> float:
     return 1.0 - len(wholly) / len(USUAL[region])
 
 
-def _holds(region: str, target: Collection[str]) -> float:
+def _owns(region: str, target: Collection[str]) -> float:
     """A tenth for a region among whose usual organs the target is, if it is any."""
     names = {organ.name for organ in USUAL[region]}
     return 0.1 if len(names.intersection(absent_organs(region, target))) < len(names) else 0.0

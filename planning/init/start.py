@@ -20,7 +20,7 @@ from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.init.case_text import CaseParts, case_text
 from puncture_twin.planning.init.finder import Ct, Found, Markers, Wanted, find
 from puncture_twin.planning.init.mesh_folder import MeshFolder
-from puncture_twin.planning.init.roles import assign, role_notes, told_region
+from puncture_twin.planning.init.roles import assign, likely_region, role_notes
 from puncture_twin.planning.init.segmentation import Assigned, Place, Segmentation
 from puncture_twin.planning.init.target import Target, label_target, parse_point, shown, typed_target
 
@@ -29,7 +29,7 @@ ALLOWED = "a folder with a CT (NIfTI or NRRD) and a segmentation, see docs/how-t
 
 @dataclass(frozen=True)
 class Request:
-    """What the user asks for.
+    """What the user wants.
 
     Attributes:
         folder: Where the files are, and the case will be.
@@ -67,7 +67,7 @@ def start_case(request: Request, cache: Cache) -> Start:
     """Find the files of a folder, and write the text of a case with them.
 
     Args:
-        request: What the user asks for.
+        request: What the user wants.
         cache: Where surfaces are kept.
 
     Raises:
@@ -81,7 +81,7 @@ def start_case(request: Request, cache: Cache) -> Start:
         _refuse_outside(point, ct, space)
     target = _target(request, point, found.segmentations)
     names = [name for one in found.segmentations for name in one.names.values()]
-    region = request.region or told_region(names, target.holding.target)
+    region = request.region or likely_region(names, target.holding.target)
     rows = [assign(one.names, region, target.holding) for one in found.segmentations]
     if ct is None:
         rows = [_with_skin(one, some) for one, some in zip(found.segmentations, rows, strict=True)]
@@ -131,11 +131,11 @@ def _below(where: str, folder: Path) -> str:
 
 def _holding(cts: Sequence[Ct], point: Floats | None) -> list[Ct]:
     """The CTs that hold a point, or all where none does."""
-    holding = [one for one in cts if point is not None and _holds(one.surfaces.source.grid, point)]
+    holding = [one for one in cts if point is not None and _contains(one.surfaces.source.grid, point)]
     return holding or list(cts)
 
 
-def _holds(grid: VolumeGrid, point_ct: Floats) -> bool:
+def _contains(grid: VolumeGrid, point_ct: Floats) -> bool:
     index = apply(np.linalg.inv(grid.T_ct_index), point_ct[None])[0]
     return bool(np.all((index >= -0.5) & (index <= np.array(grid.shape) - 0.5)))
 
@@ -153,11 +153,11 @@ def _refuse_outside(point: Floats, ct: Ct, space: Space) -> None:
     """A target outside of the CT or of the body in it."""
     other = Space.RAS if space is Space.LPS else Space.LPS
     mirrored = to_lps(point[None], Space.RAS)[0]
-    inside = _holds(ct.surfaces.source.grid, point)
+    inside = _contains(ct.surfaces.source.grid, point)
     if inside and side_of(ct.surfaces.skin_of_ct().mesh, point) is not Side.OUTSIDE:
         return
     hint = ""
-    if _holds(ct.surfaces.source.grid, mirrored):
+    if _contains(ct.surfaces.source.grid, mirrored):
         in_body = side_of(ct.surfaces.skin_of_ct().mesh, mirrored) is not Side.OUTSIDE
         hint = f" (read in {other} it lies in the body: --space {other})" if in_body else ""
     place = "the body in" if inside else "the CT"
@@ -176,7 +176,7 @@ def _markers_of_ct(markers: Sequence[Markers], ct: Ct | None) -> list[Markers]:
     if ct is None:
         return sorted(markers, key=lambda one: one.source)
     grid = ct.surfaces.source.grid
-    return sorted(markers, key=lambda one: (not all(_holds(grid, point) for point in one.points.points), one.source))
+    return sorted(markers, key=lambda one: (not all(_contains(grid, point) for point in one.points.points), one.source))
 
 
 def _notes(request: Request, found: Found, target: Target, parts: CaseParts) -> Iterator[str]:

@@ -77,9 +77,9 @@ def typed_target(
     if not names and (space_stated or not other):
         return Target(point_ct, Holding(None, frozenset()), (_in_nothing(point_ct, segmentations, other),))
     if not names or other:
-        held = f"in '{chosen_target(names)}'" if names else "in no structure"
+        place = f"in '{chosen_target(names)}'" if names else "in no structure"
         raise InputError(
-            f"target ({shown(point_ct, space)}) lies {held}{other}",
+            f"target ({shown(point_ct, space)}) lies {place}{other}",
             where="--target",
             allowed="--space LPS or --space RAS, whichever is meant",
         )

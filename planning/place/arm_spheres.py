@@ -102,7 +102,7 @@ def clear_branches(
 
 
 def base_is_clear(spheres: ArmSpheres, surroundings: Surroundings, T_ct_base: Floats) -> bool:
-    """Whether the base itself stands free of the patient and of what stands with him. A True is proven for boxes."""
+    """Whether the base itself is free of the patient and of the boxes that are fixed to them. Exact for boxes."""
     base = (spheres.centres, spheres.radii + surroundings.padding_mm, spheres.starts[:2], spheres.frames[:1])
     # the base is bolted to what it carries
     alone = Surroundings(surroundings.skin, surroundings.fixed, Boxes.of([]), surroundings.padding_mm)
@@ -148,7 +148,7 @@ def skin_distance(origin, values, x, y, z):
 
 
 @nb.njit(cache=True)
-def _meets_box(boxes, x, y, z, radius):
+def _touches_box(boxes, x, y, z, radius):
     """Whether a ball meets one of the boxes."""
     poses, halves = boxes
     for k in range(len(halves)):
@@ -166,10 +166,10 @@ def _touches(surroundings, T_ct_base, T_base_body, centre, radius):
     """Whether one ball meets anything."""
     skin, fixed, carried = surroundings
     x, y, z = _moved(T_base_body, centre[0], centre[1], centre[2])
-    if _meets_box(carried, x, y, z, radius):
+    if _touches_box(carried, x, y, z, radius):
         return True
     x, y, z = _moved(T_ct_base, x, y, z)
-    return skin_distance(skin[0], skin[1], x, y, z) < radius or _meets_box(fixed, x, y, z, radius)
+    return skin_distance(skin[0], skin[1], x, y, z) < radius or _touches_box(fixed, x, y, z, radius)
 
 
 @nb.njit(cache=True)

@@ -1,4 +1,4 @@
-"""The bed frame: the room as a person sees it who stands at the table, with its origin at the target."""
+"""The bed frame: the workcell as a person at the table sees it, with its origin at the target."""
 
 from __future__ import annotations
 

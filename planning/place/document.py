@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.place.estimate import ReachEstimate
 from puncture_twin.planning.place.mount_lines import mount_lines
 from puncture_twin.planning.place.search import PlaceSearch, RatedPlacement
 
@@ -32,18 +33,27 @@ def placement_rows(found: PlaceSearch) -> list[dict[str, Any]]:
 
 def _row(rank: int | None, one: RatedPlacement) -> dict[str, Any]:
     along, across, height = (None, None, None) if one.site is None else one.site.position
-    values = (rank, one.name, along, across, height, one.verdict.share, one.verdict.held, one.verdict.asked)
+    values = (rank, one.name, along, across, height, one.verdict.fraction, one.verdict.reached, one.verdict.count)
     rest = (one.verdict.margin, one.verdict.home_contact, *one.mount.position_mm)
     return dict(zip(COLUMNS, (*values, *rest), strict=True))
 
 
+def _estimate(estimate: ReachEstimate) -> dict[str, float]:
+    return {
+        "reach": estimate.reach,
+        "room": estimate.unobstructed,
+        "share": estimate.fraction,
+        "margin": estimate.margin,
+    }
+
+
 def place_document(found: PlaceSearch, provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """Everything as plain values: mm; shares and margins 0..1."""
+    """Everything as plain values: mm; fractions and margins 0..1."""
     rows = placement_rows(found)
     for row, one in zip(rows, (*found.rated, *((found.own,) if found.own else ())), strict=True):
         row["mount"] = {key: list(value) for key, value in one.mount.model_dump().items()}
         row["reasons"] = dict(one.verdict.reasons)
-        row["estimate"] = None if one.estimate is None else one.estimate._asdict()
+        row["estimate"] = None if one.estimate is None else _estimate(one.estimate)
     best = found.rated[0] if found.rated else None
     return {
         "version": PLACE_VERSION,

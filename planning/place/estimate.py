@@ -1,4 +1,4 @@
-"""What share of directions an arm might hold from a placement: kinematics for all at once, then balls, then itself."""
+"""Which fraction of directions an arm may reach from a placement: kinematics of all, bounding spheres, then itself."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ class Branches(NamedTuple):
     q: Floats
     """Shape (n, 8, m, 6), rad, standoff first; NaN where a branch does not exist."""
     margin: Floats
-    """Shape (n, 8): least distance from a singularity over the states, 0..1; 0 where a way is not drivable."""
+    """Shape (n, 8): least distance from a singularity over the states, 0..1; 0 where the insertion is not possible."""
 
 
 class ReachEstimate(NamedTuple):
-    """Shares of the directions, 0..1, each what the one before leaves."""
+    """Fractions of the directions, 0..1: each counts those that the one before left and that pass its own test."""
 
     reach: float
     """Kinematics allow the insertion."""
-    room: float
-    """And links and holder keep clear of patient and room."""
-    share: float
-    """And of one another, where that is asked; else the same."""
+    unobstructed: float
+    """Links and holder keep clear of the patient and of what is around, too."""
+    fraction: float
+    """They keep clear of one another, too; equal to `unobstructed` where that is not tested."""
     margin: float
-    """Mean distance of the held directions from singularities, 0..1; 0 where none is held."""
+    """Mean distance of the reached directions from singularities, 0..1; 0 where none is reached."""
 
 
 NOTHING = ReachEstimate(0.0, 0.0, 0.0, 0.0)
@@ -51,7 +51,7 @@ NOTHING = ReachEstimate(0.0, 0.0, 0.0, 0.0)
 def insertion_branches(
     model: UrModel, target_base: Floats, outward_base: Floats, distances_mm: Floats, at_least: float = MIN_SINGULARITY
 ) -> Branches:
-    """Every branch of many insertions, by kinematics alone; joint limits are not asked for.
+    """Every branch of many insertions, by kinematics alone; joint limits are not tested.
 
     Args:
         model: The arm.
@@ -69,12 +69,12 @@ def insertion_branches(
 
 @dataclass(frozen=True, eq=False)
 class Estimator:
-    """Estimates placements of one arm about one target. What it holds can be sent to another process.
+    """Estimates placements of one arm about one target. Its values can be sent to another process.
 
     Attributes:
         model: Name of the arm.
         tool: What its flange carries.
-        room: What stands about it.
+        surroundings: Patient and boxes around it.
         T_ct_bed: Shape (4, 4), mm, its origin the target.
         wanted: The directions.
         itself: Whether the arm must keep clear of itself, which takes as long as all the rest.
@@ -82,16 +82,16 @@ class Estimator:
 
     model: str
     tool: Tool
-    room: Surroundings
+    surroundings: Surroundings
     T_ct_bed: Floats
     wanted: WantedDirections
     itself: bool
 
     def estimate(self, site: Site) -> ReachEstimate:
-        """The shares at one site; ``NOTHING`` where the base would stand in something."""
+        """The fractions at one site; ``NOTHING`` where the base would lie in something."""
         model, spheres = ur_model(self.model), _spheres(self.model, self.tool)
         T_ct_base = self.T_ct_bed @ site.T_bed_base()
-        if not base_is_clear(spheres, self.room, T_ct_base):
+        if not base_is_clear(spheres, self.surroundings, T_ct_base):
             return NOTHING
         T_base_ct = np.linalg.inv(T_ct_base)
         target = T_base_ct[:3, :3] @ self.T_ct_bed[:3, 3] + T_base_ct[:3, 3]
@@ -100,36 +100,38 @@ class Estimator:
         found = insertion_branches(model, target, self.wanted.outward_ct @ T_base_ct[:3, :3].T, distances)
         open_margin = self._open_margins(found, T_ct_base)
         best = self._clear_of_itself(found.q, open_margin) if self.itself else open_margin.max(axis=1)
-        fraction = self._share(best)
+        fraction = self._fraction(best)
         margin = float(best @ self.wanted.weight) / fraction if fraction > 0.0 else 0.0
         return ReachEstimate(
-            self._share(found.margin.max(axis=1)), self._share(open_margin.max(axis=1)), fraction, margin
+            self._fraction(found.margin.max(axis=1)), self._fraction(open_margin.max(axis=1)), fraction, margin
         )
 
-    def _open_margins(self, ways: Branches, T_ct_base: Floats) -> Floats:
-        """The margins of the ways that keep clear of the room, shape (n, 8); 0 for the others.
+    def _open_margins(self, found_branches: Branches, T_ct_base: Floats) -> Floats:
+        """The margins of the branches that keep clear of the surroundings, shape (n, 8); 0 for the others.
 
-        Of each direction the branches are asked about in the order of their margins. Where the arm itself does not
+        The branches of each direction are tested in the order of their margins. Where the arm itself does not
         count, those after the first clear one are left at 0: no answer depends on them.
         """
         model, spheres = ur_model(self.model), _spheres(self.model, self.tool)
-        open_margin = np.zeros_like(ways.margin)
-        order = np.argsort(-ways.margin, axis=1, kind="stable")
+        open_margin = np.zeros_like(found_branches.margin)
+        order = np.argsort(-found_branches.margin, axis=1, kind="stable")
         rows = np.arange(len(order))
         for place in range(N_BRANCHES):
-            rows = rows[ways.margin[rows, order[rows, place]] > 0.0]
+            rows = rows[found_branches.margin[rows, order[rows, place]] > 0.0]
             branches = order[rows, place]
-            clear = clear_branches(spheres, self.room, T_ct_base, link_poses(model, ways.q[rows, branches]))
-            open_margin[rows[clear], branches[clear]] = ways.margin[rows[clear], branches[clear]]
+            clear = clear_branches(
+                spheres, self.surroundings, T_ct_base, link_poses(model, found_branches.q[rows, branches])
+            )
+            open_margin[rows[clear], branches[clear]] = found_branches.margin[rows[clear], branches[clear]]
             if not self.itself:
                 rows = rows[~clear]
         return open_margin
 
-    def _share(self, margins: Floats) -> float:
+    def _fraction(self, margins: Floats) -> float:
         return float(self.wanted.weight[margins > 0.0].sum())
 
     def _clear_of_itself(self, q: Floats, margin: Floats) -> Floats:
-        """The margin of each direction's best branch on which the arm does not meet itself, shape (n,); 0 for none."""
+        """The margin of each direction's best branch on which the arm does not touch itself, shape (n,); 0 for none."""
         checker = _alone(self.model, self.tool)
         best = np.zeros(len(q))
         for row in np.flatnonzero(margin.any(axis=1)):
@@ -149,5 +151,5 @@ def _spheres(model: str, tool: Tool) -> ArmSpheres:
 
 @cache
 def _alone(model: str, tool: Tool) -> FastChecker:
-    """The arm in an empty room: it meets nothing but itself."""
+    """The arm in an empty workcell: it can touch nothing but itself."""
     return FastChecker(ur_model(model), tool, cache=user_cache())

@@ -1,4 +1,4 @@
-"""What a placement is worth: the search's own answer for the arm, asked for every organ-safe direction."""
+"""What a placement is worth: the search's own answer for the arm, for every organ-safe direction."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ class Verdict:
     """The exact answer for one placement.
 
     Attributes:
-        share: Solid angle of the held directions over that of the asked ones, 0..1.
-        held: How many directions the arm can hold and drive through.
-        asked: How many there are.
-        margin: Mean reach margin of the held ones, 0..1; 0 for none.
+        fraction: Solid angle of the reached directions over that of all that are wanted, 0..1.
+        reached: How many directions the arm can reach and insert along.
+        count: How many directions are wanted.
+        margin: Mean reach margin of the reached ones, 0..1; 0 for none.
         reasons: How many of the others fell to which reason.
         home_contact: What the arm touches in its home configuration, or "".
     """
 
-    share: float
-    held: int
-    asked: int
+    fraction: float
+    reached: int
+    count: int
     margin: float
     reasons: Mapping[str, int]
     home_contact: str
@@ -69,7 +69,7 @@ class PlacementCheck:
     home: Floats
 
     def verdict(self, T_base_ct: Floats) -> Verdict:
-        """Ask for every direction.
+        """Check every direction.
 
         Raises:
             InputError: The base stands in the patient.
@@ -81,15 +81,15 @@ class PlacementCheck:
             for outward, standoff in zip(self.wanted.outward_ct, self.wanted.standoff_mm, strict=True)
         ]
         answers = assess_reach_all(checker, requests)
-        held = np.array([answer.reachable for answer in answers], bool)
+        reached = np.array([answer.reachable for answer in answers], bool)
         margins = [answer.margin for answer in answers if answer.reachable]
         return Verdict(
-            share=float(self.wanted.weight[held].sum()),
-            held=int(held.sum()),
-            asked=len(held),
+            fraction=float(self.wanted.weight[reached].sum()),
+            reached=int(reached.sum()),
+            count=len(reached),
             margin=float(np.mean(margins)) if margins else 0.0,
             reasons=dict(Counter(answer.reason.value for answer in answers if not answer.reachable).most_common()),
-            home_contact=_words(checker.contact(self.home, needle_may_touch_patient=False)),
+            home_contact=_contact_text(checker.contact(self.home, needle_may_touch_patient=False)),
         )
 
     def _checker(self, T_base_ct: Floats) -> FastChecker:
@@ -101,5 +101,5 @@ class PlacementCheck:
         )
 
 
-def _words(contact: Contact | None) -> str:
+def _contact_text(contact: Contact | None) -> str:
     return "" if contact is None else f"{contact.body} touches {contact.other}"

@@ -110,7 +110,7 @@ def regions(case: Case, T_ct_bed: Floats) -> tuple[Region, ...]:
     """Where the case lets a base stand.
 
     Raises:
-        InputError: A rail is asked for, and there is no table to which it belongs.
+        InputError: A rail is wanted, and there is no table to which it belongs.
     """
     settings, model = case.place, ur_model(case.robot.model)
     table = next((o for o in case.obstacles if o.name == settings.table and o.frame == "ct"), None)
@@ -151,7 +151,7 @@ def _region(
 
 
 def _side(facing: str, axis: tuple[int, int, int], bounds: MountBounds, reach: float) -> Region:
-    """The base's axis lies level and leads to the target's side of the room."""
+    """The base's axis lies level and leads to the target's side."""
     toward = {1: (-reach, 0.0), -1: (0.0, reach), 0: (-reach, reach)}
     return _region("side", facing, axis, bounds, (toward[axis[0]], toward[axis[1]], (-ABOVE_MM, reach)))
 

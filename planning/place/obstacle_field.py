@@ -1,4 +1,4 @@
-"""The patient as a field of signed distances, and the room's boxes: what many arm poses are held against quickly."""
+"""The patient as a field of signed distances, and the workcell's boxes: for quick tests of many arm poses."""
 
 from __future__ import annotations
 

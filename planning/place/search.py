@@ -11,7 +11,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.base.processes import ask_all
+from puncture_twin.planning.base.processes import map_all
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import MountSection
@@ -147,13 +147,13 @@ def search_placements(
         for region in regions(case, T_ct_bed)
         for x, y, z in region.lattice(case.place.step_mm)
     ]
-    estimates = ask_all(coarse.estimate, sites, jobs=jobs, progress=partial(progress, "placements"))
+    estimates = map_all(coarse.estimate, sites, jobs=jobs, progress=partial(progress, "placements"))
     first = tuple(zip(sites, estimates, strict=True))
     seeds = [site for site, _ in _best_apart(first, 1.5 * case.place.step_mm, SEEDS)]
     refiner = _Refiner(fine, partial(progress, "refining"))
     finalists = _best_apart(refiner.refine(seeds, case.place.step_mm), case.place.step_mm / 2, FINALISTS)
     rated, own = _checked(case, check, T_ct_bed, finalists, placement, jobs, partial(progress, "checked"))
-    return PlaceSearch(T_ct_bed, first, refiner.asked, float(startable.weight.sum()), rated, own)
+    return PlaceSearch(T_ct_bed, first, refiner.estimated, float(startable.weight.sum()), rated, own)
 
 
 def _checked(
@@ -168,15 +168,15 @@ def _checked(
     """The finalists as they would be written, best first, and the case's own placement."""
     mounts = [mount_section(T_ct_bed @ site.T_bed_base(), case.space) for site, _ in finalists]
     poses = [mount_pose(mount, case.space, case.path) for mount in mounts]
-    if placement is not None:  # first: nobody chose it, and the directions that are not held take longest
+    if placement is not None:  # first: nobody chose it, and the directions that are not reached take longest
         poses.insert(0, placement.T_base_ct)
-    verdicts = ask_all(check.verdict, poses, jobs=jobs, progress=progress)
+    verdicts = map_all(check.verdict, poses, jobs=jobs, progress=progress)
     own = None
     if placement is not None:
         T_ct_base = np.asarray(np.linalg.inv(placement.T_base_ct), dtype=np.float64)
         own = RatedPlacement(None, mount_section(T_ct_base, case.space), None, verdicts.pop(0))
     rated = [RatedPlacement(site, m, e, v) for (site, e), m, v in zip(finalists, mounts, verdicts, strict=True)]
-    rated.sort(key=lambda one: (-round(one.verdict.share, FRACTION_DIGITS), -one.verdict.margin))
+    rated.sort(key=lambda one: (-round(one.verdict.fraction, FRACTION_DIGITS), -one.verdict.margin))
     return tuple(rated), own
 
 
@@ -199,10 +199,10 @@ def _placement_check(case: Case, anatomy: Anatomy, found: Candidates) -> Placeme
 
 
 class _Refiner:
-    """Walks from sites to better ones with ever shorter steps; asks about no site twice.
+    """Walks from sites to better ones with ever shorter steps; estimates no site twice.
 
-    Whether the arm meets itself takes longest and can only lower a share: it is asked of the site that leads alone,
-    until the one that leads has been asked.
+    Whether the arm touches itself takes longest and can only lower a fraction: that is computed for the leading
+    site alone, until the leading site is one for which it is known.
     """
 
     def __init__(self, estimator: Estimator, progress: Count) -> None:
@@ -213,7 +213,7 @@ class _Refiner:
         self._sure: dict[Site, ReachEstimate] = {}
 
     @property
-    def asked(self) -> int:
+    def estimated(self) -> int:
         """How many sites were estimated."""
         return len(self._hoped)
 
@@ -226,17 +226,17 @@ class _Refiner:
 
     def _leaders(self, groups: Sequence[Sequence[Site]]) -> list[Site]:
         """The best site of each group."""
-        self._ask(self._quick, self._hoped, [site for group in groups for site in group])
+        self._estimate(self._quick, self._hoped, [site for group in groups for site in group])
         while True:
             leaders = [max(group, key=lambda site: _score(self._sure.get(site, self._hoped[site]))) for group in groups]
             if all(leader in self._sure for leader in leaders):
                 return leaders
-            self._ask(self._full, self._sure, leaders)
+            self._estimate(self._full, self._sure, leaders)
 
-    def _ask(self, estimator: Estimator, known: dict[Site, ReachEstimate], sites: Sequence[Site]) -> None:
+    def _estimate(self, estimator: Estimator, known: dict[Site, ReachEstimate], sites: Sequence[Site]) -> None:
         new = [site for site in dict.fromkeys(sites) if site not in known]
         # In this process: there are few of them, and a new process would have to build its arm first.
-        known |= dict(zip(new, ask_all(estimator.estimate, new, jobs=1, progress=self._progress), strict=True))
+        known |= dict(zip(new, map_all(estimator.estimate, new, jobs=1, progress=self._progress), strict=True))
 
 
 def _neighbours(site: Site, step_mm: float) -> list[Site]:
@@ -246,7 +246,7 @@ def _neighbours(site: Site, step_mm: float) -> list[Site]:
 
 def _score(estimate: ReachEstimate) -> tuple[float, float]:
     """More is better."""
-    return round(estimate.share, FRACTION_DIGITS), estimate.margin
+    return round(estimate.fraction, FRACTION_DIGITS), estimate.margin
 
 
 def _order(estimate: ReachEstimate) -> tuple[float, float]:
@@ -264,7 +264,7 @@ def _best_apart(
         distance_mm: Two of the same region are at least so far apart.
         count: So many, or as many as there are mounts.
     """
-    holding = [pair for pair in pairs if pair[1].share > 0.0]
+    holding = [pair for pair in pairs if pair[1].fraction > 0.0]
     mounts = {site.region.mount for site, _ in holding}
     firsts: list[tuple[Site, ReachEstimate]] = []
     others: list[tuple[Site, ReachEstimate]] = []

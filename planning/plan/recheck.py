@@ -67,8 +67,8 @@ def _check_limits(plan: Plan, context: CaseContext, path: Path) -> None:
     """Refuse a plan that ends in a configuration beyond the case's limits of chances: the search's may be another."""
     if context.chance is None:
         return
-    asked = context.case, context.anatomy, context.engine, context.chance
-    if not keeps_limits(*asked, plan.outward_ct[None], plan.insertion.q[-1:]).all():
+    settings = context.case, context.anatomy, context.engine, context.chance
+    if not keeps_limits(*settings, plan.outward_ct[None], plan.insertion.q[-1:]).all():
         what = "the configuration in which it ends does not keep search.min_hit and max_touch"
         raise InputError(what, where=path, allowed="plan again")
 

@@ -49,18 +49,18 @@ class OneMore:
 
 def without_each(registration: Registration, target_ct: Floats) -> tuple[WithoutMarker, ...]:
     """What each marker's absence would do; empty with three markers or without declared errors."""
-    told, markers = registration.uncertainty, registration.markers
-    if told is None or len(markers) <= MIN_MARKERS:
+    uncertainty, markers = registration.uncertainty, registration.markers
+    if uncertainty is None or len(markers) <= MIN_MARKERS:
         return ()
     fitted = apply(registration.T_base_ct, markers.points_ct)
     target, residuals = apply(registration.T_base_ct, target_ct), markers.points_base - fitted
-    omega, whole = told.noise.independent(told.R_base_ct), told.noise.whole(told.R_base_ct)
+    omega, whole = uncertainty.noise.independent(uncertainty.R_base_ct), uncertainty.noise.whole(uncertainty.R_base_ct)
     found = []
     for row, name in enumerate(markers.names):
         kept = np.delete(np.arange(len(markers)), row)
         axes = (3 * kept[:, None] + np.arange(3)).ravel()
         A, center = design(fitted[kept], fitted[kept].mean(axis=0)), fitted[kept].mean(axis=0)
-        rms = told.test.scale * _rms(A.T @ np.linalg.inv(omega[np.ix_(axes, axes)]) @ A, center, target)
+        rms = uncertainty.test.scale * _rms(A.T @ np.linalg.inv(omega[np.ix_(axes, axes)]) @ A, center, target)
         test = noise_test(residuals[kept].ravel(), whole[np.ix_(axes, axes)], A)
         found.append(WithoutMarker(name, rms, test.probability))
     return tuple(found)
@@ -74,22 +74,22 @@ def one_more(registration: Registration, target_ct: Floats, skin_points_ct: Floa
         target_ct: Shape (3,).
         skin_points_ct: Shape (n, 3), where a marker could sit, mm.
     """
-    told, markers = registration.uncertainty, registration.markers
+    uncertainty, markers = registration.uncertainty, registration.markers
     points = skin_points_ct
     gaps = np.linalg.norm(points[:, None] - markers.points_ct, axis=2).min(axis=1, initial=np.inf)
     points = points[gaps >= APART_MM]
-    if told is None or not len(points):
+    if uncertainty is None or not len(points):
         return None
     T, fitted = registration.T_base_ct, apply(registration.T_base_ct, markers.points_ct)
-    center, omega = fitted.mean(axis=0), told.noise.independent(told.R_base_ct)
+    center, omega = fitted.mean(axis=0), uncertainty.noise.independent(uncertainty.R_base_ct)
     A = design(fitted, center)
     known = A.T @ np.linalg.inv(omega) @ A
-    weight = np.linalg.inv(told.noise.blocks(told.R_base_ct).mean(axis=0))
+    weight = np.linalg.inv(uncertainty.noise.blocks(uncertainty.R_base_ct).mean(axis=0))
     more = design(apply(T, points), center).reshape(-1, 3, 6)
     X = carried(center, apply(T, target_ct))[:3]
     covs = X @ np.linalg.inv(known + np.swapaxes(more, 1, 2) @ weight @ more) @ X.T
     best = int(np.argmin(np.trace(covs, axis1=1, axis2=2)))
-    return OneMore(points[best], told.test.scale * float(np.sqrt(np.trace(covs[best]))))
+    return OneMore(points[best], uncertainty.test.scale * float(np.sqrt(np.trace(covs[best]))))
 
 
 def odd_branches(registration: Registration, model: UrModel) -> tuple[str, ...]:

@@ -44,7 +44,7 @@ def fit_weighted(points_ct: Floats, points_base: Floats, noise: ReadingNoise, T_
     """
     R, t, center = T_start[..., :3, :3], T_start[..., :3, 3], points_base.mean(axis=-2)
     for _ in range(STEPS):
-        fitted = points_ct @ _turned(R) + t[..., None, :]
+        fitted = points_ct @ _transposed(R) + t[..., None, :]
         weights = np.linalg.inv(noise.blocks(R))
         A = _blocks(fitted, center)
         weighted = np.swapaxes(A, -1, -2) @ weights
@@ -63,7 +63,7 @@ def _blocks(points: Floats, center: Floats) -> Floats:
     return np.concatenate([eye, -skew(points - center[..., None, :])], axis=-1)
 
 
-def _turned(R: Floats) -> Floats:
+def _transposed(R: Floats) -> Floats:
     return np.swapaxes(R, -1, -2)
 
 

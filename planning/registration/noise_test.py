@@ -42,7 +42,7 @@ class NoiseTest:
         return float(chdtrc(self.freedom, self.chi_squared))
 
     @property
-    def holds(self) -> bool:
+    def agrees(self) -> bool:
         """Whether the residuals agree with the declaration, or nothing was declared about their size."""
         return self.found or self.probability >= WARNED
 
@@ -66,12 +66,12 @@ class NoiseTest:
     @property
     def scale(self) -> float:
         """By which the declared deviations are multiplied: 1 where the declaration holds."""
-        return self.estimate if self.found or not self.holds else 1.0
+        return self.estimate if self.found or not self.agrees else 1.0
 
     @property
     def scaled(self) -> bool:
         """Whether the size is that of the residuals, so that chances follow Student's t and regions Fisher's F."""
-        return self.found or not self.holds
+        return self.found or not self.agrees
 
     @property
     def region_factor(self) -> float:
@@ -86,9 +86,9 @@ class NoiseTest:
         size = f"the residuals say {self.estimate:.2f} times the declared errors (95 %: {low:.2f} to {high:.2f})"
         if self.found:
             return f"noise found: {size}"
-        told = "agree with" if self.holds else "do not agree with"
+        verdict = "agree with" if self.agrees else "do not agree with"
         return (
-            f"residuals {told} the declared errors (chi-squared {self.chi_squared:.1f}, {self.freedom} degrees of "
+            f"residuals {verdict} the declared errors (chi-squared {self.chi_squared:.1f}, {self.freedom} degrees of "
             f"freedom, p {self.probability:.2g}); {size}"
         )
 

@@ -119,7 +119,7 @@ class Registration:
             test = self.residual_test
             return () if test.explained else (f"{test.text()}; accepted by the case",)
         declared = self.uncertainty.test
-        if declared.holds:
+        if declared.agrees:
             return ()
         return (
             declared.text() + ("; all errors are scaled to them" if declared.explained else "; accepted by the case"),
@@ -243,10 +243,10 @@ def register(
         uncertainty = fit_uncertainty(method, fit, T_base_ct, *points, noise, found=noise_found)
         fle_mm = None if noise_found else _greatest_fle_mm(noise, T_base_ct)
     test = ResidualTest(len(markers), _rigid_fre(markers), fle_mm)
-    told = test if uncertainty is None else uncertainty.test
-    if not (told.explained or accept_residuals):
+    noise_test = test if uncertainty is None else uncertainty.test
+    if not (noise_test.explained or accept_residuals):
         odd = _odd_marker(markers, fle_mm)
-        what = told.text() if odd is None else f"{told.text()}; {odd.text()}"
+        what = noise_test.text() if odd is None else f"{noise_test.text()}; {odd.text()}"
         raise InputError(what, where=where, allowed=ALLOWED_RESIDUALS)
     weak = conditioning(markers.points_ct, target_ct)
     return Registration(method, T_base_ct, markers, residuals, test, weak, uncertainty)
@@ -288,7 +288,7 @@ def _fit(method: Method, noise: ReadingNoise | None) -> Callable[[Floats, Floats
 
 
 def _greatest_fle_mm(noise: ReadingNoise, T_base_ct: Floats) -> float:
-    """The noise of the isotropic test that other pairings of the names are held against: the worst axis in all three.
+    """The noise of the isotropic test that other pairings of the names are compared with: the worst axis in all three.
 
     Residuals that pass the weighted test have |r|^2 <= lambda_max chi-squared: the given names pass this one too.
     """

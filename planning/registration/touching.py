@@ -64,7 +64,7 @@ def untouchable(case: Case, points_ct: Floats, normals_ct: Floats) -> tuple[tupl
     found = []
     for row, (point, normal) in enumerate(zip(points_ct, normals_ct, strict=True)):
         directions = _cone(normal)
-        blocked = [_meets(box, point, directions, case.needle.length_mm) for box in _boxes_ct(case)]
+        blocked = [_intersects(box, point, directions, case.needle.length_mm) for box in _boxes_ct(case)]
         if blocked and np.any(blocked, axis=0).all():
             found.append((row, _boxes_ct(case)[int(np.argmax(np.sum(blocked, axis=1)))].name))
     return tuple(found)
@@ -108,7 +108,7 @@ def _cone(axis: Floats) -> Floats:
     return np.asarray(local @ np.stack([across, np.cross(axis, across), axis]))
 
 
-def _meets(box: Obstacle, point: Floats, directions: Floats, length_mm: float) -> NDArray[np.bool_]:
+def _intersects(box: Obstacle, point: Floats, directions: Floats, length_mm: float) -> NDArray[np.bool_]:
     """Which segments from a point meet a box with axes parallel to the frame's (slabs), shape (k,)."""
     with np.errstate(divide="ignore", invalid="ignore"):  # along a slab: from -inf to inf, or nowhere
         one, other = ((box.center_mm + side * box.size_mm / 2 - point) / directions for side in (-1.0, 1.0))

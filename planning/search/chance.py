@@ -66,8 +66,8 @@ def with_chances(
     parts = [rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)]
     outward, q = found.outward_ct, found.arm.q_insertion
     measured = (None if axes is None else axes.at(part) for part in parts)
-    asked = zip(parts, measured, strict=True)
-    arrays = [chances_of(case, anatomy, engine, model, outward[part], q[part], known) for part, known in asked]
+    pairs = zip(parts, measured, strict=True)
+    arrays = [chances_of(case, anatomy, engine, model, outward[part], q[part], known) for part, known in pairs]
     values = {name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]}
     filled = {name: getattr(blank, name).copy() for name in values}
     for name, value in values.items():
@@ -176,7 +176,7 @@ def with_joint_chances(
     rows = found.ranked[:BEST]
     if model is None or found.chances is None or not len(rows):
         return found
-    asked = needles_of(case, anatomy, engine, model, found.outward_ct[rows], found.arm.q_insertion[rows])
+    needles = needles_of(case, anatomy, engine, model, found.outward_ct[rows], found.arm.q_insertion[rows])
     joint = found.chances.touch_joint.copy()
-    joint[rows] = joint_touch_chance(asked.near, asked.cov_ct, case.needle.radius_mm, asked.freedom)
+    joint[rows] = joint_touch_chance(needles.near, needles.cov_ct, case.needle.radius_mm, needles.freedom)
     return replace(found, chances=replace(found.chances, touch_joint=joint))

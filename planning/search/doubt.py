@@ -28,7 +28,7 @@ WISHED_HIT = 0.99
 HALVINGS = 40
 """Of the interval in which a source's factor lies: far below any digit that is printed."""
 
-LEAST_SHARE = 0.005
+LEAST_FRACTION = 0.005
 """Of the variance: a smaller source is not named to people."""
 
 
@@ -59,20 +59,20 @@ class Goal:
     all_sources: float | None
 
     @property
-    def words(self) -> str:
-        """What would hold then."""
+    def claim(self) -> str:
+        """What the limit demands."""
         return f"{self.limit:g} to {f'touch {self.structure}' if self.structure else 'hit'}"
 
     def text(self) -> str:
         """What would have to shrink, in one sentence."""
         if not self.remedies:
             if self.all_sources is None:
-                return f"{self.words} cannot be had, however small the errors"
-            told = f"all of them together would have to shrink to {100 * self.all_sources:.0f} %"
-            return f"for {self.words} no single error is enough: {told}"
+                return f"{self.claim} cannot be had, however small the errors"
+            shrunk = f"all of them together would have to shrink to {100 * self.all_sources:.0f} %"
+            return f"for {self.claim} no single error is enough: {shrunk}"
         source, declared, needed = self.remedies[0]
-        words, key, unit = SOURCES[source]
-        return f"for {self.words} the {words} ({key}) would have to be {needed:.2g} {unit}, not {declared:.2g}"
+        source_text, key, unit = SOURCES[source]
+        return f"for {self.claim} the {source_text} ({key}) would have to be {needed:.2g} {unit}, not {declared:.2g}"
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON, in the units of the keys of ``[errors]``."""
@@ -114,31 +114,31 @@ class Doubt:
         return max(self.p_touch.items(), key=lambda item: item[1], default=("", 0.0))
 
     def sources(self) -> list[tuple[str, float]]:
-        """Sources worth naming with their share of the error's variance, the largest first."""
-        fractions = sorted(self.budget.share.items(), key=lambda item: -item[1])
-        return [(source, fraction) for source, fraction in fractions if fraction >= LEAST_SHARE]
+        """Sources worth naming with their fraction of the error's variance, the largest first."""
+        fractions = sorted(self.budget.fraction.items(), key=lambda item: -item[1])
+        return [(source, fraction) for source, fraction in fractions if fraction >= LEAST_FRACTION]
 
     def sentence(self) -> str:
         """The whole in one line."""
         name, chance = self.likeliest
-        parts = [f"{chance_words(self.p_hit)} to hit"]
-        parts += [f"{chance_words(chance)} to touch {name}"] if name else []
+        parts = [f"{chance_text(self.p_hit)} to hit"]
+        parts += [f"{chance_text(chance)} to touch {name}"] if name else []
         parts += [
-            f"{100 * fraction:.0f} % of the doubt is {SOURCES[source].words}" for source, fraction in self.sources()[:1]
+            f"{100 * fraction:.0f} % of the doubt is {SOURCES[source].text}" for source, fraction in self.sources()[:1]
         ]
         return "; ".join([*parts, *(goal.text() for goal in self.goals)])
 
     def lines(self) -> list[str]:
         """For a person, below the sentence."""
         budget, axes = self.budget, ", ".join(f"{mm:.2f}" for mm in self.budget.half_axes_mm)
-        fractions = ", ".join(f"{SOURCES[source].words} {100 * fraction:.0f} %" for source, fraction in self.sources())
+        fractions = ", ".join(f"{SOURCES[source].text} {100 * fraction:.0f} %" for source, fraction in self.sources())
         return [
             self.sentence(),
             f"  expected error {budget.rms_mm:8.2f} mm (rms): {budget.lateral_mm:.2f} across the needle, "
             f"{budget.depth_mm:.2f} along it; half axes of the 95 % ellipsoid {axes} mm",
             f"  of its variance: {fractions}",
             f"  {self.declaration}",
-            f"  touches anything: {chance_words(self.p_touch_any)} at most, to first order",
+            f"  touches anything: {chance_text(self.p_touch_any)} at most, to first order",
             f"  not modelled: {NOT_MODELLED}",
         ]
 
@@ -162,11 +162,11 @@ def budget_summary(budget: ErrorBudget) -> dict[str, Any]:
         "expected_lateral_mm": budget.lateral_mm,
         "expected_depth_mm": budget.depth_mm,
         "half_axes_95_mm": budget.half_axes_mm.tolist(),
-        "share": dict(budget.share),
+        "share": dict(budget.fraction),
     }
 
 
-def chance_words(chance: float) -> str:
+def chance_text(chance: float) -> str:
     """A chance for people: what is not sure never reads as 0 or 1."""
     if 0 < chance < 5e-5:
         return "<0.0001"
@@ -286,27 +286,27 @@ def goals_of(needle: ShrinkableNeedle, p_hit: float, p_touch: Mapping[str, float
 
 
 def _goal(needle: ShrinkableNeedle, structure: str, limit: float, *, stated: bool) -> Goal:
-    def holds(factors: Mapping[str, float]) -> bool:
+    def passes(factors: Mapping[str, float]) -> bool:
         chance = needle.chance(structure, factors)
         return chance <= limit if structure else chance >= limit
 
     errors, remedies = needle.model.error.errors.scaled(needle.model.error.fit.test.scale), []
     for source in needle.parts:
-        factor = _greatest(lambda f, source=source: holds({source: f}))  # type: ignore[misc]
+        factor = _greatest(lambda f, source=source: passes({source: f}))  # type: ignore[misc]
         if factor is not None:
             declared = deviation(errors, source)
             remedies.append((factor, Remedy(source, declared, factor * declared)))
-    together = _greatest(lambda f: holds(dict.fromkeys(needle.parts, f)))
+    together = _greatest(lambda f: passes(dict.fromkeys(needle.parts, f)))
     ordered = tuple(remedy for _, remedy in sorted(remedies, key=lambda one: -one[0]))
     return Goal(structure, limit, stated, ordered, together)
 
 
-def _greatest(holds: Callable[[float], bool]) -> float | None:
+def _greatest(passes: Callable[[float], bool]) -> float | None:
     """The greatest factor below 1 that mends it, by halving; None where not even 0 does."""
-    if not holds(0.0):
+    if not passes(0.0):
         return None
     low, high = 0.0, 1.0
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if holds(middle) else (low, middle)
+        low, high = (middle, high) if passes(middle) else (low, middle)
     return low

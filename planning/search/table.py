@@ -25,7 +25,7 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
         candidates: The search's result.
         provenance: Case name, input hashes, version, seed, step; stored under the key ``run`` as JSON.
     """
-    reachable = [None if asked < 0 else bool(asked) for asked in candidates.arm.reachable]
+    reachable = [None if one < 0 else bool(one) for one in candidates.arm.reachable]
     columns: dict[str, Any] = {
         "theta_deg": np.degrees(candidates.theta),
         "beta_deg": np.degrees(candidates.beta),

@@ -56,7 +56,7 @@ def demanding(structures: tuple[Structure, ...]) -> Ints:
 
 
 def check_limits(case: Case, anatomy: Anatomy, model: ChanceModel | None) -> None:
-    """Refuse limits that no candidate can be held against: it would pass unasked.
+    """Refuse limits that no candidate can be tested against: every one would pass untested.
 
     Raises:
         InputError: Limits without a pose error, or of a structure that has no chance to be touched.

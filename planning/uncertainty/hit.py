@@ -81,9 +81,9 @@ def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
     inside = along**2 - offset @ offset + radius_mm**2
     half = np.sqrt(np.maximum(inside, 0.0))
     depth, sign = np.concatenate([half - along, -half - along]), np.repeat([1.0, -1.0], DIRECTIONS)
-    met = (np.tile(inside, 2) > 0) & (depth > 0)
+    ahead = (np.tile(inside, 2) > 0) & (depth > 0)
     ray = np.tile(np.arange(DIRECTIONS), 2)
-    return TargetRays(directions, ray[met], depth[met], sign[met])
+    return TargetRays(directions, ray[ahead], depth[ahead], sign[ahead])
 
 
 def hit_in_mesh(rays: TargetRays, cov_ct: Floats, freedom: int | None = None) -> Floats:

@@ -1,4 +1,4 @@
-"""The chance to touch, beyond first order: the needle is moved along lines, and asked where it touches.
+"""The chance to touch, beyond first order: the needle is moved along lines, and where it touches is found.
 
 With Sigma5 the covariance of the tip's shift and of the lean across the needle (turning about its own axis moves it
 nowhere), xi = B z, B B' = Sigma5, and z standard normal, every line is

@@ -1,6 +1,6 @@
 """Chances of any needles that reach the target: to hit, to touch and to break margins, and whether they keep limits.
 
-To first order, or by line sampling where it is asked for.
+To first order, or by line sampling where it is wanted.
 """
 
 from __future__ import annotations
@@ -119,9 +119,12 @@ def refined_chances(
     outward_ct, q = needles
     columns, every = demanding(anatomy.checked), np.ones(first[0].shape, bool)
     around = Surroundings(engine, columns, axis_lengths(case, anatomy.checked)[columns], case.target_ct)
-    asked, (touching, breaking) = needles_of(case, anatomy, engine, model, outward_ct, q), _thresholds(case, anatomy)
-    touch = refined(around, asked, touching, first[0], every if wanted is None else wanted)
-    margin = first[1] if wanted is not None else refined(around, asked, breaking, first[1], every)
+    posed, (touching, breaking) = (
+        needles_of(case, anatomy, engine, model, outward_ct, q),
+        _thresholds(case, anatomy),
+    )
+    touch = refined(around, posed, touching, first[0], every if wanted is None else wanted)
+    margin = first[1] if wanted is not None else refined(around, posed, breaking, first[1], every)
     return {"touch": touch, "margin": margin, "touch_any": _any(touch)}
 
 
@@ -138,14 +141,14 @@ def keeps_limits(
         outward_ct: Shape (n, 3), unit.
         q: Shape (n, 6), rad, the tip on the target.
     """
-    asked, settings = (case, anatomy, engine, model), case.search
+    model_of, settings = (case, anatomy, engine, model), case.search
     kept = np.ones(len(q), bool)
     if settings.min_hit is not None:
         kept &= model.hit.chance(model.error, model.error.covariance_ct(q)) >= settings.min_hit
     limits = np.array([touch_limit(case, anatomy.checked[column].name) for column in demanding(anatomy.checked)])
     if not np.isfinite(limits).any():
         return kept
-    first = chances_of(*asked, outward_ct, q)
+    first = chances_of(*model_of, outward_ct, q)
     wanted = np.broadcast_to(np.isfinite(limits), first["touch"].shape)
-    touch = refined_chances(*asked, (outward_ct, q), (first["touch"], first["margin"]), wanted)["touch"]
+    touch = refined_chances(*model_of, (outward_ct, q), (first["touch"], first["margin"]), wanted)["touch"]
     return np.asarray(kept & (np.where(np.isnan(touch), np.inf, touch) <= limits).all(axis=1))

@@ -1,7 +1,7 @@
 """Lines of displaced needles, walked to where they touch: the compiled inside of `line_sampling`.
 
 A step is never longer than the needle's distance over the fastest that any of its points moves, so that no approach
-is outrun; through what it touches it goes in small steps, and asks at every exit whether it has been swallowed.
+is outrun; through what it touches it goes in small steps, and at every exit it is tested whether the needle is inside.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ RAYS_TO, RAY_STEP = 4.0, 0.1
 """Standard deviations that a ray is followed, and its smallest step: it only tells what is touched about as soon."""
 
 NUDGE_MM = 1e-6
-"""By which a tip's way is moved aside, so that it does not run through an edge of a face."""
+"""By which a tip's path is moved aside, so that it does not run through an edge of a face."""
 
 ROOT_HALF = math.sqrt(0.5)
 
@@ -111,7 +111,7 @@ def _outran(clear_to, beta, clear, smallest):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, error_model="numpy")
 def _swallowed(scene, start, ahead, beta):  # type: ignore[no-untyped-def]
-    """Whether a needle that is near no face is inside: its tip came through an odd number of them on its way.
+    """Whether a needle that is near no face is inside: its tip came through an odd number of them.
 
     Faces that the tip can come through are near the nominal needle, all of them.
     """

@@ -160,7 +160,7 @@ class ErrorBudget:
     lateral_mm: float
     depth_mm: float
     half_axes_mm: Floats
-    share: Mapping[str, float]
+    fraction: Mapping[str, float]
 
 
 def expected_error_mm(error: PoseError, q: Floats) -> float:
@@ -186,5 +186,5 @@ def error_budget(error: PoseError, q: Floats, outward_base: Floats) -> ErrorBudg
         lateral_mm=float(np.sqrt(max(variance - along, 0.0))),
         depth_mm=float(np.sqrt(along)),
         half_axes_mm=error.fit.test.region_factor * np.sqrt(np.linalg.eigvalsh(whole)[::-1]),
-        share={source: part / variance if variance > 0 else 0.0 for source, part in parts.items()},
+        fraction={source: part / variance if variance > 0 else 0.0 for source, part in parts.items()},
     )

@@ -21,7 +21,7 @@ ISOTROPIC = 1e-9
 class Source(NamedTuple):
     """What a source is called, the key of ``[errors]`` that states it, and that key's unit."""
 
-    words: str
+    text: str
     key: str
     unit: str
 
@@ -62,8 +62,8 @@ def deviation(errors: ErrorModel, source: str) -> float:
         return float(np.sqrt(np.linalg.eigvalsh(reading_parts(errors.marker_cov_ct)[source])[2]))
     if source == "target":
         return float(np.sqrt(np.linalg.eigvalsh(errors.target_cov_ct)[2]))
-    held = errors.arm if hasattr(errors.arm, _attribute(source)) else errors
-    value = float(getattr(held, _attribute(source)))
+    declared = errors.arm if hasattr(errors.arm, _attribute(source)) else errors
+    value = float(getattr(declared, _attribute(source)))
     return float(np.degrees(value)) if SOURCES[source].unit == "deg" else value
 
 

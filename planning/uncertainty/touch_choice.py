@@ -1,8 +1,8 @@
 """How to touch the markers so that the arm's errors cancel best: the choice among reachable poses of least error.
 
-What an arm does wrong at the markers it does again at the target, but only where it stands alike: touched with the
+What an arm does wrong at the markers it does again at the target, but only in a similar configuration: touched with the
 insertion's own orientation and branch, errors of a nominal UR3 fall to a third; touched from elsewhere they add up.
-Motion and contact are not asked here.
+Motion and contact are not tested here.
 """
 
 from __future__ import annotations

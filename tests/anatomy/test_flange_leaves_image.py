@@ -146,7 +146,7 @@ def test_the_certificate_agrees_with_the_search(cut, certified, rng):
     assert found.safe[letters == "S"].all()
     assert not found.safe[letters == "R"].any()
     assert min((letters == "S").sum(), (letters == "R").sum()) > 300
-    assert certified.share("U") < 0.05
+    assert certified.fraction("U") < 0.05
     verify(certified, cut.case, cut.anatomy)
 
 
@@ -185,7 +185,7 @@ def test_a_certificate_for_inserted_needles_alone_is_refused(cut, certified, mon
     for name in ("any_flange", "flange_bounds"):
         monkeypatch.setattr(module, name, lambda *_: FlangeBounds(LENGTH, LENGTH))
     careless = certify(cut.case, cut.anatomy, size=0.5 * DEG, **CAP)
-    assert careless.share("S") > certified.share("S") + 0.05
+    assert careless.fraction("S") > certified.fraction("S") + 0.05
     with pytest.raises(InputError, match="is not proven safe"):
         verify(careless, cut.case, cut.anatomy)
 

@@ -282,9 +282,9 @@ def test_nearly_all_of_the_cap_is_decided(certified):
     _, found = certified
     assert sum(found.areas.values()) == pytest.approx(20626.48, rel=1e-6)
     assert (2 * found.leaves.radius()[found.verdict == "U"] <= found.size).all()
-    assert found.share("U") < 0.15
-    assert found.share("S") > 0.15
-    assert found.share("R") > 0.15
+    assert found.fraction("U") < 0.15
+    assert found.fraction("S") > 0.15
+    assert found.fraction("R") > 0.15
 
 
 def test_the_safe_cone_is_safe(certified, rng):
@@ -319,7 +319,7 @@ def test_fewer_queries_than_the_dense_grid(carton):
     context, _ = carton
     found = certify(context.case, context.anatomy, size=np.radians(0.5))
     assert found.queries < 0.1 * 720 * 181
-    assert found.share("U") < 0.01
+    assert found.fraction("U") < 0.01
 
 
 def test_the_checker_proves_every_cell(certified):
@@ -484,7 +484,7 @@ def test_a_cap_without_area_is_certified_too(carton, theta, beta):
     """An arc, a point and a pole: certified without an area to share, and the search agrees."""
     context, _ = carton
     found = certify(context.case, context.anatomy, size=np.radians(1), theta=theta, beta=beta)
-    assert found.share("S") is None
+    assert found.fraction("S") is None
     assert found.areas["S"] == 0
     centres = found.leaves.centres() @ context.case.T_ct_entry[:3, :3].T
     middle = Directions(found.leaves.theta.mean(axis=1), found.leaves.beta.mean(axis=1), centres)
@@ -524,7 +524,7 @@ def test_when_nothing_is_safe_the_map_proves_it(carton):
     anatomy = replace(context.anatomy, structures=structures)
     found = certify(context.case, anatomy, size=np.radians(4))
     assert found.areas["S"] == 0
-    assert found.share("R") == pytest.approx(1)
+    assert found.fraction("R") == pytest.approx(1)
     verify(found, context.case, anatomy)
 
 
@@ -576,7 +576,7 @@ def test_without_organs_the_skin_alone_decides(carton):
     anatomy = Anatomy((), context.anatomy.skin, ())
     found = certify(context.case, anatomy, size=np.radians(3))
     assert found.queries == 0
-    assert found.share("S") > 0.5
+    assert found.fraction("S") > 0.5
     verify(found, context.case, anatomy)
 
 

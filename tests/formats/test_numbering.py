@@ -5,7 +5,7 @@ import pytest
 from places import REAL_CT
 
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap, labelmap_of
-from puncture_twin.planning.formats.labels.numbering import told_numbering
+from puncture_twin.planning.formats.labels.numbering import likely_numbering
 from puncture_twin.planning.formats.labels.totalsegmentator import V1, V2
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 
@@ -31,16 +31,16 @@ def map_of(table, places):
 @pytest.mark.parametrize(("table", "name"), [(V1, "totalsegmentator-v1"), (V2, "totalsegmentator-v2")])
 def test_the_version_under_which_organs_lie_right_is_told(table, name):
     """Under the other one vertebrae and sides are in no order."""
-    assert told_numbering(map_of(table, PLACES)) == name
+    assert likely_numbering(map_of(table, PLACES)) == name
 
 
 def test_what_cannot_be_told_is_not_guessed():
     """The first six numbers are alike in both versions; a mirrored map fits none."""
     few = {name: PLACES[name] for name in ("liver", "spleen", "kidney_left", "kidney_right")}
-    assert told_numbering(map_of(V1, few)) is None
+    assert likely_numbering(map_of(V1, few)) is None
     mirrored = {name: (-x, y, -z) for name, (x, y, z) in PLACES.items()}
-    assert told_numbering(map_of(V1, mirrored)) is None
-    assert told_numbering(map_of(V2, mirrored)) is None
+    assert likely_numbering(map_of(V1, mirrored)) is None
+    assert likely_numbering(map_of(V2, mirrored)) is None
 
 
 @pytest.mark.skipif(not REAL_CT.is_dir(), reason=f"the real CT is not at {REAL_CT}")
@@ -51,6 +51,6 @@ def test_what_cannot_be_told_is_not_guessed():
 def test_the_version_of_real_maps_is_told(file, name):
     """Of the same patient, by both versions; also of the lower half alone."""
     whole = labelmap_of(read_volume(REAL_CT / file))
-    assert told_numbering(whole) == name
+    assert likely_numbering(whole) == name
     half = LabelMap(whole.labels[:, :, :60], whole.T_ct_index, None, whole.path)
-    assert told_numbering(half) == name
+    assert likely_numbering(half) == name

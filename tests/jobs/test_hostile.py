@@ -12,7 +12,7 @@ from hostile.makers import MAKERS
 from places import TESTS
 
 from puncture_twin.planning.base.output.manifest import problems
-from puncture_twin.planning.base.processes import ask_all, worker_count
+from puncture_twin.planning.base.processes import map_all, worker_count
 
 HERE = TESTS
 CASES = tomllib.loads((HERE / "hostile" / "cases.toml").read_text())["case"]
@@ -100,7 +100,7 @@ def test_a_million_jobs_are_as_many_processes_as_cores():
     assert worker_count(1_000_000, 1_000_000) == cores
     assert worker_count(1_000_000, 1) == 1
     assert worker_count(1_000_000, 0) == 1
-    answers = ask_all(_process, range(400), jobs=1_000_000, progress=lambda done, of: None)
+    answers = map_all(_process, range(400), jobs=1_000_000, progress=lambda done, of: None)
     assert [number for number, _ in answers] == list(range(400))
     assert len({process for _, process in answers}) <= cores
 

@@ -18,7 +18,7 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.processes import ask_all
+from puncture_twin.planning.base.processes import map_all
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.mount import mount_pose
@@ -274,7 +274,7 @@ def test_turning_the_base_about_its_own_axis_changes_no_share(ball):
     shares = set()
     for turn in (0.0, 2.5):
         R = trimesh.transformations.rotation_matrix(turn, [0, 0, 1])
-        shares.add(check.verdict(np.linalg.inv(T @ R)).held)
+        shares.add(check.verdict(np.linalg.inv(T @ R)).reached)
     assert len(shares) == 1 and 0 < shares.pop() < 30
 
 
@@ -282,11 +282,11 @@ def test_answers_come_in_order_from_however_many_processes():
     """And progress ends at the number of things."""
     seen = []
     for jobs in (1, 2):
-        assert ask_all(abs, [-3, 2, -1, 0, -7, 5], jobs=jobs, progress=lambda done, n: seen.append((done, n))) == [
+        assert map_all(abs, [-3, 2, -1, 0, -7, 5], jobs=jobs, progress=lambda done, n: seen.append((done, n))) == [
             *(3, 2, 1, 0, 7, 5)
         ]
     assert seen.count((6, 6)) == 2
-    assert ask_all(abs, [], jobs=2, progress=lambda done, n: None) == []
+    assert map_all(abs, [], jobs=2, progress=lambda done, n: None) == []
 
 
 def test_asking_the_best_branch_first_changes_no_estimate():
@@ -314,10 +314,10 @@ def test_asking_the_best_branch_first_changes_no_estimate():
         if not base_is_clear(spheres, room, T_ct_base):
             best[:] = 0.0
         said = quick.estimate(site)
-        assert said.share == pytest.approx((best > 0).mean())
+        assert said.fraction == pytest.approx((best > 0).mean())
         assert said.margin == pytest.approx(best[best > 0].mean() if best.any() else 0.0)
-        assert replace(quick, itself=True).estimate(site).room == said.room
-        seen.add(round(said.share, 3))
+        assert replace(quick, itself=True).estimate(site).unobstructed == said.unobstructed
+        seen.add(round(said.fraction, 3))
     assert len(seen) > 3
 
 
@@ -359,8 +359,8 @@ def _same_as_the_search(here, best):
     pasted.write_text(text[:start] + text[end:] + "\n" + mount + "\n")
     context = prepare(pasted)
     found = organ_candidates(context.case, context.anatomy, context.engine, case_directions(context.case))
-    held = with_reach(context.case, found, ArmReach(context.reach.checker, context.reach.T_base_ct))
-    assert int((held.arm.reachable == 1).sum()) == best["held"] and int(found.safe.sum()) == best["asked"]
+    reached = with_reach(context.case, found, ArmReach(context.reach.checker, context.reach.T_base_ct))
+    assert int((reached.arm.reachable == 1).sum()) == best["held"] and int(found.safe.sum()) == best["asked"]
 
 
 def test_no_placement_holds_anything(case_folder, tmp_path, capsys):

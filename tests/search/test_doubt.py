@@ -7,7 +7,7 @@ from uncertainty_world import declared, world
 
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.doubt import WISHED_HIT, chance_words, goals_of, shrinkable
+from puncture_twin.planning.search.doubt import WISHED_HIT, chance_text, goals_of, shrinkable
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.chances import HitModel
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
@@ -91,7 +91,7 @@ SHOWN = {1.0: "1.00", 0.0: "0.00", 0.93: "0.93", 1e-9: "<0.0001", 1 - 1e-9: ">0.
 @pytest.mark.parametrize(("chance", "words"), SHOWN.items())
 def test_what_is_not_sure_never_reads_as_sure(chance, words):
     """Neither 0 nor 1 by rounding."""
-    assert chance_words(chance) == words
+    assert chance_text(chance) == words
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_explanation_says_the_chances_of_the_table(carton):
     assert chances["p_touch_any"] == found.candidates.chances.touch_any[0]
     assert sum(chances["share"].values()) == pytest.approx(1)
     text = found.text()
-    assert f"{chance_words(chances['p_hit'])} to hit; " in text and "not modelled: breathing" in text
+    assert f"{chance_text(chances['p_hit'])} to hit; " in text and "not modelled: breathing" in text
     assert "do not agree with the declared errors" in text
 
 

@@ -100,6 +100,6 @@ def test_the_budget_adds_up():
     """The parts of every source are 1 together; lateral and depth are the whole."""
     w = world("carton/case_m.toml", "weighted", declared(**SLICES))
     budget = error_budget(w.error, w.puncture.q_insertion, w.puncture.T_base_ct[:3, :3] @ w.puncture.outward_ct)
-    assert sum(budget.share.values()) == pytest.approx(1.0, abs=1e-12)
+    assert sum(budget.fraction.values()) == pytest.approx(1.0, abs=1e-12)
     assert np.hypot(budget.lateral_mm, budget.depth_mm) == pytest.approx(budget.rms_mm, rel=1e-12)
-    assert min(budget.share.values()) >= 0
+    assert min(budget.fraction.values()) >= 0

@@ -121,23 +121,23 @@ class Distribution:
             "realised_rms_mm": finite(self.realised_rms_mm),
             "predicted_rms_mm": self.predicted_rms_mm,
             "median_mm": finite(np.median(self.tip_error_mm) if len(self) else np.nan),
-            "coverage_95": _share(self.in_region),
-            "hit_share": _share(self.hit),
+            "coverage_95": _fraction(self.in_region),
+            "hit_share": _fraction(self.hit),
             "mean_p_hit": self.p_hit,
-            "touch_share": _share(np.asarray(self.touched.any(axis=1))),
+            "touch_share": _fraction(np.asarray(self.touched.any(axis=1))),
             "mean_p_touch": float(min(1.0, self.p_touch.sum())),
             "touch_share_by_structure": {
-                name: _share(self.touched[:, column]) for column, name in enumerate(self.structures)
+                name: _fraction(self.touched[:, column]) for column, name in enumerate(self.structures)
             },
             "p_touch_by_structure": dict(zip(self.structures, self.p_touch.tolist(), strict=True)),
-            "predicted_share": dict(self.budget.share),
+            "predicted_share": dict(self.budget.fraction),
             "wrong_belief": self.wrong_belief,
             "guessed_touches": self.guessed_touches,
             **({} if self.physics is None else {"physics": self.physics.summary()}),
         }
 
 
-def _share(rooms: Bools) -> float | None:
+def _fraction(rooms: Bools) -> float | None:
     return float(rooms.mean()) if len(rooms) else None
 
 
@@ -176,8 +176,8 @@ def _as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
     """The pose error of rooms: touches as there, and errors of the size that the markers say, taken for declared."""
     errors, fit = error.errors.scaled(error.fit.test.scale), error.fit
     noise = reading_noise(errors, error.model, error.tip_mm, q_touch, known=True)
-    holds = NoiseTest(fit.test.count, float(fit.test.freedom))
-    return replace(error, errors=errors, fit=FitUncertainty(noise, fit.R_base_ct, fit.center_base, fit.fit_map, holds))
+    test = NoiseTest(fit.test.count, float(fit.test.freedom))
+    return replace(error, errors=errors, fit=FitUncertainty(noise, fit.R_base_ct, fit.center_base, fit.fit_map, test))
 
 
 def _measured(
@@ -189,9 +189,9 @@ def _measured(
     cov_ct, error_ct = believed.tip_covariance_ct(q)[0], rooms.tip_ct - rooms.target_ct
     model = chance_model(case, context.anatomy, believed)
     assert model is not None
-    asked = (case, context.anatomy, context.engine, model)
-    chances = chances_of(*asked, puncture.outward_ct[None], q)
-    chances |= refined_chances(*asked, (puncture.outward_ct[None], q), (chances["touch"], chances["margin"]))
+    settings = (case, context.anatomy, context.engine, model)
+    chances = chances_of(*settings, puncture.outward_ct[None], q)
+    chances |= refined_chances(*settings, (puncture.outward_ct[None], q), (chances["touch"], chances["margin"]))
     inverse = np.linalg.inv(cov_ct + LEAST_VARIANCE * np.eye(3))
     square = np.einsum("na,ab,nb->n", error_ct, inverse, error_ct)
     columns = demanding(context.anatomy.checked)

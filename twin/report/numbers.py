@@ -32,7 +32,7 @@ class ReasonCount:
     code: str
     colour: Rgb
     count: int
-    share: float
+    fraction: float
     solid_angle: float
 
 
@@ -45,9 +45,9 @@ def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
         reason = reason_of(str(value))
         colour = REASON_COLOURS.get(reason, SAFE)
         words = REASON_WORDS[reason] if reason else candidates.safe_text
-        share, solid = float(here.mean()), float(weights[here].sum() / weights.sum())
+        fraction, solid = float(here.mean()), float(weights[here].sum() / weights.sum())
         count = int(here.sum())
-        lines.append(ReasonCount(words, reason.value or "safe", colour, count, share, solid))
+        lines.append(ReasonCount(words, reason.value or "safe", colour, count, fraction, solid))
     if not candidates.safe.any():
         lines.append(ReasonCount(candidates.safe_text, "safe", SAFE, 0, 0.0, 0.0))
     return tuple(sorted(lines, key=lambda line: (line.code != "safe", -line.count)))
@@ -76,9 +76,9 @@ def number(value: float, digits: int = 1, unit: str = "") -> str:
     return f"{text} {unit}" if unit else text
 
 
-def percent(share: float) -> str:
+def percent(fraction: float) -> str:
     """A share 0..1 in percent; what is there never reads as zero."""
-    return "<0.1 %" if 0 < share < 0.0005 else f"{100 * share:.1f} %"
+    return "<0.1 %" if 0 < fraction < 0.0005 else f"{100 * fraction:.1f} %"
 
 
 def arm_words(candidates: Candidates) -> str:

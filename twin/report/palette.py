@@ -92,7 +92,7 @@ def organ_colours(names: tuple[str, ...]) -> dict[str, Rgb]:
     return colours
 
 
-def safe_shades(share: NDArray[np.float64]) -> NDArray[np.uint8]:
+def safe_shades(fraction: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Greens for a share 0..1 of the clearance range, shape (n,) to (n, 3)."""
-    share = np.clip(np.nan_to_num(share, nan=0.0), 0.0, 1.0)[..., None]
-    return np.round(np.array(SAFE_LOW) * (1 - share) + np.array(SAFE_HIGH) * share).astype(np.uint8)
+    fraction = np.clip(np.nan_to_num(fraction, nan=0.0), 0.0, 1.0)[..., None]
+    return np.round(np.array(SAFE_LOW) * (1 - fraction) + np.array(SAFE_HIGH) * fraction).astype(np.uint8)

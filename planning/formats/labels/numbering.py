@@ -71,7 +71,7 @@ class Plausibility(NamedTuple):
         return self.nameless > 0 or self.broken >= max(LEAST_WRONG, LEAST_BROKEN * self.rules)
 
 
-def told_numbering(labelmap: LabelMap) -> str | None:
+def likely_numbering(labelmap: LabelMap) -> str | None:
     """The built-in naming in which the organs of a map lie where they do in a body; None where that is not sure."""
     centres = label_centres(labelmap)
     found = {name: plausibility(table, centres) for name, table in BUILT_IN.items()}
@@ -97,8 +97,8 @@ def plausibility(table: Mapping[int, str], centres: Mapping[int, Floats]) -> Pla
         centres: Label to its middle, LPS mm.
     """
     at = {table[label]: centre for label, centre in centres.items() if label in table}
-    held = list(_rules(at))
-    return Plausibility(len(held), held.count(False), sum(label not in table for label in centres))
+    kept = list(_rules(at))
+    return Plausibility(len(kept), kept.count(False), sum(label not in table for label in centres))
 
 
 def _rules(at: Mapping[str, Floats]) -> Iterator[bool]:

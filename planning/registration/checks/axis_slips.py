@@ -1,8 +1,8 @@
-"""Have the axes of the CT markers slipped by a half turn? The skin and the couch can tell, the residuals cannot.
+"""Have the axes of the CT markers slipped by a half turn? The skin and the couch show it, the residuals cannot.
 
 Coordinates of RAS read as LPS are turned by 180 degrees about z: a proper rotation, which the registration swallows
 without a residual. But markers lie on the skin, and a needle's tip touched them. A list that does so only after a half
-turn is refused; one that does so either way is named in a warning.
+turn is refused; one that does so before and after it is named in a warning.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class MarkerList:
 
 
 def marker_list(case: Case, skin: Skin, registration: Registration, signs: Signs = (1.0, 1.0, 1.0)) -> MarkerList:
-    """The CT markers with some axes negated, held against skin, couch and the robot's place."""
+    """The CT markers with some axes negated, compared with skin, couch and the robot's place."""
     points = registration.markers.points_ct * np.array(signs)
     fit = skin_fit(points, skin)
     T_base_ct = fit_rigid(points, registration.markers.points_base)

@@ -135,10 +135,10 @@ def _renaming(markers: MarkerPairs, order: Ints, T_given: Floats, target_ct: Flo
     moved = np.linalg.norm(apply(T, points) - apply(T_given, points), axis=1)
     rows = np.flatnonzero(order != np.arange(len(order)))
     names, touched_as = (tuple(markers.names[row] for row in which) for which in (rows, order[rows]))
-    return Renaming(names, touched_as, fre, T, float(moved[0]), turn_between(T, T_given)), float(moved.max())
+    return Renaming(names, touched_as, fre, T, float(moved[0]), angle_between(T, T_given)), float(moved.max())
 
 
-def turn_between(T: Floats, T_other: Floats) -> float:
+def angle_between(T: Floats, T_other: Floats) -> float:
     """The angle between two poses, rad."""
     cosine = (np.trace(T[:3, :3] @ T_other[:3, :3].T) - 1) / 2
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))

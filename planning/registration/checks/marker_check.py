@@ -34,7 +34,7 @@ class MarkerFindings(NamedTuple):
 
 
 class CheckedPlacement(NamedTuple):
-    """A placement whose markers have been held against names, skin and couch."""
+    """A placement whose markers have been compared with names, skin and couch."""
 
     placement: Placement
     findings: MarkerFindings

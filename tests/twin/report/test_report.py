@@ -74,7 +74,7 @@ def plan(case, candidates):
     return world.make_plan(case, candidates)
 
 
-def turn_between(a, b):
+def angle_between(a, b):
     """The unsigned angle between two bearings, rad."""
     return abs(np.mod(a - b + np.pi, 2 * np.pi) - np.pi)
 
@@ -86,7 +86,7 @@ def test_labels_of_a_patient_on_the_back(case, candidates):
     wanted = {"head": 90, "patient's right": 180, "feet": 270, "patient's left": 0}
     assert angles.keys() == wanted.keys()
     for name, angle in wanted.items():
-        assert turn_between(np.radians(angles[name]), np.radians(angle)) < 1e-9
+        assert angle_between(np.radians(angles[name]), np.radians(angle)) < 1e-9
     assert view.centre == "front"
 
 
@@ -114,7 +114,7 @@ def test_the_map_is_what_a_camera_outside_sees(name):
     seen = camera.project(case.target_ct + 100 * found.outward_ct[rows])[:, :2] - 500
     on_map = view.place(found.theta[rows], found.beta[rows])
     angle_seen, angle_map = np.arctan2(-seen[:, 1], seen[:, 0]), np.arctan2(on_map[:, 1], on_map[:, 0])
-    assert turn_between(angle_seen, angle_map).max() < 1e-3
+    assert angle_between(angle_seen, angle_map).max() < 1e-3
     for label in view.rim:
         words = {"front": "anterior", "back": "posterior"}
         if "/" in label.text or FRAMES[name][0] == "local":
@@ -122,7 +122,7 @@ def test_the_map_is_what_a_camera_outside_sees(name):
         body = label.text.split(" (")[0].removeprefix("patient's ")
         vector = np.array(ANATOMICAL_LPS[words.get(body, body)])
         x, y = (camera.project(case.target_ct + 100 * vector)[0, :2] - 500) * [1, -1]
-        assert turn_between(np.arctan2(y, x), label.angle) < 1e-3
+        assert angle_between(np.arctan2(y, x), label.angle) < 1e-3
 
 
 def test_a_local_frame_has_no_anatomy():

@@ -132,16 +132,16 @@ def _branch_warning(case: Case, registration: Registration) -> tuple[str, ...]:
 
 def _advice(case: Case, registration: Registration) -> dict[str, Any]:
     """Ellipsoid and sources at the target by the readings alone, and what would make it better; for declared errors."""
-    told = registration.uncertainty
-    if told is None:
+    uncertainty = registration.uncertainty
+    if uncertainty is None:
         return {}
     target_base = apply(registration.T_base_ct, case.target_ct)
-    cov = told.cov_at(target_base)[:3, :3]
-    read, touched = (np.trace(part) for part in told.parts_at(target_base))
+    cov = uncertainty.cov_at(target_base)[:3, :3]
+    read, touched = (np.trace(part) for part in uncertainty.parts_at(target_base))
     skin = load_skin(case, user_cache())
     more = one_more(registration, case.target_ct, touchable_points(case, skin.mesh, registration.T_base_ct))
     return {
-        "half_axes_95_mm": (told.test.region_factor * np.sqrt(np.linalg.eigvalsh(cov)[::-1])).tolist(),
+        "half_axes_95_mm": (uncertainty.test.region_factor * np.sqrt(np.linalg.eigvalsh(cov)[::-1])).tolist(),
         "share": {"markers_ct": float(read / (read + touched)), "touch": float(touched / (read + touched))},
         "without": {
             one.name: {"rms_mm": one.rms_mm, "probability": one.probability}

@@ -43,7 +43,7 @@ def with_pictures(run: Run, out: Path) -> Run:
     shown = None if registration is None else registration_summary(registration)
     film = next((path.name for path in run.files if path.stem == Path(FILM).stem and path.suffix != ".json"), None)
     with stages.time("page"):
-        page, told = out / PAGE, _uncertainty(run)
+        page, uncertainty = out / PAGE, _uncertainty(run)
         write_page(
             case,
             anatomy,
@@ -53,7 +53,7 @@ def with_pictures(run: Run, out: Path) -> Run:
             shown,
             page,
             film=film,
-            uncertainty=told,
+            uncertainty=uncertainty,
             pick=run.pick,
             slices=slices,
             facts=run.facts,

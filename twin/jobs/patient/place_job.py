@@ -63,7 +63,7 @@ def place_case(context: CaseContext, out: Path, *, jobs: int, pictures: bool = T
     except NoAnswerError:
         withdraw(out, "place")
         raise
-    if not any(one.verdict.held for one in run.found.rated):
+    if not any(one.verdict.reached for one in run.found.rated):
         raise NoAnswerError(f"no placement holds any of the {run.directions} organ-safe directions")
     return replace(run, files=draft.final(run.files))
 
@@ -90,11 +90,11 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool) -> Place
         with stages.time("pictures"):
             draw_placements(found, case, context.anatomy.skin.mesh, out / "placements.png")
             files.append(out / "placements.png")
-    if pictures and any(one.verdict.held for one in found.rated):
+    if pictures and any(one.verdict.reached for one in found.rated):
         T_base_ct = mount_pose(found.rated[0].mount, case.space, case.path)
         with stages.time("map"):
             reach = ArmReach(case_checker(case, context.anatomy, T_base_ct), np.asarray(T_base_ct))
-            held = ranked(case, with_reach(case, candidates, reach))
-            draw_map(held, replace(case, name=f"{case.name}, arm at the best place"), out / "map_best_place.png")
+            reached = ranked(case, with_reach(case, candidates, reach))
+            draw_map(reached, replace(case, name=f"{case.name}, arm at the best place"), out / "map_best_place.png")
             files.append(out / "map_best_place.png")
     return PlaceRun(context, found, document, tuple(files), int(candidates.safe.sum()))

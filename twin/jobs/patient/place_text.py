@@ -13,10 +13,10 @@ HALF_A_DIGIT = 5e-4
 def place_text(run: PlaceRun) -> str:
     """The ranked placements, the case's own, the lines to paste, and the files."""
     case, found = run.context.case, run.found
-    asked = found.rated[0].verdict.asked if found.rated else 0
+    wanted = found.rated[0].verdict.count if found.rated else 0
     x, y, z = (direction_words(found.T_ct_bed[:3, axis], str(case.space)) for axis in range(3))
     lines = [
-        f"case {case.name}: {asked} organ-safe directions; {len(found.coarse)} + {found.refined} placements estimated,"
+        f"case {case.name}: {wanted} organ-safe directions; {len(found.coarse)} + {found.refined} placements estimated,"
         f" {len(found.rated)} checked",
         f"  from the target, mm: along = toward {x}, across = toward {y}, height = toward {z}",
         *needle_line(found.possible),
@@ -38,8 +38,8 @@ def needle_line(possible: float) -> list[str]:
     """What no placement can mend, where there is such a thing."""
     if possible > 1.0 - HALF_A_DIGIT:
         return []
-    share = f"at most {100 * possible:.1f} % can be held from anywhere"
-    return [f"  {share}: elsewhere the needle itself would start too near the skin"]
+    fraction = f"at most {100 * possible:.1f} % can be held from anywhere"
+    return [f"  {fraction}: elsewhere the needle itself would start too near the skin"]
 
 
 def _line(rank: str, one: RatedPlacement, run: PlaceRun) -> str:
@@ -47,4 +47,4 @@ def _line(rank: str, one: RatedPlacement, run: PlaceRun) -> str:
     where = "     -       -       -" if one.site is None else "{:6.0f}  {:6.0f}  {:6.0f}".format(*one.site.position)
     name = one.name if one.site is None else mount_words(one.site.region, run.found.T_ct_bed, space)
     home = f"; home: {verdict.home_contact}" if verdict.home_contact else ""
-    return f"{rank}  {100 * verdict.share:7.1f}  {verdict.held:5d}  {verdict.margin:6.2f}  {where}  {name}{home}"
+    return f"{rank}  {100 * verdict.fraction:7.1f}  {verdict.reached:5d}  {verdict.margin:6.2f}  {where}  {name}{home}"

@@ -47,9 +47,9 @@ class SlicerExport:
 
     def text(self) -> str:
         """As lines."""
-        told = [*self.notes, *(f"warning: {one}" for one in self.warnings)]
+        lines = [*self.notes, *(f"warning: {one}" for one in self.warnings)]
         return "\n".join(
-            [f"{SLICER}: {self.path}", *(f"  {file}" for file in self.files), *(f"  {one}" for one in told)]
+            [f"{SLICER}: {self.path}", *(f"  {file}" for file in self.files), *(f"  {one}" for one in lines)]
         )
 
 

@@ -18,8 +18,8 @@ from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
 
 def registration_summary(registration: Registration) -> dict[str, Any]:
     """A registration as plain values: mm."""
-    told = registration.uncertainty
-    test = registration.residual_test if told is None else told.test
+    uncertainty = registration.uncertainty
+    test = registration.residual_test if uncertainty is None else uncertainty.test
     return {
         "method": registration.method,
         "T_base_ct": registration.T_base_ct.tolist(),
@@ -47,7 +47,7 @@ def _declared(registration: Registration) -> dict[str, Any]:
     test = registration.uncertainty.test
     return {
         "declaration": {
-            "holds": test.holds,
+            "holds": test.agrees,
             "probability": test.probability,
             "residuals_over_declared": test.estimate,
             "interval": list(test.interval),

@@ -20,7 +20,7 @@ from puncture_twin.twin.report.page.page import TRUTH_IS_BELIEF
 LEAST_SOURCE = 0.005
 """Of the variance: a smaller source is not named to people."""
 
-TELLS = 0.05
+NOTABLE = 0.05
 """Of an expected error: by as much two configurations' differ before people are told."""
 
 LEAST_SHOWN = 5e-5
@@ -80,7 +80,7 @@ def _otherwise(found: Candidates, plan: Plan) -> list[str]:
     if found.chances is None or not len(row):
         return []
     other = float(np.hypot(found.chances.lateral_mm[row[0]], found.chances.depth_mm[row[0]]))
-    if not abs(other - plan.expected_target_error_mm) > TELLS * plan.expected_target_error_mm:
+    if not abs(other - plan.expected_target_error_mm) > NOTABLE * plan.expected_target_error_mm:
         return []
     return [f"    in the configuration of the table and of check {other:.2f} mm: an approach may end in another one"]
 
@@ -107,9 +107,9 @@ def distribution_lines(rooms: dict[str, Any]) -> list[str]:
     guessed = ["  nobody says how the arm touched the markers: a posture was assumed (touch.csv, q1_deg to q6_deg)"]
     missed = [f"  in {rooms['unreached']} of them the arm did not reach the pose; they are not counted"]
     chances = [
-        f"    {name}: touched in {100 * share:.2f} %, predicted {100 * rooms['p_touch_by_structure'][name]:.2f} %"
-        for name, share in rooms["touch_share_by_structure"].items()
-        if max(share, rooms["p_touch_by_structure"][name]) >= LEAST_SHOWN
+        f"    {name}: touched in {100 * fraction:.2f} %, predicted {100 * rooms['p_touch_by_structure'][name]:.2f} %"
+        for name, fraction in rooms["touch_share_by_structure"].items()
+        if max(fraction, rooms["p_touch_by_structure"][name]) >= LEAST_SHOWN
     ]
     sources = sorted(rooms["predicted_share"].items(), key=lambda source: -source[1])
     return [
@@ -120,7 +120,7 @@ def distribution_lines(rooms: dict[str, Any]) -> list[str]:
         f"  touched anything           {100 * rooms['touch_share']:12.2f} {100 * rooms['mean_p_touch']:11.2f} %",
         *chances,
         "  of the predicted variance: "
-        + ", ".join(f"{SOURCES[name].words} {100 * part:.0f} %" for name, part in sources if part >= LEAST_SOURCE),
+        + ", ".join(f"{SOURCES[name].text} {100 * part:.0f} %" for name, part in sources if part >= LEAST_SOURCE),
         *(missed if rooms["unreached"] else []),
         *(guessed if rooms["guessed_touches"] else []),
         *_physics(rooms.get("physics")),
@@ -139,15 +139,15 @@ def _physics(run_again: dict[str, Any] | None) -> list[str]:
 
 def certificate_lines(summary: dict[str, Any]) -> list[str]:
     """What a certificate says of the cap; where nothing is safe, that this is proven, and to what."""
-    share = summary["undecided_share"]
-    undecided = "" if share is None else f" ({100 * share:.2f} % of the cap)"
+    fraction = summary["undecided_share"]
+    undecided = "" if fraction is None else f" ({100 * fraction:.2f} % of the cap)"
     area = f"{summary['undecided_square_deg']:.1f} square degrees{undecided}"
     if summary["safe_cells"] == 0:
         left = f", except perhaps in {area} of undecided cells" if summary["undecided_cells"] else ""
         said = f"proven: no direction of the cap is safe, to {summary['size_deg']:g} deg{left}"
     else:
-        share = summary["safe_share"]
-        safe = "" if share is None else f" ({100 * share:.1f} % of the cap)"
+        fraction = summary["safe_share"]
+        safe = "" if fraction is None else f" ({100 * fraction:.1f} % of the cap)"
         said = f"certified to {summary['size_deg']:g} deg: safe {summary['safe_square_deg']:.1f} square degrees{safe}"
         said += f", undecided {area}"
     return [f"{said}; {summary['queries']} exact queries", f"  not certified: {', '.join(summary['not_certified'])}"]

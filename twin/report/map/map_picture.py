@@ -18,7 +18,7 @@ from scipy import ndimage
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.doubt import chance_words
+from puncture_twin.planning.search.doubt import chance_text
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.report.map.chance_layer import chance_legend, draw_chances
@@ -233,7 +233,7 @@ def _legend(axes: Axes, candidates: Candidates) -> float:
         axes.add_patch(Rectangle((0.0, y - 0.017), 0.06, 0.032, facecolor=colour, edgecolor="black", lw=0.8))
         axes.text(0.085, y, _folded(line.words), fontsize=10.5, va="center", fontweight=bold, linespacing=0.95)
         axes.text(0.62, y, f"{line.count:,}", fontsize=10.5, ha="right", va="center", fontweight=bold)
-        axes.text(0.79, y, percent(line.share), fontsize=10.5, ha="right", va="center", fontweight=bold)
+        axes.text(0.79, y, percent(line.fraction), fontsize=10.5, ha="right", va="center", fontweight=bold)
         axes.text(1.0, y, percent(line.solid_angle), fontsize=10.5, ha="right", va="center", fontweight=bold)
     return y
 
@@ -302,7 +302,7 @@ def _chances(candidates: Candidates, row: int) -> str:
     chances = candidates.chances
     if chances is None or not np.isfinite(chances.hit[row]):
         return ""
-    hit, touch = chance_words(float(chances.hit[row])), chance_words(float(chances.touch_any[row]))
+    hit, touch = chance_text(float(chances.hit[row])), chance_text(float(chances.touch_any[row]))
     return f"; p(hit) {hit}, p(touch) {touch}"
 
 

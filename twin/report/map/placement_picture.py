@@ -67,8 +67,8 @@ def draw_placements(found: PlaceSearch, case: Any, skin: TriangleMesh, path: Pat
     rows = -(-(len(panels) + 1) // columns)
     figure = Figure(figsize=(columns * PANEL_INCHES, rows * PANEL_INCHES + 1.0), dpi=DPI, facecolor="white")
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    top = max((e.share for _, e in found.coarse), default=0.0)
-    scale = Normalize(0.0, max(top, max((one.verdict.share for one in found.rated), default=0.0), 0.01))
+    top = max((e.fraction for _, e in found.coarse), default=0.0)
+    scale = Normalize(0.0, max(top, max((one.verdict.fraction for one in found.rated), default=0.0), 0.01))
     extent = _extent(found, float(case.place.step_mm))
     for axes, regions in zip(grid, panels, strict=False):
         _panel(axes, regions, found, case, scale)
@@ -106,11 +106,11 @@ def _panel(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any,
     for site, estimate in found.coarse:
         if site.region in regions:
             key = site.position[:2]
-            best[key] = max(best.get(key, 0.0), estimate.share)
+            best[key] = max(best.get(key, 0.0), estimate.fraction)
     step = float(case.place.step_mm)
-    for key, share in best.items():
+    for key, fraction in best.items():
         y, x = key
-        colour = SHADES(scale(share)) if share > 0 else NOTHING
+        colour = SHADES(scale(fraction)) if fraction > 0 else NOTHING
         axes.add_patch(Rectangle((x - step / 2, y - step / 2), step, step, facecolor=colour, edgecolor="none"))
     space = str(case.space)
     words = mount_words(regions[0], found.T_ct_bed, space) if len(regions) == 1 else regions[0].mount
@@ -151,7 +151,7 @@ def _marks(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any)
 
 
 def _worth(one: RatedPlacement) -> str:
-    return f"{100 * one.verdict.share:.0f} %"
+    return f"{100 * one.verdict.fraction:.0f} %"
 
 
 def _mark(axes: Axes, x: float, y: float, shape: str, words: str) -> None:

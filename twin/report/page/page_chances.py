@@ -8,7 +8,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from puncture_twin.planning.search.doubt import Doubt, chance_words
+from puncture_twin.planning.search.doubt import Doubt, chance_text
 from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
 from puncture_twin.twin.report.numbers import number
 from puncture_twin.twin.report.page.page_tables import faint, listed, pairs, table, two
@@ -22,8 +22,8 @@ NO_CHANCES = "No chances: they need markers, the arm, and a direction that organ
 
 def chance_card(doubt: Doubt) -> Card:
     """Both chances and the expected error, for the top of the page."""
-    expected = f"touches anything forbidden {chance_words(doubt.p_touch_any)}; expected error (rms) "
-    return Card("chance to hit", chance_words(doubt.p_hit), expected + number(doubt.budget.rms_mm, 2, "mm"))
+    expected = f"touches anything forbidden {chance_text(doubt.p_touch_any)}; expected error (rms) "
+    return Card("chance to hit", chance_text(doubt.p_hit), expected + number(doubt.budget.rms_mm, 2, "mm"))
 
 
 def chances_section(doubt: Doubt | None, registration: Mapping[str, Any] | None) -> Markup:
@@ -37,9 +37,9 @@ def chances_section(doubt: Doubt | None, registration: Mapping[str, Any] | None)
         return Markup("<p>{}</p>").format(NO_CHANCES)
     budget, (name, chance) = doubt.budget, doubt.likeliest
     rows = [
-        ("chance to hit the target", Markup("<b>{}</b>").format(chance_words(doubt.p_hit))),
-        ("chance to touch anything forbidden, at most", chance_words(doubt.p_touch_any)),
-        *([("most likely touched", f"{name.replace('_', ' ')}, {chance_words(chance)}")] if name else []),
+        ("chance to hit the target", Markup("<b>{}</b>").format(chance_text(doubt.p_hit))),
+        ("chance to touch anything forbidden, at most", chance_text(doubt.p_touch_any)),
+        *([("most likely touched", f"{name.replace('_', ' ')}, {chance_text(chance)}")] if name else []),
         ("expected error of the tip (rms)", number(budget.rms_mm, 2, "mm")),
         ("across the needle (rms)", number(budget.lateral_mm, 2, "mm")),
         ("along the needle (rms)", number(budget.depth_mm, 2, "mm")),
@@ -48,7 +48,7 @@ def chances_section(doubt: Doubt | None, registration: Mapping[str, Any] | None)
         ("the declared errors", doubt.declaration),
         ("not modelled", NOT_MODELLED),
     ]
-    shares = [(SOURCES[source].words, f"{100 * share:.1f} %") for source, share in doubt.sources()]
+    shares = [(SOURCES[source].text, f"{100 * fraction:.1f} %") for source, fraction in doubt.sources()]
     goals = [goal.text() for goal in doubt.goals]
     wanting = listed(goals) if goals else Markup("")
     return wanting + two(pairs(rows), table(("source", "of the error's variance"), shares, kind="numbers"))
@@ -77,10 +77,10 @@ def rooms_section(rooms: Mapping[str, Any] | None, picture: Path | None) -> Mark
         ("hit the target", _percent(rooms["hit_share"]), _percent(rooms["mean_p_hit"])),
         ("touched anything forbidden", _percent(rooms["touch_share"]), _percent(rooms["mean_p_touch"])),
     ]
-    for name, share in rooms["touch_share_by_structure"].items():
+    for name, fraction in rooms["touch_share_by_structure"].items():
         chance = rooms["p_touch_by_structure"][name]
-        if max(share, chance) >= LEAST_SHOWN:
-            rows.append((f"touched {name.replace('_', ' ')}", _percent(share), _percent(chance)))
+        if max(fraction, chance) >= LEAST_SHOWN:
+            rows.append((f"touched {name.replace('_', ' ')}", _percent(fraction), _percent(chance)))
     shown = table((f"{rooms['rooms']:,} rooms, seed {rooms['seed']}", "realised", "predicted"), rows, kind="numbers")
     image = Markup("")
     if picture is not None:
@@ -101,5 +101,5 @@ def _reserves(rooms: Mapping[str, Any]) -> list[str]:
     return said
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.2f} %"
+def _percent(fraction: float) -> str:
+    return f"{100 * fraction:.2f} %"

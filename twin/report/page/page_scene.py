@@ -93,8 +93,8 @@ def box_of(points_ct: Floats) -> Floats:
 
 def lightened(bodies: Sequence[SceneBody], triangles: int, cache: Cache = NO_CACHE) -> list[SceneBody]:
     """The bodies with about so many triangles altogether, each cut by the same share."""
-    share = min(1.0, triangles / max(1, sum(len(b.mesh.faces) for b in bodies)))
-    wanted = [max(LEAST_TRIANGLES, int(share * len(body.mesh.faces))) for body in bodies]
+    fraction = min(1.0, triangles / max(1, sum(len(b.mesh.faces) for b in bodies)))
+    wanted = [max(LEAST_TRIANGLES, int(fraction * len(body.mesh.faces))) for body in bodies]
     return [replace(body, mesh=lighter_mesh(body.mesh, most, cache)) for body, most in zip(bodies, wanted, strict=True)]
 
 

@@ -126,7 +126,7 @@ def counts_table(candidates: Candidates) -> Markup:
             ),
             Markup("<code>{}</code>").format(line.code),
             f"{line.count:,}",
-            percent(line.share),
+            percent(line.fraction),
             percent(line.solid_angle),
         )
         for line in reason_counts(candidates)
@@ -215,7 +215,7 @@ def rehearsal_section(rehearsal: Any | None, keep_away: frozenset[str], film: st
         f"{f' ({c.depth_mm:.2f} mm deep)' if math.isfinite(c.depth_mm) else ''}"
         for c in rehearsal.contacts
     ]
-    share = np.max(rehearsal.max_joint_speed / rehearsal.speed_limits)
+    fraction = np.max(rehearsal.max_joint_speed / rehearsal.speed_limits)
     rows = [
         ("tip error at the end", _bold(number(rehearsal.tip_error_mm, 2, "mm"))),
         *([] if rehearsal.standing is None else [("of all", rehearsal.standing.words)]),
@@ -223,7 +223,7 @@ def rehearsal_section(rehearsal: Any | None, keep_away: frozenset[str], film: st
         ("its depth part", depth),
         ("expected beforehand (rms)", number(rehearsal.predicted_error_mm, 2, "mm")),
         ("contacts", listed(touched) if touched else "none"),
-        ("fastest joint", f"{100 * share:.0f} % of its limit{'' if share <= 1 else ' (too fast)'}"),
+        ("fastest joint", f"{100 * fraction:.0f} % of its limit{'' if fraction <= 1 else ' (too fast)'}"),
         ("joint speeds, °/s", ", ".join(f"{v:.0f}" for v in np.degrees(rehearsal.max_joint_speed))),
         ("their limits, °/s", ", ".join(f"{v:.0f}" for v in np.degrees(rehearsal.speed_limits))),
         ("truth", str(getattr(rehearsal, "truth_source", "–"))),

@@ -107,8 +107,8 @@ def _beads(segments: Floats, plane: Plane) -> Floats:
     if not len(segments):
         return np.zeros((0, 2))
     length = float(np.linalg.norm(np.diff(segments, axis=1), axis=2).max())
-    share = np.linspace(0, 1, 2 + int(length / cell))[:, None, None]
-    points = (segments[:, 0] * (1 - share) + segments[:, 1] * share).reshape(-1, 2)
+    fraction = np.linspace(0, 1, 2 + int(length / cell))[:, None, None]
+    points = (segments[:, 0] * (1 - fraction) + segments[:, 1] * fraction).reshape(-1, 2)
     points = points[(np.abs(points - plane.centre) <= plane.half_mm).all(axis=1)]
     column, row = np.round(points / cell).astype(np.int64).T
     return np.asarray(points[np.unique(column * MOST_BEADS + row, return_index=True)[1]])

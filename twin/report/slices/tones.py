@@ -19,8 +19,8 @@ class Tone(NamedTuple):
 
     def grey(self, hu: Floats) -> NDArray[np.uint8]:
         """Grey values of Hounsfield units; where the image ends (NaN) black."""
-        share = (np.nan_to_num(hu, nan=-1e6) - self.level) / self.width + 0.5
-        return np.round(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
+        fraction = (np.nan_to_num(hu, nan=-1e6) - self.level) / self.width + 0.5
+        return np.round(255 * np.clip(fraction, 0.0, 1.0)).astype(np.uint8)
 
 
 TONES = MappingProxyType(
