@@ -188,6 +188,36 @@ def check(
 
 
 @app.command()
+def compare(
+    source: SourceArgument,
+    other: Annotated[Path | None, typer.Argument(metavar="PLAN_B", help="The other plan.json, of two plans.")] = None,
+    case: Annotated[Path | None, typer.Option("--case", help="Of two plans: check them again.")] = None,
+    theta: Annotated[list[float] | None, typer.Option("--theta", min=0, max=180, help="As for check; twice.")] = None,
+    beta: Annotated[list[float] | None, typer.Option("--beta", min=0, max=360, help="As for check; twice.")] = None,
+    rank: Annotated[list[int] | None, typer.Option("--rank", min=1, help="As for check; may be repeated.")] = None,
+    window: Annotated[list[int] | None, typer.Option("--window", min=1, help="The same.")] = None,
+    entry: Annotated[list[str] | None, typer.Option("--entry", metavar="X,Y,Z", help="The same.")] = None,
+    arm: ArmOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show two paths side by side: two choices of a case, one and the best, or two plans; 1 where one is rejected."""
+    from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.choosing.compare_job import compare_choices, compare_plans, parse_two, two_plans
+
+    stated = (theta or [], beta or [], rank or [], window or [], entry or [])
+    plans = two_plans(source, other, case, any(stated))
+    with progress_display() as progress:
+        if plans is None:
+            choices = parse_two(*stated)
+            compared = compare_choices(prepare(source, arm=arm, watcher=progress), choices)
+        else:
+            compared = compare_plans(plans, None if case is None else prepare(case, watcher=progress))
+    _print(compared.summary(), compared.text(), as_json)
+    if not compared.safe:
+        raise typer.Exit(ANSWER_IS_NO)
+
+
+@app.command()
 @with_choice
 def plan(
     case: CaseArgument,

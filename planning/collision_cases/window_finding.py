@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from decimal import ROUND_FLOOR
 
-import numpy as np
-
 from puncture_twin.planning.collision_cases.checks_file import WindowSection
 from puncture_twin.planning.collision_cases.finding import Difference, Finding
 from puncture_twin.planning.collision_cases.new_number import NewNumber
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.explain import reason_text
-from puncture_twin.planning.search.selection.windows import Windows, find_windows
+from puncture_twin.planning.search.selection.windows import Windows, find_windows, nearest_row
 
 DIGIT_SQUARE_DEG = 1.0
 """To which a rewritten area is rounded."""
@@ -40,9 +38,8 @@ def _differences(
     if not direction.safe[0]:
         yield Difference(f"the direction is rejected: {reason_text(direction, 0)}")
         return
-    row = int(np.argmax(search.outward_ct @ direction.outward_ct[0]))
-    apart = float(np.arctan2(*_sine_cosine(search.outward_ct[row], direction.outward_ct[0])))
-    if search.grid is None or apart > search.grid.step:
+    row = nearest_row(search, direction.outward_ct[0])
+    if row is None:
         yield Difference("the direction is safe, but lies beyond the grid that the case searches")
     elif not search.safe[row]:
         yield Difference(f"the nearest direction of the grid, {_angles(search, row)}: {reason_text(search, row)}")
@@ -66,7 +63,3 @@ def _listed(search: Candidates, windows: Windows) -> Iterator[str]:
 def _angles(found: Candidates, row: int) -> str:
     at = found.at(row)
     return f"theta {at['theta_deg']:g} deg, beta {at['beta_deg']:g} deg"
-
-
-def _sine_cosine(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
-    return float(np.linalg.norm(np.cross(a, b))), float(a @ b)

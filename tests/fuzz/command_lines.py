@@ -6,7 +6,7 @@ import io
 from fuzz.mutate import NUMBERS, pick
 
 COMMANDS = [
-    *["search", "verify", "check", "plan", "rehearse", "place", "mirror", "export", "register", "batch"],
+    *["search", "verify", "check", "compare", "plan", "rehearse", "place", "mirror", "export", "register", "batch"],
     *["init", "selfcal", "servo", "reproduce", "", "serch", "x" * 3000, "--help", "-h", "--version"],
 ]
 """Not ``demo``, which needs nothing and takes a minute."""
@@ -14,6 +14,9 @@ COMMANDS = [
 OPTIONS = {
     "--theta": "number",
     "--beta": "number",
+    "--rank": "number",
+    "--window": "number",
+    "--entry": "word",
     "--case": "path",
     "--from": "path",
     "--recording": "path",

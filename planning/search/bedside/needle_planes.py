@@ -39,21 +39,27 @@ class NeedlePlanes(NamedTuple):
 
     def rows(self) -> tuple[tuple[str, str], ...]:
         """What it is, and how a person reads it."""
-        side = "left" if self.in_plane > 0 else "right"
-        seen = f"{abs(np.degrees(self.in_plane)):.1f} deg from the front, hub to the {side}"
-        along = "toward the head" if self.out_of_plane > 0 else "toward the feet"
         beyond = f", more than the usual {np.degrees(MOST_TILT):.0f}" if abs(self.gantry_tilt) > MOST_TILT else ""
-        top = "top toward the feet" if self.gantry_tilt > 0 else "top toward the head"
+        seen = _angle(self.in_plane, " from the front", ", hub to the left", ", hub to the right")
+        along = _angle(self.out_of_plane, "", ", hub toward the head", ", hub toward the feet")
+        tilt = _angle(self.gantry_tilt, "", ", top toward the feet", ", top toward the head")
         return (
             ("in-plane angle", seen if np.isfinite(self.in_plane) else "none: the needle runs along the patient"),
-            ("out-of-plane angle", f"{abs(np.degrees(self.out_of_plane)):.1f} deg, hub {along}"),
-            ("gantry tilt", f"{abs(np.degrees(self.gantry_tilt)):.1f} deg, {top}{beyond}"),
+            ("out-of-plane angle", along),
+            ("gantry tilt", tilt + beyond),
         )
 
     def summary(self) -> dict[str, Any]:
         """Plain values: degrees; null where there is no angle."""
         angles = {f"{name}_deg": float(np.degrees(angle)) for name, angle in self._asdict().items()}
         return {name: angle if np.isfinite(angle) else None for name, angle in angles.items()}
+
+
+def _angle(angle: float, of: str, positive: str, negative: str) -> str:
+    """An angle with its side; none for what is shown as 0."""
+    size = f"{abs(np.degrees(angle)):.1f}"
+    side = "" if float(size) == 0.0 else positive if angle > 0 else negative
+    return f"{size} deg{of}{side}"
 
 
 def needle_planes(outward_ct: Floats) -> NeedlePlanes:

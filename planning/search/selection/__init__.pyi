@@ -9,4 +9,10 @@ from .choice import (
     parse_choice as parse_choice,
 )
 from .safe_cone import grid_cone as grid_cone, with_grid_cone as with_grid_cone
-from .windows import MOST_WINDOWS as MOST_WINDOWS, Window as Window, Windows as Windows, find_windows as find_windows
+from .windows import (
+    MOST_WINDOWS as MOST_WINDOWS,
+    Window as Window,
+    Windows as Windows,
+    find_windows as find_windows,
+    nearest_row as nearest_row,
+)

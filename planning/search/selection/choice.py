@@ -12,7 +12,7 @@ from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
-from puncture_twin.planning.geometry.spaces import to_lps
+from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
@@ -45,6 +45,14 @@ class Choice:
     def of_grid(self) -> bool:
         """Whether a search's result has to be looked at."""
         return self.angles is None and self.entry_mm is None
+
+    def text(self, space: Space) -> str:
+        """How it was chosen, such as "rank 3"; an entry in the case's space."""
+        if self.angles is not None:
+            return "its angles"
+        if self.entry_mm is not None:
+            return f"entry ({', '.join(f'{mm:g}' for mm in self.entry_mm)}) mm {space}"
+        return f"window {self.window}" if self.window is not None else f"rank {self.rank or 1}"
 
 
 BEST = Choice()
@@ -84,7 +92,7 @@ def choose(context: CaseContext, found: Candidates, choice: Choice) -> Chosen:
     """
     if not choice.of_grid:
         checked = context.check(*chosen_angles(context.case, choice))
-        _refuse_other_entry(context.case, checked, choice)
+        refuse_other_entry(context.case, checked, choice)
         if not checked.safe[0]:
             at = checked.at(0)
             where = f"theta {at['theta_deg']:.4g} deg, beta {at['beta_deg']:.4g} deg"
@@ -154,7 +162,7 @@ def _refuse_beyond(number: int, count: int, where: str, what: str) -> None:
         raise InputError(f"{number}: there are {count} {what}", where=where, allowed=f"1 to {count}")
 
 
-def _refuse_other_entry(case: Case, checked: Candidates, choice: Choice) -> None:
+def refuse_other_entry(case: Case, checked: Candidates, choice: Choice) -> None:
     """Refuse a point from which a straight path enters the skin somewhere else.
 
     Raises:

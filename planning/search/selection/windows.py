@@ -72,6 +72,14 @@ def find_windows(found: Candidates) -> Windows:
     return Windows(number, tuple(parts))
 
 
+def nearest_row(found: Candidates, outward_ct: Floats) -> int | None:
+    """The row of a search beside which a direction, shape (3,), lies; None where it is beyond the grid by a step."""
+    row = int(np.argmax(found.outward_ct @ outward_ct))
+    near = found.outward_ct[row]
+    apart = float(np.arctan2(np.linalg.norm(np.cross(near, outward_ct)), near @ outward_ct))
+    return None if found.grid is None or apart > found.grid.step else row
+
+
 def _connected(grid: AngleGrid | None, safe: Bools) -> Ints:
     """A label for each row; safe neighbours share theirs."""
     if grid is None:

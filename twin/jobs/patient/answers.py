@@ -30,9 +30,10 @@ from puncture_twin.planning.registration.checks.marker_check import checked_plac
 from puncture_twin.planning.registration.checks.squareness import Squareness, check_squareness
 from puncture_twin.planning.registration.registration import Registration, match, register
 from puncture_twin.planning.registration.touching import touchable_points
+from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
-from puncture_twin.planning.search.selection.choice import Choice, choose, chosen_angles
+from puncture_twin.planning.search.selection.choice import Choice, choose, chosen_angles, refuse_other_entry
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
 
 
@@ -43,10 +44,23 @@ def check_candidate(context: CaseContext, choice: Choice) -> Explanation:
         InputError: See `chosen_angles`, `choose`.
         NoAnswerError: Nothing is safe, so that there are no ranks.
     """
-    if not choice.of_grid:
-        return context.explain(*chosen_angles(context.case, choice))
-    found, rows = choose(context, context.search(), choice)
-    return context.explain(found.theta[rows[0]], found.beta[rows[0]])
+    return explain_choice(context, choice, context.search() if choice.of_grid else None)
+
+
+def explain_choice(context: CaseContext, choice: Choice, found: Candidates | None) -> Explanation:
+    """Explain a choice, safe or not, with the search of the case where it is of one.
+
+    Raises:
+        InputError: See `chosen_angles`, `choose`; an entry where the path does not enter.
+        NoAnswerError: Nothing is safe, so that there are no ranks.
+    """
+    if choice.of_grid:
+        assert found is not None
+        chosen, rows = choose(context, found, choice)
+        return context.explain(chosen.theta[rows[0]], chosen.beta[rows[0]])
+    explained = context.explain(*chosen_angles(context.case, choice))
+    refuse_other_entry(context.case, explained.candidates, choice)
+    return explained
 
 
 def registration_report(path: Path) -> dict[str, Any]:
