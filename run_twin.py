@@ -462,14 +462,20 @@ def reproduce(
     paper: Annotated[str, typer.Argument(metavar="chen2019|liu2007|axp-ybq", help="Which paper.")],
     out_dir: OutOfCaseOption = None,
     seeds: Annotated[int | None, typer.Option("--seeds", min=1, max=MOST_SEEDS, help="How many draws, if any.")] = None,
+    experiment: Annotated[
+        bool, typer.Option("--experiment", help="Of chen2019: draw its experiment anew, --seeds times.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Print a paper's numbers beside ours; exit 0 only if every one holds."""
-    from puncture_twin.twin.jobs.papers.papers import PAPERS
+    from puncture_twin.twin.jobs.papers.papers import PAPERS, chen2019_experiment
 
     if paper not in PAPERS:
         raise InputError(f"paper '{paper}' is not known", where="reproduce", allowed=", ".join(PAPERS))
-    result = PAPERS[paper](_out(out_dir, Path(paper), "reproduce"), seeds)
+    if experiment and paper != "chen2019":
+        raise InputError(f"{paper} has no such experiment", where="--experiment", allowed="reproduce chen2019")
+    folder = _out(out_dir, Path(paper), "reproduce")
+    result = chen2019_experiment(seeds) if experiment else PAPERS[paper](folder, seeds)
     _print(result.summary, result.text, as_json)
     if not result.holds:
         raise typer.Exit(ANSWER_IS_NO)

@@ -8,6 +8,12 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from puncture_twin.twin.jobs.papers import axp_ybq, chen2019
+from puncture_twin.twin.jobs.papers.chen2019_experiment import (
+    DRAWS,
+    experiment_summary,
+    experiment_text,
+    reproduce_experiment,
+)
 from puncture_twin.twin.jobs.papers.chen2019_text import reproduction_summary, reproduction_text
 from puncture_twin.twin.jobs.servo.job import reproduce_paper
 
@@ -31,6 +37,12 @@ def _chen2019(out_dir: Path, seeds: int | None) -> PaperResult:
     del out_dir, seeds  # arithmetic on printed tables: nothing is drawn, in either sense
     result = chen2019.reproduce()
     return PaperResult(result.holds, reproduction_summary(result), reproduction_text(result))
+
+
+def chen2019_experiment(draws: int | None) -> PaperResult:
+    """The experiment of Chen 2019 drawn anew: whether its stated errors can be its own."""
+    report = reproduce_experiment(DRAWS if draws is None else draws)
+    return PaperResult(report.agrees, experiment_summary(report), experiment_text(report))
 
 
 def _axp_ybq(out_dir: Path, seeds: int | None) -> PaperResult:
