@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import binom
+from selfcal_world import as_estimate
 
 from benchmarks.selfcal_rooms import Kind, outcome, recorded, room_of
 from puncture_twin.planning.arm.kinematics import flange_pose
@@ -34,8 +35,11 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import Whitening
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import drawing
 from puncture_twin.twin.guidance.ultrasound.puncture import aim
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
+from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording
 
 ROOMS = 30
+PICTURED = 12
+"""Rooms of rendered pictures: one takes a second and a half."""
 ALL = active_columns(tip=True, scale=False, direction=True)
 NOISE = Noise(0.0, 0.0, 0.1, float(np.radians(0.3)), off_plane_mm=0.15)
 
@@ -215,6 +219,35 @@ def test_the_region_holds_the_truth(thirty, name):
     inside = sum(one.inside for one in thirty[name])
     assert max(binom.ppf(0.001, ROOMS, 0.95), 0.85 * ROOMS - 1) <= inside <= ROOMS
     assert np.mean([one.mahalanobis for one in thirty[name]]) == pytest.approx(1.0, abs=0.25)
+
+
+def test_a_direction_counts_by_how_much_of_the_shaft_shows():
+    """Directions that err as the power -3/2 of the shaft: their one size is found, and the region holds the truth."""
+    sizes, inside, narrower = [], 0, []
+    for seed in range(ROOMS):
+        rng = np.random.default_rng([31, seed])
+        recording, truth = simulate_recording(rng, 30, noise=SPEC_NOISE._replace(direction_rad=0.0))
+        recording = replace(recording, shaft_mm=np.exp(rng.uniform(np.log(8.0), np.log(60.0), 30)))
+        spread = recording.direction_spread * SPEC_NOISE.direction_rad
+        assert np.sqrt(np.mean(spread**2)) == pytest.approx(SPEC_NOISE.direction_rad)
+        angle = np.arctan2(*recording.v.T[::-1]) + rng.normal(0.0, spread)
+        recording = replace(recording, v=np.column_stack([np.cos(angle), np.sin(angle)]))
+        found, same = calibrate(recording), calibrate(replace(recording, shaft_mm=None))
+        e = found.parameter_error(as_estimate(truth))
+        inside += e @ np.linalg.solve(found.covariance_counts, e) <= found.region_limit()
+        sizes.append(found.noise.direction_rad)
+        narrower.append(np.trace(found.covariance[15:, 15:]) < np.trace(same.covariance[15:, 15:]))
+    assert np.sqrt(np.mean(np.square(sizes))) == pytest.approx(SPEC_NOISE.direction_rad, rel=0.15)
+    assert inside >= binom.ppf(0.001, ROOMS, 0.95)
+    assert np.mean(narrower) > 0.8
+
+
+def test_the_region_holds_the_truth_of_rendered_pictures():
+    """Detected tips and directions, play, and noise found: as often as the binomial distribution allows (99.9 %)."""
+    kind = Kind(told=False, rendered=True, play_deg=0.02)
+    rooms = [outcome(kind, seed) for seed in range(PICTURED)]
+    assert sum(one.inside for one in rooms) >= binom.ppf(0.001, PICTURED, 0.95)
+    assert np.mean([one.mahalanobis for one in rooms]) < 1.35
 
 
 @pytest.mark.parametrize("name", KINDS)

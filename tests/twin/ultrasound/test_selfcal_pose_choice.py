@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 from selfcal_world import as_estimate
 
+from benchmarks.selfcal_rooms import DIRECTION_RAD, IMAGE_MM, compared, recorded, room_of
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import N_PARAMETERS
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.pose_choice import choose_poses, expected_tre_mm
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
+from puncture_twin.twin.guidance.ultrasound.candidate_poses import drawing as belief_of
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
 from puncture_twin.twin.guidance.ultrasound.simulate import (
     SPEC_NOISE,
     PoseRanges,
@@ -89,3 +93,22 @@ def test_impossible_numbers_are_refused(world, n):
     _, candidates, _, drawing = world
     with pytest.raises(InputError, match="of 300 candidates"):
         choose_poses(candidates, n, SPEC_NOISE, drawing)
+
+
+def test_arms_that_err_alike_in_every_pose_change_the_choice():
+    """The bound counts them as the calibration does: so chosen it is lower, and it is the error in hidden rooms."""
+    case, _, candidates, _ = room_of(0.0)
+    poses, arms, belief = candidates.poses, case.declared_arms, belief_of(case)
+    noise = Noise(0.0, 0.0, IMAGE_MM, DIRECTION_RAD, off_plane_mm=0.15)
+    chosen, blind = (choose_poses(poses, 30, noise, belief, arms=declared) for declared in (arms, None))
+    bounds = [expected_tre_mm(poses.subset(c), noise, belief, poses, arms) for c in (chosen, blind)]
+    assert expected_tre_mm(poses.subset(chosen), noise, belief, poses) < 0.8 * bounds[0] < 0.8 * bounds[1]
+    squared = []
+    for seed in range(20):
+        rng = np.random.default_rng([7, seed])
+        truth = draw_workcell(case, rng)
+        recording, _ = recorded(case, candidates, truth, chosen, rng, noise=True)
+        found = calibrate(recording, noise=noise, arms=arms, direction=False)
+        held = recorded(case, candidates, truth, np.setdiff1d(np.arange(len(poses)), chosen)[::12], rng, noise=False)
+        squared.append(compared(found, truth, *held).errors_mm ** 2)
+    assert np.sqrt(np.mean(squared)) == pytest.approx(bounds[0], rel=0.2)

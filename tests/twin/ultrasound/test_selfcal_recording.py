@@ -14,19 +14,21 @@ def recording(rng):
     return simulate_recording(rng, 6)[0]
 
 
-@pytest.mark.parametrize("kind", ["2-D directions", "3-D directions", "no directions", "pixels"])
+@pytest.mark.parametrize("kind", ["2-D directions", "3-D directions", "no directions", "pixels", "shaft"])
 def test_the_csv_keeps_every_digit(recording, tmp_path, kind):
     """Writing and reading gives the same numbers, names and units."""
     v = {"2-D directions": recording.v, "no directions": None}.get(
         kind, np.column_stack([recording.v, np.full(6, 0.1)])
     )
-    written = Recording(recording.A, recording.B, recording.P, v, ("a", "b", "c", "d", "e", "f"), kind == "pixels")
+    shaft = np.linspace(9.1, 40.3, 6) if kind in ("shaft", "pixels") else None
+    names = ("a", "b", "c", "d", "e", "f")
+    written = Recording(recording.A, recording.B, recording.P, v, names, kind == "pixels", shaft_mm=shaft)
     write_recording(written, tmp_path / "recording.csv")
     for path in (tmp_path, tmp_path / "recording.csv"):
         read = read_recording(path)
         assert read.names == written.names
         assert read.pixels == written.pixels
-        for key in "ABPv":
+        for key in (*"ABPv", "shaft_mm"):
             np.testing.assert_array_equal(getattr(read, key), getattr(written, key))
 
 
@@ -36,6 +38,16 @@ def test_arrays_are_read_only_and_directions_unit(recording):
     np.testing.assert_allclose(np.linalg.norm(doubled.v, axis=1), 1, rtol=1e-15)
     with pytest.raises(ValueError, match="read-only"):
         doubled.P[0] = 0
+
+
+def test_a_shafts_length_needs_a_direction_and_is_one(recording):
+    """Without directions, or with a length that shows none, the recording is bad input that says so."""
+    parts = (recording.A, recording.B, recording.P)
+    with pytest.raises(InputError, match="shaft_mm without directions"):
+        Recording(*parts, shaft_mm=np.full(6, 20.0))
+    for wrong in (0.5, -3.0, np.nan, np.inf):
+        with pytest.raises(InputError, match="shaft_mm of pose 1 is"):
+            Recording(*parts, recording.v, shaft_mm=np.append(wrong, np.full(5, 20.0)))
 
 
 @pytest.mark.parametrize(

@@ -149,7 +149,8 @@ def choose(
         return np.sort(rng.choice(left, n, replace=False))
     recorded = candidates.poses.subset(np.array([shot.candidate for shot in shots])) if shots else None
     noise = choice_noise(case)
-    return left[choose_poses(candidates.poses.subset(left), n, noise, drawing(case), recorded=recorded)]
+    poses, arms = candidates.poses.subset(left), case.declared_arms
+    return left[choose_poses(poses, n, noise, drawing(case), recorded=recorded, arms=arms)]
 
 
 def choice_noise(case: SelfcalCase) -> Noise:
@@ -209,6 +210,7 @@ def _recording(room: TwoArms, shots: list[ProbeShot], *, play: bool) -> Recordin
         q_needle=q_needle,
         turn_probe=turn_probe,
         turn_needle=turn_needle,
+        shaft_mm=np.array([one.shaft_mm for one in found]),
     )
 
 

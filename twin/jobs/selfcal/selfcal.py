@@ -194,7 +194,7 @@ def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisi
     rows = np.array([shot.candidate for shot in taken.shots])
 
     def expected(some: NDArray[np.int_]) -> float:
-        return expected_tre_mm(poses.subset(some), noise, belief, poses)
+        return expected_tre_mm(poses.subset(some), noise, belief, poses, case.declared_arms)
 
     sets = [rng.choice(len(poses), len(rows), replace=False) for _ in range(RANDOM_SETS)]
     return Choice(expected(rows), tuple(expected(some) for some in sets))

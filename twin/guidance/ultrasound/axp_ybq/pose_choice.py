@@ -1,4 +1,8 @@
-"""Which of many possible poses to record: those that tell most about the error at the tip."""
+"""Which of many possible poses to record: those that tell most about the error at the tip.
+
+Errors of the arms that all poses share stand behind the parameters as unknowns with a prior (their deviations are 1):
+poses that repeat one of them do not average it out, and poses that show it correct the aim.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +13,11 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, active_columns, parameter_units
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import covariances, linearised_tip
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import Problem, linear_model
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import whitener
 
 PRIOR_WEIGHT = 1e-6
@@ -20,6 +25,9 @@ PRIOR_WEIGHT = 1e-6
 
 NO_INFORMATION = 1e-13
 """Least over largest eigenvalue of an information matrix below which nothing but rounding is left."""
+
+N_FREE = len(active_columns(tip=True, scale=False, direction=False))
+"""Parameters of the calibration; the arms' errors stand behind them."""
 
 MAX_SWEEPS = 20
 """How often all chosen poses are looked at for a better exchange."""
@@ -32,7 +40,8 @@ class _Design(NamedTuple):
     """What every candidate tells, and what is to be known."""
 
     rows: Floats
-    """Jacobian of each candidate over its residuals' spread, shape (n, 3, p): its information is rows^T rows."""
+    """Jacobian of each candidate over its residuals' spread, shape (n, 3, p), p of parameters and arms' errors: its
+    information is rows^T rows."""
     wanted: Floats
     """Mean of J^T J over the workspace, shape (p, p): trace(C wanted) is the mean squared error at the tip."""
     base: Floats
@@ -50,6 +59,7 @@ def choose_poses(
     prior: Calibration | Estimate,
     *,
     recorded: Recording | None = None,
+    arms: DeclaredArms | None = None,
 ) -> NDArray[np.int_]:
     """Choose poses by Fisher information: greedily, then by exchange until no single exchange helps.
 
@@ -61,6 +71,7 @@ def choose_poses(
         noise: Of both arms and the image.
         prior: A rough calibration, such as the drawing's: 10 deg and 20 mm off will do.
         recorded: Poses that are recorded already and count.
+        arms: Both arms' lasting errors; every recording then needs joints. None takes all errors of flanges for noise.
 
     Returns:
         Indices into the candidates, ascending.
@@ -71,7 +82,7 @@ def choose_poses(
     if not 0 < n <= len(candidates):
         raise InputError(f"{n} poses of {len(candidates)} candidates", where="pose choice", allowed="1 to all of them")
     prior = prior.estimate if isinstance(prior, Calibration) else prior
-    design = _design(candidates, noise, prior, recorded)
+    design = _design(candidates, _Belief(noise, prior, arms), recorded)
     chosen: list[int] = []
     H = design.base
     for _ in range(n):
@@ -80,41 +91,61 @@ def choose_poses(
     return np.sort(_exchanged(design, H, chosen))
 
 
-def expected_tre_mm(poses: Recording, noise: Noise, prior: Estimate, workspace: Recording) -> float:
+class _Belief(NamedTuple):
+    """What is believed before anything is recorded."""
+
+    noise: Noise
+    prior: Estimate
+    arms: DeclaredArms | None
+
+
+def expected_tre_mm(
+    poses: Recording, noise: Noise, prior: Estimate, workspace: Recording, arms: DeclaredArms | None = None
+) -> float:
     """Cramer-Rao bound of the rms error at the tip over a workspace, mm, if these poses are recorded.
 
-    Infinite where they leave a combination of the unknowns free.
+    Infinite where they leave a combination of the unknowns free. ``arms`` as in `choose_poses`.
     """
-    rows = _whitened(poses, noise, prior)
+    belief = _Belief(noise, prior, arms)
+    rows = _whitened(poses, belief)
     H = np.einsum("nip,niq->pq", rows, rows)
-    values = np.linalg.eigvalsh(H)
+    values = np.linalg.eigvalsh(H[:N_FREE, :N_FREE])
     if values[0] <= NO_INFORMATION * values[-1]:
         return float("inf")
-    return float(np.sqrt(np.trace(np.linalg.solve(H, _wanted(workspace, prior)))))
+    return float(np.sqrt(np.trace(np.linalg.solve(_with_prior(H), _wanted(workspace, belief)))))
 
 
-def _scaled(recording: Recording, prior: Estimate) -> Floats:
+def _with_prior(H: Floats) -> Floats:
+    """Information with what is known of the arms' errors beforehand: their deviation is 1."""
+    return H + np.diag((np.arange(len(H)) >= N_FREE).astype(float))
+
+
+def _slopes(recording: Recording, belief: _Belief) -> tuple[Floats, Floats]:
+    """Residuals by parameters in their units and by the arms' errors, (n, 3, p), and their own noise, (n, 3, 3)."""
     active = active_columns(tip=True, scale=False, direction=False)
-    return np.asarray(linearised_tip(prior, recording).jacobian[:, :, active] * parameter_units(active, prior.scale))
+    errors = None if belief.arms is None else arm_errors(belief.arms, recording)
+    model = linear_model(Problem(recording, belief.noise, active, arms=errors), belief.prior)
+    J = model.jacobian * parameter_units(active, belief.prior.scale)
+    return (J if model.shared is None else np.concatenate([J, model.shared], axis=2)), model.sigma
 
 
-def _whitened(recording: Recording, noise: Noise, prior: Estimate) -> Floats:
-    W = whitener(covariances(prior, recording, noise), np.ones((len(recording), 3)))
-    return np.asarray(W @ _scaled(recording, prior))
+def _whitened(recording: Recording, belief: _Belief) -> Floats:
+    slopes, sigma = _slopes(recording, belief)
+    return np.asarray(whitener(sigma, np.ones((len(recording), 3))) @ slopes)
 
 
-def _wanted(workspace: Recording, prior: Estimate) -> Floats:
-    J = _scaled(workspace, prior)
+def _wanted(workspace: Recording, belief: _Belief) -> Floats:
+    J, _ = _slopes(workspace, belief)
     return np.asarray((J.transpose(0, 2, 1) @ J).mean(axis=0))
 
 
-def _design(candidates: Recording, noise: Noise, prior: Estimate, recorded: Recording | None) -> _Design:
-    rows = _whitened(candidates, noise, prior)
-    base = PRIOR_WEIGHT * np.diag((rows**2).sum(axis=1).mean(axis=0))
+def _design(candidates: Recording, belief: _Belief, recorded: Recording | None) -> _Design:
+    rows = _whitened(candidates, belief)
+    base = _with_prior(PRIOR_WEIGHT * np.diag((rows**2).sum(axis=1).mean(axis=0)))
     if recorded is not None:
-        held = _whitened(recorded, noise, prior).reshape(-1, rows.shape[2])
+        held = _whitened(recorded, belief).reshape(-1, rows.shape[2])
         base = base + held.T @ held
-    return _Design(rows, _wanted(candidates, prior), base)
+    return _Design(rows, _wanted(candidates, belief), base)
 
 
 def _value(design: _Design, H: Floats) -> float:

@@ -257,7 +257,7 @@ def covariances(
     else:
         sigma += _propagated(estimate, recording, noise, v_image)
     if v_image is not None:
-        sigma[:, 3, 3] += noise.direction_rad**2
+        sigma[:, 3, 3] += (noise.direction_rad * recording.direction_spread) ** 2
         sigma[:, 4, 4] += lean_rad**2
     return sigma
 

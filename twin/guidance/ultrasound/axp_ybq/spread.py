@@ -64,7 +64,8 @@ def found_spreads(problem: Problem, fit: RobustFit) -> ResidualSpreads:
     at_fit = weighed(problem, fit)
     turn, lean = 1.0, problem.lean_rad
     if problem.with_direction:
-        turn, lean = (_direction_part(at_fit, fit, column) for column in (3, 4))
+        turn = _direction_part(at_fit, fit, 3, problem.recording.direction_spread)
+        lean = _direction_part(at_fit, fit, 4, np.ones(len(problem.recording)))
         arms = 0.0 if isinstance(problem.noise, Spread) else 2 * problem.noise.robot_rad**2
         lean = float(np.sqrt(max(lean**2 - arms, arms / 100, LEAST_RAD**2)))
     return ResidualSpreads(Spread(*_tip_parts(problem, at_fit, fit), turn), lean)
@@ -80,12 +81,12 @@ def _tip_parts(problem: Problem, at_fit: Fitted, fit: RobustFit) -> tuple[float,
     return _two_parts((r**2).sum(axis=0), len(r) - taken.sum(axis=0))
 
 
-def _direction_part(at_fit: Fitted, fit: RobustFit, column: int) -> float:
-    """Spread of one of the direction's two residuals, rad."""
+def _direction_part(at_fit: Fitted, fit: RobustFit, column: int, spread: Floats) -> float:
+    """Of one of the direction's two residuals, rad: what its spread (n,), whose mean square is 1, is multiplied by."""
     used = fit.direction_kept
     r, J, expected = at_fit.residuals[used, column], at_fit.jacobian[used, column], at_fit.sigma[used, column, column]
     freedom = len(r) - float((((J @ at_fit.covariance) * J).sum(axis=1) / expected).sum())
-    return max(float(np.sqrt(r @ r / max(freedom, 1.0))), LEAST_RAD)
+    return max(float(np.sqrt(np.sum((r / spread[used]) ** 2) / max(freedom, 1.0))), LEAST_RAD)
 
 
 def _two_parts(squares: Floats, freedom: Floats) -> tuple[float, float]:
@@ -153,7 +154,7 @@ def _structures(problem: Problem, fit: RobustFit) -> dict[str, Floats]:
         rows = {"lean": 4} if not found else {"turn": 3, "lean": 4}
         for name, row in rows.items():
             found[name] = np.zeros((n, k, k))
-            found[name][:, row, row] = 1.0
+            found[name][:, row, row] = problem.recording.direction_spread**2 if name == "turn" else 1.0
     return found
 
 

@@ -118,6 +118,8 @@ class Detection(NamedTuple):
     """Sum along the visible segment of the amplitude over background, times mm."""
     contrast_db: float
     """Amplitude of the last piece of shaft over the background."""
+    shaft_mm: float
+    """Of shaft that shows: the more, the better its direction is known."""
 
 
 def detect(picture: Pixels, imager: Imager, settings: DetectorSettings | None = None) -> Detection | Missed:
@@ -153,7 +155,7 @@ def detect(picture: Pixels, imager: Imager, settings: DetectorSettings | None = 
     if np.any(found < settings.edge_mm) or np.any(found > high):
         return Missed.TIP_AT_EDGE
     contrast = 20.0 * float(np.log10(max(1.0 + tip.step, 1e-6)))
-    return Detection(found, line.direction, segment.score, contrast)
+    return Detection(found, line.direction, segment.score, contrast, -line.start)
 
 
 def over_background(picture: Pixels, imager: Imager) -> Floats:
