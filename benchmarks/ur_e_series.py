@@ -75,15 +75,15 @@ def _arm(name: str, wheel: zipfile.ZipFile, package: str, urdf: str, mesh: str, 
         data = wheel.read(mesh.format(file))
         shape = trimesh.load_mesh(io.BytesIO(data), file_type=mesh.rsplit(".", 1)[1], process=False)
         written = trimesh.exchange.stl.export_stl(shape)
-        entries.append(_entry(out, f"{name}/{link}.stl", written, package, mesh.format(file), data))
+        entries.append(manifest_entry(out, f"{name}/{link}.stl", written, package, mesh.format(file), data))
         entries[-1]["triangles"] = len(shape.faces)
     data = wheel.read(urdf)
     written = _urdf(name, ElementTree.fromstring(data.decode().replace("<robot ", f"<robot {UNBOUND} ", 1)))
-    entries.append(_entry(out, f"{name}.urdf", written, package, urdf, data))
+    entries.append(manifest_entry(out, f"{name}.urdf", written, package, urdf, data))
     return entries
 
 
-def _entry(out: Path, path: str, written: bytes, package: str, source: str, data: bytes) -> dict[str, Any]:
+def manifest_entry(out: Path, path: str, written: bytes, package: str, source: str, data: bytes) -> dict[str, Any]:
     """Write one file; where it comes from, and both hashes."""
     (out / path).write_bytes(written)
     return {

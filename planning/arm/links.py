@@ -1,12 +1,10 @@
 """The bodies of the arm's links, in the link frames of :mod:`puncture_twin.planning.arm.kinematics`, in mm.
 
-Source: the URDF and meshes of example-robot-data (BSD) for the UR3, UR5 and UR10; those in ``meshes/ur``, whose LICENSE
-says whence, for the UR3e, UR5e and UR10e.
+Source: the URDFs and collision meshes of ``ur_description`` in ``meshes/ur``, whose LICENSE says whence.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -41,11 +39,8 @@ JOINT_NAMES = (
 )
 """The joints as the URDF (and ROS) names them."""
 
-PACKAGE = "example-robot-data"
-DESCRIPTION = f"share/{PACKAGE}/robots/ur_description"
-
-OWN = "ur/"
-"""Where the shapes of the e-Series lie below our meshes, and how their URDFs' addresses begin."""
+SHAPES = "ur"
+"""Where URDFs and shapes lie below our meshes, and how the URDFs' addresses begin."""
 
 T_BASE_URDFBASE = np.diag([-1.0, -1.0, 1.0, 1.0])
 """The URDF's ``base_link`` against the controller's base: half a turn about z."""
@@ -126,31 +121,21 @@ def visual_links(model: UrModel) -> tuple[Link, ...]:
 
 
 def urdf_path(model: UrModel) -> Path:
-    """The URDF of a model: our own, or as example-robot-data installed it.
+    """The URDF of a model.
 
     Raises:
-        InputError: If the package is not installed, or nobody has such a model.
+        InputError: Nobody has the shapes of such a model.
     """
-    own = meshes.folder() / f"{OWN}{model.name}.urdf"
-    if own.is_file():
-        return own
-    path = _share() / DESCRIPTION / "urdf" / f"{model.name}_robot.urdf"
+    path = meshes.folder() / SHAPES / f"{model.name}.urdf"
     if not path.is_file():
-        raise InputError(f"no link meshes for robot {model.name!r}", where=PACKAGE, allowed=", ".join(_with_meshes()))
+        allowed = ", ".join(sorted(p.stem for p in path.parent.glob("*.urdf")))
+        raise InputError(f"no link meshes for robot {model.name!r}", where=f"meshes/{SHAPES}", allowed=allowed)
     return path
-
-
-def _with_meshes() -> list[str]:
-    """Names of the arms whose shapes are there."""
-    shipped = [p.name.removesuffix("_robot.urdf") for p in (_share() / DESCRIPTION / "urdf").glob("ur?*_robot.urdf")]
-    own = [p.stem for p in (meshes.folder() / OWN).glob("*.urdf")]
-    return sorted(name for name in shipped + own if "joint_limited" not in name)
 
 
 def resolve_package(address: str) -> Path:
     """The file behind a URDF's ``package://`` address."""
-    name = address.removeprefix("package://")
-    return meshes.folder() / name if name.startswith(OWN) else _share() / "share" / name
+    return meshes.folder() / address.removeprefix("package://")
 
 
 def urdf_link_poses(model: UrModel, q: Floats) -> Floats:
@@ -171,17 +156,6 @@ def urdf_link_poses(model: UrModel, q: Floats) -> Floats:
         turn = pose(exp_rotation(_floats(axis, "xyz") * angle), np.zeros(3))
         poses.append(poses[-1] @ _origin(joints[name]) @ turn)
     return np.stack(poses)
-
-
-def _share() -> Path:
-    spec = importlib.util.find_spec("cmeel")
-    places = list(spec.submodule_search_locations or ()) if spec else []
-    roots = [Path(place).parent / "cmeel.prefix" for place in places]
-    roots += [Path(np.__file__).parents[1] / "cmeel.prefix"]
-    for root in roots:
-        if (root / DESCRIPTION).is_dir():
-            return root
-    raise InputError("robot description not found", where="site-packages", allowed=f"{PACKAGE} installed")
 
 
 def _link_meshes(model: UrModel) -> list[tuple[str, TriangleMesh]]:

@@ -1,19 +1,22 @@
-"""The shapes of the e-Series that ship here: pinned, of the stated licence, and the arm's own."""
+"""The shapes that ship here: pinned, of the stated licence, and the arms' own."""
 
 import hashlib
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from puncture_twin import meshes
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.links import LINK_NAMES, resolve_package, urdf_link_poses, visual_links
+from puncture_twin.planning.arm.links import LINK_NAMES, urdf_link_poses, urdf_path, visual_links
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.errors import InputError
 
 FOLDER = meshes.folder() / "ur"
 FILES = {entry["path"]: entry for entry in json.loads((FOLDER / "manifest.json").read_text(encoding="utf-8"))["files"]}
 E_SERIES = ["ur3e", "ur5e", "ur10e"]
+ARMS = ["ur3", "ur5", "ur10", *E_SERIES]
 EDGE_MM = 1.0
 """How far apart two shapes may lie where they share a joint: 0.7 mm at the UR5e's wrist 3, which a pin closes."""
 
@@ -21,7 +24,7 @@ EDGE_MM = 1.0
 def test_every_shape_is_listed_with_its_hash_and_source():
     """Seven meshes and a URDF an arm, and nothing else; the licence lies beside them."""
     there = {path.relative_to(FOLDER).as_posix() for path in FOLDER.rglob("*.*") if path.suffix in {".stl", ".urdf"}}
-    assert there == set(FILES) and len(FILES) == len(E_SERIES) * (len(LINK_NAMES) + 1)
+    assert there == set(FILES) and len(FILES) == len(ARMS) * (len(LINK_NAMES) + 1)
     for path, entry in FILES.items():
         data = (FOLDER / path).read_bytes()
         assert (hashlib.sha256(data).hexdigest(), len(data)) == (entry["sha256"], entry["bytes"])
@@ -46,15 +49,21 @@ def test_each_shape_begins_where_the_one_before_ends(name):
         assert gap < EDGE_MM or (high.min() < low.max() and low.min() < high.max()), LINK_NAMES[joint : joint + 2]
 
 
-@pytest.mark.parametrize("name", E_SERIES)
+@pytest.mark.parametrize("name", ARMS)
 def test_the_urdf_is_the_table(name):
-    """At random angles the flange is where the Denavit-Hartenberg table has it, to 0.1 mm and far below."""
+    """At random angles the last link is where the Denavit-Hartenberg table has it, to 0.1 mm and far below.
+
+    The older URDFs have their links' axes otherwise: there it is the same motion at every angle.
+    """
     model = ur_model(name)
+    urdf, table = (poses(model, np.zeros(6))[6] for poses in (urdf_link_poses, link_poses))
+    T_table_urdf = np.linalg.inv(table) @ urdf
+    assert name not in E_SERIES or np.abs(T_table_urdf - np.eye(4)).max() < 1e-5
     for q in np.random.default_rng(8).uniform(-np.pi, np.pi, (50, 6)):
-        assert np.abs(urdf_link_poses(model, q)[6] - link_poses(model, q)[6]).max() < 1e-5
+        assert np.abs(urdf_link_poses(model, q)[6] - link_poses(model, q)[6] @ T_table_urdf).max() < 1e-5
 
 
-def test_addresses_lead_to_our_own_files_or_to_the_package():
-    """Shapes of the e-Series are ours, others example-robot-data's."""
-    assert resolve_package("package://ur/ur3e/base.stl") == FOLDER / "ur3e" / "base.stl"
-    assert "cmeel.prefix" in str(resolve_package("package://example-robot-data/robots/x.stl"))
+def test_no_arm_without_shapes_is_given_any():
+    """An arm that has no URDF here is refused, with those that have one."""
+    with pytest.raises(InputError, match="no link meshes for robot 'ur16e'.*ur10, ur10e, ur3, ur3e, ur5, ur5e"):
+        urdf_path(replace(ur_model("ur10e"), name="ur16e"))

@@ -209,8 +209,4 @@ def test_every_runtime_part_is_imported_by_the_product():
     tops = {name.split(".")[0] for path in modules().values() for name in imported(path)}
     known = packages_distributions()
     used = {part.lower().replace("_", "-") for top in tops for part in (top, *known.get(top, ()))}
-    assert {part for part in project["dependencies"] if part not in used} == DATA_ALONE
-
-
-DATA_ALONE = {"example-robot-data"}
-"""Its files are read (the arms' shapes), its code is not."""
+    assert {part for part in project["dependencies"] if part not in used} == set()

@@ -1,4 +1,4 @@
-"""The arm as PyBullet reads it: the URDF of example-robot-data with absolute addresses, holder and needle added."""
+"""The arm as PyBullet reads it: its URDF with absolute addresses, holder and needle added."""
 
 from __future__ import annotations
 
@@ -15,9 +15,6 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.twin.world.surface_file import write_obj
 from puncture_twin.twin.world.units import to_m
 
-UNUSED_LINKS = frozenset({"world", "base", "ee_link"})
-"""A second root, a frame without a body, and a 1 cm box where the holder sits."""
-
 HOLDER_DENSITY_KG_M3 = 1200.0
 """A printed holder, solid ABS or similar."""
 
@@ -33,7 +30,7 @@ def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
     Args:
         model: The arm.
         tool: What the flange carries.
-        folder: Where to write; the URDF's pictures stay in their package and are named by absolute paths.
+        folder: Where to write; the links' meshes stay where they are and are named by absolute paths.
 
     Returns:
         The URDF's path.
@@ -42,7 +39,6 @@ def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
         InputError: There is no URDF of that model.
     """
     robot = ET.parse(urdf_path(model)).getroot()
-    _drop_unused(robot)
     for mesh in robot.iter("mesh"):
         mesh.set("filename", str(resolve_package(mesh.get("filename", ""))))
     _replace_collisions(robot, model, folder)
@@ -52,16 +48,6 @@ def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
     path = folder / "arm.urdf"
     ET.ElementTree(robot).write(path, encoding="utf-8", xml_declaration=True)
     return path
-
-
-def _drop_unused(robot: ET.Element) -> None:
-    for element in list(robot):
-        child = element.find("child")
-        parent = element.find("parent")
-        ends = {end.get("link") for end in (child, parent) if end is not None}
-        unused_link = element.tag == "link" and element.get("name") in UNUSED_LINKS
-        if element.tag in {"gazebo", "transmission"} or unused_link or ends & UNUSED_LINKS:
-            robot.remove(element)
 
 
 def _replace_collisions(robot: ET.Element, model: UrModel, folder: Path) -> None:
