@@ -2,6 +2,7 @@
 
 import base64
 import gzip
+import hashlib
 import json
 from importlib.resources import files
 
@@ -10,7 +11,7 @@ import pytest
 from markupsafe import Markup
 
 from puncture_twin.twin.report.page.page_tables import listed, pairs, table
-from puncture_twin.twin.report.page.template import Card, script_json, write_html
+from puncture_twin.twin.report.page.template import Card, plotly_script, script_json, write_html
 
 EVIL = "</script><script>alert('1')</script>{{ title }}"
 SERVO = ("setup", "paper", "targets", "needle", "convergence", "statistics", "calibration", "inputs")
@@ -28,6 +29,22 @@ def servo_parts(text):
 def test_every_template_is_in_the_package_and_is_read(name):
     """By name, as text."""
     assert (files("puncture_twin.twin.report") / "templates" / name).read_text(encoding="utf-8")
+
+
+def test_plotly_is_the_published_bundle():
+    """Every byte of the script and of its licence is what was pinned, and the page says whose it is."""
+    folder = files("puncture_twin.twin.report") / "plotly_js"
+    pinned = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["files"]
+    assert {entry["path"] for entry in pinned} == {"LICENSE", "plotly-gl3d.min.js"}
+    for entry in pinned:
+        data = (folder / entry["path"]).read_bytes()
+        assert (len(data), hashlib.sha256(data).hexdigest()) == (entry["bytes"], entry["sha256"])
+    assert "Licensed under the MIT license" in plotly_head()
+
+
+def plotly_head():
+    """The first lines of the script as a page carries it."""
+    return gzip.decompress(base64.b64decode(plotly_script())).decode()[:400]
 
 
 def test_texts_are_escaped_wherever_they_stand(tmp_path):

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from markupsafe import Markup
-from plotly.utils import PlotlyJSONEncoder
 
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.jobs.selfcal.facts import Facts, selfcal_facts
@@ -43,7 +42,7 @@ def write_page(run: SelfcalRun, sheet: Path | None, room: Path | None, path: Pat
         twin=twin,
         inputs=inputs_table(run.inputs),
         origin=_origin(run),
-        data=script_json(charts, PlotlyJSONEncoder),
+        data=script_json(charts),
         plotly=plotly_script(),
     )
     return path

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
 
 MOST_STRUCTURES = 6
 """Curves of clearance: so many of the nearest structures; the table has the rest."""
@@ -16,32 +16,56 @@ NAMED_PHASE = 0.07
 """Share of the time that a phase must last to carry its name; shorter ones would overlap."""
 
 
+COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
+"""Okabe and Ito's, one for each curve."""
+
+
 def rehearsal_charts(rehearsal: Any, keep_away: frozenset[str]) -> dict[str, Any]:
     """Two figures as plain values: ``distance`` (tip to target) and ``clearance`` (needle to structures)."""
     every = max(1, len(rehearsal.times_s) // MOST_POINTS)
     times = rehearsal.times_s[::every]
     away = np.linalg.norm(rehearsal.tip_true_ct[::every] - rehearsal.target_true_ct, axis=1)
-    distance = go.Figure(
-        data=[go.Scatter(x=times, y=np.round(away, 3), mode="lines", name="tip to target", line={"color": "#00684a"})],
-        layout=_layout("true tip to true target, mm"),
-    )
-    for phase, start, length in _phases(rehearsal):
-        words = phase if length > NAMED_PHASE * rehearsal.times_s[-1] else ""
-        distance.add_vline(x=start, line={"color": "#999999", "width": 1, "dash": "dot"}, annotation_text=words)
+    distance = curve("tip to target", times, np.round(away, 3)) | {"line": {"color": "#00684a"}}
     names = [name for name in rehearsal.clearance_mm if name in keep_away]
     nearest = sorted(names, key=lambda n: float(np.min(rehearsal.clearance_mm[n], initial=np.inf)))
     curves = [
-        go.Scatter(
-            x=rehearsal.clearance_times_s,
-            y=np.round(rehearsal.clearance_mm[name], 2),
-            mode="lines",
-            name=name.replace("_", " "),
-        )
+        curve(name.replace("_", " "), rehearsal.clearance_times_s, np.round(rehearsal.clearance_mm[name], 2))
         for name in nearest[:MOST_STRUCTURES]
     ]
-    clearance = go.Figure(data=curves, layout=_layout("true needle to true structure, mm"))
-    clearance.add_hline(y=0, line={"color": "#d6001e", "width": 1})
-    return {"distance": dict(distance.to_plotly_json()), "clearance": dict(clearance.to_plotly_json())}
+    return {
+        "distance": {
+            "data": [distance],
+            "layout": _layout("true tip to true target, mm") | _phase_marks(rehearsal),
+        },
+        "clearance": {
+            "data": curves,
+            "layout": _layout("true needle to true structure, mm") | {"shapes": [_contact_line()]},
+        },
+    }
+
+
+def curve(name: str, x: Any, y: Any, mode: str = "lines") -> dict[str, Any]:
+    """One trace of a flat chart, as plotly's script reads it; what is no finite number is a gap."""
+    heights = [float(value) if math.isfinite(value) else None for value in y]
+    return {"type": "scatter", "name": name, "mode": mode, "x": np.asarray(x).tolist(), "y": heights}
+
+
+def _phase_marks(rehearsal: Any) -> dict[str, Any]:
+    """A dotted line where each phase begins, and its name where there is room."""
+    long = NAMED_PHASE * rehearsal.times_s[-1]
+    shapes, names = [], []
+    for phase, start, length in _phases(rehearsal):
+        line = {"color": "#999999", "width": 1, "dash": "dot"}
+        shapes.append({"type": "line", "x0": start, "x1": start, "y0": 0, "y1": 1, "yref": "paper", "line": line})
+        at = {"x": start, "y": 1, "yref": "paper", "xanchor": "left", "yanchor": "top", "showarrow": False}
+        names += [at | {"text": phase}] if length > long else []
+    return {"shapes": shapes, "annotations": names}
+
+
+def _contact_line() -> dict[str, Any]:
+    """Across the chart at 0 mm."""
+    ends = {"x0": 0, "x1": 1, "xref": "paper", "y0": 0, "y1": 0}
+    return {"type": "line", **ends, "line": {"color": "#d6001e", "width": 1}}
 
 
 def _phases(rehearsal: Any) -> list[tuple[str, float, float]]:
@@ -60,6 +84,7 @@ def _layout(title: str) -> dict[str, Any]:
         "yaxis": {"title": {"text": title}, "rangemode": "tozero"},
         "legend": {"orientation": "h", "y": 1.22},
         "hovermode": "x unified",
+        "colorway": list(COLOURS),
         "plot_bgcolor": "#fbfbfc",
         "paper_bgcolor": "#ffffff",
     }
