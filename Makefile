@@ -50,12 +50,12 @@ install: $(VENV)/installed
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[test]'
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[twin,test]'
 	touch $@
 
 # The pages and the API reference, as a site in out/site.
 docs: install
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[twin,docs]'
 	$(BIN)/python docs/command_line.py
 	$(BIN)/python docs/default_roles.py
 	$(BIN)/mkdocs build --quiet

@@ -21,6 +21,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import check_writable
 from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, exit_code_of
+from puncture_twin.twin.jobs.extras import require_extra
 from puncture_twin.twin.jobs.options import (
     ArmOption,
     CaseArgument,
@@ -69,6 +70,7 @@ def _without_command(context: typer.Context, version: VersionOption = False) -> 
 @app.command()
 def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> None:
     """The main job on the embedded abdomen: search, plan, rehearse, report."""
+    require_extra("twin", "demo")
     from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.patient import main_job, text
 
@@ -249,13 +251,15 @@ def rehearse(
     as_json: JsonOption = False,
 ) -> None:
     """Execute a plan in the twin, where the truth differs from the belief, and say where the tip ended."""
+    require_extra("twin", "rehearse")
     from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.patient import main_job, text
     from puncture_twin.twin.jobs.patient.case_or_plan import case_of, is_plan
+    from puncture_twin.twin.jobs.patient.run import RoomCount
 
     if physics and seeds is None:
         raise InputError("--physics runs some of the rooms", where="--physics", allowed="--seeds N --physics K, K <= N")
-    rooms = None if seeds is None else main_job.RoomCount(seeds, physics)
+    rooms = None if seeds is None else RoomCount(seeds, physics)
     folder = _out(out_dir, source, "rehearse")
     planned_case = case_of(source, case, choice)
     if planned_case is None:
@@ -430,6 +434,7 @@ def selfcal(
     as_json: JsonOption = False,
 ) -> None:
     """Let two arms calibrate themselves by ultrasound, AXP = YBQ, and send the needle to targets in the image."""
+    require_extra("twin", "selfcal")
     from puncture_twin.twin.jobs.selfcal.facts import selfcal_facts
     from puncture_twin.twin.jobs.selfcal.job import run_selfcal
     from puncture_twin.twin.jobs.selfcal.text import selfcal_text
@@ -448,6 +453,7 @@ def servo(
     as_json: JsonOption = False,
 ) -> None:
     """Servo the tool onto every target by two cameras, in rooms whose truth is drawn; pictures, plot and page."""
+    require_extra("twin", "servo")
     from puncture_twin.twin.jobs.servo.job import run_servo
 
     with progress_display() as progress:
@@ -468,6 +474,7 @@ def reproduce(
     as_json: JsonOption = False,
 ) -> None:
     """Print a paper's numbers beside ours; exit 0 only if every one holds."""
+    require_extra("twin", "reproduce")
     from puncture_twin.twin.jobs.papers.papers import PAPERS, chen2019_experiment
 
     if paper not in PAPERS:

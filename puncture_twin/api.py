@@ -303,7 +303,13 @@ def rehearse(context: CaseContext, plan: Plan, *, seed: int | None = None) -> Re
         context: The plan's case.
         plan: From `make_plan` or `read_plan`.
         seed: What the ground truth is drawn from; the case's by default.
+
+    Raises:
+        InputError: The extra ``twin`` is not installed.
     """
+    from puncture_twin.twin.jobs.extras import require_extra
+
+    require_extra("twin", "rehearse")
     from puncture_twin.twin.rehearsal.plan_truth import plan_truth
     from puncture_twin.twin.rehearsal.rehearsal import rehearse
 

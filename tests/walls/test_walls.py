@@ -12,6 +12,8 @@ from importlib.metadata import packages_distributions
 import pytest
 from walls.house import NAME, ROOT, arrows, cycle, imported, is_package, modules, room_arrows, room_of, tree
 
+from puncture_twin.twin.jobs.extras import MODULES
+
 MOST_MODULES = 16
 """A folder that a person can take in at a glance."""
 
@@ -210,3 +212,5 @@ def test_every_runtime_part_is_imported_by_the_product():
     known = packages_distributions()
     used = {part.lower().replace("_", "-") for top in tops for part in (top, *known.get(top, ()))}
     assert {part for part in project["dependencies"] if part not in used} == set()
+    assert {part for part in project["optional-dependencies"]["twin"] if part not in used} == set()
+    assert tops.issuperset(MODULES["twin"])

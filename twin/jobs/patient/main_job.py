@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.draft import Draft
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
-from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.certify.certificate import (
     write_certificate,
 )
@@ -33,14 +29,7 @@ from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.selection.choice import BEST, Choice, Pick, choose
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.twin.jobs.patient.pictures import FILM, PAGE, PICTURES, ROOMS, with_pictures
-from puncture_twin.twin.jobs.patient.run import Run
-from puncture_twin.twin.jobs.patient.summaries import rehearsal_summary
-from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_rooms
-from puncture_twin.twin.rehearsal.physics import physics_rooms
-from puncture_twin.twin.rehearsal.plan_truth import median_truth, plan_truth, standing
-from puncture_twin.twin.rehearsal.rehearsal import Rehearsal, rehearse
-from puncture_twin.twin.report.rooms_picture import draw_rooms_picture
-from puncture_twin.twin.report.scene.film import draw_film
+from puncture_twin.twin.jobs.patient.run import RoomCount, Run
 from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
 CERTIFICATE = "certificate.json"
@@ -50,13 +39,6 @@ NO_PLAN = "no plan: "
 
 DEMO_ROOMS = 1000
 """What a stranger sees first is a distribution, where the case declares what it may be off by."""
-
-
-class RoomCount(NamedTuple):
-    """How many rooms are rehearsed, and how many of them in the simulator too."""
-
-    rooms: int
-    physics: int = 0
 
 
 def search_case(
@@ -98,12 +80,14 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
         InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
         NoAnswerError: No plan; the search's files are written all the same.
     """
+    from puncture_twin.twin.jobs.patient.rehearsed import rehearsed
+
     _refuse_without_arm(context)
     names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
     with _writing(out, "plan", context, names) as draft:
         run = _searched_and_planned(context, draft.folder, choice)
         planned = run.files
-        run = run if run.plan is None else _rehearsed(run, draft.folder, rooms)
+        run = run if run.plan is None else rehearsed(run, draft.folder, rooms)
         run = with_pictures(run, draft.folder)
         if run.rehearsal is not None:  # the page shows it: it goes with it
             shown = {draft.folder / name for name in PICTURES if name != PAGE}
@@ -173,11 +157,13 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     Raises:
         InputError: A plan that does not belong to the case or does not hold any more.
     """
+    from puncture_twin.twin.jobs.patient.rehearsed import rehearsed
+
     source, plan = _read_plan(plan_path, context.watcher.note)
     with context.stages.time("plan"):
         candidates = check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
     with _writing(out, "rehearse", context, ("rehearsal.json", FILM, ROOMS), source) as draft:
-        run = _rehearsed(Run(context, candidates, (), plan, read=(source,)), draft.folder, rooms)
+        run = rehearsed(Run(context, candidates, (), plan, read=(source,)), draft.folder, rooms)
         if not draft.source_has("scene.png"):
             with context.stages.time("scene"):
                 draw_scene(context.case, context.anatomy, candidates, plan, draft.folder / "scene.png")
@@ -192,54 +178,6 @@ def _read_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Plan]:
     if found.note:
         note(f"warning: {found.note}")
     return found.input("plan"), plan
-
-
-def _rehearsed(run: Run, out: Path, rooms: RoomCount | None) -> Run:
-    """Execute the run's plan where the truth differs, of many rooms the median, write the numbers and the film."""
-    assert run.plan is not None
-    context, plan = run.context, run.plan
-    run = run if rooms is None else replace(run, distribution=_distribution(run, rooms))
-    rehearsal = _executed(run, plan)
-    shown = {} if run.distribution is None else {"distribution": run.distribution.summary()}
-    document = {**rehearsal_summary(rehearsal), **shown, "inputs": inputs_document(run.inputs)}
-    run = replace(run, rehearsal=rehearsal).with_files(_write_json(document, out / "rehearsal.json"))
-    with context.stages.time("film"):
-        film = draw_film(
-            rehearsal,
-            plan,
-            context.case,
-            context.anatomy,
-            out / FILM,
-            progress=partial(context.watcher.count, "film"),
-        )
-    run = run.with_files(film)
-    if run.distribution is None:
-        return run
-    with context.stages.time("rooms.png"):
-        draw_rooms_picture(run.distribution, out / ROOMS)
-    return run.with_files(out / ROOMS)
-
-
-def _executed(run: Run, plan: Plan) -> Rehearsal:
-    """One rehearsal in the simulator, and where its error stands among those of the rooms, or in the prediction."""
-    context, found = run.context, run.distribution
-    with context.stages.time("rehearsal"):
-        truth = plan_truth(context, plan) if found is None else median_truth(found)
-        done = rehearse(plan, context.case, context.anatomy, truth)
-        return replace(done, standing=standing(context, plan.insertion.q[-1], done.tip_error_mm, found))
-
-
-def _distribution(run: Run, count: RoomCount) -> Distribution:
-    assert run.plan is not None
-    context = run.context
-    with context.stages.time("rooms"):
-        q = run.plan.insertion.q[-1]
-        found = rehearse_rooms(context, run.plan.outward_ct, q, count.rooms, context.case.rehearsal.seed)
-    if not (count.physics and len(found)):
-        return found
-    with context.stages.time("physics"):
-        again = partial(context.watcher.count, "rooms in the simulator")
-        return replace(found, physics=physics_rooms(context, run.plan, found, count.physics, again))
 
 
 def export_case(context: CaseContext, format_name: str, out: Path, choice: Choice) -> Exported:
@@ -302,9 +240,3 @@ def _with_table(run: Run, out: Path) -> Run:
     with run.context.stages.time("table"):
         write_table(run.candidates, run.context.provenance(), path)
     return run.with_files(path)
-
-
-def _write_json(summary: dict[str, Any], path: Path) -> Path:
-    with atomic(path) as temporary:
-        temporary.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return path

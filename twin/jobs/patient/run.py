@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.certify.certificate import Certificate
@@ -17,8 +17,17 @@ from puncture_twin.planning.search.explain import needle_warnings
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.jobs.patient.summaries import plan_summary, rehearsal_summary, window_summary
-from puncture_twin.twin.rehearsal.distribution import Distribution
-from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
+
+if TYPE_CHECKING:  # they bring the simulator with them
+    from puncture_twin.twin.rehearsal.distribution import Distribution
+    from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
+
+
+class RoomCount(NamedTuple):
+    """How many rooms are rehearsed, and how many of them in the simulator too."""
+
+    rooms: int
+    physics: int = 0
 
 
 @dataclass(frozen=True, eq=False)

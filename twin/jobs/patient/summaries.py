@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,7 +13,9 @@ from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.explain import finite
 from puncture_twin.planning.search.selection.windows import Window
-from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
+
+if TYPE_CHECKING:  # it brings the simulator with it
+    from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
 
 
 def registration_summary(registration: Registration) -> dict[str, Any]:

@@ -23,11 +23,10 @@ from puncture_twin.planning.base.whole_lines import unfinished_warnings
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.raw_mesh import decode_text
 from puncture_twin.planning.registration.checks.marker_check import checked_placement
+from puncture_twin.twin.jobs.extras import require_extra
 
 JOINT_COLUMNS = tuple(f"q{joint}_rad" for joint in range(1, 7))
 """Of a recording, beside ``time_s``: the columns that ``export --format csv`` writes."""
-
-INSTALL = "pip install 'puncture-twin[mirror]'"
 
 MAX_RECORDING_BYTES = 200_000_000
 """An hour at 125 states a second is 60 MB."""
@@ -138,10 +137,9 @@ def connect(host: str) -> Receiver:
     Raises:
         InputError: The extra is not installed, or no robot answers there.
     """
-    try:
-        from rtde_receive import RTDEReceiveInterface
-    except ImportError as error:
-        raise InputError("mirroring a robot needs ur-rtde, an extra", where="mirror", allowed=INSTALL) from error
+    require_extra("mirror", "mirror")
+    from rtde_receive import RTDEReceiveInterface
+
     _check_host(host)
     try:  # first by ourselves: the library waits for minutes, and cannot be interrupted
         socket.create_connection((host, RTDE_PORT), timeout=ANSWER_S).close()

@@ -1,0 +1,47 @@
+"""What is installed by itself is enough for planner, map and page; what needs more says so."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from walls.house import modules
+
+from puncture_twin.run_twin import main
+from puncture_twin.twin.jobs.extras import MODULES
+
+ROOT = Path(__file__).parents[2]
+
+
+IMPORT_ALL = """
+import importlib, sys
+for name in {missing!r}:
+    sys.modules[name] = None  # as if it were not installed
+for name in {modules!r}:
+    importlib.import_module(name)
+"""
+
+
+def test_planner_map_and_page_need_no_extra():
+    """All of the planner, and of what searches, plans, exports and draws, is imported where no extra is installed."""
+    missing = [*MODULES["twin"], *MODULES["mirror"], "SimpleITK", "pytest", "gdcm"]
+    rooms = tuple(f"puncture_twin.{room}." for room in ("planning", "twin.report", "twin.jobs.patient"))
+    others = ("planning.collision_cases", "twin.report.scene.film", "twin.jobs.patient.rehearsed")
+    names = [name for name in modules() if name.startswith(rooms)]
+    names = [name for name in names if not name.startswith(tuple(f"puncture_twin.{other}" for other in others))]
+    assert len(names) > 200
+    code = IMPORT_ALL.format(missing=missing, modules=["puncture_twin.run_twin", *names])
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+@pytest.mark.parametrize(
+    "arguments", [["demo"], ["rehearse", "nowhere"], ["servo", "nowhere"], ["selfcal"], ["reproduce", "chen2019"]]
+)
+def test_a_missing_extra_is_one_line(arguments, monkeypatch, capsys):
+    """A command that needs it names it, says how to get it, and ends with exit code 2 before it does anything."""
+    monkeypatch.setattr("puncture_twin.twin.jobs.extras.find_spec", lambda name: None)
+    assert main(arguments) == 2
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1
+    assert told[0].startswith(f"{arguments[0]}: it needs the extra 'twin', which is not installed (no pybullet")
+    assert told[0].endswith("allowed: pip install 'puncture-twin[twin]'")
