@@ -171,14 +171,31 @@ def check(
         Path | None, typer.Option("--picture", metavar="FILE.png", help="Draw the CT's slices about it.")
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="List every structure, not only the nearest.")] = False,
+    entries: Annotated[
+        Path | None, typer.Option("--entries", metavar="FILE", help="Check every row: entries, or angles.")
+    ] = None,
+    targets: Annotated[
+        Path | None, typer.Option("--targets", metavar="FILE", help="Check every row: each another target.")
+    ] = None,
+    out_dir: Annotated[
+        Path | None, typer.Option("--out", help="Folder for checked.csv and checked.parquet of a list.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Explain one candidate in full; the best, where none is named."""
+    """Explain one candidate in full, the best where none is named; or check a list, a row a row."""
     from puncture_twin.planning.search.context import prepare
     from puncture_twin.planning.search.explain import NEAREST
+    from puncture_twin.twin.jobs.choosing.list_job import check_list, lists_of
     from puncture_twin.twin.jobs.patient.answers import check_candidate
     from puncture_twin.twin.jobs.patient.pictures import write_check_picture
 
+    if lists_of(entries, targets, choice, picture=picture, out_dir=out_dir):
+        with progress_display() as progress:
+            listed = check_list(case, entries, targets, choice, out_dir=out_dir, arm=arm, watcher=progress)
+        _print(listed.summary(), listed.text(), as_json)
+        if not listed.safe:
+            raise typer.Exit(ANSWER_IS_NO)
+        return
     with progress_display() as progress:
         context = prepare(case, arm=arm, watcher=progress)
         explained = check_candidate(context, choice)

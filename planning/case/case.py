@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 
@@ -108,6 +108,11 @@ class Case:
     def _repr_html_(self) -> str:
         """What a notebook shows."""
         return case_html(self)
+
+    def aimed_at(self, target_ct: Floats) -> Case:
+        """The same with another target, shape (3,), mm: in the same structure, with the entry frame about it."""
+        target = _read_only(target_ct)
+        return replace(self, target_ct=target, T_ct_entry=view_frame(self.T_ct_entry[:3, :3], target))
 
     @property
     def folder(self) -> Path:

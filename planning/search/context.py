@@ -170,7 +170,12 @@ class CaseContext:
 
 
 def prepare(
-    path: Path | str, *, arm: bool | None = None, engine: str = "fast", watcher: Watcher | None = None
+    path: Path | str,
+    *,
+    arm: bool | None = None,
+    engine: str = "fast",
+    watcher: Watcher | None = None,
+    target_ct: Floats | None = None,
 ) -> CaseContext:
     """Read a case and everything that it names.
 
@@ -179,6 +184,7 @@ def prepare(
         arm: Whether the arm is checked too; None checks it where the case says where its base is.
         engine: A name of `ENGINES`.
         watcher: Whoever shows progress.
+        target_ct: Another target than the case's, shape (3,), mm.
 
     Raises:
         InputError: Anything in the case that cannot be used, an unknown engine, or an arm that is to be checked in a
@@ -190,6 +196,7 @@ def prepare(
     stages = Stages(announce=partial(watcher.step, "stage"))
     with stages.time("case"):
         case = load_case(path)
+        case = case if target_ct is None else case.aimed_at(target_ct)
         placement = load_placement(case)
     if arm and placement is None:
         raise InputError(f"the arm is to be checked, but {NO_BASE}", where=case.path, allowed=ALLOWED_BASE)

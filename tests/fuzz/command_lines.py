@@ -17,6 +17,8 @@ OPTIONS = {
     "--rank": "number",
     "--window": "number",
     "--entry": "word",
+    "--entries": "path",
+    "--targets": "path",
     "--case": "path",
     "--from": "path",
     "--recording": "path",
