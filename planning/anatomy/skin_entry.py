@@ -60,7 +60,7 @@ def skin_paths(
     reentry[again] = found.depth[found.first[again] + 1]
     reentry[reentry > (length if farthest is None else farthest)] = np.nan
     cut = has & skin.cut_faces[face]
-    view = _view_depth(skin, target_ct, outward_ct)
+    view = view_depth(skin, target_ct, outward_ct)
     unknown = np.where(view < length, view, np.nan)
     unknown[cut] = depth[cut]
     if skin.mesh.closed:
@@ -94,10 +94,18 @@ def _turned(directions: Floats) -> Floats:
     return np.asarray(rotated / np.linalg.norm(rotated, axis=1, keepdims=True))
 
 
-def _view_depth(skin: Skin, target_ct: Floats, outward_ct: Floats) -> Floats:
+def view_depth(skin: Skin, target_ct: Floats, outward_ct: Floats) -> Floats:
     """Where each path leaves the field of view through a face beyond which the body goes on, NaN elsewhere.
 
     Also in the air: what lies beside the image at that face is a body of which nothing is known.
+
+    Args:
+        skin: With its field of view.
+        target_ct: Shape (3,), where the paths start, mm.
+        outward_ct: Shape (n, 3), unit.
+
+    Raises:
+        InputError: The target lies outside the image.
     """
     if skin.field_of_view is None:
         return np.full(len(outward_ct), np.nan)

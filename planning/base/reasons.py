@@ -22,6 +22,7 @@ class Reason(StrEnum):
     TOO_CLOSE = "too_close"
     HIT_UNLIKELY = "hit_unlikely"
     TOUCH_LIKELY = "touch_likely"
+    UNSAFE_WHEN_BREATHING = "unsafe_when_breathing"
     UNKNOWN_REGION = "unknown_region"
     UNREACHABLE = "unreachable"
     ARM_COLLISION = "arm_collision"
@@ -43,6 +44,7 @@ REASON_COLOURS = MappingProxyType(
         Reason.TOO_CLOSE: (213, 94, 0),
         Reason.HIT_UNLIKELY: (153, 153, 51),
         Reason.TOUCH_LIKELY: (204, 51, 17),
+        Reason.UNSAFE_WHEN_BREATHING: (102, 17, 0),
         Reason.UNKNOWN_REGION: (110, 110, 110),
         Reason.UNREACHABLE: (0, 90, 178),
         Reason.ARM_COLLISION: (204, 121, 167),
@@ -61,6 +63,7 @@ REASON_WORDS = MappingProxyType(
         Reason.TOO_CLOSE: "hits a structure or its margin",
         Reason.HIT_UNLIKELY: "too unlikely to hit the target",
         Reason.TOUCH_LIKELY: "too likely to touch a structure",
+        Reason.UNSAFE_WHEN_BREATHING: "unsafe at a phase of the breath",
         Reason.UNKNOWN_REGION: "unknown region (image ends, or not named)",
         Reason.UNREACHABLE: "arm cannot reach the pose",
         Reason.ARM_COLLISION: "arm would collide",

@@ -15,6 +15,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
 from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
+from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.case_file import (
     CaseFile,
     GantrySection,
@@ -39,6 +40,7 @@ from puncture_twin.planning.case.registration_section import (
     RegistrationSection,
     stated_base_ct,
 )
+from puncture_twin.planning.case.sections.breath import breathing_of
 from puncture_twin.planning.case.settings import (
     CtSettings,
     Gantry,
@@ -72,6 +74,7 @@ class Case:
         hit_radius_mm: Within which of the target the tip hits; None counts the target's own mesh.
         errors: What is declared to err, or None.
         truth_errors: From what a rehearsal's truth is drawn instead, to test a wrong belief; None draws from `errors`.
+        breathing: How the body moves with the breath, or None where the case does not say.
         own_target: Whether the target lies in no structure: its own is then the ball of the hit radius about it, which
             has its name.
     """
@@ -103,6 +106,7 @@ class Case:
     hit_radius_mm: float | None = None
     errors: ErrorModel | None = None
     truth_errors: ErrorModel | None = None
+    breathing: Breathing | None = None
     own_target: bool = False
 
     def _repr_html_(self) -> str:
@@ -177,6 +181,7 @@ def load_case(path: Path | str) -> Case:
         hit_radius_mm=content.target.hit_radius_mm,
         errors=_errors(content, content.errors, case_volumes, path),
         truth_errors=_errors(content, content.rehearsal.errors, case_volumes, path, truth=True),
+        breathing=breathing_of(content.breathing, space, path),
     )
 
 

@@ -12,6 +12,7 @@ from puncture_twin.planning.base.text_names import unprintable_texts
 from puncture_twin.planning.case.case_schema import CaseSchema, Region, check_statement, count_difference, with_count
 from puncture_twin.planning.case.errors_section import ErrorsSection
 from puncture_twin.planning.case.registration_section import RegistrationSection
+from puncture_twin.planning.case.sections.breathing_section import BreathingSection
 from puncture_twin.planning.case.toml_types import (
     Anatomical,
     Coordinate,
@@ -363,6 +364,7 @@ class CaseFile(Section):
     gantry: GantrySection | None = None
     place: PlaceSection = PlaceSection()
     errors: ErrorsSection | None = None
+    breathing: BreathingSection | None = None
     rehearsal: RehearsalSection = RehearsalSection()
     end: EndSection | None = None
 

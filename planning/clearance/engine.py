@@ -58,6 +58,10 @@ class ClearanceEngine(Protocol):
         """FCL's own word on whether a capsule of this radius about one axis (3,) touches one structure."""
         ...
 
+    def of(self, columns: Ints) -> ClearanceEngine:
+        """The same engine for some of its structures, in this order; nothing is prepared again."""
+        ...
+
     def near(
         self, structure: int, origin_ct: Floats, outward_ct: Floats, length: float, reach: tuple[float, float]
     ) -> NearFaces:

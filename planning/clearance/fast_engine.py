@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.direction_tiles import Tiles, bundle
@@ -102,6 +103,14 @@ class FastEngine:
         if structure not in self._references:
             self._references[structure] = FclEngine([self._meshes[structure]])
         return self._references[structure].collides(0, target_ct, outward_ct, length, radius)
+
+    def of(self, columns: Ints) -> FastEngine:
+        """The same engine for some of its structures; see `ClearanceEngine`."""
+        part = copy(self)
+        part._meshes = tuple(self._meshes[column] for column in columns)
+        part._blocks = tuple(self._blocks[column] for column in columns)
+        part._references, part._seen, part._progress = {}, None, None
+        return part
 
     def near(
         self, structure: int, origin_ct: Floats, outward_ct: Floats, length: float, reach: tuple[float, float]

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 
 import fcl
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.kernels.blocks import pack
@@ -82,6 +83,14 @@ class FclEngine:
         capsule = fcl.CollisionObject(fcl.Capsule(radius, length), pose)
         hits = fcl.collide(capsule, self._objects[structure], fcl.CollisionRequest(), fcl.CollisionResult())
         return bool(hits > 0)
+
+    def of(self, columns: Ints) -> FclEngine:
+        """The same engine for some of its structures; see `ClearanceEngine`."""
+        part = copy(self)
+        part._meshes = tuple(self._meshes[column] for column in columns)
+        part._objects = tuple(self._objects[column] for column in columns)
+        part._progress = None
+        return part
 
     def near(
         self, structure: int, origin_ct: Floats, outward_ct: Floats, length: float, reach: tuple[float, float]

@@ -17,6 +17,9 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 
 GANTRY = "gantry"
+OF_CASE_FILE = "case file"
+"""Source of the solids that the case file describes."""
+
 NOWHERE = (
     'obstacles of the frame "base" are not checked, since the case does not say where the robot\'s base is: {names}'
 )
@@ -61,7 +64,7 @@ def surroundings(case: Case, T_base_ct: Floats | None) -> tuple[Structure, ...]:
 
 
 def _structure(name: str, mesh: TriangleMesh) -> Structure:
-    return Structure(name, Role.AVOID, 0.0, mesh, "case file", outside=True)
+    return Structure(name, Role.AVOID, 0.0, mesh, OF_CASE_FILE, outside=True)
 
 
 def _mesh(box: Box, T_ct_base: Floats) -> TriangleMesh:

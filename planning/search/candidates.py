@@ -51,6 +51,10 @@ class Verdict(Columns):
     amount: Floats
     detail: Texts
 
+    def of(self, rows: Ints) -> Verdict:
+        """Those of some rows."""
+        return Verdict(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
     def rejected(self, rows: Ints, reason: Reason, structure: Texts, amount: Floats) -> Verdict:
         """The same with some rows rejected: each by a structure, shape (m,), and a number, shape (m,)."""
         arrays = {field.name: getattr(self, field.name).copy() for field in fields(self)}
@@ -133,6 +137,24 @@ class Ranking(Columns):
 
 
 @dataclass(frozen=True, eq=False)
+class BreathingColumns(Columns):
+    """What the breath leaves of each candidate that is safe for the organs where the CT shows them.
+
+    Attributes:
+        safe_all_phases: Shape (n,), safe for the organs at every phase, if inserted at that phase.
+        worst_phase: Shape (n,), the position s in the gate's window (without a gate: of all) with the least clearance
+            beyond a margin; NaN for what was rejected before.
+        clearance: Shape (n,), the least to any structure with a margin, in the window, mm; NaN for the same.
+        safe_when: At each phase, or in the gate's window, if inserted then; never that a needle may stay.
+    """
+
+    safe_all_phases: Bools
+    worst_phase: Floats
+    clearance: Floats
+    safe_when: str
+
+
+@dataclass(frozen=True, eq=False)
 class Candidates(Columns):
     """Every direction of the grid: n rows in groups of columns; mm, radians, points in the CT frame.
 
@@ -149,6 +171,7 @@ class Candidates(Columns):
             for rejected candidates, and where neither a grid nor a certificate says.
         arm_note: `ARM_CHECKED`, or "not checked: " and why: then a safe candidate is safe for the organs alone.
         chances: To hit and to touch; None where the case declares no errors.
+        breathing: What the breath leaves; None where the case does not declare it.
         grid: The regular grid that the rows are; None for any others.
         cone_source: `CONE_OF_GRID` or `CONE_CERTIFIED`; "" where there are no safe cones.
     """
@@ -164,6 +187,7 @@ class Candidates(Columns):
     safe_cone: Floats
     arm_note: str = "not checked"
     chances: Chances | None = None
+    breathing: BreathingColumns | None = None
     grid: AngleGrid | None = None
     cone_source: str = ""
 
@@ -186,8 +210,16 @@ class Candidates(Columns):
 
     @property
     def safe_text(self) -> str:
-        """What a person reads for a safe candidate: never "safe" alone where the arm was not checked."""
-        return "safe" if self.arm_checked else "safe for the organs"
+        """What a person reads for a safe candidate: never "safe" alone with an unchecked arm, or a breath."""
+        safe = "safe" if self.arm_checked else "safe for the organs"
+        return safe if self.breathing is None else f"{safe} {self.breathing.safe_when}"
+
+    @property
+    def least_clearance(self) -> Floats:
+        """To any structure with a margin, shape (n,), mm: the least of all positions of the breath that are checked."""
+        if self.breathing is None:
+            return self.clearance.least
+        return np.asarray(np.fmin(self.clearance.least, self.breathing.clearance))
 
     @property
     def ranked(self) -> Ints:

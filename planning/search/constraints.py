@@ -106,8 +106,8 @@ def closest_miss(found: Candidates) -> int | None:
         demanded = ~np.isnan(found.clearance.margins)
         lack = (found.clearance.margins - found.clearance.distance)[:, demanded].max(axis=1)
         return int(lacking[np.argmin(lack[lacking])])
-    chances = (Reason.TOUCH_LIKELY, Reason.HIT_UNLIKELY)
-    order = (*chances, Reason.APPROACH_NOT_FOUND, Reason.INSERTION_BLOCKED, Reason.ARM_COLLISION, Reason.UNREACHABLE)
+    late = (Reason.TOUCH_LIKELY, Reason.HIT_UNLIKELY, Reason.UNSAFE_WHEN_BREATHING)
+    order = (*late, Reason.APPROACH_NOT_FOUND, Reason.INSERTION_BLOCKED, Reason.ARM_COLLISION, Reason.UNREACHABLE)
     for reason in (*order, Reason.SKIN_ANGLE, Reason.TOO_LONG, Reason.REENTERS_SKIN, Reason.UNKNOWN_REGION):
         rows = np.flatnonzero(found.verdict.reason == reason.value)
         if len(rows):

@@ -34,6 +34,7 @@ from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
 from puncture_twin.planning.search.consistency import check_consistency
 from puncture_twin.planning.search.doubt import Doubt, doubt_of
 from puncture_twin.planning.search.explain import Explanation
+from puncture_twin.planning.search.phases.breath_warnings import breath_warnings
 from puncture_twin.planning.search.search import case_directions, one_direction, search
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding
 from puncture_twin.planning.uncertainty.chances import Chances
@@ -204,6 +205,7 @@ def prepare(
         anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), user_cache())
         anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
         warnings = (*case.warnings, *anatomy.warnings, *check_consistency(case, anatomy, placement))
+        warnings += breath_warnings(case, anatomy)
         anatomy = replace(anatomy, warnings=warnings)
         case.files.release()
     with stages.time("trees"):

@@ -19,7 +19,7 @@ from puncture_twin.planning.uncertainty.chance_model import ChanceModel, touch_l
 from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.hit import hit_in_ball, hit_in_mesh
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget, error_budget
-from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES, deviation, reading_parts
+from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES, deviation, not_modelled, reading_parts
 from puncture_twin.planning.uncertainty.touch import Proximity, touch_chance
 
 WISHED_HIT = 0.99
@@ -99,6 +99,7 @@ class Doubt:
         budget: The tip's expected error and its sources.
         declaration: Whether the markers' residuals agree with the declared errors, in one sentence.
         goals: What does not hold: the case's limits, or `WISHED_HIT` where it demands no chance to hit.
+        not_modelled: What these chances leave out.
     """
 
     p_hit: float
@@ -107,6 +108,7 @@ class Doubt:
     budget: ErrorBudget
     declaration: str
     goals: tuple[Goal, ...]
+    not_modelled: str = NOT_MODELLED
 
     @property
     def likeliest(self) -> tuple[str, float]:
@@ -139,7 +141,7 @@ class Doubt:
             f"  of its variance: {fractions}",
             f"  {self.declaration}",
             f"  touches anything: {chance_text(self.p_touch_any)} at most, to first order",
-            f"  not modelled: {NOT_MODELLED}",
+            f"  not modelled: {self.not_modelled}",
         ]
 
     def summary(self) -> dict[str, Any]:
@@ -151,7 +153,7 @@ class Doubt:
             **budget_summary(self.budget),
             "declaration": self.declaration,
             "for_the_limits": [goal.summary() for goal in self.goals],
-            "not_modelled": NOT_MODELLED,
+            "not_modelled": self.not_modelled,
         }
 
 
@@ -196,6 +198,7 @@ def doubt_of(case: Case, model: ChanceModel, near: Proximity, chances: Chances, 
         error_budget(model.error, q, model.error.fit.R_base_ct @ outward_ct),
         model.error.fit.test.text(),
         tuple(goals_of(needle, float(chances.hit[0]), touch)),
+        not_modelled(case),
     )
 
 

@@ -112,7 +112,21 @@ class Explanation:
             ],
             "warnings": list(self.anatomy.warnings),
             **self._chances(),
+            **self._breathing(),
         }
+
+    def _breathing(self) -> dict[str, Any]:
+        """Only of a case that declares its breathing."""
+        found = self.candidates.breathing
+        if found is None:
+            return {}
+        values = {
+            "safe_all_phases": bool(found.safe_all_phases[0]),
+            "worst_phase": finite(found.worst_phase[0]),
+            "breathing_clearance_mm": finite(found.clearance[0]),
+            "safe_means": self.candidates.safe_text,
+        }
+        return {"breathing": values}
 
     def _chances(self) -> dict[str, Any]:
         """Only of a case that declares errors, so that others keep their keys."""
@@ -146,6 +160,7 @@ class Explanation:
                 *self._doubt(),
                 *self._path(),
                 self._target(),
+                *self._breath(),
                 *self._scan(),
                 *self.structure_lines(most),
                 *self._rest(),
@@ -177,6 +192,18 @@ class Explanation:
             f"  skin angle     {np.degrees(row.path.skin_angle[0]):8.2f} deg, allowed {limit:g}",
             f"  standoff       {standoff:8.2f} mm, its tip {before:.1f} mm before the skin, the flange at {flange:.1f}",
             f"  tissue crossed {row.path.tissue[0]:8.2f} mm",
+        ]
+
+    def _breath(self) -> list[str]:
+        """The least clearance of all phases that the gate lets through."""
+        found, breathing = self.candidates.breathing, self.case.breathing
+        if found is None or breathing is None or np.isnan(found.clearance[0]):
+            return []
+        step = f"at positions up to {breathing.widest_step_mm:.1f} mm apart; between them nothing is checked"
+        return [
+            f"  breathing      {found.clearance[0]:8.2f} mm least clearance, at "
+            f"{breathing.phase_text(float(found.worst_phase[0]))}; {step}",
+            "                 a needle in place moves with the organ and bends: no verdict is about leaving it there",
         ]
 
     def _scan(self) -> list[str]:

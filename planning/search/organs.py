@@ -13,6 +13,7 @@ from puncture_twin.planning.clearance.measure import measure
 from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking
 from puncture_twin.planning.search.constraints import first_broken
+from puncture_twin.planning.search.phases.organ_phases import with_breathing
 from puncture_twin.planning.search.tissue import tissue_crossed
 
 
@@ -28,7 +29,7 @@ def organ_candidates(
     directions: Directions,
     axes: AxisDistances | None = None,
 ) -> Candidates:
-    """Check every direction against skin and organs alone; nothing is ranked yet.
+    """Check every direction against skin and organs alone, at every phase of a declared breath; nothing is ranked yet.
 
     Args:
         case: The validated case.
@@ -45,7 +46,7 @@ def organ_candidates(
     verdicts = first_broken(paths, clearances, checked, needle=needle, max_skin_angle=case.search.max_skin_angle)
     demanding = np.array([s.demands_margin for s in checked], bool)
     count = len(directions)
-    return Candidates(
+    found = Candidates(
         theta=directions.theta,
         beta=directions.beta,
         outward_ct=outward,
@@ -67,3 +68,4 @@ def organ_candidates(
         safe_cone=np.full(count, np.nan),
         grid=directions.grid,
     )
+    return with_breathing(case, anatomy, engine, found)

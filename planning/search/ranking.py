@@ -50,7 +50,7 @@ def ranked(case: Case, found: Candidates) -> Candidates:
     """Give cost, rank and Pareto mark to the safe candidates."""
     rows = np.flatnonzero(found.safe)
     order = rank(
-        min_clearance=found.clearance.least[rows],
+        min_clearance=found.least_clearance[rows],
         path_length=found.path.length[rows],
         skin_angle=found.path.skin_angle[rows],
         tissue=found.path.tissue[rows],

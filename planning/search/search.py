@@ -11,6 +11,7 @@ from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.chance import with_best_refined, with_chances, with_joint_chances
 from puncture_twin.planning.search.organs import organ_candidates, organ_distances
+from puncture_twin.planning.search.phases.arm_phases import with_breathing_reach
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.search.selection.safe_cone import with_grid_cone
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
@@ -51,7 +52,7 @@ def search(
     axes = None if chance is None else organ_distances(case, anatomy, engine, directions)
     found = with_grid_cone(organ_candidates(case, anatomy, engine, directions, axes))
     if reach is not None:
-        found = with_reach(case, found, reach, progress)
+        found = with_breathing_reach(case, anatomy, with_reach(case, found, reach, progress), reach)
     found = ranked(case, with_chances(case, anatomy, engine, found, chance, axes))
     found = with_best_refined(case, anatomy, engine, found, chance)
     return with_joint_chances(case, anatomy, engine, found, chance)

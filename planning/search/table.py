@@ -56,6 +56,12 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
     }
     if candidates.chances is not None:
         columns |= chance_columns(candidates.chances)
+    if candidates.breathing is not None:
+        columns |= {
+            "safe_all_phases": candidates.breathing.safe_all_phases,
+            "worst_phase": candidates.breathing.worst_phase,
+            "breathing_clearance_mm": candidates.breathing.clearance,
+        }
     run = {**provenance, "safe_cone_from": candidates.cone_source}
     table = pa.table({name: _array(value) for name, value in columns.items()})
     return table.replace_schema_metadata({"run": json.dumps(run, sort_keys=True)})

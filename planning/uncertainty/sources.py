@@ -9,10 +9,19 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 
 NOT_MODELLED = "breathing, a needle that bends, tissue that moves"
 """What no source stands for: it is not known, which is something else than 0."""
+
+BREATHING_ALONE = "breathing in the chances (they are of the body as the CT shows it)"
+
+
+def not_modelled(case: Case) -> str:
+    """What the chances of a case leave out: what it does not declare, and what is declared but checked elsewhere."""
+    return ", ".join(["breathing" if case.breathing is None else BREATHING_ALONE, *NOT_MODELLED.split(", ")[1:]])
+
 
 ISOTROPIC = 1e-9
 """Relative difference of variances below which a marker is read equally well along all axes."""

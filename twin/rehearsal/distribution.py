@@ -23,6 +23,7 @@ from puncture_twin.planning.uncertainty.chance_model import chance_model, demand
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE
 from puncture_twin.planning.uncertainty.needle_chances import chances_of, refined_chances
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget, PoseError, error_budget, pose_error
+from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, not_modelled
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
 
 REGION = 0.95
@@ -71,6 +72,7 @@ class Distribution:
         budget: Where the predicted error comes from.
         guessed_touches: Whether nobody says how the arm touched the markers, so that a posture was assumed.
         physics: Some of the rooms in the simulator, where that was wanted.
+        not_modelled: What neither the rooms nor the chances hold.
     """
 
     seed: int
@@ -88,6 +90,7 @@ class Distribution:
     budget: ErrorBudget
     guessed_touches: bool
     physics: PhysicsRooms | None = None
+    not_modelled: str = NOT_MODELLED
 
     def __len__(self) -> int:
         return len(self.rooms.tip_ct)
@@ -133,6 +136,7 @@ class Distribution:
             "predicted_share": dict(self.budget.fraction),
             "wrong_belief": self.wrong_belief,
             "guessed_touches": self.guessed_touches,
+            **({} if self.not_modelled == NOT_MODELLED else {"not_modelled": self.not_modelled}),
             **({} if self.physics is None else {"physics": self.physics.summary()}),
         }
 
@@ -210,6 +214,7 @@ def _measured(
         wrong_belief=case.truth_errors is not None,
         budget=error_budget(believed, q[0], puncture.T_base_ct[:3, :3] @ puncture.outward_ct),
         guessed_touches=guessed,
+        not_modelled=not_modelled(case),
     )
 
 

@@ -124,7 +124,7 @@ def distribution_lines(rooms: dict[str, Any]) -> list[str]:
         *(missed if rooms["unreached"] else []),
         *(guessed if rooms["guessed_touches"] else []),
         *_physics(rooms.get("physics")),
-        f"  not modelled: {NOT_MODELLED}",
+        f"  not modelled: {rooms.get('not_modelled', NOT_MODELLED)}",
     ]
 
 

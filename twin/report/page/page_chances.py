@@ -46,7 +46,7 @@ def chances_section(doubt: Doubt | None, registration: Mapping[str, Any] | None)
         ("half axes of the 95 % ellipsoid", ", ".join(number(float(mm), 2) for mm in budget.half_axes_mm) + " mm"),
         *_fle(registration),
         ("the declared errors", doubt.declaration),
-        ("not modelled", NOT_MODELLED),
+        ("not modelled", doubt.not_modelled),
     ]
     shares = [(SOURCES[source].text, f"{100 * fraction:.1f} %") for source, fraction in doubt.sources()]
     goals = [goal.text() for goal in doubt.goals]
@@ -86,7 +86,7 @@ def rooms_section(rooms: Mapping[str, Any] | None, picture: Path | None) -> Mark
     if picture is not None:
         form = '<p><img src="{}" style="max-width:100%" alt="Tips of all rooms in the frame of the needle"></p>'
         image = Markup(form).format(data_address(picture))
-    return shown + listed(_reserves(rooms)) + image + faint(f"Not modelled: {NOT_MODELLED}.")
+    return shown + listed(_reserves(rooms)) + image + faint(f"Not modelled: {rooms.get('not_modelled', NOT_MODELLED)}.")
 
 
 def _reserves(rooms: Mapping[str, Any]) -> list[str]:

@@ -26,6 +26,7 @@ DETAIL_UNITS = {
     Reason.UNKNOWN_REGION: ("clearance", "mm"),
     Reason.TOO_LONG: ("path", "mm"),
     Reason.SKIN_ANGLE: ("skin angle", "°"),
+    Reason.UNSAFE_WHEN_BREATHING: ("clearance", "mm"),
     Reason.HIT_UNLIKELY: ("chance to hit", " "),
     Reason.TOUCH_LIKELY: ("chance to touch", " "),
 }

@@ -35,5 +35,18 @@ def methods_text(case: Any, anatomy: Any, candidates: Candidates) -> str:
         f"between the needle and each of {checked} structures to keep away from was computed exactly on their triangle "
         f"meshes and compared with the structure's margin; a direction through a region that the images or labels do "
         f"not show was refused as unknown. {arm} {chances} Every input is listed below with its SHA-256. "
-        "Breathing, needle bending and tissue motion were not modelled."
+        + _left_out(case)
+    )
+
+
+def _left_out(case: Any) -> str:
+    """What was not modelled, and what was of the breath."""
+    if case.breathing is None:
+        return "Breathing, needle bending and tissue motion were not modelled."
+    breath = case.breathing
+    return (
+        f"Breathing was taken as a motion of {breath.amplitude_mm:g} mm along one line after Lujan et al. 1999 "
+        f"(exponent {breath.exponent}, {len(breath.positions)} positions), each structure with a weight of its own: a "
+        f"safe direction is safe {breath.window_text}; a needle in place moves with the organ and bends. Needle "
+        "bending and the deformation of tissue were not modelled."
     )

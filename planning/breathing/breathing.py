@@ -1,0 +1,141 @@
+"""The breathing that a case declares: how far, whereto, and how much of it each structure follows.
+
+The model is the plainest that there is: everything moves along one line, structure i by s w_i b, with s the position in
+the breath, b the amplitude and w_i its weight. The target's weight is 1. Nothing deforms, and in and out pass the same
+places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.breathing.lujan import positions
+from puncture_twin.planning.formats.labels.naming import specificity
+
+SHOWN = 8
+"""Names that an error lists."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Pattern of names to weight.
+
+    Attributes:
+        of_pattern: Shell patterns; the most specific that matches a name holds.
+    """
+
+    of_pattern: Mapping[str, float]
+
+    def of(self, name: str) -> float | None:
+        """The weight of one name; None where no pattern matches it.
+
+        >>> Weights({"*": 0.0, "rib*": 0.5}).of("rib_1"), Weights({"rib*": 0.5}).of("liver")
+        (0.5, None)
+        """
+        matching = [pattern for pattern in self.of_pattern if fnmatchcase(name, pattern)]
+        best = max(matching, key=lambda pattern: specificity(pattern, name), default=None)
+        return None if best is None else self.of_pattern[best]
+
+    def check(self, names: Iterable[str], where: str | Path, *, others: Iterable[str] = ()) -> None:
+        """Refuse patterns that leave a name out, match nothing, or contradict each other.
+
+        Args:
+            names: All that needs a weight.
+            where: For errors.
+            others: What has a weight by itself, and may be named all the same.
+
+        Raises:
+            InputError: One of the three.
+        """
+        names, known = list(names), [*names, *others]
+        if missing := [name for name in names if self.of(name) is None]:
+            message = f"breathing.weights: no weight for {_listed(missing)}"
+            raise InputError(message, where=where, allowed='a weight for each, such as "liver" = 1; "*" is the rest')
+        for pattern in self.of_pattern:
+            if not any(fnmatchcase(name, pattern) for name in known):
+                message = f"breathing.weights: pattern '{pattern}' matches no structure"
+                raise InputError(message, where=where, allowed=_listed(known))
+        for name in names:
+            _refuse_contradiction(self.of_pattern, name, where)
+
+
+def _refuse_contradiction(of_pattern: Mapping[str, float], name: str, where: str | Path) -> None:
+    """Two equally specific patterns that give one name two weights."""
+    matching = [pattern for pattern in of_pattern if fnmatchcase(name, pattern)]
+    best = max(specificity(pattern, name) for pattern in matching)
+    equal = [pattern for pattern in matching if specificity(pattern, name) == best]
+    if len({of_pattern[pattern] for pattern in equal}) > 1:
+        message = f"breathing.weights: {' and '.join(map(repr, equal))} give '{name}' two weights"
+        raise InputError(message, where=where, allowed="one pattern that is more specific than the others")
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(names[:SHOWN]) + more
+
+
+@dataclass(frozen=True, eq=False)
+class Breathing:
+    """What a case declares of the breath; mm.
+
+    Attributes:
+        amplitude_mm: b, of the target, from exhale to full inhale.
+        direction_ct: Shape (3,), unit: whereto inhaling moves it.
+        weights: Of everything else.
+        phases: Of one period.
+        exponent: n of Lujan's curve.
+        scanned_at: The position s in which the CT shows the body.
+        gate: The needle goes in while s is at most this; None for any time.
+    """
+
+    amplitude_mm: float
+    direction_ct: Floats
+    weights: Weights
+    phases: int
+    exponent: int
+    scanned_at: float
+    gate: float | None
+
+    def __post_init__(self) -> None:
+        direction = np.array(self.direction_ct, dtype=np.float64)
+        direction.setflags(write=False)
+        object.__setattr__(self, "direction_ct", direction)
+
+    @property
+    def positions(self) -> Floats:
+        """All positions s that are checked, ascending, shape (m,): the phases', and the gate itself."""
+        of_phases = positions(self.phases, self.exponent)
+        return of_phases if self.gate is None else np.union1d(of_phases, [self.gate])
+
+    @property
+    def in_window(self) -> Bools:
+        """Which of `positions` the gate lets through, shape (m,)."""
+        s = self.positions
+        return np.asarray(s <= (1.0 if self.gate is None else self.gate))
+
+    def moved_ct(self, s: float, weight: float = 1.0) -> Floats:
+        """How far something of a weight is from where the CT shows it, at a position s; shape (3,), mm."""
+        return np.asarray((s - self.scanned_at) * weight * self.amplitude_mm * self.direction_ct)
+
+    @property
+    def widest_step_mm(self) -> float:
+        """Between neighbouring positions of the target in the window: between them nothing is checked."""
+        return float(self.amplitude_mm * np.diff(self.positions[self.in_window], prepend=0.0).max())
+
+    def phase_text(self, s: float) -> str:
+        """A position for people."""
+        return f"s = {s:.2f}, {s * self.amplitude_mm:.1f} mm from exhale"
+
+    @property
+    def window_text(self) -> str:
+        """When a safe candidate is safe. It never says that a needle may stay while the patient breathes."""
+        if self.gate is None:
+            return "at each phase if inserted at that phase"
+        return f"when gated to this window (s <= {self.gate:g})"

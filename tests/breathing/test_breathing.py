@@ -1,0 +1,122 @@
+"""The breath as it is declared: Lujan's positions, weights by pattern, and what is refused."""
+
+import numpy as np
+import pytest
+from case_world import ORGAN, SKIN, case_text, structure, write_balls
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.breathing.breathing import Breathing, Weights
+from puncture_twin.planning.breathing.lujan import fraction_within, positions
+from puncture_twin.planning.case.case import load_case
+
+BREATHING = '[breathing]\namplitude_mm = 12.0\ndirection = "feet"\n{keys}\n[breathing.weights]\n"*" = 0.0\n'
+
+
+def case_with(folder, keys="", text=BREATHING, space="LPS"):
+    """A case that breathes."""
+    write_balls(folder)
+    sections = (text.format(keys=keys), SKIN, ORGAN, structure("rib", "avoid"))
+    (folder / "case.toml").write_text(case_text(*sections, space=space))
+    return load_case(folder / "case.toml")
+
+
+def breathing(**keys):
+    """Twelve millimetres to the feet."""
+    usual = {"amplitude_mm": 12.0, "direction_ct": np.array([0, 0, -1.0]), "weights": Weights({"*": 0.0})}
+    return Breathing(**{**usual, "phases": 8, "exponent": 2, "scanned_at": 0.0, "gate": None, **keys})
+
+
+@pytest.mark.parametrize("exponent", [1, 2, 3, 4])
+def test_positions_are_those_of_the_curve_in_time(exponent):
+    """Each is z0 - b cos^2n at one of the evenly spaced times, exhale and inhale among them."""
+    times = np.arange(10) / 10
+    curve = np.cos(np.pi * times - np.pi / 2) ** (2 * exponent)
+    found = positions(10, exponent)
+    assert found[0] == 0 and found[-1] == 1
+    assert np.abs(curve[:, None] - found).min(axis=1).max() < 1e-11
+    assert np.abs(curve[:, None] - found).min(axis=0).max() < 1e-11
+
+
+def test_one_phase_is_exhale():
+    """A breath that is looked at once is the body at rest."""
+    assert positions(1, 2).tolist() == [0.0]
+
+
+@pytest.mark.parametrize(("exponent", "published"), [(1, 0.27), (2, 0.44), (3, 0.53), (4, 0.59)])
+def test_the_time_within_two_millimetres_of_exhale_is_that_of_the_curve(exponent, published):
+    """For 12 mm; and so often does a sampled curve lie there."""
+    told = fraction_within(2 / 12, exponent)
+    sampled = np.mean(np.sin(np.pi * (np.arange(200_000) + 0.5) / 200_000) ** (2 * exponent) <= 2 / 12)
+    assert told == pytest.approx(sampled, abs=1e-4)
+    assert told == pytest.approx(published, abs=5e-3)
+
+
+def test_a_gate_lets_through_itself_and_all_below():
+    """Its own position is checked, and is one of all phases too: what all phases allow, the gate allows."""
+    found = breathing(gate=0.3)
+    assert found.positions[found.in_window].tolist() == [0.0, *found.positions[1:3].tolist(), 0.3]
+    assert 0.3 in found.positions
+    assert breathing(gate=0.0).positions[breathing(gate=0.0).in_window].tolist() == [0.0]
+    assert breathing().in_window.all()
+
+
+def test_what_is_seen_at_inhale_moves_the_other_way():
+    """A CT at full inhale shows the target low: at exhale it is higher."""
+    np.testing.assert_allclose(breathing(scanned_at=1.0).moved_ct(0.0), [0, 0, 12])
+    np.testing.assert_allclose(breathing().moved_ct(1.0, 0.5), [0, 0, -6])
+    assert breathing().widest_step_mm == pytest.approx(12 * np.diff(positions(8, 2)).max())
+    assert breathing(gate=0.0).widest_step_mm == 0.0
+
+
+def test_the_most_specific_pattern_gives_the_weight():
+    """As for margins; capitals count."""
+    weights = Weights({"*": 0.0, "rib*": 0.2, "rib_left_7": 0.4})
+    assert [weights.of(name) for name in ("Rib_1", "rib_1", "rib_left_7")] == [0.0, 0.2, 0.4]
+    assert Weights({"rib*": 0.2}).of("liver") is None
+
+
+@pytest.mark.parametrize(
+    ("patterns", "message"),
+    [
+        ({"rib": 0.0}, "no weight for liver"),
+        ({"*": 0.0, "kidny": 1.0}, "'kidny' matches no structure"),
+        ({"*": 0.0, "r?b": 0.1, "ri?": 0.2}, "give 'rib' two weights"),
+    ],
+)
+def test_weights_that_leave_a_doubt_are_refused(patterns, message):
+    """A structure that nobody thought of must not count as resting."""
+    with pytest.raises(InputError, match=message):
+        Weights(patterns).check(["rib", "liver"], "case.toml")
+
+
+def test_a_direction_need_not_be_a_unit_vector(tmp_path):
+    """It says whereto; the amplitude says how far. In RAS it is turned."""
+    text = BREATHING.replace('"feet"', "[0.0, 3.0, -4.0]")
+    np.testing.assert_allclose(case_with(tmp_path, text=text).breathing.direction_ct, [0, 0.6, -0.8])
+    np.testing.assert_allclose(case_with(tmp_path, text=text, space="RAS").breathing.direction_ct, [0, -0.6, -0.8])
+
+
+@pytest.mark.parametrize(
+    ("keys", "text", "space", "message"),
+    [
+        ("phases = 7", BREATHING, "LPS", "an even number"),
+        ("gate = 1.5", BREATHING, "LPS", "gate"),
+        ("scanned_at = -0.1", BREATHING, "LPS", "scanned_at"),
+        ("exponent = 0", BREATHING, "LPS", "exponent"),
+        ("", BREATHING.replace("12.0", "-12.0"), "LPS", "amplitude_mm"),
+        ("", BREATHING.replace('"feet"', "[0.0, 0.0, 0.0]"), "LPS", "direction is zero"),
+        ("", BREATHING.replace('"*" = 0.0', '"*" = 2.5'), "LPS", "weights"),
+        ("", BREATHING.replace('"*" = 0.0', '"*" = -1.0'), "LPS", "weights"),
+        ("", BREATHING, "local", "has no feet"),
+        ("", BREATHING.split("[breathing.weights]")[0], "LPS", "weights"),
+    ],
+)
+def test_a_breath_that_cannot_be_meant_is_refused(tmp_path, keys, text, space, message):
+    """In one line that names the key."""
+    with pytest.raises(InputError, match=message):
+        case_with(tmp_path, keys, text, space)
+
+
+def test_a_case_without_the_table_declares_none(tmp_path):
+    """Nothing changes for it."""
+    assert case_with(tmp_path, text="").breathing is None

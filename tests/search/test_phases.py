@@ -1,0 +1,177 @@
+"""Directions of a body that breathes, against a plain oracle that moves every mesh and searches anew at each phase."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from case_world import ORGAN, SKIN, ball, case_text, structure, write_balls
+
+from puncture_twin.meshes import folder
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.skin_entry import skin_paths
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.breathing.breathing import Breathing, Weights
+from puncture_twin.planning.certify.subdivision import certify
+from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.collision.workcell import case_checker
+from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.phases.arm_phases import with_breathing_reach
+from puncture_twin.planning.search.search import case_directions
+from puncture_twin.planning.search.table import to_table
+
+SEARCH = "theta_deg = [0, 80]\nstep_deg = 10.0\nmax_skin_angle_deg = 25.0"
+WEIGHTS = {"skin": 0.4, "rib": 0.0, "vessel": 0.7, "dome": 1.4}
+
+
+@pytest.fixture(scope="module")
+def patient(tmp_path_factory):
+    """A round body that holds an organ, and about it a rib, a vessel, and a dome that moves more than the target."""
+    folder = tmp_path_factory.mktemp("breathing")
+    write_balls(folder)
+    ball(folder / "vessel.stl", 6.0, (-35, -25, 30))
+    ball(folder / "dome.stl", 8.0, (5, -45, -35))
+    names = ("rib", "vessel", "dome")
+    avoided = [structure(name, "avoid", margin_mm=margin) for name, margin in zip(names, (3.0, 1.0, 2.0), strict=True)]
+    (folder / "case.toml").write_text(case_text(SKIN, ORGAN, *avoided, search=SEARCH))
+    return prepare(folder / "case.toml", arm=False, engine="fcl")
+
+
+def breathing(**keys):
+    """Thirty millimetres to the feet and a little to the front: enough to bring ribs in."""
+    direction = np.array([0.1, -0.2, -1.0])
+    usual = {"amplitude_mm": 30.0, "direction_ct": direction / np.linalg.norm(direction), "weights": Weights(WEIGHTS)}
+    return Breathing(**{**usual, "phases": 8, "exponent": 2, "scanned_at": 0.0, "gate": None, **keys})
+
+
+def searched(patient, breath=None, case=None, anatomy=None):
+    """The organs' verdicts, with FCL."""
+    case, anatomy = replace(case or patient.case, breathing=breath), anatomy or patient.anatomy
+    engine = FclEngine([one.mesh for one in anatomy.checked])
+    return organ_candidates(case, anatomy, engine, case_directions(case))
+
+
+def moved_body(patient, breath, s):
+    """The oracle: every mesh truly moved to where it is at a position, and the target with it."""
+
+    def moved(mesh, weight):
+        return mesh.transformed(pose(np.eye(3), breath.moved_ct(s, weight)))
+
+    structures = tuple(
+        replace(one, mesh=moved(one.mesh, 1.0 if one.name == "organ" else WEIGHTS[one.name]))
+        for one in patient.anatomy.structures
+    )
+    skin = replace(patient.anatomy.skin, mesh=moved(patient.anatomy.skin.mesh, WEIGHTS["skin"]))
+    case = replace(patient.case, target_ct=patient.case.target_ct + breath.moved_ct(s))
+    return case, Anatomy(structures, skin, ())
+
+
+@pytest.mark.parametrize("scanned_at", [0.0, 0.6])
+@pytest.mark.parametrize("gate", [None, 0.4])
+def test_phases_are_those_of_a_body_that_is_moved_and_searched_anew(patient, gate, scanned_at):
+    """Verdicts, the least clearance and where it is."""
+    breath = breathing(gate=gate, scanned_at=scanned_at)
+    found, static = searched(patient, breath), searched(patient)
+    anew = [searched(patient, None, *moved_body(patient, breath, s)) for s in breath.positions]
+    safe = np.array([one.safe for one in anew])
+    window = breath.in_window
+    np.testing.assert_array_equal(found.safe, static.safe & safe[window].all(axis=0))
+    np.testing.assert_array_equal(found.breathing.safe_all_phases, static.safe & safe.all(axis=0))
+    least = np.array([one.clearance.least for one in anew])[window][:, static.safe]
+    np.testing.assert_allclose(found.breathing.clearance[static.safe], least.min(axis=0), atol=1e-9)
+    excess = np.array([(one.clearance.distance - one.clearance.margins)[:, 1:].min(axis=1) for one in anew])[window]
+    entered = found.safe
+    worst = breath.positions[window][excess[:, entered].argmin(axis=0)]
+    np.testing.assert_array_equal(found.breathing.worst_phase[entered], worst)
+    assert np.isnan(found.breathing.clearance[~static.safe]).all()
+
+
+def test_the_breath_only_takes_away_and_a_gate_gives_back(patient):
+    """Every phase within the gated set, and that within the body at rest; the example has some of each."""
+    every, gated, static = searched(patient, breathing()), searched(patient, breathing(gate=0.4)), searched(patient)
+    assert 0 < every.safe.sum() < gated.safe.sum() < static.safe.sum()
+    assert not np.any(every.safe & ~gated.safe) and not np.any(gated.safe & ~static.safe)
+    np.testing.assert_array_equal(gated.breathing.safe_all_phases, every.safe)
+
+
+@pytest.mark.parametrize("breath", [breathing(amplitude_mm=0.0), breathing(phases=1), breathing(gate=0.0)])
+def test_a_body_that_does_not_move_keeps_its_map(patient, breath):
+    """No amplitude, one phase, or a gate at exhale, where the CT was taken: all of today's columns, to the last bit."""
+    found, static = searched(patient, breath), searched(patient)
+    today, moving = to_table(static, {}), to_table(found, {})
+    assert moving.select(today.column_names).equals(today)
+    assert moving.column_names[len(today.column_names) :] == [
+        "safe_all_phases",
+        "worst_phase",
+        "breathing_clearance_mm",
+    ]
+
+
+def test_a_rejected_direction_names_structure_and_phase(patient):
+    """And says how near it comes there; what was rejected before keeps its reason."""
+    found, static = searched(patient, breathing()), searched(patient)
+    new = static.safe & ~found.safe
+    assert set(found.verdict.reason[new]) == {"unsafe_when_breathing"}
+    hit = [row for row in np.flatnonzero(new) if "hits a structure" in found.verdict.detail[row]]
+    assert hit and all(found.verdict.structure[row] in {"rib", "vessel", "dome"} for row in hit)
+    margins = dict(zip(found.clearance.structures, found.clearance.margins, strict=True))
+    for row in hit:
+        assert found.verdict.detail[row].startswith("at s = ")
+        assert found.verdict.amount[row] < margins[found.verdict.structure[row]]
+    before = ~static.safe
+    np.testing.assert_array_equal(found.verdict.reason[before], static.verdict.reason[before])
+
+
+def test_what_is_safe_says_when_and_never_that_a_needle_may_stay(patient):
+    """The words of both kinds of safe."""
+    assert searched(patient, breathing()).safe_text.endswith("at each phase if inserted at that phase")
+    assert searched(patient, breathing(gate=0.25)).safe_text.endswith("when gated to this window (s <= 0.25)")
+    assert "stay" not in searched(patient, breathing()).safe_text
+
+
+def test_a_weight_for_the_targets_own_structure_is_refused_unless_it_is_one(patient):
+    """The amplitude is the target's; a pattern for all does not mean it."""
+    with pytest.raises(InputError, match="'organ' holds the target"):
+        searched(patient, breathing(weights=Weights({**WEIGHTS, "organ": 0.5})))
+    rest = searched(patient, breathing(weights=Weights({"*": 0.0})))
+    stated = searched(patient, breathing(weights=Weights({"*": 0.0, "organ": 1.0})))
+    np.testing.assert_array_equal(rest.safe, stated.safe)
+
+
+def test_a_breath_that_takes_the_target_out_of_the_skin_leaves_nothing_safe(patient):
+    """A skin that stays, and a target that leaves it, are a slip of weights: nothing is known then."""
+    found = searched(patient, breathing(amplitude_mm=95.0, weights=Weights({"*": 0.0})))
+    assert not found.safe.any()
+
+
+def test_a_certificate_refuses_a_body_that_moves(patient):
+    """It proves directions for the surfaces where the CT shows them."""
+    with pytest.raises(InputError, match="a body that does not move"):
+        certify(replace(patient.case, breathing=breathing()), patient.anatomy, size=0.1)
+
+
+def test_the_arm_is_checked_where_the_breath_puts_target_and_skin():
+    """Against an arm that is asked anew in a carton whose skin, obstacles apart, truly moved."""
+    context = prepare(folder() / "carton" / "case_m.toml")
+    weights = Weights({"*": 0.5})
+    breath = breathing(amplitude_mm=60.0, weights=weights, direction_ct=np.array([1.0, 0, 0]), phases=2)
+    settings = replace(context.case.search, step=np.radians(15.0))
+    case = replace(context.case, breathing=breath, search=settings)
+    base = context.placement.T_base_ct
+    organs = organ_candidates(case, context.anatomy, context.engine, case_directions(case))
+    static = with_reach(case, organs, context.reach)
+    found = with_breathing_reach(case, context.anatomy, static, context.reach)
+    there = replace(case, target_ct=case.target_ct + breath.moved_ct(1.0), breathing=None)
+    moved = pose(np.eye(3), breath.moved_ct(1.0, 0.5))
+    skin = context.anatomy.skin
+    body = replace(context.anatomy, skin=replace(skin, mesh=skin.mesh.transformed(moved)))
+    paths = skin_paths(body.skin, there.target_ct, organs.outward_ct, case.needle.length_mm)
+    path = replace(organs.path, length=paths.path_length, skin_angle=paths.skin_angle)
+    oracle = with_reach(there, replace(static, path=path), ArmReach(case_checker(there, body, base), base))
+    np.testing.assert_array_equal(found.safe, static.safe & oracle.safe)
+    assert 0 < found.safe.sum() < static.safe.sum()
+    new = static.safe & ~found.safe
+    assert set(found.verdict.reason[new]) == {"unsafe_when_breathing"}
+    assert all("arm" in detail or "insertion" in detail for detail in found.verdict.detail[new])
