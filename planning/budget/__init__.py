@@ -1,0 +1,8 @@
+"""Where the next millimetre is won: what each source costs a puncture, and what a change of scan, markers or arm gains.
+
+It computes with the one error model; nothing here decides a verdict.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,117 @@
+"""The chain from scan to needle as numbers that can be changed: errors, markers, touches, and one insertion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from puncture_twin.planning.arm.insertion import away_from_singularities, flange_poses
+from puncture_twin.planning.arm.kinematics import inverse, nearest_within_limits
+from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.entry import outward
+from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.fit_uncertainty import fit_uncertainty
+from puncture_twin.planning.registration.placement import default_method, touches
+from puncture_twin.planning.registration.reading_noise import reading_noise
+from puncture_twin.planning.registration.registration import Registration, fit_triad
+from puncture_twin.planning.uncertainty.pose_error import PoseError
+
+TILTS_DEG = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)
+"""Puncture angles that are tried for an insertion that the arm reaches, in this order."""
+
+AZIMUTHS = 12
+"""Directions tried at each."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """What ties a target in the CT to a needle's tip.
+
+    Attributes:
+        model: The arm.
+        tip_mm: Flange to tip.
+        method: Of the registration: triad, rigid or weighted.
+        errors: As declared, times ``scale``.
+        scale: By which the markers' residuals multiply every declared error: 1 where they agree.
+        points_ct: Shape (N, 3), mm, the markers.
+        q_touch: Shape (N, 6), rad, how the arm touches them.
+        T_base_ct: Shape (4, 4), mm.
+        target_ct: Shape (3,), mm.
+        q_insertion: Shape (6,), rad, the tip on the target.
+    """
+
+    model: UrModel
+    tip_mm: float
+    method: str
+    errors: ErrorModel
+    scale: float
+    points_ct: Floats
+    q_touch: Floats
+    T_base_ct: Floats
+    target_ct: Floats
+    q_insertion: Floats
+
+    def pose_error(self) -> PoseError:
+        """Of this chain, its errors taken for declared."""
+        noise = reading_noise(self.errors, self.model, self.tip_mm, self.q_touch, known=True)
+        points_base = apply(self.T_base_ct, self.points_ct)
+        fit = fit_uncertainty(self.method, fit_triad, self.T_base_ct, self.points_ct, points_base, noise, found=False)
+        return PoseError(self.model, self.tip_mm, apply(self.T_base_ct, self.target_ct), self.errors, fit)
+
+    def expected_mm(self) -> float:
+        """Tip against the point that was meant, rms."""
+        return float(np.sqrt(np.trace(self.pose_error().tip_covariance(self.q_insertion[None])[0])))
+
+    def with_errors(self, errors: ErrorModel) -> Chain:
+        """With other errors; weighted again as they ask for, unless the method is a triad."""
+        method = self.method if self.method == "triad" else default_method(errors)
+        return replace(self, errors=errors, method=method)
+
+
+def chain_of(case: Case, registration: Registration, q_insertion: Floats) -> Chain:
+    """The chain of a case.
+
+    Args:
+        case: With declared errors.
+        registration: Of its markers, with the case's own declaration, to whose residuals the errors are scaled.
+        q_insertion: Shape (6,), rad, the tip on the target.
+    """
+    assert case.errors is not None and registration.uncertainty is not None
+    scale = registration.uncertainty.test.scale
+    return Chain(
+        ur_model(case.robot.model),
+        case.needle.length_mm,
+        registration.method,
+        case.errors.scaled(scale),
+        scale,
+        registration.markers.points_ct,
+        touches(case, registration.markers),
+        registration.T_base_ct,
+        case.target_ct,
+        q_insertion,
+    )
+
+
+def reached_insertion(case: Case, T_base_ct: Floats) -> Floats | None:
+    """Joints (6,), rad, that hold the tip on the target at the least puncture angle tried; None where none reach.
+
+    Only an arm's kinematics are looked at: organs and collisions are the search's.
+    """
+    model = ur_model(case.robot.model)
+    target = apply(T_base_ct, case.target_ct)
+    home = np.zeros(6)
+    for tilt in np.radians(TILTS_DEG):
+        azimuths = np.linspace(0, 2 * np.pi, AZIMUTHS if tilt else 1, endpoint=False)
+        local = np.array([outward(float(tilt), float(azimuth)) for azimuth in azimuths])
+        directions = local @ (T_base_ct[:3, :3] @ case.T_ct_entry[:3, :3]).T
+        q = inverse(model, flange_poses(target, directions, case.needle.length_mm)).reshape(-1, 6)
+        q = nearest_within_limits(model, q, home)
+        q = q[~np.isnan(q).any(axis=1)]
+        q = q[away_from_singularities(model, q)]
+        if len(q):
+            return np.asarray(q[0])
+    return None

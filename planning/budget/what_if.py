@@ -1,0 +1,175 @@
+"""What each source costs alone, and what other slices, markers, touches or another arm would leave of the error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits
+from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.budget.chain import Chain
+from puncture_twin.planning.case.errors import ARM_KINDS, UNIFORM, ErrorModel
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.registration import MIN_MARKERS
+from puncture_twin.planning.uncertainty.pose_error import error_budget
+from puncture_twin.planning.uncertainty.touch_choice import choose_touches
+
+SPACINGS_MM = (1.0, 2.0, 3.0, 5.0)
+MOST_MARKERS = 10
+CANDIDATES = 40
+"""Places of the skin that are tried for each further marker."""
+
+APART_MM = 20.0
+"""One more marker is no nearer than this to another."""
+
+PIVOTED_MM = 0.05
+"""What a pivot calibration with 20 poses leaves of the tip's offset, per axis."""
+
+
+@dataclass(frozen=True)
+class SourceCost:
+    """One source of the expected error.
+
+    Attributes:
+        source: As in `SOURCES`.
+        alone_mm: The tip's rms error, were there no other.
+        without_mm: The same, were there all but this one; the registration's weights stay.
+    """
+
+    source: str
+    alone_mm: float
+    without_mm: float
+
+
+@dataclass(frozen=True)
+class Change:
+    """Something that could be done differently.
+
+    Attributes:
+        group: slices, markers, touches, arm or tip.
+        what: In words.
+        rms_mm: The tip's expected error then, all else as it is.
+    """
+
+    group: str
+    what: str
+    rms_mm: float
+
+
+def source_costs(chain: Chain) -> tuple[SourceCost, ...]:
+    """Every source, the dearest first; their squares alone add up to the whole's."""
+    outward_base = -flange_pose(chain.model, chain.q_insertion)[:3, 2]
+    budget = error_budget(chain.pose_error(), chain.q_insertion, outward_base)
+    costs = [
+        SourceCost(source, budget.rms_mm * float(np.sqrt(part)), budget.rms_mm * float(np.sqrt(max(1.0 - part, 0.0))))
+        for source, part in budget.fraction.items()
+    ]
+    return tuple(sorted(costs, key=lambda one: -one.alone_mm))
+
+
+def changes(chain: Chain, skin_points_ct: Floats, bed_ct: Floats | None) -> tuple[Change, ...]:
+    """What could be done differently, each alone.
+
+    Args:
+        chain: As it is.
+        skin_points_ct: Shape (n, 3), mm, where a further marker could sit.
+        bed_ct: Shape (3,), unit, across the CT's slices; None where nobody says, and slices are left out.
+    """
+    return (
+        *([] if bed_ct is None else _slices(chain, bed_ct)),
+        *_touches(chain),
+        *_arms(chain),
+        *_fewer_markers(chain),
+        *_more_markers(chain, skin_points_ct),
+    )
+
+
+def best_change(found: tuple[Change, ...]) -> Change:
+    """The one that leaves the least error."""
+    return min(found, key=lambda one: one.rms_mm)
+
+
+def _slices(chain: Chain, bed_ct: Floats) -> Iterator[Change]:
+    cov = chain.errors.marker_cov_ct
+    across = np.outer(bed_ct, bed_ct)
+    for spacing in SPACINGS_MM:
+        reading = cov + ((chain.scale * UNIFORM * spacing) ** 2 - bed_ct @ cov @ bed_ct) * across
+        errors = replace(chain.errors, marker_cov_ct=reading, target_cov_ct=_target(chain.errors, reading))
+        yield Change("slices", f"slices of {spacing:g} mm", chain.with_errors(errors).expected_mm())
+
+
+def _target(errors: ErrorModel, reading: Floats) -> Floats:
+    """The target is read in the same slices, unless it was declared by itself."""
+    alike = np.array_equal(errors.target_cov_ct, errors.marker_cov_ct)
+    return reading if alike else errors.target_cov_ct
+
+
+def _touches(chain: Chain) -> Iterator[Change]:
+    try:
+        q_touch = choose_touches(chain.pose_error(), apply(chain.T_base_ct, chain.points_ct), chain.q_insertion)
+    except NoAnswerError:
+        return
+    planned = replace(chain, q_touch=q_touch).expected_mm()
+    yield Change("touches", "markers touched in the poses of least error", planned)
+    fresh = replace(chain.errors, arm=replace(chain.errors.arm, drift=0.0))
+    yield Change("touches", "markers touched right before the insertion", chain.with_errors(fresh).expected_mm())
+
+
+def _arms(chain: Chain) -> Iterator[Change]:
+    arm = chain.errors.arm
+    for name, kind in ARM_KINDS.items():
+        twist, joint = np.radians([kind.twist_deg, kind.joint_deg]) * chain.scale
+        of_kind = replace(arm, link_mm=chain.scale * kind.link_mm, twist=float(twist), joint=float(joint))
+        yield Change("arm", f"a {name} arm", chain.with_errors(replace(chain.errors, arm=of_kind)).expected_mm())
+    pivoted = replace(chain.errors, arm=replace(arm, tip_offset_mm=chain.scale * PIVOTED_MM))
+    yield Change("tip", f"a tip known to {PIVOTED_MM:g} mm", chain.with_errors(pivoted).expected_mm())
+
+
+def _fewer_markers(chain: Chain) -> Iterator[Change]:
+    """Without the marker that is missed least, again and again down to three."""
+    found = []
+    while len(chain.points_ct) > MIN_MARKERS:
+        every = np.arange(len(chain.points_ct))
+        rest = [_with_rows(chain, np.delete(every, row)) for row in every]
+        chain = min(rest, key=lambda one: one.expected_mm())
+        found.append(Change("markers", f"{len(chain.points_ct)} markers", chain.expected_mm()))
+    yield from reversed(found)
+
+
+def _with_rows(chain: Chain, rows: Ints) -> Chain:
+    return replace(chain, points_ct=chain.points_ct[rows], q_touch=chain.q_touch[rows])
+
+
+def _more_markers(chain: Chain, skin_points_ct: Floats) -> Iterator[Change]:
+    """One more where it helps most, again and again; touched in the insertion's orientation."""
+    points = skin_points_ct[:: max(1, len(skin_points_ct) // CANDIDATES)]
+    q = _touch_like_insertion(chain, points)
+    points, q = points[~np.isnan(q).any(axis=1)], q[~np.isnan(q).any(axis=1)]
+    while len(chain.points_ct) < MOST_MARKERS:
+        gaps = np.linalg.norm(points[:, None] - chain.points_ct, axis=2).min(axis=1, initial=np.inf)
+        grown = [_with_one_more(chain, points[row], q[row]) for row in np.flatnonzero(gaps >= APART_MM)]
+        if not grown:
+            return
+        chain = min(grown, key=lambda one: one.expected_mm())
+        place = ", ".join(f"{mm:.0f}" for mm in chain.points_ct[-1])
+        count = len(chain.points_ct)
+        yield Change("markers", f"{count} markers, the {count}th at ({place}) mm", chain.expected_mm())
+
+
+def _with_one_more(chain: Chain, point_ct: Floats, q: Floats) -> Chain:
+    """A triad takes three: with more markers the fit is that of the declared errors."""
+    grown = replace(chain, points_ct=np.vstack([chain.points_ct, point_ct]), q_touch=np.vstack([chain.q_touch, q]))
+    return replace(grown, method="rigid").with_errors(chain.errors)
+
+
+def _touch_like_insertion(chain: Chain, points_ct: Floats) -> Floats:
+    """Joints (n, 6), rad, that touch points (n, 3) in the insertion's orientation, nearest to it; NaN where none do."""
+    R = flange_pose(chain.model, chain.q_insertion)[:3, :3]
+    poses = np.tile(np.eye(4), (len(points_ct), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = R, apply(chain.T_base_ct, points_ct) - chain.tip_mm * R[:, 2]
+    q = nearest_within_limits(chain.model, inverse(chain.model, poses), chain.q_insertion)
+    far = np.abs(q - chain.q_insertion).max(axis=2)
+    return np.asarray(q[np.arange(len(q)), np.where(np.isnan(far), np.inf, far).argmin(axis=1)])

@@ -1,0 +1,116 @@
+"""The error budget: what each source costs against rooms drawn with it alone, and what changes must obey."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from places import ROOT
+
+from puncture_twin.planning.anatomy.anatomy import load_skin
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.budget.chain import chain_of, reached_insertion
+from puncture_twin.planning.budget.what_if import MOST_MARKERS, best_change, changes, source_costs
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.errors import ArmUncertainty
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.registration.reading_noise import reading_noise
+from puncture_twin.planning.uncertainty.sources import reading_parts
+from puncture_twin.twin.rehearsal.rooms import Puncture, draw_rooms
+
+BEDS = {"abdomen/case.toml": (0.0, 0.0, 1.0), "carton/case_m_setup2.toml": (1.0, 0.0, 0.0)}
+"""Of each case, the direction across its slices."""
+
+NOTHING = ArmUncertainty(**{field.name: 0.0 for field in fields(ArmUncertainty)})
+
+
+def chain(name):
+    """The chain of an embedded case, at an insertion that its arm reaches."""
+    case = load_case(ROOT / "meshes" / name)
+    placement = load_placement(case)
+    return chain_of(case, placement.registration, reached_insertion(case, placement.T_base_ct))
+
+
+@pytest.fixture(scope="module", params=BEDS)
+def found(request):
+    """Chain, skin points and bed of a case."""
+    case = load_case(ROOT / "meshes" / request.param)
+    skin = load_skin(case, user_cache()).mesh.vertices[::50]
+    return chain(request.param), changes(chain(request.param), skin, np.array(BEDS[request.param]))
+
+
+@pytest.mark.parametrize("name", BEDS)
+def test_an_insertion_puts_the_tip_on_the_target(name):
+    """By forward kinematics."""
+    one = chain(name)
+    flange = flange_pose(one.model, one.q_insertion)
+    tip = flange[:3, 3] + one.tip_mm * flange[:3, 2]
+    assert tip == pytest.approx(apply(one.T_base_ct, one.target_ct), abs=1e-6)
+
+
+@pytest.mark.parametrize("name", BEDS)
+def test_squares_of_the_sources_add_up(name):
+    """Alone they make up the whole; without one, the rest."""
+    one = chain(name)
+    costs = source_costs(one)
+    assert sum(cost.alone_mm**2 for cost in costs) == pytest.approx(one.expected_mm() ** 2)
+    assert all(np.hypot(cost.alone_mm, cost.without_mm) == pytest.approx(one.expected_mm()) for cost in costs)
+
+
+def _alone(errors, source):
+    """The declaration with one source left."""
+    nothing = replace(errors, marker_cov_ct=np.zeros((3, 3)), touch_mm=0.0, target_cov_ct=np.zeros((3, 3)), arm=NOTHING)
+    if source in ("ct_slice", "ct_in_plane"):
+        return replace(nothing, marker_cov_ct=reading_parts(errors.marker_cov_ct)[source])
+    if source == "touch":
+        return replace(nothing, touch_mm=errors.touch_mm)
+    if source == "target":
+        return replace(nothing, target_cov_ct=errors.target_cov_ct)
+    name = f"{source}_mm" if source in ("link", "tip_offset") else source
+    return replace(nothing, arm=replace(NOTHING, **{name: getattr(errors.arm, name)}))
+
+
+@pytest.mark.parametrize("source", ["ct_slice", "touch", "target", "link", "drift", "tip_offset", "repeatability"])
+@pytest.mark.parametrize("name", BEDS)
+def test_rooms_drawn_with_one_source_err_as_it_costs(name, source):
+    """Whole nonlinear chains, 4,000 of them: their rms is known to 1 %."""
+    one = chain(name)
+    noise = reading_noise(one.errors, one.model, one.tip_mm, one.q_touch, known=True)
+    outward_ct = -(one.T_base_ct[:3, :3].T @ flange_pose(one.model, one.q_insertion)[:3, 2])
+    puncture = Puncture(
+        one.model, one.tip_mm, one.method, noise, one.points_ct, one.q_touch, one.T_base_ct, one.target_ct, outward_ct,
+        one.q_insertion,
+    )  # fmt: skip
+    rooms = draw_rooms(puncture, _alone(one.errors, source), 4000, np.random.default_rng(6)).reached_alone()
+    realised = np.sqrt(np.mean(np.sum((rooms.tip_ct - rooms.target_ct) ** 2, axis=1)))
+    predicted = {cost.source: cost.alone_mm for cost in source_costs(one)}[source]
+    assert realised == pytest.approx(predicted, rel=0.03)
+
+
+def test_changes_obey_what_is_known_of_them(found):
+    """Thinner slices, a better arm, better touches and more markers never cost, beyond what another fit weighs."""
+    one, all_changes = found
+    now, of = one.expected_mm(), {}
+    for change in all_changes:
+        of.setdefault(change.group, []).append(change.rms_mm)
+    assert of["slices"] == sorted(of["slices"])
+    assert of["arm"] == sorted(of["arm"])
+    assert max(of["touches"]) <= now + 1e-9
+    assert min(of["tip"]) <= now + 1e-9
+    assert of["markers"][-1] < of["markers"][0]
+    assert best_change(all_changes).rms_mm < now
+
+
+def test_slices_as_they_are_change_nothing():
+    """The carton's second setup has slices of 5 mm: the change to them is none, scaled as all errors are."""
+    one = chain("carton/case_m_setup2.toml")
+    same = [c for c in changes(one, np.empty((0, 3)), np.array([1.0, 0.0, 0.0])) if c.what == "slices of 5 mm"]
+    assert same[0].rms_mm == pytest.approx(one.expected_mm())
+
+
+def test_markers_are_counted_from_three_to_ten(found):
+    """All numbers but today's."""
+    one, all_changes = found
+    counts = [int(c.what.split()[0]) for c in all_changes if c.group == "markers"]
+    assert counts == [n for n in range(3, MOST_MARKERS + 1) if n != len(one.points_ct)]
