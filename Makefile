@@ -66,9 +66,10 @@ pictures: demo
 	$(BIN)/python run_twin.py place meshes/abdomen --out out/place
 	$(BIN)/python run_twin.py selfcal --seeds 1 --out out/selfcal
 	$(BIN)/python run_twin.py servo meshes/head --out out/servo
+	$(BIN)/python run_twin.py register meshes/abdomen --picture out/budget/budget.png
 	$(BIN)/python docs/concept_pictures.py $(OUT)/plan.json
 	$(BIN)/python docs/reliability_picture.py
-	$(BIN)/python docs/copy_pictures.py $(OUT) out/place out/selfcal out/servo
+	$(BIN)/python docs/copy_pictures.py $(OUT) out/place out/selfcal out/servo out/budget
 
 meshes: install
 	$(BIN)/python -m puncture_twin.twin.phantoms --out meshes

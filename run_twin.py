@@ -408,9 +408,12 @@ def register(
         Space, typer.Option("--space", help="Of the CT's list and the target, where the file is silent.")
     ] = Space.LPS,
     fle: Annotated[float | None, typer.Option("--fle", min=0.001, help="Known localisation error (rms), mm.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option("--picture", metavar="FILE.png", help="Draw a case's error budget.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Register a case's markers, or two lists of markers; print residuals, FRE, expected TRE and weak points."""
+    """Register a case's markers, or two lists of markers; print residuals, the expected error and its sources."""
     from puncture_twin.twin.jobs.patient import answers, text
 
     if markers_base is None:
@@ -419,6 +422,10 @@ def register(
         raise InputError("two lists of markers need a target", where="register", allowed="--target X,Y,Z in mm")
     else:
         report = answers.lists_report(source, markers_base, target, space, fle)
+    if picture is not None:
+        from puncture_twin.twin.jobs.patient.pictures import write_budget_picture
+
+        write_budget_picture(report, picture)
     _print(report, text.registration_text(report), as_json)
 
 

@@ -15,6 +15,7 @@ NAMES = {
     "room.png": "two_arms.png",
     "convergence.png": "convergence.png",
     "camera_1.png": "camera.png",
+    "budget.png": "budget.png",
 }
 """What a command calls a picture, and what the pages call it."""
 

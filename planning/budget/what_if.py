@@ -44,7 +44,7 @@ class SourceCost:
     without_mm: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Change:
     """Something that could be done differently.
 
@@ -52,11 +52,13 @@ class Change:
         group: slices, markers, touches, arm or tip.
         what: In words.
         rms_mm: The tip's expected error then, all else as it is.
+        point_ct: Shape (3,), mm, where the last of further markers sits; None for other changes.
     """
 
     group: str
     what: str
     rms_mm: float
+    point_ct: Floats | None = None
 
 
 def source_costs(chain: Chain) -> tuple[SourceCost, ...]:
@@ -135,7 +137,7 @@ def _fewer_markers(chain: Chain) -> Iterator[Change]:
         every = np.arange(len(chain.points_ct))
         rest = [_with_rows(chain, np.delete(every, row)) for row in every]
         chain = min(rest, key=lambda one: one.expected_mm())
-        found.append(Change("markers", f"{len(chain.points_ct)} markers", chain.expected_mm()))
+        found.append(Change("markers", f"only {len(chain.points_ct)} markers", chain.expected_mm()))
     yield from reversed(found)
 
 
@@ -154,9 +156,7 @@ def _more_markers(chain: Chain, skin_points_ct: Floats) -> Iterator[Change]:
         if not grown:
             return
         chain = min(grown, key=lambda one: one.expected_mm())
-        place = ", ".join(f"{mm:.0f}" for mm in chain.points_ct[-1])
-        count = len(chain.points_ct)
-        yield Change("markers", f"{count} markers, the {count}th at ({place}) mm", chain.expected_mm())
+        yield Change("markers", f"{len(chain.points_ct)} markers", chain.expected_mm(), chain.points_ct[-1])
 
 
 def _with_one_more(chain: Chain, point_ct: Floats, q: Floats) -> Chain:

@@ -1,10 +1,12 @@
 """The error budget: what each source costs against rooms drawn with it alone, and what changes must obey."""
 
+import json
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from places import ROOT
+from typer.testing import CliRunner
 
 from puncture_twin.planning.anatomy.anatomy import load_skin
 from puncture_twin.planning.arm.kinematics import flange_pose
@@ -17,11 +19,13 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.uncertainty.sources import reading_parts
+from puncture_twin.run_twin import app
 from puncture_twin.twin.rehearsal.rooms import Puncture, draw_rooms
 
 BEDS = {"abdomen/case.toml": (0.0, 0.0, 1.0), "carton/case_m_setup2.toml": (1.0, 0.0, 0.0)}
 """Of each case, the direction across its slices."""
 
+ABDOMEN = ROOT / "meshes" / "abdomen"
 NOTHING = ArmUncertainty(**{field.name: 0.0 for field in fields(ArmUncertainty)})
 
 
@@ -112,5 +116,18 @@ def test_slices_as_they_are_change_nothing():
 def test_markers_are_counted_from_three_to_ten(found):
     """All numbers but today's."""
     one, all_changes = found
-    counts = [int(c.what.split()[0]) for c in all_changes if c.group == "markers"]
+    counts = [int(c.what.removeprefix("only ").split()[0]) for c in all_changes if c.group == "markers"]
     assert counts == [n for n in range(3, MOST_MARKERS + 1) if n != len(one.points_ct)]
+
+
+def test_register_prints_the_budget_and_draws_it(tmp_path):
+    """Each source, each change, and what wins most; a name that is no PNG's is refused in one line."""
+    done = CliRunner().invoke(app, ["register", str(ABDOMEN), "--json", "--picture", str(tmp_path / "budget.png")])
+    budget = json.loads(done.stdout)["budget"]
+    assert (tmp_path / "budget.png").read_bytes().startswith(b"\x89PNG")
+    assert sum(one["alone_mm"] ** 2 for one in budget["sources"]) == pytest.approx(budget["expected_mm"] ** 2)
+    assert budget["best"]["expected_mm"] == min(one["expected_mm"] for one in budget["changes"])
+    text = CliRunner().invoke(app, ["register", str(ABDOMEN)]).stdout
+    assert "mm is won by" in text
+    refused = CliRunner().invoke(app, ["register", str(ABDOMEN), "--picture", str(tmp_path / "budget.txt")])
+    assert "no PNG's name" in str(refused.exception)

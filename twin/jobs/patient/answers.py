@@ -25,7 +25,7 @@ from puncture_twin.planning.formats.points.point_files import MAX_FILE_BYTES, pa
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, to_lps
-from puncture_twin.planning.registration.advice import odd_branches, one_more, without_each
+from puncture_twin.planning.registration.advice import OneMore, odd_branches, one_more, without_each
 from puncture_twin.planning.registration.checks.marker_check import checked_placement
 from puncture_twin.planning.registration.checks.squareness import Squareness, check_squareness
 from puncture_twin.planning.registration.registration import Registration, match, register
@@ -34,6 +34,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.selection.choice import Choice, choose, chosen_angles, refuse_other_entry
+from puncture_twin.twin.jobs.patient.budget import budget_facts
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
 
 
@@ -153,16 +154,25 @@ def _advice(case: Case, registration: Registration) -> dict[str, Any]:
     cov = uncertainty.cov_at(target_base)[:3, :3]
     read, touched = (np.trace(part) for part in uncertainty.parts_at(target_base))
     skin = load_skin(case, user_cache())
-    more = one_more(registration, case.target_ct, touchable_points(case, skin.mesh, registration.T_base_ct))
+    touchable = touchable_points(case, skin.mesh, registration.T_base_ct)
+    more = one_more(registration, case.target_ct, touchable)
     return {
+        "budget": budget_facts(case, registration, touchable),
         "half_axes_95_mm": (uncertainty.test.region_factor * np.sqrt(np.linalg.eigvalsh(cov)[::-1])).tolist(),
         "share": {"markers_ct": float(read / (read + touched)), "touch": float(touched / (read + touched))},
         "without": {
             one.name: {"rms_mm": one.rms_mm, "probability": one.probability}
             for one in without_each(registration, case.target_ct)
         },
-        "one_more": None if more is None else {"point_ct_mm": more.point_ct.tolist(), "rms_mm": more.rms_mm},
+        "one_more": None if more is None else _one_more(case, more),
     }
+
+
+def _one_more(case: Case, more: OneMore) -> dict[str, Any]:
+    """Where: LPS, and as the case speaks."""
+    typed = to_lps(more.point_ct[None], case.space)[0]  # its own inverse
+    place = {"point_ct_mm": more.point_ct.tolist(), "point_mm": typed.tolist(), "space": str(case.space)}
+    return {**place, "rms_mm": more.rms_mm}
 
 
 def verify_certificate(path: Path, context: CaseContext) -> dict[str, Any]:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.base.provenance import read_inputs
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
@@ -13,6 +16,7 @@ from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.jobs.patient.run import Run
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
+from puncture_twin.twin.report.budget_picture import draw_budget
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.page.page import Uncertainty, write_page
 from puncture_twin.twin.report.scene.scene_picture import draw_scene
@@ -61,14 +65,29 @@ def with_pictures(run: Run, out: Path) -> Run:
     return run.with_files(out / "map.png", out / "scene.png", out / PAGE)
 
 
+def write_budget_picture(report: Mapping[str, Any], path: Path) -> Path:
+    """Write the error budget of a registration's report, as an entry of its folder's set.
+
+    Raises:
+        InputError: Not a PNG's name, no budget to draw, or a folder or file that cannot be written.
+    """
+    _check_png(path)
+    budget = report.get("budget")
+    if budget is None:
+        raise InputError("no error budget to draw", where="--picture", allowed="a case with [errors] and an arm")
+    inputs = read_inputs(report["inputs"])
+    with writing(path.parent, f"register {path.name}", inputs=inputs, names=(path.name,), note=lambda _: None) as draft:
+        draw_budget(budget, draft.folder / path.name)
+    return path
+
+
 def write_check_picture(context: CaseContext, explained: Explanation, path: Path) -> Path:
     """Write the slices of one explained direction, as an entry of its folder's set; safe or not.
 
     Raises:
         InputError: Not a PNG's name, or a folder or file that cannot be written.
     """
-    if path.suffix.lower() != ".png":
-        raise InputError(f"'{path.name}' is no PNG's name", where="--picture", allowed="FILE.png")
+    _check_png(path)
     inputs, note = context.case.inputs, context.watcher.note
     with writing(path.parent, f"check {path.name}", inputs=inputs, names=(path.name,), note=note) as draft:
         write_sheet(draw_slices(_subject(context, Pick(explained.candidates, 0))), draft.folder / path.name)
@@ -106,3 +125,8 @@ def _uncertainty(run: Run) -> Uncertainty | None:
         return Uncertainty(None, rooms, picture)
     row = found.ranked[0]
     return Uncertainty(context.explain(found.theta[row], found.beta[row]).doubt, rooms, picture)
+
+
+def _check_png(path: Path) -> None:
+    if path.suffix.lower() != ".png":
+        raise InputError(f"'{path.name}' is no PNG's name", where="--picture", allowed="FILE.png")

@@ -13,6 +13,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.explain import needle_warnings, reason_text
 from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
+from puncture_twin.twin.jobs.patient.budget import budget_lines
 from puncture_twin.twin.jobs.patient.run import Run
 from puncture_twin.twin.jobs.patient.summaries import plan_summary, rehearsal_summary
 from puncture_twin.twin.report.page.page import TRUTH_IS_BELIEF
@@ -213,9 +214,10 @@ def _declared_lines(report: dict[str, Any]) -> list[str]:
         for name, one in report["without"].items()
     ]
     if report["one_more"] is not None:
-        place = ", ".join(f"{mm:.0f}" for mm in report["one_more"]["point_ct_mm"])
-        lines.append(f"  one more marker helps most at ({place}) mm in the CT: {report['one_more']['rms_mm']:.3f} mm")
-    return lines
+        more = report["one_more"]
+        place = ", ".join(f"{mm:.0f}" for mm in more["point_mm"])
+        lines.append(f"  one more marker helps most at ({place}) mm {more['space']}: {more['rms_mm']:.3f} mm")
+    return [*lines, *budget_lines(report["budget"])]
 
 
 def _interval(bounds: Sequence[float]) -> str:

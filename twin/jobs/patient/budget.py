@@ -1,0 +1,95 @@
+"""The error budget of a case as facts and text: what each source costs, and what would win the next millimetre."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.budget.chain import chain_of, reached_insertion
+from puncture_twin.planning.budget.what_if import Change, best_change, changes, source_costs
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.entry import angles
+from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
+
+POLE = 1e-6
+"""Puncture angle below which an azimuth says nothing, rad."""
+
+TOLD_MM = 0.005
+"""A source that costs less is not printed: it would be 0.00."""
+
+
+def budget_facts(case: Case, registration: Registration, skin_points_ct: Floats) -> dict[str, Any] | None:
+    """The budget of an insertion that the arm reaches, mm; None where it reaches none, or no errors are declared.
+
+    Args:
+        case: The case.
+        registration: Of its markers.
+        skin_points_ct: Shape (n, 3), mm, where a further marker could sit.
+    """
+    q = reached_insertion(case, registration.T_base_ct) if registration.uncertainty is not None else None
+    if q is None:
+        return None
+    chain = chain_of(case, registration, q)
+    found = changes(chain, skin_points_ct, _bed_ct(case, chain.errors.marker_cov_ct))
+    best = best_change(found)
+    outward_ct = -(registration.T_base_ct[:3, :3].T @ flange_pose(chain.model, q)[:3, 2])
+    theta, beta = angles(outward_ct @ case.T_ct_entry[:3, :3])
+    return {
+        "theta_deg": float(np.degrees(theta)),
+        "beta_deg": float(np.degrees(beta)) if theta > POLE else 0.0,
+        "expected_mm": chain.expected_mm(),
+        "sources": [
+            {"text": SOURCES[one.source].text, "alone_mm": one.alone_mm, "without_mm": one.without_mm}
+            for one in source_costs(chain)
+        ],
+        "changes": [_change(case, one) for one in found],
+        "best": _change(case, best),
+        "not_modelled": NOT_MODELLED,
+    }
+
+
+def _change(case: Case, one: Change) -> dict[str, Any]:
+    facts = {"group": one.group, "text": one.what, "expected_mm": one.rms_mm}
+    if one.point_ct is None:
+        return facts
+    point = to_lps(one.point_ct[None], case.space)[0]  # its own inverse
+    place = ", ".join(f"{mm:.0f}" for mm in point)
+    return {**facts, "text": f"{one.what}, the last at ({place}) mm {case.space}", "last_mm": point.tolist()}
+
+
+def _bed_ct(case: Case, marker_cov_ct: Floats) -> Floats | None:
+    """Across the slices: along which a marker is read worst; z where it is read alike and the space has a head."""
+    values, axes = np.linalg.eigh(marker_cov_ct)
+    if values[2] > values[1] * (1 + 1e-9):
+        return np.asarray(axes[:, 2])
+    return None if case.space is Space.LOCAL else np.array([0.0, 0.0, 1.0])
+
+
+def budget_lines(facts: dict[str, Any] | None) -> list[str]:
+    """A table of the sources, and the changes that win something."""
+    if facts is None:
+        return []
+    now = facts["expected_mm"]
+    lines = [
+        f"  the needle's whole error, inserted at theta {facts['theta_deg']:.0f}, beta {facts['beta_deg']:.0f}: "
+        f"{now:.2f} mm (rms); not modelled: {facts['not_modelled']}",
+        f"    {'source':34s} {'alone':>7s} {'all but it':>11s}",
+    ]
+    lines += [
+        f"    {one['text']:34s} {one['alone_mm']:7.2f} {one['without_mm']:11.2f}"
+        for one in facts["sources"]
+        if one["alone_mm"] >= TOLD_MM
+    ]
+    lines.append("    what if (all else as it is)")
+    lines += [f"    {one['text']:50s} {one['expected_mm']:7.2f}" for one in facts["changes"]]
+    best = facts["best"]
+    if now - best["expected_mm"] >= TOLD_MM:
+        lines.append(
+            f"  the next {now - best['expected_mm']:.2f} mm is won by {best['text']}: {best['expected_mm']:.2f} mm"
+        )
+    return lines
