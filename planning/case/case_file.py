@@ -334,6 +334,7 @@ class RehearsalSection(Section):
     fle_ct_mm: NotNegative = 0.5
     fle_touch_mm: NotNegative = 0.1
     joint_offset_deg: NotNegative = 0.02
+    control: Literal["position", "impedance", "admittance"] = "position"
     errors: ErrorsSection | None = None
 
 

@@ -1,7 +1,7 @@
 """A plan, executed in the twin: the arm moves under its motors, the patient lies where he truly lies.
 
-What is modelled: rigid bodies, gravity, motor lag and torque limits, joint offsets, a registration that errs. What is
-not: tissue that resists or moves, a needle that bends, breathing.
+What is modelled: rigid bodies, gravity, motor lag and torque limits, joint offsets, a registration that errs; the
+insertion by the motors too, or by a spring at the tip (``[rehearsal] control``). What is not: tissue that resists or moves, a needle that bends, breathing.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.twin.plant.truth import Truth
 from puncture_twin.twin.rehearsal.standing import Standing
 from puncture_twin.twin.world.client import TIME_STEP_S
-from puncture_twin.twin.world.execution import Execution, execute
+from puncture_twin.twin.world.control.insertion import Insertion, insert
+from puncture_twin.twin.world.execution import Execution, execute, joined
 from puncture_twin.twin.world.workcell import open_workcell
 
 SETTLE_S = 0.5
@@ -34,6 +35,9 @@ SETTLE_S = 0.5
 
 HOLD_S = 1.0
 """Pause at the end, before the tip is measured."""
+
+ROUNDING = 1e-6
+"""Of a time over the physics step: a whole number of steps must not fall short of itself."""
 
 CLEARANCE_SAMPLES = 48
 """Moments of the insertion at which the needle's clearance is measured, the last one included."""
@@ -133,13 +137,10 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
     Raises:
         InputError: The twin has no body of this arm, or its base stands in the patient.
     """
-    commands = _commands(plan)
     T_base_ct = truth.T_base_ct_true
-    model, tool, boxes = ur_model(plan.model), case_tool(case), case_boxes(case, T_base_ct)
-    down_ct = -bed_frame(case)[:3, 2]
-    with open_workcell(model, tool, anatomy.skin.mesh, T_base_ct, boxes, down_ct=down_ct) as room:
-        done = execute(room, commands.q, truth.joint_offsets)
-    times, phase = commands.times_s[done.steps], commands.phase[done.steps]
+    model = ur_model(plan.model)
+    done = _executed(plan, case, anatomy, truth)
+    times, phase = done.times_s, _phases(plan, done.times_s)
     T_ct_flange = np.linalg.inv(T_base_ct) @ done.T_base_flange
     forward_ct = T_ct_flange[:, :3, 2]
     tip_ct = T_ct_flange[:, :3, 3] + plan.needle_length_mm * forward_ct
@@ -152,7 +153,7 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
         T_base_ct_true=T_base_ct,
         times_s=times,
         q=done.q,
-        q_command=commands.q[done.steps],
+        q_command=done.q_command,
         phase=phase,
         T_base_flange_true=done.T_base_flange,
         tip_true_ct=tip_ct,
@@ -183,26 +184,39 @@ def split_error(tip: Floats, forward: Floats, target: Floats) -> TipError:
     return TipError(float(np.linalg.norm(error)), float(np.linalg.norm(error - depth * forward)), depth)
 
 
-@dataclass(frozen=True, eq=False)
-class _Commands:
-    """One row a physics step: times (n,), q (n, 6), phase (n,)."""
+def _executed(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Execution:
+    """The approach by position motors, and after a pause the insertion as the case wants it controlled."""
+    T_base_ct, control = truth.T_base_ct_true, case.rehearsal.control
+    model, tool, boxes = ur_model(plan.model), case_tool(case), case_boxes(case, T_base_ct)
+    down_ct = -bed_frame(case)[:3, 2]
+    parts = _parts(plan)
+    with open_workcell(model, tool, anatomy.skin.mesh, T_base_ct, boxes, down_ct=down_ct) as room:
+        if control == "position":
+            return execute(room, np.concatenate(list(parts.values())), truth.joint_offsets)
+        before = np.concatenate([parts["approach"], parts["settle"]])
+        approached = execute(room, before, truth.joint_offsets)
+        insertion = Insertion(model, tool, T_base_ct[:3, :3] @ down_ct, plan.insertion, HOLD_S)
+        start_s = TIME_STEP_S * len(before)
+        return joined(approached, insert(room, insertion, control, truth.joint_offsets, start_s=start_s))
 
-    times_s: Floats
-    q: Floats
-    phase: NDArray[np.str_]
 
-
-def _commands(plan: Plan) -> _Commands:
+def _parts(plan: Plan) -> dict[str, Floats]:
+    """Joint commands of each phase, one row a physics step, shape (n, 6)."""
     approach, insertion = _steps(plan.approach), _steps(plan.insertion)
-    parts = {
+    return {
         "approach": approach,
         "settle": np.repeat(approach[-1:], round(SETTLE_S / TIME_STEP_S), axis=0),
         "insertion": insertion,
         "hold": np.repeat(insertion[-1:], round(HOLD_S / TIME_STEP_S), axis=0),
     }
-    q = np.concatenate(list(parts.values()))
-    phase = np.repeat(list(parts), [len(part) for part in parts.values()])
-    return _Commands(TIME_STEP_S * np.arange(len(q), dtype=np.float64), q, phase)
+
+
+def _phases(plan: Plan, times_s: Floats) -> NDArray[np.str_]:
+    """The phase of each time, shape (m,)."""
+    parts = _parts(plan)
+    ends = np.cumsum([len(part) for part in parts.values()])
+    row = np.floor(times_s / TIME_STEP_S + ROUNDING).astype(np.int64)
+    return np.array(list(parts))[np.searchsorted(ends[:-1], row, side="right")]
 
 
 def _steps(trajectory: Trajectory) -> Floats:
@@ -247,7 +261,7 @@ def _contacts(
     The physics lets the needle pass the skin and the arm pass itself, and rounds large skins; FCL says the first
     contact of a record only.
     """
-    seen = [RehearsalContact(t.step * TIME_STEP_S, t.link, t.body, t.depth_mm) for t in done.touches]
+    seen = [RehearsalContact(t.time_s, t.link, t.body, t.depth_mm) for t in done.touches]
     checker = case_checker(case, anatomy, truth.T_base_ct_true)
     inside = (phase == "insertion") | (phase == "hold")
     for time, q, may_touch in zip(times_s.tolist(), done.q + truth.joint_offsets, inside.tolist(), strict=True):

@@ -92,6 +92,30 @@ class Arm:
             physicsClientId=self.client,
         )
 
+    def release(self) -> None:
+        """Switch the motors off, for torques."""
+        pybullet.setJointMotorControlArray(
+            self.body, self.joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * 6, physicsClientId=self.client
+        )
+
+    def torque(self, torque_nm: Floats) -> None:
+        """Torques (6,), N m, for the next step alone, cut to what the joints can give."""
+        cut = np.clip(torque_nm, -np.array(self.max_torque), self.max_torque)
+        pybullet.setJointMotorControlArray(
+            self.body, self.joints, pybullet.TORQUE_CONTROL, forces=cut.tolist(), physicsClientId=self.client
+        )
+
+    def push(self, link: str, force_n: Floats, point_m: Floats) -> None:
+        """Push a link in the next step alone: a force (3,), N, at a point (3,), m, both in the world frame."""
+        pybullet.applyExternalForce(
+            self.body,
+            self.links[link],
+            force_n.tolist(),
+            point_m.tolist(),
+            pybullet.WORLD_FRAME,
+            physicsClientId=self.client,
+        )
+
     def state(self) -> JointState:
         """Angles and speeds of the joints."""
         states = pybullet.getJointStates(self.body, self.joints, physicsClientId=self.client)
@@ -133,7 +157,7 @@ def load_arm(client: int, model: UrModel, tool: Tool, T_world_base: Floats | Non
             position,
             quaternion,
             useFixedBase=True,
-            flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+            flags=pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_IMPLICIT_CYLINDER,
             physicsClientId=client,
         )
     joints, links = [], {"base": -1}

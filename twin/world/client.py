@@ -51,6 +51,11 @@ def physics_client(down: NDArray[np.float64] | None = None) -> Iterator[int]:
         pybullet.disconnect(physicsClientId=client)
 
 
+def set_time_step(client: int, seconds: float) -> None:
+    """Change how long a step is: motors are tuned for `TIME_STEP_S`, torques need shorter ones."""
+    pybullet.setPhysicsEngineParameter(fixedTimeStep=seconds, physicsClientId=client)
+
+
 def step(client: int) -> None:
     """Advance the physics by one time step."""
     pybullet.stepSimulation(physicsClientId=client)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.world.arm import Arm
 from puncture_twin.twin.world.engine import pybullet
 from puncture_twin.twin.world.units import to_m, to_mm
@@ -32,6 +35,18 @@ def touches(arm: Arm) -> tuple[Touch, ...]:
             key = (link, other)
             deepest[key] = max(deepest.get(key, 0.0), -float(to_mm(distance_m)))
     return tuple(Touch(arm.link_name(link), other, depth) for (link, other), depth in sorted(deepest.items()))
+
+
+def felt_force(arm: Arm, link: str) -> Floats:
+    """What the bodies of the room press on one link with, as of the last physics step: shape (3,), N, world frame."""
+    force = np.zeros(3)
+    for point in pybullet.getContactPoints(
+        bodyA=arm.body, linkIndexA=arm.links[link], physicsClientId=arm.client
+    ):
+        if point[2] != arm.body:
+            normal, (first, along_first, second, along_second) = np.array(point[7]), point[10:14]
+            force += point[9] * normal + first * np.array(along_first) + second * np.array(along_second)
+    return force
 
 
 def gap_mm(client: int, first: int, second: int, within_mm: float) -> float:

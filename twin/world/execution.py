@@ -1,4 +1,4 @@
-"""Commands in, what happened out: the arm driven through its motors, step by step of the physics."""
+"""Commands in, what happened out: the arm moved by its motors, step by step of the physics."""
 
 from __future__ import annotations
 
@@ -6,21 +6,20 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.world.client import TIME_STEP_S, step
 from puncture_twin.twin.world.contacts import touches
 from puncture_twin.twin.world.workcell import SimulatedWorkcell
 
-RECORD_EVERY = 4
-"""Physics steps between two records: 60 records a second."""
+RECORD_S = 4 * TIME_STEP_S
+"""Between two records: 60 a second."""
 
 
 class TouchAt(NamedTuple):
     """A contact of the arm with a body of the room, at one physics step."""
 
-    step: int
+    time_s: float
     link: str
     body: str
     depth_mm: float
@@ -31,44 +30,90 @@ class Execution:
     """What was measured, one row for each of m records.
 
     Attributes:
-        steps: Shape (m,), the number of the physics step of each record.
+        times_s: Shape (m,), of each record, from the first command.
+        q_command: Shape (m, 6), rad, what was asked.
         q: Shape (m, 6), rad, what the encoders say: true angle minus offset.
         T_base_flange: Shape (m, 4, 4), mm, where the flange truly was.
         touches: Every contact at every physics step.
         max_speed: Shape (6,), rad/s, over every step.
     """
 
-    steps: NDArray[np.int64]
+    times_s: Floats
+    q_command: Floats
     q: Floats
     T_base_flange: Floats
     touches: tuple[TouchAt, ...]
     max_speed: Floats
 
 
+class Recorder:
+    """Looks at the arm after every physics step, and keeps a record `RECORD_S` apart and at the end.
+
+    Args:
+        room: An open room.
+        q_command: Shape (n, 6), rad, one row a physics step.
+        joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
+        dt: The physics step, s.
+        start_s: Time of the first row.
+    """
+
+    def __init__(
+        self, room: SimulatedWorkcell, q_command: Floats, joint_offsets: Floats, dt: float, start_s: float = 0.0
+    ) -> None:
+        self._room, self._q_command, self._joint_offsets = room, q_command, joint_offsets
+        self._dt, self._start_s, self._every = dt, start_s, round(RECORD_S / dt)
+        self._rows: list[int] = []
+        self._q: list[Floats] = []
+        self._poses: list[Floats] = []
+        self._touches: list[TouchAt] = []
+        self._max_speed = np.zeros(6)
+
+    def see(self, row: int) -> None:
+        """Look after the step of a row."""
+        arm, state = self._room.arm, self._room.arm.state()
+        self._max_speed = np.maximum(self._max_speed, np.abs(state.speed))
+        time = self._time(row)
+        self._touches += [TouchAt(time, t.link, self._room.bodies[t.body], t.depth_mm) for t in touches(arm)]
+        if row % self._every == 0 or row == len(self._q_command) - 1:
+            self._rows.append(row)
+            self._q.append(state.q - self._joint_offsets)
+            self._poses.append(arm.flange_pose())
+
+    def execution(self) -> Execution:
+        """What was seen so far."""
+        times = np.array([self._time(row) for row in self._rows])
+        found = np.array(self._q), np.array(self._poses), tuple(self._touches), self._max_speed
+        return Execution(times, self._q_command[self._rows], *found)
+
+    def _time(self, row: int) -> float:
+        return self._start_s + row * self._dt
+
+
 def execute(room: SimulatedWorkcell, q_command: Floats, joint_offsets: Floats) -> Execution:
-    """Drive the arm from rest at the first command through all of them, one a physics step.
+    """Move the arm by its position motors from rest at the first command through all of them, one a physics step.
 
     Args:
         room: An open room.
         q_command: Shape (n, 6), rad, spaced by the physics time step.
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
     """
-    arm = room.arm
+    arm, recorder = room.arm, Recorder(room, q_command, joint_offsets, TIME_STEP_S)
     speeds = np.gradient(q_command, TIME_STEP_S, axis=0) if len(q_command) > 1 else np.zeros_like(q_command)
     arm.place(q_command[0] + joint_offsets)
-    rows: list[int] = []
-    q: list[Floats] = []
-    poses: list[Floats] = []
-    seen: list[TouchAt] = []
-    max_speed = np.zeros(6)
-    for number, (angles, speed) in enumerate(zip(q_command, speeds, strict=True)):
+    for row, (angles, speed) in enumerate(zip(q_command, speeds, strict=True)):
         arm.command(angles + joint_offsets, speed)
         step(room.client)
-        state = arm.state()
-        max_speed = np.maximum(max_speed, np.abs(state.speed))
-        seen += [TouchAt(number, t.link, room.bodies[t.body], t.depth_mm) for t in touches(arm)]
-        if number % RECORD_EVERY == 0 or number == len(q_command) - 1:
-            rows.append(number)
-            q.append(state.q - joint_offsets)
-            poses.append(arm.flange_pose())
-    return Execution(np.array(rows), np.array(q), np.array(poses), tuple(seen), max_speed)
+        recorder.see(row)
+    return recorder.execution()
+
+
+def joined(first: Execution, then: Execution) -> Execution:
+    """Two executions, one after the other."""
+    return Execution(
+        np.concatenate([first.times_s, then.times_s]),
+        np.concatenate([first.q_command, then.q_command]),
+        np.concatenate([first.q, then.q]),
+        np.concatenate([first.T_base_flange, then.T_base_flange]),
+        first.touches + then.touches,
+        np.maximum(first.max_speed, then.max_speed),
+    )

@@ -1,0 +1,88 @@
+"""The insertion under a controller of the tip, taken over from the position motors while the arm is at rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.twin.world.client import TIME_STEP_S
+from puncture_twin.twin.world.control.admittance import Admittance, VirtualMass
+from puncture_twin.twin.world.control.gains import Stiffness, allowed_step
+from puncture_twin.twin.world.control.impedance import Impedance
+from puncture_twin.twin.world.control.reference import reference_of
+from puncture_twin.twin.world.control.rigid_model import RigidModel, rigid_model
+from puncture_twin.twin.world.control.run import Controller, Resistance, Surroundings, run
+from puncture_twin.twin.world.control.tip import Tip, tips
+from puncture_twin.twin.world.execution import Execution, Recorder
+from puncture_twin.twin.world.units import to_m
+from puncture_twin.twin.world.workcell import SimulatedWorkcell
+
+TipControl = Literal["impedance", "admittance"]
+"""A spring at the tip by joint torques, or by moved goals of the position motors."""
+
+
+@dataclass(frozen=True, eq=False)
+class Insertion:
+    """A straight motion of the tip.
+
+    Attributes:
+        model: The arm.
+        tool: What its flange carries.
+        down_base: Shape (3,), unit vector of gravity, base frame.
+        trajectory: From rest to rest.
+        hold_s: How long its end is held.
+    """
+
+    model: UrModel
+    tool: Tool
+    down_base: Floats
+    trajectory: Trajectory
+    hold_s: float
+
+
+def insert(
+    room: SimulatedWorkcell,
+    insertion: Insertion,
+    control: TipControl,
+    joint_offsets: Floats,
+    *,
+    start_s: float = 0.0,
+    resistance: Resistance | None = None,
+) -> Execution:
+    """Run an insertion from where the arm is.
+
+    Args:
+        room: An open room, its arm at rest at the trajectory's start.
+        insertion: What is wanted.
+        control: How the tip follows it.
+        joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
+        start_s: Time of its first step.
+        resistance: Of tissue; None for none.
+
+    Raises:
+        InputError: No time step carries the stiffness at some pose of the path.
+    """
+    model, tip_m = insertion.model, float(to_m(insertion.tool.needle_length_mm))
+    with rigid_model(model, insertion.tool, insertion.down_base) as rigid:
+        controller = _controller(rigid, control, insertion.trajectory.q)
+        reference = reference_of(model, tip_m, insertion.trajectory, controller.dt, insertion.hold_s)
+        recorder = Recorder(room, reference.q, joint_offsets, controller.dt, start_s)
+        around = Surroundings(joint_offsets, resistance, watch=recorder.see)
+        run(room.arm, controller, reference, lambda q: tips(model, tip_m, q[None]), around)
+    return recorder.execution()
+
+
+def _controller(rigid: RigidModel, control: TipControl, q_path: Floats) -> Controller:
+    """The controller with the longest step that the whole path allows."""
+    if control == "admittance":
+        return Admittance(rigid.kinematics, rigid.tip_m, VirtualMass(), TIME_STEP_S)
+    stiffness = Stiffness()
+    J = tips(rigid.kinematics, rigid.tip_m, q_path).J
+    dt = min(allowed_step(stiffness, row, rigid.mass_matrix(q)) for q, row in zip(q_path, J, strict=True))
+    return Impedance(rigid, stiffness, dt, keep_compliance=False)
