@@ -7,7 +7,7 @@ import importlib
 import sys
 from pathlib import Path
 
-NO_PARTS = ("__main__", "row")
+NO_PARTS = ("__main__", "row", "workbench")
 """Files beside the parts."""
 
 

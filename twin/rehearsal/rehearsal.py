@@ -1,7 +1,8 @@
 """A plan, executed in the twin: the arm moves under its motors, the patient lies where he truly lies.
 
 What is modelled: rigid bodies, gravity, motor lag and torque limits, joint offsets, a registration that errs; the
-insertion by the motors too, or by a spring at the tip (``[rehearsal] control``). What is not: tissue that resists or moves, a needle that bends, breathing.
+insertion by the motors too, or by a spring at the tip (``[rehearsal] control``). What is not: tissue that resists or
+moves, a needle that bends, breathing.
 """
 
 from __future__ import annotations

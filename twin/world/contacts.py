@@ -40,9 +40,7 @@ def touches(arm: Arm) -> tuple[Touch, ...]:
 def felt_force(arm: Arm, link: str) -> Floats:
     """What the bodies of the room press on one link with, as of the last physics step: shape (3,), N, world frame."""
     force = np.zeros(3)
-    for point in pybullet.getContactPoints(
-        bodyA=arm.body, linkIndexA=arm.links[link], physicsClientId=arm.client
-    ):
+    for point in pybullet.getContactPoints(bodyA=arm.body, linkIndexA=arm.links[link], physicsClientId=arm.client):
         if point[2] != arm.body:
             normal, (first, along_first, second, along_second) = np.array(point[7]), point[10:14]
             force += point[9] * normal + first * np.array(along_first) + second * np.array(along_second)

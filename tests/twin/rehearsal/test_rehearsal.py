@@ -202,6 +202,23 @@ def test_tip_path_is_the_straight_line_of_the_plan(exact):
     assert np.all(np.diff(along) < 0.05)
 
 
+@pytest.mark.parametrize("control", ["impedance", "admittance"])
+def test_control_of_the_tip_ends_where_the_motors_do(exact, control):
+    """In the air there is nothing to yield to; phases and times stay, and the hand-over moves nothing."""
+    controlled = dataclasses.replace(case(), rehearsal=RehearsalSection(control=control))
+    done = rehearse(PLAN, controlled, anatomy(vessel=ball(10.0, 60.0, 0.0, 0.0)), truth())
+    assert np.linalg.norm(done.tip_true_ct[-1] - exact.tip_true_ct[-1]) < APART_MM
+    assert done.contacts == () and done.times_s[-1] == pytest.approx(exact.times_s[-1], abs=0.01)
+    starts = [[run.times_s[run.phase == name][0] for name in ("settle", "insertion", "hold")] for run in (done, exact)]
+    np.testing.assert_allclose(*starts, atol=0.03)
+    np.testing.assert_allclose(done.clearance_mm["vessel"][-1], exact.clearance_mm["vessel"][-1], atol=APART_MM)
+    handed_over = np.flatnonzero(done.phase == "insertion")[0]
+    asked = flange_pose(UR3, done.q_command[handed_over - 1 : handed_over + 1])
+    tips = asked[:, :3, 3] + NEEDLE.length_mm * asked[:, :3, 2]
+    tips_ct = (tips - T_BASE_CT[:3, 3]) @ T_BASE_CT[:3, :3]
+    np.testing.assert_allclose(done.tip_true_ct[handed_over - 1 : handed_over + 1], tips_ct, atol=0.02)
+
+
 def test_same_truth_same_numbers(exact):
     """Bit for bit."""
     again = rehearse(PLAN, case(), anatomy(vessel=ball(10.0, 60.0, 0.0, 0.0)), truth())

@@ -1,4 +1,4 @@
-"""The arm in torque mode: its inverse dynamics, impedance and admittance at the needle's tip. SI units: m, kg, N, rad."""
+"""The arm in torque mode: inverse dynamics, impedance and admittance at the needle's tip. SI units: m, kg, N, rad."""
 
 import lazy_loader
 

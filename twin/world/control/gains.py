@@ -53,7 +53,9 @@ def damping(stiffness: Stiffness, J: Floats, M: Floats) -> Floats:
     With Lambda the tip's mass and B its factor such that Lambda = B B', K = B diag(w^2) B': D = 2 zeta B diag(w) B'.
     """
     inverse_mass = J @ np.linalg.solve(M, J.T)
-    squares, V = eigh(np.diag(stiffness.diagonal), np.linalg.inv((inverse_mass + inverse_mass.T) / 2))  # V' Lambda V = 1
+    squares, V = eigh(
+        np.diag(stiffness.diagonal), np.linalg.inv((inverse_mass + inverse_mass.T) / 2)
+    )  # V' Lambda V = 1
     B = np.linalg.inv(V).T
     return np.asarray(2.0 * stiffness.damping_ratio * (B * np.sqrt(squares)) @ B.T)
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import log_rotation
 from puncture_twin.twin.world.control.gains import Stiffness, damping, refuse_unstable
 from puncture_twin.twin.world.control.reference import Reference

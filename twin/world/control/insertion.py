@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
@@ -18,7 +16,7 @@ from puncture_twin.twin.world.control.impedance import Impedance
 from puncture_twin.twin.world.control.reference import reference_of
 from puncture_twin.twin.world.control.rigid_model import RigidModel, rigid_model
 from puncture_twin.twin.world.control.run import Controller, Resistance, Surroundings, run
-from puncture_twin.twin.world.control.tip import Tip, tips
+from puncture_twin.twin.world.control.tip import tips
 from puncture_twin.twin.world.execution import Execution, Recorder
 from puncture_twin.twin.world.units import to_m
 from puncture_twin.twin.world.workcell import SimulatedWorkcell

@@ -97,7 +97,9 @@ class Surroundings:
     watch: Callable[[int], None] | None = None
 
 
-def run(arm: Arm, controller: Controller, reference: Reference, tip_of: Callable[[Floats], Tip], around: Surroundings) -> Run:
+def run(
+    arm: Arm, controller: Controller, reference: Reference, tip_of: Callable[[Floats], Tip], around: Surroundings
+) -> Run:
     """Follow a reference from where the arm is.
 
     Args:

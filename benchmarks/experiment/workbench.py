@@ -1,0 +1,173 @@
+"""A UR3 at the carton of Chen et al. 2019, alone with a wall, a weight or a piece of tissue at its needle's tip."""
+
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.arm.insertion import flange_poses
+from puncture_twin.planning.arm.kinematics import inverse, nearest_within_limits
+from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.geometry.rigid import frame_about, pose
+from puncture_twin.planning.motion.timing import Rates, time_law
+from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
+from puncture_twin.planning.registration.registration import fit_rigid
+from puncture_twin.twin.world.arm import load_arm
+from puncture_twin.twin.world.bodies import load_box
+from puncture_twin.twin.world.client import physics_client
+from puncture_twin.twin.world.control.gains import Stiffness
+from puncture_twin.twin.world.control.impedance import Impedance
+from puncture_twin.twin.world.control.reference import reference_of
+from puncture_twin.twin.world.control.rigid_model import rigid_model
+from puncture_twin.twin.world.control.run import Goals, Surroundings, run
+from puncture_twin.twin.world.control.tip import tips
+from puncture_twin.twin.world.engine import pybullet
+
+UR3 = ur_model("ur3")
+TOOL = Tool(401.0, 250.0, 2.0, 30.0)
+TIP_M = 0.401
+HOME = np.radians([0, -90, -90, -90, 90, 0.0])
+MARKERS_CT = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80]])
+TOUCHED = np.array([[417.67, -291.23, 534.59], [557.74, -272.83, 534.57], [423.48, -231.41, 604.06]])
+T_BASE_CT = fit_rigid(MARKERS_CT, TOUCHED)
+THETA, BETA = np.radians([18.0, 232.0])
+OUTWARD = T_BASE_CT[:3, :3] @ [np.sin(THETA) * np.cos(BETA), np.sin(THETA) * np.sin(BETA), np.cos(THETA)]
+TARGET = T_BASE_CT[:3, :3] @ [50.0, 130, 63] + T_BASE_CT[:3, 3]
+DOWN = -T_BASE_CT[:3, 2]
+EXACT = np.zeros(6)
+FRICTION_NM = np.array([0.3, 0.3, 0.15, 0.05, 0.05, 0.05])
+
+
+def nearest(T_base_flange, q):
+    """The configuration of a pose nearest to another one."""
+    found = nearest_within_limits(UR3, inverse(UR3, T_base_flange)[0], q)
+    found = found[~np.isnan(found).any(axis=1)]
+    return found[np.argmin(np.abs(found - q).max(axis=1))]
+
+
+def along_needle(start_mm, length_mm, speed_mm_s):
+    """The needle moved in from a distance to the target, from rest to rest."""
+    law = time_law(length_mm, Rates(speed_mm_s, 100.0, 1000.0))
+    times = np.unique(np.append(np.arange(0.0, law.duration_s, SAMPLE_S), law.duration_s))
+    q = [nearest(flange_poses(TARGET, OUTWARD, TIP_M * 1e3 + start_mm)[0], HOME)]
+    for distance in start_mm - law.driven(times):
+        q.append(nearest(flange_poses(TARGET, OUTWARD, TIP_M * 1e3 + distance)[0], q[-1]))
+    return Trajectory(times, np.array(q[1:]))
+
+
+class Position:
+    """PyBullet's own position motors, beside the controllers of the tip."""
+
+    dt = 1 / 240
+
+    def act(self, measured, reference, row):
+        """Goals of the next step."""
+        del measured
+        return Goals(reference.q[row], reference.speed[row])
+
+
+class WithFriction:
+    """A controller whose torques Coulomb friction (6,), N m, works against, blurred below 2 mrad/s."""
+
+    def __init__(self, controller, friction_nm):
+        self.dt, self._controller, self._friction = controller.dt, controller, friction_nm
+
+    def act(self, measured, reference, row):
+        """Torques of the next step, friction taken off."""
+        action = self._controller.act(measured, reference, row)
+        return action._replace(torque_nm=action.torque_nm - self._friction * np.clip(measured.speed / 2e-3, -1, 1))
+
+
+class Bench(NamedTuple):
+    """An open world with the arm, and the controller's model of it."""
+
+    client: int
+    arm: object
+    model: object
+
+
+@contextmanager
+def bench(down=DOWN, factors=None, T_world_base=None):
+    """Open it; the true masses are the model's times some factors, one a link."""
+    with physics_client(down) as client, rigid_model(UR3, TOOL, down) as model:
+        arm = load_arm(client, UR3, TOOL, T_world_base)
+        for link in range(-1, -1 if factors is None else pybullet.getNumJoints(arm.body, physicsClientId=client)):
+            mass, _, inertia = pybullet.getDynamicsInfo(arm.body, link, physicsClientId=client)[:3]
+            scaled = {"mass": mass * factors[link], "localInertiaDiagonal": [one * factors[link] for one in inertia]}
+            pybullet.changeDynamics(arm.body, link, **scaled, physicsClientId=client)
+        yield Bench(client, arm, model)
+
+
+def true_tip(q):
+    """The tip of true joints."""
+    return tips(UR3, TIP_M, q[None])
+
+
+def follow(bench, controller, trajectory, *, settle_s=0.0, hold_s=0.5, resistance=None, place=True):
+    """Rest at the trajectory's start, then run it; the run, and the tip's error of every row after the rest, mm."""
+    around = Surroundings(EXACT, resistance)
+    if place:
+        bench.arm.place(trajectory.q[0])
+    if settle_s > 0:
+        rest = reference_of(UR3, TIP_M, Trajectory(np.zeros(1), trajectory.q[:1]), controller.dt, settle_s)
+        run(bench.arm, controller, rest, true_tip, around)
+    reference = reference_of(UR3, TIP_M, trajectory, controller.dt, hold_s)
+    done = run(bench.arm, controller, reference, true_tip, around)
+    return done, 1e3 * np.linalg.norm(done.tip_m - reference.position_m[: len(done.tip_m)], axis=1)
+
+
+def impedance(bench, K=2e4, K_i=5.0, dt=5e-4, keep=False):
+    """A spring at the tip."""
+    return Impedance(bench.model, Stiffness(K, integral_per_s=K_i), dt, keep_compliance=keep)
+
+
+class Pressed(NamedTuple):
+    """What a wall felt."""
+
+    times_s: np.ndarray
+    force_n: np.ndarray
+    steady_n: float
+    peak_n: float
+    lost_steps: int
+    felt_mm: float
+    """How deep in the wall the tip was when it was first felt."""
+
+
+def press(controller_of, wall_n_m=None, *, ahead_mm=2.0, over_mm=3.0, speed_mm_s=5.0, hold_s=1.0):
+    """Run the needle square onto a wall and on; the wall is rigid where it has no stiffness."""
+    trajectory = along_needle(60.0, ahead_mm + over_mm, speed_mm_s)
+    with bench() as world:
+        face, into = TARGET + (60.0 - ahead_mm) * OUTWARD, -OUTWARD
+        wall = load_box(world.client, np.array([200.0, 200, 40]), pose(frame_about(into), face + 20.0 * into))
+        if wall_n_m is not None:
+            soft = {"contactStiffness": wall_n_m, "contactDamping": 100.0}
+            pybullet.changeDynamics(wall, -1, **soft, physicsClientId=world.client)
+        done, _ = follow(world, controller_of(world), trajectory, hold_s=hold_s)
+    force = np.linalg.norm(done.force_n, axis=1)
+    first = int(np.argmax(force > 0))
+    steady = float(force[-round(0.2 / done.dt) :].mean())
+    depth = float((1e3 * done.tip_m[first] - face) @ into)
+    times = done.dt * np.arange(len(force))
+    return Pressed(times, force, steady, float(force.max()), int((force[first:] == 0).sum()), depth)
+
+
+class Layers:
+    """Skin that ruptures at 4 N, a capsule at 25 mm, cutting and shaft friction: along the needle, N over mm."""
+
+    def __init__(self, entry_m):
+        self._entry, self._skin, self._capsule = entry_m, False, False
+
+    def __call__(self, tip, velocity):
+        """The force on the tip, (3,), N."""
+        into = tip.R_base_tip[0, :, 2]
+        depth = 1e3 * float((tip.position_m[0] - self._entry) @ into)
+        return -self._force(depth) * np.clip((velocity @ into) / 1e-3, -1, 1) * into if depth > 0 else np.zeros(3)
+
+    def _force(self, depth):
+        self._skin = self._skin or depth > 4.0
+        self._capsule = self._capsule or depth > 28.0
+        if not self._skin:
+            return 1.0 * depth
+        capsule = 0.0 if self._capsule else max(0.0, depth - 25.0) * 0.7
+        return 0.9 + 0.02 * depth + capsule
