@@ -40,8 +40,8 @@ LIMB_ATTACHED = (
     f"unknown_region ({ATTACHED_LIMB})"
 )
 
-MOST_ROOM = 0.02
-"""Of a body, that a CT beside its skin may show as the room's air: an open mouth and nose hold less."""
+MOST_AIR = 0.02
+"""Of a body, that a CT beside its skin may show as the ambient air: an open mouth and nose hold less."""
 CT_SHIFTED = (
     "the CT {name} shows {fraction:.0%} of what the skin encloses as the room's air: it is likely shifted against the "
     "skin (a slip of space, another position or breath); what it adds (outside_body, unnamed_dense, unnamed_gas) lies "
@@ -118,7 +118,7 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
         loader.warnings.append(OUTSIDE_NOT_KNOWN)
     else:
         outside = _outside(case, scan, loader.warnings)
-        if (fraction := scan.room_in_skin()) > MOST_ROOM:
+        if (fraction := scan.air_in_skin()) > MOST_AIR:
             loader.warnings.append(CT_SHIFTED.format(name=scan.name, fraction=fraction))
         if any(structure.name == ATTACHED_LIMB for structure in outside):
             loader.warnings.append(LIMB_ATTACHED)

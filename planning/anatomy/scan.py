@@ -27,7 +27,7 @@ from puncture_twin.planning.anatomy.body.outside_body import (
     outside_mask,
     outside_surface,
 )
-from puncture_twin.planning.anatomy.body.room_air import room_fraction
+from puncture_twin.planning.anatomy.body.room_air import outside_air_fraction
 from puncture_twin.planning.anatomy.body.support import FACES, find_support
 from puncture_twin.planning.anatomy.body.unscanned import measured_hu, unscanned_voxels
 from puncture_twin.planning.anatomy.second_witness import BodyImage, Named, Unnamed, unnamed_surfaces
@@ -139,18 +139,22 @@ class Scan:
         named = {"structures": [f"{one.name} {_digest(one.mesh)}" for one in structures]}
         return Unnamed(*self._kept({"what": "unnamed", "dense_hu": dense_hu, **named}, lambda: list(make())))
 
-    def room_in_skin(self) -> float:
-        """How much of a body, whose skin comes from elsewhere, is the room's air in this CT; 0..1."""
+    def air_in_skin(self) -> float:
+        """How much of a body, whose skin comes from elsewhere, is the ambient air in this CT; 0..1."""
         if self.skin is None:
             return 0.0
 
         def make() -> Arrays:
-            return {"fraction": np.array(room_fraction(self._hu, self._body, self._ct.spacing_mm, self._tolerance_mm))}
+            return {
+                "fraction": np.array(
+                    outside_air_fraction(self._hu, self._body, self._ct.spacing_mm, self._tolerance_mm)
+                )
+            }
 
         made_from = {"what": "room in skin", "skin": _digest(self.skin.mesh)}
         return float(self.source.kept(made_from, make, by=__name__, check=_fraction)["fraction"])
 
-    def holds(self, point_ct: NDArray[np.float64]) -> bool:
+    def contains(self, point_ct: NDArray[np.float64]) -> bool:
         """Whether a point (3,), LPS mm, lies in the image; only the header is read."""
         grid = self.source.source.grid
         index = np.linalg.solve(grid.T_ct_index, np.append(point_ct, 1.0))[:3]

@@ -45,7 +45,7 @@ class Named(NamedTuple):
     mesh: TriangleMesh
 
     @property
-    def may_hold_gas(self) -> bool:
+    def may_contain_gas(self) -> bool:
         """Whether its name is that of lung, bowel or another hollow organ that air gets into."""
         words = re.findall("[a-z]+", self.name.lower())
         return any(word.startswith(GAS_HOLDERS) or word in GAS_WORDS for word in words)
@@ -60,7 +60,7 @@ class BodyImage:
         body: Same shape.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
         spacing_mm: Shape (3,).
-        slack_mm: So deep below the body's surface there may still be the room's air, because the surface is from
+        slack_mm: So deep below the body's surface there may still be the ambient air, because the surface is from
             elsewhere and was widened.
     """
 
@@ -91,7 +91,7 @@ def unnamed_surfaces(image: BodyImage, structures: Sequence[Named], *, dense_hu:
     dense = image.body & (image.hu >= dense_hu) & ~named
     gas = image.hu < GAS_HU
     if gas.any():
-        gas &= _deep(image) & ~_grown_union([one for one in structures if one.may_hold_gas], image)
+        gas &= _deep(image) & ~_grown_union([one for one in structures if one.may_contain_gas], image)
     return Unnamed(_surface(dense, image, where), _surface(gas, image, where))
 
 

@@ -81,13 +81,13 @@ def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) ->
     odd = found.count % 2 == 1
     if mesh.closed and not odd.all():
         rotated = directions.copy()
-        rotated[~odd] = _turned(directions[~odd])
+        rotated[~odd] = _rotated(directions[~odd])
         found = crossings(mesh, origin, rotated)
         odd = found.count % 2 == 1
     return found, odd
 
 
-def _turned(directions: Floats) -> Floats:
+def _rotated(directions: Floats) -> Floats:
     helper = np.eye(3)[np.argmin(np.abs(directions), axis=1)]
     aside = np.cross(directions, helper)
     rotated = directions + NUDGE * aside / np.linalg.norm(aside, axis=1, keepdims=True)

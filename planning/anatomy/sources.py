@@ -151,7 +151,7 @@ class StructureSources:
             return None
         self._progress("CT beside the structures")
         scan = Scan(name, self._volume(name), None if own else skin)
-        if not scan.holds(self._case.target_ct):
+        if not scan.contains(self._case.target_ct):
             raise InputError(
                 f"[ct] file '{name}' does not show the target: a slip of file or space?",
                 where=self._case.path,

@@ -1,4 +1,4 @@
-"""A CT gantry for the arm's room: a wall with a round bore, as boxes that leave less room than the bore, never more."""
+"""A CT gantry for the arm's workcell: a wall with a round bore, as boxes that never leave more space than the bore."""
 
 from __future__ import annotations
 

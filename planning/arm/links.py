@@ -226,8 +226,8 @@ def _crossings(starts: Floats, ends: Floats, axis: int, cut: float) -> Floats:
     """Where edges (n, 3) to (n, 3) pass the plane ``axis = cut``, shape (k, 3), mm."""
     a, b = starts[:, axis], ends[:, axis]
     crosses = (a - cut) * (b - cut) < 0.0
-    share = ((cut - a[crosses]) / (b[crosses] - a[crosses]))[:, None]
-    points = starts[crosses] + share * (ends[crosses] - starts[crosses])
+    fraction = ((cut - a[crosses]) / (b[crosses] - a[crosses]))[:, None]
+    points = starts[crosses] + fraction * (ends[crosses] - starts[crosses])
     points[:, axis] = cut
     return np.asarray(points)
 

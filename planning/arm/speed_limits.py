@@ -15,7 +15,7 @@ class SpeedLimits(NamedTuple):
     """Of the needle's tip, on the approach: what ISO 10218-1 calls reduced speed."""
 
     insertion_speed_mm_s: float = 10.0
-    """Of the tip, along the insertion: a needle is driven slowly, and an operator must be able to stop it."""
+    """Of the tip, along the insertion: a needle is inserted slowly, and an operator must be able to stop it."""
 
     joint_speed_fraction: float = 0.5
     """Of each joint's highest speed, as MoveIt's velocity scaling."""

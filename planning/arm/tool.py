@@ -1,4 +1,4 @@
-"""What the arm carries and what stands about it: needle holder and needle, and the room's boxes."""
+"""What the arm carries and what stands about it: needle holder and needle, and the workcell's boxes."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Tool:
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """A solid cuboid in the room, such as the table.
+    """A solid cuboid in the workcell, such as the table.
 
     Attributes:
         name: What contacts call it.

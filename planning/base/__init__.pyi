@@ -28,7 +28,7 @@ from .provenance import (
 )
 from .reasons import (
     REASON_COLOURS as REASON_COLOURS,
-    REASON_WORDS as REASON_WORDS,
+    REASON_TEXT as REASON_TEXT,
     SAFE as SAFE,
     Reason as Reason,
     Rgb as Rgb,

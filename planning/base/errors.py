@@ -64,8 +64,8 @@ def one_line(text: str, most: int = MOST_MESSAGE) -> str:
         text: Any text.
         most: Characters, from 3 on; a longer text loses its middle.
     """
-    words = " ".join(text.split())
-    if len(words) > most:
+    line = " ".join(text.split())
+    if len(line) > most:
         head = (most - 3) // 2
-        words = words[:head] + "..." + words[len(words) - (most - 3 - head) :]
-    return "".join(c if c.isprintable() else "?" for c in words)
+        line = line[:head] + "..." + line[len(line) - (most - 3 - head) :]
+    return "".join(c if c.isprintable() else "?" for c in line)

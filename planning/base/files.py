@@ -102,7 +102,7 @@ def check_writable(folder: Path) -> Path:
     try:
         str(folder).encode("utf-8")
         nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists() or place.is_symlink())
-        usable = nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK) and _room_for_names(nearest, folder)
+        usable = nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK) and _names_fit(nearest, folder)
     except (OSError, ValueError) as error:
         raise InputError(f"output folder cannot be used ({error})", where=_shown(folder), allowed=allowed) from error
     if not usable:
@@ -110,7 +110,7 @@ def check_writable(folder: Path) -> Path:
     return folder
 
 
-def _room_for_names(nearest: Path, folder: Path) -> bool:
+def _names_fit(nearest: Path, folder: Path) -> bool:
     """Whether every part of the name fits the file system, and no folder of a file's name is in the way."""
     longest = os.pathconf(nearest, "PC_NAME_MAX")
     names = all(len(part.encode()) <= longest for part in folder.parts)

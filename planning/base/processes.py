@@ -23,7 +23,7 @@ def worker_count(wanted: int, pieces: int) -> int:
     """Processes for some pieces of work: no more than wanted, than the processor's cores, or than pieces.
 
     Args:
-        wanted: What the caller asks for; any number.
+        wanted: What the caller wants; any number.
         pieces: Of the work.
 
     Returns:

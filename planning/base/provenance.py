@@ -105,7 +105,7 @@ class InputFiles:
         return content
 
     def read(self, role: str, name: str, *, max_bytes: int, key: str, where: Path) -> bytes:
-        """The content of a file, which is read where no role has asked for it before.
+        """The content of a file, which is read where no role has wanted it before.
 
         Args:
             role: What the file is to the result.

@@ -53,7 +53,7 @@ REASON_COLOURS = MappingProxyType(
     }
 )
 
-REASON_WORDS = MappingProxyType(
+REASON_TEXT = MappingProxyType(
     {
         Reason.NONE: "safe",
         Reason.NO_SKIN_ENTRY: "no skin entry",

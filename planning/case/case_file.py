@@ -263,7 +263,7 @@ class RobotSection(Section):
 
 
 class ObstacleSection(Section):
-    """A box in the room (table, gantry side), axes parallel to its frame's."""
+    """A box in the workcell (table, gantry side), axes parallel to its frame's."""
 
     name: Name
     frame: Literal["ct", "base"]

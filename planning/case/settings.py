@@ -68,7 +68,7 @@ class CtSettings:
 
 @dataclass(frozen=True, eq=False)
 class Obstacle:
-    """A box in the room, axes parallel to its frame's."""
+    """A box in the workcell, axes parallel to its frame's."""
 
     name: str
     frame: str

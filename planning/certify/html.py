@@ -8,7 +8,7 @@ import numpy as np
 
 from puncture_twin.planning.base.html import Facts, card, never_raises
 from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
-from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_WORDS, SAFE, Rgb
+from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Rgb
 
 UNDECIDED: Rgb = (255, 255, 255)
 """Of cells that are too small to say: neither a safe colour nor a reason's."""
@@ -35,7 +35,7 @@ def _map(certificate: Any) -> str:
     reasons = list(REASON_COLOURS)
     legend = [
         Entry("proven safe for the organs", SAFE),
-        *(Entry(REASON_WORDS[reason], REASON_COLOURS[reason]) for reason in reasons),
+        *(Entry(REASON_TEXT[reason], REASON_COLOURS[reason]) for reason in reasons),
         Entry("undecided", UNDECIDED),
     ]
     number = {reason.value: row for row, reason in enumerate(reasons, start=1)}

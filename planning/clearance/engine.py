@@ -30,7 +30,7 @@ class AxisDistances:
 
 
 class ClearanceEngine(Protocol):
-    """Prepared once for a set of surfaces, asked for any target.
+    """Prepared once for a set of surfaces, wanted any target.
 
     An engine sees surfaces only. That a needle lies wholly inside a closed surface is the caller's to find, and is
     decided by the target alone, because every axis starts there (see `puncture_twin.planning.clearance.measure`).
@@ -42,7 +42,7 @@ class ClearanceEngine(Protocol):
         """Exact distances of the axes from ``target_ct`` (3,) along ``outward_ct`` (n, 3).
 
         ``length`` is one number or shape (k,), mm: as long is an axis for each structure. Without ``shown`` no progress
-        is told: the same axes are asked again.
+        is told: the same axes are tested again.
         """
         ...
 

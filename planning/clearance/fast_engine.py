@@ -44,7 +44,7 @@ class _Placed:
 class FastEngine:
     """Exact distances by bundles of directions over trees of discs; FCL where a verdict hangs on rounding.
 
-    Answers what `FclEngine` answers, to rounding of float64. Prepared once for a patient's surfaces, asked for any
+    Answers what `FclEngine` answers, to rounding of float64. Prepared once for a patient's surfaces, wanted any
     target; FCL's own tree of a structure is built when `collides` is first called for it.
 
     Args:

@@ -50,10 +50,10 @@ class FclEngine:
             if shown and self._progress is not None:
                 self._progress(row + 1, len(outward_ct))
         for column, mesh in enumerate(self._meshes):
-            met = distance[:, column] <= 0
-            distance[met, column] = 0.0
-            if met.any():
-                depth[met, column] = first_crossing(mesh, target_ct, outward_ct[met], float(lengths[column]))
+            touching = distance[:, column] <= 0
+            distance[touching, column] = 0.0
+            if touching.any():
+                depth[touching, column] = first_crossing(mesh, target_ct, outward_ct[touching], float(lengths[column]))
         return AxisDistances(distance, depth, nearest)
 
     def normals(self, target_ct: Floats, outward_ct: Floats, axes: AxisDistances) -> Floats:

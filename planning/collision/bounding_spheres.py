@@ -1,8 +1,8 @@
-"""Balls that enclose the bodies of an arm: what is clear of them is clear of the body.
+"""Spheres that enclose the bodies of an arm: what is clear of them is clear of the body.
 
-A ball is convex, so it contains the convex hull of any points in it. A convex piece is cut by planes into smaller
+A sphere is convex, so it contains the convex hull of any points in it. A convex piece is cut by planes into smaller
 ones; the corners of each part are the piece's corners on that side and the points where its edges cross the plane;
-a ball about those corners contains the part, and the parts together are the piece (docs/concepts/arm-collisions.md).
+a sphere about those corners contains the part, and the parts together are the piece (docs/concepts/arm-collisions.md).
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.geometry.triangle_distance import farthest_from
 
 LEAF_RADIUS_MM = 30.0
-"""Parts are cut until their ball is no larger: half of a UR3 wrist's size."""
+"""Parts are cut until their sphere is no larger: half of a UR3 wrist's size."""
 
 SLACK_MM = 1e-6
-"""Every ball is larger by this: covers the rounding of cuts and of the hull's edges (about 1e-12 mm)."""
+"""Every sphere is larger by this: covers the rounding of cuts and of the hull's edges (about 1e-12 mm)."""
 
 CENTRE_STEPS = 25
-"""Of the walk to a ball's centre; how good it is decides how tight the ball is, never whether it encloses."""
+"""Of the walk to a sphere's centre; how good it is decides how tight the sphere is, never whether it encloses."""
 
 INSIDE = 1e-5
-"""By this share a prism within a cylinder is smaller still: more than the slack of any cylinder of 1 mm or more."""
+"""By this fraction a prism within a cylinder is smaller still: more than the slack of any cylinder of 1 mm or more."""
 
 PRISM_SIDES = 24
 """Of the prism about a cylinder: 0.9 % fuller than it."""
 
 
 class BoundingSphere(NamedTuple):
-    """A ball, mm."""
+    """A sphere, mm."""
 
     centre: Floats
     radius: float
@@ -57,8 +57,8 @@ class Coarse(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class BallTree:
-    """Balls in a tree, the root first: every node's ball encloses all parts below it.
+class SphereTree:
+    """Spheres in a tree, the root first: every node's sphere encloses all parts below it.
 
     Attributes:
         centres: Shape (n, 3), mm, in the frame of the body.
@@ -72,7 +72,7 @@ class BallTree:
 
     @property
     def leaves(self) -> NDArray[np.int64]:
-        """Rows of the leaves, whose balls together cover the body."""
+        """Rows of the leaves, whose spheres together cover the body."""
         return np.flatnonzero(self.children[:, 0] < 0)
 
 
@@ -88,7 +88,7 @@ def settings() -> dict[str, float]:
 
 
 def enclosing_sphere(points: Floats) -> BoundingSphere:
-    """A small ball about points (n, 3): steps toward the farthest point, ever shorter (Badoiu and Clarkson 2003)."""
+    """A small sphere about points (n, 3): steps toward the farthest point, ever shorter (Badoiu and Clarkson 2003)."""
     centre = np.empty(3)
     radius = _walk_to_centre(np.ascontiguousarray(points), CENTRE_STEPS, centre)
     return BoundingSphere(centre, radius + SLACK_MM)
@@ -160,8 +160,8 @@ def halves(corners: Floats) -> tuple[Floats, Floats]:
     return np.concatenate([corners[below], crossings]), np.concatenate([corners[~below], crossings])
 
 
-def sphere_tree(pieces: Sequence[Floats], leaf_radius_mm: float = LEAF_RADIUS_MM) -> BallTree:
-    """Balls that enclose the union of convex pieces, each given by its corners (n, 3), mm."""
+def sphere_tree(pieces: Sequence[Floats], leaf_radius_mm: float = LEAF_RADIUS_MM) -> SphereTree:
+    """Spheres that enclose the union of convex pieces, each given by its corners (n, 3), mm."""
     spheres: list[BoundingSphere] = []
     children: list[tuple[int, int]] = []
 
@@ -178,9 +178,9 @@ def sphere_tree(pieces: Sequence[Floats], leaf_radius_mm: float = LEAF_RADIUS_MM
         return row
 
     add(pieces)
-    return BallTree(
-        np.array([ball.centre for ball in spheres]),
-        np.array([ball.radius for ball in spheres]),
+    return SphereTree(
+        np.array([sphere.centre for sphere in spheres]),
+        np.array([sphere.radius for sphere in spheres]),
         np.array(children, dtype=np.int64),
     )
 

@@ -79,13 +79,13 @@ class CellChecker:
     Args:
         model: The arm; its meshes must ship (UR3, UR5, UR10).
         tool: What the flange carries.
-        boxes: Solids of the room, base frame. The base link is not tested against them: it is bolted to one.
-        patient: The skin, base frame, mm; None for an empty room.
+        boxes: Solids of the workcell, base frame. The base link is not tested against them: it is bolted to one.
+        patient: The skin, base frame, mm; None for an empty workcell.
         skin: The skin alone, where ``patient`` holds more: the base may touch the rest (a table), not the skin, and
             contacts with the rest are named ``outside_body``.
         padding_mm: How much fuller the arm is for contacts with patient and boxes (not for distances, nor with itself):
             room for what robot and registration get wrong. With 1 mm or more, free states between which no body moves
-            more than 2 mm prove that the way between them meets neither patient nor box.
+            more than 2 mm prove that the path between them meets neither patient nor box.
 
     Raises:
         InputError: If the padding is negative, two boxes share a name, the patient's mesh is unusable, or the base
@@ -116,7 +116,7 @@ class CellChecker:
         if patient is not None:
             self._bounds[PATIENT] = patient.bounds
             self._refuse_base_in(patient, patient if skin is None else skin)
-        self._checks = tuple(self._room_checks()) + tuple(self._self_checks())
+        self._checks = tuple(self._workcell_checks()) + tuple(self._self_checks())
 
     def contact(self, q: Floats, *, needle_may_touch_patient: bool) -> Contact | None:
         """The first contact found, or None when the arm is clear.
@@ -204,7 +204,7 @@ class CellChecker:
             return check.contact
         return check.contact._replace(other=OUTSIDE_BODY)
 
-    def _room_checks(self) -> Iterator[Check]:
+    def _workcell_checks(self) -> Iterator[Check]:
         """Every moving body against the patient, then the boxes."""
         for body in self._bodies[1:]:
             if self._patient is not None:
@@ -232,14 +232,14 @@ class CellChecker:
         base = self._bodies[0]
         centre = collision_links(self.model)[0].mesh.bounds.mean(axis=0)
         surface = skin_surface(skin, PATIENT)
-        if touch(surface, base.bare.surface) or _holds(skin, centre):
+        if touch(surface, base.bare.surface) or _encloses(skin, centre):
             raise InputError("the robot's base stands in the patient", where="cell", allowed="a base outside the skin")
-        if patient is not skin and _holds(patient, centre):
+        if patient is not skin and _encloses(patient, centre):
             what = "the robot's base stands in what the CT shows outside of the body (its table?)"
             raise InputError(what, where="cell", allowed="a base outside of it")
 
 
-def _holds(mesh: TriangleMesh, point: Floats) -> bool:
+def _encloses(mesh: TriangleMesh, point: Floats) -> bool:
     """Whether a point lies inside a surface; more than half around an open one counts too."""
     side = side_of(mesh, point)
     return side is Side.INSIDE or (side is Side.UNKNOWN and abs(winding_number(mesh, point)) > 0.5)

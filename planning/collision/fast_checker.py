@@ -1,4 +1,4 @@
-"""The same verdicts as :class:`CellChecker`, sooner: FCL is asked only where balls and planes prove nothing."""
+"""The same verdicts as :class:`CellChecker`, sooner: FCL is queried only where spheres and planes prove nothing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from puncture_twin.planning.collision.checker import (
     require_finite,
 )
 from puncture_twin.planning.collision.never_touching import without_neighbours
-from puncture_twin.planning.collision.proofs import Motion, Proofs, ask_fcl
+from puncture_twin.planning.collision.proofs import Motion, Proofs, fcl_touches
 from puncture_twin.planning.collision.segments import SegmentChecker
 from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.collision.sweep import SweptBodies
@@ -59,16 +59,16 @@ class FastChecker(CellChecker):
         super().__init__(model, tool, boxes, patient, skin=skin, padding_mm=padding_mm)
         self._swept_full = SweptBodies.of(model, tool, padding_mm)
         self._proofs = Proofs(model, self._checks, boxes, patient, cache)
-        self._asked = without_neighbours(model, self._checks, self._proofs, cache)
+        self._tested = without_neighbours(model, self._checks, self._proofs, cache)
         self._still = (np.zeros((1, 7)), np.zeros((1, 6)))
-        needle = np.array([check.contact == NEEDLE_IN_PATIENT for check in self._asked])
+        needle = np.array([check.contact == NEEDLE_IN_PATIENT for check in self._tested])
         self._masks = {False: np.ones_like(needle), True: ~needle}
         self._padding_mm = padding_mm
 
     def contact(self, q: Floats, *, needle_may_touch_patient: bool) -> Contact | None:
         """See :meth:`CellChecker.contact`."""
-        met = self.first_contact(np.asarray(q)[None], needle_may_touch_patient=needle_may_touch_patient)
-        return None if met is None else met.contact
+        first = self.first_contact(np.asarray(q)[None], needle_may_touch_patient=needle_may_touch_patient)
+        return None if first is None else first.contact
 
     def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
         """See :meth:`CellChecker.first_contact`."""
@@ -79,9 +79,9 @@ class FastChecker(CellChecker):
     def _first_contact(self, motion: Motion, mask: Bools) -> FirstContact | None:
         open_at = self._proofs.first_unproven(motion, 0, mask)
         while open_at >= 0:
-            index, check = divmod(open_at, len(self._asked))
-            if ask_fcl(self._asked[check], motion.frames[index]):
-                return FirstContact(index, self._named(self._asked[check]))
+            index, check = divmod(open_at, len(self._tested))
+            if fcl_touches(self._tested[check], motion.frames[index]):
+                return FirstContact(index, self._named(self._tested[check]))
             open_at = self._proofs.first_unproven(motion, open_at + 1, mask)
         return None
 
@@ -95,7 +95,7 @@ class FastChecker(CellChecker):
 
     def segment_checker(self) -> SegmentChecker:
         """A check of many segments, which remembers what touched last."""
-        return SegmentChecker(self.model, self._asked, self._proofs)
+        return SegmentChecker(self.model, self._tested, self._proofs)
 
     def open_checks(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact]:
         """The questions at ``q`` (6,) that are left to FCL."""
@@ -103,14 +103,14 @@ class FastChecker(CellChecker):
         mask = self._masks[needle_may_touch_patient]
         found, open_at = [], self._proofs.first_unproven(motion, 0, mask)
         while open_at >= 0:
-            found.append(self._asked[open_at].contact)
+            found.append(self._tested[open_at].contact)
             open_at = self._proofs.first_unproven(motion, open_at + 1, mask)
         return found
 
     def next_nearer(self, motion: Motion, begin: int, pair: str, body: str, mm: float) -> int:
         """The first state at or after one that is not proven to keep one kind of a body's distance; -1 for none.
 
-        The bounds are of the padded body: every plane and every ball stands off the bare one by the padding.
+        The bounds are of the padded body: every plane and every sphere stands off the bare one by the padding.
 
         Args:
             motion: Of :meth:`motion`.
@@ -119,12 +119,12 @@ class FastChecker(CellChecker):
             body: One of its bodies.
             mm: The distance, of the body without its padding, that is to be exceeded.
         """
-        room = [check.contact.body == body and check.first_body is None for check in self._asked]
-        skin = [check.contact.other == PATIENT for check in self._asked]
-        asked = np.array(room) & (np.array(skin) == (pair != "boxes"))
-        rest = Motion(motion.frames[begin:], motion.moved[begin:], motion.turned[begin:])
-        at = self._proofs.first_unproven(rest, 0, asked, mm - self._padding_mm)
-        return -1 if at < 0 else begin + at // len(self._asked)
+        of_body = [check.contact.body == body and check.first_body is None for check in self._tested]
+        skin = [check.contact.other == PATIENT for check in self._tested]
+        tested = np.array(of_body) & (np.array(skin) == (pair != "boxes"))
+        rest = Motion(motion.frames[begin:], motion.moved[begin:], motion.rotated[begin:])
+        at = self._proofs.first_unproven(rest, 0, tested, mm - self._padding_mm)
+        return -1 if at < 0 else begin + at // len(self._tested)
 
     def motion(self, path: Floats) -> Motion:
         """States (m, 6) with what the bounds need of them."""

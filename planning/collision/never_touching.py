@@ -1,4 +1,4 @@
-"""Pieces two joints apart that never touch, at no angle: proven once for an arm, and not asked again."""
+"""Pieces two joints apart that never touch, at no angle: proven once for an arm, and not tested again."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.collision.checker import Check
-from puncture_twin.planning.collision.proofs import Proofs, ask_fcl, made_from
+from puncture_twin.planning.collision.proofs import Proofs, fcl_touches, made_from
 
-Judge = Callable[[int, Floats], bool]
+Touches = Callable[[int, Floats], bool]
 
 JOINTS_BETWEEN = 2
 """Such pairs see two angles alone, whose square can be searched in full; a cube of three would take too long."""
@@ -39,7 +39,9 @@ def without_neighbours(model: UrModel, checks: Sequence[Check], proofs: Proofs, 
     pieces = [hull for pair in pairs for hull in pair if hull is not None]
     stored = cache.arrays(
         made_from("never touching", [model.lengths, proofs.joint_spans[between], *pieces]),
-        lambda: {"never": never_touching(model, proofs, lambda check, frames: ask_fcl(checks[check], frames))[between]},
+        lambda: {
+            "never": never_touching(model, proofs, lambda check, frames: fcl_touches(checks[check], frames))[between]
+        },
         by=__name__,
     )
     never = between.copy()
@@ -48,28 +50,28 @@ def without_neighbours(model: UrModel, checks: Sequence[Check], proofs: Proofs, 
     return tuple(check for check, gone in zip(checks, never.tolist(), strict=True) if not gone)
 
 
-def never_touching(model: UrModel, proofs: Proofs, touches: Judge) -> Bools:
+def never_touching(model: UrModel, proofs: Proofs, touches: Touches) -> Bools:
     """Which checks of a cell (k,) are proven clear at every angle: squares of angles, quartered until each is proven.
 
     Args:
         model: The arm.
         proofs: Its checks, packed.
-        touches: Asked where enclosures overlap: whether a check's bodies do, at frames (7, 4, 4).
+        touches: Called where enclosures overlap: whether a check's bodies do, at frames (7, 4, 4).
     """
     never = np.zeros(len(proofs), np.bool_)
     spans = proofs.joint_spans
     apart = np.where(spans[:, 0] > 0, spans[:, 2] - spans[:, 1], 0)
     for first in range(6):
-        asked = (apart == JOINTS_BETWEEN) & (spans[:, 1] == first)
-        if asked.any():
-            never |= _clear_all_over(model, proofs, touches, first, asked)
+        tested = (apart == JOINTS_BETWEEN) & (spans[:, 1] == first)
+        if tested.any():
+            never |= _clear_all_over(model, proofs, touches, first, tested)
     return never
 
 
-def _clear_all_over(model: UrModel, proofs: Proofs, touches: Judge, joint: int, asked: Bools) -> Bools:
-    """Which of the checks asked (k,) are clear wherever two neighbouring joints stand."""
+def _clear_all_over(model: UrModel, proofs: Proofs, touches: Touches, joint: int, tested: Bools) -> Bools:
+    """Which of the tested checks (k,) are clear at all angles of two neighbouring joints."""
     middles, half = np.zeros((1, 2)), np.pi
-    unproven, touching = asked[None], np.zeros_like(asked)
+    unproven, touching = tested[None], np.zeros_like(tested)
     for _ in range(HALVINGS):
         q, turns = np.zeros((len(middles), 6)), np.zeros(6)
         q[:, joint : joint + 2], turns[joint : joint + 2] = middles, half
@@ -85,4 +87,4 @@ def _clear_all_over(model: UrModel, proofs: Proofs, touches: Judge, joint: int, 
         unproven, half = np.repeat(still[kept], len(QUARTERS), axis=0), half / 2.0
     else:
         touching |= unproven.any(axis=0)
-    return asked & ~touching
+    return tested & ~touching

@@ -1,4 +1,4 @@
-"""The checks of one cell as compiled code takes them: hulls, balls and the skin's tree, packed once."""
+"""The checks of one cell as compiled code takes them: hulls, spheres and the skin's tree, packed once."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.collision import bounding_spheres as enclosures
 from puncture_twin.planning.collision.bodies import Body
 from puncture_twin.planning.collision.bounding_spheres import (
-    BallTree,
+    SphereTree,
     coarse_hull,
     enclosing_sphere,
     inscribed_prism,
@@ -43,7 +43,7 @@ NO_BOX = -1.0
 """Half sizes of what is no box."""
 
 FIELD_MARGIN_MM = 500.0
-"""How far around the skin distances are kept: beyond, they are seldom asked for."""
+"""How far around the skin distances are kept: beyond, they are seldom needed."""
 
 MOST_CELLS = 4_000_000
 """Of that field (16 MB): a larger skin gets a narrower margin."""
@@ -57,7 +57,7 @@ class Motion(NamedTuple):
 
     frames: Floats
     moved: Floats
-    turned: Floats
+    rotated: Floats
 
 
 class Around(NamedTuple):
@@ -77,7 +77,7 @@ class Proofs:
     Args:
         model: The arm.
         checks: The questions, in order.
-        boxes: The room's boxes.
+        boxes: The workcell's boxes.
         patient: The skin, or None.
         cache: Where enclosures are kept: they depend on arm and tool alone.
     """
@@ -110,7 +110,7 @@ class Proofs:
         return len(self._proven)
 
     def drop(self, never: Bools) -> None:
-        """Ask no more of some checks (k,): the others keep their order."""
+        """Drop some checks (k,) for good: the others keep their order."""
         kept = ~never
         self.scene = self.scene._replace(checks=self.scene.checks[kept])
         self.movers = self.movers._replace(of_check=self.movers.of_check[kept])
@@ -118,36 +118,36 @@ class Proofs:
         self._work, self._proven = scratch(int(kept.sum()), len(self.scene.hulls.radii)), self._proven[kept].copy()
 
     def first_unproven(
-        self, motion: Motion, begin: int, asked: Bools, clear_mm: float = proof_kernels.MIN_GAP_MM
+        self, motion: Motion, begin: int, tested: Bools, clear_mm: float = proof_kernels.MIN_GAP_MM
     ) -> int:
         """The first check at or after ``begin``, counted as state * checks + check, that is not proven; -1 for none.
 
         Args:
             motion: The states, in order.
             begin: 0 for a new path.
-            asked: Shape (k,): which checks.
+            tested: Shape (k,): which checks.
             clear_mm: What the distance must exceed.
         """
         if begin == 0:
             self._proven.fill(-np.inf)
         at = divmod(begin, len(self._proven))
-        arguments = (self.scene, self._levers, tuple(motion), self._work, self._proven, *at, asked, clear_mm)
+        arguments = (self.scene, self._levers, tuple(motion), self._work, self._proven, *at, tested, clear_mm)
         return int(proof_kernels.first_unproven(*arguments))
 
-    def clear_about(self, frames: Floats, turns: Floats, asked: Bools) -> Around:
+    def clear_about(self, frames: Floats, turns: Floats, tested: Bools) -> Around:
         """Prove checks clear all about some states.
 
         Args:
             frames: Shape (m, 7, 4, 4), mm: the states.
             turns: Shape (6,), rad: how far each joint may turn either way from each of them.
-            asked: Shape (m, k): what is to be proven.
+            tested: Shape (m, k): what is to be proven.
         """
-        unproven, gaps = asked.copy(), np.full(asked.shape, np.inf)
+        unproven, gaps = tested.copy(), np.full(tested.shape, np.inf)
         proof_kernels.clear_about(self.scene, self.movers, frames, turns, self._work, gaps, unproven)
         return Around(gaps <= 0.0, unproven)
 
 
-def ask_fcl(check: Check, frames: Floats) -> bool:
+def fcl_touches(check: Check, frames: Floats) -> bool:
     """Whether the shapes of a check touch where ``link_poses`` (7, 4, 4) has them."""
     check.second.setTransform(check.second_body.pose(frames))
     if check.first_body is not None:
@@ -185,7 +185,7 @@ def _moving(checks: Sequence[Check]) -> Movers:
             frames.append(body.frame)
             spheres.append(enclosing_sphere(_in_frame(corners, body)))
         mover.append(rows[key])
-    centres, radii = np.array([ball.centre for ball in spheres]), np.array([ball.radius for ball in spheres])
+    centres, radii = np.array([sphere.centre for sphere in spheres]), np.array([sphere.radius for sphere in spheres])
     return Movers(np.array(mover, dtype=np.int64), np.array(frames, dtype=np.int64), centres, radii)
 
 
@@ -240,13 +240,13 @@ class _Hulls:
 
 
 def _enclosed(hulls: Sequence[Floats]) -> Arrays:
-    """Of each convex hull a ball about it and a coarse hull: their numbers, one array each."""
+    """Of each convex hull a sphere about it and a coarse hull: their numbers, one array each."""
     spheres, coarse = [enclosing_sphere(corners) for corners in hulls], [coarse_hull(corners) for corners in hulls]
     edges, first = [neighbours(corners) for corners in hulls], _starts([len(corners) for corners in hulls])
     rows = [hull.rows + start for hull, start in zip(edges, first[:-1], strict=True)]
     return {
-        "centres": np.array([ball.centre for ball in spheres]).reshape(-1, 3),
-        "radii": np.array([ball.radius for ball in spheres]),
+        "centres": np.array([sphere.centre for sphere in spheres]).reshape(-1, 3),
+        "radii": np.array([sphere.radius for sphere in spheres]),
         "slack": np.array([hull.slack_mm for hull in coarse]),
         "sizes": np.array([len(hull.corners) for hull in coarse], dtype=np.int64),
         "few": np.concatenate([np.empty((0, 3)), *(hull.corners for hull in coarse)]),
@@ -274,7 +274,7 @@ def _axes(points: Floats) -> _Axes:
 
 
 def _skin(patient: TriangleMesh | None) -> SkinTree:
-    """The skin's tree and its field, of which nothing is known yet; or some that no check asks for."""
+    """The skin's tree and its field, of which nothing is known yet; or some that no check wants."""
     if patient is None:
         nothing = (np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 1, 3, 3)))
         return SkinTree(nothing, np.zeros((1, 1, 1), np.float32), np.zeros(3))
@@ -293,12 +293,12 @@ def _tree_arrays(pieces: Sequence[Floats]) -> Arrays:
 
 
 def _trees(bodies: Sequence[Body], cache: Cache) -> tuple[dict[str, int], tuple[Floats, Floats, Ints]]:
-    """The balls of the bodies' full shapes, each in the body's frame, and the row of each body's root."""
+    """The spheres of the bodies' full shapes, each in the body's frame, and the row of each body's root."""
     roots: dict[str, int] = {}
     centres, radii, children = [np.empty((0, 3))], [np.empty(0)], [np.empty((0, 2), np.int64)]
     for body in bodies:
         pieces = [_in_frame(hull, body) for hull in body.full.hulls]
-        tree = BallTree(**cache.arrays(made_from("balls", pieces), partial(_tree_arrays, pieces), by=__name__))
+        tree = SphereTree(**cache.arrays(made_from("balls", pieces), partial(_tree_arrays, pieces), by=__name__))
         start = sum(len(part) for part in radii)
         roots[body.name] = start
         centres.append(tree.centres)

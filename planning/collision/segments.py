@@ -13,8 +13,8 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.checker import Check, Contact, require_finite
 from puncture_twin.planning.collision.kernels import segments as segment_kernels
-from puncture_twin.planning.collision.kernels.segments import ASK, CONTACT, NOT_FINITE, Answer
-from puncture_twin.planning.collision.proofs import Proofs, ask_fcl
+from puncture_twin.planning.collision.kernels.segments import CONTACT, NOT_FINITE, QUERY, Answer
+from puncture_twin.planning.collision.proofs import Proofs, fcl_touches
 
 LOOK_FIRST_RAD = 0.125
 """States of a segment so far apart are looked at before it is proven: what it touches is found soonest so."""
@@ -28,9 +28,9 @@ QUESTIONS = 256
 
 
 class SegmentChecker:
-    """Says of straight joint segments whether they are free. Not for several threads.
+    """Checks whether straight joint segments are free. Not for several threads.
 
-    What touched last is asked first. That decides which contact is named where there are several, and never whether a
+    What touched last is tested first. That decides which contact is named where there are several, and never whether a
     segment is free: each segment's proof begins anew.
 
     Args:
@@ -43,7 +43,7 @@ class SegmentChecker:
         self._model, self._checks = model, checks
         self._packed = (proofs.scene, proofs.movers, model.lengths)
         self._order = np.arange(len(checks), dtype=np.int64)
-        self._answer = _room_for(QUESTIONS)
+        self._answer = _empty_answer(QUESTIONS)
 
     def __call__(self, start: Floats, end: Floats) -> Contact | None:
         """A contact on the segment between two states (6,), rad, the needle being outside the patient; None if free.
@@ -61,29 +61,29 @@ class SegmentChecker:
             segment_kernels.check_segment(
                 *self._packed, start, end, fractions, begin, FINE_MM, self._order, self._answer
             )
-            status, check, begin, asked = self._answer.status.tolist()
+            status, check, begin, count = self._answer.status.tolist()
             if status == NOT_FINITE:
                 require_finite(np.stack([start, end]))
             if status == CONTACT:
-                return self._met(check)
-            if asked > len(self._answer.shares):
-                self._answer, begin = _room_for(2 * asked), 0
+                return self._contact(check)
+            if count > len(self._answer.fractions):
+                self._answer, begin = _empty_answer(2 * count), 0
                 continue
-            questions = self._answer.shares[:asked].tolist(), self._answer.checks[:asked].tolist()
+            questions = self._answer.fractions[:count].tolist(), self._answer.checks[:count].tolist()
             for fraction, at in zip(*questions, strict=True):
-                if ask_fcl(self._checks[at], link_poses(self._model, start + fraction * (end - start))):
-                    return self._met(at)
-            if status != ASK:
+                if fcl_touches(self._checks[at], link_poses(self._model, start + fraction * (end - start))):
+                    return self._contact(at)
+            if status != QUERY:
                 return None
 
-    def _met(self, check: int) -> Contact:
-        """The contact of a check, which is asked first from now on."""
+    def _contact(self, check: int) -> Contact:
+        """The contact of a check, which is tested first from now on."""
         if self._order[0] != check:
             self._order = np.concatenate([[check], self._order[self._order != check]])
         return self._checks[check].contact
 
 
-def _room_for(questions: int) -> Answer:
+def _empty_answer(questions: int) -> Answer:
     return Answer(np.zeros(4, np.int64), np.empty(questions), np.empty(questions, np.int64))
 
 
@@ -101,5 +101,5 @@ def halving_order(count: int) -> Floats:
 
 @lru_cache(maxsize=256)
 def looks(count: int) -> Floats:
-    """Where on a segment so many states stand, the end first: shares of its way, shape (n,)."""
+    """Where on a segment so many states stand, the end first: fractions of its path, shape (n,)."""
     return np.asarray(1.0 - halving_order(count))

@@ -42,7 +42,7 @@ def convex(mesh: TriangleMesh) -> fcl.Convex:
 
 
 def padded(mesh: TriangleMesh, padding_mm: float) -> TriangleMesh:
-    """A convex mesh grown by at least ``padding_mm`` on every side: its sum with the cube about a ball of that size."""
+    """A convex mesh grown by at least ``padding_mm`` on every side: its sum with the cube about such a sphere."""
     if padding_mm == 0.0:
         return mesh
     corners = padding_mm * np.array(list(product((-1.0, 1.0), repeat=3)))

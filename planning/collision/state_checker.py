@@ -49,7 +49,7 @@ class Distances(NamedTuple):
     needle: Nearest
     """Needle to the skin: 0 while it goes in."""
     boxes: Nearest
-    """Moving links, holder and needle to the room's boxes."""
+    """Moving links, holder and needle to the workcell's boxes."""
 
 
 DISTANCE_PAIRS: Mapping[str, tuple[str, ...]] = MappingProxyType(

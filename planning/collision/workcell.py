@@ -19,7 +19,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, pose
 
 ARM_PADDING_MM = 5.0
-"""The arm keeps this distance from patient and room: more than the registration's error, and enough to prove the way
+"""The arm keeps this distance from all around it: more than the registration's error, and enough to prove the path
 between two checked states."""
 
 
@@ -92,7 +92,7 @@ def patient_surface(anatomy: Anatomy) -> TriangleMesh:
 
 
 def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats) -> FastChecker:
-    """The collision checker of the case's room, with the patient where ``T_base_ct`` says.
+    """The collision checker of the case's workcell, with the patient where ``T_base_ct`` says.
 
     Raises:
         InputError: The robot's base stands in the patient, or the gantry's wall does.

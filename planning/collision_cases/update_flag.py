@@ -1,4 +1,4 @@
-"""The flag ``--collision-update``: light, since every run of pytest asks for it."""
+"""The flag ``--collision-update``: light, since every run of pytest wants it."""
 
 from __future__ import annotations
 

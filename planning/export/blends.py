@@ -62,17 +62,17 @@ def _radius_mm(checker: StateChecker, waypoints: Floats) -> float:
 
 
 def _fraction_within(checker: StateChecker, corner: Floats, other: Floats, radius_mm: float) -> float:
-    """The last share of the way from a corner at which the tip is still within a radius of it, or the next sample.
+    """The last fraction of the path from a corner at which the tip is still within a radius of it, or the next sample.
 
     1 where the tip is so near the other end, so that half of the distance between two tips bounds both radii.
     """
-    shares = np.linspace(0.0, 1.0, SAMPLES + 1)
-    poses = flange_pose(checker.model, corner + shares[:, None] * (other - corner))
+    fractions = np.linspace(0.0, 1.0, SAMPLES + 1)
+    poses = flange_pose(checker.model, corner + fractions[:, None] * (other - corner))
     tips = poses[:, :3, 3] + checker.tool.needle_length_mm * poses[:, :3, 2]
     far = np.linalg.norm(tips - tips[0], axis=1)
     if radius_mm > LARGEST_FRACTION * far[-1]:
         return 1.0
-    return float(shares[min(SAMPLES, int(np.flatnonzero(far <= radius_mm)[-1]) + 1)])
+    return float(fractions[min(SAMPLES, int(np.flatnonzero(far <= radius_mm)[-1]) + 1)])
 
 
 def _free(checker: StateChecker, corner: Floats, back: Floats, ahead: Floats) -> bool:

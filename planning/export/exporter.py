@@ -1,4 +1,4 @@
-"""Export: written, read back, held against the plan and the arm's limits, and only then published."""
+"""Export: written, read back, compared with the plan and the arm's limits, and only then published."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ POSITION_SLACK_RAD = 1e-9
 """A printed angle may round beyond its limit by this."""
 
 RELATIVE_SLACK = 1e-6
-"""Rounding of printed speeds and of differences, as a share of the limit."""
+"""Rounding of printed speeds and of differences, as a fraction of the limit."""
 
 ROUNDINGS = 8.0
 """Differences of differences of angles carry at most this many roundings of one angle."""

@@ -138,9 +138,9 @@ def straight_move(model: UrModel, program: Program) -> Trajectory:
     """
     start, end = program.T_base_standoff[:3, 3], program.T_base_target[:3, 3]
     length = float(np.linalg.norm(end - start))
-    times, driven = _trapezoid(length, program.insertion_mm_s, program.insertion_mm_s2)
+    times, travelled = _trapezoid(length, program.insertion_mm_s, program.insertion_mm_s2)
     poses = np.repeat(program.T_base_target[None], len(times), axis=0)
-    poses[:, :3, 3] = start + driven[:, None] * (end - start) / length - program.tcp_mm * poses[:, :3, 2]
+    poses[:, :3, 3] = start + travelled[:, None] * (end - start) / length - program.tcp_mm * poses[:, :3, 2]
     branches = inverse(model, poses)
     off = np.abs(wrap_to_pi(branches[0] - program.standoff_q)).max(axis=1)
     if np.isnan(off).all():
@@ -160,7 +160,7 @@ def _joint_move(trajectory: Trajectory, first: int, last: int, blend_mm: float) 
     return JointMove(q[-1], ramp.speed, ramp.acceleration, blend_mm)
 
 
-def _ramp(driven: Floats, times: Floats) -> _Ramp:
+def _ramp(travelled: Floats, times: Floats) -> _Ramp:
     """The trapezoid from rest to rest with a motion's length L, duration T and highest acceleration a.
 
     From T = L / v + v / a follows v = a (T - sqrt(T^2 - 4 L / a)) / 2: below the motion's own peak speed, since a plan
@@ -168,15 +168,15 @@ def _ramp(driven: Floats, times: Floats) -> _Ramp:
     apart can make it seem, v = a T / 2 takes longer.
 
     Args:
-        driven: Shape (m,), rad or mm.
+        travelled: Shape (m,), rad or mm.
         times: Shape (m,), s.
     """
     steps = np.diff(times)
-    speeds = np.concatenate([[0.0], np.diff(driven) / steps, [0.0]])
+    speeds = np.concatenate([[0.0], np.diff(travelled) / steps, [0.0]])
     between = (np.concatenate([[0.0], steps]) + np.concatenate([steps, [0.0]])) / 2.0
     acceleration = float(np.abs(np.diff(speeds) / between).max())
     duration = float(times[-1] - times[0])
-    spare = max(0.0, duration**2 - 4.0 * float(driven[-1]) / acceleration)
+    spare = max(0.0, duration**2 - 4.0 * float(travelled[-1]) / acceleration)
     return _Ramp(acceleration * (duration - math.sqrt(spare)) / 2.0, acceleration)
 
 
@@ -203,10 +203,10 @@ def _insertion_ramp(plan: Plan, tips: Floats) -> _Ramp:
 def _trapezoid(length: float, speed: float, acceleration: float) -> tuple[Floats, Floats]:
     """Times and distances run, both (m,), from rest to rest, in equal steps of ``STREAM_S`` or, of a long one, more."""
     speed = min(speed, math.sqrt(length * acceleration))
-    ramp, hold = speed / acceleration, length / speed - speed / acceleration
-    end = 2.0 * ramp + hold
+    ramp, plateau = speed / acceleration, length / speed - speed / acceleration
+    end = 2.0 * ramp + plateau
     times = np.linspace(0.0, end, min(max(2, math.ceil(end / STREAM_S)), MOST_SAMPLES) + 1)
-    early, late = np.minimum(times, ramp), np.maximum(times - ramp - hold, 0.0)
-    driven = acceleration * early**2 / 2 + speed * (times - early) - acceleration * late**2 / 2
-    driven[-1] = length
-    return times, driven
+    early, late = np.minimum(times, ramp), np.maximum(times - ramp - plateau, 0.0)
+    travelled = acceleration * early**2 / 2 + speed * (times - early) - acceleration * late**2 / 2
+    travelled[-1] = length
+    return times, travelled

@@ -29,10 +29,10 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import POSE_TOLERANCE_MM, SPEED_ROUNDING, STRAIGHT_TOLERANCE_MM
 
 SAME_BRANCH_RAD = 0.01
-"""How far the joints of the straight move may end from the plan's: a hundredth of the way to another branch."""
+"""How far the joints of the straight move may end from the plan's: a hundredth of the path to another branch."""
 
 SAME_RATE = 1e-6
-"""How far, as a share, a printed speed may be from the plan's: a speed of 1e-6 rad/s still has six digits."""
+"""How far, as a fraction, a printed speed may be from the plan's: a speed of 1e-6 rad/s still has six digits."""
 
 TURN_TOLERANCE_RAD = 1e-3
 """How far the straight move's orientation may be from the plan's: 0.2 mm over 200 mm of needle."""
@@ -86,10 +86,10 @@ def _check_approach(program: Program, plan: Plan, model: UrModel, where: Path) -
     check_positions(model, path, what="approach", where=where)
     _check_same(path, plan.approach.q[waypoint_rows(plan)], "the approach", where)
     for (start, end), move in zip(pairwise(path), program.moves, strict=True):
-        share = np.abs(end - start) / np.abs(end - start).max()
-        rates = share[None] * move.speed, share[None] * move.acceleration
+        fraction = np.abs(end - start) / np.abs(end - start).max()
+        rates = fraction[None] * move.speed, fraction[None] * move.acceleration
         check_rates(model, *rates, what="approach", where=where)
-        _check_tip(model, start, end, share * move.speed * np.sign(end - start), plan, where)
+        _check_tip(model, start, end, fraction * move.speed * np.sign(end - start), plan, where)
     if program.moves and program.moves[-1].blend_mm != 0.0:
         raise InputError("the approach does not stop at its end", where=where, allowed="a last blend of 0")
 
@@ -110,38 +110,38 @@ def _check_insertion(program: Program, plan: Plan, model: UrModel, where: Path) 
         ("standoff", program.T_base_standoff, tips[0]),
         ("target", program.T_base_target, tips[-1]),
     ):
-        off, turned = _pose_difference(read, planned)
-        if not (off <= POSE_TOLERANCE_MM and turned <= TURN_TOLERANCE_RAD):
+        off, angle = _pose_difference(read, planned)
+        if not (off <= POSE_TOLERANCE_MM and angle <= TURN_TOLERANCE_RAD):
             raise InputError(f"the {name} pose is {off:.3g} mm off", where=where, allowed=f"{POSE_TOLERANCE_MM} mm")
     if not program.insertion_mm_s <= plan.speeds.insertion_speed_mm_s * (1.0 + SPEED_ROUNDING):
         allowed = f"at most {plan.speeds.insertion_speed_mm_s:g} mm/s"
         raise InputError(f"the insertion at {program.insertion_mm_s:.4g} mm/s", where=where, allowed=allowed)
-    turned = _pose_difference(program.T_base_standoff, program.T_base_target)[1]
-    if not turned <= TURN_TOLERANCE_RAD:
-        raise InputError(f"the needle turns by {turned:.3g} rad on its way", where=where, allowed="a straight way")
-    driven = straight_move(model, program)
-    ends = np.abs(driven.q[[0, -1]] - np.stack([program.standoff_q, program.target_q])).max()
+    angle = _pose_difference(program.T_base_standoff, program.T_base_target)[1]
+    if not angle <= TURN_TOLERANCE_RAD:
+        raise InputError(f"the needle turns by {angle:.3g} rad on its way", where=where, allowed="a straight way")
+    moved = straight_move(model, program)
+    ends = np.abs(moved.q[[0, -1]] - np.stack([program.standoff_q, program.target_q])).max()
     if not ends <= SAME_BRANCH_RAD:
         raise InputError(f"the straight move ends {ends:.3g} rad off", where=where, allowed="the plan's own branch")
-    worst = _farthest_mm(flange_pose(model, driven.q)[:, :3, 3], flange_pose(model, plan.insertion.q)[:, :3, 3])
+    worst = _farthest_mm(flange_pose(model, moved.q)[:, :3, 3], flange_pose(model, plan.insertion.q)[:, :3, 3])
     if not worst <= STRAIGHT_TOLERANCE_MM:
         raise InputError(f"the straight move is {worst:.3g} mm off the plan's way", where=where, allowed="the plan")
-    check_trajectory(model, driven, time_resolution_s=0.0, what="insertion", where=where)
+    check_trajectory(model, moved, time_resolution_s=0.0, what="insertion", where=where)
 
 
 def _farthest_mm(points: Floats, line: Floats) -> float:
     """The farthest that points (m, 3) stand from the straight line through the ends of another way (k, 3)."""
     unit = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
     worst = 0.0
-    for way in (points, line):
-        away = way - line[0]
+    for path in (points, line):
+        away = path - line[0]
         worst = max(worst, float(np.linalg.norm(away - (away @ unit)[:, None] * unit, axis=1).max()))
     return worst
 
 
 def _pose_difference(T_a: Floats, T_b: Floats) -> tuple[float, float]:
-    turned = math.acos(float(np.clip((np.trace(T_a[:3, :3].T @ T_b[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
-    return float(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3])), turned
+    angle = math.acos(float(np.clip((np.trace(T_a[:3, :3].T @ T_b[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
+    return float(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3])), angle
 
 
 def _check_same(read: Floats, planned: Floats, what: str, where: Path) -> None:

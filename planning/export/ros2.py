@@ -75,7 +75,7 @@ def velocities(model: UrModel, trajectory: Trajectory) -> Floats:
 
     Of three parabolas through a sample and two neighbours (both before, one on each side, both after) at least two have
     the motion's own slope when its acceleration changes at samples only, and not at two in a row: the middle one of the
-    three slopes is taken. It is held within what keeps a cubic through the samples between its neighbours.
+    three slopes is taken. It is kept within what keeps a cubic through the samples between its neighbours.
 
     Args:
         model: The arm.
@@ -117,7 +117,7 @@ def _middle_slope(slopes: Floats, steps: Floats) -> Floats:
 
 
 def read_ros2(text: str, model: UrModel, *, where: Path) -> SampledMotion:
-    """Read the messages back, line by line as they are written; speeds are held against the limits.
+    """Read the messages back, line by line as they are written; speeds are compared with the limits.
 
     Raises:
         InputError: Any line that is not one of this layout's, other joints, or points that are no motion.

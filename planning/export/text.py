@@ -30,7 +30,7 @@ def heading(plan: Plan, notes: Iterable[str], *, case_checked: bool) -> list[str
 
     Args:
         plan: The plan that the file holds.
-        case_checked: Whether the plan was held against its case when it was exported.
+        case_checked: Whether the plan was compared with its case when it was exported.
         notes: Further lines.
     """
     lines = [

@@ -155,13 +155,13 @@ def read_urscript(text: str, *, where: Path) -> Program:
     values = {match[1]: _floats(match[2]) for line in lines if (match := _VALUE.fullmatch(line))}
     moves = [match for line in lines if (match := _MOVEJ.fullmatch(line))]
     streamed = [match for line in lines if (match := _SERVOJ.fullmatch(line))]
-    driven = [(at, match) for at, line in enumerate(lines) if (match := _INSERTION.fullmatch(line))]
+    insertions = [(at, match) for at, line in enumerate(lines) if (match := _INSERTION.fullmatch(line))]
     others = sum(line.lstrip().startswith(("movej", "movel", "movep", "movec", "servo", "speed")) for line in lines)
     settles = lines.count(_SETTLE) if streamed else 0
     waits = [at for at, line in enumerate(lines) if line == _WAIT]
-    if len(values) != 6 or len(driven) != 1 or others != len(moves) + len(streamed) + 2 + settles:
+    if len(values) != 6 or len(insertions) != 1 or others != len(moves) + len(streamed) + 2 + settles:
         raise InputError("the program does not read back", where=where, allowed="known moves and one insertion")
-    at, insertion = driven[0]
+    at, insertion = insertions[0]
     last = max((n for n, line in enumerate(lines) if line.startswith(("  movej", "  servoj"))), default=-1)
     if len(waits) != 1 or not last < waits[0] < at:
         raise InputError("the insertion does not wait for the operator", where=where, allowed="a wait before it")

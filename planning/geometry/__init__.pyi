@@ -18,8 +18,8 @@ from .rigid import (
     log_rotation as log_rotation,
     log_twist as log_twist,
     pose as pose,
+    rotated_about as rotated_about,
     skew as skew,
-    turned_about as turned_about,
 )
 from .spaces import Space as Space, Unit as Unit, parse_space as parse_space, parse_unit as parse_unit, to_lps as to_lps
 from .triangle_distance import farthest_from as farthest_from, squared_distance as squared_distance

@@ -22,10 +22,10 @@ X = TypeVar("X")
 """What is estimated."""
 
 NO_PIVOT = 1e-15
-"""An eigenvalue of the normal equations below this share of the largest is rounding: no step is made along it."""
+"""An eigenvalue of the normal equations below this fraction of the largest is rounding: no step is made along it."""
 
 SMALL_GAIN = 1e-10
-"""A step that would lower the cost by a smaller share is not made: the fit has settled."""
+"""A step that would lower the cost by a smaller fraction is not made: the fit has settled."""
 
 NOT_HIGHER = 1 + 1e-12
 """A cost that rises by no more than rounding has not risen."""

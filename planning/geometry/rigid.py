@@ -88,7 +88,7 @@ def apply(T_b_a: NDArray[np.floating[Any]], points_a: NDArray[np.floating[Any]])
     return np.asarray(points_a @ T_b_a[:3, :3].T + T_b_a[:3, 3])
 
 
-def turned_about(T: Floats, center: Floats, change: Floats) -> Floats:
+def rotated_about(T: Floats, center: Floats, change: Floats) -> Floats:
     """A pose (4, 4) turned about a point (3,) of the frame that it leads to, then shifted.
 
     Args:

@@ -10,7 +10,7 @@ from puncture_twin.planning.anatomy.regions import USUAL, absent_organs
 from puncture_twin.planning.init.segmentation import Assigned
 
 LEAST_SHOWN = 0.3
-"""Of a region's usual organs; with fewer the region is told by nothing."""
+"""Of a region's usual organs; with fewer the region is found by nothing."""
 
 
 class Holding(NamedTuple):

@@ -7,5 +7,5 @@ from .approach import (
     least_clearance as least_clearance,
     plan_approach as plan_approach,
 )
-from .follow import MAX_JERK as MAX_JERK, drive_smoothly as drive_smoothly
+from .follow import MAX_JERK as MAX_JERK, follow_smoothly as follow_smoothly
 from .trajectory import SAMPLE_S as SAMPLE_S, Peaks as Peaks, Trajectory as Trajectory

@@ -176,8 +176,8 @@ def _segment_check(checker: StateChecker, resolution_rad: float) -> SegmentConta
         return checker.segment_checker()
 
     def sampled(start: Floats, end: Floats) -> Contact | None:
-        shares = halving_order(max(1, math.ceil(float(np.linalg.norm(end - start)) / resolution_rad)))
-        states = end + shares[:, None] * (start - end)
+        fractions = halving_order(max(1, math.ceil(float(np.linalg.norm(end - start)) / resolution_rad)))
+        states = end + fractions[:, None] * (start - end)
         return first_contact(checker, states)
 
     return sampled

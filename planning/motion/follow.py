@@ -39,7 +39,7 @@ TIP_STEP_RAD = 0.005
 """Of the samples at which the tip's speed along a path is looked at; between two of them it rises by at most 5e-5 of
 what the arm's whole reach would have: h^2 / 8 times the second derivative."""
 
-TIP_SHARE = 0.999
+TIP_FRACTION = 0.999
 """Of the tip's speed limit that is used: what samples may miss."""
 
 TINY = 1e-30
@@ -61,7 +61,7 @@ class _Straight(NamedTuple):
         return self.law.duration_s
 
     def at(self, times_s: Floats) -> Floats:
-        return np.asarray(self.start + self.law.driven(times_s)[:, None] * self.direction)
+        return np.asarray(self.start + self.law.travelled(times_s)[:, None] * self.direction)
 
 
 class _Round(NamedTuple):
@@ -95,7 +95,7 @@ class _Slow(NamedTuple):
         if self.tip is None:
             return math.inf
         fastest = float(tip_rates(model, q, directions, self.tip.tip_mm).max())
-        return TIP_SHARE * self.tip.speed_mm_s / max(fastest, TINY)
+        return TIP_FRACTION * self.tip.speed_mm_s / max(fastest, TINY)
 
 
 def rounded(corner: Floats, before: Floats, after: Floats, cut: float, fraction: Floats) -> Floats:
@@ -250,7 +250,7 @@ def _ending_at(end: Floats, rows: Floats) -> Trajectory:
     return Trajectory(SAMPLE_S * np.arange(len(q), dtype=np.float64), q)
 
 
-def drive_smoothly(model: UrModel, q: Floats, depths_mm: Floats, *, max_tip_speed_mm_s: float) -> Trajectory:
+def follow_smoothly(model: UrModel, q: Floats, depths_mm: Floats, *, max_tip_speed_mm_s: float) -> Trajectory:
     """Run a dense, smooth motion in one go, such as the insertion: rest, steady tip speed, rest.
 
     A cubic spline over depth passes through every row. With the tip's speed v, acceleration a and jerk j, and the
@@ -261,7 +261,7 @@ def drive_smoothly(model: UrModel, q: Floats, depths_mm: Floats, *, max_tip_spee
     Args:
         model: The arm.
         q: Shape (m, 6), rad, m >= 2.
-        depths_mm: Shape (m,), strictly rising, mm driven at each row.
+        depths_mm: Shape (m,), strictly rising, mm inserted at each row.
         max_tip_speed_mm_s: mm/s.
 
     Returns:
@@ -278,7 +278,7 @@ def drive_smoothly(model: UrModel, q: Floats, depths_mm: Floats, *, max_tip_spee
     spline = CubicSpline(depths, q)
     law = time_law(float(depths[-1] - depths[0]), _tip_rates(model, spline, max_tip_speed_mm_s))
     steps = _steps(law.duration_s)
-    return _ending_at(q[-1], spline(depths[0] + law.driven(law.duration_s * np.arange(steps + 1) / steps)))
+    return _ending_at(q[-1], spline(depths[0] + law.travelled(law.duration_s * np.arange(steps + 1) / steps)))
 
 
 def _tip_rates(model: UrModel, spline: CubicSpline, max_tip_speed_mm_s: float) -> Rates:

@@ -37,7 +37,7 @@ class TimeLaw(NamedTuple):
     profile: Profile | None
     """Ruckig's; None where the speed is constant."""
 
-    def driven(self, times_s: Floats) -> Floats:
+    def travelled(self, times_s: Floats) -> Floats:
         """The length run at some times (m,) from 0 to ``duration_s``."""
         if self.profile is None:
             return np.asarray(self.length * times_s / self.duration_s)
@@ -68,7 +68,7 @@ def time_law(length: float, rates: Rates, start_speed: float = 0.0, end_speed: f
 
 
 def speed_change_length(start_speed: float, end_speed: float, rates: Rates) -> float:
-    """The shortest way from one speed to another, both without acceleration: the mean speed times the time it takes.
+    """The shortest path from one speed to another, both without acceleration: the mean speed times the time it takes.
 
     The speed changes by jerk, steady acceleration and jerk again, in |dv| / a + a / j, or 2 sqrt(|dv| / j) where the
     acceleration limit is not reached.

@@ -1,4 +1,4 @@
-"""The arm as balls, and whether they keep clear of the patient and the workcell: quick, and about right.
+"""The arm as spheres, and whether they keep clear of the patient and the workcell: quick, and about right.
 
 Only for choosing where to look: what a placement is worth says :func:`planning.reach.reach.assess_reach_all`.
 """
@@ -22,7 +22,7 @@ from puncture_twin.planning.collision.bounding_spheres import prism, sphere_tree
 from puncture_twin.planning.place.obstacle_field import CELL_MM, Boxes, SkinField
 
 BALL_MM = 30.0
-"""Bodies are cut until their balls are no larger: half of a UR3 wrist's size."""
+"""Bodies are cut until their spheres are no larger: half of a UR3 wrist's size."""
 
 FLANGE = 6
 """The frame of wrist 3, with which the holder moves."""
@@ -30,12 +30,12 @@ FLANGE = 6
 
 @dataclass(frozen=True, eq=False)
 class ArmSpheres:
-    """Balls that enclose the links and the needle's holder, in bodies; not the needle.
+    """Spheres that enclose the links and the needle's holder, in bodies; not the needle.
 
     Attributes:
         centres: Shape (n, 3), mm, each in its body's frame.
         radii: Shape (n,), mm.
-        starts: Shape (k + 1,): the first ball of each body, which encloses all of the body; the others cover it.
+        starts: Shape (k + 1,): the first sphere of each body, which encloses all of the body; the others cover it.
         frames: Shape (k,), the body's frame among ``link_poses``: 0 is the base's.
     """
 
@@ -46,7 +46,7 @@ class ArmSpheres:
 
     @classmethod
     def of(cls, model: UrModel, tool: Tool) -> ArmSpheres:
-        """The balls of an arm with its tool.
+        """The spheres of an arm with its tool.
 
         Raises:
             InputError: If the model's meshes do not ship.
@@ -149,7 +149,7 @@ def skin_distance(origin, values, x, y, z):
 
 @nb.njit(cache=True)
 def _touches_box(boxes, x, y, z, radius):
-    """Whether a ball meets one of the boxes."""
+    """Whether a sphere meets one of the boxes."""
     poses, halves = boxes
     for k in range(len(halves)):
         squared = 0.0
@@ -163,7 +163,7 @@ def _touches_box(boxes, x, y, z, radius):
 
 @nb.njit(cache=True)
 def _touches(surroundings, T_ct_base, T_base_body, centre, radius):
-    """Whether one ball meets anything."""
+    """Whether one sphere meets anything."""
     skin, fixed, carried = surroundings
     x, y, z = _moved(T_base_body, centre[0], centre[1], centre[2])
     if _touches_box(carried, x, y, z, radius):
@@ -174,7 +174,7 @@ def _touches(surroundings, T_ct_base, T_base_body, centre, radius):
 
 @nb.njit(cache=True)
 def _is_clear(arm, surroundings, T_ct_base, frames, last):
-    """One state. First the ball ``last`` (body, ball) that touched last time; then the far bodies before the near."""
+    """One state: first the sphere ``last`` (body, sphere) that touched last; then the far bodies before the near."""
     centres, radii, starts, body_frames = arm
     body, ball = last
     if ball >= 0:

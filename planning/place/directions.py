@@ -23,7 +23,7 @@ class WantedDirections:
     Attributes:
         outward_ct: Shape (n, 3), unit, from the target outward.
         standoff_mm: Shape (n,), tip to target before the insertion.
-        weight: Shape (n,), share of the organ-safe solid angle that each stands for.
+        weight: Shape (n,), fraction of the organ-safe solid angle that each stands for.
     """
 
     outward_ct: Floats

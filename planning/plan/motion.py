@@ -9,7 +9,7 @@ from puncture_twin.planning.plan.plan import Plan
 
 
 def phase_clearances(plan: Plan, checker: StateChecker) -> dict[str, float]:
-    """How near arm and holder come to patient and room in each phase of the stored motion; mm."""
+    """How near arm and holder come to patient and workcell in each phase of the stored motion; mm."""
     found = {}
     for phase, part in (("approach", plan.approach), ("insertion", plan.insertion)):
         least = least_clearance(checker, dense_states(checker, part.q, RESOLUTION_RAD / FINER))

@@ -34,7 +34,7 @@ class Plan:
         approach: From home to standoff.
         insertion: From standoff to the target.
         clearance_mm: Per phase, the least distance that was found: ``approach`` and ``insertion`` of arm and holder
-            to patient and room, ``needle`` to the nearest structure with a margin.
+            to patient and workcell, ``needle`` to the nearest structure with a margin.
         speeds: What it keeps: the case's. A file that does not say so keeps the default.
     """
 

@@ -149,8 +149,8 @@ def _between(q: Floats, path: Path) -> Floats:
         raise InputError("the insertion turns its joints over and over", where=path, allowed="a straight insertion")
     segment = np.repeat(np.arange(len(counts)), counts.astype(np.int64))
     starts = np.cumsum(counts) - counts
-    share = (np.arange(len(segment)) - starts[segment]) / counts[segment]
-    return np.concatenate([q[segment] + share[:, None] * (q[segment + 1] - q[segment]), q[-1:]])
+    fraction = (np.arange(len(segment)) - starts[segment]) / counts[segment]
+    return np.concatenate([q[segment] + fraction[:, None] * (q[segment + 1] - q[segment]), q[-1:]])
 
 
 def _check_speeds(plan: Plan, path: Path) -> None:

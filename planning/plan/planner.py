@@ -13,7 +13,7 @@ from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.motion.approach import plan_approach
-from puncture_twin.planning.motion.follow import drive_smoothly
+from puncture_twin.planning.motion.follow import follow_smoothly
 from puncture_twin.planning.plan.motion import motion_contact, phase_clearances
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.reach.answer import ReachAnswer
@@ -26,7 +26,7 @@ from puncture_twin.planning.uncertainty.needle_chances import keeps_limits
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
 
 MAX_TRIES = 20
-"""Candidates to which an approach is sought; what none of the best twenty allows is a matter of the room."""
+"""Candidates to which an approach is sought; what none of the best twenty allows is a matter of the workcell."""
 
 
 class Planned(NamedTuple):
@@ -110,7 +110,7 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
         standoff_mm=request.standoff_mm,
         needle_length_mm=case.needle.length_mm,
         approach=approach.trajectory,
-        insertion=drive_smoothly(
+        insertion=follow_smoothly(
             slowed(checker.model, speeds),
             answer.insertion_q,
             answer.insertion_depth_mm,

@@ -1,4 +1,4 @@
-"""A plan, held against its case again: same inputs, same verdict, and a motion that FCL finds free."""
+"""A plan, compared with its case again: same inputs, same verdict, and a motion that FCL finds free."""
 
 from __future__ import annotations
 

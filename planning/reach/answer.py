@@ -56,13 +56,13 @@ class ReachAnswer:
     Attributes:
         reachable: The verdict.
         reason: ``NONE``, ``UNREACHABLE``, ``ARM_COLLISION`` (at standoff) or ``INSERTION_BLOCKED``.
-        depth_mm: How far the needle was driven from standoff when it was blocked; None for other reasons.
+        depth_mm: How far the needle was inserted from standoff when it was blocked; None for other reasons.
         detail: One sentence for people: what touched what, or what was missing; empty when reachable.
         contact: What touched what, where that was the reason.
         roll: Turn about the needle against :func:`flange_poses`' zero, rad; NaN when not reachable.
         branch: Index among the eight branches of ``inverse``; -1 when not reachable.
         insertion_q: Shape (m, 6), rad: standoff first, tip on the target last; empty when not reachable.
-        insertion_depth_mm: Shape (m,), mm driven from standoff at each row.
+        insertion_depth_mm: Shape (m,), mm inserted from standoff at each row.
         margin: 0..1, the least over the insertion of: each joint's distance to its limits over a quarter turn, and the
             three singularity terms. 0 when not reachable.
     """

@@ -52,9 +52,9 @@ def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_leng
         return ()
     depths = np.arange(0.0, path_length + BEYOND_SKIN_MM, STEP_MM)
     hu = anatomy.scan.hu_at(target_ct + depths[:, None] * outward_ct)
-    held = np.array([_holds(s, target_ct, outward_ct, depths) for s in anatomy.checked if s.mesh.closed])
+    around = np.array([_contains(s, target_ct, outward_ct, depths) for s in anatomy.checked if s.mesh.closed])
     names = np.array([s.name for s in anatomy.checked if s.mesh.closed], dtype=object)
-    keys = [(*names[held[:, row]], "" if depth <= path_length else "outside") for row, depth in enumerate(depths)]
+    keys = [(*names[around[:, row]], "" if depth <= path_length else "outside") for row, depth in enumerate(depths)]
     found, first = [], 0
     for key, group in groupby(keys):
         rows = slice(first, first + len(list(group)))
@@ -64,7 +64,7 @@ def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_leng
     return tuple(found)
 
 
-def _holds(structure: Structure, target_ct: Floats, outward_ct: Floats, depths: Floats) -> NDArray[np.bool_]:
+def _contains(structure: Structure, target_ct: Floats, outward_ct: Floats, depths: Floats) -> NDArray[np.bool_]:
     """At which depths the path is inside a closed structure: the parity of the crossings before."""
     points = target_ct + depths[:, None] * outward_ct
     low, high = structure.mesh.bounds

@@ -52,7 +52,7 @@ def with_chances(
         axes: What ``engine`` measured of the candidates; None measures those that are left again.
 
     Raises:
-        InputError: A limit that nothing can be held against.
+        InputError: A limit that nothing can be compared with.
     """
     if case.errors is None:
         return found

@@ -136,7 +136,7 @@ def _refuse_open_around_target(case: Case, anatomy: Anatomy) -> None:
 
 
 def _needle_warnings(case: Case, skin: Skin) -> tuple[str, ...]:
-    """A needle that is shorter than the shortest way from the target to the skin."""
+    """A needle that is shorter than the shortest path from the target to the skin."""
     triangles = skin.mesh.triangles[~skin.cut_faces]
     if len(triangles) == 0:
         return ()

@@ -23,7 +23,7 @@ SKIN = "skin"
 
 
 def longest_path(needle: Needle) -> float:
-    """The longest path, target to skin, that the needle can drive, mm.
+    """The longest path, target to skin, that the needle can travel, mm.
 
     The shaft must reach; and with a fixed standoff the tip must still lie ``skin_gap_mm`` outside, along the needle.
     """

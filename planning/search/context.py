@@ -1,4 +1,4 @@
-"""A case, read and ready to be asked: its structures, its engine, and the arm in its room."""
+"""A case, read and ready to be asked: its structures, its engine, and the arm in its workcell."""
 
 from __future__ import annotations
 

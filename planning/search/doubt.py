@@ -23,7 +23,7 @@ from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES, de
 from puncture_twin.planning.uncertainty.touch import Proximity, touch_chance
 
 WISHED_HIT = 0.99
-"""Chance to hit that is asked for where the case demands none."""
+"""Chance to hit that is wanted where the case demands none."""
 
 HALVINGS = 40
 """Of the interval in which a source's factor lies: far below any digit that is printed."""

@@ -23,7 +23,7 @@ MOST = 0.5
 """Of all directions: a needle that is too short for more of them was likely not meant for this target."""
 
 NEAREST = 8
-"""Structures that are listed where nobody asks for all: a case has a hundred, and those far away decide nothing."""
+"""Structures that are listed where nobody wants all: a case has a hundred, and those far away decide nothing."""
 
 COARSE_VOXEL_MM = 1.0
 """A surface drawn around voxels of this size is somewhere within half of it."""

@@ -9,7 +9,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.html import Facts, card, never_raises
 from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
-from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_WORDS, SAFE, Reason
+from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Reason
 
 SAME_ANGLE = 1e-7
 """rad: two angles nearer than this are one line of the grid."""
@@ -38,15 +38,15 @@ def _facts(candidates: Any) -> Facts:
         yield "its path, target to skin", f"{candidates.path.length[best]:.1f} mm"
         yield "its least clearance", f"{candidates.clearance.least[best]:.1f} mm"
     for code, count in candidates.counts().items():
-        words = candidates.safe_text if code == "safe" else REASON_WORDS[Reason(code)]
-        yield words, f"{count:,}"
+        text = candidates.safe_text if code == "safe" else REASON_TEXT[Reason(code)]
+        yield text, f"{count:,}"
 
 
 def _map(candidates: Any) -> str:
     if not 0 < len(candidates) <= MOST_ROWS:
         return ""
     reasons = [Reason.NONE, *REASON_COLOURS]
-    legend = [Entry(candidates.safe_text, SAFE), *(Entry(REASON_WORDS[r], REASON_COLOURS[r]) for r in reasons[1:])]
+    legend = [Entry(candidates.safe_text, SAFE), *(Entry(REASON_TEXT[r], REASON_COLOURS[r]) for r in reasons[1:])]
     number = {reason.value: row for row, reason in enumerate(reasons)}
     code = np.array([number[str(reason)] for reason in candidates.verdict.reason])
     azimuth, half = np.mod(candidates.beta, 2 * np.pi), np.array([-0.5, 0.5])

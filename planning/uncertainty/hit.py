@@ -161,7 +161,7 @@ def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Fl
 
 
 def _fibonacci(count: int) -> Floats:
-    """Unit vectors spread evenly over the sphere, shape (n, 3)."""
+    """Unit vectors spread evenly over the ball, shape (n, 3)."""
     number = np.arange(count)
     z = 1 - (2 * number + 1) / count
     angle = number * np.pi * (3 - np.sqrt(5))

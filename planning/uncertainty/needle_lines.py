@@ -69,7 +69,7 @@ def _walk(scene, start, ahead, hint):  # type: ignore[no-untyped-def]
     fastest = _fastest(scene, start, ahead)
     low, high, closing, inside, entry, total = -np.inf, -FARTHEST, False, False, -np.inf, 0.0
     clear = 0.0  # beyond low, of what the last distance leaves free
-    while True:  # one place that asks for the distance: it is compiled into each
+    while True:  # one place that wants the distance: it is compiled into each
         beta = 0.5 * (low + high) if closing else high
         gap, hint = _gap(scene, start, ahead, beta, hint)
         doubtful = inside or low == -np.inf or scene[7] > 0.0

@@ -311,8 +311,8 @@ def test_a_certificate_holds_outside_of_the_body_too(scene):
     low_theta, high_theta = certificate.leaves.theta.T
     low_beta, high_beta = certificate.leaves.beta.T
     for theta, beta, safe in zip(found.theta, found.beta, found.safe, strict=True):
-        holds = (low_theta <= theta) & (theta <= high_theta) & (low_beta <= beta) & (beta <= high_beta)
-        letters = set(certificate.verdict[holds])
+        contains = (low_theta <= theta) & (theta <= high_theta) & (low_beta <= beta) & (beta <= high_beta)
+        letters = set(certificate.verdict[contains])
         assert safe or "S" not in letters
         assert not safe or "R" not in letters
 
@@ -598,10 +598,10 @@ def hit_parts_from_target(prepared, found, part):
 
 
 @pytest.mark.parametrize(
-    ("name", "holds"),
+    ("name", "contains"),
     [("lung_upper_lobe_left", True), ("small_bowel", True), ("femoral_artery", False), ("pectoral_muscle", False),
      ("oral_cavity", True), ("liver", False), ("hair", False), ("trachea", True)],
 )  # fmt: skip
-def test_whose_name_may_hold_gas(name, holds):
+def test_whose_name_may_contain_gas(name, contains):
     """Words, not letters within words."""
-    assert Named(name, None).may_hold_gas is holds
+    assert Named(name, None).may_contain_gas is contains

@@ -11,9 +11,9 @@ from puncture_twin.planning.clearance.fast_engine import _placed
 from puncture_twin.planning.clearance.kernels.blocks import pack
 from puncture_twin.planning.clearance.kernels.segment_triangle import axis_triangle
 from puncture_twin.planning.clearance.kernels.side_by_side import (
-    ASK,
     BEYOND,
     ROWS,
+    UNDECIDED,
     bring_into_frame,
     measure_beside,
     measure_other,
@@ -144,7 +144,7 @@ def test_side_by_side_equals_the_oracle(rng):
         assert depth_distance(u, depth[k], triangle) == pytest.approx(distance[k], abs=1e-7)
     np.testing.assert_allclose(distance[-5:], [0, 0, 0, 2, 4], atol=TIGHT_MM)
     np.testing.assert_allclose(depth[-5:], [5, 20, 39, 0, 40], atol=TIGHT_MM)
-    assert (marks >= 0).sum() > 50 and (marks == ASK).sum() > 50 and (marks == BEYOND).sum() > 10
+    assert (marks >= 0).sum() > 50 and (marks == UNDECIDED).sum() > 50 and (marks == BEYOND).sum() > 10
 
 
 def test_triangles_beyond_the_top_over_it_and_beside_it(rng):
@@ -180,7 +180,7 @@ def test_pairs_beside_the_axis_need_no_second_answer():
     )
     _, _, marks = beside(shapes.reshape(-1, 9), LENGTH, [Z_FRAME] * len(shapes), np.zeros(3))
     np.testing.assert_allclose(marks[:2], [4.0, 10.0])
-    np.testing.assert_array_equal(marks[2:], [ASK, ASK, BEYOND, ASK, 0.0, ASK])
+    np.testing.assert_array_equal(marks[2:], [UNDECIDED, UNDECIDED, BEYOND, UNDECIDED, 0.0, UNDECIDED])
 
 
 def test_only_the_pairs_that_are_there_are_answered():

@@ -7,9 +7,9 @@ import pytest
 from puncture_twin.planning.clearance.kernels.lanes import LANES, at_most, least_of, lowest
 from puncture_twin.planning.clearance.kernels.segment_triangle import axis_triangle
 from puncture_twin.planning.clearance.kernels.side_by_side import (
-    ASK,
     BEYOND,
     ROWS,
+    UNDECIDED,
     bring_into_frame,
     measure_beside,
     measure_other,
@@ -79,7 +79,12 @@ def test_pairs_answer_what_one_triangle_answers(kind):
     depths = np.abs(pairs[10] - expected[:, 1])
     assert np.median(depths[apart]) < 1e-10 if apart.any() else True
     np.testing.assert_allclose(pairs[10][~apart], expected[~apart, 1], atol=1e-6)
-    answered = {"beside": marks >= 0.0, "pierced": marks == 0.0, "beyond": marks == BEYOND, "behind": marks == ASK}
+    answered = {
+        "beside": marks >= 0.0,
+        "pierced": marks == 0.0,
+        "beyond": marks == BEYOND,
+        "behind": marks == UNDECIDED,
+    }
     assert answered.get(kind, np.ones(1, bool)).mean() > 0.9  # each kind really goes its own way
 
 

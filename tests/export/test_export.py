@@ -31,7 +31,7 @@ from puncture_twin.planning.export.program_check import check_program
 from puncture_twin.planning.export.ros2 import read_ros2, ros2_text, velocities
 from puncture_twin.planning.export.text import PLAIN
 from puncture_twin.planning.export.urscript import read_urscript, urscript_text
-from puncture_twin.planning.motion.follow import drive_smoothly, follow
+from puncture_twin.planning.motion.follow import follow, follow_smoothly
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import read_plan, write_plan
@@ -83,7 +83,7 @@ def plan_to(waypoints, *, speed_scale=0.5, tip_mm_s=10.0, model=UR3):
         standoff_mm=STANDOFF_MM,
         needle_length_mm=TOOL.needle_length_mm,
         approach=follow(model, np.concatenate([waypoints, way[:1]]), speed_scale=speed_scale),
-        insertion=drive_smoothly(model, way, depths, max_tip_speed_mm_s=tip_mm_s),
+        insertion=follow_smoothly(model, way, depths, max_tip_speed_mm_s=tip_mm_s),
         clearance_mm={"approach": 12.0},
         speeds=FAST if speed_scale <= 0.5 else FAST._replace(tip_speed_mm_s=5000.0),
     )

@@ -116,7 +116,7 @@ def test_a_turn_about_a_point_leaves_it():
     """And the shift moves it by itself."""
     center, shift = np.array([10.0, -20.0, 30.0]), np.array([1.0, 2.0, 3.0])
     for T, w in zip(poses(), rotation_vectors(0.7), strict=True):
-        moved = rigid.turned_about(T, center, np.concatenate([w, shift]))
+        moved = rigid.rotated_about(T, center, np.concatenate([w, shift]))
         there = rigid.apply(rigid.inverse(T), center)
         np.testing.assert_allclose(rigid.apply(moved, there), center + shift, atol=1e-11)
         np.testing.assert_allclose(moved[:3, :3], rigid.exp_rotation(w) @ T[:3, :3], atol=1e-14)

@@ -18,7 +18,7 @@ from puncture_twin.planning.collision.checker import Box, CellChecker, Contact, 
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, Approach, plan_approach
-from puncture_twin.planning.motion.follow import MAX_JERK, drive_smoothly, follow, rounded
+from puncture_twin.planning.motion.follow import MAX_JERK, follow, follow_smoothly, rounded
 from puncture_twin.planning.motion.path_check import (
     CLEARANCE_STEP_MM,
     MAX_SWEEP_MM,
@@ -367,7 +367,7 @@ def test_a_smooth_drive_keeps_the_tips_speed_and_the_joints_limits(tip_speed: fl
     """Through every row without a stop; the slower of tip and joints decides."""
     depths = np.linspace(0.0, 100.0, 51)
     q = LEFT + np.sin(depths[:, None] / 80.0) * np.array([0.1, 0.5, -0.8, 0.3, 0.05, 0.0])
-    trajectory = drive_smoothly(UR3, q, depths, max_tip_speed_mm_s=tip_speed)
+    trajectory = follow_smoothly(UR3, q, depths, max_tip_speed_mm_s=tip_speed)
     assert trajectory.q[0] == pytest.approx(q[0]) and trajectory.q[-1] == pytest.approx(q[-1])
     assert_within(trajectory, 1.0)
     assert trajectory.duration_s >= 100.0 / tip_speed
@@ -410,11 +410,11 @@ def test_time_laws_refuse_bad_numbers() -> None:
     with pytest.raises(InputError, match="speed_scale"):
         follow(UR3, two, speed_scale=0.0)
     with pytest.raises(InputError, match="max_tip_speed"):
-        drive_smoothly(UR3, two, np.array([0.0, 1.0]), max_tip_speed_mm_s=np.nan)
+        follow_smoothly(UR3, two, np.array([0.0, 1.0]), max_tip_speed_mm_s=np.nan)
     with pytest.raises(InputError, match="rising depth"):
-        drive_smoothly(UR3, two, np.array([1.0, 0.0]), max_tip_speed_mm_s=1.0)
+        follow_smoothly(UR3, two, np.array([1.0, 0.0]), max_tip_speed_mm_s=1.0)
     with pytest.raises(InputError, match="no joint moves"):
-        drive_smoothly(UR3, np.stack([LEFT, LEFT]), np.array([0.0, 1.0]), max_tip_speed_mm_s=1.0)
+        follow_smoothly(UR3, np.stack([LEFT, LEFT]), np.array([0.0, 1.0]), max_tip_speed_mm_s=1.0)
 
 
 @given(waypoints=rows, share=st.floats(0.0, 0.5), limit=st.floats(20.0, 1000.0), tip_mm=st.floats(0.0, 400.0))

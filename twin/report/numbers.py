@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_WORDS, SAFE, Rgb
+from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Rgb
 from puncture_twin.planning.place.directions import ring_weights
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import step_of
@@ -44,7 +44,7 @@ def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
         here = candidates.verdict.reason == value
         reason = reason_of(str(value))
         colour = REASON_COLOURS.get(reason, SAFE)
-        words = REASON_WORDS[reason] if reason else candidates.safe_text
+        words = REASON_TEXT[reason] if reason else candidates.safe_text
         fraction, solid = float(here.mean()), float(weights[here].sum() / weights.sum())
         count = int(here.sum())
         lines.append(ReasonCount(words, reason.value or "safe", colour, count, fraction, solid))

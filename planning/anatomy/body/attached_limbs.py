@@ -24,7 +24,7 @@ NECK_MM = 30.0
 is pressed against the trunk, some 50 mm wide."""
 FLAT, SLACK_MM = 1.5, 5.0
 """From its bone a limb that is pressed flat reaches so many times as far as the air is away, and so much farther."""
-HELD = 0.9
+WHOLE_FRACTION = 0.9
 """Of a bone's slices: where less of it is known by a neck, such as one end of an arm, the bone tells the rest."""
 BEYOND_ENDS_MM = 50.0
 """So far beyond the end of its bone a limb goes on, to a joint and the next bone."""
@@ -47,7 +47,7 @@ def attached_limbs(hu: NDArray[np.float32], body: Bools, spacing_mm: Floats, tar
     stride = np.maximum(1, (SAMPLING_MM / spacing_mm).astype(int))
     coarse = body[:: stride[0], :: stride[1], :: stride[2]]
     at = tuple(np.clip(np.round(target_index / stride).astype(int), 0, np.array(coarse.shape) - 1))
-    trunk = _holding(coarse, at)
+    trunk = _component_at(coarse, at)
     owner = _nearest_core(trunk, spacing_mm * stride)
     voxel_ml = float(np.prod(spacing_mm)) / 1000.0
     parts = _spread(owner, stride, body.shape) * body
@@ -57,19 +57,19 @@ def attached_limbs(hu: NDArray[np.float32], body: Bools, spacing_mm: Floats, tar
             part = parts == number
             if np.count_nonzero(hu[part] > BONE_HU) * voxel_ml >= MIN_BONE_ML:
                 limbs |= part
-    held = _holding(body, tuple(np.clip(np.round(target_index).astype(int), 0, np.array(body.shape) - 1)))
-    for bone in limb_bones(hu, held, spacing_mm):
-        if not _holds_whole(limbs, bone) and not _about(bone, target_index, spacing_mm):
-            limbs |= _surroundings(bone, body.shape, spacing_mm) & held
-    across = _across(_blocks(held & (hu > BONE_HU), stride), trunk, spacing_mm * stride, at)
-    return limbs | ((_spread(across.astype(np.int32), stride, body.shape) > 0) & held)
+    component = _component_at(body, tuple(np.clip(np.round(target_index).astype(int), 0, np.array(body.shape) - 1)))
+    for bone in limb_bones(hu, component, spacing_mm):
+        if not _is_whole(limbs, bone) and not _about(bone, target_index, spacing_mm):
+            limbs |= _surroundings(bone, body.shape, spacing_mm) & component
+    across = _across(_blocks(component & (hu > BONE_HU), stride), trunk, spacing_mm * stride, at)
+    return limbs | ((_spread(across.astype(np.int32), stride, body.shape) > 0) & component)
 
 
-def _across(bone: Bools, held: Bools, spacing_mm: Floats, at: tuple[int, ...]) -> Bools:
+def _across(bone: Bools, component: Bools, spacing_mm: Floats, at: tuple[int, ...]) -> Bools:
     """Voxels of limbs that lie across the part that holds a voxel, known by air on many sides of their bones."""
-    across = np.zeros(held.shape, bool)
-    for limb in exposed_bones(bone, held, spacing_mm):
-        about = _about_exposed(limb, held.shape, spacing_mm)
+    across = np.zeros(component.shape, bool)
+    for limb in exposed_bones(bone, component, spacing_mm):
+        about = _about_exposed(limb, component.shape, spacing_mm)
         if not about.own[at]:
             across |= about.reach
     return across
@@ -115,10 +115,10 @@ def _blocks(mask: Bools, stride: NDArray[np.int_]) -> Bools:
     return np.asarray(fraction >= np.prod(stride) / 8.0)
 
 
-def _holds_whole(limbs: Bools, bone: LimbBone) -> bool:
+def _is_whole(limbs: Bools, bone: LimbBone) -> bool:
     """Whether a bone lies in limbs that are known by their necks, in all slices but a few at its ends."""
     x, y = np.round(bone.middle).astype(int).T
-    return bool(limbs[x, y, bone.slices].mean() > HELD)
+    return bool(limbs[x, y, bone.slices].mean() > WHOLE_FRACTION)
 
 
 def _about(bone: LimbBone, at: Floats, spacing_mm: Floats) -> bool:
@@ -139,7 +139,7 @@ def _surroundings(bone: LimbBone, shape: tuple[int, ...], spacing_mm: Floats) ->
     return about
 
 
-def _holding(body: Bools, at: tuple[int, ...]) -> Bools:
+def _component_at(body: Bools, at: tuple[int, ...]) -> Bools:
     """The connected part of the body that holds a voxel; the others are limbs with a skin of their own."""
     labels, _ = ndimage.label(body)
     return np.asarray(labels == labels[at]) & body

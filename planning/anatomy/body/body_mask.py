@@ -25,7 +25,7 @@ from puncture_twin.planning.base.errors import InputError
 BODY_HU = -500.0
 """Half way between air (-1000) and water (0): where a voxel is half skin, half air."""
 OUTSIDE_AIR_HU = -940.0
-"""Room air has -1000, inflated lung rarely less than -920: an air region that the border cuts is the room only
+"""Ambient air has -1000, inflated lung rarely less than -920: an air region that the border cuts is the room only
 if its median is below this."""
 MIN_OUTSIDE_ML = 50.0
 """A smaller air region at the border may be bowel gas that the field of view cuts."""

@@ -265,9 +265,9 @@ def _commonest_slope(ends_mm: Floats, step_mm: float) -> float:
     if len(slopes) == 0:
         return 0.0
     window = 2.0 * DRAWN_MM / (lag * step_mm)
-    held = np.searchsorted(slopes, slopes + window, side="right") - np.arange(len(slopes))
-    first = int(np.argmax(held))
-    return float(np.median(slopes[first : first + held[first]]))
+    counts = np.searchsorted(slopes, slopes + window, side="right") - np.arange(len(slopes))
+    first = int(np.argmax(counts))
+    return float(np.median(slopes[first : first + counts[first]]))
 
 
 def _side(view: _Ends, bed: _Bed, table: bool) -> DrawnSide | None:

@@ -21,14 +21,14 @@ SPHERE = 1.6
 EXPOSED, PARTLY = 0.30, 0.26
 """Shares of air. Bones of a real trunk have .27 at most where they are as near to the air; those of random forearms
 .35 and more in the median. What is partly exposed and continues an exposed bone belongs to it."""
-DEEPEST_MM, DEEPEST_SHARE = 60.0, 0.45
-"""From a limb's bone to the air, and as a share of what the trunk's middle has: a spine lies deeper."""
+DEEPEST_MM, DEEPEST_FRACTION = 60.0, 0.45
+"""From a limb's bone to the air, and as a fraction of what the trunk's middle has: a spine lies deeper."""
 GAP_MM = 16.0
 """Bones of one limb are so near to each other, at a wrist or an elbow."""
 LEAST_LENGTH_MM = 40.0
 """Diagonal of the box about the exposed bone of one limb. A nose's and a spinous process's are shorter."""
 DIRECTIONS = 200
-"""Points of the sphere; the share is right to some .02."""
+"""Points of the sphere; the fraction is right to some .02."""
 
 FULL = np.ones((3, 3, 3), bool)
 
@@ -55,7 +55,7 @@ def exposed_bones(bone: Bools, body: Bools, spacing_mm: Floats) -> list[Exposed]
     """
     padded = np.pad(body, 1, mode="edge")
     depth = ndimage.distance_transform_edt(padded, sampling=spacing_mm)[1:-1, 1:-1, 1:-1]
-    near = bone & body & (depth <= min(DEEPEST_MM, DEEPEST_SHARE * float(depth.max())))
+    near = bone & body & (depth <= min(DEEPEST_MM, DEEPEST_FRACTION * float(depth.max())))
     index = np.argwhere(near)
     fraction = np.zeros(body.shape)
     fraction[near] = _air_about(index, depth[near], body, spacing_mm)

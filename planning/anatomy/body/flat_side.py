@@ -102,5 +102,5 @@ def _commonest(values: Floats, window: float) -> float:
     if len(values) == 0:
         return float("nan")
     values = np.sort(values)
-    held = np.searchsorted(values, values + window, side="right") - np.arange(len(values))
-    return float(values[np.argmax(held)] + window / 2)
+    counts = np.searchsorted(values, values + window, side="right") - np.arange(len(values))
+    return float(values[np.argmax(counts)] + window / 2)

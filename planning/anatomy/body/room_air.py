@@ -1,4 +1,4 @@
-"""The room's air inside a skin that comes from elsewhere: the CT beside it is shifted, or of another position."""
+"""The ambient air inside a skin that comes from elsewhere: the CT beside it is shifted, or of another position."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ WIDE_MM = 5.0
 """Air into which a ball of this radius fits and that goes on outside is the room's; a nose's is narrower."""
 
 
-def room_fraction(hu: NDArray[np.float32], body: Bools, spacing_mm: Floats, tolerance_mm: float) -> float:
+def outside_air_fraction(hu: NDArray[np.float32], body: Bools, spacing_mm: Floats, tolerance_mm: float) -> float:
     """How much of a body is air that holds together with the room's, 0..1.
 
     Args:
@@ -26,8 +26,10 @@ def room_fraction(hu: NDArray[np.float32], body: Bools, spacing_mm: Floats, tole
     wide = ndimage.distance_transform_edt(np.pad(air, 1, mode="edge"), sampling=spacing_mm)[1:-1, 1:-1, 1:-1] > WIDE_MM
     labels, _ = ndimage.label(wide)
     outside = np.unique(labels[~body])
-    room = np.isin(labels, outside[outside > 0])
-    near_room = ndimage.distance_transform_edt(~room, sampling=spacing_mm) <= WIDE_MM if room.any() else room
+    ambient = np.isin(labels, outside[outside > 0])
+    near_ambient = (
+        ndimage.distance_transform_edt(~ambient, sampling=spacing_mm) <= WIDE_MM if ambient.any() else ambient
+    )
     deep = ndimage.distance_transform_edt(np.pad(body, 1, mode="edge"), sampling=spacing_mm)[1:-1, 1:-1, 1:-1]
     inside = deep > 2.0 * tolerance_mm
-    return float((air & near_room)[inside].mean()) if inside.any() else 0.0
+    return float((air & near_ambient)[inside].mean()) if inside.any() else 0.0

@@ -60,8 +60,8 @@ def find_support(
     whole = [side for side in (*drawn, *touching) if not isinstance(side, DrawnSide) or side.whole]
     supports = {(side.axis, side.end) for side in whole}
     cut = [face for face in FACES if _cuts(outside, face) and any(face[0] != axis for axis, _ in supports)]
-    asked = cut if supports else FACES
-    gaps = {face: _gap_mm(body, face, spacing_mm) for face in asked}
+    faces = cut if supports else FACES
+    gaps = {face: _gap_mm(body, face, spacing_mm) for face in faces}
     near = tuple(face for face, gap in gaps.items() if gap <= NEAR_MM and not (supports and gap == 0.0))
     return Support(drawn, bool(supports), near)
 
@@ -90,6 +90,6 @@ def _cuts(outside: Bools, face: Side) -> bool:
 def _gap_mm(body: Bools, face: Side, spacing_mm: Floats) -> float:
     """From the body to a face of the image; 0 where the face cuts it."""
     axis, end = face
-    held = np.flatnonzero(body.any(axis=(1 - axis, 2)))
-    voxels = held[0] if end == 0 else body.shape[axis] - 1 - held[-1]
+    occupied = np.flatnonzero(body.any(axis=(1 - axis, 2)))
+    voxels = occupied[0] if end == 0 else body.shape[axis] - 1 - occupied[-1]
     return float(voxels * spacing_mm[axis])

@@ -21,7 +21,7 @@ UNSCANNED_HU = -1500.0
 BLANK_HU = -2000.0
 """Written in the place of paddings that are denser than air, such as 0."""
 CIRCLE_PIXELS = 2.0
-"""A circle of reconstruction is drawn to the pixel; the room's air never ends in one."""
+"""A circle of reconstruction is drawn to the pixel; the ambient air never ends in one."""
 NEARLY_AIR_HU = -900.0
 """Below this a voxel is air, with its noise."""
 STILL_AIR = 0.9
@@ -123,8 +123,8 @@ def _padded(hu: NDArray[np.float32], circle: Bools) -> Bools:
         if not _fills_a_corner(same):
             continue
         labels, _ = ndimage.label(_block(same))
-        held = np.unique(labels[_corners(hu)])
-        padded |= np.isin(labels, held[held > 0])
+        at_corners = np.unique(labels[_corners(hu)])
+        padded |= np.isin(labels, at_corners[at_corners > 0])
     for value in np.unique(hu[padded]):
         if not _measured_air_has_noise(hu, value):
             padded &= hu != value

@@ -61,7 +61,7 @@ class CheckedFiles(NumbasFiles):
 
     def save(self, key: Any, data: Any) -> None:
         """Save under a key; a folder that cannot be written to costs time, not the result."""
-        overloads = self._load_index(say=False)
+        overloads = self._load_index(report=False)
         taken = set(overloads.values())
         free = (self._data_name(number) for number in itertools.count(1))
         name = overloads.get(key) or next(name for name in free if name not in taken)
@@ -72,25 +72,25 @@ class CheckedFiles(NumbasFiles):
         except OSError:
             return
 
-    def _load_index(self, *, say: bool = True) -> dict[Any, str]:
-        content = self._content(self._index_name, say=say)
+    def _load_index(self, *, report: bool = True) -> dict[Any, str]:
+        content = self._content(self._index_name, report=report)
         return {} if content is None else pickle.loads(content)
 
     def _save_index(self, overloads: dict[Any, str]) -> None:
         self._write(self._index_name, self._dump(overloads))
 
-    def _content(self, name: str, *, say: bool = True) -> bytes | None:
+    def _content(self, name: str, *, report: bool = True) -> bytes | None:
         """The content of a file, or None where it is not there, of other sources or, which is said, not whole."""
         try:
             stored = read_plain_file(self._folder / name)
         except FileNotFoundError:
             return None
         except DamagedError as error:
-            _say(str(error), say)
+            _report(str(error), report)
             return None
         stamp, digest, content = _split(stored)
         if digest != _digest(name, stamp, content):
-            _say("is cut, damaged, or another's", say)
+            _report("is cut, damaged, or another's", report)
             return None
         return content if stamp == self._stamp else None
 
@@ -136,8 +136,8 @@ def _digest(name: str, stamp: bytes, content: bytes) -> bytes:
     return digest.digest()
 
 
-def _say(why: str, say: bool) -> None:
-    if say:
+def _report(why: str, report: bool) -> None:
+    if report:
         warnings.warn(f"cache: a compiled kernel {why}; it is compiled anew and replaced", CacheWarning, stacklevel=1)
 
 

@@ -39,7 +39,7 @@ def _locked(path: Path) -> int:
         handle = _opened(path)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if _stands_under(handle, path):
+            if _is_at(handle, path):
                 return handle
         except BlockingIOError:
             holder = os.pread(handle, 20, 0).decode(errors="replace")
@@ -61,7 +61,7 @@ def _opened(path: Path) -> int:
         raise InputError(what, where=path.parent, allowed="a folder that may be written to") from error
 
 
-def _stands_under(handle: int, path: Path) -> bool:
+def _is_at(handle: int, path: Path) -> bool:
     """Whether the file is still the one of that name: its last holder may have removed it meanwhile."""
     try:
         return os.path.samestat(os.fstat(handle), path.stat())

@@ -56,7 +56,7 @@ def publish(draft: Draft, started: datetime) -> None:
         _remove(out, left - files)
         (state / "timings").replace(out / TIMINGS_NAME)
         (state / "after").replace(out / MANIFEST_NAME)
-    _tell(draft, gone - {draft.command, *new} - _dependents(old, {draft.command, *new}))
+    _report_removed(draft, gone - {draft.command, *new} - _dependents(old, {draft.command, *new}))
 
 
 def _entries(draft: Draft) -> dict[str, ManifestEntry]:
@@ -100,13 +100,13 @@ def refuse_foreign(draft: Draft, files: Iterable[str]) -> None:
     if (draft.out / MANIFEST_NAME).exists():
         known.add(TIMINGS_NAME)
     for name in sorted({*files, TIMINGS_NAME} - known):
-        foreign = _in_the_way(draft.out, name)
+        foreign = _foreign_entry(draft.out, name)
         if foreign is not None:
             what = f"{name} is to be written, but the file {foreign} there comes from no run of this program"
             raise InputError(what, where=draft.out, allowed="another folder, or this one without that file")
 
 
-def _in_the_way(out: Path, name: str) -> str | None:
+def _foreign_entry(out: Path, name: str) -> str | None:
     """What stands under a name that is to be written, or where a sub-folder of it must be; a link leads elsewhere."""
     place = out / name
     for folder in reversed(Path(name).parents[:-1]):
@@ -127,7 +127,7 @@ def _remove(out: Path, names: Iterable[str]) -> None:
                     (out / parent).rmdir()
 
 
-def _tell(draft: Draft, others: set[str]) -> None:
+def _report_removed(draft: Draft, others: set[str]) -> None:
     """Name what went although neither the command's own nor made from it."""
     if others:
         named = ", ".join(sorted(others))

@@ -1,6 +1,6 @@
 """Lower bounds in float32, 16 at a time: how near a needle axis can come to a disc, and to a triangle.
 
-The two that are asked most are written as vectors (`lanes.py`); the loops are written for vectorisation: no calls, no
+The two that are tested most are written as vectors (`lanes.py`); the loops are written for vectorisation: no calls, no
 branches, no float minimum. The slack of each bound is derived in docs/concepts/fast-search.md.
 """
 
@@ -204,7 +204,7 @@ def lower_upper_bounds(frames, lanes, corners, length, error, upper):  # type: i
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
 def _past(t, length):  # type: ignore[no-untyped-def]  # numba infers
-    """A depth, held to 0..length."""
+    """A depth, clamped to 0..length."""
     t = t if t > ZERO else ZERO
     return t if t < length else length
 

@@ -33,17 +33,17 @@ THREE, FOUR = np.float32(3), np.float32(4)
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def measure_bundle(surface, needle, count, low, high, lanes, room, answer, seed):  # type: ignore[no-untyped-def]  # numba infers
+def measure_bundle(surface, needle, count, low, high, lanes, scratch, answer, seed):  # type: ignore[no-untyped-def]  # numba infers
     """Measure a bundle's axes from the found blocks: each from its most promising one, then from what may be nearer.
 
     Args:
         surface: `Blocks.triangles` and ``local``.
         needle: `Needle`.
-        count: Found blocks, their nodes in ``room.chosen``.
+        count: Found blocks, their nodes in ``scratch.chosen``.
         low: First direction of the bundle.
         high: The one behind its last.
         lanes: `LANES`, as an argument: a constant would be unrolled to scalar code.
-        room: `Scratch`.
+        scratch: `Scratch`.
         answer: `Found`; rows ``low`` to ``high`` are lowered.
         seed: Returned where nothing nearer is found.
 
@@ -51,12 +51,12 @@ def measure_bundle(surface, needle, count, low, high, lanes, room, answer, seed)
         The row of a triangle that was found nearest to one of the axes.
     """
     groups = (count + LANES - 1) // LANES
-    waiting, m, group = _most_promising(needle, groups, low, high, room, answer), 0, 0
+    waiting, m, group = _most_promising(needle, groups, low, high, scratch, answer), 0, 0
     while waiting > 0 or m < high - low:
-        seed = _measure_pairs(surface, needle, low, waiting, lanes, room, answer, seed)
+        seed = _measure_pairs(surface, needle, low, waiting, lanes, scratch, answer, seed)
         waiting = 0
         while m < high - low and waiting <= PAIRS - LANES:
-            waiting = _others(needle, groups, m, group, low, waiting, room, answer)
+            waiting = _others(needle, groups, m, group, low, waiting, scratch, answer)
             group += 1
             if group == groups:
                 m, group = m + 1, 0
@@ -76,20 +76,20 @@ def across(frames, m):  # type: ignore[no-untyped-def]  # numba infers
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _most_promising(needle, groups, low, high, room, answer):  # type: ignore[no-untyped-def]  # numba infers
+def _most_promising(needle, groups, low, high, scratch, answer):  # type: ignore[no-untyped-def]  # numba infers
     """Bound all found blocks for all axes; pair each axis with the block of the least bound. How many pairs."""
     waiting = 0
     for m in range(high - low):
-        u, best, least = direction(room.frames32, m), 0, HUGE
+        u, best, least = direction(scratch.frames32, m), 0, HUGE
         for group in range(groups):
             row = m * groups + group
-            disc_bounds(room.chosen, group, u, SINGLE, needle.short, needle.slack, room.bounds, row)
-            bound = least_of(room.bounds, row)
+            disc_bounds(scratch.chosen, group, u, SINGLE, needle.short, needle.slack, scratch.bounds, row)
+            bound = least_of(scratch.bounds, row)
             best, least = row if bound < least else best, bound if bound < least else least
-        if least <= room.upper[m]:
-            lane = lowest(at_most(room.bounds, best, least))
-            room.bounds[best, lane] = HUGE
-            room.pairs[waiting, 0], room.pairs[waiting, 1] = m, (best - m * groups) * LANES + lane
+        if least <= scratch.upper[m]:
+            lane = lowest(at_most(scratch.bounds, best, least))
+            scratch.bounds[best, lane] = HUGE
+            scratch.pairs[waiting, 0], scratch.pairs[waiting, 1] = m, (best - m * groups) * LANES + lane
             waiting += 1
     answer.counts[3] += high - low
     answer.counts[4] += groups * (high - low)
@@ -97,23 +97,23 @@ def _most_promising(needle, groups, low, high, room, answer):  # type: ignore[no
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _others(needle, groups, m, group, low, waiting, room, answer):  # type: ignore[no-untyped-def]  # numba infers
+def _others(needle, groups, m, group, low, waiting, scratch, answer):  # type: ignore[no-untyped-def]  # numba infers
     """Pair an axis with the blocks of a group that may be nearer, or be met before, than what was found."""
-    bits = at_most(room.bounds, m * groups + group, room.upper[m])
+    bits = at_most(scratch.bounds, m * groups + group, scratch.upper[m])
     while bits != 0:
         lane = lowest(bits)
         bits &= bits - 1
-        room.pairs[waiting, 0], room.pairs[waiting, 1] = m, group * LANES + lane
+        scratch.pairs[waiting, 0], scratch.pairs[waiting, 1] = m, group * LANES + lane
         waiting += 1
         if answer.square[low + m] == 0.0:
-            met_from = _met_from(room.chosen, group, lane, direction(room.frames32, m), needle.slack)
-            waiting -= 1 if met_from > np.float32(answer.depth[low + m]) * GROWN else 0
+            contact_from = _contact_from(scratch.chosen, group, lane, direction(scratch.frames32, m), needle.slack)
+            waiting -= 1 if contact_from > np.float32(answer.depth[low + m]) * GROWN else 0
     return waiting
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _met_from(chosen, group, lane, u, slack):  # type: ignore[no-untyped-def]  # numba infers
-    """Depth before which an axis cannot meet what a disc holds: where it enters the ball about it, and the slab, mm."""
+def _contact_from(chosen, group, lane, u, slack):  # type: ignore[no-untyped-def]  # numba infers
+    """Depth before which an axis cannot meet what a disc holds: where it enters its sphere and its slab, mm."""
     center = (chosen[group, 0, lane], chosen[group, 1, lane], chosen[group, 2, lane])
     normal = (chosen[group, 3, lane], chosen[group, 4, lane], chosen[group, 5, lane])
     h, slope = chosen[group, 7, lane] + slack, _dot(normal, u)
@@ -128,67 +128,67 @@ def _dot(p, q):  # type: ignore[no-untyped-def]  # numba infers
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _measure_pairs(surface, needle, low, waiting, lanes, room, answer, seed):  # type: ignore[no-untyped-def]  # numba infers
+def _measure_pairs(surface, needle, low, waiting, lanes, scratch, answer, seed):  # type: ignore[no-untyped-def]  # numba infers
     """Measure axes from blocks; row of a triangle that was found nearer, or ``seed``.
 
     Of each block the triangle that seems nearest comes first; then what is still as near as the nearest found.
     """
     answer.counts[5] += waiting
     for p in range(waiting):
-        _test_block(surface[1], needle, p, lanes, room)
+        _test_block(surface[1], needle, p, lanes, scratch)
     for turn in range(2):
         count = 0
         for p in range(waiting):
-            m, first = room.pairs[p, 0], room.found[room.pairs[p, 1]] * LANES
-            reach = (room.upper[m] + room.errors[p]) * (room.upper[m] + room.errors[p]) * GROWN
-            limit = reach if turn == 1 or reach < room.least[p] else room.least[p]
-            bits = at_most(room.squares, p, limit)
+            m, first = scratch.pairs[p, 0], scratch.found[scratch.pairs[p, 1]] * LANES
+            reach = (scratch.upper[m] + scratch.errors[p]) * (scratch.upper[m] + scratch.errors[p]) * GROWN
+            limit = reach if turn == 1 or reach < scratch.least[p] else scratch.least[p]
+            bits = at_most(scratch.squares, p, limit)
             while bits != 0:
                 lane = lowest(bits)
                 bits &= bits - 1
-                room.squares[p, lane] = HUGE
-                room.tried[count, 0], room.tried[count, 1] = m, first + lane
+                scratch.squares[p, lane] = HUGE
+                scratch.tried[count, 0], scratch.tried[count, 1] = m, first + lane
                 count += 1
-        seed = _try_all(surface[0], needle, low, count, room, answer, seed)
+        seed = _try_all(surface[0], needle, low, count, scratch, answer, seed)
     return seed
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _test_block(local, needle, p, lanes, room):  # type: ignore[no-untyped-def]  # numba infers
+def _test_block(local, needle, p, lanes, scratch):  # type: ignore[no-untyped-def]  # numba infers
     """The float32 distances of a pair's axis from the triangles of its block, the least of them, and their error."""
-    m, slot, slack = room.pairs[p, 0], room.pairs[p, 1], needle.slack
-    group, at, block = slot // LANES, slot % LANES, room.found[slot]
-    u, (e, f) = direction(room.frames32, m), across(room.frames32, m)
-    center = (room.chosen[group, 0, at], room.chosen[group, 1, at], room.chosen[group, 2, at])
-    radius, x, y, along = room.chosen[group, 8, at], _dot(center, e), _dot(center, f), _dot(center, u)
+    m, slot, slack = scratch.pairs[p, 0], scratch.pairs[p, 1], needle.slack
+    group, at, block = slot // LANES, slot % LANES, scratch.found[slot]
+    u, (e, f) = direction(scratch.frames32, m), across(scratch.frames32, m)
+    center = (scratch.chosen[group, 0, at], scratch.chosen[group, 1, at], scratch.chosen[group, 2, at])
+    radius, x, y, along = scratch.chosen[group, 8, at], _dot(center, e), _dot(center, f), _dot(center, u)
     around = np.sqrt(x * x + y * y) + radius
     tolerance = -around * (AREA_ROUNDING * around + THREE * slack)
-    line_distances(local, block, e, f, x, y, tolerance, room.squares, p)
+    line_distances(local, block, e, f, x, y, tolerance, scratch.squares, p)
     if along + radius > needle.short or along < radius:
         near = slack + ROUNDING * (abs(along) + radius)
-        heed_ends(local, block, lanes, u, along, needle.short, near, room.squares, p)
-    room.least[p], room.errors[p] = least_of(room.squares, p), ROUNDING * around + slack
+        heed_ends(local, block, lanes, u, along, needle.short, near, scratch.squares, p)
+    scratch.least[p], scratch.errors[p] = least_of(scratch.squares, p), ROUNDING * around + slack
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _try_all(triangles, needle, low, count, room, answer, seed):  # type: ignore[no-untyped-def]  # numba infers
+def _try_all(triangles, needle, low, count, scratch, answer, seed):  # type: ignore[no-untyped-def]  # numba infers
     """Measure axes from triangles; row of one that was found nearer, or ``seed``.
 
     What is nearer is kept, and of equals what comes first.
     """
-    corners, length = room.corners, needle.length
+    corners, length = scratch.corners, needle.length
     for k in range(count):
-        m, (e, f) = room.tried[k, 0], across(room.frames, room.tried[k, 0])
-        bring_into_frame(direction(room.frames, m), e, f, triangles, room.tried[k, 1], needle.target, corners, k)
+        m, (e, f) = scratch.tried[k, 0], across(scratch.frames, scratch.tried[k, 0])
+        bring_into_frame(direction(scratch.frames, m), e, f, triangles, scratch.tried[k, 1], needle.target, corners, k)
     measure_beside(corners, count, length)
     answer.counts[6] += count
     for k in range(count):
-        m, square, depth = room.tried[k, 0], corners[9, k], corners[10, k]
+        m, square, depth = scratch.tried[k, 0], corners[9, k], corners[10, k]
         if square < 0.0:
             square, depth = measure_other(corners, k, length)
         i = low + m
         if square < answer.square[i] or (square == answer.square[i] and depth < answer.depth[i]):
-            answer.square[i], answer.depth[i], seed = square, depth, room.tried[k, 1]
+            answer.square[i], answer.depth[i], seed = square, depth, scratch.tried[k, 1]
             answer.triangle[i] = seed
-            room.upper[m] = min(room.upper[m], np.float32(np.sqrt(square)) * GROWN)
+            scratch.upper[m] = min(scratch.upper[m], np.float32(np.sqrt(square)) * GROWN)
     return seed

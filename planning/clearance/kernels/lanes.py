@@ -90,7 +90,7 @@ def most(p: Vector, q: Vector | Number) -> Vector:
 
 
 class Arguments:
-    """The arguments of an intrinsic as vectors; each is asked for by its place."""
+    """The arguments of an intrinsic as vectors; each is wanted by its place."""
 
     def __init__(self, context: Any, builder: Any, signature: Any, arguments: Any) -> None:
         self._context, self._builder, self._signature, self._arguments = context, builder, signature, arguments

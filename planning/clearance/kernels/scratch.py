@@ -82,11 +82,11 @@ class NeedleAxes(NamedTuple):
 
 def scratch_for(groups: int) -> Scratch:
     """Room for bundles that may have to look at all of ``groups`` groups of blocks."""
-    room = groups + 1
+    size = groups + 1
     return Scratch(
-        found=np.empty(room * LANES, np.int64),
-        chosen=np.empty((room, NODE_ROWS, LANES), np.float32),
-        bounds=np.empty((room * LANES, LANES), np.float32),
+        found=np.empty(size * LANES, np.int64),
+        chosen=np.empty((size, NODE_ROWS, LANES), np.float32),
+        bounds=np.empty((size * LANES, LANES), np.float32),
         stack=np.empty((STACK, 2), np.int64),
         frames=np.empty((9, LANES)),
         frames32=np.empty((9, LANES), np.float32),

@@ -72,7 +72,7 @@ def _point(ux, uy, uz, length, x, y, z):  # type: ignore[no-untyped-def]  # numb
 
 @nb.njit(cache=True, error_model="numpy")
 def _along(ux, uy, uz, length, px, py, pz, dx, dy, dz, up, down):  # type: ignore[no-untyped-def]  # numba infers
-    """The candidate on the edge p + t d at t = up / down, held to 0..1."""
+    """The candidate on the edge p + t d at t = up / down, clamped to 0..1."""
     t = up / down if down > 0.0 else 0.0
     t = min(max(t, 0.0), 1.0)
     return _point(ux, uy, uz, length, px + t * dx, py + t * dy, pz + t * dz)

@@ -13,7 +13,7 @@ from puncture_twin.planning.clearance.kernels.segment_triangle import CONTACT_MM
 ROWS = 11
 """Of a buffer of pairs: nine coordinates, squared distance, depth."""
 
-ASK, BEYOND = -1.0, -2.0
+UNDECIDED, BEYOND = -1.0, -2.0
 """In place of a squared distance: `axis_triangle` must be asked; the triangle lies wholly beyond the axis' top."""
 
 
@@ -52,11 +52,11 @@ def measure_beside(pairs, count, length):  # type: ignore[no-untyped-def]  # num
         fraction = 1.0 / (wa + wb + wc)
         x, y = (wa * ax + wb * bx + wc * cx) * fraction, (wa * ay + wb * by + wc * cy) * fraction
         pierced = (wa * ta + wb * tb + wc * tc) * fraction
-        met = around & (x * x + y * y < CONTACT_MM * CONTACT_MM) & (pierced >= 0.0) & (pierced <= length)
-        met &= best >= CONTACT_MM  # else the axis may run along the triangle's plane and meet it earlier
-        best = ASK if around | outside | (best < CONTACT_MM) else best
+        pierces = around & (x * x + y * y < CONTACT_MM * CONTACT_MM) & (pierced >= 0.0) & (pierced <= length)
+        pierces &= best >= CONTACT_MM  # else the axis may run along the triangle's plane and meet it earlier
+        best = UNDECIDED if around | outside | (best < CONTACT_MM) else best
         best = BEYOND if (ta > length) & (tb > length) & (tc > length) else best
-        pairs[9, k], pairs[10, k] = 0.0 if met else best, pierced if met else depth
+        pairs[9, k], pairs[10, k] = 0.0 if pierces else best, pierced if pierces else depth
 
 
 @nb.njit(cache=True, error_model="numpy")

@@ -39,24 +39,24 @@ def search_tiles(  # type: ignore[no-untyped-def]  # numba infers
     """
     triangles, local, base = bare(surface[0]), bare(surface[1]), bare(surface[2])
     outward, starts, middle, chords = bare(tiles[0]), bare(tiles[1]), bare(tiles[2]), bare(tiles[3])
-    nodes, room, answer = bare(all_nodes), _bare_scratch(scratch), _bare_found(found)
+    nodes, work, answer = bare(all_nodes), _bare_scratch(scratch), _bare_found(found)
     target, seed = (origin[0], origin[1], origin[2]), nearest
     needle = NeedleAxes(target, length, np.float32(length), np.float32(slack))
     for tile in range(len(middle)):
         low, high = starts[tile], starts[tile + 1]
-        _begin(outward, low, high, at_target, nearest, lanes, room, answer)
+        _begin(outward, low, high, at_target, nearest, lanes, work, answer)
         if seed != nearest:
             corners = _corners(triangles, seed, target)
-            lower_upper_bounds(room.frames32, lanes, corners, needle.short, FOUR * needle.slack, room.upper)
+            lower_upper_bounds(work.frames32, lanes, corners, needle.short, FOUR * needle.slack, work.upper)
         worst = ZERO
         for k in range(high - low):
-            worst = max(worst, room.upper[k])
-        axis = direction(room.frames32, middle[tile] - low)
-        count = _collect(nodes, base, axis, np.float32(chords[tile]), needle, worst, room, answer)
+            worst = max(worst, work.upper[k])
+        axis = direction(work.frames32, middle[tile] - low)
+        count = _collect(nodes, base, axis, np.float32(chords[tile]), needle, worst, work, answer)
         seed = nearest
         if count > 0:
-            _gather(nodes, count, room)
-            seed = measure_bundle((triangles, local), needle, count, low, high, lanes, room, answer, nearest)
+            _gather(nodes, count, work)
+            seed = measure_bundle((triangles, local), needle, count, low, high, lanes, work, answer, nearest)
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
@@ -90,7 +90,7 @@ def _across(u):  # type: ignore[no-untyped-def]  # numba infers
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _begin(outward, low, high, start, nearest, lanes, room, answer):  # type: ignore[no-untyped-def]  # numba infers
+def _begin(outward, low, high, start, nearest, lanes, work, answer):  # type: ignore[no-untyped-def]  # numba infers
     """Set up a bundle: its members' frames and the first upper bound; lanes to spare repeat the last member."""
     for i in range(low, high):
         answer.square[i], answer.depth[i], answer.triangle[i] = start * start, 0.0, nearest
@@ -98,13 +98,13 @@ def _begin(outward, low, high, start, nearest, lanes, room, answer):  # type: ig
         i = min(low + k, high - 1)
         u = (outward[i, 0], outward[i, 1], outward[i, 2])
         e, f = _across(u)
-        room.frames[0, k], room.frames[1, k], room.frames[2, k] = u
-        room.frames[3, k], room.frames[4, k], room.frames[5, k] = e
-        room.frames[6, k], room.frames[7, k], room.frames[8, k] = f
-        room.upper[k] = np.float32(start) * GROWN
+        work.frames[0, k], work.frames[1, k], work.frames[2, k] = u
+        work.frames[3, k], work.frames[4, k], work.frames[5, k] = e
+        work.frames[6, k], work.frames[7, k], work.frames[8, k] = f
+        work.upper[k] = np.float32(start) * GROWN
     for row in range(9):
         for k in range(lanes):
-            room.frames32[row, k] = np.float32(room.frames[row, k])
+            work.frames32[row, k] = np.float32(work.frames[row, k])
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
@@ -117,9 +117,9 @@ def _corners(triangles, row, o):  # type: ignore[no-untyped-def]  # numba infers
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _collect(nodes, base, axis, chord, needle, worst, room, answer):  # type: ignore[no-untyped-def]  # numba infers
+def _collect(nodes, base, axis, chord, needle, worst, work, answer):  # type: ignore[no-untyped-def]  # numba infers
     """Walk the tree: the blocks that may be nearer than ``worst`` to some axis of a bundle."""
-    stack, bounds, top = room.stack, room.bounds, len(base) - 1
+    stack, bounds, top = work.stack, work.bounds, len(base) - 1
     stack[0, 0], stack[0, 1] = base[top], top
     waiting, count = 1, 0
     while waiting > 0:
@@ -132,7 +132,7 @@ def _collect(nodes, base, axis, chord, needle, worst, room, answer):  # type: ig
             child = above + lowest(bits)
             bits &= bits - 1
             if level == 0:
-                room.found[count] = child
+                work.found[count] = child
                 count += 1
             else:
                 stack[waiting, 0], stack[waiting, 1] = base[level - 1] + child, level - 1
@@ -143,12 +143,12 @@ def _collect(nodes, base, axis, chord, needle, worst, room, answer):  # type: ig
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _gather(nodes, count, room):  # type: ignore[no-untyped-def]  # numba infers
+def _gather(nodes, count, work):  # type: ignore[no-untyped-def]  # numba infers
     """Copy the nodes of the found blocks side by side; what else the last group holds counts as behind the target."""
     for k in range(count):
-        group, lane = room.found[k] // LANES, room.found[k] % LANES
+        group, lane = work.found[k] // LANES, work.found[k] % LANES
         for row in range(NODE_ROWS):
-            room.chosen[k // LANES, row, k % LANES] = nodes[group, row, lane]
+            work.chosen[k // LANES, row, k % LANES] = nodes[group, row, lane]
     for k in range(count, (count + LANES - 1) // LANES * LANES):
         for row in range(NODE_ROWS):
-            room.chosen[k // LANES, row, k % LANES] = BEHIND if row == 8 else ZERO
+            work.chosen[k // LANES, row, k % LANES] = BEHIND if row == 8 else ZERO

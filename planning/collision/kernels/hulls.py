@@ -37,7 +37,7 @@ FLAT = 1e-10
 
 
 ONWARD = 1.0 - 1e-9
-"""A step that brings the nearest points no nearer than by this share is the last."""
+"""A step that brings the nearest points no nearer than by this fraction is the last."""
 
 
 class Hulls(NamedTuple):
@@ -63,7 +63,7 @@ class Hulls(NamedTuple):
     neighbours: Ints
     """Their rows."""
     centres: Floats
-    """Shape (h, 3): of a ball about each hull."""
+    """Shape (h, 3): of a sphere about each hull."""
     radii: Floats
     frames: Ints
     """Shape (h,): the frame that each moves with."""
@@ -89,13 +89,13 @@ def _nearest_of_segment(S, i, j):
     ax, ay, az = S[i, 0], S[i, 1], S[i, 2]
     ux, uy, uz = S[j, 0] - ax, S[j, 1] - ay, S[j, 2] - az
     length = ux * ux + uy * uy + uz * uz
-    share = -(ax * ux + ay * uy + az * uz)
-    if share <= 0.0 or length <= ROUNDING_MM2:
+    fraction = -(ax * ux + ay * uy + az * uz)
+    if fraction <= 0.0 or length <= ROUNDING_MM2:
         return i, -1, ax, ay, az
-    if share >= length:
+    if fraction >= length:
         return j, -1, S[j, 0], S[j, 1], S[j, 2]
-    share /= length
-    return i, j, ax + share * ux, ay + share * uy, az + share * uz
+    fraction /= length
+    return i, j, ax + fraction * ux, ay + fraction * uy, az + fraction * uz
 
 
 @nb.njit(cache=True)
@@ -244,7 +244,7 @@ def _plane_gap(axes, starts, first, second, M, x, y, z):
 
 @nb.njit(cache=True)
 def _toward(hulls, first, second, M, axis):
-    """Fill ``axis`` with the unit direction from one hull's ball to the other's."""
+    """Fill ``axis`` with the unit direction from one hull's sphere to the other's."""
     squared = 0.0
     for i in range(3):
         axis[i] = M[i, 3] - hulls.centres[first, i]

@@ -21,7 +21,7 @@ from puncture_twin.planning.collision.kernels.hulls import Hulls, hull_gap
 from puncture_twin.planning.collision.kernels.surfaces import STACK, moved, skin_gap
 
 SKIN, BOX, PAIR = 0, 1, 2
-"""Kinds of checks: body against skin, hull against a box of the room, hull against hull."""
+"""Kinds of checks: body against skin, hull against a box of the workcell, hull against hull."""
 
 MIN_GAP_MM = 1e-3
 """What a gap must exceed to prove anything: far above the rounding of these sums (1e-10 mm) and FCL's tolerance."""
@@ -39,7 +39,7 @@ class SkinTree(NamedTuple):
     tree: tuple[Floats, Floats, Floats]
     """Lowest and highest corners of its boxes and the triangles' corners: see :class:`TriangleTree`."""
     field: NDArray[np.float32]
-    """Shape (i, j, k), mm: distances of the middles of cells; NaN where nobody has asked yet."""
+    """Shape (i, j, k), mm: distances of the middles of cells; NaN where nobody has computed yet."""
     origin: Floats
     """Shape (3,), mm: the lowest corner of the field."""
 
@@ -49,10 +49,10 @@ class ProofScene(NamedTuple):
 
     checks: Ints
     """Shape (k, 5): kind, first, second, and the frames of both. For ``SKIN`` the second is the row of the body's root
-    among the balls, else both are rows of hulls."""
+    among the spheres, else both are rows of hulls."""
     skin: SkinTree
     spheres: tuple[Floats, Floats, Ints]
-    """Centres, radii and children of all bodies' trees of balls, each in the frame of its body."""
+    """Centres, radii and children of all bodies' trees of bounding spheres, each in the frame of its body."""
     hulls: Hulls
     T_box_base: Floats
     """Shape (h, 4, 4): by hull, where it is a box."""
@@ -61,7 +61,7 @@ class ProofScene(NamedTuple):
 
 
 class Movers(NamedTuple):
-    """What moves in each check, and a ball about it in the frame that it moves with."""
+    """What moves in each check, and a sphere about it in the frame that it moves with."""
 
     of_check: Ints
     frames: Ints
@@ -77,7 +77,7 @@ class ProofScratch(NamedTuple):
     corners: Ints
     """Shape (k, 2): the last corners."""
     spheres: Floats
-    """Shape (h, 3), mm: where the centres of the hulls' balls stand."""
+    """Shape (h, 3), mm: where the centres of the hulls' spheres stand."""
     stack: Ints
     inner_stack: Ints
     M: Floats
@@ -94,7 +94,7 @@ def scratch(checks, hulls):
 
 @nb.njit(cache=True)
 def place_spheres(hulls, frames, spheres):
-    """Fill ``spheres`` (h, 3) with the centres of the hulls' balls, the arm standing at ``frames`` (7, 4, 4)."""
+    """Fill ``spheres`` (h, 3) with the centres of the hulls' spheres, the arm standing at ``frames`` (7, 4, 4)."""
     for hull in range(len(spheres)):
         frame = hulls.frames[hull]
         x, y, z = hulls.centres[hull, 0], hulls.centres[hull, 1], hulls.centres[hull, 2]
@@ -105,7 +105,7 @@ def place_spheres(hulls, frames, spheres):
 
 @nb.njit(cache=True)
 def sphere_gap(is_box, first, second, spheres, radii, T_box_base, halves):
-    """Lower bound on the distance of two hulls: of their balls, or of a box and a ball."""
+    """Lower bound on the distance of two hulls: of their spheres, or of a box and a sphere."""
     x, y, z = spheres[second, 0], spheres[second, 1], spheres[second, 2]
     squared = 0.0
     if is_box:
@@ -143,7 +143,7 @@ def near_gap(scene, work, at, frames, enough, far, needed):
 
 
 @nb.njit(cache=True)
-def first_unproven(scene, levers, motion, work, proven, state, check, asked, clear_mm):
+def first_unproven(scene, levers, motion, work, proven, state, check, tested, clear_mm):
     """The first state and check, in order, that the bounds do not prove to be more than ``clear_mm`` apart.
 
     A check whose gap was g stays clear until its two bodies have moved by g - ``clear_mm`` against one another.
@@ -151,33 +151,33 @@ def first_unproven(scene, levers, motion, work, proven, state, check, asked, cle
     Args:
         scene: See :class:`ProofScene`.
         levers: Shape (k, 6), mm: how far a radian of each joint may move the two bodies of a PAIR.
-        motion: (frames, moved, turned), with
+        motion: (frames, moved, rotated), with
             frames: Shape (m, 7, 4, 4), mm: the states;
             moved: Shape (m, 7), mm: how far each frame's bodies may have moved since the first state; rising;
-            turned: Shape (m, 6), rad: how far each joint has turned since the first state; rising.
+            rotated: Shape (m, 6), rad: how far each joint has turned since the first state; rising.
         work: See :class:`ProofScratch`.
         proven: Shape (k,): scratch, mm: what the motion must stay below; -inf at the beginning.
         state: Where to begin.
         check: The first check there.
-        asked: Shape (k,): which checks.
-        clear_mm: ``MIN_GAP_MM``, or any other distance that is asked for.
+        tested: Shape (k,): which checks.
+        clear_mm: ``MIN_GAP_MM``, or any other distance that is wanted.
 
     Returns:
         state * k + check; -1 where all is clear.
     """
     checks, radii, T_box_base, halves = scene.checks, scene.hulls.radii, scene.T_box_base, scene.halves
-    frames, ways, turned = motion
+    frames, paths, rotated = motion
     count, stood = len(checks), -1
     enough, far = (clear_mm + ENOUGH_MM, clear_mm + FAR_MM) if len(frames) > 1 else (clear_mm, clear_mm + MIN_GAP_MM)
     for row in range(state, len(frames)):
         for at in range(check if row == state else 0, count):
             kind, first, second, frame_a, frame_b = checks[at]
-            way = ways[row, frame_b]
+            path = paths[row, frame_b]
             if kind == PAIR:
-                way = 0.0
+                path = 0.0
                 for joint in range(frame_a, frame_b):
-                    way += levers[at, joint] * turned[row, joint]
-            if way < proven[at] or not asked[at]:
+                    path += levers[at, joint] * rotated[row, joint]
+            if path < proven[at] or not tested[at]:
                 continue
             if stood < row:
                 stood = row
@@ -190,26 +190,26 @@ def first_unproven(scene, levers, motion, work, proven, state, check, asked, cle
             if gap <= clear_mm:
                 proven[at] = -math.inf
                 return row * count + at
-            proven[at] = way + gap - clear_mm
+            proven[at] = path + gap - clear_mm
     return -1
 
 
 @nb.njit(cache=True)
-def paths_about(frames, body_frame, centre, radius, turns, share, ways):
-    """How far a body may move while each joint turns by no more than a share of ``turns`` (6,), rad, either way.
+def paths_about(frames, body_frame, centre, radius, turns, fraction, paths):
+    """How far a body may move while each joint turns by no more than a fraction of ``turns`` (6,), rad, either way.
 
-    Fills ``ways`` (7,), mm: entry j bounds the motion against the frame before joint j, the arm standing at ``frames``
-    (7, 4, 4) in the middle. A point's distance from axis j is at most that of the body's ball, plus what the joints
+    Fills ``paths`` (7,), mm: entry j bounds the motion against the frame before joint j, the arm standing at ``frames``
+    (7, 4, 4) in the middle. A point's distance from axis j is at most that of the body's sphere, plus what the joints
     beyond have moved it against that axis.
     """
     x, y, z = moved(frames[body_frame], centre)
-    ways[body_frame] = 0.0
+    paths[body_frame] = 0.0
     for joint in range(body_frame - 1, -1, -1):
         dx, dy, dz = x - frames[joint, 0, 3], y - frames[joint, 1, 3], z - frames[joint, 2, 3]
         ax, ay, az = frames[joint, 0, 2], frames[joint, 1, 2], frames[joint, 2, 2]
         cx, cy, cz = dy * az - dz * ay, dz * ax - dx * az, dx * ay - dy * ax
-        lever = math.sqrt(cx * cx + cy * cy + cz * cz) + radius + ways[joint + 1]
-        ways[joint] = ways[joint + 1] + share * turns[joint] * lever
+        lever = math.sqrt(cx * cx + cy * cy + cz * cz) + radius + paths[joint + 1]
+        paths[joint] = paths[joint + 1] + fraction * turns[joint] * lever
 
 
 @nb.njit(cache=True)
@@ -222,16 +222,16 @@ def clear_about(scene, movers, frames, turns, work, gaps, unproven):
         frames: Shape (m, 7, 4, 4), mm: the states.
         turns: Shape (6,), rad.
         work: See :class:`ProofScratch`.
-        gaps: Shape (m, k): filled with the bound at the state itself, ``TOUCHING`` included, for what is asked.
-        unproven: Shape (m, k): True where a check is asked; left so where nothing is proven.
+        gaps: Shape (m, k): filled with the bound at the state itself, ``TOUCHING`` included, for what is tested.
+        unproven: Shape (m, k): True where a check is tested; left so where nothing is proven.
     """
-    ways = np.empty(7)
+    paths = np.empty(7)
     for row in range(len(frames)):
         for at in range(len(scene.checks)):
             if unproven[row, at]:
                 mover = movers.of_check[at]
-                ball = movers.centres[mover], movers.radii[mover]
-                paths_about(frames[row], movers.frames[mover], ball[0], ball[1], turns, 1.0, ways)
-                way = ways[scene.checks[at, 3]] + MIN_GAP_MM
-                gaps[row, at] = near_gap(scene, work, at, frames[row], way, way + MIN_GAP_MM, way)
-                unproven[row, at] = gaps[row, at] <= way
+                sphere = movers.centres[mover], movers.radii[mover]
+                paths_about(frames[row], movers.frames[mover], sphere[0], sphere[1], turns, 1.0, paths)
+                path = paths[scene.checks[at, 3]] + MIN_GAP_MM
+                gaps[row, at] = near_gap(scene, work, at, frames[row], path, path + MIN_GAP_MM, path)
+                unproven[row, at] = gaps[row, at] <= path

@@ -28,15 +28,15 @@ from puncture_twin.planning.collision.kernels.proofs import (
     sphere_gap,
 )
 
-CLEAR, CONTACT, ASK, NOT_FINITE = 0, 1, 2, 3
-"""What a segment came to: proven but for the questions, a contact, a question to be asked at once, no numbers."""
+CLEAR, CONTACT, QUERY, NOT_FINITE = 0, 1, 2, 3
+"""What a segment came to: proven but for the queries, a contact, a query to be made at once, no numbers."""
 
-STATUS, CHECK, GO_ON, ASKED = 0, 1, 2, 3
-"""Where in an answer's status stand: one of the above; the check that touches; where to go on after a question; how
-many questions."""
+STATUS, CHECK, GO_ON, QUERIES = 0, 1, 2, 3
+"""The entries of an answer's status: one of the above; the check that touches; where to go on after a query; how
+many queries."""
 
 PARTS = 256
-"""Room for parts of a segment that wait: one more for each halving, and 64 of them leave nothing of a segment."""
+"""Space for parts of a segment that wait: one more for each halving, and 64 of them leave nothing of a segment."""
 
 
 class Answer(NamedTuple):
@@ -44,14 +44,14 @@ class Answer(NamedTuple):
 
     status: Ints
     """Shape (4,)."""
-    shares: Floats
-    """Shape (q,): of each question, the share of the way at which its state stands."""
+    fractions: Floats
+    """Shape (q,): of each query, the fraction of the segment at which its state is."""
     checks: Ints
-    """Shape (q,): the checks asked about."""
+    """Shape (q,): the checks that are queried."""
 
 
-class Way(NamedTuple):
-    """A segment, and where the arm stands on it."""
+class Segment(NamedTuple):
+    """A segment, and the arm at one state of it."""
 
     lengths: Floats
     start: Floats
@@ -65,47 +65,47 @@ class Way(NamedTuple):
 
 
 @nb.njit(cache=True)
-def _stand(way, share):
-    """Put the arm at a share of the way."""
+def _place_arm(segment, fraction):
+    """Put the arm at a fraction of the segment."""
     for joint in range(6):
-        way.q[0, joint] = way.start[joint] + share * way.step[joint]
-    link_frames(way.lengths, way.q, way.frames)
+        segment.q[0, joint] = segment.start[joint] + fraction * segment.step[joint]
+    link_frames(segment.lengths, segment.q, segment.frames)
 
 
 @nb.njit(cache=True)
 def _not_far(scene, movers, frames, turns, order, work, near):
-    """Fills ``near`` with the checks, in order, that the balls in the middle of a segment do not clear all over it."""
+    """Fills ``near`` with the checks, in order, that the spheres in the middle of a segment do not clear everywhere."""
     checks, hulls, T_box_base, halves = scene.checks, scene.hulls, scene.T_box_base, scene.halves
     place_spheres(hulls, frames, work.spheres)
-    ways, known = np.empty((len(movers.frames), 7)), np.zeros(len(movers.frames), np.bool_)
+    paths, known = np.empty((len(movers.frames), 7)), np.zeros(len(movers.frames), np.bool_)
     count = 0
     for at in order:
         mover = movers.of_check[at]
         if not known[mover]:
             known[mover] = True
-            ball = movers.centres[mover], movers.radii[mover]
-            paths_about(frames, movers.frames[mover], ball[0], ball[1], turns, 0.5, ways[mover])
-        way = ways[mover, checks[at, 3]] + MIN_GAP_MM
+            sphere = movers.centres[mover], movers.radii[mover]
+            paths_about(frames, movers.frames[mover], sphere[0], sphere[1], turns, 0.5, paths[mover])
+        segment = paths[mover, checks[at, 3]] + MIN_GAP_MM
         if checks[at, 0] == SKIN:
-            gap = near_gap(scene, work, at, frames, way, way + MIN_GAP_MM, way)
+            gap = near_gap(scene, work, at, frames, segment, segment + MIN_GAP_MM, segment)
         else:
             is_box = checks[at, 0] == BOX
             gap = sphere_gap(is_box, checks[at, 1], checks[at, 2], work.spheres, hulls.radii, T_box_base, halves)
-        if gap <= way:
+        if gap <= segment:
             near[count] = at
             count += 1
     return count
 
 
 @nb.njit(cache=True)
-def _look(scene, way, shares, near, begin, work, answer):
+def _look(scene, segment, fractions, near, begin, work, answer):
     """Whether a check finds something at the states looked at first, from ``begin`` (state * checks + check) on."""
     checks, hulls, T_box_base, halves = scene.checks, scene.hulls, scene.T_box_base, scene.halves
-    frames = way.frames[0]
-    for position in range(begin, len(shares) * len(near)):
+    frames = segment.frames[0]
+    for position in range(begin, len(fractions) * len(near)):
         look, row = divmod(position, len(near))
         if row == 0 or position == begin:
-            _stand(way, shares[look])
+            _place_arm(segment, fractions[look])
             place_spheres(hulls, frames, work.spheres)
         at, gap = near[row], 0.0
         if checks[at, 0] != SKIN:
@@ -114,53 +114,53 @@ def _look(scene, way, shares, near, begin, work, answer):
         if gap <= MIN_GAP_MM:
             gap = near_gap(scene, work, at, frames, MIN_GAP_MM, 2.0 * MIN_GAP_MM, MIN_GAP_MM)
         if gap <= MIN_GAP_MM:
-            answer.status[STATUS], answer.status[CHECK] = CONTACT if gap == TOUCHING else ASK, at
-            answer.status[GO_ON], answer.status[ASKED] = position + 1, 1
-            answer.shares[0], answer.checks[0] = shares[look], at
+            answer.status[STATUS], answer.status[CHECK] = CONTACT if gap == TOUCHING else QUERY, at
+            answer.status[GO_ON], answer.status[QUERIES] = position + 1, 1
+            answer.fractions[0], answer.checks[0] = fractions[look], at
             return True
     return False
 
 
 @nb.njit(cache=True)
-def _prove(scene, movers, way, at, fine_mm, work, parts, answer):
-    """Whether a check surely finds something; else it is clear, or what is left to ask joins the answer.
+def _prove(scene, movers, segment, at, fine_mm, work, parts, answer):
+    """Whether a check surely finds something; else it is clear, or what is left to query joins the answer.
 
     The middle of a part clears what lies nearer to it than its gap allows to move; the rest is checked in the same way,
     by the middles of what is left on either side (after Schwarzer, Saha and Latombe 2005, "Adaptive dynamic collision
     checking for single and multiple articulated robots in complex environments").
     """
-    mover, frame_a, frames, ways = movers.of_check[at], scene.checks[at, 3], way.frames[0], np.empty(7)
+    mover, frame_a, frames, paths = movers.of_check[at], scene.checks[at, 3], segment.frames[0], np.empty(7)
     parts[0, 0], parts[0, 1], top = 0.0, 1.0, 1
     while top > 0:
         top -= 1
         low, high = parts[top, 0], parts[top, 1]
         middle, half = (low + high) / 2.0, (high - low) / 2.0
-        _stand(way, middle)
-        ball = movers.centres[mover], movers.radii[mover]
-        paths_about(frames, movers.frames[mover], ball[0], ball[1], way.turns, half, ways)
-        needed = ways[frame_a] + MIN_GAP_MM
+        _place_arm(segment, middle)
+        sphere = movers.centres[mover], movers.radii[mover]
+        paths_about(frames, movers.frames[mover], sphere[0], sphere[1], segment.turns, half, paths)
+        needed = paths[frame_a] + MIN_GAP_MM
         gap = near_gap(scene, work, at, frames, needed, needed + MIN_GAP_MM, needed)
         if gap > needed:
             continue
         if gap == TOUCHING:
             answer.status[STATUS], answer.status[CHECK] = CONTACT, at
             return True
-        if ways[frame_a] > fine_mm:
+        if paths[frame_a] > fine_mm:
             clear = half * max(0.0, gap - MIN_GAP_MM) / needed
             parts[top, 0], parts[top, 1] = low, middle - clear
             parts[top + 1, 0], parts[top + 1, 1] = middle + clear, high
             top += 2
         elif gap <= MIN_GAP_MM:
-            asked = answer.status[ASKED]
-            if asked < len(answer.shares):
-                answer.shares[asked], answer.checks[asked] = middle, at
-            answer.status[ASKED] += 1
+            queries = answer.status[QUERIES]
+            if queries < len(answer.fractions):
+                answer.fractions[queries], answer.checks[queries] = middle, at
+            answer.status[QUERIES] += 1
     return False
 
 
 @nb.njit(cache=True)
-def check_segment(scene, movers, lengths, start, end, shares, begin, fine_mm, order, answer):
-    """Judge a straight joint segment: fills ``answer``.
+def check_segment(scene, movers, lengths, start, end, fractions, begin, fine_mm, order, answer):
+    """Check a straight joint segment: fills ``answer``.
 
     Args:
         scene: See :class:`Scene`.
@@ -168,24 +168,24 @@ def check_segment(scene, movers, lengths, start, end, shares, begin, fine_mm, or
         lengths: Of the arm, see :mod:`puncture_twin.planning.arm.kernels`.
         start: Shape (6,), rad.
         end: The same.
-        shares: Shape (m,): of the way, where states stand that are looked at first.
-        begin: 0; after a question whose answer was no, where the answer says to go on.
+        fractions: Shape (m,): of the segment, where states are that are looked at first.
+        begin: 0; after a query whose answer was no, where the answer says to go on.
         fine_mm: Where the bodies of a check move no farther than this within a part, its middle decides.
-        order: Shape (k,): the checks in the order in which they are asked.
+        order: Shape (k,): the checks in the order in which they are tested.
         answer: See :class:`Answer`.
     """
     step, frames = end - start, np.empty((1, 7, 4, 4))
-    way = Way(lengths, start, step, np.abs(step), np.empty((1, 6)), frames)
-    answer.status[STATUS], answer.status[ASKED] = CLEAR, 0
-    _stand(way, 0.5)
+    segment = Segment(lengths, start, step, np.abs(step), np.empty((1, 6)), frames)
+    answer.status[STATUS], answer.status[QUERIES] = CLEAR, 0
+    _place_arm(segment, 0.5)
     if not np.isfinite(frames).all():
         answer.status[STATUS] = NOT_FINITE
         return
     work, every = scratch(len(scene.checks), len(scene.hulls.radii)), np.empty(len(order), np.int64)
-    near = every[: _not_far(scene, movers, frames[0], way.turns, order, work, every)]
-    if _look(scene, way, shares, near, begin, work, answer):
+    near = every[: _not_far(scene, movers, frames[0], segment.turns, order, work, every)]
+    if _look(scene, segment, fractions, near, begin, work, answer):
         return
     parts = np.empty((PARTS, 2))
     for at in near:
-        if _prove(scene, movers, way, at, fine_mm, work, parts, answer):
+        if _prove(scene, movers, segment, at, fine_mm, work, parts, answer):
             return

@@ -1,4 +1,4 @@
-"""Compiled distances to a surface of triangles: of points, and of a tree of balls that encloses a body.
+"""Compiled distances to a surface of triangles: of points, and of a tree of bounding spheres that encloses a body.
 
 Each answer for a body is a lower bound, in mm: above 0 it proves that nothing touches; at or below, nothing is said.
 """
@@ -92,10 +92,10 @@ def _field_distance(tree, field, origin, x, y, z, stack):
 
 @nb.njit(cache=True)
 def skin_gap(skin, spheres, root, T, enough, far, needed, stack, inner_stack):
-    """Lower bound on the distance of a body's balls to the skin, the body's frame standing at ``T`` (4, 4).
+    """Lower bound on the distance of a body's spheres to the skin, the body's frame standing at ``T`` (4, 4).
 
-    The field is asked first: a ball's centre is no farther from the middle of its cell than half of its diagonal. A
-    ball as clear as ``enough``, mm, is not divided further; no bound exceeds ``far``; the first part that is not clear
+    The field is tested first: a sphere's centre is no farther from the middle of its cell than half of its diagonal. A
+    sphere as clear as ``enough``, mm, is not divided; no bound exceeds ``far``; the first part that is not clear
     by ``needed`` ends the search, and then the answer is no bound, only no more than ``needed``. Both stacks are
     scratch.
     """
@@ -112,7 +112,7 @@ def skin_gap(skin, spheres, root, T, enough, far, needed, stack, inner_stack):
         if about >= 0.0:
             if about - HALF_CELL_MM - r >= best:
                 continue
-            if about + HALF_CELL_MM + r <= needed:  # no part of the body in this ball is clear by as much
+            if about + HALF_CELL_MM + r <= needed:  # no part of the body in this sphere is clear by as much
                 return 0.0
             cutoff = min(cutoff, about + HALF_CELL_MM)
         stop = max(0.0, needed + r)

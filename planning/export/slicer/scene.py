@@ -68,8 +68,8 @@ def scene_text(nodes: Sequence[SceneNode]) -> str:
 def scene_references(text: str) -> tuple[set[str], set[str]]:
     """The files that a scene names, and the nodes that it refers to but does not hold."""
     nodes = list(ElementTree.fromstring(text))
-    held = {node.get("id", "") for node in nodes}
+    present = {node.get("id", "") for node in nodes}
     parts = [part for node in nodes for part in node.get("references", "").split(";") if part]
     return {node.attrib["fileName"] for node in nodes if "fileName" in node.attrib}, {
-        number for part in parts for number in part.partition(":")[2].split() if number not in held
+        number for part in parts for number in part.partition(":")[2].split() if number not in present
     }

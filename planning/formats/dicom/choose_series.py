@@ -58,8 +58,8 @@ def choose_series(path: Path) -> SeriesFiles:
 
 def _check_one_series(slices: Sequence[DicomFile], found: Sequence[DicomFile], path: Path) -> None:
     if not slices:
-        held = Counter(one.sop_class for one in found)
-        shown = ", ".join(f"{count} {name}" for name, count in held.most_common(SHOWN)) or "no DICOM file"
+        classes = Counter(one.sop_class for one in found)
+        shown = ", ".join(f"{count} {name}" for name, count in classes.most_common(SHOWN)) or "no DICOM file"
         below = (
             "" if found or not any(one.is_dir() for one in path.iterdir()) else "; the folders in it were not entered"
         )

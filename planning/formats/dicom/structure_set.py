@@ -73,7 +73,7 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
 
     Args:
         path: Its name.
-        file: As the content is asked for it.
+        file: As the content is wanted it.
         content: Gives its bytes.
         ct: The CT on which it was drawn.
 
@@ -153,8 +153,8 @@ def _points(item: Dataset, label: str) -> Floats:
     with refused_if_damaged(f"{label}: {name('ContourData')}"):
         raw = item.get_item("ContourData")
         stored = raw.value if isinstance(raw, RawDataElement) else None
-        words = bytes(stored or b"").rstrip(b" \0").split(b"\\")
-        flat = np.array(words, dtype=np.float64) if words != [b""] else np.zeros(0)
+        parts = bytes(stored or b"").rstrip(b" \0").split(b"\\")
+        flat = np.array(parts, dtype=np.float64) if parts != [b""] else np.zeros(0)
     count = len(flat) // 3
     if len(flat) != 3 * count or not 3 <= count <= MAX_CONTOUR_POINTS or not (np.abs(flat) <= MAX_ORIGIN_MM).all():
         what = f"{name('ContourData')} holds {len(flat)} numbers"
@@ -244,7 +244,7 @@ def _notes(regions: dict[str, _Region], grid: VolumeGrid, where: str) -> list[st
     small = [c for c, some in points.items() if any(_is_tiny(one, grid.shape[:2]) for one in some)]
     gaps = [called for called, region in regions.items() if _gaps(region.contours)]
     others = [called for called, region in regions.items() if region.others]
-    told = (
+    findings = (
         (others, "contours that are not closed (points, lines) were left out of"),
         (
             gaps,
@@ -254,7 +254,7 @@ def _notes(regions: dict[str, _Region], grid: VolumeGrid, where: str) -> list[st
         (small, "contours smaller than a pixel count for the pixels along them, in"),
         (cut, "contours that reach beyond the CT's image end there, in"),
     )
-    return [f"{where}: {said} {_listed(some)}" for some, said in told if some]
+    return [f"{where}: {said} {_listed(some)}" for some, said in findings if some]
 
 
 def _is_tiny(points: Floats, shape: tuple[int, int]) -> bool:

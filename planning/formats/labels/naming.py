@@ -216,10 +216,10 @@ def _weaker_warnings(rule: LabelRule, patterns: Sequence[LabelRule], where: str 
     for other in patterns:
         overruled = other.kind is RuleKind.AVOID and other.pattern != REST and fnmatchcase(rule.name, other.pattern)
         if overruled and (rule.kind is not RuleKind.AVOID or other.margin_mm > rule.margin_mm):
-            holds = f"{rule.kind} {rule.pattern!r}"
+            applies = f"{rule.kind} {rule.pattern!r}"
             yield (
-                f"{where}: {rule.name!r} is named by {holds} and by avoid {other.pattern!r} = {other.margin_mm:g}; "
-                f"the more specific holds: {holds}, {rule.margin_mm:g} mm"
+                f"{where}: {rule.name!r} is named by {applies} and by avoid {other.pattern!r} = {other.margin_mm:g}; "
+                f"the more specific holds: {applies}, {rule.margin_mm:g} mm"
             )
 
 

@@ -112,12 +112,12 @@ class _Glb:
         total = _Size(*(sum(sizes[mesh][kind] for mesh, _ in placed) for kind in range(3)))
         if total.parts > MAX_PARTS:
             refuse(f"{total.parts} parts in all places", self.where, f"at most {MAX_PARTS}")
-        held = len(self.binary)
-        vertices = min(MAX_VERTICES, held // _VERTEX_BYTES + MAX_REPEATED_VERTICES)
-        triangles = min(MAX_TRIANGLES, held // _TRIANGLE_BYTES + MAX_REPEATED_VERTICES // 3)
+        size = len(self.binary)
+        vertices = min(MAX_VERTICES, size // _VERTEX_BYTES + MAX_REPEATED_VERTICES)
+        triangles = min(MAX_TRIANGLES, size // _TRIANGLE_BYTES + MAX_REPEATED_VERTICES // 3)
         if total.triangles > triangles or total.vertices > vertices:
             what = f"{total.triangles} triangles and {total.vertices} vertices in all places"
-            refuse(what, self.where, f"at most {triangles} and {vertices} from {held} bytes of data")
+            refuse(what, self.where, f"at most {triangles} and {vertices} from {size} bytes of data")
 
     def _size(self, mesh: Mesh) -> _Size:
         corners = [self._count(primitive.attributes.get("POSITION")) for primitive in mesh.primitives]

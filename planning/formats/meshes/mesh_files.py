@@ -83,8 +83,8 @@ def parse_mesh(data: bytes, path: Path, *, unit: Unit, space: Space, space_is_de
     with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite or NaN here, the guard refuses
         raw = reader(data, name)
         stated = raw.space or _stated_space(data)
-        held = space if stated is None else _held_space(stated, space, default=space_is_default, where=name)
-        vertices = to_lps(raw.vertices, held) * unit.mm
+        actual = space if stated is None else _actual_space(stated, space, default=space_is_default, where=name)
+        vertices = to_lps(raw.vertices, actual) * unit.mm
     return guard_mesh(vertices, raw.faces, where=name)
 
 
@@ -93,7 +93,7 @@ def _stated_space(data: bytes) -> Space | None:
     return None if found is None else Space(found[1].decode())
 
 
-def _held_space(stated: Space, space: Space, *, default: bool, where: str) -> Space:
+def _actual_space(stated: Space, space: Space, *, default: bool, where: str) -> Space:
     """The space of a file that states one; that of a frame of its own may be declared local."""
     if stated is space or (space is Space.LOCAL and not default):
         return space

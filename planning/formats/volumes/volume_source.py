@@ -20,7 +20,7 @@ class VolumeSource(Protocol):
 
     Attributes:
         path: What was named.
-        files: Every file that decides a voxel or its place, as the content is asked for it.
+        files: Every file that decides a voxel or its place, as the content is wanted it.
         part: Which part of these files it is, where they hold several volumes.
         notes: What a person should be told of how it was read, one sentence each.
         grid: Where the voxels lie, LPS mm.

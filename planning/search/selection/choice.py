@@ -27,7 +27,7 @@ LEAST_LEVER_MM = 1.0
 
 @dataclass(frozen=True)
 class Choice:
-    """What a person asked for; with nothing stated the best candidate that the arm can approach.
+    """What a person wanted; with nothing stated the best candidate that the arm can approach.
 
     Attributes:
         angles: θ and β, rad.
@@ -84,11 +84,11 @@ def choose(context: CaseContext, found: Candidates, choice: Choice) -> Chosen:
     Args:
         context: Of the case.
         found: The search of its grid.
-        choice: What a person asked for.
+        choice: What a person wanted.
 
     Raises:
         InputError: A rank or window that there is not, or a point that is no skin entry.
-        NoAnswerError: Nothing is safe, or what was asked for is rejected: says why.
+        NoAnswerError: Nothing is safe, or what was wanted is rejected: says why.
     """
     if not choice.of_grid:
         checked = context.check(*chosen_angles(context.case, choice))

@@ -15,7 +15,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
-from puncture_twin.planning.geometry.rigid import apply, turned_about
+from puncture_twin.planning.geometry.rigid import apply, rotated_about
 from puncture_twin.planning.registration.conditioning import Conditioning
 from puncture_twin.planning.registration.registration import MarkerPairs, register
 
@@ -109,7 +109,7 @@ def map_head(
         return System((roots @ (fitted - seen.points_c)[:, :, None]).ravel(), slopes.reshape(-1, 6))
 
     def moved(T: Floats, step: Floats) -> Floats:
-        return turned_about(T, center, step)
+        return rotated_about(T, center, step)
 
     fit = gauss_newton(plain.T_base_ct, linearised, moved, _arrived, MAX_ITERATIONS)
     residuals = apply(fit.estimate, pairs.points_ct) - seen.points_c

@@ -19,7 +19,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.crossings import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import apply, exp_rotation, frame_yz, pose, turned_about
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, frame_yz, pose, rotated_about
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, stereo_pair, tangent_axes
 from puncture_twin.twin.guidance.stereo.declared_errors import CameraErrors
 from puncture_twin.twin.guidance.stereo.joint.needle_outcome import TrueNeedle
@@ -162,7 +162,7 @@ def draw_workcell(case: ServoCase, rng: np.random.Generator) -> StereoWorkcell:
     )
     T_c_m = T_c_base @ head_pose(case)
     moved = np.concatenate([rng.normal(0.0, errors.head_turn, 3), rng.normal(0.0, errors.head_shift_mm, 3)])
-    after = turned_about(T_c_m, apply(T_c_m, case.markers.points.mean(axis=0)), moved)
+    after = rotated_about(T_c_m, apply(T_c_m, case.markers.points.mean(axis=0)), moved)
     return StereoWorkcell(case, arm, T_c_base, cameras, T_c_m, after, tool)
 
 

@@ -12,7 +12,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibrati
 from puncture_twin.twin.jobs.selfcal.facts import Facts, selfcal_facts
 from puncture_twin.twin.jobs.selfcal.page_charts import puncture_chart, residual_charts
 from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun
-from puncture_twin.twin.jobs.selfcal.text import NOISE_WORDS, REASON_WORDS, counted, missed_text
+from puncture_twin.twin.jobs.selfcal.text import NOISE_WORDS, REASON_TEXT, counted, missed_text
 from puncture_twin.twin.report.numbers import number
 from puncture_twin.twin.report.page.page_tables import TIMES, faint, inputs_table, origin_section, pairs, table
 from puncture_twin.twin.report.page.template import Card, data_address, plotly_script, script_json, write_html
@@ -105,7 +105,7 @@ def _calibration(facts: Facts, sigma: dict[str, float]) -> Markup:
 
 
 def _twin_section(facts: Facts, sheet: Path, room: Path) -> dict[str, str]:
-    counts = [(REASON_WORDS[key], f"{value:,}") for key, value in facts["candidates"].items()]
+    counts = [(REASON_TEXT[key], f"{value:,}") for key, value in facts["candidates"].items()]
     choice, asked, trials = facts["choice"], facts["poses"], facts["trials"]
     bounds = [
         (f"expected error with the {asked} recorded poses", number(choice["chosen_bound_mm"], 3, "mm")),

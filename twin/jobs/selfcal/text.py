@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 from puncture_twin.twin.jobs.selfcal.facts import Facts
 
-REASON_WORDS = MappingProxyType(
+REASON_TEXT = MappingProxyType(
     {
         "ok": "can be taken",
         "tip_outside_phantom": "tip outside the phantom",
@@ -45,7 +45,7 @@ def _poses(facts: Facts) -> list[str]:
     if counts is None or choice is None:
         return [f"recording {facts['name']}: {facts['poses']} poses"]
     lines = [f"case {facts['name']}: {sum(counts.values())} poses drawn in the common workspace"]
-    lines += [f"  {count:5d}  {REASON_WORDS[reason]}" for reason, count in counts.items() if count]
+    lines += [f"  {count:5d}  {REASON_TEXT[reason]}" for reason, count in counts.items() if count]
     lines.append(
         f"{facts['poses']} recorded; expected error (Cramer-Rao, with the usual noise) "
         "{chosen_bound_mm:.3f} mm; random choices of as many: median {random_bound_median_mm:.3f}, best "

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from puncture_twin.planning.base.reasons import REASON_WORDS, Reason
+from puncture_twin.planning.base.reasons import REASON_TEXT, Reason
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.selection.choice import Pick
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
@@ -56,7 +56,7 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None) -> dict[str, 
         "rim": [{"text": label.text, "angle_deg": float(np.degrees(label.angle))} for label in view.rim],
         "centre": view.centre,
         "structures": structures,
-        "reasons": [REASON_WORDS[reason_of(r)] for r in reasons],
+        "reasons": [REASON_TEXT[reason_of(r)] for r in reasons],
         "safe": candidates.safe_text,
         "arm": candidates.arm_note,
         "codes": [r or "safe" for r in reasons],

@@ -17,7 +17,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.geometry.gauss_newton import System
-from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, turned_about
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, rotated_about
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.lens import coefficient_slope
 from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors
@@ -148,7 +148,7 @@ class JointModel:
 
     def pose_of_head(self, x: Unknowns) -> Floats:
         """T_c_m, shape (4, 4), mm."""
-        return turned_about(self.guess.T_c_m, self._head_center, x.head)
+        return rotated_about(self.guess.T_c_m, self._head_center, x.head)
 
     def head_slopes(self, x: Unknowns, points_c: Floats) -> Floats:
         """Derivative (n, 3, 6) of points (n, 3) of the head by ``x.head``."""
@@ -156,7 +156,7 @@ class JointModel:
 
     def pose_of_base(self, x: Unknowns) -> Floats:
         """T_c_base, shape (4, 4), mm."""
-        return turned_about(self.guess.T_c_base, self._base_center, x.base)
+        return rotated_about(self.guess.T_c_base, self._base_center, x.base)
 
     def base_slopes(self, x: Unknowns, points_c: Floats) -> Floats:
         """Derivative (n, 3, 6) of points (n, 3) of the base by ``x.base``."""

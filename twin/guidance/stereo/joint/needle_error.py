@@ -199,5 +199,5 @@ class _Anatomy:
 
 
 def _turn_rows(change: Floats) -> Floats:
-    """Rotation of a pose by the turn and shift (6,) of `turned_about`, shape (3, 6)."""
+    """Rotation of a pose by the turn and shift (6,) of `rotated_about`, shape (3, 6)."""
     return np.concatenate([left_jacobian(change[:3]), np.zeros((3, 3))], axis=1)
