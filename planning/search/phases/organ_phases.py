@@ -17,7 +17,7 @@ from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.skin_entry import SkinPaths, skin_paths, view_depth
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.reasons import REASON_WORDS, Reason
+from puncture_twin.planning.base.reasons import REASON_TEXT, Reason
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import ClearanceEngine
@@ -88,7 +88,7 @@ def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Brea
     arrays["amount"][rows[new]] = np.where(near, at_phase.amount[new], np.nan)
     arrays["reason"][rows[new]] = Reason.UNSAFE_WHEN_BREATHING.value
     for row, reason, more in zip(rows[new], at_phase.reason[new], at_phase.detail[new], strict=True):
-        arrays["detail"][row] = f"at {breathing.phase_text(s)}: {REASON_WORDS[Reason(reason)]}{more and f', {more}'}"
+        arrays["detail"][row] = f"at {breathing.phase_text(s)}: {REASON_TEXT[Reason(reason)]}{more and f', {more}'}"
     return Verdict(**arrays)
 
 
