@@ -352,7 +352,10 @@ def export(
     source: SourceArgument,
     choice: Choice,
     format_name: Annotated[
-        str, typer.Option("--format", metavar="urscript|ros2|csv|slicer", help="For which robot, or 3D Slicer.")
+        str,
+        typer.Option(
+            "--format", metavar="FORMAT", help="urscript, ros2, csv, slicer, candidates-csv or candidates-json."
+        ),
     ],
     case: Annotated[Path | None, typer.Option("--case", help="The plan's case: check the plan again.")] = None,
     out_dir: OutOfCaseOption = None,
@@ -362,15 +365,19 @@ def export(
     from puncture_twin.planning.export.exporter import FORMATS
     from puncture_twin.planning.export.slicer.slicer_files import SLICER
     from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.choosing.candidates_export import CANDIDATE_FORMATS
     from puncture_twin.twin.jobs.patient import main_job, text
     from puncture_twin.twin.jobs.patient.case_or_plan import case_of, is_plan
     from puncture_twin.twin.jobs.patient.summaries import export_summary
 
-    formats = (*FORMATS, SLICER)
+    formats = (*FORMATS, SLICER, *CANDIDATE_FORMATS)
     if format_name not in formats:
         raise InputError(f"format '{format_name}' is not known", where="--format", allowed=", ".join(formats))
-    planned_case = case_of(source, case, choice)
     folder = _out(out_dir, source, "export")
+    if format_name in CANDIDATE_FORMATS:
+        _export_candidates(source, format_name, folder, choice, as_json)
+        return
+    planned_case = case_of(source, case, choice)
     if format_name == SLICER:
         _export_to_slicer(source, folder, choice, as_json)
         return
@@ -382,6 +389,20 @@ def export(
             done = main_job.export_case(context, format_name, folder, choice)
     checked = context is not None
     _print(export_summary(done, checked), text.export_text(done, checked), as_json)
+
+
+def _export_candidates(source: Path, format_name: str, out_dir: Path, choice: Choice, as_json: bool) -> None:
+    from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.choosing.candidates_export import TABLE, export_candidates, table_of
+    from puncture_twin.twin.jobs.patient.main_job import search_case
+
+    table = table_of(source, choice)
+    with progress_display() as progress:
+        if table is None:
+            search_case(prepare(source, watcher=progress), out_dir, pictures=False)
+            table = out_dir / TABLE
+        done = export_candidates(table, format_name, out_dir, progress.note)
+    _print(done.summary(), done.text(), as_json)
 
 
 def _export_to_slicer(source: Path, out_dir: Path, choice: Choice, as_json: bool) -> None:

@@ -22,6 +22,10 @@ CONE_OF_GRID, CONE_CERTIFIED = "grid", "certificate"
 """Where a safe cone comes from: the directions of the search, or the proof of all between them."""
 
 
+ANGLE_DIGITS = 9
+"""Of an angle in degrees: a grid's 59.99999999999999 is 60; 1e-9 degrees move no needle by a nanometre."""
+
+
 class Columns:
     """Arrays of one length, row by row; read-only."""
 
@@ -234,6 +238,6 @@ class Candidates(Columns):
     def at(self, row: int) -> dict[str, float]:
         """The angles of one row, degrees, rounded to what a person types."""
         return {
-            "theta_deg": round(float(np.degrees(self.theta[row])), 9),
-            "beta_deg": round(float(np.degrees(self.beta[row])), 9),
+            "theta_deg": round(float(np.degrees(self.theta[row])), ANGLE_DIGITS),
+            "beta_deg": round(float(np.degrees(self.beta[row])), ANGLE_DIGITS),
         }

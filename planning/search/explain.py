@@ -81,8 +81,7 @@ class Explanation:
         return {
             "case": self.case.name,
             "inputs": inputs_document(self.case.inputs),
-            "theta_deg": float(np.degrees(row.theta[0])),
-            "beta_deg": float(np.degrees(row.beta[0])),
+            **row.at(0),
             "verdict": self.verdict,
             "arm": row.arm_note,
             "reason": str(row.verdict.reason[0]),

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.candidates import ANGLE_DIGITS, Candidates
 from puncture_twin.planning.search.selection.windows import find_windows
 from puncture_twin.planning.uncertainty.chances import Chances
 
@@ -27,8 +27,8 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
     """
     reachable = [None if one < 0 else bool(one) for one in candidates.arm.reachable]
     columns: dict[str, Any] = {
-        "theta_deg": np.degrees(candidates.theta),
-        "beta_deg": np.degrees(candidates.beta),
+        "theta_deg": np.round(np.degrees(candidates.theta), ANGLE_DIGITS),
+        "beta_deg": np.round(np.degrees(candidates.beta), ANGLE_DIGITS),
         "verdict": np.where(candidates.safe, "safe", "rejected"),
         "reason": candidates.verdict.reason,
         "reason_structure": candidates.verdict.structure,

@@ -63,8 +63,7 @@ def window_summary(found: Candidates, window: Window) -> dict[str, Any]:
     row = window.best
     return {
         "rank": int(found.ranking.rank[row]),
-        "theta_deg": float(np.degrees(found.theta[row])),
-        "beta_deg": float(np.degrees(found.beta[row])),
+        **found.at(row),
         "cost": finite(found.ranking.cost[row]),
         "min_clearance_mm": finite(found.clearance.least[row]),
         "path_length_mm": finite(found.path.length[row]),
