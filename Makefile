@@ -51,6 +51,8 @@ install: $(VENV)/installed
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[twin,test]'
+	@command -v chromium chromium-browser google-chrome >/dev/null || $(BIN)/playwright install chromium || \
+	  echo "no browser: the page's tests in one will skip"
 	touch $@
 
 # The pages and the API reference, as a site in out/site.

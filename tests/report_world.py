@@ -14,6 +14,10 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking, Verdict
+from puncture_twin.planning.search.selection.choice import best_pick
+from puncture_twin.twin.report.page.page import write_page
+from puncture_twin.twin.report.slices.sheet import draw_slices
+from puncture_twin.twin.report.slices.subject import Subject
 
 TARGET = np.array([10.0, -20.0, 30.0])
 SKIN_RADIUS = 100.0
@@ -209,6 +213,17 @@ def make_registration():
         "leverage": 2.5,
         "flags": ["markers nearly in one line"],
     }
+
+
+def make_page(path):
+    """The whole page of this patient: a plan, a rehearsal, slices; returns its candidates."""
+    case = make_case()
+    candidates, anatomy = make_candidates(case), make_anatomy()
+    anatomy.scan = SimpleNamespace(hu_at=lambda points: np.where(np.abs(points).max(axis=1) < 150, 40.0, np.nan))
+    plan, slices = make_plan(case, candidates), (draw_slices(Subject(case, anatomy, best_pick(candidates))),)
+    told = (make_rehearsal(plan), make_registration())
+    write_page(case, anatomy, candidates, plan, *told, path, film="rehearsal.mp4", slices=slices)
+    return candidates
 
 
 def _ball(radius, centre, subdivisions=3):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,52 +28,88 @@ SKIN: Rgb = (226, 176, 148)
 TARGET_POINT: Rgb = (214, 0, 30)
 
 ORGAN_COLOURS: tuple[Rgb, ...] = (
-    (166, 86, 70),
     (118, 120, 196),
     (206, 128, 60),
     (126, 92, 150),
     (98, 150, 190),
     (196, 150, 120),
-    (150, 166, 90),
+    (170, 166, 90),
     (186, 96, 130),
-    (90, 140, 140),
     (140, 110, 80),
 )
-"""For organs without a colour of custom, in order of appearance."""
+"""For structures without a colour of custom, in order of appearance; right and left are one."""
+
+ARTERY, VEIN, BONE, MUSCLE = (216, 101, 79), (0, 151, 206), (241, 214, 145), (176, 132, 122)
 
 CUSTOM_COLOURS: tuple[tuple[str, Rgb], ...] = (
     ("lesion", (255, 205, 40)),
     ("tumor", (255, 205, 40)),
     ("tumour", (255, 205, 40)),
-    ("aorta", (205, 32, 44)),
-    ("artery", (205, 32, 44)),
+    ("metasta", (255, 205, 40)),
+    ("cyst", (205, 205, 100)),
+    ("pulmonary_vein", (186, 77, 64)),
+    ("pulmonary_artery", (0, 122, 171)),
     ("portal", (122, 76, 178)),
-    ("vena", (44, 88, 190)),
-    ("vein", (44, 88, 190)),
-    ("hepatic_v", (44, 88, 190)),
-    ("ureter", (232, 220, 120)),
-    ("rib", (232, 222, 198)),
-    ("vertebra", (226, 214, 188)),
-    ("spine", (226, 214, 188)),
-    ("sacrum", (226, 214, 188)),
-    ("hip", (226, 214, 188)),
-    ("sternum", (232, 222, 198)),
-    ("skull", (232, 222, 198)),
-    ("bone", (232, 222, 198)),
-    ("costal", (214, 214, 200)),
-    ("liver", (150, 70, 56)),
-    ("kidney", (176, 92, 92)),
-    ("spleen", (140, 74, 120)),
-    ("stomach", (222, 150, 130)),
-    ("colon", (196, 146, 90)),
-    ("bowel", (206, 160, 110)),
-    ("duodenum", (206, 160, 110)),
-    ("gallbladder", (92, 150, 70)),
-    ("pancreas", (222, 184, 96)),
-    ("lung", (226, 160, 176)),
-    ("heart", (190, 60, 70)),
+    ("aorta", (224, 97, 76)),
+    ("arter", ARTERY),
+    ("brachiocephalic_trunk", ARTERY),
+    ("vena", VEIN),
+    ("vein", VEIN),
+    ("hepatic_v", VEIN),
+    ("muscle", MUSCLE),
+    ("gluteus", MUSCLE),
+    ("autochthon", MUSCLE),
+    ("iliopsoas", MUSCLE),
+    ("psoas", MUSCLE),
+    ("trapezius", MUSCLE),
+    ("quadriceps", MUSCLE),
+    ("ureter", (247, 182, 164)),
+    ("cartilage", (111, 184, 210)),
+    ("costal", (111, 184, 210)),
+    ("spinal_cord", (244, 214, 49)),
+    ("nerve", (234, 202, 40)),
+    ("vertebra", (226, 202, 134)),
+    ("spine", (226, 202, 134)),
+    ("sacrum", (212, 188, 102)),
+    ("rib", (253, 232, 158)),
+    ("sternum", (244, 217, 154)),
+    ("skull", (241, 213, 144)),
+    ("hip", BONE),
+    ("femur", BONE),
+    ("humerus", BONE),
+    ("scapula", BONE),
+    ("clavicula", (205, 179, 108)),
+    ("clavicle", (205, 179, 108)),
+    ("bone", BONE),
+    ("brain", (250, 250, 225)),
+    ("liver", (221, 130, 101)),
+    ("adrenal", (249, 186, 150)),
+    ("kidney", (185, 102, 83)),
+    ("spleen", (157, 108, 162)),
+    ("esophagus", (211, 171, 143)),
+    ("oesophagus", (211, 171, 143)),
+    ("stomach", (216, 132, 105)),
+    ("duodenum", (255, 253, 229)),
+    ("colon", (204, 168, 143)),
+    ("bowel", (205, 167, 142)),
+    ("gallbladder", (139, 150, 98)),
+    ("pancreas", (249, 180, 111)),
+    ("bladder", (222, 154, 132)),
+    ("prostate", (230, 158, 140)),
+    ("trachea", (182, 228, 255)),
+    ("lung", (197, 165, 145)),
+    ("heart", (206, 110, 84)),
+    ("atri", (203, 108, 81)),
 )
-"""What books of anatomy use: part of a structure's name, colour; the first match counts."""
+"""Part of a structure's name, colour; the first match counts.
+
+The colours by which 3D Slicer shows anatomy (its GenericAnatomyColors of 2010), so that a structure looks here as
+there. Two are not followed: a mass is green there, and green means safe here; muscles are muted, since they fill the
+picture. The portal vein is told from the veins that drain the liver.
+"""
+
+SIDES = re.compile(r"(^|[_ ])(right|left|r|l)(?=[_ ]|$)")
+"""Of a structure's name: both sides look alike."""
 
 
 def reason_of(value: str) -> Reason:
@@ -82,12 +120,12 @@ def reason_of(value: str) -> Reason:
 def organ_colours(names: tuple[str, ...]) -> dict[str, Rgb]:
     """One colour for each structure name; by custom where there is one, else by turn."""
     colours: dict[str, Rgb] = {}
-    spare = 0
+    spare: dict[str, Rgb] = {}
     for name in names:
-        custom = next((colour for part, colour in CUSTOM_COLOURS if part in name.lower()), None)
+        plain = name.lower().replace(" ", "_")
+        custom = next((colour for part, colour in CUSTOM_COLOURS if part in plain), None)
         if custom is None:
-            custom = ORGAN_COLOURS[spare % len(ORGAN_COLOURS)]
-            spare += 1
+            custom = spare.setdefault(SIDES.sub("", plain), ORGAN_COLOURS[len(spare) % len(ORGAN_COLOURS)])
         colours[name] = custom
     return colours
 

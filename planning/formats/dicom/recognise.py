@@ -28,10 +28,13 @@ _TAGS = [
     tag_for_keyword(keyword) or 0
     for keyword in (
         *("SOPClassUID", "SOPInstanceUID", "ImageType", "SeriesDescription", "SeriesInstanceUID"),
+        *("AcquisitionDate", "SeriesDate", "StudyDate"),
         *("SeriesNumber", "ImagePositionPatient", "ImageOrientationPatient", "FrameOfReferenceUID"),
     )
 ]
 _LAST_TAG = max(_TAGS)
+
+DATE_DIGITS = 8
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,7 @@ class DicomFile:
         series: Its number and description, as a person knows it.
         frame_of_reference: The coordinates in which it lies, or the empty string.
         is_slice: Whether it is a CT image, and no scout or page of text.
+        date: When it was taken, as ``2019-11-04``; the empty string where the file does not say.
     """
 
     name: str
@@ -55,6 +59,7 @@ class DicomFile:
     series: str
     frame_of_reference: str
     is_slice: bool
+    date: str
 
 
 def recognise(path: Path) -> DicomFile | None:
@@ -100,7 +105,15 @@ def described(data: Dataset, path: Path) -> DicomFile:
         series=f"{number or '?'} {description or 'without description'}",
         frame_of_reference=text(data, "FrameOfReferenceUID", where=where),
         is_slice=kind is Kind.CT and placed and not types & NO_SLICES,
+        date=_date(data, where),
     )
+
+
+def _date(data: Dataset, where: str) -> str:
+    """Of the acquisition, else of its series or study: eight digits, all else is none."""
+    stated = (text(data, keyword, where=where) for keyword in ("AcquisitionDate", "SeriesDate", "StudyDate"))
+    plain = next((one for one in stated if len(one) == DATE_DIGITS and one.isascii() and one.isdigit()), "")
+    return plain and f"{plain[:4]}-{plain[4:6]}-{plain[6:]}"
 
 
 def list_folder(folder: Path) -> tuple[DicomFile, ...]:

@@ -8,17 +8,12 @@ import shutil
 import subprocess
 import sys
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import report_world as world
 
-from puncture_twin.planning.search.selection.choice import best_pick
 from puncture_twin.twin.report.map_view import map_view
-from puncture_twin.twin.report.page.page import write_page
-from puncture_twin.twin.report.slices.sheet import draw_slices
-from puncture_twin.twin.report.slices.subject import Subject
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
@@ -154,13 +149,7 @@ def browser(case, candidates, tmp_path_factory):
         pytest.skip("no chromium, chromium-browser or google-chrome on this machine")
     folder = tmp_path_factory.mktemp("browser")
     path = folder / "report.html"
-    plan = world.make_plan(case, candidates)
-    registration = world.make_registration()
-    anatomy = world.make_anatomy()
-    anatomy.scan = SimpleNamespace(hu_at=lambda points: np.where(np.abs(points).max(axis=1) < 150, 40.0, np.nan))
-    slices = (draw_slices(Subject(case, anatomy, best_pick(candidates))),)
-    rehearsal = world.make_rehearsal(plan)
-    write_page(case, anatomy, candidates, plan, rehearsal, registration, path, slices=slices)
+    world.make_page(path)
     with Browser(folder / "profile") as browser:
         browser.open(path)
         browser.until("document.body.dataset.ready === 'true'")

@@ -27,6 +27,7 @@ from puncture_twin.twin.report.numbers import (
 from puncture_twin.twin.report.page import page_tables as tables
 from puncture_twin.twin.report.page.page_chances import chance_card, chances_section, rooms_section
 from puncture_twin.twin.report.page.page_charts import rehearsal_charts
+from puncture_twin.twin.report.page.page_dates import dates_text
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_methods import methods_text
 from puncture_twin.twin.report.page.page_scene import scene_figure
@@ -100,6 +101,7 @@ def write_page(
         path,
         title=f"{case.name}: puncture of {target_words(case)}",
         stands=_stands(case),
+        dates=dates_text(case),
         needle=needle_words(case),
         sliced=bool(slices),
         tones=SHOWN_TONES if slices and slices[0].panels[0].hu is not None else (),

@@ -54,6 +54,10 @@ GROUP_NAMES = {"safe": "safe region", "arm": "arm", "room": "room", "needle": "n
 """Bodies that share one line of the legend."""
 
 
+HOLDER_OPACITY = 0.3
+"""Of the needle's holder: from the entry it stands before what the needle goes to."""
+
+
 def scene_figure(
     case: Any,
     anatomy: Any,
@@ -131,7 +135,7 @@ def _trace(body: SceneBody, *, hidden: bool, in_legend: bool) -> dict[str, Any]:
         **{axis: _packed(values, np.float32) for axis, values in zip("xyz", vertices.T, strict=True)},
         **{corner: _packed(values, index) for corner, values in zip("ijk", body.mesh.faces.T, strict=True)},
         "color": css(body.colour),
-        "opacity": body.alpha,
+        "opacity": HOLDER_OPACITY if body.name.startswith("needle holder") else body.alpha,
         "name": group,
         "legendgroup": group,
         "showlegend": in_legend,

@@ -124,15 +124,14 @@ def counts_table(candidates: Candidates) -> Markup:
             Markup('<span class="patch {}" style="background-color:{}"></span>{}').format(
                 "hatched" if line.code == Reason.UNKNOWN_REGION.value else "", css(line.colour), line.words
             ),
-            Markup("<code>{}</code>").format(line.code),
-            f"{line.count:,}",
-            percent(line.fraction),
             percent(line.solid_angle),
+            f"{line.count:,}",
+            Markup("<code>{}</code>").format(line.code),
         )
         for line in reason_counts(candidates)
     ]
     words = faint(f"{arm_words(candidates)}.")
-    return table(("verdict", "code", "directions", "of grid", "of solid angle"), rows, kind="numbers") + words
+    return table(("verdict", "of solid angle", "directions", "code"), rows, kind="numbers") + words
 
 
 def registration_section(registration: Mapping[str, Any] | None, plan: Any | None) -> Markup:

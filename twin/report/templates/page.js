@@ -76,7 +76,7 @@
   const shown = (value, digits, unit) => value === null ? "–" : `${value.toFixed(digits)}${unit === "°" ? "" : " "}${unit}`.replace("-", "−");
 
   function chanceWords(chance) { // what is not sure never reads as 0 or 1
-    if (chance > 0 && chance < 5e-5) return "<0.0001";
+    if (chance < 5e-5) return "<0.0001"; // what the page was given is rounded: 0 may be 1e-10
     if (chance < 1 && chance > 1 - 5e-5) return ">0.9999";
     return chance.toFixed(chance === 0 || chance === 1 || chance >= 0.0095 && chance <= 0.99 ? 2 : 4);
   }

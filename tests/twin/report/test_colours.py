@@ -1,0 +1,71 @@
+"""Colours that a reader with deuteranopia tells apart, and that look as they do in the field."""
+
+import numpy as np
+import pytest
+from skimage.color import deltaE_ciede2000, rgb2lab
+
+from puncture_twin.planning.base.reasons import REASON_COLOURS, SAFE, Reason
+from puncture_twin.twin.report.map.map_raster import HATCH
+from puncture_twin.twin.report.palette import CUSTOM_COLOURS, ORGAN_COLOURS, SAFE_HIGH, SAFE_LOW, organ_colours
+
+DEUTERANOPIA = np.array(
+    [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+)
+"""Of linear RGB, severity 1 (Machado et al. 2009, table 1)."""
+
+
+def as_seen(colour):
+    """A colour in Lab as a reader with deuteranopia sees it."""
+    rgb = np.asarray(colour) / 255
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(DEUTERANOPIA @ linear, 0, 1)
+    return rgb2lab(np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055))
+
+
+def difference(first, second):
+    """CIEDE2000 between two colours as that reader sees them."""
+    return float(deltaE_ciede2000(as_seen(first), as_seen(second)))
+
+
+def test_the_difference_is_that_of_equal_and_of_opposite_colours():
+    """Nothing between equal ones, 100 between black and white, little between the red and green they confuse."""
+    assert difference(SAFE, SAFE) == 0 and difference((0, 0, 0), (255, 255, 255)) == pytest.approx(100, abs=1e-3)
+    confused = [(161, 105, 56), (110, 131, 60)]
+    assert difference(*confused) < 8 < float(deltaE_ciede2000(*(rgb2lab(np.array(c) / 255) for c in confused)))
+
+
+@pytest.mark.parametrize("shade", [SAFE, SAFE_LOW, SAFE_HIGH])
+def test_safe_is_told_from_unknown_by_more_than_its_hue(shade):
+    """Unknown is hatched, in lines that differ from its own ground by more than 30; no shade of safe is hatched."""
+    unknown = REASON_COLOURS[Reason.UNKNOWN_REGION]
+    assert difference(unknown, HATCH) > 30
+    assert min(difference(shade, unknown), difference(shade, HATCH)) > 5
+
+
+@pytest.mark.parametrize("reason", [r for r in REASON_COLOURS if r is not Reason.UNKNOWN_REGION])
+def test_no_other_reason_looks_safe(reason):
+    """To the same reader, beside the legend's green: 10 is a difference that is seen at a glance."""
+    assert difference(REASON_COLOURS[reason], SAFE) > 10
+
+
+def test_no_structure_is_green_as_safe_is():
+    """To every reader: what is green in the scene is where a needle may go."""
+    for colour in (*ORGAN_COLOURS, *(colour for _, colour in CUSTOM_COLOURS)):
+        for shade in (SAFE, SAFE_HIGH):
+            lab = (rgb2lab(np.array(one) / 255) for one in (colour, shade))
+            assert float(deltaE_ciede2000(*lab)) > 15, colour
+
+
+def test_right_and_left_are_one_colour():
+    """Of custom or by turn, in any way of naming sides; others differ from their neighbours."""
+    pairs = [("rib_right_9", "rib_left_9"), ("ovary_right", "ovary_left"), ("Right eye", "Left eye")]
+    colours = organ_colours(tuple(name for pair in pairs for name in pair))
+    assert all(colours[first] == colours[second] for first, second in pairs)
+    assert colours["ovary_right"] != colours["Right eye"]
+
+
+def test_muscles_are_muted():
+    """Less colourful than organs: they fill the picture, and are no obstacle."""
+    colours = organ_colours(("gluteus_maximus_left", "liver", "aorta"))
+    chroma = {name: float(np.hypot(*rgb2lab(np.array(colour) / 255)[1:])) for name, colour in colours.items()}
+    assert chroma["gluteus_maximus_left"] < 0.6 * min(chroma["liver"], chroma["aorta"])
