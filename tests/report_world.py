@@ -44,6 +44,7 @@ def make_case(*, space="LPS", frame=None, name="ball"):
         inputs=(Input("case", "case.toml", "ab" * 32), Input("mesh liver", "liver.ply", "cd" * 32)),
         robot=SimpleNamespace(model="ur3"),
         rehearsal=SimpleNamespace(seed=7),
+        breathing=None,
     )
 
 
