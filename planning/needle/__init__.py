@@ -1,0 +1,8 @@
+"""A needle that bends: its cross section, the beam on an elastic foundation, the path of a bevel, the force on the way.
+
+Pure mechanics in N and mm; it knows neither cases nor patients.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

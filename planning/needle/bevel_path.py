@@ -1,0 +1,74 @@
+"""The path that a bevel cuts, and the needle in it.
+
+A bevel cuts at an angle alpha to the shaft behind it. A lateral force at the tip of a bent beam alone gives a path that
+depends on the step; the path is kinematic (Webster et al., Int. J. Robotics Research 25, 2006):
+
+    dy/ds = w'(tip) + alpha,   w(tip) = y(s)
+
+with w the shaft in the foundation of the path that was cut (mechanics: Misra et al., Int. J. Robotics Research 29,
+2010). Explicit in s, by the two-step formula of Adams and Bashforth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.needle.beam import Beam, Shape
+from puncture_twin.planning.needle.shaft import Shaft
+
+STEP_MM = 1.0
+"""Of an insertion; halving it changes a path by less than 1.5 %."""
+
+
+@dataclass(frozen=True, eq=False)
+class BevelPath:
+    """A path of m steps, in the plane of the bevel.
+
+    Attributes:
+        depth_mm: Shape (m + 1,), how far the tip is in.
+        cut_mm: Shape (m + 1,), how far the path is off the straight line there.
+        needle_mm: Shape (m + 1,), how far the shaft is off at those depths, once it is all in.
+        tip_force_n: Shape (m + 1,), the lateral force between tip and tissue as each depth was reached.
+        largest_mm: Shape (m + 1,), the greatest deflection anywhere along the shaft, up to each depth.
+    """
+
+    depth_mm: Floats
+    cut_mm: Floats
+    needle_mm: Floats
+    tip_force_n: Floats
+    largest_mm: Floats
+
+
+def bevel_path(shaft: Shaft, stiffness: Floats, alpha: Floats, step_mm: float = STEP_MM) -> BevelPath:
+    """Insert a needle step by step.
+
+    Args:
+        shaft: Its length is rounded to whole steps.
+        stiffness: k of the tissue in each step of depth, shape (m,), N/mm^2.
+        alpha: The bevel's angle in each, shape (m,), rad; its sign is the side to which the bevel points.
+        step_mm: Length of a step.
+    """
+    count = len(stiffness)
+    elements = max(round(shaft.length_mm / step_mm), count)
+    beam = Beam(shaft.bending_stiffness, step_mm, elements)
+    cut, force, largest = np.zeros(count + 1), np.zeros(count + 1), np.zeros(count + 1)
+    before, slope, shape = 0.0, 0.0, None
+    for done in range(count):
+        ahead = 1.5 * slope - 0.5 * before
+        cut[done + 1] = cut[done] + step_mm * (ahead + alpha[done])
+        shape = _inserted(beam, stiffness[: done + 1], cut[: done + 2])
+        before, slope, force[done + 1] = slope, float(shape.slope[-1]), shape.tip_force
+        largest[done + 1] = max(largest[done], float(np.abs(shape.deflection).max()), abs(cut[done + 1]))
+    needle = cut.copy() if shape is None else shape.deflection[elements - count :]
+    return BevelPath(step_mm * np.arange(count + 1), cut, needle, force, largest)
+
+
+def _inserted(beam: Beam, stiffness: Floats, cut: Floats) -> Shape:
+    """The shaft with its last part in the tissue, and its tip on the end of the path."""
+    foundation, rest = np.zeros(beam.elements), np.zeros(beam.elements + 1)
+    foundation[beam.elements - len(stiffness) :] = stiffness
+    rest[beam.elements - len(stiffness) :] = cut
+    return beam.bent(foundation, rest, tip_mm=float(cut[-1]))

@@ -1,0 +1,133 @@
+"""The axial force of an insertion: capsules, cutting and friction, and where the arm's work goes.
+
+After Okamura, Simone and O'Leary (IEEE Trans. Biomed. Eng. 51, 2004): before a surface ruptures it is a nonlinear
+spring; behind it a constant cutting force and friction along the shaft. The spring's form is ours, F = P (x / d)^2 up
+to the rupture at P and d, and so is every number of a case: those of the paper are of bovine liver, and none is copied
+here. At the steady speed of an insertion the paper's friction (Karnopp's) is Coulomb's. A surface that ruptured goes
+back to its place: the tip is then in by d, without further work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.needle.tissue import Layer
+
+SAMPLE_MM = 0.1
+"""Between two samples of the force."""
+
+
+class Push(NamedTuple):
+    """A capsule that is pushed in, from one depth to its rupture at another, with a force there."""
+
+    start_mm: float
+    end_mm: float
+    force_n: float
+
+
+@dataclass(frozen=True, eq=False)
+class InsertionForce:
+    """The force over depth, and its work; N and mm.
+
+    Attributes:
+        depth_mm: Shape (n,), of the tip from the skin.
+        capsule_n: Shape (n,).
+        cutting_n: Shape (n,).
+        friction_n: Shape (n,).
+        energy_n_mm: What rupture, cutting and friction take, in closed form.
+    """
+
+    depth_mm: Floats
+    capsule_n: Floats
+    cutting_n: Floats
+    friction_n: Floats
+    energy_n_mm: tuple[float, float, float]
+
+    @property
+    def total_n(self) -> Floats:
+        """Shape (n,)."""
+        return np.asarray(self.capsule_n + self.cutting_n + self.friction_n)
+
+    @property
+    def peak_n(self) -> float:
+        """The greatest force."""
+        return float(self.total_n.max(initial=0.0))
+
+    @property
+    def work_n_mm(self) -> float:
+        """Of the arm: the force integrated over the samples."""
+        return float(np.trapezoid(self.total_n, self.depth_mm))
+
+
+def insertion_force(layers: Sequence[Layer], step_mm: float = SAMPLE_MM) -> InsertionForce:
+    """The force of a needle that goes through layers at a steady speed.
+
+    Args:
+        layers: From the skin on, each beginning where the one before ends.
+        step_mm: Between two samples.
+    """
+    end = layers[-1].end_mm if layers else 0.0
+    depth = np.linspace(0.0, end, round(end / step_mm) + 1) if end > 0 else np.zeros(1)
+    pushes = _pushes(layers, end)
+    capsule, cutting, inside = np.zeros(len(depth)), np.zeros(len(depth)), depth.copy()
+    for layer in layers:
+        cutting[(depth >= layer.start_mm) & (depth <= layer.end_mm)] = layer.tissue.cutting_n
+    for push in pushes:
+        pushing = (depth >= push.start_mm) & (depth < push.end_mm)
+        capsule[pushing] = _spring(push, layers, depth[pushing])
+        cutting[pushing], inside[pushing] = 0.0, push.start_mm
+    friction = sum((_friction(layer, inside) for layer in layers), np.zeros(len(depth)))
+    return InsertionForce(depth, capsule, cutting, friction, _energies(layers, pushes))
+
+
+def _pushes(layers: Sequence[Layer], end: float) -> list[Push]:
+    """Capsules in order; what lies within the reach of one that ruptures goes with it. The target ends the last."""
+    found: list[Push] = []
+    for layer in layers:
+        tissue, inside = layer.tissue, found[-1].end_mm if found else 0.0
+        if tissue.capsule_n > 0 and tissue.capsule_mm > 0 and layer.start_mm >= inside:
+            found.append(Push(layer.start_mm, min(layer.start_mm + tissue.capsule_mm, end), tissue.capsule_n))
+    return found
+
+
+def _spring(push: Push, layers: Sequence[Layer], depth: Floats) -> Floats:
+    """P (x / d)^2, with d of the capsule, also where the target ends the push before its rupture."""
+    reach = next(layer.tissue.capsule_mm for layer in layers if layer.start_mm == push.start_mm)
+    return np.asarray(push.force_n * ((depth - push.start_mm) / reach) ** 2)
+
+
+def _friction(layer: Layer, inside: Floats) -> Floats:
+    """Of the shaft's length inside one layer."""
+    length = np.clip(inside, layer.start_mm, layer.end_mm) - layer.start_mm
+    return np.asarray(layer.tissue.friction_n_mm * length)
+
+
+def _energies(layers: Sequence[Layer], pushes: Sequence[Push]) -> tuple[float, float, float]:
+    """Rupture, cutting, friction: integrals of the three in closed form."""
+    rupture = cutting = friction = 0.0
+    for push in pushes:
+        reach = next(layer.tissue.capsule_mm for layer in layers if layer.start_mm == push.start_mm)
+        rupture += push.force_n * (push.end_mm - push.start_mm) ** 3 / (3 * reach**2)
+    end = layers[-1].end_mm if layers else 0.0
+    for layer in layers:
+        pushed = sum(max(0.0, min(p.end_mm, layer.end_mm) - max(p.start_mm, layer.start_mm)) for p in pushes)
+        length = layer.end_mm - layer.start_mm
+        cutting += layer.tissue.cutting_n * (length - pushed)
+        friction += layer.tissue.friction_n_mm * (length**2 / 2 + length * (end - layer.end_mm))
+        for p in pushes:  # while a capsule is pushed in, the shaft inside does not grow
+            friction -= layer.tissue.friction_n_mm * _unfelt(layer, p)
+    return rupture, cutting, friction
+
+
+def _unfelt(layer: Layer, push: Push) -> float:
+    """Integral over a push of the length that a shaft that cut on would have had more inside a layer."""
+    low = max(push.start_mm, layer.start_mm)
+    reached = min(push.end_mm, layer.end_mm)
+    if push.end_mm <= layer.start_mm or reached <= low:
+        return 0.0
+    return (reached - low) ** 2 / 2 + (reached - low) * (push.end_mm - reached)

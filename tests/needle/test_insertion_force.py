@@ -1,0 +1,66 @@
+"""The force of an insertion, and where the arm's work goes."""
+
+import numpy as np
+import pytest
+
+from puncture_twin.planning.needle.insertion_force import insertion_force
+from puncture_twin.planning.needle.tissue import Layer, Tissue
+
+SKIN = Tissue(0.1, cutting_n=0.6, friction_n_mm=0.01, capsule_n=4.0, capsule_mm=5.0)
+FAT = Tissue(0.02, cutting_n=0.3, friction_n_mm=0.005)
+LIVER = Tissue(0.1, cutting_n=0.9, friction_n_mm=0.02, capsule_n=2.0, capsule_mm=3.0)
+PATH = [Layer(0.0, 8.0, SKIN), Layer(8.0, 25.0, FAT), Layer(25.0, 80.0, LIVER)]
+
+
+def test_the_arms_work_goes_into_rupture_cutting_and_friction():
+    """To 1 %: the sampled force integrated, beside the three integrals in closed form; and it converges."""
+    found = insertion_force(PATH)
+    assert found.work_n_mm == pytest.approx(sum(found.energy_n_mm), rel=0.01)
+    finer = insertion_force(PATH, 0.01)
+    assert abs(finer.work_n_mm - sum(finer.energy_n_mm)) < 0.2 * abs(found.work_n_mm - sum(found.energy_n_mm))
+    for part, energy in zip((finer.capsule_n, finer.cutting_n, finer.friction_n), finer.energy_n_mm, strict=True):
+        assert np.trapezoid(part, finer.depth_mm) == pytest.approx(energy, rel=0.01)
+
+
+def test_layers_at_random_keep_the_balance(rng):
+    """Thin ones, capsules that reach beyond their layer, and a target within a capsule's reach."""
+    for _ in range(40):
+        ends = np.cumsum(rng.uniform(0.5, 20.0, 5))
+        layers, start = [], 0.0
+        for end in ends:
+            numbers = rng.uniform(0.1, 2.0, 2) * [1.0, 0.02]
+            capsule = (rng.uniform(0.5, 5.0), rng.uniform(0.5, 8.0)) if rng.random() < 0.6 else (0.0, 0.0)
+            layers.append(Layer(start, float(end), Tissue(0.1, *numbers, *capsule)))
+            start = float(end)
+        found = insertion_force(layers, 0.01)
+        assert found.work_n_mm == pytest.approx(sum(found.energy_n_mm), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("tissue", "zero"),
+    [
+        (Tissue(0.1, 0.9, 0.02), "capsule_n"),
+        (Tissue(0.1, 0.0, 0.02, 4.0, 5.0), "cutting_n"),
+        (Tissue(0.1, 0.9, 0.0, 4.0, 5.0), "friction_n"),
+    ],
+)
+def test_each_term_can_be_off(tissue, zero):
+    """It is nothing then, and the others are not."""
+    found = insertion_force([Layer(0.0, 50.0, tissue)])
+    parts = {name: getattr(found, name) for name in ("capsule_n", "cutting_n", "friction_n")}
+    assert not parts.pop(zero).any()
+    assert all(part.any() for part in parts.values())
+
+
+def test_a_capsule_gives_way_at_its_force():
+    """The peak is there, and behind it the tip cuts."""
+    found = insertion_force(PATH, 0.01)
+    assert found.capsule_n.max() == pytest.approx(4.0, rel=0.01)
+    assert found.peak_n == pytest.approx(4.0, rel=0.01)
+    behind = (found.depth_mm > 5.01) & (found.depth_mm < 8.0)
+    assert not found.capsule_n[behind].any() and np.all(found.cutting_n[behind] == 0.6)
+
+
+def test_nothing_to_pass_needs_no_force():
+    """A path without length."""
+    assert insertion_force([]).peak_n == 0.0
