@@ -7,8 +7,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.breathing.breathing import Breathing, Weights
+from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.breathing.lujan import fraction_within, positions
+from puncture_twin.planning.formats.labels.by_name import ByName
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.organs import organ_candidates
 from puncture_twin.planning.search.search import case_directions
@@ -41,7 +42,7 @@ GATE = 0.25
 
 def abdomen_breath(gate: float | None) -> Breathing:
     """Twelve millimetres to the feet, cos^4, eight phases, scanned at exhale."""
-    return Breathing(12.0, np.array([0.0, 0.0, -1.0]), Weights(WEIGHTS), 8, 2, 0.0, gate)
+    return Breathing(12.0, np.array([0.0, 0.0, -1.0]), ByName(WEIGHTS), 8, 2, 0.0, gate)
 
 
 def draw_curve(axes):

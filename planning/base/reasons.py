@@ -23,6 +23,7 @@ class Reason(StrEnum):
     HIT_UNLIKELY = "hit_unlikely"
     TOUCH_LIKELY = "touch_likely"
     UNSAFE_WHEN_BREATHING = "unsafe_when_breathing"
+    NEEDLE_BENDS = "needle_bends"
     UNKNOWN_REGION = "unknown_region"
     UNREACHABLE = "unreachable"
     ARM_COLLISION = "arm_collision"
@@ -45,6 +46,7 @@ REASON_COLOURS = MappingProxyType(
         Reason.HIT_UNLIKELY: (153, 153, 51),
         Reason.TOUCH_LIKELY: (204, 51, 17),
         Reason.UNSAFE_WHEN_BREATHING: (102, 17, 0),
+        Reason.NEEDLE_BENDS: (170, 68, 153),
         Reason.UNKNOWN_REGION: (110, 110, 110),
         Reason.UNREACHABLE: (0, 90, 178),
         Reason.ARM_COLLISION: (204, 121, 167),
@@ -64,6 +66,7 @@ REASON_TEXT = MappingProxyType(
         Reason.HIT_UNLIKELY: "too unlikely to hit the target",
         Reason.TOUCH_LIKELY: "too likely to touch a structure",
         Reason.UNSAFE_WHEN_BREATHING: "unsafe at a phase of the breath",
+        Reason.NEEDLE_BENDS: "may bend into a structure's margin",
         Reason.UNKNOWN_REGION: "unknown region (image ends, or not named)",
         Reason.UNREACHABLE: "arm cannot reach the pose",
         Reason.ARM_COLLISION: "arm would collide",

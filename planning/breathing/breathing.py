@@ -7,78 +7,13 @@ places.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
-from pathlib import Path
 
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.breathing.lujan import positions
-from puncture_twin.planning.formats.labels.naming import specificity
-
-SHOWN = 8
-"""Names that an error lists."""
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Pattern of names to weight.
-
-    Attributes:
-        of_pattern: Shell patterns; the most specific that matches a name holds.
-    """
-
-    of_pattern: Mapping[str, float]
-
-    def of(self, name: str) -> float | None:
-        """The weight of one name; None where no pattern matches it.
-
-        >>> Weights({"*": 0.0, "rib*": 0.5}).of("rib_1"), Weights({"rib*": 0.5}).of("liver")
-        (0.5, None)
-        """
-        matching = [pattern for pattern in self.of_pattern if fnmatchcase(name, pattern)]
-        best = max(matching, key=lambda pattern: specificity(pattern, name), default=None)
-        return None if best is None else self.of_pattern[best]
-
-    def check(self, names: Iterable[str], where: str | Path, *, others: Iterable[str] = ()) -> None:
-        """Refuse patterns that leave a name out, match nothing, or contradict each other.
-
-        Args:
-            names: All that needs a weight.
-            where: For errors.
-            others: What has a weight by itself, and may be named all the same.
-
-        Raises:
-            InputError: One of the three.
-        """
-        names, known = list(names), [*names, *others]
-        if missing := [name for name in names if self.of(name) is None]:
-            message = f"breathing.weights: no weight for {_listed(missing)}"
-            raise InputError(message, where=where, allowed='a weight for each, such as "liver" = 1; "*" is the rest')
-        for pattern in self.of_pattern:
-            if not any(fnmatchcase(name, pattern) for name in known):
-                message = f"breathing.weights: pattern '{pattern}' matches no structure"
-                raise InputError(message, where=where, allowed=_listed(known))
-        for name in names:
-            _refuse_contradiction(self.of_pattern, name, where)
-
-
-def _refuse_contradiction(of_pattern: Mapping[str, float], name: str, where: str | Path) -> None:
-    """Two equally specific patterns that give one name two weights."""
-    matching = [pattern for pattern in of_pattern if fnmatchcase(name, pattern)]
-    best = max(specificity(pattern, name) for pattern in matching)
-    equal = [pattern for pattern in matching if specificity(pattern, name) == best]
-    if len({of_pattern[pattern] for pattern in equal}) > 1:
-        message = f"breathing.weights: {' and '.join(map(repr, equal))} give '{name}' two weights"
-        raise InputError(message, where=where, allowed="one pattern that is more specific than the others")
-
-
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return ", ".join(names[:SHOWN]) + more
+from puncture_twin.planning.formats.labels.by_name import ByName
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +32,7 @@ class Breathing:
 
     amplitude_mm: float
     direction_ct: Floats
-    weights: Weights
+    weights: ByName[float]
     phases: int
     exponent: int
     scanned_at: float

@@ -40,6 +40,7 @@ from puncture_twin.planning.case.registration_section import (
     RegistrationSection,
     stated_base_ct,
 )
+from puncture_twin.planning.case.sections.bend import bending_of
 from puncture_twin.planning.case.sections.breath import breathing_of
 from puncture_twin.planning.case.settings import (
     CtSettings,
@@ -55,6 +56,7 @@ from puncture_twin.planning.formats.labels.mask_folder import structure_name
 from puncture_twin.planning.formats.points.point_files import parse_points
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.needle.bending import Bending
 
 ALLOWED_CASE = "a TOML case file with schema = 1 or 2, or a folder with case.toml"
 
@@ -75,6 +77,7 @@ class Case:
         errors: What is declared to err, or None.
         truth_errors: From what a rehearsal's truth is drawn instead, to test a wrong belief; None draws from `errors`.
         breathing: How the body moves with the breath, or None where the case does not say.
+        bending: How the needle bends, and in what, or None where the case does not say.
         own_target: Whether the target lies in no structure: its own is then the ball of the hit radius about it, which
             has its name.
     """
@@ -107,6 +110,7 @@ class Case:
     errors: ErrorModel | None = None
     truth_errors: ErrorModel | None = None
     breathing: Breathing | None = None
+    bending: Bending | None = None
     own_target: bool = False
 
     def _repr_html_(self) -> str:
@@ -160,7 +164,7 @@ def load_case(path: Path | str) -> Case:
         target_name=content.target.name,
         target_structure=content.target.structure or content.target.name,
         own_target=content.target.structure is None,
-        needle=Needle(**content.needle.model_dump()),
+        needle=Needle(**content.needle.model_dump(include={*Needle.__dataclass_fields__})),
         search=_search(content.search),
         ranking=content.ranking,
         T_ct_entry=view_frame(entry_frame(settings.frame, space, where=path), target),
@@ -182,6 +186,7 @@ def load_case(path: Path | str) -> Case:
         errors=_errors(content, content.errors, case_volumes, path),
         truth_errors=_errors(content, content.rehearsal.errors, case_volumes, path, truth=True),
         breathing=breathing_of(content.breathing, space, path),
+        bending=bending_of(content.needle, content.tissue, path),
     )
 
 

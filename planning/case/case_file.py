@@ -13,6 +13,7 @@ from puncture_twin.planning.case.case_schema import CaseSchema, Region, check_st
 from puncture_twin.planning.case.errors_section import ErrorsSection
 from puncture_twin.planning.case.registration_section import RegistrationSection
 from puncture_twin.planning.case.sections.breathing_section import BreathingSection
+from puncture_twin.planning.case.sections.tissue_section import TissueSection
 from puncture_twin.planning.case.toml_types import (
     Anatomical,
     Coordinate,
@@ -77,11 +78,17 @@ class NeedleSection(Section):
     standoff_mm: Annotated[Number, Field(ge=5, le=1000)] | None = None
     skin_gap_mm: Annotated[Number, Field(ge=6, le=200)] = 10.0  # the least, along the needle; see standoff.py
     holder_diameter_mm: Annotated[Number, Field(ge=1, le=200)] = 30.0
+    gauge: Annotated[int, Strict()] | None = None
+    solid: Annotated[bool, Strict()] | None = None
+    bevel_deg: Annotated[Number, Field(ge=0, le=10)] | None = None
+    modulus_gpa: Annotated[Number, Field(ge=1, le=1000)] | None = None
 
     @model_validator(mode="after")
     def _shaft_fits(self) -> Self:
         if self.shaft_mm > self.length_mm:
             raise ValueError(f"shaft_mm {self.shaft_mm:g} is longer than length_mm {self.length_mm:g}")
+        if self.solid is not None and self.gauge is None:
+            raise ValueError("solid belongs to gauge; without one the shaft is solid, of diameter_mm")
         return self
 
 
@@ -366,6 +373,7 @@ class CaseFile(Section):
     place: PlaceSection = PlaceSection()
     errors: ErrorsSection | None = None
     breathing: BreathingSection | None = None
+    tissue: Annotated[dict[Text, TissueSection], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
     rehearsal: RehearsalSection = RehearsalSection()
     end: EndSection | None = None
 

@@ -68,10 +68,13 @@ def question_of(
     beta: tuple[float, float] | None = None,
 ) -> Question:
     """The question that a certificate of a case answers; see `certify`."""
-    if case.breathing is not None:
-        allowed = "a case without [breathing]; or a search, which checks phase by phase"
-        message = "[breathing]: a certificate proves a body that does not move"
-        raise InputError(message, where=case.path, allowed=allowed)
+    for table, declared, straight in (
+        ("breathing", case.breathing, "a body that does not move"),
+        ("tissue", case.bending, "a needle that does not bend"),
+    ):
+        if declared is not None:
+            allowed = f"a case without [{table}]; or a search, which counts it"
+            raise InputError(f"[{table}]: a certificate proves {straight}", where=case.path, allowed=allowed)
     theta, beta = theta or case.search.theta, beta or case.search.beta
     if not (0 <= theta[0] <= theta[1] <= np.pi + 1e-12 and beta[0] <= beta[1] <= beta[0] + 2 * np.pi + 1e-12):
         raise InputError("the cap is no range of angles", where="certify", allowed="theta 0 to 180, beta 0 to 360")

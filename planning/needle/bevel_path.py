@@ -62,8 +62,8 @@ def bevel_path(shaft: Shaft, stiffness: Floats, alpha: Floats, step_mm: float = 
         shape = _inserted(beam, stiffness[: done + 1], cut[: done + 2])
         before, slope, force[done + 1] = slope, float(shape.slope[-1]), shape.tip_force
         largest[done + 1] = max(largest[done], float(np.abs(shape.deflection).max()), abs(cut[done + 1]))
-    needle = cut.copy() if shape is None else shape.deflection[elements - count :]
-    return BevelPath(step_mm * np.arange(count + 1), cut, needle, force, largest)
+    needle: Floats = cut if shape is None else np.asarray(shape.deflection[elements - count :])
+    return BevelPath(step_mm * np.arange(count + 1, dtype=np.float64), cut, needle, force, largest)
 
 
 def _inserted(beam: Beam, stiffness: Floats, cut: Floats) -> Shape:

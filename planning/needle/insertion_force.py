@@ -22,6 +22,10 @@ SAMPLE_MM = 0.1
 """Between two samples of the force."""
 
 
+ROUNDING_MM = 1e-9
+"""A sample this near behind a rupture is the rupture."""
+
+
 class Push(NamedTuple):
     """A capsule that is pushed in, from one depth to its rupture at another, with a force there."""
 
@@ -78,7 +82,7 @@ def insertion_force(layers: Sequence[Layer], step_mm: float = SAMPLE_MM) -> Inse
     for layer in layers:
         cutting[(depth >= layer.start_mm) & (depth <= layer.end_mm)] = layer.tissue.cutting_n
     for push in pushes:
-        pushing = (depth >= push.start_mm) & (depth < push.end_mm)
+        pushing = (depth >= push.start_mm) & (depth <= push.end_mm + ROUNDING_MM)
         capsule[pushing] = _spring(push, layers, depth[pushing])
         cutting[pushing], inside[pushing] = 0.0, push.start_mm
     friction = sum((_friction(layer, inside) for layer in layers), np.zeros(len(depth)))

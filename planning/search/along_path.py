@@ -52,7 +52,7 @@ def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_leng
         return ()
     depths = np.arange(0.0, path_length + BEYOND_SKIN_MM, STEP_MM)
     hu = anatomy.scan.hu_at(target_ct + depths[:, None] * outward_ct)
-    around = np.array([_contains(s, target_ct, outward_ct, depths) for s in anatomy.checked if s.mesh.closed])
+    around = np.array([inside_at(s, target_ct, outward_ct, depths) for s in anatomy.checked if s.mesh.closed])
     names = np.array([s.name for s in anatomy.checked if s.mesh.closed], dtype=object)
     keys = [(*names[around[:, row]], "" if depth <= path_length else "outside") for row, depth in enumerate(depths)]
     found, first = [], 0
@@ -64,8 +64,15 @@ def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_leng
     return tuple(found)
 
 
-def _contains(structure: Structure, target_ct: Floats, outward_ct: Floats, depths: Floats) -> NDArray[np.bool_]:
-    """At which depths the path is inside a closed structure: the parity of the crossings before."""
+def inside_at(structure: Structure, target_ct: Floats, outward_ct: Floats, depths: Floats) -> NDArray[np.bool_]:
+    """At which depths the path is inside a closed structure: the parity of the crossings before.
+
+    Args:
+        structure: Closed.
+        target_ct: Shape (3,), mm.
+        outward_ct: Shape (3,), unit.
+        depths: Shape (n,), from the target outward, mm.
+    """
     points = target_ct + depths[:, None] * outward_ct
     low, high = structure.mesh.bounds
     if not np.any(np.all((low <= points) & (points <= high), axis=1)):

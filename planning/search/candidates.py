@@ -176,6 +176,8 @@ class Candidates(Columns):
         arm_note: `ARM_CHECKED`, or "not checked: " and why: then a safe candidate is safe for the organs alone.
         chances: To hit and to touch; None where the case declares no errors.
         breathing: What the breath leaves; None where the case does not declare it.
+        deflection: Shape (n,), how far the needle may bend on each path, mm, NaN without one; None where the case
+            declares no tissue.
         grid: The regular grid that the rows are; None for any others.
         cone_source: `CONE_OF_GRID` or `CONE_CERTIFIED`; "" where there are no safe cones.
     """
@@ -192,6 +194,7 @@ class Candidates(Columns):
     arm_note: str = "not checked"
     chances: Chances | None = None
     breathing: BreathingColumns | None = None
+    deflection: Floats | None = None
     grid: AngleGrid | None = None
     cone_source: str = ""
 

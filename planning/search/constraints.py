@@ -106,7 +106,7 @@ def closest_miss(found: Candidates) -> int | None:
         demanded = ~np.isnan(found.clearance.margins)
         lack = (found.clearance.margins - found.clearance.distance)[:, demanded].max(axis=1)
         return int(lacking[np.argmin(lack[lacking])])
-    late = (Reason.TOUCH_LIKELY, Reason.HIT_UNLIKELY, Reason.UNSAFE_WHEN_BREATHING)
+    late = (Reason.TOUCH_LIKELY, Reason.HIT_UNLIKELY, Reason.UNSAFE_WHEN_BREATHING, Reason.NEEDLE_BENDS)
     order = (*late, Reason.APPROACH_NOT_FOUND, Reason.INSERTION_BLOCKED, Reason.ARM_COLLISION, Reason.UNREACHABLE)
     for reason in (*order, Reason.SKIN_ANGLE, Reason.TOO_LONG, Reason.REENTERS_SKIN, Reason.UNKNOWN_REGION):
         rows = np.flatnonzero(found.verdict.reason == reason.value)

@@ -30,6 +30,7 @@ from puncture_twin.planning.registration.placement import Placement, load_placem
 from puncture_twin.planning.search.arm_reach import ArmReach
 from puncture_twin.planning.search.bedside.entry_facts import EntryFacts, entry_facts
 from puncture_twin.planning.search.bedside.entry_place import Landmark
+from puncture_twin.planning.search.bending.path_layers import check_tissues
 from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
 from puncture_twin.planning.search.consistency import check_consistency
 from puncture_twin.planning.search.doubt import Doubt, doubt_of
@@ -206,6 +207,7 @@ def prepare(
         anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
         warnings = (*case.warnings, *anatomy.warnings, *check_consistency(case, anatomy, placement))
         warnings += breath_warnings(case, anatomy)
+        check_tissues(case, anatomy)
         anatomy = replace(anatomy, warnings=warnings)
         case.files.release()
     with stages.time("trees"):

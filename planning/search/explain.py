@@ -15,6 +15,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.along_path import Stretch, stretches
 from puncture_twin.planning.search.bedside.entry_facts import EntryFacts
+from puncture_twin.planning.search.bending.insertion import Insertion, insertion_along
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.constraints import longest_path
 from puncture_twin.planning.search.doubt import Doubt
@@ -111,6 +112,7 @@ class Explanation:
             ],
             "warnings": list(self.anatomy.warnings),
             **self._chances(),
+            **self._needle(),
             **self._breathing(),
         }
 
@@ -159,6 +161,7 @@ class Explanation:
                 *self._doubt(),
                 *self._path(),
                 self._target(),
+                *self._bending(),
                 *self._breath(),
                 *self._scan(),
                 *self.structure_lines(most),
@@ -192,6 +195,33 @@ class Explanation:
             f"  standoff       {standoff:8.2f} mm, its tip {before:.1f} mm before the skin, the flange at {flange:.1f}",
             f"  tissue crossed {row.path.tissue[0]:8.2f} mm",
         ]
+
+    @cached_property
+    def insertion(self) -> Insertion | None:
+        """Where the needle bends to, and what it feels; None without tissue, or without an entry."""
+        row, bending = self.candidates, self.case.bending
+        if bending is None or np.isnan(row.path.length[0]):
+            return None
+        return insertion_along(self.case, bending, self.anatomy, row.outward_ct[0], float(row.path.length[0]))
+
+    def _bending(self) -> list[str]:
+        if self.insertion is None or self.candidates.deflection is None:
+            return []
+        return self.insertion.lines(float(self.candidates.deflection[0]))
+
+    def _needle(self) -> dict[str, Any]:
+        """Only of a case that declares its tissue."""
+        if self.candidates.deflection is None:
+            return {}
+        found = self.insertion
+        values = {
+            "deflection_bound_mm": finite(self.candidates.deflection[0]),
+            "deflection_mm": None if found is None else found.tip_mm,
+            "peak_force_n": None if found is None else found.force.peak_n,
+            "buckling_free_n": None if found is None else found.buckling_free_n,
+            "buckling_pinned_n": None if found is None else found.buckling_pinned_n,
+        }
+        return {"bending": values}
 
     def _breath(self) -> list[str]:
         """The least clearance of all phases that the gate lets through."""

@@ -11,8 +11,9 @@ from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
 from puncture_twin.planning.clearance.measure import measure
 from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange
+from puncture_twin.planning.search.bending.bent_needle import with_bending
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking
-from puncture_twin.planning.search.constraints import first_broken
+from puncture_twin.planning.search.constraints import first_broken, longest_path
 from puncture_twin.planning.search.phases.organ_phases import with_breathing
 from puncture_twin.planning.search.tissue import tissue_crossed
 
@@ -29,7 +30,7 @@ def organ_candidates(
     directions: Directions,
     axes: AxisDistances | None = None,
 ) -> Candidates:
-    """Check every direction against skin and organs alone, at every phase of a declared breath; nothing is ranked yet.
+    """Check every direction against skin and organs alone, bent and breathing as declared; nothing is ranked yet.
 
     Args:
         case: The validated case.
@@ -68,4 +69,5 @@ def organ_candidates(
         safe_cone=np.full(count, np.nan),
         grid=directions.grid,
     )
-    return with_breathing(case, anatomy, engine, found)
+    bound = None if case.bending is None else case.bending.bound(longest_path(needle))
+    return with_breathing(case, anatomy, engine, with_bending(anatomy, found, bound), bound)

@@ -56,6 +56,8 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
     }
     if candidates.chances is not None:
         columns |= chance_columns(candidates.chances)
+    if candidates.deflection is not None:
+        columns |= {"deflection_bound_mm": candidates.deflection}
     if candidates.breathing is not None:
         columns |= {
             "safe_all_phases": candidates.breathing.safe_all_phases,

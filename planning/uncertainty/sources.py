@@ -15,12 +15,20 @@ from puncture_twin.planning.case.errors import ErrorModel
 NOT_MODELLED = "breathing, a needle that bends, tissue that moves"
 """What no source stands for: it is not known, which is something else than 0."""
 
-BREATHING_ALONE = "breathing in the chances (they are of the body as the CT shows it)"
+NOT_IN_CHANCES = (
+    "breathing in the chances (they are of the body as the CT shows it)",
+    "a needle that bends in the chances (its greatest deflection is kept as clearance)",
+)
+"""The first two of them where the case declares them: what is done with them instead."""
 
 
 def not_modelled(case: Case) -> str:
-    """What the chances of a case leave out: what it does not declare, and what is declared but checked elsewhere."""
-    return ", ".join(["breathing" if case.breathing is None else BREATHING_ALONE, *NOT_MODELLED.split(", ")[1:]])
+    """What the chances of a case leave out: what it does not declare, and what is declared but counted elsewhere."""
+    left_out = NOT_MODELLED.split(", ")
+    for at, declared in enumerate((case.breathing, case.bending)):
+        if declared is not None:
+            left_out[at] = NOT_IN_CHANCES[at]
+    return ", ".join(left_out)
 
 
 ISOTROPIC = 1e-9

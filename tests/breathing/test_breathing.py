@@ -5,9 +5,10 @@ import pytest
 from case_world import ORGAN, SKIN, case_text, structure, write_balls
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.breathing.breathing import Breathing, Weights
+from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.breathing.lujan import fraction_within, positions
 from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.formats.labels.by_name import ByName
 
 BREATHING = '[breathing]\namplitude_mm = 12.0\ndirection = "feet"\n{keys}\n[breathing.weights]\n"*" = 0.0\n'
 
@@ -22,7 +23,7 @@ def case_with(folder, keys="", text=BREATHING, space="LPS"):
 
 def breathing(**keys):
     """Twelve millimetres to the feet."""
-    usual = {"amplitude_mm": 12.0, "direction_ct": np.array([0, 0, -1.0]), "weights": Weights({"*": 0.0})}
+    usual = {"amplitude_mm": 12.0, "direction_ct": np.array([0, 0, -1.0]), "weights": ByName({"*": 0.0})}
     return Breathing(**{**usual, "phases": 8, "exponent": 2, "scanned_at": 0.0, "gate": None, **keys})
 
 
@@ -70,23 +71,23 @@ def test_what_is_seen_at_inhale_moves_the_other_way():
 
 def test_the_most_specific_pattern_gives_the_weight():
     """As for margins; capitals count."""
-    weights = Weights({"*": 0.0, "rib*": 0.2, "rib_left_7": 0.4})
+    weights = ByName({"*": 0.0, "rib*": 0.2, "rib_left_7": 0.4})
     assert [weights.of(name) for name in ("Rib_1", "rib_1", "rib_left_7")] == [0.0, 0.2, 0.4]
-    assert Weights({"rib*": 0.2}).of("liver") is None
+    assert ByName({"rib*": 0.2}).of("liver") is None
 
 
 @pytest.mark.parametrize(
     ("patterns", "message"),
     [
-        ({"rib": 0.0}, "no weight for liver"),
+        ({"rib": 0.0}, "nothing for liver"),
         ({"*": 0.0, "kidny": 1.0}, "'kidny' matches no structure"),
-        ({"*": 0.0, "r?b": 0.1, "ri?": 0.2}, "give 'rib' two weights"),
+        ({"*": 0.0, "r?b": 0.1, "ri?": 0.2}, "both name 'rib', and differ"),
     ],
 )
 def test_weights_that_leave_a_doubt_are_refused(patterns, message):
     """A structure that nobody thought of must not count as resting."""
     with pytest.raises(InputError, match=message):
-        Weights(patterns).check(["rib", "liver"], "case.toml")
+        ByName(patterns).check(["rib", "liver"], "breathing.weights", "case.toml")
 
 
 def test_a_direction_need_not_be_a_unit_vector(tmp_path):

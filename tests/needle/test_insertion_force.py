@@ -55,8 +55,8 @@ def test_each_term_can_be_off(tissue, zero):
 def test_a_capsule_gives_way_at_its_force():
     """The peak is there, and behind it the tip cuts."""
     found = insertion_force(PATH, 0.01)
-    assert found.capsule_n.max() == pytest.approx(4.0, rel=0.01)
-    assert found.peak_n == pytest.approx(4.0, rel=0.01)
+    assert found.capsule_n.max() == pytest.approx(4.0)
+    assert found.peak_n == pytest.approx(4.0)
     behind = (found.depth_mm > 5.01) & (found.depth_mm < 8.0)
     assert not found.capsule_n[behind].any() and np.all(found.cutting_n[behind] == 0.6)
 

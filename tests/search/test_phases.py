@@ -10,10 +10,11 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.breathing.breathing import Breathing, Weights
+from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.collision.workcell import case_checker
+from puncture_twin.planning.formats.labels.by_name import ByName
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.context import prepare
@@ -42,7 +43,7 @@ def patient(tmp_path_factory):
 def breathing(**keys):
     """Thirty millimetres to the feet and a little to the front: enough to bring ribs in."""
     direction = np.array([0.1, -0.2, -1.0])
-    usual = {"amplitude_mm": 30.0, "direction_ct": direction / np.linalg.norm(direction), "weights": Weights(WEIGHTS)}
+    usual = {"amplitude_mm": 30.0, "direction_ct": direction / np.linalg.norm(direction), "weights": ByName(WEIGHTS)}
     return Breathing(**{**usual, "phases": 8, "exponent": 2, "scanned_at": 0.0, "gate": None, **keys})
 
 
@@ -134,15 +135,15 @@ def test_what_is_safe_says_when_and_never_that_a_needle_may_stay(patient):
 def test_a_weight_for_the_targets_own_structure_is_refused_unless_it_is_one(patient):
     """The amplitude is the target's; a pattern for all does not mean it."""
     with pytest.raises(InputError, match="'organ' holds the target"):
-        searched(patient, breathing(weights=Weights({**WEIGHTS, "organ": 0.5})))
-    rest = searched(patient, breathing(weights=Weights({"*": 0.0})))
-    stated = searched(patient, breathing(weights=Weights({"*": 0.0, "organ": 1.0})))
+        searched(patient, breathing(weights=ByName({**WEIGHTS, "organ": 0.5})))
+    rest = searched(patient, breathing(weights=ByName({"*": 0.0})))
+    stated = searched(patient, breathing(weights=ByName({"*": 0.0, "organ": 1.0})))
     np.testing.assert_array_equal(rest.safe, stated.safe)
 
 
 def test_a_breath_that_takes_the_target_out_of_the_skin_leaves_nothing_safe(patient):
     """A skin that stays, and a target that leaves it, are a slip of weights: nothing is known then."""
-    found = searched(patient, breathing(amplitude_mm=95.0, weights=Weights({"*": 0.0})))
+    found = searched(patient, breathing(amplitude_mm=95.0, weights=ByName({"*": 0.0})))
     assert not found.safe.any()
 
 
@@ -155,7 +156,7 @@ def test_a_certificate_refuses_a_body_that_moves(patient):
 def test_the_arm_is_checked_where_the_breath_puts_target_and_skin():
     """Against an arm that is asked anew in a carton whose skin, obstacles apart, truly moved."""
     context = prepare(folder() / "carton" / "case_m.toml")
-    weights = Weights({"*": 0.5})
+    weights = ByName({"*": 0.5})
     breath = breathing(amplitude_mm=60.0, weights=weights, direction_ct=np.array([1.0, 0, 0]), phases=2)
     settings = replace(context.case.search, step=np.radians(15.0))
     case = replace(context.case, breathing=breath, search=settings)

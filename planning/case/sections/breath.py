@@ -8,10 +8,11 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.breathing.breathing import Breathing, Weights
+from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.case.sections.breathing_section import BreathingSection
 from puncture_twin.planning.case.toml_types import Vector
+from puncture_twin.planning.formats.labels.by_name import ByName
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 
@@ -31,7 +32,7 @@ def breathing_of(section: BreathingSection | None, space: Space, where: str | Pa
     return Breathing(
         amplitude_mm=section.amplitude_mm,
         direction_ct=_unit(section.direction, space, where),
-        weights=Weights(section.weights),
+        weights=ByName(section.weights),
         phases=section.phases,
         exponent=section.exponent,
         scanned_at=section.scanned_at,

@@ -34,7 +34,8 @@ def moving_weights(case: Case, breathing: Breathing, anatomy: Anatomy) -> Moving
     stated = breathing.weights.of_pattern
     fixed = {one.name: _by_itself(case, one) for one in anatomy.checked}
     needed = [skin, *(name for name, weight in fixed.items() if weight is None)]
-    breathing.weights.check(needed, case.path, others=[name for name in fixed if name not in needed])
+    others = [name for name in fixed if name not in needed]
+    breathing.weights.check(needed, "breathing.weights", case.path, others=others)
     own = stated.get(case.target_structure, 1.0)
     if own != 1.0:
         message = f"breathing.weights: '{case.target_structure}' holds the target, and {own:g} is not its weight"

@@ -22,12 +22,14 @@ from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.clearance.measure import Clearances, measure
+from puncture_twin.planning.needle.deflection import DeflectionBound
 from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange
+from puncture_twin.planning.search.bending.bent_needle import bent_verdict
 from puncture_twin.planning.search.candidates import BreathingColumns, Candidates, Verdict
 from puncture_twin.planning.search.constraints import first_broken
 from puncture_twin.planning.search.phases.moving_weights import moving_weights
 
-CLEARANCES = (Reason.TOO_CLOSE.value, Reason.UNKNOWN_REGION.value)
+CLEARANCES = (Reason.TOO_CLOSE.value, Reason.UNKNOWN_REGION.value, Reason.NEEDLE_BENDS.value)
 """Reasons whose number is a clearance, the only one that is told of a phase."""
 
 
@@ -39,7 +41,9 @@ class _Phase(NamedTuple):
     excess: Floats
 
 
-def with_breathing(case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates) -> Candidates:
+def with_breathing(
+    case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates, bound: DeflectionBound | None = None
+) -> Candidates:
     """Check what is safe at every phase, and reject what is not at one that the gate lets through.
 
     Args:
@@ -47,6 +51,7 @@ def with_breathing(case: Case, anatomy: Anatomy, engine: ClearanceEngine, found:
         anatomy: Its structures.
         engine: Prepared for the meshes of ``anatomy.checked``, in that order.
         found: Checked where the CT shows the body.
+        bound: How far the needle may bend; None bends nothing.
 
     Raises:
         InputError: See `moving_weights`.
@@ -57,7 +62,7 @@ def with_breathing(case: Case, anatomy: Anatomy, engine: ClearanceEngine, found:
     rows = np.flatnonzero(found.safe)
     blank = np.full(len(found), np.nan)
     safe_all, worst, clearance = np.zeros(len(found), bool), blank.copy(), blank.copy()
-    phases = [_at_phase(case, breathing, anatomy, engine, found, rows, s) for s in breathing.positions.tolist()]
+    phases = [_at_phase(case, breathing, anatomy, engine, found, rows, s, bound) for s in breathing.positions.tolist()]
     safe = np.array([phase.verdict.reason == Reason.NONE.value for phase in phases])
     safe_all[rows] = safe.all(axis=0)
     window = np.flatnonzero(breathing.in_window)
@@ -100,6 +105,7 @@ def _at_phase(
     found: Candidates,
     rows: Ints,
     s: float,
+    bound: DeflectionBound | None,
 ) -> _Phase:
     weights, needle = moving_weights(case, breathing, anatomy), case.needle
     outward, moved = found.outward_ct[rows], breathing.moved_ct(s)
@@ -111,7 +117,10 @@ def _at_phase(
     margins = np.array([one.margin_mm for one in checked])[demanding]
     least = clearances.clearance[:, demanding].min(axis=1, initial=np.inf)
     excess = (clearances.clearance[:, demanding] - margins).min(axis=1, initial=np.inf)
-    beyond = (verdict.reason != Reason.NONE.value) & ~clearances.violated.any(axis=1)
+    if bound is not None:
+        verdict = bent_verdict(verdict, checked, clearances.clearance, bound.at(paths.path_length))
+    near = (verdict.reason == Reason.NEEDLE_BENDS.value) | clearances.violated.any(axis=1)
+    beyond = (verdict.reason != Reason.NONE.value) & ~near
     return _Phase(verdict, least, np.where(beyond, -np.inf, excess))
 
 

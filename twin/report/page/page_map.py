@@ -27,6 +27,7 @@ DETAIL_UNITS = {
     Reason.TOO_LONG: ("path", "mm"),
     Reason.SKIN_ANGLE: ("skin angle", "°"),
     Reason.UNSAFE_WHEN_BREATHING: ("clearance", "mm"),
+    Reason.NEEDLE_BENDS: ("clearance", "mm"),
     Reason.HIT_UNLIKELY: ("chance to hit", " "),
     Reason.TOUCH_LIKELY: ("chance to touch", " "),
 }

@@ -40,13 +40,26 @@ def methods_text(case: Any, anatomy: Any, candidates: Candidates) -> str:
 
 
 def _left_out(case: Any) -> str:
-    """What was not modelled, and what was of the breath."""
-    if case.breathing is None:
+    """What was not modelled, and what was of breath and needle."""
+    if case.breathing is None and case.bending is None:
         return "Breathing, needle bending and tissue motion were not modelled."
-    breath = case.breathing
+    return " ".join([_breath(case.breathing), _needle(case.bending), "The deformation of tissue was not modelled."])
+
+
+def _breath(breath: Any) -> str:
+    if breath is None:
+        return "Breathing was not modelled."
     return (
         f"Breathing was taken as a motion of {breath.amplitude_mm:g} mm along one line after Lujan et al. 1999 "
         f"(exponent {breath.exponent}, {len(breath.positions)} positions), each structure with a weight of its own: a "
-        f"safe direction is safe {breath.window_text}; a needle in place moves with the organ and bends. Needle "
-        "bending and the deformation of tissue were not modelled."
+        f"safe direction is safe {breath.window_text}; a needle in place moves with the organ and bends."
+    )
+
+
+def _needle(bending: Any) -> str:
+    if bending is None:
+        return "Needle bending was not modelled."
+    return (
+        f"The needle was taken as a beam in an elastic foundation whose bevel cuts {np.degrees(bending.alpha):g}° off "
+        "its direction (Webster et al. 2006); its greatest deflection to any side was kept as clearance."
     )

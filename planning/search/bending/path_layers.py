@@ -1,0 +1,66 @@
+"""The tissues along one path, from the skin to the target."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import groupby
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.formats.labels.naming import REST
+from puncture_twin.planning.needle.bending import Bending
+from puncture_twin.planning.needle.tissue import Layer
+from puncture_twin.planning.search.along_path import inside_at
+
+STEP_MM = 0.5
+"""Between two samples of a path."""
+
+
+def check_tissues(case: Case, anatomy: Anatomy) -> None:
+    """Refuse tissues that match no structure, or contradict each other.
+
+    Raises:
+        InputError: One of them.
+    """
+    if case.bending is not None:
+        case.bending.tissues.check([one.name for one in anatomy.structures], "tissue", case.path)
+
+
+def path_layers(
+    bending: Bending, anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_length: float
+) -> tuple[Layer, ...]:
+    """What a needle passes, the skin first. In nested structures the smallest counts, by its box.
+
+    A surface is a capsule where it is entered. That of the rest is the skin: coming out of an organ there is none.
+
+    Args:
+        bending: Of the case.
+        anatomy: Its structures; only closed ones have an inside.
+        target_ct: Shape (3,), mm.
+        outward_ct: Shape (3,), unit.
+        path_length: Target to skin, mm.
+    """
+    count = max(1, round(path_length / STEP_MM))
+    edges = np.linspace(0.0, path_length, count + 1)
+    depths = path_length - 0.5 * (edges[1:] + edges[:-1])
+    names = np.full(count, REST, dtype=object)
+    for one in sorted((s for s in anatomy.structures if s.mesh.closed), key=_size, reverse=True):
+        names[inside_at(one, target_ct, outward_ct, depths)] = one.name
+    layers: list[Layer] = []
+    for name, group in groupby(range(count), key=lambda at: names[at]):
+        rows = list(group)
+        tissue = bending.tissues.of(str(name)) or bending.tissues.of_pattern[REST]
+        at_skin = not layers
+        if not at_skin and tissue == bending.tissues.of_pattern[REST]:
+            tissue = replace(tissue, capsule_n=0.0, capsule_mm=0.0)
+        layers.append(Layer(float(edges[rows[0]]), float(edges[rows[-1] + 1]), tissue))
+    return tuple(layers)
+
+
+def _size(structure: Structure) -> float:
+    """Volume of the box that holds a structure."""
+    low, high = structure.mesh.bounds
+    return float(np.prod(high - low))

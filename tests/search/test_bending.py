@@ -1,0 +1,174 @@
+"""Directions of a needle that bends: what is rejected, and by how much; the tissues along a path."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from case_world import ORGAN, SKIN, ball, case_text, structure, write_balls
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.breathing.breathing import Breathing
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.certify.subdivision import certify
+from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.formats.labels.by_name import ByName
+from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.search.bending.path_layers import path_layers
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import case_directions
+from puncture_twin.planning.search.table import to_table
+
+NEEDLE = "length_mm = 210.0\nshaft_mm = 150.0\ndiameter_mm = 1.27\n"
+BENT = NEEDLE + "gauge = 18\nbevel_deg = 2.0"
+TISSUE = """[tissue."*"]
+stiffness_n_mm2 = 0.05
+cutting_n = 0.5
+friction_n_mm = 0.01
+capsule_n = 3.0
+capsule_mm = 4.0
+[tissue.organ]
+stiffness_n_mm2 = 0.2
+cutting_n = 0.9
+friction_n_mm = 0.02
+capsule_n = 1.0
+capsule_mm = 2.0
+"""
+
+
+def written(folder, needle=BENT, tissue=TISSUE):
+    """A round body with an organ of 20 mm in its middle, and a rib and a vessel to avoid."""
+    write_balls(folder)
+    ball(folder / "vessel.stl", 6.0, (-35, -25, 30))
+    avoided = [structure("rib", "avoid", margin_mm=3.0), structure("vessel", "avoid", margin_mm=1.0)]
+    search = "theta_deg = [0, 80]\nstep_deg = 5.0"
+    (folder / "case.toml").write_text(case_text(tissue, SKIN, ORGAN, *avoided, needle=needle, search=search))
+    return folder / "case.toml"
+
+
+@pytest.fixture(scope="module")
+def patient(tmp_path_factory):
+    """The case, read."""
+    return prepare(written(tmp_path_factory.mktemp("bending")), arm=False, engine="fcl")
+
+
+def searched(patient, **changes):
+    """The organs' verdicts of a case with something else."""
+    case = replace(patient.case, **changes)
+    return organ_candidates(case, patient.anatomy, patient.engine, case_directions(case))
+
+
+def test_what_lacks_the_clearance_to_bend_is_rejected_and_nothing_else(patient):
+    """The bound of each path's length beside every margin; today's columns but the verdict's stay."""
+    straight, bent = searched(patient, bending=None), searched(patient)
+    bound = patient.case.bending.bound(150.0)
+    excess = (straight.clearance.distance - straight.clearance.margins)[:, 1:].min(axis=1)
+    np.testing.assert_array_equal(bent.safe, straight.safe & (excess >= bound.at(straight.path.length)))
+    assert 0 < bent.safe.sum() < straight.safe.sum()
+    new = straight.safe & ~bent.safe
+    assert set(bent.verdict.reason[new]) == {"needle_bends"}
+    row = np.flatnonzero(new)[0]
+    assert bent.verdict.amount[row] == straight.clearance.distance[row, 1:].min()
+    assert f"{bent.deflection[row]:.2f} mm" in bent.verdict.detail[row]
+    today, with_tissue = to_table(straight, {}), to_table(bent, {})
+    assert with_tissue.column_names == [*today.column_names, "deflection_bound_mm"]
+    changed = {"verdict", "reason", "reason_structure", "reason_amount", "reason_detail", "window"}
+    same = [name for name in today.column_names if name not in changed]
+    assert with_tissue.select(same).equals(today.select(same))
+
+
+def test_a_symmetric_tip_leaves_the_sag_alone(patient):
+    """Nothing but its weight takes the needle off."""
+    bending = replace(patient.case.bending, alpha=0.0)
+    found = searched(patient, bending=bending)
+    known = np.isfinite(found.deflection)
+    assert np.all(found.deflection[known] == bending.shaft.sag_mm)
+
+
+def test_a_needle_that_bends_further_than_anything_is_clear_of_leaves_nothing_safe(patient):
+    """And says so of each."""
+    found = searched(patient, bending=replace(patient.case.bending, alpha=np.radians(30.0)))
+    assert not found.safe.any() and "needle_bends" in found.verdict.reason
+
+
+def test_a_body_that_breathes_is_checked_with_a_needle_that_bends(patient):
+    """At every phase, against bodies that are moved and searched anew with the same bound."""
+    weights = {"skin": 0.4, "rib": 0.0, "vessel": 0.5}
+    breath = Breathing(25.0, np.array([0.0, 0.0, -1.0]), ByName(weights), 4, 2, 0.0, None)
+    found = searched(patient, breathing=breath)
+    safe = []
+    for s in breath.positions:
+
+        def moved(mesh, weight, s=s):
+            return mesh.transformed(pose(np.eye(3), breath.moved_ct(s, weight)))
+
+        structures = tuple(replace(o, mesh=moved(o.mesh, weights.get(o.name, 1.0))) for o in patient.anatomy.structures)
+        skin = replace(patient.anatomy.skin, mesh=moved(patient.anatomy.skin.mesh, 0.4))
+        case = replace(patient.case, target_ct=patient.case.target_ct + breath.moved_ct(s))
+        anatomy = replace(patient.anatomy, structures=structures, skin=skin)
+        engine = FclEngine([one.mesh for one in structures])
+        safe.append(organ_candidates(case, anatomy, engine, case_directions(case)).safe)
+    np.testing.assert_array_equal(found.safe, np.all(safe, axis=0))
+    assert 0 < found.safe.sum() < safe[0].sum()
+
+
+def test_layers_are_those_that_the_path_passes(patient):
+    """From the skin at 90 mm to the organ's surface at 20, whose capsule it meets; the skin is the rest's."""
+    outward = np.array([0.0, -1.0, 0.0])
+    rest, organ = path_layers(patient.case.bending, patient.anatomy, np.zeros(3), outward, 90.0)
+    assert (rest.start_mm, rest.end_mm) == (0.0, organ.start_mm) and organ.end_mm == 90.0
+    assert organ.start_mm == pytest.approx(70.0, abs=1.0)
+    assert (rest.tissue.capsule_n, organ.tissue.capsule_n) == (3.0, 1.0)
+
+
+def test_a_check_says_how_far_it_bends_and_what_it_needs(patient):
+    """The path of a bevel that never turns is within the bound, and the peak above the skin's rupture."""
+    explained = patient.explain(0.0, 0.0)
+    told = explained.summary()["bending"]
+    assert 0 < told["deflection_mm"] < told["deflection_bound_mm"]
+    assert told["peak_force_n"] >= 3.0
+    assert "kept as clearance" in explained.text() and "buckles at" in explained.text()
+
+
+def test_a_certificate_refuses_a_needle_that_bends(patient):
+    """It proves straight ones."""
+    with pytest.raises(InputError, match="a needle that does not bend"):
+        certify(patient.case, patient.anatomy, size=0.1)
+
+
+@pytest.mark.parametrize(
+    ("needle", "tissue", "message"),
+    [
+        (BENT, "", "depends on the tissue"),
+        (NEEDLE + "gauge = 18", TISSUE, "needs needle.bevel_deg"),
+        (BENT, TISSUE.replace('"*"', "fat"), r'tissue."\*"'),
+        (BENT.replace("1.27", "1.2"), TISSUE, "is 1.27 mm wide"),
+        (BENT.replace("gauge = 18", "gauge = 99"), TISSUE, "not in the chart"),
+        (BENT.replace("gauge = 18", "solid = true"), TISSUE, "solid belongs to gauge"),
+        (BENT.replace("2.0", "-2.0"), TISSUE, "bevel_deg"),
+        (BENT, TISSUE.replace("capsule_mm = 4.0", "capsule_mm = 0.0"), "go together"),
+        (BENT, TISSUE.replace("0.05", "-0.05"), "stiffness_n_mm2"),
+        (BENT, TISSUE.replace("0.05", "1e9"), "stiffness_n_mm2"),
+    ],
+)
+def test_half_a_declaration_is_refused(tmp_path, needle, tissue, message):
+    """Nothing that is stated may count for nothing."""
+    with pytest.raises(InputError, match=message):
+        load_case(written(tmp_path, needle, tissue))
+
+
+def test_a_tissue_that_is_nowhere_is_refused(tmp_path):
+    """A pattern without a structure is a slip."""
+    path = written(tmp_path, tissue=TISSUE.replace("tissue.organ", "tissue.orgn"))
+    with pytest.raises(InputError, match="'orgn' matches no structure"):
+        prepare(path, arm=False, engine="fcl")
+
+
+def test_a_solid_shaft_of_the_stated_diameter_stands_for_a_gauge(tmp_path):
+    """Where none is stated; and a solid gauge bends less than its tube."""
+    plain = load_case(written(tmp_path, BENT.replace("gauge = 18\n", ""))).bending.shaft
+    solid = load_case(written(tmp_path, BENT + "\nsolid = true\nmodulus_gpa = 193.0")).bending.shaft
+    tube = load_case(written(tmp_path)).bending.shaft
+    assert (plain.outer_mm, plain.inner_mm, plain.length_mm) == (1.27, 0.0, 150.0)
+    assert solid.bending_stiffness / 193.0 == pytest.approx(plain.bending_stiffness / 200.0)
+    assert tube.bending_stiffness < plain.bending_stiffness
