@@ -61,6 +61,12 @@ from puncture_twin.planning.needle.bending import Bending
 ALLOWED_CASE = "a TOML case file with schema = 1 or 2, or a folder with case.toml"
 
 
+ROBOT_NOWHERE = (
+    "the case names a robot ({robot}), but not where its base is: the arm is not checked "
+    "([registration] or [robot.mount] says it)"
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Case:
     """What a search, a plan and a rehearsal start from. A `Case` has been validated.
@@ -181,7 +187,7 @@ def load_case(path: Path | str) -> Case:
         place=content.place,
         stated_structures=content.stated_structures,
         region=content.region,
-        warnings=(*wholeness_warnings(content, files, path), *_of_transform(content)),
+        warnings=(*wholeness_warnings(content, files, path), *_of_transform(content), *_of_robot(content)),
         hit_radius_mm=content.target.hit_radius_mm,
         errors=_errors(content, content.errors, case_volumes, path),
         truth_errors=_errors(content, content.rehearsal.errors, case_volumes, path, truth=True),
@@ -269,6 +275,14 @@ def _of_transform(content: CaseFile) -> tuple[str, ...]:
     if stated is None or stated.transform is None:
         return ()
     return (f"registration: {NO_RESIDUALS.format(file=stated.transform)}",)
+
+
+def _of_robot(content: CaseFile) -> tuple[str, ...]:
+    """That a robot is named, and nothing said of where it is located: then no verdict is about it."""
+    located = content.registration is not None or content.robot.mount is not None
+    return (
+        () if located or "robot" not in content.model_fields_set else (ROBOT_NOWHERE.format(robot=content.robot.model),)
+    )
 
 
 def _markers(section: RegistrationSection | None) -> MarkerSection | None:

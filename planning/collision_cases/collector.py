@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.collision_cases.arm_notes import ARM_PROPERTY
 from puncture_twin.planning.collision_cases.checks_file import (
     CheckSection,
     ChecksFile,
@@ -99,6 +100,8 @@ class CollisionItem(pytest.Item):
     def runtest(self) -> None:
         """Check, and fail with what differs, or keep the numbers that are to be rewritten."""
         session, table = session_of(self.config), self._table
+        if table.kind != "plan":
+            self.user_properties += arm_properties(session, table)
         found = FINDERS[table.kind](session, table, self.path.parent)
         if found.differences and not (updating(self.config) and self._kept(session, found)):
             raise CollisionMismatchError(found.text(table.expected.why))
@@ -124,6 +127,16 @@ class CollisionItem(pytest.Item):
         """Where the test stands."""
         line = self._table.line
         return self.path, None if line is None else line - 1, f"{self.path.name}: {self.name}"
+
+
+def arm_properties(session: Session, table: Table) -> list[tuple[str, object]]:
+    """What a test's report says of the arm.
+
+    Raises:
+        InputError: The case cannot be read, or has no arm to be checked.
+    """
+    context = session.context(table.case, arm=bool(getattr(table.expected, "arm", False)))
+    return [("case", str(table.case)), (ARM_PROPERTY, context.arm)]
 
 
 def check_in_python(config: pytest.Config, case: Path, keys: Mapping[str, Any]) -> Explanation:

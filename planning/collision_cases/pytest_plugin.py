@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from puncture_twin.planning.collision_cases.arm_notes import arm_notes
 from puncture_twin.planning.collision_cases.update_flag import add_flag, updating
 
 if TYPE_CHECKING:
@@ -49,7 +50,12 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """Say every number that was rewritten."""
+    """Say where no arm was checked, and every number that was rewritten."""
+    notes = arm_notes(report for reports in terminalreporter.stats.values() for report in reports)
+    if notes:
+        terminalreporter.section("collision files: arm")
+        for line in notes:
+            terminalreporter.line(line)
     if updating(config):
         from puncture_twin.planning.collision_cases.session import rewritten_lines
 

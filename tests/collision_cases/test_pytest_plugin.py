@@ -105,6 +105,21 @@ def test_a_check_of_the_arm_fails_where_the_case_does_not_say_where_it_is(pytest
     result.stdout.fnmatch_lines(["*the arm is to be checked, but the case does not say where the robot's base is*"])
 
 
+def test_a_run_without_an_arm_says_so_though_it_is_green(pytester, carton_without_base):
+    """Once for each case, with the reason; a case whose arm was checked is not mentioned."""
+    other = GOOD.replace(str(CARTON), str(carton_without_base))
+    result = run(
+        pytester, GOOD + GOOD[GOOD.index("[[") :] + other[other.index("[[") :] + f'case = "{carton_without_base}"'
+    )
+    result.assert_outcomes(passed=3)
+    result.stdout.fnmatch_lines(
+        [
+            f"*{CARTON}: arm not checked: switched off (--no-arm) (2 tests)",
+            f"*{carton_without_base}: arm not checked: the case does not say where the robot's base is (1 test)",
+        ]
+    )
+
+
 def test_the_fixture_judges_in_python(collision_check):
     """The same in Python: returns the explanation, raises what differs."""
     found = collision_check(CARTON, theta_deg=0, beta_deg=0, verdict="safe")

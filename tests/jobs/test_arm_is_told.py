@@ -1,0 +1,50 @@
+"""A result that asked no arm says so wherever it is read: terminal, JSON, page; pytest is in tests/collision_cases."""
+
+import json
+import shutil
+
+import pytest
+
+from puncture_twin.meshes import folder
+from puncture_twin.run_twin import main
+from puncture_twin.twin.jobs.exit_codes import OK
+
+NOT_CHECKED = "not checked: the case does not say where the robot's base is"
+NAMED = "the case names a robot (ur3), but not where its base is: the arm is not checked"
+
+
+@pytest.fixture(scope="module")
+def nowhere(tmp_path_factory):
+    """The carton, coarse, which names a robot and does not say where its base is."""
+    here = tmp_path_factory.mktemp("nowhere") / "carton"
+    shutil.copytree(folder() / "carton", here)
+    case = here / "case_m.toml"
+    text = case.read_text().replace("step_deg = 2.0", "step_deg = 20.0")
+    start, end = text.index("[registration]"), text.index("[robot]")
+    case.write_text(text[:start] + text[end:])
+    return case
+
+
+def test_terminal_and_page_say_that_no_arm_was_checked(nowhere, tmp_path, capfd):
+    """And that the robot which the case names has no place."""
+    assert main(["search", str(nowhere), "--out", str(tmp_path)]) == OK
+    told, page = capfd.readouterr().out, (tmp_path / "report.html").read_text()
+    assert f"arm {NOT_CHECKED}" in told and f"warning: {NAMED}" in told
+    assert "safe for the organs" in told and "safe for the organs" in page
+    for words in ("the case does not say where the robot", NAMED):
+        assert words.replace("'", "&#39;") in page
+
+
+def test_json_says_so_too(nowhere, capfd):
+    """Verdict and arm stand beside each other."""
+    assert main(["check", str(nowhere), "--theta", "0", "--beta", "0", "--json"]) == OK
+    found = json.loads(capfd.readouterr().out)
+    assert (found["verdict"], found["arm"], found["reachable"]) == ("safe", NOT_CHECKED, None)
+    assert any(NAMED in warning for warning in found["warnings"])
+
+
+def test_a_robot_with_a_place_is_no_warning(capfd):
+    """Nor is a case that names none."""
+    arguments = ["--theta", "0", "--beta", "0", "--no-arm", "--json"]
+    assert main(["check", str(folder() / "carton" / "case_m.toml"), *arguments]) == OK
+    assert "names a robot" not in capfd.readouterr().out
