@@ -5,6 +5,7 @@ from .choice import (
     Pick as Pick,
     best_pick as best_pick,
     choose as choose,
+    choose_stated as choose_stated,
     chosen_angles as chosen_angles,
     parse_choice as parse_choice,
 )

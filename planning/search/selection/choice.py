@@ -91,13 +91,7 @@ def choose(context: CaseContext, found: Candidates, choice: Choice) -> Chosen:
         NoAnswerError: Nothing is safe, or what was wanted is rejected: says why.
     """
     if not choice.of_grid:
-        checked = context.check(*chosen_angles(context.case, choice))
-        refuse_other_entry(context.case, checked, choice)
-        if not checked.safe[0]:
-            at = checked.at(0)
-            where = f"theta {at['theta_deg']:.4g} deg, beta {at['beta_deg']:.4g} deg"
-            raise NoAnswerError(f"{where} is rejected: {reason_text(checked, 0)}", counts=checked.counts())
-        return Chosen(checked, np.zeros(1, np.int64))
+        return choose_stated(context, choice)
     rows = found.ranked
     if not len(rows):
         raise NoAnswerError("no candidate is safe", counts=found.counts())
@@ -109,6 +103,22 @@ def choose(context: CaseContext, found: Candidates, choice: Choice) -> Chosen:
         _refuse_beyond(choice.window, len(windows.windows), "--window", "windows")
         return Chosen(found, rows[windows.of_row[rows] == choice.window])
     return Chosen(found, rows)
+
+
+def choose_stated(context: CaseContext, choice: Choice) -> Chosen:
+    """The one candidate of a choice by angles or by entry; takes no search.
+
+    Raises:
+        InputError: A point that is no skin entry.
+        NoAnswerError: It is rejected: says why.
+    """
+    checked = context.check(*chosen_angles(context.case, choice))
+    refuse_other_entry(context.case, checked, choice)
+    if not checked.safe[0]:
+        at = checked.at(0)
+        where = f"theta {at['theta_deg']:.4g} deg, beta {at['beta_deg']:.4g} deg"
+        raise NoAnswerError(f"{where} is rejected: {reason_text(checked, 0)}", counts=checked.counts())
+    return Chosen(checked, np.zeros(1, np.int64))
 
 
 def chosen_angles(case: Case, choice: Choice) -> tuple[float, float]:

@@ -12,7 +12,7 @@ import numpy as np
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.output.draft import Draft
 from puncture_twin.planning.base.output.manifest import read_output
-from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.certify.certificate import (
     write_certificate,
@@ -26,7 +26,7 @@ from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
 from puncture_twin.planning.plan.planner import make_plan
 from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.selection.choice import BEST, Choice, Pick, choose
+from puncture_twin.planning.search.selection.choice import BEST, Choice, Pick, choose, choose_stated
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.twin.jobs.patient.pictures import FILM, PAGE, PICTURES, ROOMS, with_pictures
 from puncture_twin.twin.jobs.patient.run import RoomCount, Run
@@ -68,6 +68,7 @@ def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
         NoAnswerError: No plan; the search's files are written all the same.
     """
     _refuse_without_arm(context)
+    _refuse_before_search(context, out, choice)
     with _writing(out, "plan", context, ("candidates.parquet", "plan.json", *PICTURES)) as draft:
         run = with_pictures(_searched_and_planned(context, draft.folder, choice), draft.folder)
     return _answered(_final(run, draft), out)
@@ -83,6 +84,7 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
     from puncture_twin.twin.jobs.patient.rehearsed import rehearsed
 
     _refuse_without_arm(context)
+    _refuse_before_search(context, out, choice)
     names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
     with _writing(out, "plan", context, names) as draft:
         run = _searched_and_planned(context, draft.folder, choice)
@@ -107,6 +109,22 @@ def _refuse_without_arm(context: CaseContext) -> None:
             where=context.case.path,
             allowed="[registration] with markers_ct and markers_base, or [robot.mount]",
         )
+
+
+def _refuse_before_search(context: CaseContext, out: Path, choice: Choice) -> None:
+    """Check a direction that is stated by itself, before the search of all others is made for nothing.
+
+    Raises:
+        InputError: An entry where the path does not enter.
+        NoAnswerError: It is rejected; an older plan in the folder goes, as it does where a search finds none.
+    """
+    if choice.of_grid:
+        return
+    try:
+        choose_stated(context, choice)
+    except NoAnswerError as error:
+        withdraw(out, "plan")
+        raise NoAnswerError(f"{NO_PLAN}{error}", counts=error.counts) from error
 
 
 def _writing(

@@ -11,7 +11,7 @@ from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.export.slicer.entry_area import entry_area
 from puncture_twin.planning.export.slicer.slicer_files import NAMES, SLICER, Drawn, slicer_files
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.selection.choice import Choice, choose
+from puncture_twin.planning.search.selection.choice import Choice, choose, choose_stated
 
 NO_APPROACH = "the directions were checked; no approach of the arm was planned"
 
@@ -61,6 +61,8 @@ def export_to_slicer(context: CaseContext, out: Path, choice: Choice) -> SlicerE
         NoAnswerError: Nothing is safe, or what was chosen is not.
     """
     case, stages = context.case, context.stages
+    if not choice.of_grid:
+        choose_stated(context, choice)  # before the search is made for nothing
     with writing(
         out, f"export {SLICER}", inputs=case.inputs, seconds=stages.seconds, names=NAMES, note=context.watcher.note
     ) as draft:
