@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure, surface_distance
-from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.reach.standoff import standoffs
@@ -48,6 +48,7 @@ class Explanation:
         candidates: A search's result with this candidate alone.
         facts: The same path for whoever stands at the patient.
         doubt: How sure it is; None where the case declares no errors, or the candidate was rejected before.
+        read: What was read beside the case to choose it.
     """
 
     case: Case
@@ -55,6 +56,7 @@ class Explanation:
     candidates: Candidates
     facts: EntryFacts
     doubt: Doubt | None = None
+    read: tuple[Input, ...] = ()
 
     @property
     def safe(self) -> bool:
@@ -81,7 +83,7 @@ class Explanation:
         row = self.candidates
         return {
             "case": self.case.name,
-            "inputs": inputs_document(self.case.inputs),
+            "inputs": inputs_document((*self.read, *self.case.inputs)),
             **row.at(0),
             "verdict": self.verdict,
             "arm": row.arm_note,

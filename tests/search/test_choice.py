@@ -1,11 +1,22 @@
 """Choosing a candidate: by rank, window, angles or entry; and what is refused."""
 
+import hashlib
+import json
+
 import numpy as np
 import pytest
 
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.selection.choice import BEST, Choice, choose, chosen_angles, parse_choice
+from puncture_twin.planning.search.selection.choice import (
+    BEST,
+    Choice,
+    choose,
+    choose_stated,
+    chosen_angles,
+    parse_choice,
+    with_file_read,
+)
 from puncture_twin.planning.search.selection.windows import find_windows
 from tests.case_world import write_case
 
@@ -98,6 +109,38 @@ def test_choices_that_are_none_are_refused(typed, said):
     """One line that says what is allowed."""
     with pytest.raises(InputError, match=said):
         parse_choice(*typed)
+
+
+def line(path, *points, kind="Line", system="LPS"):
+    """A markups file as Slicer writes it."""
+    controls = [{"label": f"L-{n}", "position": list(map(float, p)), "positionStatus": "defined"} for n, p in points]
+    markup = {"type": kind, "coordinateSystem": system, "coordinateUnits": "mm", "controlPoints": controls}
+    path.write_text(json.dumps({"markups": [markup]}))
+    return path
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_the_end_of_a_line_away_from_the_target_is_the_entry(context, found, tmp_path, order):
+    """Drawn in either direction; the file's own space holds, and its hash is handed on."""
+    row = int(found.ranked[0])
+    ends = [found.path.entry_ct[row], context.case.target_ct + 3.0]
+    path = line(tmp_path / "line.mrk.json", *((n, ends[n]) for n in order))
+    choice = with_file_read(context.case, parse_choice(None, None, None, None, str(path)))
+    np.testing.assert_allclose(np.multiply(choice.entry_mm, [-1, -1, 1]), found.path.entry_ct[row])
+    np.testing.assert_allclose(choose_stated(context, choice).candidates.theta, found.theta[row], atol=1e-9)
+    assert choice.read[0].sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    one = line(tmp_path / "one.mrk.json", (0, ends[0]), kind="Fiducial")
+    assert with_file_read(context.case, Choice(entry_file=one)).entry_mm == choice.entry_mm
+
+
+def test_a_line_to_elsewhere_or_many_points_are_no_entry(context, tmp_path):
+    """Neither end is guessed."""
+    elsewhere = line(tmp_path / "line.mrk.json", (1, (80, 0, 0)), (2, (0, 60, 0)))
+    with pytest.raises(InputError, match="neither end is the target: 60.0 mm"):
+        with_file_read(context.case, Choice(entry_file=elsewhere))
+    many = line(tmp_path / "many.mrk.json", *((n, (n, 0, 0)) for n in range(3)), kind="Fiducial")
+    with pytest.raises(InputError, match="3 points"):
+        with_file_read(context.case, Choice(entry_file=many))
 
 
 def test_nothing_stated_is_the_best():

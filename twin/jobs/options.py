@@ -47,7 +47,9 @@ CHOICE_OPTIONS = {
     "window": Annotated[int | None, typer.Option("--window", min=1, help="The best of this window of the search.")],
     "entry": Annotated[
         str | None,
-        typer.Option("--entry", metavar="X,Y,Z", help="Where the needle enters the skin, mm, case's space."),
+        typer.Option(
+            "--entry", metavar="X,Y,Z", help="Where the needle enters the skin, mm, case's space; or a Slicer line."
+        ),
     ],
 }
 """What names a candidate, in the order in which `parse_choice` takes it."""

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
+from puncture_twin.planning.formats.points.point_files import MAX_FILE_BYTES, parse_points
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.search.candidates import Candidates
@@ -20,6 +24,12 @@ from puncture_twin.planning.search.selection.windows import find_windows
 
 NEAR_ENTRY_MM = 10.0
 """How far from the skin entry of its path a point may be that is to be that entry: a hand's precision on a screen."""
+
+FILES = (".mrk.json", ".fcsv", ".csv")
+"""Endings of files that may hold an entry."""
+
+MOST_POINTS = 2
+"""Of such a file: both ends of a line."""
 
 LEAST_LEVER_MM = 1.0
 """A point nearer to the target than this gives no direction."""
@@ -34,22 +44,28 @@ class Choice:
         rank: 1 is the best candidate.
         window: 1 is the window of the best candidate: then the best of this window.
         entry_mm: Where the needle is to enter the skin, in the case's space, as it is typed.
+        entry_file: A markups file that holds the entry instead; `with_file_read` reads it.
+        read: That file, once it has been read.
     """
 
     angles: tuple[float, float] | None = None
     rank: int | None = None
     window: int | None = None
     entry_mm: tuple[float, float, float] | None = None
+    entry_file: Path | None = None
+    read: tuple[Input, ...] = ()
 
     @property
     def of_grid(self) -> bool:
         """Whether a search's result has to be looked at."""
-        return self.angles is None and self.entry_mm is None
+        return self.angles is None and self.entry_mm is None and self.entry_file is None
 
     def text(self, space: Space) -> str:
         """How it was chosen, such as "rank 3"; an entry in the case's space."""
         if self.angles is not None:
             return "its angles"
+        if self.entry_file is not None and self.entry_mm is None:
+            return f"entry of {self.entry_file.name}"
         if self.entry_mm is not None:
             return f"entry ({', '.join(f'{mm:g}' for mm in self.entry_mm)}) mm {space}"
         return f"window {self.window}" if self.window is not None else f"rank {self.rank or 1}"
@@ -152,7 +168,30 @@ def parse_choice(
     if len(names) > 1:
         raise InputError(f"{', '.join(names)} at once", where="choice", allowed="one of them")
     angles = None if theta_deg is None or beta_deg is None else (np.radians(theta_deg), np.radians(beta_deg))
+    if entry is not None and entry.lower().endswith(FILES):
+        return Choice(entry_file=Path(entry))
     return Choice(angles, rank, window, None if entry is None else _parse_point(entry))
+
+
+def with_file_read(case: Case, choice: Choice) -> Choice:
+    """The choice with the entry that its file holds: one point, or the end of a line whose other end is the target.
+
+    Raises:
+        InputError: A file that cannot be read, more points, or a line that does not end on the target.
+    """
+    path = choice.entry_file
+    if path is None or choice.entry_mm is not None:
+        return choice
+    data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
+    points = parse_points(data, path, default_space=case.space).points
+    if len(points) > MOST_POINTS:
+        raise InputError(f"{len(points)} points", where=path, allowed="one point, or a line from entry to target")
+    away = np.linalg.norm(points - case.target_ct, axis=1)
+    if len(points) == MOST_POINTS and away.min() > NEAR_ENTRY_MM:
+        what = f"neither end is the target: {away.min():.1f} mm away from it"
+        raise InputError(what, where=path, allowed=f"a line with one end within {NEAR_ENTRY_MM:g} mm of the target")
+    x, y, z = to_lps(points[[int(np.argmax(away))]], case.space)[0].tolist()  # the change of signs undoes itself
+    return replace(choice, entry_mm=(x, y, z), read=(content_input("entry", str(path), data),))
 
 
 def _parse_point(text: str) -> tuple[float, float, float]:

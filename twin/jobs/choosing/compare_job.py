@@ -80,7 +80,8 @@ def compare_choices(context: CaseContext, choices: tuple[Choice, Choice]) -> Com
     """
     found = context.search()
     a, b = (_chosen_side(context, found, choice) for choice in choices)
-    return Comparison(context.case.name, context.case.inputs, a, b, tuple(context.anatomy.warnings))
+    read = [one for side in (a, b) if side.explained is not None for one in side.explained.read]
+    return Comparison(context.case.name, (*read, *context.case.inputs), a, b, tuple(context.anatomy.warnings))
 
 
 def compare_plans(paths: tuple[Path, Path], context: CaseContext | None) -> Comparison:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,13 @@ from puncture_twin.planning.registration.touching import touchable_points
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
-from puncture_twin.planning.search.selection.choice import Choice, choose, chosen_angles, refuse_other_entry
+from puncture_twin.planning.search.selection.choice import (
+    Choice,
+    choose,
+    chosen_angles,
+    refuse_other_entry,
+    with_file_read,
+)
 from puncture_twin.twin.jobs.patient.budget import budget_facts
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
 
@@ -59,9 +65,10 @@ def explain_choice(context: CaseContext, choice: Choice, found: Candidates | Non
         assert found is not None
         chosen, rows = choose(context, found, choice)
         return context.explain(chosen.theta[rows[0]], chosen.beta[rows[0]])
+    choice = with_file_read(context.case, choice)
     explained = context.explain(*chosen_angles(context.case, choice))
     refuse_other_entry(context.case, explained.candidates, choice)
-    return explained
+    return replace(explained, read=choice.read)
 
 
 def registration_report(path: Path) -> dict[str, Any]:

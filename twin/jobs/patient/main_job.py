@@ -26,7 +26,7 @@ from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
 from puncture_twin.planning.plan.planner import make_plan
 from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.selection.choice import BEST, Choice, Pick, choose, choose_stated
+from puncture_twin.planning.search.selection.choice import BEST, Choice, Pick, choose, choose_stated, with_file_read
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.twin.jobs.patient.pictures import FILM, PAGE, PICTURES, ROOMS, with_pictures
 from puncture_twin.twin.jobs.patient.run import RoomCount, Run
@@ -68,8 +68,8 @@ def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
         NoAnswerError: No plan; the search's files are written all the same.
     """
     _refuse_without_arm(context)
-    _refuse_before_search(context, out, choice)
-    with _writing(out, "plan", context, ("candidates.parquet", "plan.json", *PICTURES)) as draft:
+    choice = _stated(context, out, choice)
+    with _writing(out, "plan", context, ("candidates.parquet", "plan.json", *PICTURES), read=choice.read) as draft:
         run = with_pictures(_searched_and_planned(context, draft.folder, choice), draft.folder)
     return _answered(_final(run, draft), out)
 
@@ -84,9 +84,9 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
     from puncture_twin.twin.jobs.patient.rehearsed import rehearsed
 
     _refuse_without_arm(context)
-    _refuse_before_search(context, out, choice)
+    choice = _stated(context, out, choice)
     names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
-    with _writing(out, "plan", context, names) as draft:
+    with _writing(out, "plan", context, names, read=choice.read) as draft:
         run = _searched_and_planned(context, draft.folder, choice)
         planned = run.files
         run = run if run.plan is None else rehearsed(run, draft.folder, rooms)
@@ -111,20 +111,22 @@ def _refuse_without_arm(context: CaseContext) -> None:
         )
 
 
-def _refuse_before_search(context: CaseContext, out: Path, choice: Choice) -> None:
-    """Check a direction that is stated by itself, before the search of all others is made for nothing.
+def _stated(context: CaseContext, out: Path, choice: Choice) -> Choice:
+    """The choice with its file read, its direction checked before the search of all others is made for nothing.
 
     Raises:
         InputError: An entry where the path does not enter.
         NoAnswerError: It is rejected; an older plan in the folder goes, as it does where a search finds none.
     """
     if choice.of_grid:
-        return
+        return choice
+    choice = with_file_read(context.case, choice)
     try:
         choose_stated(context, choice)
     except NoAnswerError as error:
         withdraw(out, "plan")
         raise NoAnswerError(f"{NO_PLAN}{error}", counts=error.counts) from error
+    return choice
 
 
 def _writing(
@@ -133,16 +135,17 @@ def _writing(
     context: CaseContext,
     names: Iterable[str],
     source: Input | None = None,
+    read: tuple[Input, ...] = (),
 ) -> AbstractContextManager[Draft]:
-    """A draft of a command's files, with the case's inputs and the run's times."""
-    read = () if source is None else (source,)
+    """A draft of a command's files, with the inputs of the case and of the choice, and the run's times."""
+    made_from = () if source is None else (source,)
     return writing(
         out,
         command,
-        inputs=(*read, *context.case.inputs),
+        inputs=(*made_from, *read, *context.case.inputs),
         seconds=context.stages.seconds,
         names=names,
-        made_from={one.path: one.sha256 for one in read},
+        made_from={one.path: one.sha256 for one in made_from},
         note=context.watcher.note,
     )
 
@@ -164,7 +167,7 @@ def _answered(run: Run, out: Path) -> Run:
 
 
 def _searched_and_planned(context: CaseContext, out: Path, choice: Choice) -> Run:
-    return _with_table(_planned(Run(context, context.search(), ()), out, choice), out)
+    return _with_table(_planned(Run(context, context.search(), (), read=choice.read), out, choice), out)
 
 
 def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomCount | None = None) -> Run:

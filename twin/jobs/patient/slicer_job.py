@@ -11,7 +11,7 @@ from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.export.slicer.entry_area import entry_area
 from puncture_twin.planning.export.slicer.slicer_files import NAMES, SLICER, Drawn, slicer_files
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.selection.choice import Choice, choose, choose_stated
+from puncture_twin.planning.search.selection.choice import Choice, choose, choose_stated, with_file_read
 
 NO_APPROACH = "the directions were checked; no approach of the arm was planned"
 
@@ -61,10 +61,12 @@ def export_to_slicer(context: CaseContext, out: Path, choice: Choice) -> SlicerE
         NoAnswerError: Nothing is safe, or what was chosen is not.
     """
     case, stages = context.case, context.stages
+    choice = with_file_read(case, choice)
+    inputs = (*choice.read, *case.inputs)
     if not choice.of_grid:
         choose_stated(context, choice)  # before the search is made for nothing
     with writing(
-        out, f"export {SLICER}", inputs=case.inputs, seconds=stages.seconds, names=NAMES, note=context.watcher.note
+        out, f"export {SLICER}", inputs=inputs, seconds=stages.seconds, names=NAMES, note=context.watcher.note
     ) as draft:
         found = context.search()
         chosen = choose(context, found, choice)
@@ -77,5 +79,5 @@ def export_to_slicer(context: CaseContext, out: Path, choice: Choice) -> SlicerE
             (draft.folder / file).write_text(text, encoding="utf-8")
     files = draft.final(tuple(draft.folder / file for file in made.texts))
     return SlicerExport(
-        files, name, (NO_APPROACH, f"arm: {found.arm_note}", *made.notes), tuple(context.anatomy.warnings), case.inputs
+        files, name, (NO_APPROACH, f"arm: {found.arm_note}", *made.notes), tuple(context.anatomy.warnings), inputs
     )
