@@ -43,7 +43,8 @@ if TYPE_CHECKING:
 MOST_SEEDS = 10_000
 """Rooms or draws of one command; each takes seconds."""
 
-app = typer.Typer(add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False)
+app = typer.Typer(add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+"""Plain help: in boxes, a terminal of 40 columns shows names of options cut off."""
 
 
 def _print_version(wanted: bool) -> None:

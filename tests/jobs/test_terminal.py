@@ -26,6 +26,21 @@ def test_without_a_command_the_help_is_printed(capsys):
     assert "docs/words.md" in shown
 
 
+@pytest.mark.parametrize("command", [[], ["search"], ["export"]])
+def test_a_narrow_terminal_gets_the_whole_help(command):
+    """Every option is there, in 40 columns too; without colours where nobody wants them."""
+    narrow = {**os.environ, "COLUMNS": "40", "NO_COLOR": "1"}
+    arguments = [sys.executable, "-c", MAIN, *command, "--help"]
+    done = subprocess.run(arguments, env=narrow, capture_output=True, check=True, text=True, cwd=ROOT)
+    wide = subprocess.run(
+        arguments, env={**narrow, "COLUMNS": "200"}, capture_output=True, check=True, text=True, cwd=ROOT
+    )
+    options = set(re.findall(r"--[a-z][a-z-]+", wide.stdout))
+    assert {"--help"} <= options
+    assert options <= set(re.findall(r"--[a-z][a-z-]+", done.stdout))
+    assert "\x1b" not in done.stdout and "…" not in done.stdout
+
+
 def run_unread(code, *arguments):
     """Run Python whose stdout is a pipe that nobody reads: exit code and stderr."""
     reader, writer = os.pipe()
@@ -87,18 +102,22 @@ def test_a_search_writes_there_without_out(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
 
 
-def test_neither_width_nor_colour_changes_what_is_printed():
-    """A narrow terminal wraps; no line is broken by us, and nothing is coloured."""
+COMPARED = ["compare", str(CARTON), "--theta", "0", "--beta", "0", "--theta", "10", "--beta", "0", "--no-arm"]
+
+
+@pytest.mark.parametrize("command", [ONE, COMPARED], ids=["check", "compare"])
+def test_neither_width_nor_colour_changes_what_is_printed(command):
+    """A narrow terminal wraps; no line and no table is broken by us, and nothing is coloured."""
     shown = [
         subprocess.run(
-            [sys.executable, "-c", MAIN, *ONE],
+            [sys.executable, "-c", MAIN, *command],
             env={**os.environ, **extra},
             capture_output=True,
             check=True,
             text=True,
             cwd=ROOT,
         ).stdout
-        for extra in ({"COLUMNS": "200", "FORCE_COLOR": "1"}, {"COLUMNS": "60", "NO_COLOR": "1"})
+        for extra in ({"COLUMNS": "200", "FORCE_COLOR": "1"}, {"COLUMNS": "40", "NO_COLOR": "1"})
     ]
     assert shown[0] == shown[1]
     assert "\x1b" not in shown[0]

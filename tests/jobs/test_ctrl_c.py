@@ -1,0 +1,84 @@
+"""Ctrl-C in the middle of every command: 130, one line, and nothing half written."""
+
+import shutil
+import subprocess
+import sys
+
+import pytest
+import typer
+from kill_world import SELFCAL, coarse_cases
+from places import ROOT
+
+from puncture_twin.meshes import folder
+from puncture_twin.run_twin import app
+from puncture_twin.twin.jobs.exit_codes import INTERRUPTED
+
+PROGRAM = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts what is in the background without it
+from puncture_twin.run_twin import main
+signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+signal.setitimer(signal.ITIMER_REAL, float(sys.argv[1]))
+sys.exit(main(sys.argv[2:]))
+"""
+QUICK = {"register", "verify", "init"}
+"""Commands that take less than the second after which the others are interrupted."""
+
+WRITING = {"demo", "search", "plan", "rehearse", "place", "export", "batch", "selfcal", "servo", "reproduce"}
+
+ENDS_BY_CTRL_C = {"mirror"}
+"""It follows an arm until then, and has done what it was asked for: tests/jobs/test_mirror.py."""
+
+COMMANDS = sorted(set(typer.main.get_command(app).commands) - ENDS_BY_CTRL_C)
+
+
+@pytest.fixture(scope="module")
+def typed(tmp_path_factory):
+    """The arguments of every command, of a coarse case."""
+    here = tmp_path_factory.mktemp("ctrl-c")
+    case = str(coarse_cases(here)[0])
+    for name, text in (("selfcal", SELFCAL),):
+        (here / name).mkdir()
+        (here / name / f"{name}.toml").write_text(text)
+    meshes = here / "meshes"
+    meshes.mkdir()
+    for mesh in (folder() / "abdomen").glob("*.ply"):
+        shutil.copy(mesh, meshes)
+    angles = ["--theta", "0", "--beta", "0"]
+    return {
+        "demo": [],
+        "init": [str(meshes), "--target=-90,-10,60"],
+        "search": [case],
+        "verify": [str(here / "certificate.json"), "--case", case],  # it reads the case first
+        "check": [case, *angles],
+        "compare": [case, "--rank", "1", "--rank", "2"],
+        "plan": [case],
+        "rehearse": [case],
+        "place": [case, "--jobs", "1"],
+        "export": [case, "--format", "csv"],
+        "register": [case],
+        "batch": [case, case],
+        "selfcal": [str(here / "selfcal")],
+        "servo": [str(folder() / "head")],
+        "reproduce": ["chen2019"],
+    }
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_one_line_130_and_nothing_half_written(command, typed, tmp_path):
+    """No traceback, no file, and no folder that was not there."""
+    out = ["--out", str(tmp_path / "out")] if command in WRITING else []
+    seconds = "0.3" if command in QUICK else "1.0"
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, seconds, command, *typed[command], *out],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
+    )
+    said = done.stderr.splitlines()
+    assert (done.returncode, said[-1:], "Traceback" in done.stderr) == (INTERRUPTED, ["interrupted"], False), (
+        done.stderr
+    )
+    assert done.stdout == "" and list(tmp_path.iterdir()) == []
+    assert command != "init" or not (ROOT / typed["init"][0] / "case.toml").exists()
