@@ -16,10 +16,12 @@ from puncture_twin.planning.formats.dicom.recognise import list_folder
 from puncture_twin.planning.formats.dicom.storage import Kind
 from puncture_twin.planning.formats.labels.labelmaps import labelmap_of
 from puncture_twin.planning.formats.labels.mask_folder import MASK_ENDINGS, UNREAD, UNREAD_VOLUMES
+from puncture_twin.planning.formats.labels.slicer_segments import SEGMENT_ENDING
 from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points
+from puncture_twin.planning.formats.volumes.nrrd_header import is_layered
 from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS, Volume
 from puncture_twin.planning.geometry.spaces import Space, Unit
-from puncture_twin.planning.init.dicom_masks import dicom_masks
+from puncture_twin.planning.init.file_masks import dicom_masks, layered_masks
 from puncture_twin.planning.init.label_files import Mask, Masks, label_file, mask_of
 from puncture_twin.planning.init.mesh_folder import is_mesh, mesh_folder
 from puncture_twin.planning.init.segmentation import Place, Segmentation
@@ -210,6 +212,10 @@ class _Looker:
 
     def _volume(self, name: str, masks: list[Mask], empty: list[str]) -> None:
         if not any(self._wanted.takes(kind, name) for kind in ("ct", "labels")):
+            return
+        if name.lower().endswith(SEGMENT_ENDING) and is_layered(self._place.content(name), self._place.folder / name):
+            if self._wanted.takes("labels", name):
+                self._found.segmentations.append(layered_masks(self._place, name))
             return
         surfaces = self._place.volume(name)
         kind = volume_kind(surfaces.volume)

@@ -64,6 +64,23 @@ def write_seg_nrrd(path):
     sitk.WriteImage(image, str(path))
 
 
+def write_layered_seg_nrrd(path):
+    """As Slicer writes segments of which two overlap: a layer for each, four dimensions."""
+    layers = [inside(middle, radius).astype(np.uint8) for middle, radius in ORGANS.values()]
+    n, (x, y, z) = len(layers), X.shape[::-1]
+    lines = ["NRRD0004", "type: unsigned char", "dimension: 4", "space: left-posterior-superior"]
+    lines += [
+        f"sizes: {n} {x} {y} {z}",
+        f"space directions: none ({SPACING[0]},0,0) (0,{SPACING[1]},0) (0,0,{SPACING[2]})",
+    ]
+    lines += ["kinds: list domain domain domain", "encoding: raw", f"space origin: ({AT[0]},{AT[0]},{AT[0]})"]
+    for number, name in enumerate(ORGANS):
+        lines += [f"Segment{number}_ID:=Segment_{number}", f"Segment{number}_Name:={name}"]
+        lines += [f"Segment{number}_LabelValue:=1", f"Segment{number}_Layer:={number}"]
+    voxels = np.stack(layers, axis=-1)  # the layers run fastest
+    path.write_bytes(("\n".join(lines) + "\n\n").encode() + voxels.tobytes())
+
+
 def init(capfd, folder, *words):
     """Run it; returns exit code, stdout, stderr's lines that are no progress."""
     code = main(["init", str(folder), *words])
@@ -94,6 +111,8 @@ def segmentation_of(kind, folder):
         write_masks(folder / "run" / "seg")
     elif kind == "seg.nrrd":
         write_seg_nrrd(folder / "Segmentation.seg.nrrd")
+    elif kind == "layered seg.nrrd":
+        write_layered_seg_nrrd(folder / "Segmentation.seg.nrrd")
     elif kind == "csv":
         sitk.WriteImage(image_of(labels(), SPACING), str(folder / "map.nii.gz"))
         (folder / "organs.csv").write_text("Structure,Value\nright lung,1\naorta,2\nodd thing,3\n")
@@ -103,7 +122,10 @@ def segmentation_of(kind, folder):
         (folder / "map.json").write_text(json.dumps({str(n): name for n, name in enumerate(ORGANS, start=1)}))
 
 
-@pytest.mark.parametrize("kind", ["masks", "masks beside the CT", "masks two levels down", "seg.nrrd", "csv", "json"])
+KINDS = ["masks", "masks beside the CT", "masks two levels down", "seg.nrrd", "layered seg.nrrd", "csv", "json"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_segmentation_becomes_the_same_case(tmp_path, capfd, kind):
     """Names with spaces, an empty mask, a name that nobody knows: read by a search at once."""
     write_ct(tmp_path / "scan.nii.gz")

@@ -84,6 +84,15 @@ def parse_layered_header(content: bytes, path: Path) -> VolumeHeader:
     return _header(_without_layers(raw, path), path, _layers(raw, path))
 
 
+def is_layered(content: bytes, path: Path) -> bool:
+    """Whether a file has a fourth axis, of layers: one of Slicer's segmentations whose segments overlap.
+
+    Raises:
+        InputError: No NRRD header.
+    """
+    return split_header(content, path).fields.get("dimension") == "4"
+
+
 def _wrong_dimension(fields: dict[str, str], path: Path) -> InputError:
     stated = fields.get("dimension")
     if stated == "4":

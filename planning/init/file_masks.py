@@ -1,4 +1,4 @@
-"""A DICOM SEG or RTSTRUCT as a segmentation."""
+"""Structures of one file that may overlap, as a segmentation: DICOM SEG or RTSTRUCT, or a layered .seg.nrrd."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.dicom.ct_series import CtSeries
+from puncture_twin.planning.formats.dicom.named_masks import NamedMasks
 from puncture_twin.planning.formats.dicom.segmentation import parse_segmentation
 from puncture_twin.planning.formats.dicom.storage import Kind
 from puncture_twin.planning.formats.dicom.structure_set import parse_structure_set
+from puncture_twin.planning.formats.labels.slicer_segments import parse_segments
 from puncture_twin.planning.formats.volumes.volume_source import VolumeSource
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.init.segmentation import Assigned, Place, quoted, rules_text
@@ -23,8 +25,8 @@ NEEDS_SERIES = "an RTSTRUCT needs the CT on which it was drawn, as a DICOM serie
 
 
 @dataclass(frozen=True, eq=False)
-class DicomMasks:
-    """The structures of one DICOM file.
+class FileMasks:
+    """The structures of one file.
 
     Attributes:
         source: The file.
@@ -57,7 +59,7 @@ class DicomMasks:
         return f"[[structures]]\n{self.key} = {quoted(self.source)}\n{rules_text(rows)}"
 
 
-def dicom_masks(place: Place, source: str, kind: Kind, ct: VolumeSource | None) -> DicomMasks:
+def dicom_masks(place: Place, source: str, kind: Kind, ct: VolumeSource | None) -> FileMasks:
     """The structures of a file, on the slices of the CT.
 
     Args:
@@ -76,10 +78,23 @@ def dicom_masks(place: Place, source: str, kind: Kind, ct: VolumeSource | None) 
         raise InputError(NEEDS_SERIES, where=path, allowed="the folder of that series beside it")
     else:
         key, found = "rtstruct", parse_structure_set(path, source, place.content, series)
+    return _named(place, source, key, found)
+
+
+def layered_masks(place: Place, source: str) -> FileMasks:
+    """The segments of a segmentation of Slicer, of which some overlap.
+
+    Raises:
+        InputError: Segments that cannot be trusted.
+    """
+    return _named(place, source, "seg", parse_segments(place.folder / source, source, place.content))
+
+
+def _named(place: Place, source: str, key: str, found: NamedMasks) -> FileMasks:
     parts = {}
     for name, mask in found.masks.items():
         hashes = (hashlib.sha256(place.content(file)).hexdigest() for file in mask.files)
         surfaces = VolumeSurfaces(mask, (*hashes, *mask.part), place.cache)
         if (value := surfaces.mask_label()) is not None:
             parts[name] = (surfaces, value)
-    return DicomMasks(source, key, parts, found.notes)
+    return FileMasks(source, key, parts, found.notes)
