@@ -1,0 +1,67 @@
+"""A direction that is stated by itself is checked before anything is searched."""
+
+import numpy as np
+import pytest
+
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.output.manifest import read_manifest
+from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.search.context import CaseContext, prepare
+from puncture_twin.planning.search.selection.choice import Choice
+from puncture_twin.twin.jobs.patient import main_job
+from puncture_twin.twin.jobs.patient.slicer_job import export_to_slicer
+from tests.case_world import write_case
+
+CHANGES = (("theta_deg = [0, 10]", 'frame = "ct"\ntheta_deg = [0, 60]'),)
+
+
+@pytest.fixture(scope="module")
+def context(tmp_path_factory):
+    """Balls about a target, without an arm."""
+    return prepare(write_case(tmp_path_factory.mktemp("stated"), *CHANGES), arm=False)
+
+
+@pytest.fixture(scope="module")
+def rejected(context):
+    """The angles of a rejected direction."""
+    found = context.search()
+    row = int(np.flatnonzero(~found.safe)[0])
+    return Choice(angles=(found.theta[row], found.beta[row]))
+
+
+@pytest.fixture
+def unsearched(monkeypatch):
+    """Searching, or wanting an arm, fails."""
+
+    def searched(_):
+        raise AssertionError("searched for nothing")
+
+    monkeypatch.setattr(CaseContext, "search", searched)
+    monkeypatch.setattr(main_job, "_refuse_without_arm", lambda _: None)
+
+
+@pytest.mark.parametrize("job", [main_job.plan_case, main_job.rehearse_case], ids=["plan", "rehearse"])
+def test_a_rejected_direction_is_told_at_once_and_an_older_plan_goes(job, context, rejected, unsearched, tmp_path):
+    """Nobody takes the plan of another direction for the answer."""
+    with writing(tmp_path, "plan") as draft:
+        (draft.folder / "plan.json").write_text("{}")
+    with pytest.raises(NoAnswerError, match="no plan: theta .* is rejected: "):
+        job(context, tmp_path, choice=rejected)
+    assert not (tmp_path / "plan.json").exists()
+    assert "plan" not in read_manifest(tmp_path).entries
+
+
+def test_an_entry_off_the_skin_is_told_at_once_and_the_old_set_stays(context, unsearched, tmp_path):
+    """Bad input changes nothing."""
+    with writing(tmp_path, "plan") as draft:
+        (draft.folder / "plan.json").write_text("{}")
+    with pytest.raises(InputError, match="enters the skin"):
+        main_job.plan_case(context, tmp_path, Choice(entry_mm=(0.0, 0.0, 40.0)))
+    assert (tmp_path / "plan.json").exists()
+
+
+def test_slicer_too(context, rejected, unsearched, tmp_path):
+    """The same of a path for 3D Slicer."""
+    with pytest.raises(NoAnswerError, match="is rejected"):
+        export_to_slicer(context, tmp_path / "out", rejected)
+    assert not (tmp_path / "out").exists()
