@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from puncture_twin.planning.anatomy.scan import Scan
@@ -19,7 +20,7 @@ from puncture_twin.planning.formats.labels.naming import BUILT_IN, LabelRule, Ru
 from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
 from puncture_twin.planning.formats.volumes.volume_files import NRRD_ENDINGS
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space, parse_space, parse_unit
+from puncture_twin.planning.geometry.spaces import Space, Unit, parse_space, parse_unit
 
 Progress = Callable[[str], None]
 
@@ -127,15 +128,17 @@ class StructureSources:
             return self._volume(section.ct).skin_of_ct()
         if section.labelmap is not None and section.label is not None:
             return self._labels(section.labelmap).skin_of_label(section.label)
-        mesh = self._mesh(section)
-        ends = () if self._case.space is Space.LOCAL or section.cut is not None else flat_ends(mesh)
+        mesh, kept = self._mesh(section), self._cache.memory
+        local = self._case.space is Space.LOCAL or section.cut is not None
+        ends = () if local else kept.get((flat_ends.__name__, mesh.digest), partial(flat_ends, mesh), _no_bytes)
         if ends:
             raise InputError(
                 f"skin mesh {section.mesh} ends flat at its {', '.join(ends)} side: was the body cut there?",
                 where=self._case.path,
                 allowed=f"cut = {json.dumps(ends)} where no skin is, or cut = [] if all of it is skin",
             )
-        return skin_from_mesh(mesh, section.cut or ())
+        cut = section.cut or ()
+        return kept.get((skin_from_mesh.__name__, mesh.digest, cut), partial(skin_from_mesh, mesh, cut), _skin_bytes)
 
     def scan(self, skin_section: StructureSection, skin: Skin) -> Scan | None:
         """The CT of the case: of its skin, or the one that ``[ct]`` names; None where there is none."""
@@ -165,8 +168,15 @@ class StructureSources:
             raise InputError("no mesh with a unit", where=where, allowed="mesh and unit")
         space = parse_space(section.space or self._case.space, where=where)
         unit = parse_unit(section.unit, where=where)
-        content, file = self._case.files.content(section.mesh), self._file(section.mesh)
-        return parse_mesh(content, file, unit=unit, space=space, space_is_default=section.space is None)
+        file, by_default = self._file(section.mesh), section.space is None
+        key = (__name__, self._case.files.sha256(section.mesh), file.suffix.lower(), unit, space, by_default)
+        return self._cache.memory.get(
+            key, partial(self._parsed, section.mesh, unit, space, by_default), lambda mesh: mesh.nbytes
+        )
+
+    def _parsed(self, name: str, unit: Unit, space: Space, by_default: bool) -> TriangleMesh:
+        content = self._case.files.content(name)
+        return parse_mesh(content, self._file(name), unit=unit, space=space, space_is_default=by_default)
 
     def _label(self, section: StructureSection) -> TriangleMesh:
         if section.labelmap is None or section.label is None:
@@ -197,6 +207,15 @@ class StructureSources:
 
     def _file(self, name: str) -> Path:
         return self._case.folder / name
+
+
+def _no_bytes(ends: tuple[str, ...]) -> int:
+    """Of a few names."""
+    return 100 * len(ends)
+
+
+def _skin_bytes(skin: Skin) -> int:
+    return skin.mesh.nbytes + skin.cut_faces.nbytes
 
 
 def _ruled(rule: LabelRule, mesh: TriangleMesh, source: str, voxel_mm: float) -> Structure:

@@ -104,6 +104,10 @@ class InputFiles:
         self._held[name] = content
         return content
 
+    def state(self, role: str, content: bytes) -> None:
+        """List bytes that come from no file; no name of a file leads to them."""
+        self._inputs[role, ""] = content_input(role, "", content)
+
     def read(self, role: str, name: str, *, max_bytes: int, key: str, where: Path) -> bytes:
         """The content of a file, which is read where no role has wanted it before.
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ValidationError
 
@@ -58,7 +59,15 @@ def read_toml_bytes(path: Path, allowed: str) -> bytes:
         raise InputError(f"cannot be read ({error.strerror})", where=path, allowed=allowed) from error
 
 
-def parse_toml(content: bytes, path: Path, model: type[Model], *, allowed: str, keys: str) -> Model:
+def parse_toml(
+    content: bytes,
+    path: Path,
+    model: type[Model],
+    *,
+    allowed: str,
+    keys: str,
+    change: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+) -> Model:
     """Validate the bytes of such a file; it is not opened again.
 
     Args:
@@ -67,6 +76,7 @@ def parse_toml(content: bytes, path: Path, model: type[Model], *, allowed: str, 
         model: Its schema.
         allowed: What would have been accepted in its place.
         keys: Where its keys are described.
+        change: States some values otherwise, before any is looked at.
 
     Raises:
         InputError: Not TOML, or not of the schema: names the first key that is wrong.
@@ -78,7 +88,7 @@ def parse_toml(content: bytes, path: Path, model: type[Model], *, allowed: str, 
     except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, a number that Python does not read
         raise InputError(f"is not TOML: {error}", where=path, allowed=allowed) from error
     try:
-        return model.model_validate(data)
+        return model.model_validate(data if change is None else change(data))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in first["loc"]) or "top level"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 
@@ -34,6 +35,7 @@ from puncture_twin.planning.case.errors_section import ErrorsSection
 from puncture_twin.planning.case.html import case_html
 from puncture_twin.planning.case.mount import axes_frame, mount_pose
 from puncture_twin.planning.case.named_files import MASK_ROLE, named_files
+from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOptions
 from puncture_twin.planning.case.registration_section import (
     NO_RESIDUALS,
     MarkerSection,
@@ -147,8 +149,12 @@ class Case:
         return {structure_name(file): file for file in files if PurePosixPath(file).parent == inside}
 
 
-def load_case(path: Path | str) -> Case:
+def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
     """Read and validate a case file, or a folder that holds ``case.toml``.
+
+    Args:
+        path: The file or the folder.
+        options: What is stated in place of what the file states; they are an input of their own.
 
     Raises:
         InputError: Anything unreadable, unknown, missing or contradictory; names the key.
@@ -157,7 +163,10 @@ def load_case(path: Path | str) -> Case:
     files = InputFiles(path.parent)
     case_volumes = CaseVolumes(files, path)
     stated = files.add(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE))
-    content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md")
+    if options.sections:
+        files.state(OPTIONS_ROLE, options.text.encode())
+    change = partial(options.applied, where=path)
+    content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md", change=change)
     _read_files(content, path, files, case_volumes)
     space = Space(content.space)
     target = _target(content, path, space, files)

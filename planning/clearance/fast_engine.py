@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.direction_tiles import Tiles, bundle
@@ -50,14 +51,17 @@ class FastEngine:
     Args:
         meshes: The k surfaces, in the CT frame, mm.
         progress: Called with (structures done x directions, directions x structures).
+        memory: Where packed surfaces are kept.
 
     Attributes:
         counts: Shape (7,), what all searches so far went through, see `tile_search.COUNTED`.
     """
 
-    def __init__(self, meshes: Sequence[TriangleMesh], progress: Count | None = None) -> None:
+    def __init__(
+        self, meshes: Sequence[TriangleMesh], progress: Count | None = None, memory: Memory = NO_MEMORY
+    ) -> None:
         self._meshes = tuple(meshes)
-        self._blocks = tuple(pack(mesh) for mesh in self._meshes)
+        self._blocks = tuple(_packed(mesh, memory) for mesh in self._meshes)
         self._references: dict[int, FclEngine] = {}
         self._seen: tuple[Floats, list[_Placed]] | None = None
         self._progress = progress
@@ -117,6 +121,13 @@ class FastEngine:
     ) -> NearFaces:
         """Faces of one structure near an axis; see `ClearanceEngine`."""
         return near_faces(self._blocks[structure], origin_ct, outward_ct, length, reach)
+
+
+def _packed(mesh: TriangleMesh, memory: Memory) -> Blocks:
+    """A surface as blocks of triangles; it is the same for every target."""
+    if memory is NO_MEMORY:
+        return pack(mesh)
+    return memory.get((__name__, mesh.digest), lambda: pack(mesh), lambda blocks: blocks.nbytes)
 
 
 def _one_structure(

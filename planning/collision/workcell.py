@@ -11,6 +11,7 @@ from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Gantry, Obstacle
@@ -21,6 +22,12 @@ from puncture_twin.planning.geometry.rigid import apply, pose
 ARM_PADDING_MM = 5.0
 """The arm keeps this distance from all around it: more than the registration's error, and enough to prove the path
 between two checked states."""
+
+CHECKER_BYTES = 20_000_000
+"""About what the arm's links, hulls and spheres hold in one checker."""
+
+TREE_COPIES = 8
+"""A surface in FCL's tree and in that of the proofs holds about so many times its vertices and faces."""
 
 
 def case_tool(case: Case) -> Tool:
@@ -91,18 +98,29 @@ def patient_surface(anatomy: Anatomy) -> TriangleMesh:
     return joined([anatomy.skin.mesh, *outside]) if outside else anatomy.skin.mesh
 
 
-def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats) -> FastChecker:
+def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory = NO_MEMORY) -> FastChecker:
     """The collision checker of the case's workcell, with the patient where ``T_base_ct`` says.
+
+    It depends on no target: of one patient and one arm it is made once where ``memory`` keeps it.
 
     Raises:
         InputError: The robot's base stands in the patient, or the gantry's wall does.
     """
     check_gantry(case, anatomy.skin.mesh)
     surface, alone = patient_surface(anatomy), anatomy.skin.mesh
-    patient, skin = surface.transformed(T_base_ct), None if surface is alone else alone.transformed(T_base_ct)
     boxes = case_boxes(case, T_base_ct)
     model, tool = ur_model(case.robot.model), case_tool(case)
-    return FastChecker(model, tool, boxes, patient, skin=skin, padding_mm=ARM_PADDING_MM, cache=user_cache())
+
+    def make() -> FastChecker:
+        patient, skin = surface.transformed(T_base_ct), None if surface is alone else alone.transformed(T_base_ct)
+        return FastChecker(model, tool, boxes, patient, skin=skin, padding_mm=ARM_PADDING_MM, cache=user_cache())
+
+    if memory is NO_MEMORY:
+        return make()
+    stated = tuple((box.name, box.T_base_box.tobytes(), box.size_mm) for box in boxes)
+    surfaces = (surface.digest, alone.digest, np.ascontiguousarray(T_base_ct, np.float64).tobytes())
+    key = (__name__, model.name, tool, stated, surfaces, ARM_PADDING_MM)
+    return memory.get(key, make, lambda _: CHECKER_BYTES + TREE_COPIES * (surface.nbytes + alone.nbytes))
 
 
 def home_configuration(case: Case) -> Floats:

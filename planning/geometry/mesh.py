@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -68,6 +69,17 @@ class TriangleMesh:
         keys = (self.vertices + 0.0).view(np.dtype((np.void, 24))).reshape(-1)  # + 0.0 makes -0.0 equal to 0.0
         _, welded = np.unique(keys, return_inverse=True)
         return np.asarray(welded[self.faces], dtype=np.int64)
+
+    @cached_property
+    def digest(self) -> str:
+        """Hexadecimal SHA-256 of its vertices and faces: two meshes of one digest are the same to the bit."""
+        shape = f"{self.vertices.shape} {self.faces.shape} ".encode()
+        return hashlib.sha256(shape + self.vertices.tobytes() + self.faces.tobytes()).hexdigest()
+
+    @property
+    def nbytes(self) -> int:
+        """What vertices and faces hold."""
+        return self.vertices.nbytes + self.faces.nbytes
 
     @property
     def bounds(self) -> NDArray[np.float64]:

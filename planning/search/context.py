@@ -15,10 +15,12 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy, load_anatomy
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Silent, Stages, Watcher
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.case.case import Case, load_case
+from puncture_twin.planning.case.options import NO_OPTIONS, CaseOptions
 from puncture_twin.planning.clearance.cross_check import CrossChecked, cross_check
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.clearance.fast_engine import FastEngine
@@ -178,6 +180,8 @@ def prepare(
     engine: str = "fast",
     watcher: Watcher | None = None,
     target_ct: Floats | None = None,
+    options: CaseOptions = NO_OPTIONS,
+    memory: Memory = NO_MEMORY,
 ) -> CaseContext:
     """Read a case and everything that it names.
 
@@ -187,6 +191,8 @@ def prepare(
         engine: A name of `ENGINES`.
         watcher: Whoever shows progress.
         target_ct: Another target than the case's, shape (3,), mm.
+        options: What is stated in place of what the case file states.
+        memory: What this process keeps from one case to the next; the answer is the same.
 
     Raises:
         InputError: Anything in the case that cannot be used, an unknown engine, or an arm that is to be checked in a
@@ -197,13 +203,13 @@ def prepare(
     watcher = watcher or Silent()
     stages = Stages(announce=partial(watcher.step, "stage"))
     with stages.time("case"):
-        case = load_case(path)
+        case = load_case(path, options)
         case = case if target_ct is None else case.aimed_at(target_ct)
         placement = load_placement(case)
     if arm and placement is None:
         raise InputError(f"the arm is to be checked, but {NO_BASE}", where=case.path, allowed=ALLOWED_BASE)
     with stages.time("anatomy"):
-        anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), user_cache())
+        anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), replace(user_cache(), memory=memory))
         anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
         warnings = (*case.warnings, *anatomy.warnings, *check_consistency(case, anatomy, placement))
         warnings += breath_warnings(case, anatomy)
@@ -212,10 +218,11 @@ def prepare(
         case.files.release()
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]
-        measurer = ENGINES[engine](meshes, partial(watcher.count, "directions"))
+        kept = {"memory": memory} if engine == "fast" else {}
+        measurer = ENGINES[engine](meshes, partial(watcher.count, "directions"), **kept)
         reach = None
         if arm is not False and placement is not None:
-            reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct), placement.T_base_ct)
+            reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct, memory), placement.T_base_ct)
         error = None if reach is None or placement is None else pose_error(case, placement.registration)
         chance = chance_model(case, anatomy, error)
     return CaseContext(case, anatomy, placement, measurer, reach, chance, watcher, stages)

@@ -13,13 +13,14 @@ import os
 import platform
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from puncture_twin.planning.base.cache.cache_folder import StoredFile, store, touch
 from puncture_twin.planning.base.cache.entry_file import Arrays, DamagedError, packed, read_plain_file, unpacked
+from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.cache.source_stamp import library_versions, source_stamp
 from puncture_twin.planning.base.errors import CacheWarning, InputError
 
@@ -48,10 +49,12 @@ class Cache:
     Attributes:
         folder: Where; None makes everything anew each time.
         most_bytes: What it may hold.
+        memory: What this process keeps beside it.
     """
 
     folder: Path | None
     most_bytes: int = MOST_BYTES
+    memory: Memory = field(default=NO_MEMORY, compare=False)
 
     def arrays(
         self,
@@ -69,9 +72,16 @@ class Cache:
             by: The module whose code makes them, such as ``puncture_twin.planning.anatomy.surfaces``.
             check: Raises ValueError, KeyError, TypeError or InputError for arrays that cannot be what ``make`` gives.
         """
+        if self.memory is NO_MEMORY:
+            return make() if self.folder is None else self._from_folder(_entry(made_from, by), make, check)
+        entry = _entry(made_from, by)
+        return self.memory.get((__name__, entry), lambda: _frozen(self._from_folder(entry, make, check)), _size)
+
+    def _from_folder(
+        self, entry: StoredFile, make: Callable[[], Arrays], check: Callable[[Arrays], object] | None
+    ) -> Arrays:
         if self.folder is None:
             return make()
-        entry = _entry(made_from, by)
         found = _kept(self.folder / entry.file, entry.key, check)
         if found is None:
             found = make()
@@ -113,6 +123,17 @@ def _most_bytes() -> int:
             f"{stated[:40]!r} is no size", where=f"${SIZE_VARIABLE}", allowed="whole megabytes, such as 2000"
         )
     return int(stated) * 1_000_000
+
+
+def _frozen(arrays: Arrays) -> Arrays:
+    """Arrays that several will hold: read-only, as those are that come from the folder."""
+    for array in arrays.values():
+        array.setflags(write=False)
+    return arrays
+
+
+def _size(arrays: Arrays) -> int:
+    return sum(array.nbytes for array in arrays.values())
 
 
 def _entry(made_from: Mapping[str, Any], by: str) -> StoredFile:

@@ -41,6 +41,11 @@ class Blocks:
     disc: NDArray[np.float32]
     base: NDArray[np.int64]
 
+    @property
+    def nbytes(self) -> int:
+        """What the arrays hold."""
+        return sum(array.nbytes for array in (self.triangles, self.local, self.center, self.disc, self.base))
+
 
 def pack(mesh: TriangleMesh) -> Blocks:
     """Pack a surface."""

@@ -1,0 +1,153 @@
+"""What is stated in place of what a case file states: another target, margins, mount, needle, arm or errors.
+
+The case file is not changed: its tables are, before they are validated, so that an option is held to the same rules as
+a line of the file. Options are an input of their own: no result of a case with options passes for one without.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from puncture_twin.planning.base.errors import InputError
+
+OPTIONS_ROLE = "options"
+"""Of the input that options are."""
+
+TABLES = {"target": "target", "needle": "needle", "arm": "robot", "errors": "errors", "search": "search"}
+"""Options that are laid over a table of the case, key by key, and that table."""
+
+MOUNT, MARGINS, ADDED = "mount", "margins", "add_mm"
+"""Options that are more than that, and the key of `margins` that adds to all."""
+
+SECTIONS = (*TABLES, MARGINS, MOUNT)
+"""Every kind of option."""
+
+POSITIONS = ("position_mm", "points")
+"""Keys of a target of which one takes the other's place."""
+
+WITH_MARGIN = ("avoid", "unknown")
+"""Roles that demand a margin."""
+
+
+@dataclass(frozen=True)
+class CaseOptions:
+    """Options of one case.
+
+    Attributes:
+        sections: Kind of option (`SECTIONS`) to its keys and values, as TOML gives them; mm and degrees.
+    """
+
+    sections: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def text(self) -> str:
+        """The options as JSON: the same options give the same text."""
+        return json.dumps(self.sections, sort_keys=True, allow_nan=False)
+
+    def applied(self, data: dict[str, Any], *, where: Path | str) -> dict[str, Any]:
+        """A case file's tables with the options in place; nothing is validated yet.
+
+        Args:
+            data: As TOML gives them; stays as it is.
+            where: The case file, for errors.
+
+        Raises:
+            InputError: A margin of what the case has no margin for.
+        """
+        changed = copy.deepcopy(data)
+        for kind, values in self.sections.items():
+            if kind == MOUNT:
+                changed.pop("registration", None)
+                _table(changed, "robot")["mount"] = dict(values)
+            elif kind == MARGINS:
+                _set_margins(changed, values, where)
+            else:
+                _lay_over(_table(changed, TABLES[kind]), values)
+        return changed
+
+
+NO_OPTIONS = CaseOptions()
+"""Everything as the case file states it."""
+
+
+def case_options(sections: Mapping[str, Any], *, where: str) -> CaseOptions:
+    """Options from plain values.
+
+    Args:
+        sections: Kind of option to a table of keys and values.
+        where: What states them, for errors.
+
+    Raises:
+        InputError: An unknown kind, something that is no table, or a value that is no number, text or list of them.
+    """
+    for kind, values in sections.items():
+        if kind not in SECTIONS:
+            raise InputError(f"'{kind}' is no kind of option", where=where, allowed=", ".join(SECTIONS))
+        if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
+            raise InputError(f"option '{kind}' is no table", where=where, allowed="keys and values, as in the case")
+    found = CaseOptions(MappingProxyType({kind: MappingProxyType(dict(v)) for kind, v in sections.items() if v}))
+    try:
+        plain = json.loads(json.dumps({kind: dict(values) for kind, values in found.sections.items()}, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"an option cannot be used ({error})", where=where, allowed="finite numbers, texts, lists, tables"
+        ) from error
+    return CaseOptions(plain)
+
+
+def _table(data: dict[str, Any], name: str) -> dict[str, Any]:
+    """A table of the case, made where it is missing; what is no table is left to the schema's refusal."""
+    table = data.setdefault(name, {})
+    return table if isinstance(table, dict) else {}
+
+
+def _lay_over(table: dict[str, Any], values: Mapping[str, Any]) -> None:
+    for key in values:
+        if key in POSITIONS:
+            table.pop(POSITIONS[1 - POSITIONS.index(key)], None)
+    table.update(values)
+
+
+def _set_margins(data: dict[str, Any], values: Mapping[str, Any], where: Path | str) -> None:
+    """Set the margins of structures by name or pattern, then add to all.
+
+    Raises:
+        InputError: A pattern that fits nothing with a margin, or a margin that is no number.
+    """
+    stated = list(_margins(data))
+    for pattern, margin in values.items():
+        if not isinstance(margin, int | float) or isinstance(margin, bool):
+            raise InputError(f"margins '{pattern}' is no number", where=where, allowed="mm")
+        if pattern == ADDED:
+            continue
+        fitting = [one for one in stated if fnmatchcase(one[0], pattern)]
+        if not fitting:
+            known = ", ".join(name for name, _, _ in stated) or "none"
+            raise InputError(f"margins '{pattern}' fits nothing that has a margin", where=where, allowed=known)
+        for _, table, key in fitting:
+            table[key] = margin
+    for _, table, key in stated if ADDED in values else ():
+        before = table.get(key, 0.0)
+        table[key] = before + values[ADDED] if isinstance(before, int | float) else before
+
+
+def _margins(data: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:
+    """Every margin of a case: the name or pattern that it is stated for, its table and its key there."""
+    for one in _tables(data.get("structure")):
+        if one.get("role") in WITH_MARGIN:
+            yield str(one.get("name")), one, "margin_mm"
+    for many in _tables(data.get("structures")):
+        avoid = many.get("avoid")
+        if isinstance(avoid, dict):
+            yield from ((pattern, avoid, pattern) for pattern in list(avoid))
+
+
+def _tables(found: Any) -> list[dict[str, Any]]:
+    return [one for one in found if isinstance(one, dict)] if isinstance(found, list) else []
