@@ -20,11 +20,12 @@ from puncture_twin.meshes import folder as meshes_folder
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import check_writable
 from puncture_twin.planning.geometry.spaces import Space, Unit
-from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, exit_code_of
+from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, PROGRAM_FAILED, exit_code_of
 from puncture_twin.twin.jobs.extras import require_extra
 from puncture_twin.twin.jobs.options import (
     ArmOption,
     CaseArgument,
+    CohortOption,
     EngineOption,
     JobsOption,
     JsonOption,
@@ -45,6 +46,10 @@ MOST_SEEDS = 10_000
 
 app = typer.Typer(add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 """Plain help: in boxes, a terminal of 40 columns shows names of options cut off."""
+batch_app = typer.Typer(
+    add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None
+)
+app.add_typer(batch_app, name="batch", help="Many cases: plan, run, status, merge, compare.")
 
 
 def _print_version(wanted: bool) -> None:
@@ -451,24 +456,99 @@ def register(
     _print(report, text.registration_text(report), as_json)
 
 
-@app.command()
-def batch(
-    cases: Annotated[list[Path], typer.Argument(metavar="CASES...", help="Case files or folders.")],
-    out_dir: OutOption = Path("out/batch"),
+@batch_app.command("plan")
+def batch_plan(
+    cohort: Annotated[Path, typer.Argument(metavar="COHORT", help="A folder, a CSV with 'case', or cohort.toml.")],
+    out_dir: CohortOption,
+    no_arm: Annotated[bool, typer.Option("--no-arm", help="Leave the arm out of every case.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say how many, how long, how much.")] = False,
     jobs: JobsOption = 1,
-    arm: ArmOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Search many cases; one that fails does not stop the others."""
-    from puncture_twin.planning.batch.batch import run_batch
-    from puncture_twin.twin.jobs.patient import text
+    """Write down every case of a cohort, with the hash of its inputs, options and version."""
+    from puncture_twin.twin.jobs.batch.plan_job import plan_cohort
+    from puncture_twin.twin.jobs.batch.text import plan_text
 
     with progress_display() as progress:
-        rows = run_batch(cases, out_dir, jobs=jobs, arm=arm, watcher=progress)
-    _print({"cases": rows}, text.batch_text(rows), as_json)
-    for code in (PROGRAM_FAILED, BAD_INPUT, ANSWER_IS_NO):
-        if any(row["exit_code"] == code for row in rows):
-            raise typer.Exit(code)
+        run = plan_cohort(cohort, out_dir, arm=False if no_arm else None, dry=dry_run, watcher=progress)
+    _print(run.summary(jobs), plan_text(run, jobs), as_json)
+
+
+@batch_app.command("run")
+def batch_run(
+    out_dir: CohortOption,
+    part: Annotated[
+        str | None, typer.Option("--part", metavar="i/n", help="Only this part; else SLURM's array task, else all.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A Dask scheduler whose workers run the cases.")
+    ] = None,
+    jobs: JobsOption = 1,
+    memory_mb: Annotated[int | None, typer.Option("--memory-mb", min=100, help="Most that a worker may hold.")] = None,
+    timeout_s: Annotated[float | None, typer.Option("--timeout-s", min=0.1, help="Most that a case may take.")] = None,
+    pages: Annotated[bool, typer.Option("--pages", help="Draw the pictures and the page of each case too.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run the cases that have no result yet; what is done is kept, whatever stops the run."""
+    from puncture_twin.planning.batch.workers import Limits
+    from puncture_twin.twin.jobs.batch.run_job import Where, run_part, run_summary
+    from puncture_twin.twin.jobs.batch.text import run_text
+
+    where = Where(part, scheduler, jobs, pages, Limits(memory_mb, timeout_s))
+    with progress_display() as progress:
+        counts = run_part(out_dir, where, progress)
+    _print(run_summary(out_dir, counts), run_text(out_dir, counts), as_json)
+    if counts.ended[PROGRAM_FAILED] or counts.stale:
+        raise typer.Exit(PROGRAM_FAILED if counts.ended[PROGRAM_FAILED] else ANSWER_IS_NO)
+
+
+@batch_app.command("status")
+def batch_status(out_dir: CohortOption, as_json: JsonOption = False) -> None:
+    """Count the cases that are done, failed, missing and stale; every input is hashed again."""
+    from puncture_twin.planning.batch.state import cohort_state
+    from puncture_twin.twin.jobs.batch.text import state_text
+
+    with progress_display() as progress:
+        state = cohort_state(out_dir, partial(progress.count, "cases"))
+    _print(state.summary(), state_text(state), as_json)
+
+
+@batch_app.command("merge")
+def batch_merge(
+    out_dir: CohortOption,
+    expect: Annotated[
+        Path | None, typer.Option("--expect", metavar="FILE", help="An earlier cases.parquet: exit 1 where it differs.")
+    ] = None,
+    tolerance: Annotated[
+        float, typer.Option("--tolerance-mm", min=0, help="By so much a best clearance may differ from --expect.")
+    ] = 0.01,
+    as_json: JsonOption = False,
+) -> None:
+    """Write one table of all cases, one dataset of all candidates, and one page."""
+    from puncture_twin.twin.jobs.batch.merge_job import merge_cohort
+    from puncture_twin.twin.jobs.batch.text import merge_text
+
+    with progress_display() as progress:
+        merged = merge_cohort(out_dir, expect, tolerance, progress)
+    _print(merged.summary(), merge_text(merged), as_json)
+    if not merged.as_expected:
+        raise typer.Exit(ANSWER_IS_NO)
+
+
+@batch_app.command("compare")
+def batch_compare(
+    before: Annotated[Path, typer.Argument(metavar="A", help="A merged cohort: its folder, or its cases.parquet.")],
+    after: Annotated[Path, typer.Argument(metavar="B", help="Another, of the same cases.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Say what became safe, what was lost, and how far best entries moved, from A to B."""
+    from puncture_twin.planning.batch.compare import compare, read_cases
+    from puncture_twin.twin.jobs.batch.merge_job import change_summary
+    from puncture_twin.twin.jobs.batch.text import compare_text
+
+    found = compare(read_cases(before), read_cases(after))
+    summary = {"counts": dict(found.counts), "cases": [change_summary(one) for one in found.changes]}
+    _print(summary, compare_text(found), as_json)
 
 
 @app.command()

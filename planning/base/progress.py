@@ -23,8 +23,8 @@ class Watcher(Protocol):
         """A stage has come to a named thing."""
         ...
 
-    def count(self, stage: str, done: int, total: int) -> None:
-        """A stage has done so many of so many."""
+    def count(self, stage: str, done: int, total: int, failed: int = 0) -> None:
+        """A stage has done so many of so many, and so many of these have failed."""
         ...
 
     def note(self, line: str) -> None:
@@ -38,7 +38,7 @@ class Silent:
     def step(self, stage: str, what: str) -> None:
         """Nothing."""
 
-    def count(self, stage: str, done: int, total: int) -> None:
+    def count(self, stage: str, done: int, total: int, failed: int = 0) -> None:
         """Nothing."""
 
     def note(self, line: str) -> None:

@@ -1,4 +1,7 @@
-"""Many cases, one after the other or in processes; one that fails does not stop the others."""
+"""Cohorts: many cases planned, run in parts by workers that may die, merged into one table, and compared.
+
+A case is a pure function into a folder that is named by the hash of its inputs, options and version, and appears whole.
+"""
 
 import lazy_loader
 

@@ -1,1 +1,1 @@
-from .batch import run_batch as run_batch
+from .run import run_cohort as run_cohort

@@ -49,7 +49,9 @@ class CaseOptions:
     @property
     def text(self) -> str:
         """The options as JSON: the same options give the same text."""
-        return json.dumps(self.sections, sort_keys=True, allow_nan=False)
+        return json.dumps(
+            {kind: dict(values) for kind, values in self.sections.items()}, sort_keys=True, allow_nan=False
+        )
 
     def applied(self, data: dict[str, Any], *, where: Path | str) -> dict[str, Any]:
         """A case file's tables with the options in place; nothing is validated yet.
@@ -92,9 +94,8 @@ def case_options(sections: Mapping[str, Any], *, where: str) -> CaseOptions:
             raise InputError(f"'{kind}' is no kind of option", where=where, allowed=", ".join(SECTIONS))
         if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
             raise InputError(f"option '{kind}' is no table", where=where, allowed="keys and values, as in the case")
-    found = CaseOptions(MappingProxyType({kind: MappingProxyType(dict(v)) for kind, v in sections.items() if v}))
     try:
-        plain = json.loads(json.dumps({kind: dict(values) for kind, values in found.sections.items()}, allow_nan=False))
+        plain = json.loads(CaseOptions({kind: values for kind, values in sections.items() if values}).text)
     except (TypeError, ValueError) as error:
         raise InputError(
             f"an option cannot be used ({error})", where=where, allowed="finite numbers, texts, lists, tables"

@@ -23,6 +23,9 @@ OutOfCaseOption = Annotated[
         "--out", help="Folder for the files that are written.", show_default="out/, then the case's and command's names"
     ),
 ]
+CohortOption = Annotated[
+    Path, typer.Option("--out", metavar="DIR", help="The cohort's folder.", callback=check_writable)
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, and nothing else there.")]
 JobsOption = Annotated[
     int, typer.Option("--jobs", min=1, help="Processes, at most one a core; the answer is the same.")

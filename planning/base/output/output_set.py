@@ -91,11 +91,16 @@ def _explained(out: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno not in NO_SPACE and not (error.errno is None and _full(out)):
+        if not disk_is_full(error, out):
             raise
         reason = os.strerror(error.errno or errno.ENOSPC)
         what = f"cannot be written ({reason}); what it held before is untouched"
         raise InputError(what, where=out, allowed="a folder with enough free space") from error
+
+
+def disk_is_full(error: OSError, out: Path) -> bool:
+    """Whether it is the disk of a folder that takes no more; some libraries fail without a number."""
+    return error.errno in NO_SPACE or (error.errno is None and _full(out))
 
 
 def _full(out: Path) -> bool:

@@ -226,16 +226,6 @@ def _interval(bounds: Sequence[float]) -> str:
     return "" if low == high else f" (95 %: {low:.3f} to {high:.3f})"
 
 
-def batch_text(rows: Sequence[dict[str, Any]]) -> str:
-    """One line per case."""
-    width = max((len(row["case"]) for row in rows), default=4)
-    lines = [f"{'case':{width}s}  safe  of     best theta/beta  said"]
-    for row in rows:
-        best = "-" if row["best_theta_deg"] is None else f"{row['best_theta_deg']:g}/{row['best_beta_deg']:g}"
-        lines.append(f"{row['case']:{width}s}  {row['safe']:5d} {row['directions']:6d}  {best:15s}  {row['said']}")
-    return "\n".join(lines)
-
-
 def _best(run: Run) -> list[str]:
     """The best candidate of each window."""
     summary = run.summary()

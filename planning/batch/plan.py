@@ -1,0 +1,166 @@
+"""``plan.parquet``: every case of a cohort, with an id that is the hash of its inputs, its options and the version."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from puncture_twin.planning.base.errors import InputError, PlanningError, one_line
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.output.manifest import read_output
+from puncture_twin.planning.base.provenance import CASE_ROLE, Input, content_input, inputs_document
+from puncture_twin.planning.base.toml_file import find_toml, read_toml_bytes
+from puncture_twin.planning.batch.cohort_case import CohortCase
+from puncture_twin.planning.case.case import ALLOWED_CASE, load_case
+from puncture_twin.planning.case.options import case_options
+
+PLAN_NAME = "plan.parquet"
+MAX_PLAN_BYTES = 2_000_000_000
+ID_DIGITS = 32
+"""Hexadecimal digits of an id: 128 bits, and too many digits for a number in any reader of partitions."""
+
+OWN_FOLDER = "the case's folder"
+NO_PLAN = "a folder that `batch plan COHORT --out DIR` has written to"
+
+
+@dataclass(frozen=True)
+class PlannedCase:
+    """A row of the plan.
+
+    Attributes:
+        case: As the cohort writes it.
+        id: Hash of inputs, options and version; also the name of its result's folder.
+        name: What people call it.
+        path: The case file, absolute.
+        options: As JSON, see `CaseOptions`.
+        arm: False leaves the arm out; None checks it where the case says where its base is.
+        inputs: Role, path and SHA-256 of each file, as JSON.
+        refusal: Why the case cannot be read, or "".
+    """
+
+    case: str
+    id: str
+    name: str
+    path: str
+    options: str
+    arm: bool | None
+    inputs: str
+    refusal: str
+
+
+SCHEMA = pa.schema(
+    [
+        ("case", pa.string()),
+        ("id", pa.string()),
+        ("name", pa.string()),
+        ("path", pa.string()),
+        ("options", pa.string()),
+        ("arm", pa.bool_()),
+        ("inputs", pa.string()),
+        ("refusal", pa.string()),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A cohort's plan.
+
+    Attributes:
+        cases: In the cohort's order.
+        sha256: Of the file.
+        version: Of this package, when it was made.
+    """
+
+    cases: tuple[PlannedCase, ...]
+    sha256: str
+    version: str
+
+
+def case_id(options: str, arm: bool | None, inputs: Sequence[Input], refusal: str) -> str:
+    """The id of a case: the same bytes, options and version give the same id, wherever the files lie.
+
+    Args:
+        options: As JSON.
+        arm: Of `PlannedCase`.
+        inputs: Every file, with its hash.
+        refusal: Why it cannot be read, or "".
+    """
+    stated = [(one.role, "" if one.role == CASE_ROLE else one.path, one.sha256) for one in inputs]
+    decides = {"version": version("puncture-twin"), "options": options, "arm": arm, "refusal": refusal}
+    text = json.dumps({**decides, "inputs": sorted(stated)}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:ID_DIGITS]
+
+
+def planned(cohort: Sequence[CohortCase], arm: bool | None) -> Iterator[PlannedCase]:
+    """A row for each case, also for one that cannot be read: each file is read and hashed, nothing is searched."""
+    for one in cohort:
+        row = PlannedCase(one.stated, "", one.name, "", one.options.text, arm, "[]", "")
+        yield identified(replace(row, path=str(one.path.absolute())))
+
+
+def identified(row: PlannedCase) -> PlannedCase:
+    """The row with the id, the inputs and the refusal that its files give now."""
+    try:
+        case = load_case(row.path, case_options(json.loads(row.options), where=row.case))
+        inputs, refusal, name = case.inputs, "", case.name
+        called = f"{name}: {row.name}" if row.name and row.options != "{}" else row.name or name
+    except PlanningError as error:
+        inputs, refusal, called = _readable(row), relative_text(str(error), row), row.name
+    stated = json.dumps(inputs_document(inputs))
+    found = replace(row, id=case_id(row.options, row.arm, inputs, refusal), inputs=stated, refusal=refusal)
+    return found if row.id else replace(found, name=called)
+
+
+def _readable(row: PlannedCase) -> tuple[Input, ...]:
+    """Of a case that is refused, the case file where it can be read."""
+    try:
+        path = find_toml(row.path, "case.toml")
+        return (content_input(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE)),)
+    except InputError:
+        return ()
+
+
+def relative_text(text: str, row: PlannedCase) -> str:
+    """What is said of a case, without the folder in which it happens to lie: the same bytes give the same text."""
+    path = Path(row.path)
+    folders = {str(path), str(path.parent)} if path.suffix == ".toml" else {str(path)}
+    for folder in sorted(folders, key=len, reverse=True):
+        text = text.replace(f"{folder}/", "").replace(folder, OWN_FOLDER)
+    return one_line(text)
+
+
+def write_plan_table(rows: Sequence[PlannedCase], path: Path) -> None:
+    """Write the plan, whole or not at all."""
+    schema = SCHEMA.with_metadata({"version": version("puncture-twin")})
+    table = pa.Table.from_pylist([asdict(row) for row in rows], schema)
+    with atomic(path) as temporary, temporary.open("wb") as stream:
+        pq.write_table(table, stream)
+
+
+def read_plan_table(out: Path) -> Plan:
+    """The plan of a folder.
+
+    Raises:
+        InputError: There is none, or it is not the one that was written.
+    """
+    path = out / PLAN_NAME
+    if not path.is_file():
+        raise InputError("has no plan", where=out, allowed=NO_PLAN)
+    found = read_output(path, max_bytes=MAX_PLAN_BYTES)
+    try:
+        table = pq.read_table(io.BytesIO(found.data))
+        rows: list[dict[str, Any]] = table.to_pylist()
+        made_by = (table.schema.metadata or {})[b"version"].decode()
+        return Plan(tuple(PlannedCase(**row) for row in rows), found.sha256, made_by)
+    except (pa.ArrowException, TypeError, KeyError, OSError) as error:
+        raise InputError(f"is no plan ({one_line(str(error), 100)})", where=path, allowed=NO_PLAN) from error

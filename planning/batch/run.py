@@ -1,0 +1,126 @@
+"""A cohort's cases, or a part of them, run until each has a row; what has one is left as it is."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.processes import worker_count
+from puncture_twin.planning.base.progress import Watcher
+from puncture_twin.planning.batch.part import WHOLE, Part
+from puncture_twin.planning.batch.plan import PlannedCase, read_plan_table
+from puncture_twin.planning.batch.result import discard, is_final, read_row
+from puncture_twin.planning.batch.run_case import CaseEnd, CaseTask, WritePage
+from puncture_twin.planning.batch.run_lock import running
+from puncture_twin.planning.batch.workers import NO_LIMITS, Limits, run_tasks
+
+RunTasks = Callable[[Sequence[CaseTask], Limits], Generator[CaseEnd, None, None]]
+"""Runs cases somewhere, and yields how each ended."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is to be run, and how.
+
+    Attributes:
+        part: Of the plan.
+        jobs: Processes of this machine, at most one a core.
+        limits: Of each case.
+        write_page: Writes a page for each case that is searched, or None.
+    """
+
+    part: Part = WHOLE
+    jobs: int = 1
+    limits: Limits = NO_LIMITS
+    write_page: WritePage | None = None
+
+
+@dataclass
+class RunCounts:
+    """What a run did.
+
+    Attributes:
+        planned: Cases of the part.
+        same: Of them the same as others, to the byte: they are run once.
+        before: Others that had their rows.
+        ended: Exit code of a row to how many rows.
+        reasons: Of rows whose exit code is above 1.
+        stale: Cases whose files are not those of the plan; they have no row.
+    """
+
+    planned: int
+    same: int
+    before: int
+    ended: Counter[int] = field(default_factory=Counter)
+    reasons: Counter[str] = field(default_factory=Counter)
+    stale: int = 0
+
+    @property
+    def failed(self) -> int:
+        """Cases without a verdict so far."""
+        return self.stale + sum(count for code, count in self.ended.items() if code > 1)
+
+    def add(self, end: CaseEnd) -> None:
+        """Count one more."""
+        if end.exit_code is None:
+            self.stale += 1
+            return
+        self.ended[end.exit_code] += 1
+        if end.exit_code > 1:
+            self.reasons[end.reason or ""] += 1
+
+
+def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTasks | None = None) -> RunCounts:
+    """Run what has no final row yet.
+
+    Args:
+        out: The cohort's folder, with its plan.
+        request: Which part, and how.
+        watcher: Whoever shows progress, in cases.
+        elsewhere: Runs the cases; None runs them in processes of this machine.
+
+    Raises:
+        InputError: No plan, one of another version, another run in the folder, or a disk that takes no more.
+    """
+    plan = read_plan_table(out)
+    if plan.version != version("puncture-twin"):
+        what = f"the plan is of version {plan.version}, this is {version('puncture-twin')}"
+        raise InputError(what, where=out, allowed="batch plan again: what is unchanged since is not lost")
+    with running(out, request.part) as work:
+        rows = request.part.of(plan.cases)
+        cases = distinct(rows)
+        tasks = [CaseTask(one, out, work, request.write_page) for one in cases if not _is_done(one, out, work)]
+        counts = RunCounts(len(rows), len(rows) - len(cases), len(cases) - len(tasks))
+        watcher.count("cases", 0, len(tasks))
+        with closing(_ends(tasks, request, elsewhere)) as ends:
+            for done, end in enumerate(ends, start=1):
+                if end.full:
+                    what = f"cannot be written ({end.full}); the cases that are done stay"
+                    raise InputError(what, where=out, allowed="a folder with enough free space")
+                counts.add(end)
+                watcher.count("cases", done, len(tasks), counts.failed)
+    return counts
+
+
+def distinct(cases: Iterable[PlannedCase]) -> list[PlannedCase]:
+    """The first case of each id: of the same bytes, options and version the answer is one."""
+    return list({one.id: one for one in reversed(list(cases))}.values())[::-1]
+
+
+def _ends(tasks: Sequence[CaseTask], request: Request, elsewhere: RunTasks | None) -> Generator[CaseEnd, None, None]:
+    if elsewhere is not None:
+        return elsewhere(tasks, request.limits)
+    return run_tasks(tasks, worker_count(request.jobs, len(tasks)), request.limits)
+
+
+def _is_done(planned: PlannedCase, out: Path, work: Path) -> bool:
+    """Whether a case has its row; what is there otherwise, a failure of the program or half a result, goes."""
+    if is_final(read_row(out, planned.id)):
+        return True
+    discard(out, planned.id, work)
+    return False

@@ -1,0 +1,157 @@
+"""One case as a pure function: its files in, its result's folder out."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
+from puncture_twin.planning.base.errors import InputError, one_line
+from puncture_twin.planning.base.output.output_set import disk_is_full
+from puncture_twin.planning.base.progress import Stages
+from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
+from puncture_twin.planning.batch.case_row import blank_row, found_row
+from puncture_twin.planning.batch.plan import PlannedCase, case_id, identified, relative_text
+from puncture_twin.planning.batch.result import (
+    PAGE_NAME,
+    PROGRAM_FAILED,
+    TABLE_NAME,
+    commit,
+    new_draft,
+    read_row,
+    write_row,
+)
+from puncture_twin.planning.case.options import case_options
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.context import CaseContext, prepare
+from puncture_twin.planning.search.table import write_table
+
+WritePage = Callable[[CaseContext, Candidates, Path], None]
+"""Writes a case's page into a folder."""
+
+BAD_INPUT = 2
+
+
+@dataclass(frozen=True)
+class CaseTask:
+    """One case to be run; whoever runs it needs nothing else.
+
+    Attributes:
+        planned: The case.
+        out: The cohort's folder.
+        work: For what is being written, on the same file system.
+        write_page: Writes the case's page too, or None.
+        attempt: 1, or 2 after a worker has died of it.
+    """
+
+    planned: PlannedCase
+    out: Path
+    work: Path
+    write_page: WritePage | None = None
+    attempt: int = 1
+
+
+class CaseEnd(NamedTuple):
+    """How a case ended.
+
+    Attributes:
+        id: Of the case.
+        exit_code: Of its row; None where there is no row.
+        reason: Of its row; or why there is none: its files are not those of the plan.
+        full: What the system said of a disk that takes no more, or "".
+    """
+
+    id: str
+    exit_code: int | None
+    reason: str | None
+    full: str = ""
+
+
+STALE = "its files are not those of the plan"
+
+
+def run_case(task: CaseTask, memory: Memory = NO_MEMORY) -> CaseEnd:
+    """Search a case and commit its result; nothing is done where there is a final one.
+
+    Args:
+        task: The case.
+        memory: What this process keeps from one case to the next.
+    """
+    known = ended(task)
+    if known is not None and known.exit_code != PROGRAM_FAILED:
+        return known
+    draft = new_draft(task.work, task.planned.id)
+    try:
+        return _run(task, memory, draft)
+    except OSError as error:
+        if not disk_is_full(error, task.out):
+            raise
+        return CaseEnd(task.planned.id, None, None, full=error.strerror or "no space left")
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def ended(task: CaseTask) -> CaseEnd | None:
+    """How a case has ended already; None where it has no row."""
+    row = read_row(task.out, task.planned.id)
+    return None if row is None else CaseEnd(task.planned.id, row["exit_code"], row["reason"])
+
+
+def commit_failure(task: CaseTask, reason: str) -> CaseEnd:
+    """Commit the row of a case that no worker survived, or that ran into a limit."""
+    draft = new_draft(task.work, task.planned.id)
+    inputs = read_inputs(json.loads(task.planned.inputs))
+    return _committed(task, draft, blank_row(task.planned, PROGRAM_FAILED, reason), inputs, {})
+
+
+def _run(task: CaseTask, memory: Memory, draft: Path) -> CaseEnd:
+    planned, stages = task.planned, Stages()
+    try:
+        options = case_options(json.loads(planned.options), where=planned.case)
+        context = prepare(planned.path, arm=planned.arm, options=options, memory=memory)
+        stages = context.stages
+        inputs = context.case.inputs
+        if case_id(planned.options, planned.arm, inputs, "") != planned.id:
+            return CaseEnd(planned.id, None, STALE)
+        row = _searched(task, context, draft)
+    except InputError as error:
+        return _refused(task, draft, relative_text(str(error), planned))
+    except Exception as error:  # whatever breaks becomes this case's row: the others go on
+        if isinstance(error, OSError) and disk_is_full(error, task.out):
+            raise
+        said = relative_text(f"{type(error).__name__}: {error}", planned)
+        row, inputs = blank_row(planned, PROGRAM_FAILED, said), read_inputs(json.loads(planned.inputs))
+    return _committed(task, draft, row, inputs, stages.seconds)
+
+
+def _searched(task: CaseTask, context: CaseContext, draft: Path) -> dict[str, Any]:
+    found = context.search()
+    write_table(found, context.provenance(), draft / TABLE_NAME)
+    row = found_row(task.planned, context, found)
+    if task.write_page is not None:
+        task.write_page(context, found, draft)
+        row["page"] = (draft / PAGE_NAME).is_file()
+    return row
+
+
+def _refused(task: CaseTask, draft: Path, reason: str) -> CaseEnd:
+    """A refusal at reading is the plan's own, or the files have changed; a later one is of the plan's files."""
+    now = identified(task.planned)
+    if now.id != task.planned.id:
+        return CaseEnd(task.planned.id, None, STALE)
+    inputs = read_inputs(json.loads(now.inputs))
+    return _committed(task, draft, blank_row(task.planned, BAD_INPUT, one_line(reason)), inputs, {})
+
+
+def _committed(
+    task: CaseTask, draft: Path, row: dict[str, Any], inputs: tuple[Input, ...], seconds: dict[str, float]
+) -> CaseEnd:
+    row["inputs"] = json.dumps(inputs_document(inputs))
+    write_row(row, draft)
+    timings = {"seconds": {name: round(spent, 3) for name, spent in seconds.items()}, "attempt": task.attempt}
+    commit(draft, task.out, task.planned.id, inputs, timings)
+    return CaseEnd(task.planned.id, row["exit_code"], row["reason"])

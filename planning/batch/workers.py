@@ -1,0 +1,229 @@
+"""Workers of this machine: one that dies is replaced, and the case it died of is tried once more.
+
+`concurrent.futures` and joblib give up the whole pool when one process dies; here a death costs one case one try. The
+memory of a worker is watched from outside (its resident set), not limited by the system's address space: compiled code
+and its threads reserve many times what they use.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+from typing import NamedTuple
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.batch.run_case import CaseEnd, CaseTask, commit_failure, ended
+from puncture_twin.planning.batch.worker import MEMORY_BYTES, READY, work
+
+WORKER_DIED, TIMED_OUT, OUT_OF_MEMORY = "worker_died", "timed_out", "out_of_memory"
+"""Reasons of the rows that no worker could write."""
+
+TRIES = 2
+"""Of a case whose worker dies."""
+
+LOOK_EVERY_S = 0.2
+"""So often memory and time are looked at."""
+
+STATM = "/proc/{}/statm"
+SPAWN = multiprocessing.get_context("spawn")
+
+
+class Limits(NamedTuple):
+    """Of one case.
+
+    Attributes:
+        memory_mb: Resident set of its worker, 10^6 bytes; None sets no limit.
+        timeout_s: From when a warm worker begins; None sets no limit.
+    """
+
+    memory_mb: int | None = None
+    timeout_s: float | None = None
+
+
+NO_LIMITS = Limits()
+
+
+@dataclass
+class _Worker:
+    """A process and what it is at."""
+
+    process: SpawnProcess
+    connection: Connection
+    task: CaseTask
+    ready: bool = False
+    since: float = field(default_factory=time.monotonic)
+
+    def give(self, task: CaseTask) -> None:
+        """Let it run a case; one that has just died is noticed by its sentinel."""
+        self.task, self.since = task, time.monotonic()
+        with suppress(OSError):
+            self.connection.send(task)
+
+    def end(self) -> None:
+        """Kill it."""
+        self.process.kill()
+        self.process.join()
+        self.connection.close()
+
+
+class TaskQueue:
+    """Cases in groups: a worker that has a group's patient in memory gets the next case of that group.
+
+    Args:
+        tasks: What is to be done; neighbours of one folder are one group.
+    """
+
+    def __init__(self, tasks: Iterable[CaseTask]) -> None:
+        self._groups: dict[str, deque[CaseTask]] = {}
+        for task in tasks:
+            self._groups.setdefault(group_of(task), deque()).append(task)
+        self._taken: set[str] = set()
+
+    def __bool__(self) -> bool:
+        return bool(self._groups)
+
+    def next(self, last: CaseTask | None) -> CaseTask:
+        """The next case for a worker: of its last one's group, of one that nobody is at, or of any."""
+        mine = None if last is None else group_of(last)
+        fresh = (name for name in self._groups if name not in self._taken)
+        name = mine if mine in self._groups else next(fresh, next(iter(self._groups)))
+        self._taken.add(name)
+        task = self._groups[name].popleft()
+        if not self._groups[name]:
+            del self._groups[name]
+        return task
+
+    def again(self, task: CaseTask) -> None:
+        """Put a case back, before the others of its group."""
+        self._groups.setdefault(group_of(task), deque()).appendleft(task)
+
+
+def group_of(task: CaseTask) -> str:
+    """Where a case's files lie: a guess at the patient, which decides who runs it and nothing else."""
+    return str(Path(task.planned.path).parent)
+
+
+def run_tasks(tasks: Iterable[CaseTask], jobs: int, limits: Limits) -> Generator[CaseEnd, None, None]:
+    """Run cases in workers; yields how each ended, as they end.
+
+    Args:
+        tasks: What is to be done, each id once.
+        jobs: Processes.
+        limits: Of each case.
+
+    Raises:
+        InputError: Memory cannot be watched on this system.
+    """
+    if limits.memory_mb is not None and not Path(STATM.format(os.getpid())).exists():
+        raise InputError("memory cannot be watched here", where="--memory-mb", allowed="a system with /proc")
+    queue, workers = TaskQueue(tasks), list[_Worker]()
+    try:
+        while queue or workers:
+            while queue and len(workers) < jobs:
+                workers.append(_started(queue.next(None), limits))
+            for worker in _spoken(workers):
+                yield from _heard(worker, workers, queue)
+            for worker in list(workers):
+                reason = _beyond(worker, limits)
+                if reason:
+                    workers.remove(worker)
+                    worker.end()
+                    yield _without_row(worker.task, reason)
+    finally:
+        for worker in workers:
+            worker.end()
+
+
+def _started(task: CaseTask, limits: Limits) -> _Worker:
+    """A new process that begins with a case as soon as its modules are loaded."""
+    ours, theirs = SPAWN.Pipe()
+    kept = MEMORY_BYTES if limits.memory_mb is None else min(MEMORY_BYTES, limits.memory_mb * 1_000_000 // 4)
+    process = SPAWN.Process(target=work, args=(theirs, kept), daemon=True)
+    with _without_interrupt():
+        process.start()
+    theirs.close()
+    return _Worker(process, ours, task)
+
+
+@contextmanager
+def _without_interrupt() -> Iterator[None]:
+    """What is started here never sees Ctrl-C: the main process ends it."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _spoken(workers: list[_Worker]) -> list[_Worker]:
+    """The workers that have said something, or have died."""
+    handles = [handle for one in workers for handle in (one.connection, one.process.sentinel)]
+    found = wait(handles, timeout=LOOK_EVERY_S)
+    return [one for one in workers if one.connection in found or one.process.sentinel in found]
+
+
+def _heard(worker: _Worker, workers: list[_Worker], queue: TaskQueue) -> Iterator[CaseEnd]:
+    """What a worker said, and what it does next; or its death."""
+    try:
+        said = worker.connection.recv() if worker.connection.poll() else None
+    except (EOFError, OSError):
+        said = None
+    if said == READY:
+        worker.ready = True
+        worker.give(worker.task)
+    elif isinstance(said, CaseEnd):
+        yield said
+        if queue:
+            worker.give(queue.next(worker.task))
+        else:
+            workers.remove(worker)
+            worker.end()
+    elif not worker.process.is_alive():
+        workers.remove(worker)
+        worker.end()
+        yield from _died(worker.task, queue)
+
+
+def _died(task: CaseTask, queue: TaskQueue) -> Iterator[CaseEnd]:
+    """The case again, or its row; a result that was there before the death is one."""
+    end = ended(task)
+    if end is not None:
+        yield end
+    elif task.attempt < TRIES:
+        queue.again(replace(task, attempt=task.attempt + 1))
+    else:
+        yield commit_failure(task, WORKER_DIED)
+
+
+def _without_row(task: CaseTask, reason: str) -> CaseEnd:
+    """The row of a case that was stopped, unless it had just come to its end."""
+    return ended(task) or commit_failure(task, reason)
+
+
+def _beyond(worker: _Worker, limits: Limits) -> str:
+    """Which limit a worker's case has passed; "" where none."""
+    if not worker.ready:
+        return ""
+    if limits.timeout_s is not None and time.monotonic() - worker.since > limits.timeout_s:
+        return TIMED_OUT
+    if limits.memory_mb is not None and resident_bytes(worker.process.pid or 0) > limits.memory_mb * 1_000_000:
+        return OUT_OF_MEMORY
+    return ""
+
+
+def resident_bytes(process: int) -> int:
+    """What a process holds in memory; 0 where it is gone."""
+    try:
+        pages = Path(STATM.format(process)).read_text(encoding="ascii").split()[1]
+    except (OSError, IndexError):
+        return 0
+    return int(pages) * os.sysconf("SC_PAGE_SIZE")

@@ -1,0 +1,151 @@
+"""``cohort.html``: failures first, then distributions, then a sortable table; one page that needs no network."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from puncture_twin.planning.base.provenance import Input
+from puncture_twin.twin.report.numbers import number
+from puncture_twin.twin.report.page.page_tables import inputs_table, table
+from puncture_twin.twin.report.page.template import Card, plotly_script, script_json, write_html
+
+Row = Mapping[str, Any]
+
+DISTRIBUTIONS = (
+    ("safe_square_deg", "safe area, deg²"),
+    ("best_clearance_mm", "best clearance, mm"),
+    ("best_p_hit", "chance to hit, best candidate"),
+    ("reach_fraction", "fraction that the arm reaches"),
+)
+"""Columns whose distribution is drawn, each over the cases that have it."""
+
+HEAD = (
+    "case",
+    "name",
+    "verdict",
+    "safe",
+    "of",
+    "θ °",
+    "β °",
+    "clearance mm",
+    "path mm",
+    "p hit",
+    "area deg²",
+    "skin cm²",
+    "reach",
+    "page",
+)
+
+
+def write_cohort_page(name: str, rows: Sequence[Row], inputs: Sequence[Input], path: Path) -> None:
+    """Write the page.
+
+    Args:
+        name: Of the cohort's folder.
+        rows: Of ``cases.parquet``.
+        inputs: What the table was made from.
+        path: The HTML to write; it appears whole or not at all.
+    """
+    write_html(
+        "cohort.html",
+        path,
+        title=f"Cohort {name}",
+        cards=_cards(rows),
+        failures=_failures(rows),
+        charts=[column for column, _ in _drawn(rows)],
+        cases=table(HEAD, map(_line, rows), kind="numbers sortable"),
+        inputs=inputs_table(inputs),
+        data=script_json({column: _chart(rows, column, text) for column, text in _drawn(rows)}),
+        plotly=plotly_script(),
+    )
+
+
+def _cards(rows: Sequence[Row]) -> list[Card]:
+    codes = Counter(row["exit_code"] for row in rows)
+    failed = codes[2] + codes[3] + codes[None]
+    return [
+        Card("cases", f"{len(rows):,}", "of the plan"),
+        Card("with a safe direction", f"{codes[0]:,}", _part(codes[0], len(rows))),
+        Card("without one", f"{codes[1]:,}", _part(codes[1], len(rows))),
+        Card("failed", f"{failed:,}", f"{codes[2]} refused, {codes[3]} by the program, {codes[None]} not run"),
+    ]
+
+
+def _part(count: int, of: int) -> str:
+    return f"{count / of:.1%} of all" if of else "of none"
+
+
+def _failures(rows: Sequence[Row]) -> Markup:
+    """Every reason, most frequent first, with its cases."""
+    failed = [row for row in rows if row["exit_code"] not in (0, 1)]
+    if not failed:
+        return Markup("<p>None.</p>")
+    counts = Counter(str(row["reason"]) for row in failed)
+    lines = [(str(count), reason, _cases_of(failed, reason)) for reason, count in counts.most_common()]
+    return table(("cases", "reason", "which"), lines)
+
+
+def _cases_of(rows: Iterable[Row], reason: str, most: int = 5) -> str:
+    names = [str(row["case"]) for row in rows if row["reason"] == reason]
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
+def _drawn(rows: Sequence[Row]) -> list[tuple[str, str]]:
+    return [(column, text) for column, text in DISTRIBUTIONS if _values(rows, column)]
+
+
+def _values(rows: Sequence[Row], column: str) -> list[float]:
+    return [row[column] for row in rows if row[column] is not None]
+
+
+def _chart(rows: Sequence[Row], column: str, text: str) -> dict[str, Any]:
+    """A histogram, as plotly takes it."""
+    values = _values(rows, column)
+    return {
+        "data": [{"type": "histogram", "x": values, "nbinsx": 40, "marker": {"color": "#00684a"}}],
+        "layout": {
+            "height": 280,
+            "margin": {"l": 50, "r": 10, "t": 40, "b": 40},
+            "title": {"text": f"{text} ({len(values)} cases)", "font": {"size": 14}},
+            "xaxis": {"title": {"text": text}},
+            "yaxis": {"title": {"text": "cases"}},
+            "bargap": 0.05,
+            "plot_bgcolor": "#fbfbfc",
+        },
+    }
+
+
+def _line(row: Row) -> tuple[str, ...]:
+    """A row of the table; a link only to a page that is there."""
+    page = Markup('<a href="{}/report.html">page</a>').format(row["id"]) if row["page"] else "–"
+    return (
+        str(row["case"]),
+        str(row["name"]),
+        "safe" if row["exit_code"] == 0 and row["arm"] == "checked" else _verdict(row),
+        _shown(row["safe"], 0),
+        _shown(row["directions"], 0),
+        _shown(row["best_theta_deg"], 1),
+        _shown(row["best_beta_deg"], 1),
+        _shown(row["best_clearance_mm"], 2),
+        _shown(row["best_path_length_mm"], 1),
+        _shown(row["best_p_hit"], 4),
+        _shown(row["safe_square_deg"], 0),
+        _shown(row["safe_entry_cm2"], 1),
+        _shown(row["reach_fraction"], 2),
+        page,
+    )
+
+
+def _verdict(row: Row) -> str:
+    """Never "safe" alone where the arm was not checked."""
+    return "safe for the organs" if row["exit_code"] == 0 else str(row["reason"])
+
+
+def _shown(value: float | None, digits: int) -> str:
+    return "–" if value is None else number(float(value), digits)
