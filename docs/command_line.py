@@ -29,10 +29,20 @@ def option_row(parameter):
     return f"| `{shown}` | {(parameter.help or '').replace('|', ' or ')} | {default} |"
 
 
+def commands(group, before=""):
+    """Every command with its whole name, those of a group after another."""
+    for name, command in group.commands.items():
+        whole = f"{before}{name}"
+        if hasattr(command, "commands"):
+            yield from commands(command, f"{whole} ")
+        else:
+            yield whole, command
+
+
 def main() -> None:
     """Write the page."""
     lines = [HEAD]
-    for name, command in typer.main.get_command(app).commands.items():
+    for name, command in commands(typer.main.get_command(app)):
         lines += [f"## `{name}`", command.help, "", "| | | default |", "|---|---|---|"]
         lines += [*(option_row(one) for one in command.params), ""]
     path = Path(__file__).parent / "reference" / "command-line.md"

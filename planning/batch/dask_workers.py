@@ -68,7 +68,7 @@ def on_scheduler(address: str) -> RunTasks:
 
 def _ends(distributed: Any, client: Any, tasks: Sequence[CaseTask]) -> Generator[CaseEnd, None, None]:
     """How each case ended, as they end; one that killed its workers gets its row here."""
-    futures = {client.submit(run_on_worker, task, key=f"case-{task.planned.id}", pure=False): task for task in tasks}
+    futures = {client.submit(run_on_worker, task, pure=False): task for task in tasks}
     try:
         for future in distributed.as_completed(list(futures)):
             task = futures.pop(future)

@@ -19,7 +19,7 @@ from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, content_input, inputs_document
 from puncture_twin.planning.base.toml_file import find_toml, read_toml_bytes
-from puncture_twin.planning.batch.cohort_case import CohortCase
+from puncture_twin.planning.batch.cohort.cohort_case import CohortCase
 from puncture_twin.planning.case.case import ALLOWED_CASE, load_case
 from puncture_twin.planning.case.options import case_options
 
@@ -133,10 +133,8 @@ def _readable(row: PlannedCase) -> tuple[Input, ...]:
 def relative_text(text: str, row: PlannedCase) -> str:
     """What is said of a case, without the folder in which it happens to lie: the same bytes give the same text."""
     path = Path(row.path)
-    folders = {str(path), str(path.parent)} if path.suffix == ".toml" else {str(path)}
-    for folder in sorted(folders, key=len, reverse=True):
-        text = text.replace(f"{folder}/", "").replace(folder, OWN_FOLDER)
-    return one_line(text)
+    folder = str(path.parent if path.suffix == ".toml" else path)
+    return one_line(text.replace(f"{folder}/", "").replace(folder, OWN_FOLDER))
 
 
 def write_plan_table(rows: Sequence[PlannedCase], path: Path) -> None:

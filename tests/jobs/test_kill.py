@@ -46,7 +46,7 @@ WRITTEN = {
     "place": ("placements.csv", "place.json", "placements.png", "map_best_place.png"),
     "servo": ("camera_1.png", "camera_2.png", "convergence.png", "servo.html"),
     "selfcal": ("calibration.json", "recording.csv", "bmode.png", "room.png", "report.html"),
-    "batch": ("0001/candidates.parquet", "0002/candidates.parquet", "0003/candidates.parquet", "batch.csv"),
+    "batch merge": ("candidates/id=1/a.parquet", "candidates/id=2/a.parquet", "cases.parquet", "cohort.html"),
     "reproduce": ("camera_1.png", "camera_2.png", "convergence.png", "servo.html"),
 }
 """What each command writes; sizes do not matter, so a few hundred bytes stand for each."""
@@ -58,7 +58,7 @@ def write_generation(out, command, generation):
     with writing(out, command, inputs=inputs) as draft:
         for name in WRITTEN[command][: None if generation % 2 else -1] or WRITTEN[command]:
             path = draft.folder / name
-            path.parent.mkdir(exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(f"{generation} " * 200)
 
 
@@ -167,14 +167,6 @@ def test_export_killed_at_random(plans, tmp_path):
     """The same."""
     runs = [["export", plan, "--format", "csv"] for plan in plans]
     kills("export", "export plan.csv", runs, [sha256(plan) for plan in plans], tmp_path / "out")
-
-
-@needs_time
-def test_batch_killed_at_random(world, tmp_path):
-    """Two cases in two processes."""
-    cases = world[1]
-    runs = [["batch", case, "--no-arm", "--jobs", "2"] for case in cases]
-    kills("batch", "batch", runs, [sha256(case) for case in cases], tmp_path / "out")
 
 
 @needs_time

@@ -312,16 +312,6 @@ def test_register_reports_residuals_and_expectation(carton, capfd):
     assert len(found["expected_tre_along_shaft_mm"]) == 4
 
 
-def test_batch_goes_on_after_a_bad_case(carton, tmp_path, capfd):
-    """A row each; the exit code says that one was refused."""
-    out = tmp_path / "out"
-    code, found = run(capfd, "batch", carton, tmp_path / "gone.toml", "--no-arm", "--out", out)
-    assert code == BAD_INPUT
-    assert [row["exit_code"] for row in found["cases"]] == [0, 2]
-    assert (out / "0001" / "candidates.parquet").is_file()
-    assert len((out / "batch.csv").read_text().splitlines()) == 3
-
-
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no /proc on this system")
 def test_a_folder_that_only_looks_writable_is_refused(carton, capfd):
     """Permissions say yes and the system says no: one line all the same."""

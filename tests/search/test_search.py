@@ -12,7 +12,6 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.batch.batch import search_one
 from puncture_twin.planning.case.case_file import RankingSection
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.clearance.cross_check import CrossCheckError
@@ -153,17 +152,6 @@ def test_each_term_of_the_cost_says_what_it_should():
     np.testing.assert_allclose(order.cost, [2.8 / 6, 0.2 / 6])
     np.testing.assert_array_equal(order.rank, [2, 1])
     np.testing.assert_array_equal(order.pareto, [False, True])
-
-
-def test_a_batch_row_says_what_happened(tmp_path):
-    """A case that works and one that is refused: a row each, with the command line's exit code."""
-    good = search_one(folder() / "carton" / "case_m.toml", tmp_path, arm=False)
-    assert good["exit_code"] == 0
-    assert good["safe"] > 0
-    assert (tmp_path / "candidates.parquet").is_file()
-    bad = search_one(tmp_path / "gone.toml", tmp_path, arm=False)
-    assert bad["exit_code"] == 2
-    assert "gone.toml" in bad["said"]
 
 
 def test_the_fast_engine_and_fcl_give_the_same_table(carton, found):

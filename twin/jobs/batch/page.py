@@ -10,9 +10,10 @@ from typing import Any
 from markupsafe import Markup
 
 from puncture_twin.planning.base.provenance import Input
+from puncture_twin.twin.jobs.batch.histogram import histogram
 from puncture_twin.twin.report.numbers import number
 from puncture_twin.twin.report.page.page_tables import inputs_table, table
-from puncture_twin.twin.report.page.template import Card, plotly_script, script_json, write_html
+from puncture_twin.twin.report.page.template import Card, packed, script_json, write_html
 
 Row = Mapping[str, Any]
 
@@ -57,11 +58,11 @@ def write_cohort_page(name: str, rows: Sequence[Row], inputs: Sequence[Input], p
         title=f"Cohort {name}",
         cards=_cards(rows),
         failures=_failures(rows),
-        charts=[column for column, _ in _drawn(rows)],
+        charts=[histogram(_values(rows, column), text) for column, text in DISTRIBUTIONS if _values(rows, column)],
         cases=table(HEAD, map(_line, rows), kind="numbers sortable"),
         inputs=inputs_table(inputs),
-        data=script_json({column: _chart(rows, column, text) for column, text in _drawn(rows)}),
-        plotly=plotly_script(),
+        data=script_json({}),
+        plotly=packed(""),
     )
 
 
@@ -96,29 +97,8 @@ def _cases_of(rows: Iterable[Row], reason: str, most: int = 5) -> str:
     return ", ".join(names[:most]) + more
 
 
-def _drawn(rows: Sequence[Row]) -> list[tuple[str, str]]:
-    return [(column, text) for column, text in DISTRIBUTIONS if _values(rows, column)]
-
-
 def _values(rows: Sequence[Row], column: str) -> list[float]:
     return [row[column] for row in rows if row[column] is not None]
-
-
-def _chart(rows: Sequence[Row], column: str, text: str) -> dict[str, Any]:
-    """A histogram, as plotly takes it."""
-    values = _values(rows, column)
-    return {
-        "data": [{"type": "histogram", "x": values, "nbinsx": 40, "marker": {"color": "#00684a"}}],
-        "layout": {
-            "height": 280,
-            "margin": {"l": 50, "r": 10, "t": 40, "b": 40},
-            "title": {"text": f"{text} ({len(values)} cases)", "font": {"size": 14}},
-            "xaxis": {"title": {"text": text}},
-            "yaxis": {"title": {"text": "cases"}},
-            "bargap": 0.05,
-            "plot_bgcolor": "#fbfbfc",
-        },
-    }
 
 
 def _line(row: Row) -> tuple[str, ...]:

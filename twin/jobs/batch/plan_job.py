@@ -9,7 +9,7 @@ from typing import Any
 
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Watcher
-from puncture_twin.planning.batch.cohort import read_cohort
+from puncture_twin.planning.batch.cohort.read_cohort import read_cohort
 from puncture_twin.planning.batch.estimate import Estimate, estimate
 from puncture_twin.planning.batch.plan import PLAN_NAME, PlannedCase, planned, write_plan_table
 from puncture_twin.planning.batch.result import read_row

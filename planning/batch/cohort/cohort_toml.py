@@ -13,7 +13,7 @@ from pydantic import Field
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.toml_file import SchemaOne, parse_toml
-from puncture_twin.planning.batch.cohort_case import MOST_CASES, CohortCase
+from puncture_twin.planning.batch.cohort.cohort_case import MOST_CASES, CohortCase
 from puncture_twin.planning.case.options import CaseOptions, case_options
 from puncture_twin.planning.case.toml_types import Section, Text
 
@@ -21,7 +21,7 @@ ALLOWED = "a cohort.toml with cases = [patterns] and, if wanted, tables of optio
 KEYS = "docs/how-to/cohorts.md"
 
 Choices = dict[Text, dict[str, Any]] | tuple[Any, ...]
-"""Options of one kind: by name, or as a list that is counted from 1."""
+"""Options of one kind: by name, or as a list: texts are their own names, the rest is counted from 1."""
 
 AXES = {
     "targets": "target",
@@ -87,8 +87,10 @@ def _matches(patterns: Sequence[str], path: Path) -> list[str]:
 
 
 def _axis(stated: Any, axis: str, kind: str, path: Path) -> list[_Choice]:
-    items = stated.items() if isinstance(stated, Mapping) else enumerate(stated, start=1)
-    named = [(str(name), values) for name, values in items]
+    if isinstance(stated, Mapping):
+        named = list(stated.items())
+    else:
+        named = [(one if isinstance(one, str) else str(number), one) for number, one in enumerate(stated, start=1)]
     return [_Choice(name, kind, _table(values, kind, f"{path}: {axis}.{name}")) for name, values in named]
 
 

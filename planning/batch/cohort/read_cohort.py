@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, one_line
 from puncture_twin.planning.base.files import is_folder
 from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.base.provenance import Input, content_input
-from puncture_twin.planning.batch.cohort_case import MOST_CASES, CohortCase
-from puncture_twin.planning.batch.cohort_csv import csv_cases
-from puncture_twin.planning.batch.cohort_toml import toml_cases
+from puncture_twin.planning.batch.cohort.cohort_case import MOST_CASES, CohortCase
+from puncture_twin.planning.batch.cohort.cohort_csv import csv_cases
+from puncture_twin.planning.batch.cohort.cohort_toml import toml_cases
 
 CASE_FILE = "case.toml"
 ALLOWED = f"a folder with {CASE_FILE} files, a CSV with the header 'case', or a cohort.toml"
@@ -36,7 +36,18 @@ def read_cohort(cohort: Path) -> tuple[tuple[CohortCase, ...], tuple[Input, ...]
     if not 0 < len(cases) <= MOST_CASES:
         what = f"holds {len(cases)} cases" if cases else "holds no case"
         raise InputError(what, where=cohort, allowed=f"1 to {MOST_CASES} cases: {ALLOWED}")
+    for one in cases:
+        _check_path(one, cohort)
     return tuple(cases), inputs
+
+
+def _check_path(case: CohortCase, cohort: Path) -> None:
+    """Refuse a path that no table can hold: a case that cannot be named would be lost."""
+    try:
+        str(case.path.absolute()).encode("utf-8")
+    except UnicodeEncodeError as error:
+        what = f"the path '{one_line(case.stated, 100)}' is no UTF-8"
+        raise InputError(what, where=cohort, allowed="cases whose paths are UTF-8") from error
 
 
 def _listed_cases(path: Path) -> tuple[list[CohortCase], tuple[Input, ...]]:

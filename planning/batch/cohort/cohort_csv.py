@@ -11,7 +11,7 @@ from typing import Any
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.text_names import unprintable_texts
-from puncture_twin.planning.batch.cohort_case import CohortCase
+from puncture_twin.planning.batch.cohort.cohort_case import CohortCase
 from puncture_twin.planning.case.options import SECTIONS, CaseOptions, case_options
 
 CASE, NAME, TARGET = "case", "name", "target"

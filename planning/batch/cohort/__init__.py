@@ -1,0 +1,5 @@
+"""What a cohort is made of: a folder, a CSV, or a TOML file with patterns and grids of options. No case is read here."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,1 @@
+from .cohort_case import CohortCase as CohortCase

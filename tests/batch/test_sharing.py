@@ -1,0 +1,138 @@
+"""What a worker keeps from one case to the next never changes an answer: attacks on the sharing of meshes and trees."""
+
+import shutil
+
+import pytest
+from case_world import ball
+from cohort_world import plan_of, table_bytes, task_of, tiny_text, write_patient
+
+from puncture_twin.planning.base.cache.memory import Memory
+from puncture_twin.planning.batch.run_case import STALE, run_case
+from puncture_twin.planning.batch.worker import MEMORY_BYTES
+
+
+@pytest.fixture
+def memory():
+    """A worker's."""
+    return Memory(MEMORY_BYTES)
+
+
+def held(path, tmp_path, memory, number, **options):
+    """Asserts that a case gives the same bytes with and without what was kept before; returns them."""
+    shared = table_bytes(path, tmp_path / f"shared{number}", memory, **options)
+    assert shared == table_bytes(path, tmp_path / f"alone{number}", **options)
+    return shared[0]
+
+
+def test_the_same_patient_again_and_another_target(tmp_path, memory):
+    """The same bytes as alone; and something was kept."""
+    path = write_patient(tmp_path / "a")
+    first = held(path, tmp_path, memory, 0)
+    kept = memory.held_bytes
+    assert kept > 0
+    assert held(path, tmp_path, memory, 1) == first
+    assert held(path, tmp_path, memory, 2, target={"position_mm": [4.0, 0.0, 0.0]}) != first
+    assert memory.held_bytes == kept
+
+
+def test_two_patients_with_the_same_file_names(tmp_path, memory):
+    """Another rib under the name of the first: nothing goes by the path."""
+    one, other = write_patient(tmp_path / "a"), write_patient(tmp_path / "b")
+    ball(other.parent / "rib.stl", 12.0, (0, -40, 10))
+    assert held(one, tmp_path, memory, 0) != held(other, tmp_path, memory, 1)
+    assert held(one, tmp_path, memory, 2) == held(one, tmp_path, memory, 3)
+
+
+def test_a_mesh_that_is_edited_between_two_cases(tmp_path, memory):
+    """In place, of the same size and with the old date: the new bytes count, and the old plan has no such case."""
+    import os
+
+    path = write_patient(tmp_path / "a")
+    rib, (planned,) = path.parent / "rib.stl", plan_of(path)
+    before = held(path, tmp_path, memory, 0)
+    seen = rib.stat()
+    ball(rib, 12.0, (0, -40, 10))
+    os.utime(rib, ns=(seen.st_atime_ns, seen.st_mtime_ns))
+    assert rib.stat().st_size == seen.st_size
+    end = run_case(task_of(planned, tmp_path / "late"), memory)
+    assert (end.exit_code, end.reason) == (None, STALE)
+    assert list((tmp_path / "late" / "work").iterdir()) == []
+    assert held(path, tmp_path, memory, 1) != before
+
+
+def test_the_same_bytes_in_another_unit_space_role_or_margin(tmp_path, memory):
+    """All that decides a surface or a verdict beside the bytes is part of what is kept, or is not kept."""
+    text = tiny_text()
+    rib = 'role = "avoid"\nmargin_mm = 3.0'
+    found, number = set(), 0
+    for new in (
+        rib,
+        'role = "avoid"\nmargin_mm = 30.0',
+        'role = "traverse"',
+        f'{rib}\nspace = "RAS"',
+        f'{rib}\nspace = "LPS"',
+    ):
+        path = write_patient(tmp_path / f"p{number}", text=text.replace(rib, new) + extra(new))
+        found.add(held(path, tmp_path, memory, number))
+        number += 1
+    assert len(found) == number
+
+
+def extra(section):
+    """What keeps a case without a rib to be avoided a case."""
+    again = '[[structure]]\nname = "second"\nmesh = "rib.stl"\nunit = "mm"\nrole = "unknown"\nmargin_mm = 1.0\n'
+    return again if "traverse" in section else ""
+
+
+def test_the_unit_is_part_of_a_mesh(tmp_path, memory):
+    """A rib in centimetres, ten times as far away and as large, is not the rib in millimetres."""
+    mm = write_patient(tmp_path / "mm")
+    cm = write_patient(tmp_path / "cm")
+    ball(cm.parent / "rib.stl", 0.5, (4, 0, 4))
+    text = cm.read_text()
+    head, tail = text.rsplit('unit = "mm"', 1)
+    cm.write_text(head + 'unit = "cm"' + tail)
+    shutil.copy(cm.parent / "rib.stl", mm.parent / "rib.stl")
+    assert held(mm, tmp_path, memory, 0) != held(cm, tmp_path, memory, 1)
+
+
+MOUNT = {"position_mm": [350.0, -150.0, -300.0], "x_axis": [1.0, 0.0, 0.0], "z_axis": [0.0, 0.0, 1.0]}
+
+
+def test_the_arm_and_its_workcell(tmp_path, memory):
+    """Another mount, needle, model or table is another workcell; the same is the same to the byte."""
+    table = (
+        '[[obstacle]]\nname = "table"\nframe = "ct"\ncenter_mm = [0.0, 150.0, 0.0]\nsize_mm = [400.0, 40.0, 800.0]\n'
+    )
+    plain, moved = (
+        write_patient(tmp_path / name, text=tiny_text(search="theta_deg = [0, 30]\nstep_deg = 30.0") + table)
+        for name in ("a", "b")
+    )
+    moved.write_text(moved.read_text().replace("[0.0, 150.0, 0.0]", "[0.0, 130.0, 0.0]"))
+    far = {**MOUNT, "position_mm": [800.0, 0.0, 0.0]}
+    options = [
+        (plain, {"mount": MOUNT}),
+        (plain, {"mount": far}),
+        (plain, {"mount": MOUNT, "needle": {"length_mm": 250.0}}),
+        (plain, {"mount": MOUNT, "arm": {"model": "ur5"}}),
+        (moved, {"mount": MOUNT}),
+        (plain, {"mount": MOUNT}),
+    ]
+    found = [held(path, tmp_path, memory, n, with_arm=True, **chosen) for n, (path, chosen) in enumerate(options)]
+    assert found[0] == found[5] and len(set(found)) == 5
+
+
+def test_memory_is_bounded_and_forgets_the_least_recently_used():
+    """What does not fit goes; what alone is too large is never kept; a failure is not kept."""
+    memory, made = Memory(10), []
+
+    def get(key, size=4):
+        return memory.get((key,), lambda: made.append(key) or key, lambda _: size)
+
+    for key in ("a", "b", "a", "c", "a", "b", "huge", "huge"):
+        get(key, 11 if key == "huge" else 4)
+        assert memory.held_bytes <= 10
+    assert made == ["a", "b", "c", "b", "huge", "huge"]
+    with pytest.raises(ZeroDivisionError):
+        memory.get(("bad",), lambda: 1 / 0, lambda _: 1)
+    assert memory.get(("bad",), lambda: 5, lambda _: 1) == 5

@@ -1,0 +1,109 @@
+"""Workers that die, hang, or take too much: one case costs one row, and the others go on."""
+
+import cohort_world
+import pytest
+from cohort_world import merged, timings, write_cohort, write_patient
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.progress import Silent
+from puncture_twin.planning.batch.part import Part
+from puncture_twin.planning.batch.plan import read_plan_table
+from puncture_twin.planning.batch.run import Request, run_cohort
+from puncture_twin.planning.batch.run_lock import running
+from puncture_twin.planning.batch.workers import NO_LIMITS, Limits
+from puncture_twin.run_twin import main
+
+
+@pytest.fixture
+def planned(tmp_path):
+    """A cohort of three, whose last case is refused, and its folder; and how its cases are run."""
+    write_cohort(tmp_path / "c")
+    out = tmp_path / "out"
+    assert main(["batch", "plan", str(tmp_path / "c"), "--out", str(out), "--no-arm"]) == 0
+
+    def run(write_page=None, limits=NO_LIMITS, **keys):
+        counts = run_cohort(out, Request(write_page=write_page, limits=limits, **keys), Silent())
+        assert not list(out.glob(".puncture-twin-cases-*"))
+        return counts
+
+    return out, run
+
+
+def rows(out):
+    """Exit code and reason of each case, after a merge."""
+    main(["batch", "merge", "--out", str(out)])
+    return [(row["exit_code"], row["reason"]) for row in merged(out).values()]
+
+
+def test_a_worker_that_dies_twice_costs_its_case_one_row(planned):
+    """The case before and the case after have their verdicts; the next run tries it again."""
+    out, run = planned
+    assert run(cohort_world.die_at_one).reasons["worker_died"] == 1
+    found = rows(out)
+    assert [code for code, _ in found] == [0, 3, 2] and found[1] == (3, "worker_died")
+    counts = run()
+    assert (counts.before, counts.ended[0], counts.failed) == (2, 1, 0)
+    assert [code for code, _ in rows(out)] == [0, 0, 2]
+
+
+def test_a_worker_that_dies_once_costs_nothing_but_time(planned):
+    """The second try is committed; that there were two is in the timings alone."""
+    out, run = planned
+    assert run(cohort_world.die_once).ended == {0: 2, 2: 1}
+    ids = [one.id for one in read_plan_table(out).cases]
+    assert [timings(out / one)["attempt"] for one in ids] == [2, 2, 1]
+
+
+@pytest.mark.parametrize(
+    ("page", "limits", "reason"),
+    [
+        (cohort_world.sleep, Limits(timeout_s=2.0), "timed_out"),
+        (cohort_world.eat, Limits(memory_mb=1500), "out_of_memory"),
+    ],
+)
+def test_a_case_beyond_a_limit_is_stopped(planned, page, limits, reason):
+    """With its reason, and the refused one is reached."""
+    out, run = planned
+    assert run(page, limits).reasons[reason] == 2
+    assert [code for code, _ in rows(out)] == [3, 3, 2]
+
+
+def test_a_full_disk_stops_the_run_with_one_line(planned):
+    """No row says that a case failed, which only the disk did."""
+    out, run = planned
+    with pytest.raises(InputError, match="cannot be written .No space left on device.; the cases that are done stay"):
+        run(cohort_world.full)
+    assert rows(out) == [(None, "not run")] * 3
+
+
+def test_a_second_run_of_the_same_folder_is_refused(planned):
+    """At once; two parts side by side are not, and the whole waits for no part."""
+    out, run = planned
+    with running(out, Part(1, 1)):
+        for part in (Part(1, 1), Part(1, 2)):
+            with pytest.raises(InputError, match="another run is at work in this folder"):
+                run(part=part)
+    with running(out, Part(1, 2)):
+        with pytest.raises(InputError, match="another run is at work"):
+            run(part=Part(1, 2))
+        with pytest.raises(InputError, match="another run is at work"):
+            run()
+        with running(out, Part(2, 2)):
+            pass
+
+
+def test_the_parts_together_are_the_whole(planned):
+    """Each case is run in one of them."""
+    out, run = planned
+    assert sum(run(part=Part(number, 4)).planned for number in (1, 2, 3, 4)) == 3
+    assert [code for code, _ in rows(out)] == [0, 0, 2]
+
+
+def test_the_same_case_twice_is_run_once(tmp_path, capfd):
+    """Two rows, one result: the same bytes have one answer."""
+    for name in ("a", "b"):
+        write_patient(tmp_path / "c" / name)
+    assert main(["batch", "plan", str(tmp_path / "c"), "--out", str(tmp_path / "out"), "--no-arm"]) == 0
+    assert main(["batch", "run", "--out", str(tmp_path / "out")]) == 0
+    assert "2 cases: 1 the same as others, 0 had their row, 1 done, 0 failed" in capfd.readouterr().out
+    assert rows(tmp_path / "out") == [(0, None)] * 2
