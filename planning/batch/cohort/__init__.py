@@ -1,4 +1,4 @@
-"""What a cohort is made of: a folder, a CSV, or a TOML file with patterns and grids of options. No case is read here."""
+"""What a cohort is made of: a folder, a CSV, or a TOML file with patterns and grids of options; cases stay unread."""
 
 import lazy_loader
 

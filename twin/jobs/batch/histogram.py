@@ -26,7 +26,9 @@ def histogram(values: Sequence[float], text: str) -> Markup:
     bars = joined(
         '<rect x="{}" y="{}" width="{}" height="{}" fill="#00684a"><title>{}</title></rect>', _bars(counts, edges)
     )
-    form = '<svg viewBox="0 0 {} {}" role="img" aria-label="{}"><text x="{}" y="18" font-weight="600">{}</text>{}{}</svg>'
+    form = (
+        '<svg viewBox="0 0 {} {}" role="img" aria-label="{}"><text x="{}" y="18" font-weight="600">{}</text>{}{}</svg>'
+    )
     return Markup(form).format(WIDTH, HEIGHT, head, LEFT, head, _axes(int(counts.max()), edges), bars)
 
 
