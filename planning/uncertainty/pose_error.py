@@ -13,10 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.arm.error_jacobian import PARAMETERS, error_jacobian
+from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
@@ -25,6 +27,13 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.uncertainty.sources import reading_parts
+
+
+class Bend(NamedTuple):
+    """A needle that its bevel takes off, to any side alike: by how much at the tip, held how far behind it; mm."""
+
+    tip_mm: float
+    held_mm: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +45,8 @@ class PoseError:
         tip_mm: Flange to tip.
         target_base: Shape (3,), mm.
         errors: As declared.
-        fit: What the registration makes of them; its test's scale multiplies every covariance given here.
+        fit: What the registration makes of them; its test's scale multiplies every covariance but that of the bend.
+        bend: Of one direction's needle; None where it is straight, or what is asked is not of one direction.
     """
 
     model: UrModel
@@ -44,6 +54,7 @@ class PoseError:
     target_base: Floats
     errors: ErrorModel
     fit: FitUncertainty
+    bend: Bend | None = None
 
     @property
     def freedom(self) -> int | None:
@@ -56,7 +67,8 @@ class PoseError:
         lasting = self._lasting(J) * np.sqrt(self.fit.noise.eta_variances)
         anew = J[..., PARAMETERS["joint"]] * np.hypot(arm.drift, arm.repeatability)
         root = self.fit.test.scale * np.concatenate([lasting, anew], axis=-1)
-        return self.fit.cov_at(self.target_base) + root @ np.swapaxes(root, -1, -2)
+        straight = self.fit.cov_at(self.target_base) + root @ np.swapaxes(root, -1, -2)
+        return straight if self.bend is None else straight + _bend_covariance(self.model, q, self.bend)
 
     def tip_covariance(self, q: Floats) -> Floats:
         """Of the tip against the point that was meant, its reading included: shape (n, 3, 3), mm^2, base axes."""
@@ -92,7 +104,8 @@ class PoseError:
         """Sigma6 by source, each of shape (n, 6, 6); they add up to `covariance`."""
         J = error_jacobian(self.model, q, self.tip_mm)
         found = {**self._reading_parts(len(q)), **self._arm_parts(J)}
-        return {source: self.fit.test.scale**2 * cov for source, cov in found.items()}
+        parts = {source: self.fit.test.scale**2 * cov for source, cov in found.items()}
+        return parts if self.bend is None else {**parts, "bend": _bend_covariance(self.model, q, self.bend)}
 
     def _reading_parts(self, count: int) -> dict[str, Floats]:
         """Of the markers: in the CT, at the touch, and by the arm's repeatability there; the same for all rows."""
@@ -124,6 +137,18 @@ class PoseError:
         if not self.fit.noise.touches_known:
             return np.asarray(np.sqrt(2.0) * J)
         return np.asarray(J - self.fit.map_at(self.target_base) @ self.fit.noise.arm_jacobian)
+
+
+def _bend_covariance(model: UrModel, q: Floats, bend: Bend) -> Floats:
+    """Of a tip off by d to a side drawn evenly, the shaft turned about where it is held, shape (n, 6, 6), base axes.
+
+    For the sides x and y of the needle, whose z points to the tip: the tip by d x with the shaft about y by d / h, and
+    by d y with the shaft about -x; each with half the variance.
+    """
+    R = flange_pose(model, q)[..., :3, :3]
+    x, y, turn = R[..., 0], R[..., 1], 1 / bend.held_mm
+    sides = np.stack([np.concatenate([x, turn * y], axis=-1), np.concatenate([y, -turn * x], axis=-1)], axis=-1)
+    return np.asarray(bend.tip_mm**2 / 2 * sides @ np.swapaxes(sides, -1, -2))
 
 
 def _outer(J: Floats, variances: Floats) -> Floats:

@@ -22,13 +22,18 @@ NOT_IN_CHANCES = (
 """The first two of them where the case declares them: what is done with them instead."""
 
 
-def not_modelled(case: Case) -> str:
-    """What the chances of a case leave out: what it does not declare, and what is declared but counted elsewhere."""
+def not_modelled(case: Case, *, bent: bool = False) -> str:
+    """What the chances of a case leave out: what it does not declare, and what is declared but counted elsewhere.
+
+    Args:
+        case: The case.
+        bent: Whether the chances count a needle that bends.
+    """
     left_out = NOT_MODELLED.split(", ")
     for at, declared in enumerate((case.breathing, case.bending)):
         if declared is not None:
             left_out[at] = NOT_IN_CHANCES[at]
-    return ", ".join(left_out)
+    return ", ".join(left_out[:1] + left_out[2:] if bent else left_out)
 
 
 ISOTROPIC = 1e-9
@@ -57,6 +62,7 @@ SOURCES: Mapping[str, Source] = MappingProxyType(
         "drift": Source("drift since the touch", "joint_drift_deg", "deg"),
         "tip_offset": Source("offset of the needle's tip", "tip_offset_mm", "mm"),
         "needle_direction": Source("direction of the needle", "needle_direction_deg", "deg"),
+        "bend": Source("bending of the needle", "bevel_deg", "deg"),
         "surface": Source("surfaces of the structures", "surface_mm", "mm"),
     }
 )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
+from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
@@ -17,12 +18,13 @@ from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
 from puncture_twin.planning.registration.noise_test import NoiseTest
 from puncture_twin.planning.registration.placement import touches
 from puncture_twin.planning.registration.reading_noise import reading_noise
+from puncture_twin.planning.search.bending.insertion import insertion_along
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
 from puncture_twin.planning.uncertainty.chance_model import chance_model, demanding
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE
 from puncture_twin.planning.uncertainty.needle_chances import chances_of, refined_chances
-from puncture_twin.planning.uncertainty.pose_error import ErrorBudget, PoseError, error_budget, pose_error
+from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
 from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, not_modelled
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
 
@@ -136,6 +138,7 @@ class Distribution:
             "predicted_share": dict(self.budget.fraction),
             "wrong_belief": self.wrong_belief,
             "guessed_touches": self.guessed_touches,
+            **({} if self.puncture.bend is None else {"deflection_mm": self.puncture.bend.tip_mm}),
             **({} if self.not_modelled == NOT_MODELLED else {"not_modelled": self.not_modelled}),
             **({} if self.physics is None else {"physics": self.physics.summary()}),
         }
@@ -166,14 +169,28 @@ def rehearse_rooms(
     if error is None or registration is None:
         raise InputError("no rooms can be drawn", where=case.path, allowed=ALLOWED)
     q_touch = touches(case, registration.markers)
-    believed = _as_rehearsed(error, q_touch)
+    bend = _bend(context, outward_ct)
+    believed = replace(_as_rehearsed(error, q_touch), bend=bend)
     truth = (case.truth_errors or case.errors or error.errors).scaled(error.fit.test.scale)
     puncture = Puncture(
         ur_model(case.robot.model), case.needle.length_mm, registration.method, believed.fit.noise,
-        registration.markers.points_ct, q_touch, registration.T_base_ct, case.target_ct, outward_ct, q_insertion,
+        registration.markers.points_ct, q_touch, registration.T_base_ct, case.target_ct, outward_ct, q_insertion, bend,
     )  # fmt: skip
     rooms = draw_rooms(puncture, truth, count, np.random.default_rng(seed))
     return _measured(context, believed, puncture, rooms, seed, registration.markers.joints is None)
+
+
+def _bend(context: CaseContext, outward_ct: Floats) -> Bend | None:
+    """How far the bevel takes the needle off along one direction (3,), if it never turns; None for a straight one."""
+    case, anatomy = context.case, context.anatomy
+    if case.bending is None:
+        return None
+    paths = skin_paths(anatomy.skin, case.target_ct, outward_ct[None], case.needle.length_mm)
+    length = float(paths.path_length[0])
+    if not np.isfinite(length):
+        return None
+    insertion = insertion_along(case, case.bending, anatomy, outward_ct, length)
+    return Bend(insertion.tip_mm, case.bending.shaft.length_mm)
 
 
 def _as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
@@ -214,7 +231,7 @@ def _measured(
         wrong_belief=case.truth_errors is not None,
         budget=error_budget(believed, q[0], puncture.T_base_ct[:3, :3] @ puncture.outward_ct),
         guessed_touches=guessed,
-        not_modelled=not_modelled(case),
+        not_modelled=not_modelled(case, bent=puncture.bend is not None),
     )
 
 

@@ -2,7 +2,7 @@
 
 Every room draws its truth anew from one declaration of errors: what the CT shows of markers and target, the arm's 28
 parameters, its touches, what drifted since, and one arrival. The arm's motion is exact kinematics, not linearised;
-tissue does not move and the needle does not bend.
+tissue does not move. A needle that bends ends off its straight line, its bevel pointing to a side drawn in each room.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from puncture_twin.planning.arm.kinematics import flange_pose, inverse, wrap_to_
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.case.errors import ErrorModel
-from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation
 from puncture_twin.planning.registration.fit_map import design, fit_weighted, least_squares_map
 from puncture_twin.planning.registration.reading_noise import ReadingNoise, parameter_variances
 from puncture_twin.planning.registration.registration import fit_rigid, fit_triad
-from puncture_twin.twin.plant.true_needle import driven_onto, true_needle
+from puncture_twin.planning.uncertainty.pose_error import Bend
+from puncture_twin.twin.plant.true_needle import TrueNeedle, driven_onto, true_needle
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,7 @@ class Puncture:
         target_ct: Shape (3,), mm.
         outward_ct: Shape (3,), unit, from the target along the needle.
         q_insertion: Shape (6,), rad, the tip on the target.
+        bend: Of the needle; None where it is straight.
     """
 
     model: UrModel
@@ -50,6 +52,7 @@ class Puncture:
     target_ct: Floats
     outward_ct: Floats
     q_insertion: Floats
+    bend: Bend | None = None
 
 
 class Rooms(NamedTuple):
@@ -106,10 +109,26 @@ def draw_rooms(puncture: Puncture, errors: ErrorModel, count: int, rng: np.rando
     needle = true_needle(puncture.model, q + arrival, eta, puncture.tip_mm)
     T_ct_base = np.linalg.inv(puncture.T_base_ct)
     target_ct = puncture.target_ct + _normal(rng, errors.target_cov_ct, (count,))
+    if puncture.bend is not None:
+        needle = bent(needle, puncture.bend, rng.uniform(0, 2 * np.pi, count))
     outward_ct = -needle.R_base_needle[:, :, 2] @ T_ct_base[:3, :3].T
     R_ct_needle = T_ct_base[:3, :3] @ needle.R_base_needle
     tip_ct, squares = apply(T_ct_base, needle.tip_base), _chi_squared(puncture, residuals)
     return Rooms(tip_ct, outward_ct, target_ct, T_base_ct, reached, R_ct_needle, squares)
+
+
+def bent(needle: TrueNeedle, bend: Bend, side: Floats) -> TrueNeedle:
+    """Needles whose bevel took them off, each turned about where it is held so that its straight line ends at the tip.
+
+    Args:
+        needle: n straight needles.
+        bend: By how much.
+        side: Shape (n,), rad, whereto the bevel points about each needle's z.
+    """
+    x, y = needle.R_base_needle[:, :, 0], needle.R_base_needle[:, :, 1]
+    c, s = np.cos(side)[:, None], np.sin(side)[:, None]
+    turn = bend.tip_mm / bend.held_mm * (c * y - s * x)
+    return TrueNeedle(needle.tip_base + bend.tip_mm * (c * x + s * y), exp_rotation(turn) @ needle.R_base_needle)
 
 
 def _chi_squared(puncture: Puncture, residuals: Floats) -> Floats:

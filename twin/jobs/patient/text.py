@@ -122,11 +122,16 @@ def distribution_lines(rooms: dict[str, Any]) -> list[str]:
         *chances,
         "  of the predicted variance: "
         + ", ".join(f"{SOURCES[name].text} {100 * part:.0f} %" for name, part in sources if part >= LEAST_SOURCE),
+        *_bent(rooms.get("deflection_mm")),
         *(missed if rooms["unreached"] else []),
         *(guessed if rooms["guessed_touches"] else []),
         *_physics(rooms.get("physics")),
         f"  not modelled: {rooms.get('not_modelled', NOT_MODELLED)}",
     ]
+
+
+def _bent(tip_mm: float | None) -> list[str]:
+    return [] if tip_mm is None else [f"  the needle bends by {tip_mm:.2f} mm, to a side drawn in each room"]
 
 
 def _physics(run_again: dict[str, Any] | None) -> list[str]:
