@@ -1,4 +1,4 @@
-"""Draw the picture of breathing from the code that it explains: ``python docs/motion_pictures.py``."""
+"""Draw the pictures of breathing and of the needle in tissue from the code: ``python docs/motion_pictures.py``."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +10,10 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.breathing.lujan import fraction_within, positions
 from puncture_twin.planning.formats.labels.by_name import ByName
+from puncture_twin.planning.needle.bevel_path import bevel_path
+from puncture_twin.planning.needle.insertion_force import insertion_force
+from puncture_twin.planning.needle.shaft import GAUGES, Shaft
+from puncture_twin.planning.needle.tissue import Layer, Tissue
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.organs import organ_candidates
 from puncture_twin.planning.search.search import case_directions
@@ -85,14 +89,54 @@ def draw_directions(axes):
     axes.legend(loc="upper center", fontsize=8, bbox_to_anchor=(0.5, -0.07), frameon=False, markerscale=3)
 
 
+def draw_bevel(axes):
+    """The needle in tissues of three stiffnesses, and a turned one."""
+    shaft, count = Shaft(200.0, *GAUGES[18]), 120
+    for k, colour in ((0.01, GREEN), (0.1, BLUE), (0.4, ORANGE)):
+        path = bevel_path(shaft, np.full(count, k), np.full(count, np.radians(1.0)))
+        axes.plot(path.depth_mm, path.cut_mm, color=colour, label=f"path cut, k = {k:g} N/mm²")
+        axes.plot(path.depth_mm, path.needle_mm, "--", color=colour, linewidth=1)
+    turned = np.radians(np.where(np.arange(count) < 30, 1.0, -1.0))
+    path = bevel_path(shaft, np.full(count, 0.1), turned)
+    axes.plot(path.depth_mm, path.cut_mm, color=RED, label="turned by 180° at 30 mm, k = 0.1")
+    axes.plot([], [], "--", color="grey", linewidth=1, label="the shaft, once all is in")
+    axes.set(xlabel="depth in tissue, mm", ylabel="off the straight line, mm", title="18G tube, bevel 1°")
+    axes.legend(fontsize=8, frameon=False)
+
+
+def draw_force(axes):
+    """The axial force through skin, fat and liver, by its terms."""
+    layers = (
+        Layer(0.0, 25.0, Tissue(0.03, 0.4, 0.01, 4.0, 5.0)),
+        Layer(25.0, 80.0, Tissue(0.1, 0.9, 0.02, 1.5, 3.0)),
+    )
+    found = insertion_force(layers)
+    parts = (found.friction_n, found.cutting_n, found.capsule_n)
+    axes.stackplot(found.depth_mm, *parts, colors=(GREY, BLUE, ORANGE), labels=("friction", "cutting", "capsule"))
+    free = Shaft(150.0, *GAUGES[18]).buckling_n(pinned=False)
+    axes.axhline(free, color=RED, linewidth=1, label=f"18G tube of 150 mm buckles, tip free: {free:.1f} N")
+    axes.set(xlabel="depth of the tip, mm", ylabel="axial force, N", xlim=(0, 80), ylim=(0, 5.2))
+    axes.set_title("skin at 0, liver from 25 mm; numbers invented")
+    axes.legend(fontsize=8, frameon=False, loc="upper right")
+
+
+def save(figure, name):
+    """Write one picture."""
+    figure.tight_layout()
+    figure.savefig(PICTURES / name, dpi=100)
+    plt.close(figure)
+
+
 def main():
-    """The picture."""
+    """Both pictures."""
     figure = plt.figure(figsize=(11, 6))
     draw_curve(figure.add_subplot(1, 2, 1))
     draw_directions(figure.add_subplot(1, 2, 2, projection="polar"))
-    figure.tight_layout()
-    figure.savefig(PICTURES / "breathing.png", dpi=100)
-    plt.close(figure)
+    save(figure, "breathing.png")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6))
+    draw_bevel(left)
+    draw_force(right)
+    save(figure, "needle_and_tissue.png")
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ from puncture_twin.twin.report.slices.planes import Plane, letters
 from puncture_twin.twin.report.slices.subject import Subject
 
 PIXELS, DPI = 480, 96
-NEEDLE_COLOUR, REGION_COLOUR = "#00e5ff", "#ff4df0"
-"""On grey neither is near a structure's colour."""
+NEEDLE_COLOUR, REGION_COLOUR, BENT_COLOUR = "#00e5ff", "#ff4df0", "#b6ff00"
+"""On grey none is near a structure's colour."""
 
 HALO = (patheffects.withStroke(linewidth=2.4, foreground="black"),)
 """Behind letters and thin lines, so that they show on bright tissue too."""
@@ -130,6 +130,10 @@ def _needle(axes: Axes, subject: Subject, plane: Plane) -> None:
     if subject.margin_mm > 0:
         wide = (subject.needle_radius_mm + subject.margin_mm) * aside
         axes.add_collection(LineCollection([(wide, end + wide), (-wide, end - wide)], **DASHED), autolim=False)
+    if subject.bent_mm is not None:
+        along_end = end / np.linalg.norm(end)
+        sides = [subject.bent_mm @ np.stack([along_end, sign * aside]) for sign in (1, -1)]
+        axes.add_collection(LineCollection(sides, colors=BENT_COLOUR, linewidths=1.3, zorder=4), autolim=False)
     return None
 
 
@@ -139,6 +143,9 @@ def _cut(axes: Axes, subject: Subject, cosine: float, turn_deg: float) -> None:
     turned: Any = {"angle": turn_deg, "lw": 1.0}
     long = 1 / max(cosine, STEEP)
     axes.add_patch(Ellipse((0, 0), 2 * radius * long, 2 * radius, color=NEEDLE_COLOUR, zorder=3, **turned))
+    if subject.bent_mm is not None:
+        off = 2 * float(subject.bent_mm[-1, 1])
+        axes.add_patch(Ellipse((0, 0), off * long, off, fill=False, edgecolor=BENT_COLOUR, **turned))
     if subject.margin_mm > 0:
         wide = 2 * (radius + subject.margin_mm)
         look: Any = {"fill": False, "linestyle": "--", "edgecolor": NEEDLE_COLOUR}

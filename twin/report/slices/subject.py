@@ -10,6 +10,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import Rgb
+from puncture_twin.planning.search.bending.insertion import insertion_along
 from puncture_twin.planning.search.selection.choice import Pick
 from puncture_twin.twin.report.numbers import number
 from puncture_twin.twin.report.palette import OUTSIDE, organ_colours
@@ -84,6 +85,17 @@ class Subject:
     def margin_mm(self) -> float:
         """The greatest margin of the structures near, 0 without any."""
         return max((one.margin_mm for one in self.near), default=0.0)
+
+    @cached_property
+    def bent_mm(self) -> Floats | None:
+        """The shaft of a bevel that never turns, shape (m, 2): along the path from the target, and off it, mm.
+
+        None where the case declares no tissue, or the path has no entry.
+        """
+        if self.case.bending is None or not np.isfinite(self.path_mm):
+            return None
+        found = insertion_along(self.case, self.case.bending, self.anatomy, self.outward_ct, self.path_mm).path
+        return np.stack([self.path_mm - found.depth_mm, found.needle_mm], axis=1)
 
     @property
     def needle_radius_mm(self) -> float:
