@@ -193,7 +193,6 @@ def check(
     from puncture_twin.planning.search.explain import NEAREST
     from puncture_twin.twin.jobs.choosing.list_job import check_list, lists_of
     from puncture_twin.twin.jobs.patient.answers import check_candidate
-    from puncture_twin.twin.jobs.patient.pictures import write_check_picture
 
     if lists_of(entries, targets, choice, picture=picture, out_dir=out_dir):
         with progress_display() as progress:
@@ -206,6 +205,8 @@ def check(
         context = prepare(case, arm=arm, watcher=progress)
         explained = check_candidate(context, choice)
         if picture is not None:
+            from puncture_twin.twin.jobs.patient.pictures import write_check_picture
+
             write_check_picture(context, explained, picture)
     _print(explained.summary(), explained.text(None if every else NEAREST), as_json)
     if not explained.safe:

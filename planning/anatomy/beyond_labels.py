@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from puncture_twin.planning.anatomy.body.outside_body import joined
 from puncture_twin.planning.anatomy.label_grids import LabelGrid, label_grids
@@ -161,7 +161,7 @@ def _body_between(
     T_index_cell[:3, :3], T_index_cell[:3, 3] = np.diag(step), first
     T_ct_cell = grid.voxels.T_ct_index @ T_index_cell
     nx, ny, nz = (int(n) for n in count)
-    inside = ndimage.maximum_filter(voxels_inside(skin, T_ct_cell, (nx, ny, nz)).view(np.uint8), 3)
+    inside = scipy.ndimage.maximum_filter(voxels_inside(skin, T_ct_cell, (nx, ny, nz)).view(np.uint8), 3)
     if not inside.any():
         return None
     oriented = canonical(inside, T_ct_cell)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from puncture_twin.planning.anatomy.skin import FieldOfView, Skin
 from puncture_twin.planning.anatomy.skin_entry import settled_crossings
@@ -93,7 +93,7 @@ def near_surface(points: Floats, mesh: TriangleMesh, distance_mm: Floats) -> Boo
     size = np.ceil(np.log2(np.maximum(reach, distance_mm.min())))
     for one in np.unique(size):
         rows, left = np.flatnonzero(size == one), np.flatnonzero(~near)
-        found = cKDTree(centres[rows]).query_ball_point(points[left], distance_mm[left] + 2.0**one)
+        found = scipy.spatial.cKDTree(centres[rows]).query_ball_point(points[left], distance_mm[left] + 2.0**one)
         point = np.repeat(left, [len(some) for some in found])
         triangle = rows[[row for some in found for row in some]]
         squares = squared_distance(points[point], mesh.triangles[triangle])

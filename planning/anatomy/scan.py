@@ -9,8 +9,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from puncture_twin.planning.anatomy.body.attached_limbs import attached_limbs
 from puncture_twin.planning.anatomy.body.body_mask import BodyMask, body_mask
@@ -189,7 +189,7 @@ class Scan:
         if self.skin is None:
             return self._found.body
         inside = voxels_inside(self.skin.mesh, ct.T_ct_index, ct.values.shape)
-        return np.asarray(ndimage.distance_transform_edt(~inside, sampling=ct.spacing_mm) <= self._tolerance_mm)
+        return np.asarray(scipy.ndimage.distance_transform_edt(~inside, sampling=ct.spacing_mm) <= self._tolerance_mm)
 
     @cached_property
     def _found(self) -> BodyMask:

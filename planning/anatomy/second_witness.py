@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.formats.labels.label_surface import field_surface
@@ -97,9 +97,9 @@ def unnamed_surfaces(image: BodyImage, structures: Sequence[Named], *, dense_hu:
 
 def _deep(image: BodyImage) -> Bools:
     """Voxels so deep in the body that air in them is not the room's."""
-    deep = ndimage.binary_erosion(image.body, FULL, iterations=SKIN_VOXELS, border_value=1)
+    deep = scipy.ndimage.binary_erosion(image.body, FULL, iterations=SKIN_VOXELS, border_value=1)
     if image.slack_mm > 0.0 and not image.body.all():
-        deep &= ndimage.distance_transform_edt(image.body, sampling=image.spacing_mm) > image.slack_mm
+        deep &= scipy.ndimage.distance_transform_edt(image.body, sampling=image.spacing_mm) > image.slack_mm
     return np.asarray(deep)
 
 
@@ -108,7 +108,7 @@ def _grown_union(structures: Sequence[Named], image: BodyImage) -> Bools:
     union = np.zeros(image.hu.shape, bool)
     for structure in structures:
         union |= voxels_inside(structure.mesh, image.T_ct_index, image.hu.shape)
-    return np.asarray(ndimage.binary_dilation(union))
+    return np.asarray(scipy.ndimage.binary_dilation(union))
 
 
 def _surface(mask: Bools, image: BodyImage, where: str | Path) -> TriangleMesh | None:
@@ -122,6 +122,6 @@ def _surface(mask: Bools, image: BodyImage, where: str | Path) -> TriangleMesh |
 
 
 def _components(mask: Bools) -> Iterator[tuple[tuple[slice, ...], Bools]]:
-    labels, _ = ndimage.label(mask, FULL)
-    for number, box in enumerate(ndimage.find_objects(labels), start=1):
+    labels, _ = scipy.ndimage.label(mask, FULL)
+    for number, box in enumerate(scipy.ndimage.find_objects(labels), start=1):
         yield box, labels[box] == number

@@ -15,8 +15,7 @@ from types import MappingProxyType
 from xml.etree import ElementTree
 
 import numpy as np
-import trimesh
-from scipy.spatial.transform import Rotation
+import scipy
 
 from puncture_twin import meshes
 from puncture_twin.planning.arm.kinematics import link_poses
@@ -175,6 +174,8 @@ def _link_meshes(model: UrModel) -> list[tuple[str, TriangleMesh]]:
 
 
 def _load(path: Path) -> TriangleMesh:
+    import trimesh  # here: it costs a third of a second, and few need it
+
     if not path.is_file():
         raise InputError("mesh file is missing", where=path, allowed="the file that the URDF names")
     mesh = trimesh.load_mesh(path, process=False)
@@ -186,6 +187,8 @@ def _load(path: Path) -> TriangleMesh:
 
 def _convex_pieces(mesh: TriangleMesh, count: int) -> tuple[TriangleMesh, ...]:
     """The hulls of the surface's parts in equal slabs across the longest side. Their union contains the surface."""
+    import trimesh  # here: it costs a third of a second, and few need it
+
     low, high = mesh.bounds
     axis = int(np.argmax(high - low))
     cuts = np.linspace(low[axis], high[axis], count + 1)
@@ -216,6 +219,8 @@ def _joint_pins(model: UrModel, meshes: Sequence[TriangleMesh]) -> list[tuple[Tr
 
 
 def _pin(low: float, high: float) -> TriangleMesh:
+    import trimesh  # here: it costs a third of a second, and few need it
+
     turn = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
     ring = PIN_RADIUS_MM * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     hull = trimesh.convex.convex_hull(np.concatenate([np.insert(ring, 2, z, axis=1) for z in (low, high)]))
@@ -237,7 +242,10 @@ def _origin(element: ElementTree.Element) -> Floats:
     origin = element.find("origin")
     if origin is None:
         return np.eye(4)
-    return pose(Rotation.from_euler("xyz", _floats(origin, "rpy")).as_matrix(), 1000.0 * _floats(origin, "xyz"))
+    return pose(
+        scipy.spatial.transform.Rotation.from_euler("xyz", _floats(origin, "rpy")).as_matrix(),
+        1000.0 * _floats(origin, "xyz"),
+    )
 
 
 def _floats(element: ElementTree.Element | None, key: str) -> Floats:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
@@ -140,7 +140,7 @@ class Neighbours(NamedTuple):
 
 def neighbours(corners: Floats) -> Neighbours:
     """Which corners (n, 3) of a convex hull share an edge of its triangles; a corner within the hull has none."""
-    faces = ConvexHull(corners).simplices
+    faces = scipy.spatial.ConvexHull(corners).simplices
     edges = np.concatenate([np.roll(faces, turn, axis=1)[:, :2] for turn in range(3)])
     pairs = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0).astype(np.int64)
     return Neighbours(np.bincount(pairs[:, 0], minlength=len(corners)), pairs[:, 1])
@@ -151,7 +151,7 @@ def halves(corners: Floats) -> tuple[Floats, Floats]:
     low, high = corners.min(axis=0), corners.max(axis=0)
     axis = int(np.argmax(high - low))
     cut = (low[axis] + high[axis]) / 2.0
-    faces = ConvexHull(corners).simplices
+    faces = scipy.spatial.ConvexHull(corners).simplices
     below = corners[:, axis] < cut
     starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     crosses = below[starts] & ~below[ends]  # of the two faces at an edge one runs along it this way
@@ -193,7 +193,7 @@ def coarse_hull(corners: Floats) -> Coarse:
     if len(corners) <= COARSE_DIRECTIONS:
         return Coarse(corners, 0.0)
     few = corners[np.unique(np.argmax(_directions(COARSE_DIRECTIONS) @ corners.T, axis=1))]
-    hull = ConvexHull(few)
+    hull = scipy.spatial.ConvexHull(few)
     outside = (corners @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1) > -SLACK_MM
     triangles = np.ascontiguousarray(few[hull.simplices])
     return Coarse(few, float(farthest_from(triangles, corners[outside])) + SLACK_MM)

@@ -6,7 +6,6 @@ from itertools import product
 
 import fcl
 import numpy as np
-import trimesh
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -43,6 +42,8 @@ def convex(mesh: TriangleMesh) -> fcl.Convex:
 
 def padded(mesh: TriangleMesh, padding_mm: float) -> TriangleMesh:
     """A convex mesh grown by at least ``padding_mm`` on every side: its sum with the cube about such a sphere."""
+    import trimesh  # here: it costs a third of a second, and few need it
+
     if padding_mm == 0.0:
         return mesh
     corners = padding_mm * np.array(list(product((-1.0, 1.0), repeat=3)))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -25,8 +24,8 @@ def split_at_creases(mesh: TriangleMesh) -> TriangleMesh:
     corner_vertex = welded[mesh.faces]
     pairs = _smooth_pairs(mesh, corner_vertex.astype(np.int64))
     count = 3 * len(mesh.faces)
-    graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    fans, fan = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    fans, fan = scipy.sparse.csgraph.connected_components(graph, directed=False)
     vertices = np.empty((fans, 3))
     vertices[fan] = mesh.vertices[mesh.faces.reshape(-1)]
     return TriangleMesh(vertices, fan.reshape(-1, 3))

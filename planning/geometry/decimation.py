@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import fast_simplification
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
@@ -78,7 +78,7 @@ def _volume(mesh: TriangleMesh) -> float:
 def _one_sided_mm(source: TriangleMesh, goal: TriangleMesh, spacing_mm: float, enough_mm: float) -> float:
     points = np.concatenate([source.vertices, _samples(source, spacing_mm).points])
     near = _samples(goal, spacing_mm)
-    tree = cKDTree(near.points)
+    tree = scipy.spatial.cKDTree(near.points)
     distances = np.full(len(points), np.inf)
     for count in CANDIDATES:
         far = np.flatnonzero(distances > enough_mm)

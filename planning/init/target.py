@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from puncture_twin.planning.anatomy.default_roles import BODY, LESION, NEVER_CROSSED, default_role
 from puncture_twin.planning.base.arrays import Floats
@@ -162,8 +162,8 @@ def deepest_point(mesh: TriangleMesh) -> tuple[Floats, int]:
     shape = np.ceil((high - low) / cell).astype(int) + 2
     T_ct_index = pose(np.eye(3) * cell, low - cell / 2)
     inside = voxels_inside(mesh, T_ct_index, (int(shape[0]), int(shape[1]), int(shape[2])))
-    parts, count = ndimage.label(inside)
+    parts, count = scipy.ndimage.label(inside)
     largest = parts == np.argmax(np.bincount(parts.ravel())[1:]) + 1 if count > 1 else inside
-    depth = ndimage.distance_transform_edt(largest)
+    depth = scipy.ndimage.distance_transform_edt(largest)
     index = np.array(np.unravel_index(np.argmax(depth), depth.shape))
     return np.round(low - cell / 2 + cell * index, 1), count

@@ -16,7 +16,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from puncture_twin.planning.arm.tip_speed import TipLimit, tip_rates
 from puncture_twin.planning.arm.ur import UrModel
@@ -275,13 +275,13 @@ def follow_smoothly(model: UrModel, q: Floats, depths_mm: Floats, *, max_tip_spe
         raise InputError("depths do not rise row by row", where="trajectory", allowed="one rising depth a row")
     if not (math.isfinite(max_tip_speed_mm_s) and max_tip_speed_mm_s > 0.0):
         raise InputError(f"max_tip_speed_mm_s = {max_tip_speed_mm_s}", where="trajectory", allowed="above 0")
-    spline = CubicSpline(depths, q)
+    spline = scipy.interpolate.CubicSpline(depths, q)
     law = time_law(float(depths[-1] - depths[0]), _tip_rates(model, spline, max_tip_speed_mm_s))
     steps = _steps(law.duration_s)
     return _ending_at(q[-1], spline(depths[0] + law.travelled(law.duration_s * np.arange(steps + 1) / steps)))
 
 
-def _tip_rates(model: UrModel, spline: CubicSpline, max_tip_speed_mm_s: float) -> Rates:
+def _tip_rates(model: UrModel, spline: scipy.interpolate.CubicSpline, max_tip_speed_mm_s: float) -> Rates:
     """The tip's highest speed, acceleration and jerk for which every joint keeps its limits all along a spline."""
     depths = spline.x
     fraction = np.linspace(0.0, 1.0, SPLINE_SAMPLES, endpoint=False)

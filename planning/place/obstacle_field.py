@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
-from scipy import ndimage
-from scipy.spatial import cKDTree
+import scipy
 
 from puncture_twin.planning.arm.tool import Box
 from puncture_twin.planning.base.arrays import Floats
@@ -40,15 +38,17 @@ class SkinField:
     @classmethod
     def of(cls, skin: TriangleMesh) -> SkinField:
         """The field of a checked skin, CT frame."""
+        import trimesh  # here: it costs a third of a second, and few need it
+
         points, faces = trimesh.remesh.subdivide_to_size(skin.vertices, skin.faces, SAMPLE_MM, max_iter=20)
         fine = trimesh.Trimesh(points, faces, process=False)
         low, high = skin.bounds
         origin = low - MARGIN_CELLS * CELL_MM
         counts = np.ceil((high - low) / CELL_MM).astype(int) + 2 * MARGIN_CELLS + 1
         nodes = origin + CELL_MM * np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1)
-        distance, nearest = cKDTree(fine.vertices).query(nodes)
+        distance, nearest = scipy.spatial.cKDTree(fine.vertices).query(nodes)
         # A node farther from the skin than half its cell's diagonal lies on one side with all its like neighbours.
-        sides, _ = ndimage.label(distance > CELL_MM * np.sqrt(3.0) / 2.0)
+        sides, _ = scipy.ndimage.label(distance > CELL_MM * np.sqrt(3.0) / 2.0)
         outside = sides == sides[0, 0, 0]
         inside = ~outside & (sides > 0)
         if inside.any():  # nearer nodes lie where the skin's normals say

@@ -23,8 +23,8 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from scipy.special import chdtri, ndtr, ndtri, stdtr
-from scipy.stats import qmc
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.clearance.kernels.displaced_axis import displaced_distance
@@ -243,7 +243,7 @@ def _few_lines(surface: bool) -> Lines:
 def _many_lines(surface: bool, count: int, freedom: int | None) -> Lines:
     """Spread evenly over a normal, and over the sizes that are as likely."""
     mixed = 1 if surface else 0
-    drawn = qmc.Sobol(4 + mixed + (freedom is not None), scramble=True, seed=20191104).random(count)
+    drawn = scipy.stats.qmc.Sobol(4 + mixed + (freedom is not None), scramble=True, seed=20191104).random(count)
     normal = ndtri(np.clip(drawn[:, : 4 + mixed], 1e-12, 1 - 1e-12))
     length = np.linalg.norm(normal, axis=1)[:, None]
     offsets = np.zeros((count, 5))

@@ -41,3 +41,22 @@ def loaded(*arguments):
 def test_help_and_a_wrong_argument_load_no_library_of_numbers(arguments, code):
     """They answer at once."""
     assert loaded(*arguments) == f"[] {code}"
+
+
+SEARCH = """
+import sys
+sys.argv = ["run_twin.py", "search", {case!r}, "--no-arm", "--no-pictures", "--out", {out!r}]
+from puncture_twin import run_twin
+code = run_twin.main(sys.argv[1:])
+print(sorted({unused!r} & set(sys.modules)), code)
+"""
+
+UNUSED = {"matplotlib", "ompl", "networkx", "trimesh", "scipy.stats", "scipy.ndimage", "jinja2", "plotly", "pybullet"}
+"""What organs' clearance alone needs none of."""
+
+
+def test_a_search_without_arm_and_pictures_loads_no_library_that_it_does_not_use(tmp_path):
+    """The embedded carton; each of these costs a tenth of a second to half of one."""
+    code = SEARCH.format(case=str(ROOT / "meshes/carton/case_m.toml"), out=str(tmp_path / "out"), unused=UNUSED)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[] 0"

@@ -14,6 +14,11 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import step_of
 from puncture_twin.twin.report.palette import reason_of
 
+TRUTH_IS_BELIEF = (
+    "in this rehearsal the patient lies exactly where they are believed to lie: what the tip misses is the joints' "
+    "alone, and says nothing about the registration"
+)
+
 
 @dataclass(frozen=True)
 class ReasonCount:

@@ -11,8 +11,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from puncture_twin.planning.anatomy.body.detached_parts import BONE_HU, MIN_BONE_ML
 from puncture_twin.planning.anatomy.body.exposed_bones import Exposed, exposed_bones
@@ -86,7 +86,7 @@ def _about_exposed(limb: Exposed, shape: tuple[int, ...], spacing_mm: Floats) ->
     """What may belong to the limb about some bones, also some way beyond their ends."""
     depth = np.full(shape, -1.0)
     depth[tuple(limb.voxels.T)] = limb.depth_mm
-    gap, nearest = ndimage.distance_transform_edt(depth < 0.0, sampling=spacing_mm, return_indices=True)
+    gap, nearest = scipy.ndimage.distance_transform_edt(depth < 0.0, sampling=spacing_mm, return_indices=True)
     radius = depth[tuple(nearest)]
     reach = gap <= FLAT * radius + SLACK_MM
     points = limb.voxels * spacing_mm
@@ -141,7 +141,7 @@ def _surroundings(bone: LimbBone, shape: tuple[int, ...], spacing_mm: Floats) ->
 
 def _component_at(body: Bools, at: tuple[int, ...]) -> Bools:
     """The connected part of the body that holds a voxel; the others are limbs with a skin of their own."""
-    labels, _ = ndimage.label(body)
+    labels, _ = scipy.ndimage.label(body)
     return np.asarray(labels == labels[at]) & body
 
 
@@ -149,10 +149,10 @@ def _nearest_core(body: Bools, spacing_mm: Floats) -> NDArray[np.int32]:
     """For every voxel of a body, the number of the nearest place into which the ball fits; 0 outside."""
     reach = np.ceil(NECK_MM / spacing_mm).astype(int)
     padded = np.pad(body, [(r, r) for r in reach], mode="edge")
-    cores, count = ndimage.label(ndimage.distance_transform_edt(padded, sampling=spacing_mm) > NECK_MM)
+    cores, count = scipy.ndimage.label(scipy.ndimage.distance_transform_edt(padded, sampling=spacing_mm) > NECK_MM)
     if count < 2:
         return body.astype(np.int32)
-    nearest = ndimage.distance_transform_edt(
+    nearest = scipy.ndimage.distance_transform_edt(
         cores == 0, sampling=spacing_mm, return_distances=False, return_indices=True
     )
     owner = cores[tuple(nearest)][tuple(slice(r, -r) for r in reach)]

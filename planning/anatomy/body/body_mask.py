@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from puncture_twin.planning.anatomy.body.detached_parts import (
     detached_limbs,
@@ -89,7 +89,7 @@ def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where
     if body.all():
         raise InputError("no air around the body", where=where, allowed="a CT that shows the skin somewhere")
     unscanned, padded = find_unscanned(hu)
-    ends = ndimage.binary_dilation(body) & unscanned & ~body
+    ends = scipy.ndimage.binary_dilation(body) & unscanned & ~body
     if (ends & padded).any():
         warnings.append(PADDED)
     if (ends & ~padded).any():
@@ -111,17 +111,17 @@ def _table_warnings(flat: Sequence[FlatSide], drawn: Sequence[DrawnSide], length
 
 def filled_slices(mask: Bools) -> Bools:
     """The mask with every hole filled that it encloses in a slice across axis 2."""
-    return np.stack([ndimage.binary_fill_holes(mask[:, :, k]) for k in range(mask.shape[2])], axis=2)
+    return np.stack([scipy.ndimage.binary_fill_holes(mask[:, :, k]) for k in range(mask.shape[2])], axis=2)
 
 
 def _with_cut_lungs(body: Bools, hu: NDArray[np.float32], voxel_ml: float, warnings: list[str]) -> Bools:
     """Fills air regions that are not the room: small ones, and those with the density of lung."""
-    labels, count = ndimage.label(~body)
+    labels, count = scipy.ndimage.label(~body)
     if count == 0:
         return body
     numbers = np.arange(1, count + 1)
     sizes_ml = np.bincount(labels.ravel())[1:] * voxel_ml
-    medians = np.asarray(ndimage.median(hu, labels, numbers))
+    medians = np.asarray(scipy.ndimage.median(hu, labels, numbers))
     inside = (sizes_ml < MIN_OUTSIDE_ML) | (medians > OUTSIDE_AIR_HU)
     if inside.any():
         total = sizes_ml[inside].sum()

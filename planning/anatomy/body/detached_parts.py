@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 
@@ -49,10 +49,10 @@ def thick_parts(mask: Bools, spacing_mm: Floats) -> Ints32:
     coarse_mm = spacing_mm * stride
     reach = np.ceil(OPENING_MM / coarse_mm).astype(int)
     padded = np.pad(coarse, [(r, r) for r in reach], mode="edge")
-    cores = _by_size(ndimage.distance_transform_edt(padded, sampling=coarse_mm) > OPENING_MM)
+    cores = _by_size(scipy.ndimage.distance_transform_edt(padded, sampling=coarse_mm) > OPENING_MM)
     if not cores.any():
         return np.zeros(mask.shape, np.int32)
-    gap, nearest = ndimage.distance_transform_edt(cores == 0, sampling=coarse_mm, return_indices=True)
+    gap, nearest = scipy.ndimage.distance_transform_edt(cores == 0, sampling=coarse_mm, return_indices=True)
     parts = np.where(gap <= OPENING_MM + coarse_mm.max(), cores[tuple(nearest)], 0)
     parts = parts[tuple(slice(r, -r) for r in reach)]
     for axis, times in enumerate(stride):
@@ -62,7 +62,7 @@ def thick_parts(mask: Bools, spacing_mm: Floats) -> Ints32:
 
 def largest_component(mask: Bools) -> Bools:
     """The largest part of a mask whose voxels share faces; the mask itself where it is empty."""
-    labels, count = ndimage.label(mask)
+    labels, count = scipy.ndimage.label(mask)
     if count == 0:
         return mask
     return np.asarray(labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:])))
@@ -97,14 +97,14 @@ def detached_limbs(hu: NDArray[np.float32], parts: Ints32, spacing_mm: Floats) -
 def limb_warnings(limbs: Sequence[Bools], trunk: Bools, voxel_ml: float) -> Iterator[str]:
     """One sentence that names every detached part, where there is one."""
     if limbs:
-        middle = ndimage.center_of_mass(trunk)
+        middle = scipy.ndimage.center_of_mass(trunk)
         named = [f"{_side(limb, middle)} ({np.count_nonzero(limb) * voxel_ml:.0f} ml)" for limb in limbs]
         yield f"parts that do not touch the trunk (arms, legs?) count as body: {', '.join(named)}"
 
 
 def _side(limb: Bools, middle: Sequence[float]) -> str:
     """Where a part lies, seen from the trunk; axes run to the left and to the back."""
-    away = np.array(ndimage.center_of_mass(limb)) - np.array(middle)
+    away = np.array(scipy.ndimage.center_of_mass(limb)) - np.array(middle)
     if abs(away[0]) >= abs(away[1]):
         return "left of it" if away[0] > 0 else "right of it"
     return "behind it" if away[1] > 0 else "in front of it"
@@ -112,7 +112,7 @@ def _side(limb: Bools, middle: Sequence[float]) -> str:
 
 def _by_size(mask: Bools) -> Ints32:
     """Components of a mask, 1 the largest; 0 elsewhere."""
-    labels, count = ndimage.label(mask)
+    labels, count = scipy.ndimage.label(mask)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     sizes[0] = 0
     rank = np.zeros(count + 1, np.int32)

@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from puncture_twin.planning.anatomy.body.flat_side import SIDES, surface_ends
 from puncture_twin.planning.base.arrays import Bools, Floats
@@ -161,7 +161,7 @@ def support_side(outside: Bools, body: Bools, spacing_mm: Floats) -> DrawnSide |
 
 def _middle_mm(body: Bools, spacing_mm: Floats) -> Floats:
     """The body's middle, shape (3,), from the first voxel's centre."""
-    return np.asarray(ndimage.center_of_mass(body)) * spacing_mm
+    return np.asarray(scipy.ndimage.center_of_mass(body)) * spacing_mm
 
 
 def _first(mask: Bools, axis: int, end: int) -> Floats:
@@ -191,7 +191,7 @@ def _sides(views: Sequence[_Ends]) -> tuple[DrawnSide, ...]:
 
 def _connected(dense: Bools, body: Bools) -> Bools:
     """What is dense and holds together with the body, which is part of it."""
-    labels, count = ndimage.label(dense | body)
+    labels, count = scipy.ndimage.label(dense | body)
     kept = np.zeros(count + 1, bool)
     kept[np.unique(labels[body])] = True
     kept[0] = False
@@ -219,8 +219,8 @@ def _smooth(ends_mm: Floats, step_mm: float) -> Floats:
     """Means along the bed of the ends that are known."""
     size = 2 * round(SMOOTH_ALONG_MM / step_mm / 2) + 1
     known = np.isfinite(ends_mm)
-    weight = ndimage.uniform_filter1d(known.astype(float), size, axis=1, mode="nearest")
-    mean = ndimage.uniform_filter1d(np.where(known, ends_mm, 0.0), size, axis=1, mode="nearest")
+    weight = scipy.ndimage.uniform_filter1d(known.astype(float), size, axis=1, mode="nearest")
+    mean = scipy.ndimage.uniform_filter1d(np.where(known, ends_mm, 0.0), size, axis=1, mode="nearest")
     return np.where(known & (weight > 0.5), mean / np.maximum(weight, 0.5), np.nan)
 
 
@@ -274,7 +274,7 @@ def _side(view: _Ends, bed: _Bed, table: bool) -> DrawnSide | None:
     """The line from the first run of drawn lines of sight to the last; between runs the outermost end counts."""
     along_mm, across_mm, step_mm = (float(view.spacing_mm[axis]) for axis in (view.axis, 1 - view.axis, 2))
     run = max(1, int(RUN_MM / across_mm))
-    runs = ndimage.binary_opening(ndimage.binary_closing(bed.drawn, np.ones(3)), np.ones(run))
+    runs = scipy.ndimage.binary_opening(scipy.ndimage.binary_closing(bed.drawn, np.ones(3)), np.ones(run))
     if not runs.any():
         return None
     first, last = np.flatnonzero(runs)[[0, -1]]

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from puncture_twin.planning.anatomy.body.detached_parts import MIN_BONE_ML
 from puncture_twin.planning.base.arrays import Bools, Floats
@@ -54,7 +54,7 @@ def exposed_bones(bone: Bools, body: Bools, spacing_mm: Floats) -> list[Exposed]
         spacing_mm: Shape (3,).
     """
     padded = np.pad(body, 1, mode="edge")
-    depth = ndimage.distance_transform_edt(padded, sampling=spacing_mm)[1:-1, 1:-1, 1:-1]
+    depth = scipy.ndimage.distance_transform_edt(padded, sampling=spacing_mm)[1:-1, 1:-1, 1:-1]
     near = bone & body & (depth <= min(DEEPEST_MM, DEEPEST_FRACTION * float(depth.max())))
     index = np.argwhere(near)
     fraction = np.zeros(body.shape)
@@ -74,8 +74,8 @@ def _groups(mask: Bools, spacing_mm: Floats) -> NDArray[np.int32]:
     """Numbers of voxels that hold together across gaps of ``GAP_MM``, 0 outside of the mask."""
     if not mask.any():
         return np.zeros(mask.shape, np.int32)
-    gap = ndimage.distance_transform_edt(~mask, sampling=spacing_mm)
-    labels, _ = ndimage.label(gap <= GAP_MM / 2.0, FULL)
+    gap = scipy.ndimage.distance_transform_edt(~mask, sampling=spacing_mm)
+    labels, _ = scipy.ndimage.label(gap <= GAP_MM / 2.0, FULL)
     return np.asarray(np.where(mask, labels, 0), dtype=np.int32)
 
 

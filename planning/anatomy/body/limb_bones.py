@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from puncture_twin.planning.anatomy.body.detached_parts import BONE_HU
 from puncture_twin.planning.base.arrays import Bools, Floats
@@ -55,10 +55,10 @@ def limb_bones(hu: NDArray[np.float32], body: Bools, spacing_mm: Floats) -> list
         spacing_mm: Shape (3,).
     """
     bone = body & (hu > BONE_HU)
-    labels, _ = ndimage.label(bone, np.ones((3, 3, 3), bool))
+    labels, _ = scipy.ndimage.label(bone, np.ones((3, 3, 3), bool))
     least = LEAST_LENGTH_MM / spacing_mm[2]
     rods = []
-    for number, box in enumerate(ndimage.find_objects(labels), start=1):
+    for number, box in enumerate(scipy.ndimage.find_objects(labels), start=1):
         if box[2].stop - box[2].start >= least:
             rods += list(_rods(labels[box] == number, box, spacing_mm))
     return [rod for rod in (_in_body(rod, bone, body, spacing_mm) for rod in rods) if rod is not None]
@@ -67,10 +67,10 @@ def limb_bones(hu: NDArray[np.float32], body: Bools, spacing_mm: Floats) -> list
 def _rods(component: Bools, box: tuple[slice, ...], spacing_mm: Floats) -> Iterator[LimbBone]:
     """The component, if it is a straight rod along the bed of a long bone's width."""
     slices = np.flatnonzero(component.any(axis=(0, 1)))
-    filled = [ndimage.binary_fill_holes(component[:, :, k]) for k in slices]
+    filled = [scipy.ndimage.binary_fill_holes(component[:, :, k]) for k in slices]
     area = np.array([np.count_nonzero(section) for section in filled]) * spacing_mm[0] * spacing_mm[1]
     width = 2.0 * np.sqrt(np.median(area) / np.pi)
-    middle = np.array([ndimage.center_of_mass(section) for section in filled])
+    middle = np.array([scipy.ndimage.center_of_mass(section) for section in filled])
     line = np.polynomial.polynomial.polyfit(slices, middle, 1)
     off_mm = (middle - np.polynomial.polynomial.polyval(slices, line).T) * spacing_mm[:2]
     tilt = float(np.linalg.norm(line[1] * spacing_mm[:2])) / spacing_mm[2]
@@ -90,7 +90,7 @@ def _in_body(rod: LimbBone, bone: Bools, body: Bools, spacing_mm: Floats) -> Lim
         across = np.flatnonzero(bone[:, :, k].any(axis=1))
         beyond = (outward * across).max() - outward * x
         lateral.append(aside and beyond * spacing_mm[0] <= WIDTH_MM[1])
-        depth = ndimage.distance_transform_edt(body[:, :, k], sampling=spacing_mm[:2])
+        depth = scipy.ndimage.distance_transform_edt(body[:, :, k], sampling=spacing_mm[:2])
         radii.append(depth[round(x), round(y)])
     near = max(radii) <= DEEPEST_MM
     return rod._replace(radius_mm=float(max(radii))) if near and np.mean(lateral) >= LATERAL_FRACTION else None

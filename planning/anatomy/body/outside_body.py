@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
-from scipy.spatial import ConvexHull, QhullError
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU
 from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
@@ -87,9 +86,9 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     hu, body = image.hu, image.body
     unscanned = find_unscanned(hu)
     size = np.maximum(1, np.round(SMOOTH_MM / image.spacing_mm)).astype(int)
-    mean = ndimage.uniform_filter(np.maximum(hu, -1024.0), size=tuple(size), mode="nearest")
+    mean = scipy.ndimage.uniform_filter(np.maximum(hu, -1024.0), size=tuple(size), mode="nearest")
     dense = (mean > air_hu) | (hu > max(DENSE_HU, air_hu))
-    dense &= ~ndimage.maximum_filter(body, size=tuple(2 * (size // 2 + 1) + 1))
+    dense &= ~scipy.ndimage.maximum_filter(body, size=tuple(2 * (size // 2 + 1) + 1))
     dense = (dense | (hu > BODY_HU)) & ~unscanned.voxels & ~body
     dense = _without_specks(dense, MIN_PIECE_MM3 / float(np.prod(image.spacing_mm)))
     return dense | (_unscanned_beside(dense | body, body, unscanned, image.spacing_mm) & ~body)
@@ -214,7 +213,7 @@ def joined(meshes: list[TriangleMesh]) -> TriangleMesh:
 
 
 def _without_specks(mask: Bools, least_voxels: float) -> Bools:
-    labels, _ = ndimage.label(mask, FULL)
+    labels, _ = scipy.ndimage.label(mask, FULL)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
     return np.asarray((sizes >= least_voxels)[labels])
@@ -225,11 +224,11 @@ def _unscanned_beside(dense: Bools, body: Bools, unscanned: Unscanned, spacing_m
 
     A padding that cuts the body is not free anywhere, as what is beyond a face of the image that cuts it.
     """
-    ends = ndimage.binary_dilation(dense, FULL) & unscanned.voxels & ~body
+    ends = scipy.ndimage.binary_dilation(dense, FULL) & unscanned.voxels & ~body
     if not ends.any():
         return np.zeros_like(dense)
-    beside = (ndimage.distance_transform_edt(~ends, sampling=spacing_mm) <= RIM_MM) & unscanned.voxels
-    cut = unscanned.padded & ndimage.binary_dilation(body, FULL)
+    beside = (scipy.ndimage.distance_transform_edt(~ends, sampling=spacing_mm) <= RIM_MM) & unscanned.voxels
+    cut = unscanned.padded & scipy.ndimage.binary_dilation(body, FULL)
     return np.asarray(beside | unscanned.padded if cut.any() else beside)
 
 
@@ -248,7 +247,7 @@ def _hulls_beyond(mask: Bools, image: OutsideImage) -> list[TriangleMesh]:
 
     Not beyond head and feet: there a table goes on as it is cut.
     """
-    labels, _ = ndimage.label(mask, FULL)
+    labels, _ = scipy.ndimage.label(mask, FULL)
     sizes = np.bincount(labels.ravel()) * float(np.prod(image.spacing_mm)) / 1000.0
     sizes[0] = 0.0
     bulky = (sizes >= BULKY_ML)[labels]
@@ -264,8 +263,8 @@ def _hulls_beyond(mask: Bools, image: OutsideImage) -> list[TriangleMesh]:
 def _prism(section: Floats, axis: int, end: int, image: OutsideImage) -> TriangleMesh | None:
     """What stands over the convex hull of points (n, 2) of one face of the image, from the face outward."""
     try:
-        rim = section[ConvexHull(section).vertices]
-    except QhullError:  # cannot be: whole voxels have an area
+        rim = section[scipy.spatial.ConvexHull(section).vertices]
+    except scipy.spatial.QhullError:  # cannot be: whole voxels have an area
         return None
     away = image.beyond_mm[axis] / image.spacing_mm[axis]
     near = -0.5 if end == 0 else image.hu.shape[axis] - 0.5

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU
 from puncture_twin.planning.base.arrays import Bools, Floats
@@ -23,13 +23,16 @@ def outside_air_fraction(hu: NDArray[np.float32], body: Bools, spacing_mm: Float
         tolerance_mm: How far the skin may be off.
     """
     air = hu < BODY_HU
-    wide = ndimage.distance_transform_edt(np.pad(air, 1, mode="edge"), sampling=spacing_mm)[1:-1, 1:-1, 1:-1] > WIDE_MM
-    labels, _ = ndimage.label(wide)
+    wide = (
+        scipy.ndimage.distance_transform_edt(np.pad(air, 1, mode="edge"), sampling=spacing_mm)[1:-1, 1:-1, 1:-1]
+        > WIDE_MM
+    )
+    labels, _ = scipy.ndimage.label(wide)
     outside = np.unique(labels[~body])
     ambient = np.isin(labels, outside[outside > 0])
     near_ambient = (
-        ndimage.distance_transform_edt(~ambient, sampling=spacing_mm) <= WIDE_MM if ambient.any() else ambient
+        scipy.ndimage.distance_transform_edt(~ambient, sampling=spacing_mm) <= WIDE_MM if ambient.any() else ambient
     )
-    deep = ndimage.distance_transform_edt(np.pad(body, 1, mode="edge"), sampling=spacing_mm)[1:-1, 1:-1, 1:-1]
+    deep = scipy.ndimage.distance_transform_edt(np.pad(body, 1, mode="edge"), sampling=spacing_mm)[1:-1, 1:-1, 1:-1]
     inside = deep > 2.0 * tolerance_mm
     return float((air & near_ambient)[inside].mean()) if inside.any() else 0.0

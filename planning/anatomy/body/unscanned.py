@@ -11,8 +11,8 @@ import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from puncture_twin.planning.base.arrays import Bools
 
@@ -122,7 +122,7 @@ def _padded(hu: NDArray[np.float32], circle: Bools) -> Bools:
         same = (hu == value) & ~circle
         if not _fills_a_corner(same):
             continue
-        labels, _ = ndimage.label(_block(same))
+        labels, _ = scipy.ndimage.label(_block(same))
         at_corners = np.unique(labels[_corners(hu)])
         padded |= np.isin(labels, at_corners[at_corners > 0])
     for value in np.unique(hu[padded]):
@@ -143,8 +143,8 @@ def _fills_a_corner(same: Bools) -> bool:
 
 def _block(same: Bools) -> Bools:
     """Voxels of a mask that lie in a cube of it, or beside one; beyond the image's faces the mask goes on."""
-    eroded = ndimage.minimum_filter(same.view(np.uint8), BLOCK_VOXELS, mode="nearest")
-    return np.asarray(ndimage.maximum_filter(eroded, 2 * BLOCK_VOXELS - 1, mode="nearest").view(bool) & same)
+    eroded = scipy.ndimage.minimum_filter(same.view(np.uint8), BLOCK_VOXELS, mode="nearest")
+    return np.asarray(scipy.ndimage.maximum_filter(eroded, 2 * BLOCK_VOXELS - 1, mode="nearest").view(bool) & same)
 
 
 def _measured_air_has_noise(hu: NDArray[np.float32], value: np.float32) -> bool:

@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import scipy
 from pydicom.dataelem import RawDataElement
 from pydicom.dataset import Dataset
-from scipy import ndimage
 from skimage.morphology import convex_hull_image
 
 from puncture_twin.planning.base.arrays import Bools, Floats
@@ -218,13 +218,13 @@ def _narrow_parts(points: Floats, filled: Bools) -> Bools:
     at = at[((at >= 0) & (at < filled.shape)).all(axis=1)]
     passed = np.zeros_like(filled)
     passed[at[:, 0], at[:, 1]] = True
-    wide = ndimage.binary_opening(filled, np.ones((2, 2)))
+    wide = scipy.ndimage.binary_opening(filled, np.ones((2, 2)))
     return passed & grown(passed & ~grown(wide))
 
 
 def grown(pixels: Bools) -> Bools:
     """The same pixels and their eight neighbours."""
-    return np.asarray(ndimage.maximum_filter(pixels.view(np.uint8), 3, mode="constant").view(bool))
+    return np.asarray(scipy.ndimage.maximum_filter(pixels.view(np.uint8), 3, mode="constant").view(bool))
 
 
 def _gaps(contours: tuple[Contour, ...]) -> list[tuple[int, int]]:

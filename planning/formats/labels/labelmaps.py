@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.volumes.volume_files import Volume
@@ -45,7 +45,7 @@ class LabelMap:
     @cached_property
     def boxes(self) -> dict[int, Box]:
         """The smallest index box around each label present."""
-        found = ndimage.find_objects(self.labels)
+        found = scipy.ndimage.find_objects(self.labels)
         return {label: box for label, box in enumerate(found, start=1) if box is not None}
 
     def labels_present(self) -> tuple[int, ...]:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
@@ -84,7 +84,7 @@ def label_centres(labelmap: LabelMap) -> dict[int, Floats]:
     """The middle of each label present, shape (3,), LPS mm."""
     middles = {}
     for label, box in labelmap.boxes.items():
-        index = np.array(ndimage.center_of_mass(labelmap.labels[box] == label)) + [axis.start for axis in box]
+        index = np.array(scipy.ndimage.center_of_mass(labelmap.labels[box] == label)) + [axis.start for axis in box]
         middles[label] = apply(labelmap.T_ct_index, index[None])[0]
     return middles
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.formats.guard import MAX_TRIANGLES
@@ -196,7 +196,7 @@ def _local(node: Node, where: str) -> Floats:
         if np.linalg.norm(node.rotation) == 0.0:
             refuse("rotation quaternion of length 0", where, allowed)
         T = np.eye(4)
-        T[:3, :3] = Rotation.from_quat(node.rotation).as_matrix() * np.array(node.scale)
+        T[:3, :3] = scipy.spatial.transform.Rotation.from_quat(node.rotation).as_matrix() * np.array(node.scale)
         T[:3, 3] = node.translation
     determinant = np.linalg.det(T[:3, :3])
     if not np.isfinite(determinant) or determinant == 0.0 or T[3].tolist() != [0.0, 0.0, 0.0, 1.0]:

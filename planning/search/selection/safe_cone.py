@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.case.angle_grid import AngleGrid
@@ -46,5 +46,5 @@ def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:
     barred = np.concatenate([vectors[~safe], outward(*grid.beyond())])
     if not len(barred):
         return np.full(int(safe.sum()), np.pi)
-    chord, _ = cKDTree(barred).query(vectors[safe])
+    chord, _ = scipy.spatial.cKDTree(barred).query(vectors[safe])
     return np.maximum(2 * np.arcsin(np.clip(chord / 2, 0.0, 1.0)) - DIAGONAL * grid.step, 0.0)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.case.angle_grid import AngleGrid
@@ -86,8 +85,8 @@ def _connected(grid: AngleGrid | None, safe: Bools) -> Ints:
         return np.arange(len(safe))
     pairs = grid.neighbours()
     pairs = pairs[safe[pairs].all(axis=1)]
-    links = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(len(safe), len(safe)))
-    return np.asarray(connected_components(links, directed=False)[1], np.int64)
+    links = scipy.sparse.coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(len(safe), len(safe)))
+    return np.asarray(scipy.sparse.csgraph.connected_components(links, directed=False)[1], np.int64)
 
 
 def _entry_area(found: Candidates, cell: Floats) -> Floats:

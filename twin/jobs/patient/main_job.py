@@ -1,4 +1,7 @@
-"""The main job, stage by stage: search, plan, rehearse, and the files that show each."""
+"""The main job, stage by stage: search, plan, rehearse, and the files that show each.
+
+A stage loads what it needs itself: a search without pictures waits for no planner, simulator or plotter.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,23 +18,17 @@ from puncture_twin.planning.base.output.draft import Draft
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.provenance import Input
-from puncture_twin.planning.certify.certificate import (
-    write_certificate,
-)
-from puncture_twin.planning.certify.cone_column import with_safe_cone
-from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.cross_check import CrossChecked
-from puncture_twin.planning.export.exporter import Exported, export_name, export_plan
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan, write_plan
-from puncture_twin.planning.plan.planner import make_plan
-from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.selection.choice import BEST, Choice, Pick, choose, choose_stated, with_file_read
 from puncture_twin.planning.search.table import write_table
-from puncture_twin.twin.jobs.patient.pictures import FILM, PAGE, PICTURES, ROOMS, with_pictures
+from puncture_twin.twin.jobs.patient.names import FILM, PAGE, PICTURES, ROOMS
 from puncture_twin.twin.jobs.patient.run import RoomCount, Run
-from puncture_twin.twin.report.scene.scene_picture import draw_scene
+
+if TYPE_CHECKING:
+    from puncture_twin.planning.export.exporter import Exported
 
 CERTIFICATE = "certificate.json"
 
@@ -56,7 +54,7 @@ def search_case(
         if certify_deg is not None:
             run = _certified(run, certify_deg, draft.folder)
         run = _with_table(run, draft.folder)
-        run = with_pictures(run, draft.folder) if pictures else run
+        run = _with_pictures(run, draft.folder) if pictures else run
     return _final(run, draft)
 
 
@@ -70,7 +68,7 @@ def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
     _refuse_without_arm(context)
     choice = _stated(context, out, choice)
     with _writing(out, "plan", context, ("candidates.parquet", "plan.json", *PICTURES), read=choice.read) as draft:
-        run = with_pictures(_searched_and_planned(context, draft.folder, choice), draft.folder)
+        run = _with_pictures(_searched_and_planned(context, draft.folder, choice), draft.folder)
     return _answered(_final(run, draft), out)
 
 
@@ -90,7 +88,7 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
         run = _searched_and_planned(context, draft.folder, choice)
         planned = run.files
         run = run if run.plan is None else rehearsed(run, draft.folder, rooms)
-        run = with_pictures(run, draft.folder)
+        run = _with_pictures(run, draft.folder)
         if run.rehearsal is not None:  # the page shows it: it goes with it
             shown = {draft.folder / name for name in PICTURES if name != PAGE}
             draft.split("rehearse", *(path for path in run.files if path not in {*planned, *shown}))
@@ -178,7 +176,9 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     Raises:
         InputError: A plan that does not belong to the case or does not hold any more.
     """
+    from puncture_twin.planning.plan.recheck import check_plan
     from puncture_twin.twin.jobs.patient.rehearsed import rehearsed
+    from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
     source, plan = _read_plan(plan_path, context.watcher.note)
     with context.stages.time("plan"):
@@ -220,6 +220,9 @@ def export(
     Raises:
         InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
     """
+    from puncture_twin.planning.export.exporter import export_name, export_plan
+    from puncture_twin.planning.plan.recheck import check_plan
+
     source, plan = _read_plan(plan_path, note)
     if context is not None:
         check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
@@ -233,6 +236,10 @@ def export(
 
 def _certified(run: Run, size_deg: float, out: Path) -> Run:
     """Certify the cap to a cell size, and rank again with the safe cones."""
+    from puncture_twin.planning.certify.certificate import write_certificate
+    from puncture_twin.planning.certify.cone_column import with_safe_cone
+    from puncture_twin.planning.certify.subdivision import certify
+
     context = run.context
     with context.stages.time("certify"):
         certificate = certify(context.case, context.anatomy, size=float(np.radians(size_deg)))
@@ -244,6 +251,8 @@ def _certified(run: Run, size_deg: float, out: Path) -> Run:
 
 def _planned(run: Run, out: Path, choice: Choice) -> Run:
     """Plan what is chosen; where an approach fails to a candidate of the grid, the grid says so."""
+    from puncture_twin.planning.plan.planner import make_plan
+
     context = run.context
     try:
         with context.stages.time("plan"):
@@ -261,3 +270,9 @@ def _with_table(run: Run, out: Path) -> Run:
     with run.context.stages.time("table"):
         write_table(run.candidates, run.context.provenance(), path)
     return run.with_files(path)
+
+
+def _with_pictures(run: Run, out: Path) -> Run:
+    from puncture_twin.twin.jobs.patient.pictures import with_pictures
+
+    return with_pictures(run, out)

@@ -14,6 +14,7 @@ from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
+from puncture_twin.twin.jobs.patient.names import FILM, PAGE, ROOMS, SLICES
 from puncture_twin.twin.jobs.patient.run import Run
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
 from puncture_twin.twin.report.budget_picture import draw_budget
@@ -22,12 +23,6 @@ from puncture_twin.twin.report.page.page import Uncertainty, write_page
 from puncture_twin.twin.report.scene.scene_picture import draw_scene
 from puncture_twin.twin.report.slices.sheet import Slices, draw_slices, write_sheet
 from puncture_twin.twin.report.slices.subject import Subject
-
-PAGE, SLICES = "report.html", "slices.png"
-PICTURES = ("map.png", "scene.png", SLICES, PAGE)
-"""What a search writes beside its table; slices only where there is a direction to show."""
-
-FILM, ROOMS = "rehearsal.mp4", "rooms.png"
 
 
 def with_pictures(run: Run, out: Path) -> Run:

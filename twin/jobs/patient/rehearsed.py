@@ -14,7 +14,7 @@ from typing import Any
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.twin.jobs.patient.pictures import FILM, ROOMS
+from puncture_twin.twin.jobs.patient.names import FILM, ROOMS
 from puncture_twin.twin.jobs.patient.run import RoomCount, Run
 from puncture_twin.twin.jobs.patient.summaries import rehearsal_summary
 from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_rooms

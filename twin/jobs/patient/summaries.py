@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from puncture_twin.planning.base.provenance import inputs_document
-from puncture_twin.planning.export.exporter import Exported
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.explain import finite
 from puncture_twin.planning.search.selection.windows import Window
 
-if TYPE_CHECKING:  # it brings the simulator with it
+if TYPE_CHECKING:  # they bring export and simulator with them
+    from puncture_twin.planning.export.exporter import Exported
     from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
 
 

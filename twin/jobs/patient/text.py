@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from puncture_twin.planning.export.exporter import Exported
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.constraints import closest_miss
@@ -16,7 +15,10 @@ from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
 from puncture_twin.twin.jobs.patient.budget import budget_lines
 from puncture_twin.twin.jobs.patient.run import Run
 from puncture_twin.twin.jobs.patient.summaries import plan_summary, rehearsal_summary
-from puncture_twin.twin.report.page.page import TRUTH_IS_BELIEF
+from puncture_twin.twin.report.numbers import TRUTH_IS_BELIEF
+
+if TYPE_CHECKING:  # it brings the planner with it
+    from puncture_twin.planning.export.exporter import Exported
 
 LEAST_SOURCE = 0.005
 """Of the variance: a smaller source is not named to people."""

@@ -16,6 +16,7 @@ from puncture_twin.planning.search.doubt import Doubt
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.planning.search.selection.windows import find_windows
 from puncture_twin.twin.report.numbers import (
+    TRUTH_IS_BELIEF,
     demanding,
     nearest_structure,
     needle_words,
@@ -34,11 +35,6 @@ from puncture_twin.twin.report.page.page_scene import scene_figure
 from puncture_twin.twin.report.page.page_slices import SHOWN_TONES, slices_data
 from puncture_twin.twin.report.page.template import Card, plotly_script, script_json, write_html
 from puncture_twin.twin.report.slices.sheet import Slices
-
-TRUTH_IS_BELIEF = (
-    "in this rehearsal the patient lies exactly where they are believed to lie: what the tip misses is the joints' "
-    "alone, and says nothing about the registration"
-)
 
 
 class Uncertainty(NamedTuple):
