@@ -165,6 +165,7 @@ class StructureSection(Section):
     label: Label | None = None
     ct: str | None = None
     cut: tuple[Literal["right", "left", "front", "back", "feet", "head"], ...] | None = None
+    hu: Annotated[Number, Field(ge=-1024, le=30_000)] | None = None
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:

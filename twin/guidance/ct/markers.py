@@ -1,0 +1,84 @@
+"""Markers found in a CT, by a voxel and by less than a voxel.
+
+The rule of Chen 2019, section 3.1: the number of the slice that shows a marker best, times the spacing, and its place
+in that slice to 1 mm. Beside it the middle of the metal, by weights (`metal`).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.points.point_files import NamedPoints
+from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.twin.guidance.ct.metal import Metal, centroid, metal_pieces, metal_weights, spacing_mm
+
+READING_MM = 1.0
+"""To what a person reads a place in a slice."""
+FARTHEST_MM = 15.0
+"""A marker lies no farther from where it is expected."""
+LARGEST_MM = 25.0
+"""A larger piece of metal is no marker."""
+
+
+class Markers(NamedTuple):
+    """What was found, in the order of what was expected.
+
+    Attributes:
+        fine: By the middle of the metal.
+        rule: By slice number and millimetre.
+    """
+
+    fine: NamedPoints
+    rule: NamedPoints
+
+
+def find_markers(volume: Volume, expected: NamedPoints) -> Markers:
+    """Find markers of metal near where they are expected.
+
+    Args:
+        volume: The CT, LPS; its third axis runs across the slices.
+        expected: Roughly where each is, LPS mm: names the pieces of metal.
+
+    Raises:
+        InputError: A marker that no piece of metal is near to.
+    """
+    pieces = [piece for piece in metal_pieces(volume) if piece.size_mm <= LARGEST_MM]
+    chosen = _named(pieces, expected, volume)
+    weights = [metal_weights(volume, piece) for piece in chosen]
+    fine = [centroid(some, piece.box, volume.T_ct_index) for some, piece in zip(weights, chosen, strict=True)]
+    rule = [_by_rule(some, piece, volume) for some, piece in zip(weights, chosen, strict=True)]
+    return Markers(*(NamedPoints(expected.names, np.array(points), Space.LPS) for points in (fine, rule)))
+
+
+def _named(pieces: list[Metal], expected: NamedPoints, volume: Volume) -> list[Metal]:
+    """A piece for each name, such that all distances together are least."""
+    middles = np.array([piece.middle_ct for piece in pieces]).reshape(-1, 3)
+    distance = np.linalg.norm(expected.points[:, None] - middles, axis=2)
+    rows, columns = linear_sum_assignment(np.where(distance < FARTHEST_MM, distance, 1e6))
+    found = {int(row): int(column) for row, column in zip(rows, columns, strict=True)}
+    for row, name in enumerate(expected.names):
+        if row not in found or distance[row, found[row]] >= FARTHEST_MM:
+            allowed = f"a piece of metal within {FARTHEST_MM:g} mm of where it is expected"
+            raise InputError(f"marker {name} is not in the image", where=volume.path, allowed=allowed)
+    return [pieces[found[row]] for row in range(len(expected.names))]
+
+
+def _by_rule(weights: Floats, piece: Metal, volume: Volume) -> Floats:
+    """The slice with most of the metal, and there its middle to a millimetre."""
+    k = int(np.argmax(weights.sum(axis=(0, 1))))
+    i, j = (float(line @ np.arange(len(line)) / line.sum()) for line in _sides(weights[:, :, k]))
+    spacing = spacing_mm(volume)
+    index = np.array([i, j, k]) + [axis.start for axis in piece.box]
+    index[:2] = np.round(index[:2] * spacing[:2] / READING_MM) * READING_MM / spacing[:2]
+    return apply(volume.T_ct_index, index)
+
+
+def _sides(slice_weights: Floats) -> tuple[Floats, Floats]:
+    return slice_weights.sum(axis=1), slice_weights.sum(axis=0)

@@ -1,0 +1,8 @@
+"""The CT scanner: a scene of solids with Hounsfield units in, a series of slices out; and what a person reads off it.
+
+It knows the ground truth. What it writes (DICOM, NIfTI) and `readings` are all that guidance sees of it.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,203 @@
+"""A case as a scene in the scanner: its structures with Hounsfield units, markers of metal, the table, a needle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.beyond_labels import BEYOND_LABELS
+from puncture_twin.planning.anatomy.structure import Structure
+from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.place.bed import bed_frame
+from puncture_twin.planning.registration.skin_fit import skin_fit
+from puncture_twin.twin.plant.scanner.hounsfield import METAL_HU, SOFT_TISSUE_HU, TABLE_HU, default_hu
+from puncture_twin.twin.plant.scanner.image import ScanSettings
+from puncture_twin.twin.plant.scanner.solids import Solid, ball, box, check_closed, rod
+
+MARKER_MM, MARKER_THICK_MM = 8.0, 1.5
+"""A disc of metal of the size of a shirt button (ours; Chen 2019 does not state one); a ball has the diameter."""
+MOST_UNIFORM = np.sqrt(12.0)
+"""Width of a cell over the standard deviation of what is read to it."""
+
+MarkerKind = Literal["disc", "ball", "none"]
+
+
+@dataclass(frozen=True, eq=False)
+class TrueRod:
+    """A needle where it truly is, in the CT's frame of the case: tip (3,), mm, and direction to the tip (3,), unit."""
+
+    tip_ct: Floats
+    forward_ct: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class CaseScene:
+    """What lies in the scanner, in its frame (LPS of the scan, mm).
+
+    Attributes:
+        solids: In the order in which they fill each other's place.
+        T_scan_ct: Shape (4, 4): the case's frame to the scanner's; a rotation, never a mirror.
+        skin: The body's surface.
+        cut: Shape (3, 2): at which ends the body goes on beyond its surface.
+        behind_mm: To where along y the table reaches; as the skin where there is none.
+        markers: True positions, or None.
+        listed: The case's own readings of them.
+        target: Shape (3,).
+    """
+
+    solids: tuple[Solid, ...]
+    T_scan_ct: Floats
+    skin: TriangleMesh
+    cut: Bools
+    behind_mm: float
+    markers: NamedPoints | None
+    listed: NamedPoints | None
+    target: Floats
+
+
+def case_scene(
+    case: Case,
+    anatomy: Anatomy,
+    settings: ScanSettings,
+    rng: np.random.Generator,
+    *,
+    marker: MarkerKind = "disc",
+    needle: TrueRod | None = None,
+) -> CaseScene:
+    """Lay a case into the scanner.
+
+    Args:
+        case: The case.
+        anatomy: Its structures.
+        settings: By how much the patient is turned; the cells of readings where the case declares none.
+        rng: Draws where in its cell each marker truly is.
+        marker: What stands at each marker's place.
+        needle: Drawn of metal, its usable length.
+
+    Raises:
+        InputError: A structure's surface is open.
+    """
+    T = scan_frame(case, settings.turn)
+    listed = None if marker == "none" else _listed_markers(case)
+    true = None if listed is None else _drawn_in_cells(case, listed, settings, rng)
+    solids = [*_tables(case), *_body(case, anatomy)]
+    if true is not None:
+        solids += _markers(true, skin_fit(true.points, anatomy.skin).normals_ct, marker)
+    if needle is not None:
+        start = needle.tip_ct - case.needle.shaft_mm * needle.forward_ct
+        solids.append(Solid("needle", rod(start, needle.tip_ct, case.needle.diameter_mm), METAL_HU))
+    view = anatomy.skin.field_of_view
+    return CaseScene(
+        solids=tuple(one._replace(mesh=one.mesh.transformed(T)) for one in solids),
+        T_scan_ct=T,
+        skin=anatomy.skin.mesh.transformed(T),
+        cut=np.zeros((3, 2), np.bool_) if view is None else view.cut,
+        behind_mm=max([float(one.mesh.transformed(T).bounds[1, 1]) for one in _tables(case)], default=-np.inf),
+        markers=_moved(true, T),
+        listed=_moved(listed, T),
+        target=apply(T, case.target_ct),
+    )
+
+
+def scan_frame(case: Case, turn: float) -> Floats:
+    """T_scan_ct: z along the bed to the head, y down; a patient's own axes as they are.
+
+    A frame of its own is laid on the bed by its rotation: z along `bed_frame`'s x, y against its z, x = y × z. Its
+    determinant is 1, where swapping two axes would be a mirror that no distance shows.
+
+    Args:
+        case: The case.
+        turn: About the bed's direction through the target, rad.
+    """
+    R = np.eye(3)
+    if case.space is Space.LOCAL:
+        bed = bed_frame(case)[:3, :3]
+        R = np.stack([-bed[:, 1], -bed[:, 2], bed[:, 0]])
+    turned = exp_rotation(np.array([0.0, 0.0, turn]))
+    middle = R @ case.target_ct
+    return pose(turned @ R, middle - turned @ middle)
+
+
+def numbered(anatomy: Anatomy) -> dict[str, int]:
+    """The label of each structure that a segmentation would show."""
+    names = [one.name for one in anatomy.structures if one.name != BEYOND_LABELS]
+    return {name: number for number, name in enumerate(names, start=1)}
+
+
+def _body(case: Case, anatomy: Anatomy) -> list[Solid]:
+    """The skin, then what may be crossed, then what demands clearance: the more it demands, the later.
+
+    So where two structures overlap, the label map keeps the one whose margin is larger, and a search on it never finds
+    more clearance than on both.
+    """
+    stated = {one.name: one.hu for one in case.structure if one.hu is not None}
+    labels, region = numbered(anatomy), case.region or "other"
+    ordered = sorted((one for one in anatomy.structures if one.name in labels), key=_filling)
+    skin = Solid("skin", anatomy.skin.mesh, stated.get(_skin_name(case), SOFT_TISSUE_HU))
+    solids = [Solid(s.name, s.mesh, stated.get(s.name, default_hu(s.name, region)), labels[s.name]) for s in ordered]
+    return [check_closed(one, str(case.path)) for one in (skin, *solids)]
+
+
+def _filling(structure: Structure) -> tuple[bool, float, float]:
+    corners = structure.mesh.triangles
+    volume = np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+    return structure.demands_margin, structure.margin_mm, -abs(float(volume))
+
+
+def _skin_name(case: Case) -> str:
+    return next(one.name for one in case.structure if one.role == "skin")
+
+
+def _tables(case: Case) -> list[Solid]:
+    boxes = [one for one in case.obstacles if one.frame == "ct"]
+    return [Solid(one.name, box(one.center_mm, one.size_mm), TABLE_HU) for one in boxes]
+
+
+def _listed_markers(case: Case) -> NamedPoints | None:
+    if case.registration is None:
+        return None
+    name = case.registration.markers_ct
+    return parse_points(case.files.content(name), case.folder / name, default_space=case.space)
+
+
+def _drawn_in_cells(case: Case, listed: NamedPoints, settings: ScanSettings, rng: np.random.Generator) -> NamedPoints:
+    """True places anywhere in the cell of each reading, CT frame.
+
+    Readings are whole cells apart: left where they stand, all markers and the target would err alike in the next scan,
+    and a registration would not see it.
+    """
+    if case.errors is None:
+        widths, axes = np.array([settings.pixel_mm, settings.pixel_mm, settings.spacing_mm]), np.eye(3)
+    else:
+        variances, axes = np.linalg.eigh(case.errors.marker_cov_ct)
+        widths = MOST_UNIFORM * np.sqrt(variances)
+    within = rng.uniform(-0.5, 0.5, listed.points.shape) * widths
+    return NamedPoints(listed.names, listed.points + within @ axes.T, listed.space)
+
+
+def _markers(true: NamedPoints, normals: Floats, kind: MarkerKind) -> list[Solid]:
+    solids = []
+    for name, point, normal in zip(true.names, true.points, normals, strict=True):
+        half = MARKER_THICK_MM / 2 * normal
+        mesh = ball(point, MARKER_MM) if kind == "ball" else rod(point - half, point + half, MARKER_MM)
+        solids.append(Solid(f"marker {name}", mesh, METAL_HU))
+    return solids
+
+
+def _moved(points: NamedPoints | None, T_scan_ct: Floats) -> NamedPoints | None:
+    return None if points is None else NamedPoints(points.names, apply(T_scan_ct, points.points), Space.LPS)
+
+
+def mesh_bounds(meshes: Sequence[TriangleMesh]) -> Floats:
+    """Lowest and highest corner of all, shape (2, 3), mm."""
+    bounds = np.stack([mesh.bounds for mesh in meshes])
+    return np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])

@@ -1,0 +1,60 @@
+"""Which voxels a scan has: the whole body, or as much of it as the field of view shows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.volumes.volume_header import MAX_VOXELS, VolumeGrid
+from puncture_twin.twin.plant.scanner.case_scene import CaseScene
+from puncture_twin.twin.plant.scanner.image import ScanSettings
+
+AIR_MM = 15.0
+"""Air around the body: a needle's entry is not at the image's edge."""
+BEHIND_MM = 60.0
+"""Of a table behind the body, so much is shown."""
+FINEST_MM = 1e-4
+"""Positions are multiples of it, so that DICOM's decimal strings hold them whole."""
+
+
+def scan_grid(scene: CaseScene, settings: ScanSettings, rng: np.random.Generator) -> VolumeGrid:
+    """The voxels of a scan, axes along LPS.
+
+    Where the first of them falls is drawn within one voxel: a patient lies anywhere between two slices.
+
+    Args:
+        scene: What lies in the scanner; where the body goes on beyond its surface, the scan ends within it.
+        settings: Spacing, pixel and field of view.
+        rng: Draws where the grid falls.
+
+    Raises:
+        InputError: No slice, or more voxels than any reader takes.
+    """
+    low, high = _shown(scene, settings)
+    spacing = np.array([settings.pixel_mm, settings.pixel_mm, settings.spacing_mm])
+    first = np.round(low + (0.5 + rng.uniform(0.0, 1.0, 3)) * spacing, 4)
+    counts = np.floor((high - first) / spacing + 0.5).astype(int)
+    if counts.min() < 2 or np.prod(counts, dtype=float) > MAX_VOXELS:
+        shown = " x ".join(map(str, counts))
+        allowed = f"2 voxels or more along each axis, {MAX_VOXELS:,} at most"
+        raise InputError(f"a scan of {shown} voxels", where="scan", allowed=allowed)
+    T = np.diag([*spacing, 1.0])
+    T[:3, 3] = first
+    return VolumeGrid((int(counts[0]), int(counts[1]), int(counts[2])), T, {})
+
+
+def _shown(scene: CaseScene, settings: ScanSettings) -> tuple[Floats, Floats]:
+    """Lowest and highest corner of the image."""
+    low, high = scene.skin.bounds
+    low = low - np.where(scene.cut[:, 0], 0.0, AIR_MM)
+    high = high + np.where(scene.cut[:, 1], 0.0, AIR_MM)
+    if np.isfinite(scene.behind_mm):
+        high[1] = max(high[1], min(scene.behind_mm + AIR_MM, high[1] + BEHIND_MM))
+    if settings.fov_mm is not None:
+        middle = (low + high) / 2
+        low[:2], high[:2] = middle[:2] - settings.fov_mm / 2, middle[:2] + settings.fov_mm / 2
+    if settings.length_mm is not None:
+        low[2] = max(low[2], scene.target[2] - settings.length_mm / 2)
+        high[2] = min(high[2], scene.target[2] + settings.length_mm / 2)
+    return low, high
