@@ -591,6 +591,42 @@ def servo(
 
 
 @app.command()
+def scan(
+    case: CaseArgument,
+    out_dir: OutOfCaseOption = None,
+    spacing: Annotated[float, typer.Option("--spacing", min=0.3, max=10, help="Of slices as thick, mm.")] = 2.5,
+    pixel: Annotated[float, typer.Option("--pixel", min=0.2, max=5, help="Side of a pixel, mm.")] = 0.8,
+    noise: Annotated[float, typer.Option("--noise", min=0, max=200, help="Standard deviation, HU.")] = 20.0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of noise, grid and the markers' true places.")] = 0,
+    fov: Annotated[
+        float | None, typer.Option("--fov", min=20, max=2000, help="Side of the image, mm.", show_default="the body")
+    ] = None,
+    length: Annotated[
+        float | None, typer.Option("--length", min=5, max=5000, help="About the target.", show_default="the body")
+    ] = None,
+    turn: Annotated[float, typer.Option("--turn", min=-180, max=180, help="The patient's, about the bed, °.")] = 0.0,
+    marker: Annotated[str, typer.Option("--marker", metavar="disc|ball|none", help="Of metal, 8 mm.")] = "disc",
+    rehearsal: Annotated[
+        Path | None, typer.Option("--rehearsal", metavar="rehearsal.json", help="Its needle in a control CT.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Scan a case with a virtual CT; write DICOM, NIfTI, labels, and what is read off it beside the truth."""
+    from math import radians
+
+    from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.experiment.scan_job import ScanRequest, parse_marker, scan_case
+    from puncture_twin.twin.jobs.experiment.scan_text import scan_text
+    from puncture_twin.twin.plant.scanner.image import ScanSettings
+
+    settings = ScanSettings(spacing, pixel, noise, seed=seed, fov_mm=fov, length_mm=length, turn=radians(turn))
+    request = ScanRequest(settings, parse_marker(marker), rehearsal)
+    with progress_display() as progress:
+        run = scan_case(prepare(case, arm=False, watcher=progress), _out(out_dir, case, "scan"), request)
+    _print(run.summary(), scan_text(run), as_json)
+
+
+@app.command()
 def reproduce(
     paper: Annotated[str, typer.Argument(metavar="chen2019|liu2007|axp-ybq", help="Which paper.")],
     out_dir: OutOfCaseOption = None,

@@ -50,9 +50,9 @@ def spacing_mm(volume: Volume) -> Floats:
     return np.asarray(np.linalg.norm(volume.T_ct_index[:3, :3], axis=0))
 
 
-def metal_pieces(volume: Volume) -> Iterator[Metal]:
-    """Every connected piece of metal, diagonal neighbours included."""
-    labels, _ = ndimage.label(volume.values > METAL_HU, structure=np.ones((3, 3, 3)))
+def metal_pieces(volume: Volume, level_hu: float = METAL_HU) -> Iterator[Metal]:
+    """Every connected piece of metal, diagonal neighbours included, from a level on."""
+    labels, _ = ndimage.label(volume.values > level_hu, structure=np.ones((3, 3, 3)))
     spacing = spacing_mm(volume)
     around = np.ceil(AROUND_MM / spacing).astype(int)
     for number, found in enumerate(ndimage.find_objects(labels), start=1):
@@ -64,22 +64,36 @@ def metal_pieces(volume: Volume) -> Iterator[Metal]:
         yield Metal(box, voxels, middle, float(((high - low) * spacing).max()))
 
 
-def metal_weights(volume: Volume, metal: Metal) -> Floats:
-    """How much metal each voxel of a piece's box holds, 0 to 1, as far as a clipped range tells.
+def metal_parts(volume: Volume, metal: Metal) -> Floats:
+    """How much of each voxel of a piece's box is metal, 0 to 1, as far as a clipped range tells.
 
     What a voxel would show without metal is what the nearest voxel shows that is too far away to be blurred by it:
     air on one side of a marker and skin on the other. Without that, air would hide the outer edge of a marker.
     """
     values = volume.values[metal.box].astype(np.float64)
     spacing = spacing_mm(volume)
-    outside = ndimage.distance_transform_edt(~metal.voxels, spacing) > BLUR_MM
+    every = metal.voxels | (values > METAL_HU)
+    outside = ndimage.distance_transform_edt(~every, spacing) > BLUR_MM
     if not outside.any():
         return np.asarray(metal.voxels, dtype=np.float64)
     nearest = ndimage.distance_transform_edt(~outside, spacing, return_distances=False, return_indices=True)
     background = _smooth(values, outside)[tuple(nearest)]
     parts = (values - background) / (SOLID_HU - background)
-    full = (float(volume.values.max()) - background.max()) / (SOLID_HU - background.max())
-    return np.where(outside | (parts < LEAST_PART), 0.0, np.minimum(parts, full) / full)
+    others = every & ~metal.voxels
+    mine = ndimage.distance_transform_edt(~metal.voxels, spacing)
+    strange = others.any() and mine >= ndimage.distance_transform_edt(~others, spacing)
+    return np.where(outside | strange | (parts < LEAST_PART), 0.0, parts)
+
+
+def full_part(volume: Volume) -> float:
+    """From which part of metal on a voxel is clipped, in soft tissue."""
+    return float(volume.values.max()) / SOLID_HU
+
+
+def metal_weights(volume: Volume, metal: Metal) -> Floats:
+    """The same, counted as full from where it may be clipped: in air and in tissue alike."""
+    full = full_part(volume)
+    return np.asarray(np.minimum(metal_parts(volume, metal), full) / full)
 
 
 def _smooth(values: Floats, some: Bools) -> Floats:

@@ -1,26 +1,62 @@
-"""A needle in a CT: its axis by a line through the middles of its cross sections, its tip where half of it is left."""
+"""A needle in a CT: its axis by the line of least squares through its metal, its tip by a blurred rod's image."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
+from numpy.typing import NDArray
+from scipy.optimize import least_squares, minimize_scalar
+from scipy.special import ndtr
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.twin.guidance.ct.metal import Metal, centroid, metal_pieces, metal_weights
+from puncture_twin.twin.guidance.ct.metal import (
+    AROUND_MM,
+    METAL_HU,
+    Metal,
+    centroid,
+    full_part,
+    metal_parts,
+    metal_pieces,
+    metal_weights,
+    spacing_mm,
+)
 
 SHORTEST_MM = 20.0
 """A shorter piece of metal is no needle."""
-STEP_MM = 0.25
-"""Along the needle."""
-WIDE_MM = 4.0
-"""About the axis, so far a cross section is looked at."""
-SHAFT_MM = (5.0, 25.0)
-"""Behind the tip, where the needle is whole: what a full cross section shows."""
+SHAFT_MM = 12.0
+"""Behind the foremost voxel of metal, and beyond it, so far the needle is looked at."""
+WIDE_MM = 3.0
+"""About the axis of a needle, so far; of a wide rod half of its width."""
+WIDEST_SLICE = 0.6
+"""Of a slice's thickness: one slice at least is so near to the axis."""
+SLENDER = 8.0
+"""Length over width: a rib is bent, and so wider."""
+BLUR_SIGMA_MM = 0.5
+"""Assumed of reconstruction and pixel together, in the plane."""
+
+
+LEVELS_HU = (METAL_HU, 1000.0, 600.0, 400.0)
+"""From what on voxels are taken for metal, one after the other until a needle is found: thick slices dilute it."""
+
+
+FITTED_MM = 80.0
+"""Behind the tip, so much of a needle is held to be straight."""
+GROWTHS = 2
+"""The first line through a short piece is not yet the needle's."""
+LARGEST_GAP_MM = 6.0
+"""Along a needle, between voxels that show it."""
+
+
+class _Line(NamedTuple):
+    """Middle (3,) and direction (3,), unit, of an axis, LPS mm; and how far the metal lies from it (rms)."""
+
+    middle: Floats
+    forward: Floats
+    width_mm: float
 
 
 class FoundNeedle(NamedTuple):
@@ -37,23 +73,58 @@ class FoundNeedle(NamedTuple):
     width_mm: float
 
 
-def find_needle(volume: Volume, target_ct: Floats) -> FoundNeedle:
+def find_needle(volume: Volume, target_ct: Floats, diameter_mm: float | None = None) -> FoundNeedle:
     """Find the needle of a control CT.
 
     Args:
         volume: The CT.
         target_ct: Shape (3,), LPS mm: its tip is the end nearer to this.
+        diameter_mm: Of the needle; None for a rod that is wider than three pixels.
 
     Raises:
         InputError: No long piece of metal.
     """
-    rods = [piece for piece in metal_pieces(volume) if piece.size_mm >= SHORTEST_MM]
-    if not rods:
-        allowed = f"a piece of metal of {SHORTEST_MM:g} mm or more"
-        raise InputError("no needle in the image", where=volume.path, allowed=allowed)
-    metal = min(rods, key=lambda piece: _gap(piece, volume, target_ct))
-    middle, forward, width = _axis(volume, metal, target_ct)
-    return FoundNeedle(_tip(volume, metal, middle, forward), forward, width)
+    for level in LEVELS_HU[: 1 if diameter_mm is None else None]:
+        rods = [piece for piece in metal_pieces(volume, level) if piece.size_mm >= SHORTEST_MM]
+        for metal in sorted(rods, key=lambda piece: _gap(piece, volume, target_ct)):
+            line = _axis(volume, metal, target_ct)
+            if diameter_mm is None or metal.size_mm > SLENDER * line.width_mm:
+                if diameter_mm is None:
+                    return FoundNeedle(_tip(volume, metal, line, None), line.forward, line.width_mm)
+                metal, line = _whole(volume, metal, line, target_ct)
+                return _fitted(volume, metal, line, diameter_mm)
+    allowed = f"a straight piece of metal of {SHORTEST_MM:g} mm or more"
+    raise InputError("no needle in the image", where=volume.path, allowed=allowed)
+
+
+def _whole(volume: Volume, metal: Metal, line: _Line, target_ct: Floats) -> tuple[Metal, _Line]:
+    """All of a needle of which thick slices, between which it is diluted, show only pieces at first."""
+    for _ in range(GROWTHS):
+        at = np.argwhere(volume.values > LEVELS_HU[-1])
+        points = apply(volume.T_ct_index, at.astype(float)) - line.middle
+        along = points @ line.forward
+        across = np.linalg.norm(points - along[:, None] * line.forward, axis=1)
+        near = across <= WIDE_MM + WIDEST_SLICE * float(spacing_mm(volume).max())
+        at, along = at[near], along[near]
+        order = np.argsort(along)
+        parts = np.concatenate([[0], np.cumsum(np.diff(along[order]) > LARGEST_GAP_MM)])
+        own = parts[np.argmin(np.abs(along[order]))]
+        metal = _piece(volume, at[order[parts == own]])
+        line = _axis(volume, metal, target_ct)
+    return metal, line
+
+
+def _piece(volume: Volume, at: NDArray[np.int64]) -> Metal:
+    """Voxels (n, 3) as a piece of metal."""
+    spacing = spacing_mm(volume)
+    around = np.ceil(AROUND_MM / spacing).astype(int)
+    low, high = at.min(axis=0), at.max(axis=0) + 1
+    begin, end = np.maximum(low - around, 0), np.minimum(high + around, volume.values.shape)
+    voxels = np.zeros(end - begin, dtype=np.bool_)
+    voxels[tuple((at - begin).T)] = True
+    box = (slice(begin[0], end[0]), slice(begin[1], end[1]), slice(begin[2], end[2]))
+    middle = apply(volume.T_ct_index, at.mean(axis=0))
+    return Metal(box, voxels, middle, float(((high - low) * spacing).max()))
 
 
 def _gap(metal: Metal, volume: Volume, point_ct: Floats) -> float:
@@ -61,7 +132,7 @@ def _gap(metal: Metal, volume: Volume, point_ct: Floats) -> float:
     return float(np.linalg.norm(apply(volume.T_ct_index, index.astype(float)) - point_ct, axis=1).min())
 
 
-def _axis(volume: Volume, metal: Metal, target_ct: Floats) -> tuple[Floats, Floats, float]:
+def _axis(volume: Volume, metal: Metal, target_ct: Floats) -> _Line:
     """Middle and direction of the weighted line of least squares, and how far the metal lies from it."""
     weights = metal_weights(volume, metal)
     at = np.argwhere(weights > 0)
@@ -71,39 +142,106 @@ def _axis(volume: Volume, metal: Metal, target_ct: Floats) -> tuple[Floats, Floa
     spread = (points - middle) * np.sqrt(heavy / heavy.sum())[:, None]
     _, sizes, axes = np.linalg.svd(spread, full_matrices=False)
     forward = axes[0] if (target_ct - middle) @ axes[0] > 0 else -axes[0]
-    return middle, forward, float(np.hypot(sizes[1], sizes[2]))
+    return _Line(middle, forward, float(np.hypot(sizes[1], sizes[2])))
 
 
-def _tip(volume: Volume, metal: Metal, middle: Floats, forward: Floats) -> Floats:
-    """Where the metal of a cross section falls to half of what the shaft behind shows."""
-    weights = metal_weights(volume, metal)
-    T_index_ct = np.linalg.inv(volume.T_ct_index)
-    along = np.arange(-np.ceil(np.linalg.norm(middle - _corner(volume, metal, forward))), WIDE_MM * 4, STEP_MM)
-    end = _corner(volume, metal, forward)
-    stations = middle + ((end - middle) @ forward + along[:, None]) * forward
-    side = np.linalg.svd(forward[None])[2][1:]
-    grid = np.arange(-WIDE_MM, WIDE_MM + STEP_MM, 2 * STEP_MM)
-    u, v = (one.ravel() for one in np.meshgrid(grid, grid))
-    disc = np.hypot(u, v) <= WIDE_MM
-    section = u[disc, None] * side[0] + v[disc, None] * side[1]
-    index = apply(T_index_ct, stations[:, None] + section) - [axis.start for axis in metal.box]
-    profile = ndimage.map_coordinates(weights, np.moveaxis(index, -1, 0), order=1, cval=0.0).sum(axis=1)
-    return _half(profile, stations, forward)
+def _tip(volume: Volume, metal: Metal, line: _Line, diameter_mm: float | None) -> Floats:
+    """The end of the rod whose blurred and clipped image is nearest to the voxels about the axis."""
+    parts, full = metal_parts(volume, metal), full_part(volume)
+    index = np.argwhere(np.ones(parts.shape, dtype=bool))
+    points = apply(volume.T_ct_index, index + np.array([axis.start for axis in metal.box], dtype=float)) - line.middle
+    along = points @ line.forward
+    across = np.linalg.norm(points - along[:, None] * line.forward, axis=1)
+    end = float(along[parts.ravel() > full / 2].max())
+    thin = diameter_mm is not None
+    wide = max(WIDE_MM if thin else line.width_mm / 2, WIDEST_SLICE * float(spacing_mm(volume).max()))
+    near = (across <= wide) & (np.abs(along - end) <= SHAFT_MM)
+    seen, points = np.minimum(parts.ravel()[near], full), points[near]
+    image = _Rod(line.forward, _blur(volume), diameter_mm)
+
+    def misfit(tip: float) -> float:
+        return float(np.sum((np.minimum(image.parts(points - tip * line.forward), full) - seen) ** 2))
+
+    found = minimize_scalar(misfit, bounds=(end - SHAFT_MM / 2, end + SHAFT_MM / 2), method="bounded")
+    return line.middle + float(found.x) * line.forward
 
 
-def _corner(volume: Volume, metal: Metal, forward: Floats) -> Floats:
-    """The voxel of the piece that lies foremost, LPS mm."""
-    index = np.argwhere(metal.voxels) + [axis.start for axis in metal.box]
-    points = apply(volume.T_ct_index, index.astype(float))
-    return np.asarray(points[np.argmax(points @ forward)])
+def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float) -> FoundNeedle:
+    """Tip and direction of the thin rod whose blurred and clipped image is nearest to the voxels about it."""
+    start, full, blur = _tip(volume, metal, line, diameter_mm), full_part(volume), _blur(volume)
+    parts = np.minimum(metal_parts(volume, metal), full).ravel()
+    index = np.argwhere(np.ones(metal.voxels.shape, dtype=bool)) + [axis.start for axis in metal.box]
+    points = apply(volume.T_ct_index, index.astype(float)) - start
+    along = points @ line.forward
+    across = np.linalg.norm(points - along[:, None] * line.forward, axis=1)
+    reach = WIDE_MM + WIDEST_SLICE * float(spacing_mm(volume).max())
+    near = (across <= reach) & (along > -FITTED_MM) & (along < SHAFT_MM)
+    side = np.linalg.svd(line.forward[None])[2][1:]
+
+    def rod(change: Floats) -> tuple[Floats, Floats]:
+        forward = line.forward + change[3:] @ side
+        return change[:3], forward / np.linalg.norm(forward)
+
+    def misfit(change: Floats) -> Floats:
+        shift, forward = rod(change)
+        image = _Rod(forward, blur, diameter_mm).parts(points[near] - shift)
+        return np.asarray(np.minimum(image, full) - parts[near])
+
+    shift, forward = rod(least_squares(misfit, np.zeros(5), x_scale=[1.0, 1.0, 1.0, 0.02, 0.02]).x)
+    return FoundNeedle(start + shift, forward, line.width_mm)
 
 
-def _half(profile: Floats, stations: Floats, forward: Floats) -> Floats:
-    """The foremost station at half of the shaft's level, between two stations."""
-    above = int(np.flatnonzero(profile > 0.5 * profile.max())[-1])
-    behind = (stations[above] - stations) @ forward
-    shaft = (behind >= SHAFT_MM[0]) & (behind <= SHAFT_MM[1])
-    level = 0.5 * float(np.median(profile[shaft] if shaft.any() else profile[: above + 1]))
-    last = int(np.flatnonzero(profile > level)[-1])
-    drop = profile[last] - (profile[last + 1] if last + 1 < len(profile) else 0.0)
-    return np.asarray(stations[last] + (profile[last] - level) / drop * STEP_MM * forward)
+class _Rod(NamedTuple):
+    """A rod that ends in the origin, blurred by a Gaussian.
+
+    Attributes:
+        forward: Shape (3,), unit, to its end.
+        blur: Shape (3, 3), mm², covariance.
+        diameter_mm: None for a rod that is much wider than the blur: then only what is near its axis is right.
+    """
+
+    forward: Floats
+    blur: Floats
+    diameter_mm: float | None
+
+    def parts(self, points: Floats) -> Floats:
+        """How much of each point (n, 3), mm, is the rod.
+
+        Of a thin rod: π r² times the integral of the Gaussian's density along the axis, from infinity to the end. With
+        Q the inverse covariance, a = n'Qn and m = n'Qx / a that is r²/2 √(det Q / a) exp(-(x'Qx - a m²) / 2) Φ(-m √a).
+        The cross section's own width, r²/4 per axis, counts as blur.
+        """
+        n, covariance, factor = self.forward, self.blur, 1.0
+        if self.diameter_mm is not None:
+            covariance = covariance + self.diameter_mm**2 / 16 * (np.eye(3) - np.outer(n, n))
+        Q = np.linalg.inv(covariance)
+        a = float(n @ Q @ n)
+        m = points @ Q @ n / a
+        if self.diameter_mm is None:
+            return np.asarray(ndtr(-(points @ n) / np.sqrt(n @ covariance @ n)))
+        factor = self.diameter_mm**2 / 8 * np.sqrt(np.linalg.det(Q) / a)
+        lateral = np.einsum("ni,ij,nj->n", points, Q, points) - a * m**2
+        return np.asarray(factor * np.exp(-0.5 * lateral) * ndtr(-m * np.sqrt(a)))
+
+
+def _blur(volume: Volume) -> Floats:
+    """Covariance of what blurs an image, shape (3, 3), mm²: the assumed one in the plane, and the slices' thickness."""
+    spacing = spacing_mm(volume)
+    axes = volume.T_ct_index[:3, :3] / spacing
+    variances = np.array([BLUR_SIGMA_MM**2, BLUR_SIGMA_MM**2, spacing[2] ** 2 / 12])
+    return np.asarray(axes @ np.diag(variances) @ axes.T)
+
+
+class NeedleError(NamedTuple):
+    """Where a needle ended, seen from the target, mm: total² = lateral² + depth², depth positive when too deep."""
+
+    tip_to_target_mm: float
+    lateral_mm: float
+    depth_mm: float
+
+
+def needle_error(tip_ct: Floats, forward_ct: Floats, target_ct: Floats) -> NeedleError:
+    """Tip minus target (3,), mm, split along and across the needle's unit direction (3,)."""
+    error = tip_ct - target_ct
+    depth = float(error @ forward_ct)
+    return NeedleError(float(np.linalg.norm(error)), float(np.linalg.norm(error - depth * forward_ct)), depth)

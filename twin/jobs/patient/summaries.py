@@ -104,6 +104,7 @@ def rehearsal_summary(rehearsal: Rehearsal) -> dict[str, Any]:
         "predicted_error_mm": finite(rehearsal.predicted_error_mm),
         "contacts": [f"{c.link} touches {c.body} at {c.time_s:.2f} s" for c in rehearsal.contacts],
         "least_clearance_mm": {name: float(np.min(values)) for name, values in rehearsal.clearance_mm.items()},
+        "needle_end": _needle_end(rehearsal),
         "max_joint_speed_deg_s": np.degrees(rehearsal.max_joint_speed).tolist(),
         "joint_speed_limit_deg_s": np.degrees(rehearsal.speed_limits).tolist(),
         **({} if rehearsal.standing is None else rehearsal.standing.summary()),
@@ -118,4 +119,14 @@ def export_summary(done: Exported, case_checked: bool) -> dict[str, Any]:
         "case_checked": case_checked,
         "inputs": inputs_document(done.inputs),
         "files": [str(done.path)],
+    }
+
+
+def _needle_end(rehearsal: Rehearsal) -> dict[str, list[float]]:
+    """Where the needle truly ended in the patient, LPS (or the case's local frame), and the target that it was for."""
+    forward = np.linalg.inv(rehearsal.T_base_ct_true)[:3, :3] @ rehearsal.T_base_flange_true[-1, :3, 2]
+    return {
+        "tip_ct_mm": rehearsal.tip_true_ct[-1].tolist(),
+        "direction_ct": forward.tolist(),
+        "target_ct_mm": rehearsal.target_true_ct.tolist(),
     }

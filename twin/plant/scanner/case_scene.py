@@ -18,7 +18,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.place.bed import bed_frame
-from puncture_twin.planning.registration.skin_fit import skin_fit
+from puncture_twin.planning.registration.checks.skin_fit import skin_fit
 from puncture_twin.twin.plant.scanner.hounsfield import METAL_HU, SOFT_TISSUE_HU, TABLE_HU, default_hu
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 from puncture_twin.twin.plant.scanner.solids import Solid, ball, box, check_closed, rod

@@ -1,9 +1,9 @@
 """What fills each voxel: solids cut by many lines along the voxels' rows, and each line's pieces measured exactly.
 
-Every slice is cut by some planes and every row by some lines. A plane cuts a closed surface in closed chains
-of segments, and a line cuts these in crossings; both by half-open intervals, of which neighbours share the end, so that
-nothing leaks through an edge or a corner (Laidlaw et al., SIGGRAPH 1986, discuss what else happens). A point is inside a
-solid where its winding number is not 0; where solids overlap, the later one fills the place.
+Every slice is cut by some planes and every row by some lines. A plane cuts a closed surface in closed chains of
+segments, and a line cuts these in crossings; both by half-open intervals, of which neighbours share the end, so that
+nothing leaks through an edge or a corner. A point is inside a solid where its winding number is not 0; where solids
+overlap, the later one fills the place.
 """
 
 from __future__ import annotations
@@ -93,7 +93,8 @@ def _slice(corners, owners, fills, labels, cuts, empty, values, marks):  # type:
     for plane in range(planes):
         z = k + (plane + 0.5) / planes - 0.5
         count = _segments(corners, owners, z, segments, whose)
-        starts, xs, turns = _crossings(segments[:count], whose[:count], ny, subs)
+        within = (plane + 0.5) / planes  # lines of one plane lie between those of another: a face along them is met
+        starts, xs, turns = _crossings(segments[:count], whose[:count], ny, subs, within)
         for line in range(ny * subs):
             first, last = starts[line], starts[line + 1]
             if first == last:
@@ -135,12 +136,12 @@ def _segments(corners, owners, z, segments, whose):  # type: ignore[no-untyped-d
 
 
 @nb.njit(cache=True, nogil=True)
-def _crossings(segments, whose, ny, subs):  # type: ignore[no-untyped-def]
+def _crossings(segments, whose, ny, subs, within):  # type: ignore[no-untyped-def]
     """Where the lines of a plane cross its segments, line by line; a turn is the solid's number + 1, with its sign."""
     lines = ny * subs
     starts = np.zeros(lines + 2, np.int64)
     for s in range(len(segments)):
-        first, last = _lines_between(segments[s, 1], segments[s, 3], subs, lines)
+        first, last = _lines_between(segments[s, 1], segments[s, 3], subs, within, lines)
         for line in range(first, last):
             starts[line + 2] += 1
     for line in range(lines):
@@ -151,9 +152,9 @@ def _crossings(segments, whose, ny, subs):  # type: ignore[no-untyped-def]
         sign = 1 if by > ay else -1
         if sign < 0:
             ax, ay, bx, by = bx, by, ax, ay
-        first, last = _lines_between(ay, by, subs, lines)
+        first, last = _lines_between(ay, by, subs, within, lines)
         for line in range(first, last):
-            y = (line + 0.5) / subs - 0.5
+            y = (line + within) / subs - 0.5
             xs[starts[line + 1]] = ax + (y - ay) / (by - ay) * (bx - ax)
             turns[starts[line + 1]] = sign * (whose[s] + 1)
             starts[line + 1] += 1
@@ -161,16 +162,16 @@ def _crossings(segments, whose, ny, subs):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True)
-def _lines_between(a, b, subs, lines):  # type: ignore[no-untyped-def]
+def _lines_between(a, b, subs, within, lines):  # type: ignore[no-untyped-def]
     """The first line above the lower end, and the first above the upper one."""
     low, high = min(a, b), max(a, b)
-    first = min(max(0, int(np.floor((low + 0.5) * subs - 0.5)) - 1), lines)
-    while first < lines and (first + 0.5) / subs - 0.5 <= low:
+    first = min(max(0, int(np.floor((low + 0.5) * subs - within)) - 1), lines)
+    while first < lines and (first + within) / subs - 0.5 <= low:
         first += 1
     last = first
     if high > low:
-        last = min(max(first, int(np.floor((high + 0.5) * subs - 0.5)) - 1), lines)
-        while last < lines and (last + 0.5) / subs - 0.5 <= high:
+        last = min(max(first, int(np.floor((high + 0.5) * subs - within)) - 1), lines)
+        while last < lines and (last + within) / subs - 0.5 <= high:
             last += 1
     return first, last
 

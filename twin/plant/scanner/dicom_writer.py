@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from pydicom.dataset import FileDataset, FileMetaDataset
-from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian
+from pydicom.uid import UID, CTImageStorage, ExplicitVRLittleEndian
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.plant.scanner.image import CtImage, ScanSettings
@@ -50,10 +50,10 @@ def write_series(folder: Path, image: CtImage, settings: ScanSettings, identity:
     return files
 
 
-def uid(*parts: object) -> str:
+def uid(*parts: object) -> UID:
     """An identifier of 128 bits of a hash, below the root for UUIDs (DICOM PS3.5, B.2)."""
     digest = hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()
-    return f"2.25.{int(digest[:32], 16)}"
+    return UID(f"2.25.{int(digest[:32], 16)}")
 
 
 def _identified(identity: str, k: int, name: str) -> FileDataset:

@@ -51,7 +51,7 @@ HU_OF_GROUP = MappingProxyType(
 )
 """By group of the table of default roles (`planning.anatomy.default_roles`)."""
 
-OF_NAME = MappingProxyType({"bolt": METAL_HU, "costal_cartilages": 130.0, "unnamed_dense": 700.0, "unnamed_gas": -1000.0})
+OF_NAME = MappingProxyType({"bolt": METAL_HU, "unnamed_dense": 700.0, "unnamed_gas": -1000.0})
 """By the beginning of a name, before the groups."""
 
 

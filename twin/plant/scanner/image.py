@@ -64,9 +64,7 @@ class CtImage:
     grid: VolumeGrid
 
 
-def scan_solids(
-    solids: Sequence[Solid], grid: VolumeGrid, settings: ScanSettings, rng: np.random.Generator
-) -> CtImage:
+def scan_solids(solids: Sequence[Solid], grid: VolumeGrid, settings: ScanSettings, rng: np.random.Generator) -> CtImage:
     """Scan a scene in air.
 
     Args:

@@ -39,7 +39,7 @@ def check_closed(solid: Solid, where: str) -> Solid:
         InputError: Its surface is open.
     """
     if not solid.mesh.closed:
-        raise InputError(f"'{solid.name}' has an open surface", where=where, allowed="closed surfaces: what fills them?")
+        raise InputError(f"'{solid.name}' has an open surface", where=where, allowed="closed surfaces")
     return solid
 
 

@@ -1,0 +1,243 @@
+"""The job ``scan``: a case scanned, its markers, its lesion and a needle found again, and how far off each was."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.output.manifest import read_output
+from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.base.strict_json import array, fitting, parse_json
+from puncture_twin.planning.formats.points.point_files import write_points
+from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.twin.guidance.ct.lesion import read_lesion
+from puncture_twin.twin.guidance.ct.markers import READING_MM, Markers, find_markers
+from puncture_twin.twin.guidance.ct.metal import METAL_HU
+from puncture_twin.twin.guidance.ct.needle import FoundNeedle, find_needle, needle_error
+from puncture_twin.twin.jobs.experiment.scan_picture import Shown, draw_scan
+from puncture_twin.twin.plant.scanner.case_scene import CaseScene, MarkerKind, TrueRod, case_scene, numbered
+from puncture_twin.twin.plant.scanner.dicom_writer import write_series
+from puncture_twin.twin.plant.scanner.field_of_view import scan_grid
+from puncture_twin.twin.plant.scanner.image import CtImage, ScanSettings, scan_solids
+from puncture_twin.twin.plant.scanner.nifti_writer import write_nifti
+
+SERIES = "dicom"
+CT, LABELS, NAMES, FOUND, REPORT, PICTURE = (
+    *("ct.nii.gz", "labels.nii.gz", "labels.csv"),
+    *("markers_ct.csv", "scan.json", "scan.png"),
+)
+MAX_REHEARSAL_BYTES = 50_000_000
+SUB_VOXEL_SD = 0.15
+"""Of a marker's middle along the bed, over the spacing: what the detector is held to where metal is clipped."""
+
+
+class ScanRequest(NamedTuple):
+    """What the user asks for: how to scan, what stands at the markers' places, and a rehearsal with its needle."""
+
+    settings: ScanSettings
+    marker: MarkerKind = "disc"
+    rehearsal: Path | None = None
+
+
+def parse_marker(text: str) -> MarkerKind:
+    """What stands at the markers' places.
+
+    Raises:
+        InputError: Nothing that is known.
+    """
+    for kind in get_args(MarkerKind):
+        if text == kind:
+            return kind
+    raise InputError(f"marker '{text[:40]}' is not known", where="--marker", allowed=", ".join(get_args(MarkerKind)))
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """A needle in a control CT: where it truly is, where it was found, and the target that it was meant for."""
+
+    true: TrueRod
+    found: FoundNeedle
+    target: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class ScanRun:
+    """A scan, what was read off it, and the files that were written. Points in the scan's frame, LPS mm."""
+
+    context: CaseContext
+    request: ScanRequest
+    scene: CaseScene
+    image: CtImage
+    markers: Markers | None
+    lesion: tuple[Floats, Floats]
+    control: Control | None
+    inputs: tuple[Input, ...]
+    files: tuple[Path, ...] = ()
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON: mm, HU, degrees; true places beside readings."""
+        grid, settings = self.image.grid, self.request.settings
+        true, found = self.lesion
+        return {
+            "case": str(self.context.case.path),
+            "settings": {
+                **{key: value for key, value in asdict(settings).items() if key != "turn"},
+                "turn_deg": float(np.degrees(settings.turn)),
+                "marker": self.request.marker,
+            },
+            "voxels": list(grid.shape),
+            "T_scan_case": self.scene.T_scan_ct.tolist(),
+            "target_mm": self.scene.target.tolist(),
+            "theory_mm": theory(settings),
+            "markers": list(self._markers()),
+            "lesion": {"true_mm": true.tolist(), "found_mm": found.tolist(), "error_mm": (found - true).tolist()},
+            "needle": None if self.control is None else control_summary(self.control),
+            "inputs": inputs_document(self.inputs),
+            "files": [str(path) for path in self.files],
+        }
+
+    def _markers(self) -> Iterator[dict[str, Any]]:
+        if self.markers is None or self.scene.markers is None:
+            return
+        rows = zip(
+            self.markers.fine.names,
+            self.scene.markers.points,
+            self.markers.rule.points,
+            self.markers.fine.points,
+            strict=True,
+        )
+        for name, true, rule, fine in rows:
+            yield {
+                "name": name,
+                "true_mm": true.tolist(),
+                "rule_error_mm": (rule - true).tolist(),
+                "error_mm": (fine - true).tolist(),
+            }
+
+
+def theory(settings: ScanSettings) -> dict[str, float]:
+    """Standard deviations of a reading, mm: of the rule uniform in its cell, of the metal's middle the demand."""
+    return {
+        "rule_along_bed": settings.spacing_mm / np.sqrt(12),
+        "rule_in_plane": READING_MM / np.sqrt(12),
+        "along_bed_at_most": SUB_VOXEL_SD * settings.spacing_mm,
+    }
+
+
+def control_summary(control: Control) -> dict[str, Any]:
+    """A needle as found and as it is, mm and degrees; errors from the target, as clinical papers state them."""
+    found = needle_error(control.found.tip_ct, control.found.forward_ct, control.target)
+    true = needle_error(control.true.tip_ct, control.true.forward_ct, control.target)
+    cosine = np.clip(control.found.forward_ct @ control.true.forward_ct, -1.0, 1.0)
+    return {
+        "tip_mm": control.found.tip_ct.tolist(),
+        "found": found._asdict(),
+        "true": true._asdict(),
+        "tip_reading_error_mm": float(np.linalg.norm(control.found.tip_ct - control.true.tip_ct)),
+        "angle_reading_error_deg": float(np.degrees(np.arccos(cosine))),
+    }
+
+
+def scan_case(context: CaseContext, out: Path, request: ScanRequest) -> ScanRun:
+    """Scan a case; write the series, NIfTI, the label map of the truth, the markers as found, and the report.
+
+    Raises:
+        InputError: A surface that is open, a field of view without the markers, or a rehearsal that cannot be used.
+    """
+    with context.stages.time("scan"):
+        run = _scanned(context, request)
+    names = (CT, LABELS, NAMES, REPORT, PICTURE, *(() if run.markers is None else (FOUND,)))
+    seconds = context.stages.seconds
+    with writing(out, "scan", inputs=run.inputs, seconds=seconds, names=names, note=context.watcher.note) as draft:
+        with context.stages.time("files"):
+            files = list(_write(run, draft.folder))
+        run = replace(run, files=draft.final(files))
+        report = draft.folder / REPORT
+        report.write_text(json.dumps(run.summary(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return replace(run, files=(*run.files, out / REPORT))
+
+
+def _scanned(context: CaseContext, request: ScanRequest) -> ScanRun:
+    case, settings = context.case, request.settings
+    rng = np.random.default_rng(settings.seed)
+    needle, read = _rehearsed(request.rehearsal)
+    rod = None if needle is None else needle[0]
+    scene = case_scene(case, context.anatomy, settings, rng, marker=request.marker, needle=rod)
+    image = scan_solids(scene.solids, scan_grid(scene, settings, rng), settings, rng)
+    volume = Volume(image.hu, image.grid.T_ct_index, case.path)
+    markers = None if scene.listed is None else find_markers(volume, scene.listed)
+    lesion = _lesion(context, scene, image, volume)
+    control = None if needle is None else _control(scene, volume, case.needle.diameter_mm, *needle)
+    return ScanRun(context, request, scene, image, markers, lesion, control, (*read, *case.inputs))
+
+
+def _lesion(context: CaseContext, scene: CaseScene, image: CtImage, volume: Volume) -> tuple[Floats, Floats]:
+    """The target's structure, where it truly is and where it was read; of a rod of metal the end, else the middle."""
+    name = context.case.target_structure
+    solid = next(one for one in scene.solids if one.name == name)
+    if solid.hu >= METAL_HU:
+        return scene.target, find_needle(volume, scene.target).tip_ct
+    mask = image.labels == solid.label
+    if not mask.any():
+        raise InputError(f"'{name}' is not in the image", where="scan", allowed="a field of view that shows the target")
+    return middle_of(solid.mesh.triangles), read_lesion(volume, mask)
+
+
+def middle_of(triangles: Floats) -> Floats:
+    """The centroid of what closed triangles (m, 3, 3) enclose, shape (3,): tetrahedra from the origin."""
+    volumes = np.einsum("ti,ti->t", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2]))
+    return np.asarray(volumes @ triangles.sum(axis=1) / 4 / volumes.sum())
+
+
+def _rehearsed(path: Path | None) -> tuple[tuple[TrueRod, Floats] | None, tuple[Input, ...]]:
+    """The needle at the end of a rehearsal, and the true target, in the case's frame."""
+    if path is None:
+        return None, ()
+    allowed = "the rehearsal.json of this version of rehearse"
+    read = read_output(path, max_bytes=MAX_REHEARSAL_BYTES)
+    document = parse_json(read.data, where=path, allowed=allowed)
+    with fitting(path, allowed):
+        end = document["needle_end"]
+        tip, forward, target = (array(end[key], (3,)) for key in ("tip_ct_mm", "direction_ct", "target_ct_mm"))
+    return (TrueRod(tip, forward / np.linalg.norm(forward)), target), (read.input("rehearsal"),)
+
+
+def _control(scene: CaseScene, volume: Volume, diameter_mm: float, true: TrueRod, target_ct: Floats) -> Control:
+    T = scene.T_scan_ct
+    target = apply(T, target_ct)
+    moved = TrueRod(apply(T, true.tip_ct), T[:3, :3] @ true.forward_ct)
+    return Control(moved, find_needle(volume, target, diameter_mm), target)
+
+
+def _write(run: ScanRun, folder: Path) -> Iterator[Path]:
+    """Everything but the report."""
+    image, case = run.image, run.context.case
+    yield from write_series(folder / SERIES, image, run.request.settings, _identity(run), case.name)
+    yield write_nifti(folder / CT, image.hu, image.grid.T_ct_index)
+    yield write_nifti(folder / LABELS, image.labels, image.grid.T_ct_index)
+    names = [f"{number},{name}" for name, number in numbered(run.context.anatomy).items()]
+    (folder / NAMES).write_text("\n".join(["label,name", *names]) + "\n", encoding="utf-8")
+    yield folder / NAMES
+    if run.markers is not None:
+        write_points(folder / FOUND, run.markers.fine)
+        yield folder / FOUND
+    found = None if run.markers is None else run.markers.fine
+    needle = None if run.control is None else run.control.found
+    yield draw_scan(image, Shown(run.scene.target, found, needle, case.needle.shaft_mm), folder / PICTURE)
+
+
+def _identity(run: ScanRun) -> str:
+    """What the scan was made from, hashed."""
+    made_from = [*map(str, run.inputs), str(run.request)]
+    return hashlib.sha256("\n".join(made_from).encode()).hexdigest()
