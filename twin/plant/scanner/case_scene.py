@@ -19,7 +19,7 @@ from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.registration.checks.skin_fit import skin_fit
-from puncture_twin.twin.plant.scanner.hounsfield import METAL_HU, SOFT_TISSUE_HU, TABLE_HU, default_hu
+from puncture_twin.twin.plant.scanner.hounsfield import FOAM_HU, METAL_HU, SHELL_HU, SHELL_MM, SOFT_TISSUE_HU, default_hu
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 from puncture_twin.twin.plant.scanner.solids import Solid, ball, box, check_closed, rod
 
@@ -158,8 +158,14 @@ def _skin_name(case: Case) -> str:
 
 
 def _tables(case: Case) -> list[Solid]:
-    boxes = [one for one in case.obstacles if one.frame == "ct"]
-    return [Solid(one.name, box(one.center_mm, one.size_mm), TABLE_HU) for one in boxes]
+    """Boxes in the CT's frame: a shell about foam."""
+    solids = []
+    for one in case.obstacles:
+        if one.frame == "ct":
+            solids.append(Solid(one.name, box(one.center_mm, one.size_mm), SHELL_HU))
+            if one.size_mm.min() > 2 * SHELL_MM:
+                solids.append(Solid(one.name, box(one.center_mm, one.size_mm - 2 * SHELL_MM), FOAM_HU))
+    return solids
 
 
 def _listed_markers(case: Case) -> NamedPoints | None:

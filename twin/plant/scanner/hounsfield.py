@@ -14,8 +14,8 @@ METAL_HU = 8000.0
 """Steel and titanium lie beyond what 12 bits hold; how far is declared as ours."""
 SOFT_TISSUE_HU = 20.0
 """What fills the skin between the structures: fat and muscle, mixed; ours. Also of a name that no line knows."""
-TABLE_HU = 60.0
-"""Of obstacles in the CT's frame; ours. A real table is a shell about foam."""
+SHELL_HU, FOAM_HU, SHELL_MM = 60.0, -930.0, 3.0
+"""Of a table, and of every obstacle in the CT's frame: a shell so thick about foam; ours."""
 
 HU_OF_GROUP = MappingProxyType(
     {
