@@ -8,7 +8,7 @@ from fuzz.mutate import NUMBERS, pick
 COMMANDS = [
     *["search", "verify", "check", "compare", "plan", "rehearse", "place", "mirror", "export", "register"],
     *["batch", "batch run", "batch status", "batch merge", "batch compare"],
-    *["init", "selfcal", "servo", "reproduce", "", "serch", "x" * 3000, "--help", "-h", "--version"],
+    *["init", "selfcal", "servo", "reproduce", "scan", "", "serch", "x" * 3000, "--help", "-h", "--version"],
 ]
 """Not ``demo``, which needs nothing and takes a minute, nor ``batch plan``, which takes any folder."""
 

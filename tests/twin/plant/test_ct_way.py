@@ -11,7 +11,7 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.registration import fit_rigid, fit_triad, leverage
 from puncture_twin.planning.registration.touch_poses import touching_configuration
-from puncture_twin.twin.plant.scanner import Scanner, draw_true_positions, read_positions, scan, slice_number
+from puncture_twin.twin.plant.scanner.readings import Scanner, draw_true_positions, read_positions, scan, slice_number
 from puncture_twin.twin.plant.tip_touch import TouchProbe, touch
 
 MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [90, -10, 20], [20, 150, 147]])

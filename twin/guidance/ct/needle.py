@@ -88,9 +88,10 @@ def find_needle(volume: Volume, target_ct: Floats, diameter_mm: float | None = N
         rods = [piece for piece in metal_pieces(volume, level) if piece.size_mm >= SHORTEST_MM]
         for metal in sorted(rods, key=lambda piece: _gap(piece, volume, target_ct)):
             line = _axis(volume, metal, target_ct)
-            if diameter_mm is None or metal.size_mm > SLENDER * line.width_mm:
-                if diameter_mm is None:
-                    return FoundNeedle(_tip(volume, metal, line, None), line.forward, line.width_mm)
+            if diameter_mm is None:
+                return FoundNeedle(_tip(volume, metal, line, None), line.forward, line.width_mm)
+            widest = diameter_mm / 2 + 0.5 * float(spacing_mm(volume).max()) + BLUR_SIGMA_MM
+            if line.width_mm < min(widest, metal.size_mm / SLENDER):
                 metal, line = _whole(volume, metal, line, target_ct)
                 return _fitted(volume, metal, line, diameter_mm)
     allowed = f"a straight piece of metal of {SHORTEST_MM:g} mm or more"

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
@@ -26,15 +27,15 @@ from puncture_twin.twin.guidance.ct.markers import READING_MM, Markers, find_mar
 from puncture_twin.twin.guidance.ct.metal import METAL_HU
 from puncture_twin.twin.guidance.ct.needle import FoundNeedle, find_needle, needle_error
 from puncture_twin.twin.jobs.experiment.scan_picture import Shown, draw_scan
-from puncture_twin.twin.plant.scanner.case_scene import CaseScene, MarkerKind, TrueRod, case_scene, numbered
+from puncture_twin.twin.plant.scanner.case_scene import CaseScene, MarkerKind, TrueRod, case_scene, label_layers
 from puncture_twin.twin.plant.scanner.dicom_writer import write_series
 from puncture_twin.twin.plant.scanner.field_of_view import scan_grid
 from puncture_twin.twin.plant.scanner.image import CtImage, ScanSettings, scan_solids
 from puncture_twin.twin.plant.scanner.nifti_writer import write_nifti
 
 SERIES = "dicom"
-CT, LABELS, NAMES, FOUND, REPORT, PICTURE = (
-    *("ct.nii.gz", "labels.nii.gz", "labels.csv"),
+CT, LABELS, CROSSED, FOUND, REPORT, PICTURE = (
+    *("ct.nii.gz", "labels", "crossed"),
     *("markers_ct.csv", "scan.json", "scan.png"),
 )
 MAX_REHEARSAL_BYTES = 50_000_000
@@ -157,7 +158,7 @@ def scan_case(context: CaseContext, out: Path, request: ScanRequest) -> ScanRun:
     """
     with context.stages.time("scan"):
         run = _scanned(context, request)
-    names = (CT, LABELS, NAMES, REPORT, PICTURE, *(() if run.markers is None else (FOUND,)))
+    names = (CT, REPORT, PICTURE, *(() if run.markers is None else (FOUND,)))
     seconds = context.stages.seconds
     with writing(out, "scan", inputs=run.inputs, seconds=seconds, names=names, note=context.watcher.note) as draft:
         with context.stages.time("files"):
@@ -188,7 +189,7 @@ def _lesion(context: CaseContext, scene: CaseScene, image: CtImage, volume: Volu
     solid = next(one for one in scene.solids if one.name == name)
     if solid.hu >= METAL_HU:
         return scene.target, find_needle(volume, scene.target).tip_ct
-    mask = image.labels == solid.label
+    mask = image.labels[solid.layer] == solid.label
     if not mask.any():
         raise InputError(f"'{name}' is not in the image", where="scan", allowed="a field of view that shows the target")
     return middle_of(solid.mesh.triangles), read_lesion(volume, mask)
@@ -225,16 +226,29 @@ def _write(run: ScanRun, folder: Path) -> Iterator[Path]:
     image, case = run.image, run.context.case
     yield from write_series(folder / SERIES, image, run.request.settings, _identity(run), case.name)
     yield write_nifti(folder / CT, image.hu, image.grid.T_ct_index)
-    yield write_nifti(folder / LABELS, image.labels, image.grid.T_ct_index)
-    names = [f"{number},{name}" for name, number in numbered(run.context.anatomy).items()]
-    (folder / NAMES).write_text("\n".join(["label,name", *names]) + "\n", encoding="utf-8")
-    yield folder / NAMES
+    layers = label_layers(case, run.context.anatomy)
+    for file, names, labels in zip((LABELS, CROSSED), layers, image.labels, strict=False):
+        yield from _write_labels(folder, file, names, run, labels)
     if run.markers is not None:
         write_points(folder / FOUND, run.markers.fine)
         yield folder / FOUND
     found = None if run.markers is None else run.markers.fine
     needle = None if run.control is None else run.control.found
     yield draw_scan(image, Shown(run.scene.target, found, needle, case.needle.shaft_mm), folder / PICTURE)
+
+
+def _write_labels(folder: Path, file: str, names: Sequence[str], run: ScanRun, labels: NDArray[Any]) -> Iterator[Path]:
+    """A label map with a table of its names; one structure alone is a mask, which is named by its file."""
+    alone = names[0].replace("/", "_") if len(names) == 1 else None
+    yield write_nifti(folder / f"{alone or file}.nii.gz", labels, run.image.grid.T_ct_index)
+    if alone is None:
+        rows = [f"{number},{_quoted(name)}" for number, name in enumerate(names, start=1)]
+        (folder / f"{file}.csv").write_text("\n".join(["label,name", *rows]) + "\n", encoding="utf-8")
+        yield folder / f"{file}.csv"
+
+
+def _quoted(name: str) -> str:
+    return f'"{name.replace(chr(34), 2 * chr(34))}"' if any(sign in name for sign in ',"') else name
 
 
 def _identity(run: ScanRun) -> str:

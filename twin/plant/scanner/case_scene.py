@@ -19,7 +19,14 @@ from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.registration.checks.skin_fit import skin_fit
-from puncture_twin.twin.plant.scanner.hounsfield import FOAM_HU, METAL_HU, SHELL_HU, SHELL_MM, SOFT_TISSUE_HU, default_hu
+from puncture_twin.twin.plant.scanner.hounsfield import (
+    FOAM_HU,
+    METAL_HU,
+    SHELL_HU,
+    SHELL_MM,
+    SOFT_TISSUE_HU,
+    default_hu,
+)
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 from puncture_twin.twin.plant.scanner.solids import Solid, ball, box, check_closed, rod
 
@@ -127,10 +134,18 @@ def scan_frame(case: Case, turn: float) -> Floats:
     return pose(turned @ R, middle - turned @ middle)
 
 
-def numbered(anatomy: Anatomy) -> dict[str, int]:
-    """The label of each structure that a segmentation would show."""
-    names = [one.name for one in anatomy.structures if one.name != BEYOND_LABELS]
-    return {name: number for number, name in enumerate(names, start=1)}
+def label_layers(case: Case, anatomy: Anatomy) -> tuple[tuple[str, ...], ...]:
+    """The structures that a segmentation would show, in two maps; the place of a name, from 1, is its label.
+
+    First those that demand clearance, and the one that holds the target; then those that a needle may cross: an organ
+    holds its vessels and its lesion, and would have holes in one map with them.
+    """
+    first: list[str] = []
+    crossed: list[str] = []
+    for one in anatomy.structures:
+        if one.name != BEYOND_LABELS:
+            (first if one.demands_margin or one.name == case.target_structure else crossed).append(one.name)
+    return (tuple(first), tuple(crossed)) if crossed else (tuple(first),)
 
 
 def _body(case: Case, anatomy: Anatomy) -> list[Solid]:
@@ -140,10 +155,15 @@ def _body(case: Case, anatomy: Anatomy) -> list[Solid]:
     more clearance than on both.
     """
     stated = {one.name: one.hu for one in case.structure if one.hu is not None}
-    labels, region = numbered(anatomy), case.region or "other"
-    ordered = sorted((one for one in anatomy.structures if one.name in labels), key=_filling)
+    places = {
+        name: (number, layer)
+        for layer, names in enumerate(label_layers(case, anatomy))
+        for number, name in enumerate(names, start=1)
+    }
+    region = case.region or "other"
+    ordered = sorted((one for one in anatomy.structures if one.name in places), key=_filling)
     skin = Solid("skin", anatomy.skin.mesh, stated.get(_skin_name(case), SOFT_TISSUE_HU))
-    solids = [Solid(s.name, s.mesh, stated.get(s.name, default_hu(s.name, region)), labels[s.name]) for s in ordered]
+    solids = [Solid(s.name, s.mesh, stated.get(s.name, default_hu(s.name, region)), *places[s.name]) for s in ordered]
     return [check_closed(one, str(case.path)) for one in (skin, *solids)]
 
 

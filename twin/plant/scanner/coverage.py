@@ -8,7 +8,7 @@ overlap, the later one fills the place.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,18 +27,18 @@ class Cut(NamedTuple):
 
     Attributes:
         values: Shape (nx, ny, nz), float32, the mean over each voxel.
-        labels: Shape (nx, ny, nz), uint8, what is labelled at each voxel's centre; 0 for nothing.
+        labels: Shape (layers, nx, ny, nz), uint8 or uint16: what is labelled at each voxel's centre; 0 for nothing.
     """
 
     values: NDArray[np.float32]
-    labels: NDArray[np.uint8]
+    labels: NDArray[Any]
 
 
 def cut_solids(
     corners: Floats,
     owners: NDArray[np.int64],
     fills: Floats,
-    labels: NDArray[np.uint8],
+    labels: NDArray[Any],
     shape: tuple[int, int, int],
     *,
     spacing_mm: Floats,
@@ -50,7 +50,7 @@ def cut_solids(
         corners: Triangles of all solids, shape (m, 3, 3), in voxels: a voxel's centre has whole coordinates.
         owners: Which solid each triangle belongs to, shape (m,).
         fills: Value of each solid, shape (n,); a later one fills the place of an earlier one.
-        labels: Of each solid, shape (n,); 0 for those that the label map does not show.
+        labels: Of each solid in each label map, shape (layers, n); 0 where a map does not show it.
         shape: Of the grid.
         spacing_mm: Of the voxels, shape (3,); it says how many lines there are.
         empty: Value where no solid is.
@@ -58,12 +58,12 @@ def cut_solids(
     nx, ny, nz = shape
     lines, planes = (_odd(spacing) for spacing in spacing_mm[1:])
     values = np.empty((nz, ny, nx), np.float32)
-    marks = np.zeros((nz, ny, nx), np.uint8)
+    marks = np.zeros((len(labels), nz, ny, nx), labels.dtype)
     starts, members = _of_slices(corners, nz)
     for k in range(nz):
         some = members[starts[k] : starts[k + 1]]
-        _slice(corners[some], owners[some], fills, labels, (k, lines, planes), empty, values[k], marks[k])
-    return Cut(values.transpose(2, 1, 0), marks.transpose(2, 1, 0))
+        _slice(corners[some], owners[some], fills, labels, (k, lines, planes), empty, values[k], marks[:, k])
+    return Cut(values.transpose(2, 1, 0), marks.transpose(0, 3, 2, 1))
 
 
 def _odd(spacing_mm: float) -> int:
@@ -102,7 +102,9 @@ def _slice(corners, owners, fills, labels, cuts, empty, values, marks):  # type:
             _sort(xs[first:last], turns[first:last])
             _add_line(xs[first:last], turns[first:last], fills, empty, winding, steps[line // subs])
             if plane == planes // 2 and line % subs == subs // 2:
-                _mark_line(xs[first:last], turns[first:last], labels, winding, marks[line // subs])
+                for layer in range(len(labels)):
+                    row = marks[layer, line // subs]
+                    _mark_line(xs[first:last], turns[first:last], labels[layer], winding, row)
     for j in range(ny):
         sum_ = 0.0
         for i in range(nx):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,12 +56,12 @@ class CtImage:
 
     Attributes:
         hu: Shape (nx, ny, nz), int16.
-        labels: Shape (nx, ny, nz), uint8: what is labelled at each voxel's centre.
+        labels: Shape (layers, nx, ny, nz): what is labelled at each voxel's centre, in each label map.
         grid: Where the voxels lie, LPS mm.
     """
 
     hu: NDArray[np.int16]
-    labels: NDArray[np.uint8]
+    labels: NDArray[Any]
     grid: VolumeGrid
 
 
@@ -77,9 +78,17 @@ def scan_solids(solids: Sequence[Solid], grid: VolumeGrid, settings: ScanSetting
     corners = np.concatenate([apply(T_index_ct, solid.mesh.vertices)[solid.mesh.faces] for solid in solids])
     owners = np.repeat(np.arange(len(solids)), [len(solid.mesh.faces) for solid in solids])
     fills = np.array([solid.hu for solid in solids])
-    labels = np.array([solid.label for solid in solids], np.uint8)
+    labels = _label_table(solids)
     cut = cut_solids(corners, owners, fills, labels, grid.shape, spacing_mm=grid.spacing_mm, empty=AIR_HU)
     return CtImage(_stored(cut.values, grid.spacing_mm, settings, rng), cut.labels, grid)
+
+
+def _label_table(solids: Sequence[Solid]) -> NDArray[Any]:
+    """Label of each solid in each map, shape (layers, n)."""
+    table = np.zeros((1 + max(solid.layer for solid in solids), len(solids)), np.uint16)
+    for number, solid in enumerate(solids):
+        table[solid.layer, number] = solid.label
+    return table.astype(np.uint8) if table.max() <= np.iinfo(np.uint8).max else table
 
 
 def _stored(

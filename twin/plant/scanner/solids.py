@@ -23,13 +23,15 @@ class Solid(NamedTuple):
         name: What it is.
         mesh: Closed, mm.
         hu: What it is made of, Hounsfield units.
-        label: Its number in the label map; 0 for what no segmentation names.
+        label: Its number in its label map; 0 for what no segmentation names.
+        layer: Which label map shows it: bodies that hold others have one of their own.
     """
 
     name: str
     mesh: TriangleMesh
     hu: float
     label: int = 0
+    layer: int = 0
 
 
 def check_closed(solid: Solid, where: str) -> Solid:

@@ -1,0 +1,129 @@
+"""The command ``scan``: a set of files that `init` and `search` take, and what it says of the truth."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from puncture_twin.meshes import folder
+from puncture_twin.planning.formats.points.point_files import read_points
+from puncture_twin.planning.formats.volumes.volume_files import read_volume
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.run_twin import main
+
+CARTON = folder() / "carton" / "case_m.toml"
+COARSE = ("--spacing", "5", "--pixel", "0.9")
+
+
+@pytest.fixture(scope="module")
+def carton(tmp_path_factory):
+    """The carton's scan: its folder and its report."""
+    out = tmp_path_factory.mktemp("scan")
+    assert main(["scan", str(CARTON), "--out", str(out), *COARSE]) == 0
+    return out, json.loads((out / "scan.json").read_text())
+
+
+def test_the_set_is_whole(carton):
+    """Series, NIfTI, labels with names, markers, report and picture; all listed in the manifest."""
+    out, report = carton
+    listed = json.loads((out / "manifest.json").read_text())["entries"]["scan"]["files"]
+    for name in ("ct.nii.gz", "labels.nii.gz", "labels.csv", "markers_ct.csv", "scan.json", "scan.png"):
+        assert name in listed
+    assert sum(name.startswith("dicom/") for name in listed) == report["voxels"][2]
+    assert (out / "labels.csv").read_text().splitlines() == ["label,name", "1,bolt_l", "2,bolt_m", "3,bolt_h"]
+
+
+def test_the_markers_are_those_of_the_detector_and_near_the_truth(carton):
+    """In the case's format, in the scan's LPS: each within the detector's error, and so is the end of the bolt."""
+    out, report = carton
+    found = read_points(out / "markers_ct.csv", default_space=Space.LPS)
+    for name, point, one in zip(found.names, found.points, report["markers"], strict=True):
+        assert name == one["name"]
+        assert np.allclose(point - one["true_mm"], one["error_mm"])
+        assert np.abs(one["error_mm"]).max() < 1.2
+        assert abs(one["rule_error_mm"][2]) <= 3.0
+    assert np.abs(report["lesion"]["error_mm"]).max() < 0.5
+
+
+def test_true_places_are_drawn_in_their_cells(carton):
+    """Whole slices apart they would all err alike; as drawn they differ, each within its cell."""
+    _, report = carton
+    T = np.array(report["T_scan_case"])
+    listed = read_points(CARTON.parent / "markers_ct.csv", default_space=Space.LOCAL).points @ T[:3, :3].T + T[:3, 3]
+    moved = np.array([one["true_mm"] for one in report["markers"]]) - listed
+    assert np.ptp(moved[:, 2]) > 0.5
+    assert np.all(np.abs(moved) <= [0.5, 0.5, 2.5])
+
+
+def test_the_labels_lie_where_the_series_lies(carton):
+    """And the labelled bolt is of metal."""
+    out, _ = carton
+    ct, labels = read_volume(out / "ct.nii.gz"), read_volume(out / "labels.nii.gz")
+    assert np.array_equal(ct.T_ct_index, labels.T_ct_index)
+    assert np.median(ct.values[labels.values == 2]) > 2000
+
+
+def of_wood(folder):
+    """The carton with bolts of wood: a case."""
+    for path in CARTON.parent.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    case = folder / "case_m.toml"
+    text = case.read_text()
+    for name in ("bolt_l", "bolt_m", "bolt_h"):
+        text = text.replace(f'name = "{name}"\n', f'name = "{name}"\nhu = -400.0\n')
+    case.write_text(text)
+    return case
+
+
+def test_a_needle_is_read_in_a_control_ct(tmp_path, capsys):
+    """The tip that `scan` reads is where the rehearsal left it, and so are its errors along and across."""
+    forward = np.array([0.2, -0.6, -0.75])
+    forward /= np.linalg.norm(forward)
+    target = np.array([50.0, 130.0, 63.0])
+    tip = target + [0.5, 1.0, 2.0]
+    end = {"tip_ct_mm": tip.tolist(), "direction_ct": forward.tolist(), "target_ct_mm": target.tolist()}
+    (tmp_path / "rehearsal.json").write_text(json.dumps({"needle_end": end}))
+    command = [
+        "scan",
+        str(of_wood(tmp_path)),
+        "--out",
+        str(tmp_path / "ct"),
+        "--spacing",
+        "2",
+        "--pixel",
+        "1",
+        "--json",
+    ]
+    assert main([*command, "--rehearsal", str(tmp_path / "rehearsal.json")]) == 0
+    needle = json.loads(capsys.readouterr().out)["needle"]
+    assert needle["true"]["tip_to_target_mm"] == pytest.approx(np.linalg.norm(tip - target))
+    assert needle["true"]["depth_mm"] == pytest.approx((tip - target) @ forward)
+    assert needle["found"]["tip_to_target_mm"] == pytest.approx(needle["true"]["tip_to_target_mm"], abs=0.5)
+    assert needle["tip_reading_error_mm"] < 0.5
+    assert needle["angle_reading_error_deg"] < 1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--marker", "cross"), "marker 'cross' is not known"),
+        (("--fov", "30"), "marker A is not in the image"),
+        (("--fov", "30", "--marker", "none", "--length", "6", "--spacing", "10"), "voxels"),
+        (("--rehearsal", "nowhere.json"), "nowhere.json"),
+    ],
+)
+def test_what_cannot_be_scanned_is_refused_and_leaves_nothing(arguments, said, tmp_path, capsys):
+    """One line, exit code 2."""
+    out = tmp_path / "out"
+    assert main(["scan", str(CARTON), "--out", str(out), *COARSE, *arguments]) == 2
+    assert said in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_what_a_structure_is_made_of_can_be_stated(tmp_path):
+    """``hu`` of a structure; a bolt of wood is no metal."""
+    assert main(["scan", str(of_wood(tmp_path)), "--out", str(tmp_path / "ct"), *COARSE]) == 0
+    ct, labels = read_volume(tmp_path / "ct" / "ct.nii.gz"), read_volume(tmp_path / "ct" / "labels.nii.gz")
+    assert -430 < np.median(ct.values[labels.values == 3]) < -250  # 8 mm wide in slices of 5 mm
