@@ -55,7 +55,7 @@ class CaseScene:
         T_scan_ct: Shape (4, 4): the case's frame to the scanner's; a rotation, never a mirror.
         skin: The body's surface.
         cut: Shape (3, 2): at which ends the body goes on beyond its surface.
-        behind_mm: To where along y the table reaches; as the skin where there is none.
+        tables: Shape (2, 3): the box about what stands in the CT's frame, such as a table; infinite without any.
         markers: True positions, or None.
         listed: The case's own readings of them.
         target: Shape (3,).
@@ -65,7 +65,7 @@ class CaseScene:
     T_scan_ct: Floats
     skin: TriangleMesh
     cut: Bools
-    behind_mm: float
+    tables: Floats
     markers: NamedPoints | None
     listed: NamedPoints | None
     target: Floats
@@ -108,7 +108,7 @@ def case_scene(
         T_scan_ct=T,
         skin=anatomy.skin.mesh.transformed(T),
         cut=np.zeros((3, 2), np.bool_) if view is None else view.cut,
-        behind_mm=max([float(one.mesh.transformed(T).bounds[1, 1]) for one in _tables(case)], default=-np.inf),
+        tables=_bounds([one.mesh.transformed(T) for one in _tables(case)]),
         markers=_moved(true, T),
         listed=_moved(listed, T),
         target=apply(T, case.target_ct),
@@ -223,7 +223,9 @@ def _moved(points: NamedPoints | None, T_scan_ct: Floats) -> NamedPoints | None:
     return None if points is None else NamedPoints(points.names, apply(T_scan_ct, points.points), Space.LPS)
 
 
-def mesh_bounds(meshes: Sequence[TriangleMesh]) -> Floats:
+def _bounds(meshes: Sequence[TriangleMesh]) -> Floats:
     """Lowest and highest corner of all, shape (2, 3), mm."""
+    if not meshes:
+        return np.array([np.full(3, np.inf), np.full(3, -np.inf)])
     bounds = np.stack([mesh.bounds for mesh in meshes])
     return np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])

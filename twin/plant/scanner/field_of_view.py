@@ -12,8 +12,8 @@ from puncture_twin.twin.plant.scanner.image import ScanSettings
 
 AIR_MM = 15.0
 """Air around the body: a needle's entry is not at the image's edge."""
-BEHIND_MM = 60.0
-"""Of a table behind the body, so much is shown."""
+TABLE_MM = 100.0
+"""Beside and behind the body, so much of a table is shown: where the image cuts it, what is beyond is not known."""
 FINEST_MM = 1e-4
 """Positions are multiples of it, so that DICOM's decimal strings hold them whole."""
 
@@ -49,8 +49,9 @@ def _shown(scene: CaseScene, settings: ScanSettings) -> tuple[Floats, Floats]:
     low, high = scene.skin.bounds
     low = low - np.where(scene.cut[:, 0], 0.0, AIR_MM)
     high = high + np.where(scene.cut[:, 1], 0.0, AIR_MM)
-    if np.isfinite(scene.behind_mm):
-        high[1] = max(high[1], min(scene.behind_mm + AIR_MM, high[1] + BEHIND_MM))
+    for axis in (0, 1):
+        low[axis] = min(low[axis], max(scene.tables[0, axis] - AIR_MM, low[axis] - TABLE_MM))
+        high[axis] = max(high[axis], min(scene.tables[1, axis] + AIR_MM, high[axis] + TABLE_MM))
     if settings.fov_mm is not None:
         middle = (low + high) / 2
         low[:2], high[:2] = middle[:2] - settings.fov_mm / 2, middle[:2] + settings.fov_mm / 2
