@@ -12,7 +12,7 @@ KILLS ?= 10
 # Python keeps what it compiles, whatever the shell says: to read every module anew takes each process seconds.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test quick durations fuzz kill lint mutants install docs pictures meshes clean
+.PHONY: demo test quick durations fuzz kill kill-batch lint mutants install docs pictures meshes clean
 
 demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
@@ -30,6 +30,10 @@ durations: install
 	rm -f out/durations.txt
 	DURATIONS=$(CURDIR)/out/durations.txt $(BIN)/pytest -q -n auto --dist loadfile
 	$(BIN)/python tests/slow_tests.py out/durations.txt
+
+# Two hundred SIGKILLs of a cohort's workers and main process (half an hour); then the merged files are those of an undisturbed one.
+kill-batch: install
+	BATCH_KILLS=200 BATCH_CASES=40 $(BIN)/python -m pytest -q -s tests/batch/test_kill_batch.py
 
 kill: install
 	KILLS=$(KILLS) $(BIN)/python -m pytest -q -s tests/jobs/test_kill.py

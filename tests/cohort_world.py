@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import time
+import uuid
 
 import pyarrow.parquet as pq
 from case_world import ORGAN, SKIN, case_text, structure, write_balls
@@ -121,3 +122,12 @@ def run_here(cohort, out, most=None):
     assert main(["batch", "plan", str(cohort), "--out", str(out), "--no-arm"]) == 0
     for row in read_plan_table(out).cases[:most]:
         run_case(task_of(row, out))
+
+
+def slow_token(context, found, folder):
+    """A case that takes a while, and writes down that it was run: one token a run, committed or not."""
+    time.sleep(0.4)
+    token = uuid.uuid4().hex
+    (folder / "token").write_text(token)
+    with (folder.parent.parent / "runs").open("a") as stream:
+        stream.write(token + "\n")

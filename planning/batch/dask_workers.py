@@ -70,7 +70,7 @@ def _ends(distributed: Any, client: Any, tasks: Sequence[CaseTask]) -> Generator
     """How each case ended, as they end; one that killed its workers gets its row here."""
     futures = {client.submit(run_on_worker, task, pure=False): task for task in tasks}
     try:
-        for future in distributed.as_completed(list(futures)):
+        for future in distributed.as_completed(list(futures), loop=client.loop):
             task = futures.pop(future)
             error = future.exception() if future.status == "error" else None
             if future.status not in ("error", "finished"):
