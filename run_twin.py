@@ -361,7 +361,7 @@ def export(
     format_name: Annotated[
         str,
         typer.Option(
-            "--format", metavar="FORMAT", help="urscript, ros2, csv, slicer, candidates-csv or candidates-json."
+            "--format", metavar="FORMAT", help="urscript, ros2, moveit, csv, slicer, candidates-csv or candidates-json."
         ),
     ],
     case: Annotated[Path | None, typer.Option("--case", help="The plan's case: check the plan again.")] = None,
@@ -370,6 +370,7 @@ def export(
 ) -> None:
     """Write a plan for a robot, read back and within the arm's limits. Research software, not a medical device."""
     from puncture_twin.planning.export.exporter import FORMATS
+    from puncture_twin.planning.export.moveit import MOVEIT
     from puncture_twin.planning.export.slicer.slicer_files import SLICER
     from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.choosing.candidates_export import CANDIDATE_FORMATS
@@ -377,7 +378,7 @@ def export(
     from puncture_twin.twin.jobs.patient.case_or_plan import case_of, is_plan
     from puncture_twin.twin.jobs.patient.summaries import export_summary
 
-    formats = (*FORMATS, SLICER, *CANDIDATE_FORMATS)
+    formats = (*FORMATS, MOVEIT, SLICER, *CANDIDATE_FORMATS)
     if format_name not in formats:
         raise InputError(f"format '{format_name}' is not known", where="--format", allowed=", ".join(formats))
     folder = _out(out_dir, source, "export")
@@ -388,9 +389,15 @@ def export(
     if format_name == SLICER:
         _export_to_slicer(source, folder, choice, as_json)
         return
+    if format_name == MOVEIT and planned_case is None:
+        raise InputError("moveit's scene is the case's", where=source, allowed="export plan.json --case CASE")
     with progress_display() as progress:
         context = None if planned_case is None else prepare(planned_case, watcher=progress)
-        if context is None or is_plan(source):
+        if format_name == MOVEIT and context is not None:
+            from puncture_twin.twin.jobs.patient.moveit_job import export_to_moveit
+
+            done = export_to_moveit(context, source if is_plan(source) else None, folder, choice)
+        elif context is None or is_plan(source):
             done = main_job.export(source, format_name, folder, context, progress.note)
         else:
             done = main_job.export_case(context, format_name, folder, choice)
