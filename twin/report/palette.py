@@ -64,8 +64,8 @@ CUSTOM_COLOURS: tuple[tuple[str, Rgb], ...] = (
     ("trapezius", MUSCLE),
     ("quadriceps", MUSCLE),
     ("ureter", (247, 182, 164)),
-    ("cartilage", (111, 184, 210)),
-    ("costal", (111, 184, 210)),
+    ("cartilage", (214, 214, 200)),
+    ("costal", (214, 214, 200)),
     ("spinal_cord", (244, 214, 49)),
     ("nerve", (234, 202, 40)),
     ("vertebra", (226, 202, 134)),
@@ -104,8 +104,9 @@ CUSTOM_COLOURS: tuple[tuple[str, Rgb], ...] = (
 """Part of a structure's name, colour; the first match counts.
 
 The colours by which 3D Slicer shows anatomy (its GenericAnatomyColors of 2010), so that a structure looks here as
-there. Two are not followed: a mass is green there, and green means safe here; muscles are muted, since they fill the
-picture. The portal vein is told from the veins that drain the liver.
+there. Three are not followed: a mass is green there, and green means safe here; cartilage has there the blue of a vein,
+behind a see-through organ; muscles are muted, since they fill the picture. The portal vein is told from the veins that
+drain the liver.
 """
 
 SIDES = re.compile(r"(^|[_ ])(right|left|r|l)(?=[_ ]|$)")

@@ -48,8 +48,8 @@ SAME_BYTES = ("-threads", "4", "-filter_threads", "1", "-fflags", "+bitexact", "
 INSET = 240
 """Side of the close-up, upper right; below it stand the names and the body's directions."""
 
-FRAMES_PER_SECOND = 10
-LONGEST_S = 11.0
+FRAMES_PER_SECOND = 25
+LONGEST_S = 8.0
 """Playback is sped up until the motion fits into this time; then the last frame stands still."""
 
 STILL_S = 2.0
@@ -129,7 +129,7 @@ def _frames(
 ) -> Iterator[NDArray[np.uint8]]:
     T_base_ct = rehearsal.T_base_ct_true
     arm = ArmPicture(plan.model, T_base_ct)
-    still = [*patient(anatomy, case), *room(case, T_base_ct), _planned_path(plan)]
+    still = [*patient(anatomy, case), *room(case, T_base_ct), arm.plate, _planned_path(plan)]
     wide = _Stage(still, _wide_camera(case, still, arm, rehearsal, plan))
     near = _Stage([b for b in still if b.group != "room"], _near_camera(case, still, plan))
     tool = _tool_layer(case)
@@ -202,7 +202,7 @@ def _wide_camera(case: Any, still: list[SceneBody], arm: ArmPicture, rehearsal: 
     focus = plan.target_ct + np.linspace(0, plan.standoff_mm + case.needle.length_mm, 24)[:, None] * way
     at_work = [body for q in poses[1:] for body in arm.bodies(q)]
     blockers = Layer([b.surface for b in at_work] + [b.surface for b in still if b.group == "room"])
-    return overview(case, np.concatenate(content), focus, blockers, (VIEW_WIDTH, VIEW_HEIGHT))
+    return overview(case, np.concatenate(content), focus, blockers, (VIEW_WIDTH, VIEW_HEIGHT), way)
 
 
 def _near_camera(case: Any, still: list[SceneBody], plan: Any) -> ViewCamera:

@@ -39,6 +39,9 @@ WALL_OPACITY = 0.10
 TARGET_BALL_MM = 3.0
 """Radius of the ball that marks the target point."""
 
+PLATE_RADIUS_MM, PLATE_THICK_MM = 130.0, 25.0
+"""Of the plate under the arm's base: wider than any base, so that it is seen."""
+
 LEAST_NEEDLE_MM = 1.0
 """Least radius at which the needle is drawn: thinner ones would be below a pixel. The legend says so."""
 
@@ -176,10 +179,18 @@ class ArmPicture:
     def bodies(self, q: Floats) -> tuple[SceneBody, ...]:
         """The links in the CT frame at one configuration."""
         poses = self.poses_ct(q)
-        return tuple(
+        links = (
             SceneBody(link.name, "arm", link.mesh.transformed(T), palette.ARM)
             for link, T in zip(self._links, poses, strict=True)
         )
+        return (*links, self.plate)
+
+    @property
+    def plate(self) -> SceneBody:
+        """What the base stands on: that it does stand somewhere; a case does not say what carries it."""
+        T = self._T_ct_base
+        ends = (T[:3, 3], T[:3, 3] - PLATE_THICK_MM * T[:3, 2])
+        return SceneBody("base plate", "arm", bar(*ends, PLATE_RADIUS_MM), palette.TABLE)
 
 
 def room(case: Any, T_base_ct: Floats | None) -> tuple[SceneBody, ...]:

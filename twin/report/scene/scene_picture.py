@@ -113,7 +113,8 @@ def _overview_camera(case: Any, bodies: Sequence[SceneBody], path_ct: Any) -> Vi
             points.append(vertices)
     focus = np.stack([case.target_ct]) if path_ct is None else _needle_line(case, path_ct)
     blockers = Layer([b.surface for b in bodies if b.alpha >= 1 and b.group in {"arm", "room", "target"}])
-    return overview(case, np.concatenate(points), focus, blockers, size)
+    outward = None if path_ct is None else (path_ct[1] - path_ct[0]) / np.linalg.norm(path_ct[1] - path_ct[0])
+    return overview(case, np.concatenate(points), focus, blockers, size, outward)
 
 
 def _needle_line(case: Any, path_ct: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -192,6 +193,7 @@ def _words(
         items += [
             (f"arm ({plan.model})" if plan is not None else "arm", palette.ARM),
             ("needle holder", palette.HOLDER),
+            ("where its base stands", palette.TABLE),
         ]
     items += [(_see_through(b), b.colour) for b in bodies if b.group == "room"]
     below = annotate.legend(draw, items, 20, LEGEND_TOP, WIDTH - 20)

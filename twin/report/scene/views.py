@@ -21,6 +21,9 @@ UPRIGHT = 0.5
 ALONG_BODY = 0.62
 """A patient is not looked at more steeply along the body than this cosine: from head or feet little is recognised."""
 
+ENTRY_SIDE = 0.35
+"""Least cosine between the needle and the way to whoever looks: from behind the body no entry is seen."""
+
 ELEVATIONS = (np.radians(22.0), np.radians(40.0))
 AZIMUTHS = 16
 TILTS = (0.0, np.radians(25.0), np.radians(-25.0))
@@ -37,8 +40,15 @@ def up_ct(case: Any) -> Floats:
     return z
 
 
-def overview(case: Any, content_ct: Floats, focus_ct: Floats, blockers: Layer, size: tuple[int, int]) -> ViewCamera:
-    """A view of everything from above the table, from the side where the needle is best seen.
+def overview(
+    case: Any,
+    content_ct: Floats,
+    focus_ct: Floats,
+    blockers: Layer,
+    size: tuple[int, int],
+    outward_ct: Floats | None = None,
+) -> ViewCamera:
+    """A view of everything from above the table and from the needle's side, from where it is best seen.
 
     Args:
         case: For the direction up.
@@ -46,6 +56,7 @@ def overview(case: Any, content_ct: Floats, focus_ct: Floats, blockers: Layer, s
         focus_ct: Shape (k, 3), what should not be hidden.
         blockers: What can hide it.
         size: Width and height in pixels.
+        outward_ct: Shape (3,), unit, from the target out of the body along the needle; None looks from any side.
     """
     up = up_ct(case)
     side = _across(up)
@@ -56,6 +67,8 @@ def overview(case: Any, content_ct: Floats, focus_ct: Floats, blockers: Layer, s
             options.append(-np.cos(elevation) * level - np.sin(elevation) * up)
     if str(case.space) != "local":
         options = [o for o in options if abs(o @ np.array(ANATOMICAL_LPS["head"])) < ALONG_BODY]
+    if outward_ct is not None:
+        options = [o for o in options if -o @ outward_ct > ENTRY_SIDE] or options
     return _best(options, up, content_ct, focus_ct, blockers, size)
 
 
