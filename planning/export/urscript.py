@@ -2,6 +2,7 @@
 
 It looks before it moves: the arm must stand at the plan's start, and the controller's own kinematics must put the
 needle where the plan does. It stops at the standoff, sets the tip on the planned line, and waits for the operator.
+While it inserts, the controller's own `tool_contact` stops it; when the operator says so it retracts as it came.
 The text is one function and nothing else, not even a comment before it: a controller runs what it gets on its socket
 as soon as that is whole, and a second piece would replace the first.
 """
@@ -44,7 +45,10 @@ _MOVEJ = re.compile(rf"  movej\(({_LIST}), a=({_NUMBER}), v=({_NUMBER}), r=({_NU
 _SERVOJ = re.compile(rf"  servoj\(({_LIST}), 0, 0, {_NUMBER}, 0.1, 300\)")
 _SETTLE = "  movej(standoff_q, a=0.1, v=0.05)"
 _VALUE = re.compile(rf"  (start_q|standoff_q|target_q|standoff_m|target_m|tcp_m) = (p?{_LIST})")
-_INSERTION = re.compile(rf"  movel\(target_m, a=({_NUMBER}), v=({_NUMBER})\)")
+_INSERTION = re.compile(rf"    movel\(target_m, a=({_NUMBER}), v=({_NUMBER})\)")
+_RETRACTION = re.compile(rf"    movel\(standoff_m, a=({_NUMBER}), v=({_NUMBER})\)")
+_RUN = "  insertion = run insert()"
+_GUARD = "    if tool_contact(direction=get_target_tcp_speed()) > 0:"
 _WAIT = '  popup("Needle at standoff. Continue inserts it.", title="Insertion", blocking=True)'
 
 _FUNCTIONS = """\
@@ -84,7 +88,8 @@ def urscript_text(program: Program, plan: Plan, *, case_checked: bool) -> str:
     notes = [
         "units: metres and radians; poses in the controller's base frame; TCP at the needle tip",
         "corners of the approach: " + ("rounded where the plan's case shows them free" if blended else "not rounded"),
-        "not set here: payload, safety limits, forces. The arm stops for no tissue and no person.",
+        "not set here: payload, safety limits. While it inserts, tool_contact stops the arm, with the controller's own",
+        "threshold: it tells no tissue from another and is no guard for persons.",
     ]
     lines = ["def puncture():", *(f"  {line}" for line in heading(plan, notes, case_checked=case_checked))]
     lines += [*_values(program), "", *_FUNCTIONS.splitlines(), ""]
@@ -140,8 +145,39 @@ def _insertion(program: Program) -> list[str]:
         f"  if far_from(held_q, {START_TOLERANCE_RAD}):",
         '    refuse("The arm moved while it waited.")',
         "  end",
-        f"  movel(target_m, a={acceleration}, v={_number(program.insertion_mm_s * M_PER_MM)})",
-        f"  stopl({acceleration})",
+        *_guarded(acceleration, _number(program.insertion_mm_s * M_PER_MM)),
+    ]
+
+
+def _guarded(acceleration: str, speed: str) -> list[str]:
+    """The insertion in a thread that a contact ends, then the way back along the same line, at the same speed."""
+    return [
+        "  global inserted = False",
+        "  global touched = False",
+        "  thread insert():",
+        f"    movel(target_m, a={acceleration}, v={speed})",
+        f"    stopl({acceleration})",
+        "    inserted = True",
+        "  end",
+        "  def retract():",
+        f"    movel(standoff_m, a={acceleration}, v={speed})",
+        f"    stopl({acceleration})",
+        "  end",
+        _RUN,
+        "  while not (inserted or touched):",
+        _GUARD,
+        "      kill insertion",
+        f"      stopl({acceleration})",
+        "      touched = True",
+        "    end",
+        "    sync()",
+        "  end",
+        "  if touched:",
+        '    popup("Contact. Continue retracts the needle; stop leaves it.", title="Stopped", blocking=True)',
+        "  else:",
+        '    popup("Needle at target. Continue retracts it; stop leaves it.", title="Inserted", blocking=True)',
+        "  end",
+        "  retract()",
     ]
 
 
@@ -159,9 +195,13 @@ def read_urscript(text: str, *, where: Path) -> Program:
     others = sum(line.lstrip().startswith(("movej", "movel", "movep", "movec", "servo", "speed")) for line in lines)
     settles = lines.count(_SETTLE) if streamed else 0
     waits = [at for at, line in enumerate(lines) if line == _WAIT]
-    if len(values) != 6 or len(insertions) != 1 or others != len(moves) + len(streamed) + 2 + settles:
+    back = [match for line in lines if (match := _RETRACTION.fullmatch(line))]
+    if len(values) != 6 or len(insertions) != 1 or others != len(moves) + len(streamed) + 3 + settles:
         raise InputError("the program does not read back", where=where, allowed="known moves and one insertion")
     at, insertion = insertions[0]
+    if len(back) != 1 or back[0].groups() != insertion.groups() or lines.count(_RUN) != 1 or _GUARD not in lines:
+        allowed = "a guard, and a way back at the same speed"
+        raise InputError("the insertion is not guarded, or does not retract", where=where, allowed=allowed)
     last = max((n for n, line in enumerate(lines) if line.startswith(("  movej", "  servoj"))), default=-1)
     if len(waits) != 1 or not last < waits[0] < at:
         raise InputError("the insertion does not wait for the operator", where=where, allowed="a wait before it")

@@ -2,6 +2,7 @@
 
 import math
 import re
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -107,11 +108,16 @@ class HaltError(Exception):
     """The program ended itself."""
 
 
+class TouchedError(Exception):
+    """The tool met something."""
+
+
 class Controller:
     """Runs the subset of URScript that is written here: straight joint moves, straight tip moves, guards."""
 
-    def __init__(self, q, model=UR3, operator=lambda robot: None):
+    def __init__(self, q, model=UR3, operator=lambda robot: None, contact=None):
         self.q, self.model, self.operator = np.array(q, dtype=float), model, operator
+        self.contact, self.inside = contact, False  # the part of the insertion after which it meets something
         self.length = 0.0
         self.events, self.way = [], [self.q.copy()]
 
@@ -119,12 +125,36 @@ class Controller:
         """Run a program; True if it came to its end."""
         code = "\n".join([*(line for line in text.splitlines() if line.strip() != "end"), "puncture()"])
         code = re.sub(r"p\[([^]]*)\]", r"(\1)", code).replace("local ", "").replace("halt", "raise HaltError")
+        code = code.replace("thread insert():", "def insert():\n    nonlocal inserted").replace("global ", "")
+        code = code.replace("run insert()", "run(insert)").replace("kill insertion", "kill(insertion)")
         names = {name: getattr(self, name) for name in dir(self) if not name.startswith("_")}
         try:
-            exec(code, {**names, "HaltError": HaltError, "norm": abs, "sin": math.sin})
+            exec(code, {**names, "run": self.run_thread, "HaltError": HaltError, "norm": abs, "sin": math.sin})
         except HaltError:
             return False
         return True
+
+    def run_thread(self, thread):
+        """A thread, to its end or to where it meets something."""
+        self.inside = True
+        with suppress(TouchedError):
+            thread()
+        self.inside = False
+
+    def tool_contact(self, direction):
+        """Steps since a contact began, 0 without one; the direction is that of the motion."""
+        return 0 if self.contact is None else 4
+
+    def get_target_tcp_speed(self):
+        """Of the tip."""
+        return [0.0, 0.0, 0.01, 0.0, 0.0, 0.0]
+
+    def kill(self, thread):
+        """End a thread."""
+        self.events.append(("kill",))
+
+    def sync(self):
+        """The rest of the cycle."""
 
     def set_tcp(self, pose):
         """The needle's length, m, along the flange's z."""
@@ -190,6 +220,8 @@ class Controller:
         start, end = tip_poses(self.model, self.q, self.length), self.matrix(pose)
         turn = Rotation.from_matrix(end[:3, :3] @ start[:3, :3].T).as_rotvec()
         for share in np.linspace(0.0, 1.0, 201)[1:]:
+            if self.inside and self.contact is not None and share > self.contact:
+                raise TouchedError
             wanted = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
             R = Rotation.from_rotvec(share * turn).as_matrix() @ start[:3, :3]
             flange = wanted - self.length * R[:, 2]
@@ -244,8 +276,11 @@ def test_the_program_drives_the_plan(plan):
     """Executed by a controller of our own: three joint moves, a wait, a straight move; within 0.01 mm of the plan."""
     robot = Controller(plan.approach.q[0])
     assert robot.run(script(plan))
-    assert kinds(robot) == ["movej", "movej", "movej", "movel", "popup", "movel", "stopl"]
-    assert robot.events[4] == ("popup", "Insertion", True)
+    went = ["movej", "movej", "movej", "movel", "popup", "movel", "stopl"]
+    assert kinds(robot) == [*went, "popup", "movel", "stopl"]
+    assert [robot.events[at] for at in (4, 7)] == [("popup", "Insertion", True), ("popup", "Inserted", True)]
+    back = len(robot.way) - 200  # the way back is as long as the way in
+    robot.q, robot.way = robot.way[back - 1], robot.way[:back]
     planned = np.concatenate([finer(plan.approach), finer(plan.insertion)])
     assert off_way_mm(UR3, planned[::7], robot.way) < 0.01
     assert off_way_mm(UR3, robot.way[::7], planned) < 0.01
@@ -253,6 +288,17 @@ def test_the_program_drives_the_plan(plan):
     assert np.linalg.norm(tip - plan.T_base_ct[:3, 3] - plan.target_ct) < 0.01
     np.testing.assert_allclose(robot.q, plan.insertion.q[-1], atol=1e-4)
     assert robot.length == pytest.approx(plan.needle_length_mm, abs=1e-9)
+
+
+def test_a_contact_stops_the_insertion_and_it_retracts(plan):
+    """The tip goes no deeper than where it was met, waits for the operator, and comes back to the standoff."""
+    robot = Controller(plan.approach.q[0], contact=0.4)
+    assert robot.run(script(plan))
+    assert kinds(robot)[-6:] == ["movel", "popup", "kill", "stopl", "popup", "movel", "stopl"][-6:]
+    assert robot.events[-3] == ("popup", "Stopped", True)
+    tips = tip_poses(UR3, np.array(robot.way), plan.needle_length_mm)[:, :3, 3] - plan.T_base_ct[:3, 3]
+    assert np.linalg.norm(tips - plan.target_ct, axis=1).min() == pytest.approx(0.6 * STANDOFF_MM, abs=0.5)
+    np.testing.assert_allclose(robot.q, plan.insertion.q[0], atol=1e-4)
 
 
 def test_the_program_keeps_the_plans_time(plan):
@@ -317,7 +363,7 @@ def test_a_smooth_approach_is_streamed(smooth):
     check_program(read_urscript(text, where=SOURCE), smooth, where=SOURCE)
     robot = Controller(smooth.approach.q[0])
     assert robot.run(text)
-    assert kinds(robot) == ["servoj", "stopj", "movel", "popup", "movel", "stopl"]
+    assert kinds(robot) == ["servoj", "stopj", "movel", "popup", "movel", "stopl", "popup", "movel", "stopl"]
     assert off_way_mm(UR3, smooth.approach.q, robot.way) < 1e-6
 
 
@@ -328,7 +374,7 @@ def test_an_approach_that_is_already_there_has_no_moves(plan):
     text = script(there)
     check_program(read_urscript(text, where=SOURCE), there, where=SOURCE)
     assert robot.run(text)
-    assert kinds(robot) == ["movel", "popup", "movel", "stopl"]
+    assert kinds(robot) == ["movel", "popup", "movel", "stopl", "popup", "movel", "stopl"]
 
 
 @settings(max_examples=60, deadline=None)
@@ -578,9 +624,12 @@ def test_no_number_of_the_program_has_an_exponent(plan):
 TAMPERED = {
     "no wait": (lambda t: re.sub(r'  popup\("Needle.*\n', "", t), "wait"),
     "a wait after the insertion": (
-        lambda t: re.sub(r'(  popup\("Needle.*\n)((?:.*\n)*?)(  movel\(target_m.*\n)', r"\2\3\1", t),
+        lambda t: re.sub(r'(  popup\("Needle.*\n)((?:.*\n)*?)(    movel\(target_m.*\n)', r"\2\3\1", t),
         "wait",
     ),
+    "no guard": (lambda t: t.replace("if tool_contact(direction=get_target_tcp_speed()) > 0:", "if False:"), "guarded"),
+    "a faster way back": (lambda t: re.sub(r"    movel\(standoff_m, a=0.", "    movel(standoff_m, a=1.", t), "guarded"),
+    "no thread": (lambda t: t.replace("  insertion = run insert()\n", ""), "guarded"),
     "a joint changed": (lambda t: t.replace("  movej([0.3000", "  movej([0.3001"), "approach"),
     "a blend at the end": (
         lambda t: re.sub(r"r=0\.0+\)(?!(?:.*\n)+  movej)", "r=0.010000000000)", t),
