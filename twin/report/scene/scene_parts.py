@@ -189,8 +189,8 @@ class ArmPicture:
     def plate(self) -> SceneBody:
         """What the base stands on: that it does stand somewhere; a case does not say what carries it."""
         T = self._T_ct_base
-        below = np.asarray(T[:3, 3] - PLATE_THICK_MM * T[:3, 2], dtype=np.float64)
-        return SceneBody("base plate", "arm", bar(T[:3, 3], below, PLATE_RADIUS_MM), palette.TABLE)
+        top, down = np.asarray(T[:3, 3], dtype=np.float64), np.asarray(T[:3, 2], dtype=np.float64)
+        return SceneBody("base plate", "arm", bar(top, top - PLATE_THICK_MM * down, PLATE_RADIUS_MM), palette.TABLE)
 
 
 def room(case: Any, T_base_ct: Floats | None) -> tuple[SceneBody, ...]:
