@@ -45,6 +45,7 @@ def make_case(*, space="LPS", frame=None, name="ball"):
         robot=SimpleNamespace(model="ur3"),
         rehearsal=SimpleNamespace(seed=7),
         breathing=None,
+        bending=None,
     )
 
 
