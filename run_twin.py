@@ -298,6 +298,25 @@ def rehearse(
 
 
 @app.command()
+@with_choice
+def touch(
+    case: CaseArgument,
+    choice: Choice,
+    out_dir: OutOfCaseOption = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=2**31 - 1, help="Of the motions and of the truth.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Plan how the markers are touched for a puncture, touch them in the twin, and write touch.csv."""
+    from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.experiment.touch_job import touch_case, touch_text
+
+    folder = _out(out_dir, case, "touch")
+    with progress_display() as progress:
+        run = touch_case(prepare(case, watcher=progress), folder, choice, seed)
+    _print(run.summary(), touch_text(run), as_json)
+
+
+@app.command()
 def place(
     case: CaseArgument,
     out_dir: OutOfCaseOption = None,

@@ -28,7 +28,6 @@ WITHOUT_WORK = {
     "puncture_twin.twin.phantoms.ct_image",
     "puncture_twin.twin.phantoms.supine",
     "puncture_twin.twin.plant.scanner.readings",
-    "puncture_twin.twin.plant.tip_touch",
 }
 """Devices, and patients in a scanner, that no command uses yet."""
 

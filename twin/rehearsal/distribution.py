@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -12,6 +12,7 @@ from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
@@ -163,6 +164,31 @@ def rehearse_rooms(
     Raises:
         InputError: The case declares no errors, or has no markers.
     """
+    asked = _asked(context, outward_ct, q_insertion)
+    rooms = draw_rooms(asked.puncture, asked.truth, count, np.random.default_rng(seed))
+    return _measured(context, asked.believed, asked.puncture, rooms, seed, asked.guessed)
+
+
+def misregistered(context: CaseContext, outward_ct: Floats, q_insertion: Floats, seed: int) -> Floats:
+    """E with T_believed = T_true E, shape (4, 4), mm: one registration of a case that its declared errors allow.
+
+    Arguments and errors as of `rehearse_rooms`.
+    """
+    asked = _asked(context, outward_ct, q_insertion)
+    room = draw_rooms(asked.puncture, asked.truth, 1, np.random.default_rng(seed))
+    return np.asarray(np.linalg.inv(asked.puncture.T_base_ct) @ room.T_base_ct[0])
+
+
+class _Asked(NamedTuple):
+    """What rooms are drawn of."""
+
+    believed: PoseError
+    puncture: Puncture
+    truth: ErrorModel
+    guessed: bool
+
+
+def _asked(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _Asked:
     case = context.case
     registration = None if context.placement is None else context.placement.registration
     error = pose_error(case, registration)
@@ -176,8 +202,7 @@ def rehearse_rooms(
         ur_model(case.robot.model), case.needle.length_mm, registration.method, believed.fit.noise,
         registration.markers.points_ct, q_touch, registration.T_base_ct, case.target_ct, outward_ct, q_insertion, bend,
     )  # fmt: skip
-    rooms = draw_rooms(puncture, truth, count, np.random.default_rng(seed))
-    return _measured(context, believed, puncture, rooms, seed, registration.markers.joints is None)
+    return _Asked(believed, puncture, truth, registration.markers.joints is None)
 
 
 def _bend(context: CaseContext, outward_ct: Floats) -> Bend | None:

@@ -25,6 +25,9 @@ BOX_RGBA: Rgba = (0.60, 0.63, 0.67, 1.0)
 CONTACT_MARGIN_M = 0.0
 """Bullet grows concave shapes by this; contact shall begin at the surface itself."""
 
+CONTACT_DAMPING_NS_M = 100.0
+"""Of bodies that yield."""
+
 
 def load_surface(
     client: int,
@@ -87,6 +90,12 @@ def load_ball(client: int, center_mm: Floats, radius_mm: float, rgba: Rgba) -> i
 def remove(client: int, body: int) -> None:
     """Take a body out of the world."""
     pybullet.removeBody(body, physicsClientId=client)
+
+
+def soften(client: int, body: int, stiffness_n_m: float) -> None:
+    """Let a body that stands still yield in contact like a spring, N/m, lightly damped."""
+    soft = {"contactStiffness": stiffness_n_m, "contactDamping": CONTACT_DAMPING_NS_M}
+    pybullet.changeDynamics(body, -1, **soft, physicsClientId=client)
 
 
 def let_pass(client: int, body: int, link: int, other: int) -> None:

@@ -5,14 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.registration import fit_rigid, fit_triad, leverage
-from puncture_twin.planning.registration.touch_poses import touching_configuration
 from puncture_twin.twin.plant.scanner.readings import Scanner, draw_true_positions, read_positions, scan, slice_number
-from puncture_twin.twin.plant.tip_touch import TouchProbe, touch
 
 MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [90, -10, 20], [20, 150, 147]])
 """A to E of the carton (Chen 2019, Table 1)."""
@@ -31,27 +26,6 @@ SETUP_1 = np.array(
     ]
 )
 """A, B, C, L, M, H in the base frame (Table 2)."""
-
-EXACT_JOINTS = np.zeros(6)
-DOWN_IN_THE_BOX = np.array([0.0, 0.0, 1.0])
-"""CT +z is base -z in the paper: from above the box, the needle goes along base +z."""
-
-
-def probe(**changes: object) -> TouchProbe:
-    """The paper's robot: a UR3 with TCP offset 401 mm."""
-    settings = {
-        "model": ur_model("ur3"),
-        "tcp_mm": 401.0,
-        "needle_base": DOWN_IN_THE_BOX,
-        "noise_mm": 0.1,
-        "joint_offsets": EXACT_JOINTS,
-    }
-    return TouchProbe(**(settings | changes))
-
-
-def configuration(one: TouchProbe, point: np.ndarray) -> np.ndarray:
-    """How a probe's arm touches a point."""
-    return touching_configuration(one.model, one.tcp_mm, point, one.needle_base)
 
 
 def test_slices_are_numbered_from_the_inner_wall():
@@ -89,48 +63,6 @@ def test_drawn_true_positions_read_as_they_were_read():
     rng = np.random.default_rng(2)
     for _ in range(50):
         np.testing.assert_allclose(read_positions(Scanner(), draw_true_positions(Scanner(), MARKERS, rng)), MARKERS)
-
-
-def test_touch_without_noise_reads_the_truth():
-    """An exact robot reads the marker's position to rounding."""
-    readings = touch(probe(noise_mm=0.0), SETUP_1, np.random.default_rng(0))
-    np.testing.assert_allclose(readings, SETUP_1, atol=1e-6)
-
-
-def test_every_point_of_the_papers_first_placement_can_be_touched_by_a_ur3():
-    """The tip is on the point, and the needle leans by 60 degrees at most from the wished direction."""
-    for point in SETUP_1:
-        T = flange_pose(ur_model("ur3"), configuration(probe(), point))
-        np.testing.assert_allclose(T[:3, 3] + 401.0 * T[:3, 2], point, atol=1e-6)
-        assert T[:3, 2] @ DOWN_IN_THE_BOX >= np.cos(np.radians(60.0)) - 1e-9
-
-
-def test_touch_noise_is_the_one_asked_for_and_seeded():
-    """0.1 mm per axis; the same generator state gives the same readings."""
-    rng = np.random.default_rng(3)
-    errors = np.concatenate([touch(probe(), SETUP_1[:2], rng) - SETUP_1[:2] for _ in range(200)])
-    assert errors.std() == pytest.approx(0.1, rel=0.08)
-    one, same = (touch(probe(), SETUP_1, np.random.default_rng(4)) for _ in range(2))
-    np.testing.assert_array_equal(one, same)
-
-
-def test_joint_offsets_move_the_reading_by_what_the_jacobian_says():
-    """The controller believes its encoders: reading = point - J offsets, to second order."""
-    offsets = np.radians([0.02, -0.01, 0.015, 0.02, -0.02, 0.01])
-    shifted = probe(noise_mm=0.0, joint_offsets=offsets)
-    readings = touch(shifted, SETUP_1, np.random.default_rng(0))
-    for point, reading in zip(SETUP_1, readings, strict=True):
-        q = configuration(shifted, point)
-        step, tip = 1e-6, np.array([0.0, 0.0, 401.0, 1.0])
-        ahead, behind = (flange_pose(ur_model("ur3"), q + s * step * offsets) @ tip for s in (1, -1))
-        np.testing.assert_allclose(reading, point - (ahead - behind)[:3] / (2 * step), atol=2e-3)
-        assert 0.01 < np.linalg.norm(reading - point) < 1.0
-
-
-def test_a_point_out_of_reach_is_said_to_be():
-    """The answer is no, with the point and the needle."""
-    with pytest.raises(NoAnswerError, match=r"cannot touch \(2000.0, 0.0, 0.0\)"):
-        touch(probe(), np.array([[2000.0, 0, 0]]), np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("count", [3, 5])

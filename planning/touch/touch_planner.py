@@ -1,0 +1,233 @@
+"""The planning of touches: poses in which the arm's errors cancel best at the target, a short tour, its motions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.progress import Count
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.workcell import (
+    case_boxes,
+    case_tool,
+    home_configuration,
+    patient_surface,
+)
+from puncture_twin.planning.formats.points.point_files import NamedPoints
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.motion.approach import plan_approach
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.registration.placement import marker_noise
+from puncture_twin.planning.registration.reading_noise import reading_noise
+from puncture_twin.planning.registration.registration import MIN_MARKERS, MarkerPairs, Method, Registration, register
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.touch.order import shortest_tour
+from puncture_twin.planning.touch.straight_approach import STANDOFF_MM, TIP_MM, ApproachCheckers, line_to, why_not
+from puncture_twin.planning.touch.touch_plan import Touch, TouchPlan
+from puncture_twin.planning.uncertainty.pose_error import PoseError, expected_error_mm
+from puncture_twin.planning.uncertainty.touch_choice import Candidates, least_error, touch_candidates
+
+PLANNED_PADDING_MM = 4.0
+"""Kept between the shaft of a touching needle and the patient where the markers are believed: they lie elsewhere."""
+
+TOUCHING_PADDING_MM = 1.0
+"""The same when the line was set onto the marker."""
+
+ALLOWED = "a case with [errors] and markers, which say where to touch and how sure that is"
+
+MOST_MARKERS = 12
+"""The order of more takes too long to be the best one."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """Some markers of a case, and what they are touched for.
+
+    Attributes:
+        context: The case.
+        markers: Those that are touched; their points in the base frame are where they are believed to be.
+        method: Of the registration that they are for.
+        q_insertion: Shape (6,), rad, the tip on the target.
+    """
+
+    context: CaseContext
+    markers: MarkerPairs
+    method: Method
+    q_insertion: Floats
+
+    @property
+    def model(self) -> UrModel:
+        """The arm."""
+        return ur_model(self.context.case.robot.model)
+
+    @property
+    def tip_mm(self) -> float:
+        """Flange to tip."""
+        return self.context.case.needle.length_mm
+
+    def of(self, rows: Sequence[int]) -> _Task:
+        """The same of some of its markers."""
+        at, names = list(rows), self.markers.names
+        points_ct, points_base = self.markers.points_ct[at], self.markers.points_base[at]
+        return replace(self, markers=MarkerPairs(tuple(names[row] for row in at), points_ct, points_base))
+
+    def error(self, q_touch: Floats) -> PoseError:
+        """The pose error after touches in configurations (n, 6) or one (6,), rad."""
+        case = self.context.case
+        assert case.errors is not None
+        q = np.broadcast_to(q_touch, (len(self.markers), 6))
+        noise = reading_noise(case.errors, self.model, self.tip_mm, q, known=True)
+        target_ct = case.target_ct
+        fitted = register(self.markers, method=self.method, target_ct=target_ct, noise=noise, accept_residuals=True)
+        assert fitted.uncertainty is not None
+        target = apply(fitted.T_base_ct, target_ct)
+        return PoseError(self.model, self.tip_mm, target, case.errors, fitted.uncertainty)
+
+    def expected_mm(self, q_touch: Floats) -> float:
+        """Of the tip at the target (rms)."""
+        return expected_error_mm(self.error(q_touch), self.q_insertion)
+
+
+class _Open(NamedTuple):
+    """The markers that can be touched, as rows, with the poses that the workcell leaves, and why others cannot."""
+
+    rows: tuple[int, ...]
+    candidates: tuple[Floats, ...]
+    left_out: dict[str, str]
+
+
+def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progress: Count) -> TouchPlan:
+    """Plan to touch every marker that can be touched.
+
+    Args:
+        context: Of a case with declared errors, markers and an arm.
+        q_insertion: Shape (6,), rad, the tip on the target: what the touches shall be good for.
+        seed: Of the motions' planner.
+        progress: Called with motions done and all of them.
+
+    Raises:
+        InputError: The case declares no errors, or has no markers, or too many.
+        NoAnswerError: Fewer than three markers can be touched, or no motion to one was found.
+    """
+    task = _task(context, q_insertion)
+    found = _open(task)
+    if len(found.rows) < MIN_MARKERS:
+        why = "; ".join(f"{name}: {reason}" for name, reason in found.left_out.items())
+        count = f"{len(found.rows)} of {len(task.markers)} markers can be touched, {MIN_MARKERS} are needed"
+        raise NoAnswerError(f"{count}: {why}")
+    task = task.of(found.rows)
+    error = task.error(q_insertion)
+    chosen, worst = (least_error(error, found.candidates, q_insertion, worst=worst) for worst in (False, True))
+    touches, leave = _motions(task, chosen, seed, progress)
+    return TouchPlan(
+        model=task.model,
+        tip_mm=task.tip_mm,
+        touches=touches,
+        leave=leave,
+        left_out=found.left_out,
+        expected_mm=task.expected_mm(chosen),
+        worst_mm=task.expected_mm(worst),
+    )
+
+
+def registered(context: CaseContext, read: NamedPoints) -> Registration:
+    """The registration of what was touched.
+
+    Args:
+        context: For which markers were touched, and what is declared of them.
+        read: Their names, points (N, 3), mm, and joints (N, 6), rad, in any order.
+    """
+    placement, case = context.placement, context.case
+    assert placement is not None and placement.registration is not None and case.errors is not None
+    found = placement.registration.markers
+    rows = [found.names.index(name) for name in read.names]
+    pairs = MarkerPairs(read.names, found.points_ct[rows], read.points, read.joints)
+    noise = marker_noise(case, case.errors, pairs, where="touched markers")
+    method = cast(Method, placement.registration.method)
+    return register(pairs, method=method, target_ct=case.target_ct, noise=noise, accept_residuals=True)
+
+
+def _task(context: CaseContext, q_insertion: Floats) -> _Task:
+    placement = context.placement
+    if context.reach is None or placement is None or placement.registration is None or context.case.errors is None:
+        raise InputError("no touches can be planned", where=context.case.path, allowed=ALLOWED)
+    found = placement.registration.markers
+    if len(found) > MOST_MARKERS:
+        where = f"{context.case.path}: registration"
+        raise InputError(f"{len(found)} markers", where=where, allowed=f"at most {MOST_MARKERS}: see registration.use")
+    believed = MarkerPairs(found.names, found.points_ct, apply(placement.T_base_ct, found.points_ct))
+    return _Task(context, believed, cast(Method, placement.registration.method), q_insertion)
+
+
+def approach_checkers(context: CaseContext, needle_padding_mm: float) -> ApproachCheckers:
+    """The workcell with the case's needle, and with one whose tip is taken off and that is so much fuller."""
+    assert context.reach is not None
+    tool = case_tool(context.case)
+    short = Tool(
+        tool.needle_length_mm - TIP_MM, tool.shaft_mm - TIP_MM, tool.needle_diameter_mm, tool.holder_diameter_mm
+    )
+    case, anatomy, T_base_ct = context.case, context.anatomy, context.reach.T_base_ct
+    surface, alone = patient_surface(anatomy), anatomy.skin.mesh
+    blunted = FastChecker(
+        ur_model(case.robot.model),
+        short,
+        case_boxes(case, T_base_ct),
+        surface.transformed(T_base_ct),
+        skin=None if surface is alone else alone.transformed(T_base_ct),
+        padding_mm=needle_padding_mm,
+        cache=user_cache(),
+    )
+    return ApproachCheckers(context.reach.checker, blunted)
+
+
+def _open(task: _Task) -> _Open:
+    """Of each marker the poses that reach it and that nothing is in the way of."""
+    checkers = approach_checkers(task.context, PLANNED_PADDING_MM)
+    rows, kept, left_out = [], [], {}
+    for row, (name, point) in enumerate(zip(task.markers.names, task.markers.points_base, strict=True)):
+        free, why = _free(checkers, task.tip_mm, touch_candidates(task.model, task.tip_mm, point, task.q_insertion))
+        if len(free):
+            rows.append(row)
+            kept.append(free)
+        else:
+            left_out[name] = why
+    return _Open(tuple(rows), tuple(kept), left_out)
+
+
+def _free(checkers: ApproachCheckers, tip_mm: float, found: Candidates) -> tuple[Floats, str]:
+    """Of the insertion's own branch those that are free, else of the others; and what most often is in the way."""
+    reasons: list[str] = []
+    for q in (found.alike, found.others):
+        said = [why_not(checkers, tip_mm, one) for one in q]
+        free = q[[not reason for reason in said]]
+        if len(free):
+            return free, ""
+        reasons += said
+    return np.empty((0, 6)), max(set(reasons), key=reasons.count) if reasons else "out of the arm's reach"
+
+
+def _motions(task: _Task, q_touch: Floats, seed: int, progress: Count) -> tuple[tuple[Touch, ...], Trajectory]:
+    """The touches in the order of the shortest tour, and the motion home."""
+    context, markers = task.context, task.markers
+    assert context.reach is not None
+    checker, home = context.reach.checker, home_configuration(context.case)
+    lines = [line_to(checker.model, task.tip_mm, q, STANDOFF_MM, 0.0) for q in q_touch]
+    places = np.array([*(line[0] for line in lines if line is not None), home])
+    order = shortest_tour((np.abs(places[:, None] - places) / checker.model.max_speeds).max(axis=2))
+    stops, legs = pairwise([len(places) - 1, *order, len(places) - 1]), []
+    for start, end in stops:
+        found = plan_approach(checker, places[start], places[end], seed=seed, speeds=context.case.robot.speeds)
+        legs.append(found.trajectory)
+        progress(len(legs), len(places))
+    touched = zip(order, legs, strict=False)
+    touches = (Touch(markers.names[at], markers.points_base[at], q_touch[at], leg) for at, leg in touched)
+    return tuple(touches), legs[-1]

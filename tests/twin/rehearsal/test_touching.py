@@ -1,0 +1,170 @@
+"""Touches executed in the twin: what is read, what it is good for, and what stops them."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+from places import ROOT
+
+from puncture_twin.planning.arm.error_jacobian import PARAMETERS, error_jacobian
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.formats.points.point_files import read_points
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.selection.choice import Choice
+from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, approach_checkers, plan_touches
+from puncture_twin.twin.jobs.experiment.touch_job import touch_case, touch_text
+from puncture_twin.twin.plant.touch_truth import TouchTruth, nominal_tip
+from puncture_twin.twin.rehearsal.touching import execute_touches
+
+CASE = ROOT / "meshes" / "carton" / "case_m.toml"
+CHOICE = Choice(angles=(np.radians(18.0), np.radians(232.0)))
+
+
+def quiet(*_):
+    """Shows no progress."""
+
+
+@pytest.fixture(scope="module")
+def context():
+    """The carton, without a search."""
+    return prepare(CASE)
+
+
+@pytest.fixture(scope="module")
+def done(context, tmp_path_factory):
+    """Touched as the command does, and where its files are."""
+    out = tmp_path_factory.mktemp("touch")
+    return touch_case(context, out, CHOICE, 0), out
+
+
+@pytest.fixture(scope="module")
+def first(context, done):
+    """A plan of its first marker alone: there, and no motion home."""
+    plan = done[0].plan
+    stay = Trajectory(np.zeros(1), plan.touches[0].come.q[-1:])
+    short = dataclasses.replace(plan.touches[0], come=stay)
+    return dataclasses.replace(plan, touches=(short,), leave=stay)
+
+
+def exact(context, shift_base=(0.0, 0.0, 0.0)):
+    """A truth without an error, but for a shift of all markers, base frame, mm."""
+    markers, T = context.placement.registration.markers, context.placement.T_base_ct
+    points = markers.points_ct + T[:3, :3].T @ np.asarray(shift_base)
+    aim, still = dict(zip(markers.names, points, strict=True)), dict.fromkeys(markers.names, np.zeros(6))
+    return TouchTruth(0, T, np.zeros(28), aim, still)
+
+
+def executed(context, plan, truth):
+    """The readings."""
+    checkers = approach_checkers(context, TOUCHING_PADDING_MM)
+    return execute_touches(plan, context.case, context.anatomy, checkers, truth, quiet).readings
+
+
+def test_touches_are_slow_soft_and_exact(done):
+    """Felt within .03 mm of the face, at 2 mm/s at most, with 2 N at most."""
+    for one in done[0].touched.readings:
+        assert 0.0 <= one.bias_mm <= 0.03
+        assert one.speed_mm_s <= 2.0
+        assert 0.5 < one.force_n <= 2.0
+
+
+def test_the_controller_computes_the_reading_from_its_joints(done):
+    """Nominal kinematics of what is written beside the point."""
+    run, out = done
+    read = read_points(out / "touch.csv")
+    assert read.names == tuple(touch.name for touch in run.plan.touches)
+    for q, point in zip(read.joints, read.points, strict=True):
+        T = flange_pose(run.plan.model, q)
+        np.testing.assert_allclose(point, T[:3, 3] + run.plan.tip_mm * T[:3, 2], atol=1e-6)
+
+
+def test_a_case_registers_what_was_written(done, tmp_path):
+    """The file in the place of the case's own list: the registration is that of the command."""
+    run, out = done
+    shutil.copytree(CASE.parent, tmp_path / "carton")
+    shutil.copy(out / "touch.csv", tmp_path / "carton" / "touch.csv")
+    placed = load_placement(load_case(tmp_path / "carton" / CASE.name))
+    order = [placed.registration.markers.names.index(name) for name in run.registration.markers.names]
+    np.testing.assert_allclose(placed.registration.markers.points_base[order], run.registration.markers.points_base)
+    assert placed.registration.markers.joints is not None
+    assert placed.registration.fre_mm == pytest.approx(run.registration.fre_mm, rel=0.5)
+
+
+def test_times_add_up(done):
+    """Of the tour: every touch and the motion home."""
+    run = done[0]
+    assert run.touched.seconds == pytest.approx(
+        sum(one.seconds for one in run.touched.readings) + run.plan.leave.duration_s, abs=0.1
+    )
+    assert f"{len(run.touched.readings)} markers touched" in touch_text(run)
+    assert run.summary()["seconds_per_touch"] > 5.0
+
+
+def test_the_best_poses_are_better_than_the_worst(done):
+    """Of those that are free."""
+    assert 0.0 < done[0].plan.expected_mm < done[0].plan.worst_mm
+
+
+def test_without_errors_the_reading_is_the_marker(context, first):
+    """Where it was believed, within what contact needs to be felt."""
+    reading = executed(context, first, exact(context))[0]
+    assert np.linalg.norm(reading.point_base - first.touches[0].point_base) < 0.03
+    assert reading.aside_mm < 1e-6
+
+
+def test_an_erring_arm_reads_what_its_errors_say(context, first):
+    """By the Jacobian of its parameters: here of the zeros of its joints."""
+    eta = np.zeros(28)
+    eta[PARAMETERS["joint"]] = np.radians([0.05, -0.03, 0.04, 0.02, -0.05, 0.03])
+    truth = dataclasses.replace(exact(context), eta=eta)
+    reading = executed(context, first, truth)[0]
+    touch = first.touches[0]
+    moved = error_jacobian(first.model, touch.q_touch, first.tip_mm)[:3] @ eta
+    assert np.linalg.norm(moved) > 0.2
+    np.testing.assert_allclose(reading.point_base - touch.point_base, -moved, atol=0.04)
+
+
+def test_the_same_truth_gives_the_same_numbers(context, first):
+    """Bit for bit, the force sensor's noise included."""
+    one, other = (executed(context, first, exact(context))[0] for _ in range(2))
+    np.testing.assert_array_equal(one.q, other.q)
+    assert one.force_n == other.force_n
+
+
+@pytest.mark.parametrize(
+    ("along_mm", "aside_mm", "said"),
+    [
+        (8.0, 0.0, "no contact at marker .*: the tip went 5 mm past where it was believed and stopped"),
+        (-9.0, 0.0, "felt more than 5 mm before where it was believed: the arm stopped"),
+        (0.0, 15.0, "lies 15.0 mm beside where it was believed, at most 10 are allowed"),
+    ],
+)
+def test_a_marker_that_is_not_where_it_was_believed_stops_the_arm(context, first, along_mm, aside_mm, said):
+    """Deeper, nearer, beside: with the reason, and never pushed on."""
+    T = flange_pose(first.model, first.touches[0].q_touch)
+    with pytest.raises(NoAnswerError, match=said):
+        executed(context, first, exact(context, along_mm * T[:3, 2] + aside_mm * T[:3, 0]))
+
+
+def test_the_true_tip_is_on_the_true_marker(context, done):
+    """The encoders that a truth asks for put the nominal tip where the errors say, and never elsewhere."""
+    plan = done[0].plan
+    for touch in plan.touches:
+        q = exact(context).q_contact(plan.model, plan.tip_mm, touch)
+        there = apply(context.placement.T_base_ct, exact(context).aim_ct[touch.name])
+        np.testing.assert_allclose(nominal_tip(plan.model, plan.tip_mm, q), there, atol=1e-6)
+
+
+def test_a_case_without_declared_errors_is_refused(context):
+    """One line: what would have to be there."""
+    bare = dataclasses.replace(context, case=dataclasses.replace(context.case, errors=None))
+    with pytest.raises(InputError, match=r"no touches can be planned; allowed: a case with \[errors\] and markers"):
+        plan_touches(bare, np.zeros(6), seed=0, progress=quiet)
