@@ -78,6 +78,7 @@ def insertion_force(layers: Sequence[Layer], step_mm: float = SAMPLE_MM) -> Inse
     end = layers[-1].end_mm if layers else 0.0
     depth = np.linspace(0.0, end, round(end / step_mm) + 1) if end > 0 else np.zeros(1)
     pushes = _pushes(layers, end)
+    depth = np.union1d(depth, [push.end_mm for push in pushes])  # the peaks themselves
     capsule, cutting, inside = np.zeros(len(depth)), np.zeros(len(depth)), depth.copy()
     for layer in layers:
         cutting[(depth >= layer.start_mm) & (depth <= layer.end_mm)] = layer.tissue.cutting_n

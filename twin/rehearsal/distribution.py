@@ -195,7 +195,7 @@ def _asked(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _As
     if error is None or registration is None:
         raise InputError("no rooms can be drawn", where=case.path, allowed=ALLOWED)
     q_touch = touches(case, registration.markers)
-    bend = _bend(context, outward_ct)
+    bend = bend_along(context, outward_ct)
     believed = replace(_as_rehearsed(error, q_touch), bend=bend)
     truth = (case.truth_errors or case.errors or error.errors).scaled(error.fit.test.scale)
     puncture = Puncture(
@@ -205,8 +205,13 @@ def _asked(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _As
     return _Asked(believed, puncture, truth, registration.markers.joints is None)
 
 
-def _bend(context: CaseContext, outward_ct: Floats) -> Bend | None:
-    """How far the bevel takes the needle off along one direction (3,), if it never turns; None for a straight one."""
+def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:
+    """How far the bevel takes the needle off along one direction, if it never turns; None for a straight one.
+
+    Args:
+        context: Of a case.
+        outward_ct: Shape (3,), unit, from the target along the needle.
+    """
     case, anatomy = context.case, context.anatomy
     if case.bending is None:
         return None

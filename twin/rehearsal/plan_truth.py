@@ -11,6 +11,8 @@ That holds at the target; on the way the arm's own errors would differ a little 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
@@ -21,7 +23,7 @@ from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.pose_error import pose_error
 from puncture_twin.twin.plant.truth import Truth, draw_truth
-from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_rooms
+from puncture_twin.twin.rehearsal.distribution import Distribution, bend_along, rehearse_rooms
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms
 from puncture_twin.twin.rehearsal.standing import Standing
 
@@ -108,5 +110,6 @@ def standing(
     error = pose_error(context.case, registration)
     if error is None:
         return None
-    cov = error.tip_covariance(q_insertion[None])
+    outward_ct = -error.fit.R_base_ct.T @ flange_pose(error.model, q_insertion)[:3, 2]
+    cov = replace(error, bend=bend_along(context, outward_ct)).tip_covariance(q_insertion[None])
     return Standing(100 * float(hit_in_ball(cov, tip_error_mm, error.freedom)[0]))

@@ -72,9 +72,15 @@ def _plan(run: Run) -> list[str]:
         f"plan: theta {plan['theta_deg']:g} deg, beta {plan['beta_deg']:g} deg, standoff {plan['standoff_mm']:.1f} mm",
         *(f"  {label:18s} {told}" for label, told in (() if run.facts is None else run.facts.rows())),
         f"  approach {plan['approach_s']:.1f} s, insertion {plan['insertion_s']:.1f} s",
-        "  expected error at the target: " + ("unknown (no markers)" if error is None else f"{error:.2f} mm (rms)"),
+        "  expected error at the target: "
+        + ("unknown (no markers)" if error is None else f"{error:.2f} mm (rms){_straight(run)}"),
         *_otherwise(run.candidates, run.plan),
     ]
+
+
+def _straight(run: Run) -> str:
+    """A plan's number is of a straight needle; only rooms count the bend."""
+    return "" if run.context.case.bending is None else ", of a needle that does not bend"
 
 
 def _otherwise(found: Candidates, plan: Plan) -> list[str]:

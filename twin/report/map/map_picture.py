@@ -48,6 +48,9 @@ RIM = 1.26
 NAMED_FRACTION = 0.006
 """Least share of the disc that a rejected region needs to carry its structure's name."""
 
+MOST_LEGEND = 0.45
+"""Height of the legend's lines together, of the column's: more reasons stand closer."""
+
 NAMED_REASONS = (Reason.TOO_CLOSE, Reason.UNKNOWN_REGION)
 """Reasons whose structure is written into the map."""
 
@@ -226,8 +229,9 @@ def _legend(axes: Axes, candidates: Candidates) -> float:
     y = 0.0
     for x, words in ((0.62, "directions"), (0.79, "of grid"), (1.0, "of solid\nangle")):
         axes.text(x, y + 0.012, words, fontsize=9, color="0.35", ha="right", va="bottom")
-    for line in reason_counts(candidates):
-        y += 0.05
+    counts = reason_counts(candidates)
+    for line in counts:
+        y += min(0.05, MOST_LEGEND / len(counts))
         bold = "bold" if line.code == "safe" else "normal"
         colour = np.array(line.colour) / 255
         axes.add_patch(Rectangle((0.0, y - 0.017), 0.06, 0.032, facecolor=colour, edgecolor="black", lw=0.8))
@@ -259,7 +263,8 @@ def _scale(axes: Axes, candidates: Candidates, y: float) -> float:
     axes.set_ylim(1, 0)
     axes.text(0.0, y + 0.05, number(low, 1, "mm"), fontsize=9.5, va="top")
     axes.text(1.0, y + 0.05, number(high, 1, "mm"), fontsize=9.5, va="top", ha="right")
-    axes.text(0.5, y + 0.05, f"{candidates.safe_text}, by least clearance", fontsize=9.5, va="top", ha="center")
+    safe = "" if candidates.breathing is not None else f"{candidates.safe_text}, "  # too long for one line
+    axes.text(0.5, y + 0.05, f"{safe}by least clearance", fontsize=9.5, va="top", ha="center")
     return y + 0.06
 
 

@@ -52,8 +52,8 @@ class Slices:
         dotted = (
             "Thin and dotted: the needle's shadow, where it is not in the plane. Beads: the edge of what is unknown."
         )
-        bends = "" if subject.bent_mm is None else "; lime: where its bevel may take it, to either side"
-        return tuple(filter(None, (ct, f"{shown}{region}{bends}.", dotted)))
+        bends = "" if subject.bent_mm is None else "Lime: where its bevel may take it, to either side."
+        return tuple(filter(None, (ct, f"{shown}{region}.", bends, dotted)))
 
     @property
     def legend(self) -> list[tuple[str, Rgb]]:
