@@ -59,11 +59,6 @@ class Breathing:
         """How far something of a weight is from where the CT shows it, at a position s; shape (3,), mm."""
         return np.asarray((s - self.scanned_at) * weight * self.amplitude_mm * self.direction_ct)
 
-    @property
-    def widest_step_mm(self) -> float:
-        """Between neighbouring positions of the target in the window: between them nothing is checked."""
-        return float(self.amplitude_mm * np.diff(self.positions[self.in_window], prepend=0.0).max())
-
     def phase_text(self, s: float) -> str:
         """A position for people."""
         return f"s = {s:.2f}, {s * self.amplitude_mm:.1f} mm from exhale"

@@ -230,10 +230,9 @@ class Explanation:
         found, breathing = self.candidates.breathing, self.case.breathing
         if found is None or breathing is None or np.isnan(found.clearance[0]):
             return []
-        step = f"at positions up to {breathing.widest_step_mm:.1f} mm apart; between them nothing is checked"
         return [
             f"  breathing      {found.clearance[0]:8.2f} mm least clearance, at "
-            f"{breathing.phase_text(float(found.worst_phase[0]))}; {step}",
+            f"{breathing.phase_text(float(found.worst_phase[0]))}",
             "                 a needle in place moves with the organ and bends: no verdict is about leaving it there",
         ]
 

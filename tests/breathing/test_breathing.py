@@ -65,8 +65,6 @@ def test_what_is_seen_at_inhale_moves_the_other_way():
     """A CT at full inhale shows the target low: at exhale it is higher."""
     np.testing.assert_allclose(breathing(scanned_at=1.0).moved_ct(0.0), [0, 0, 12])
     np.testing.assert_allclose(breathing().moved_ct(1.0, 0.5), [0, 0, -6])
-    assert breathing().widest_step_mm == pytest.approx(12 * np.diff(positions(8, 2)).max())
-    assert breathing(gate=0.0).widest_step_mm == 0.0
 
 
 def test_the_most_specific_pattern_gives_the_weight():

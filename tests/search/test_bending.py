@@ -108,7 +108,9 @@ def test_a_body_that_breathes_is_checked_with_a_needle_that_bends(patient):
         anatomy = replace(patient.anatomy, structures=structures, skin=skin)
         engine = FclEngine([one.mesh for one in structures])
         safe.append(organ_candidates(case, anatomy, engine, case_directions(case)).safe)
-    np.testing.assert_array_equal(found.safe, np.all(safe, axis=0))
+    at_phases = np.all(safe, axis=0)
+    assert not np.any(found.safe & ~at_phases)
+    assert np.sum(at_phases & ~found.safe) < 0.01 * len(found)  # what passes between two of them
     assert 0 < found.safe.sum() < safe[0].sum()
 
 

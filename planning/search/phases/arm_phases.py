@@ -17,7 +17,8 @@ from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates
 from puncture_twin.planning.search.phases.moving_weights import MovingWeights, moving_weights
-from puncture_twin.planning.search.phases.organ_phases import paths_at, rejected_at
+from puncture_twin.planning.search.phases.one_phase import paths_at
+from puncture_twin.planning.search.phases.rejection import rejected_at
 
 
 def with_breathing_reach(case: Case, anatomy: Anatomy, found: Candidates, reach: ArmReach) -> Candidates:

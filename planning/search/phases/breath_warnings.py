@@ -7,9 +7,9 @@ from puncture_twin.planning.breathing.lujan import fraction_within
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.search.phases.moving_weights import moving_weights
 
-BETWEEN = (
-    "breathing: checked at {count} positions up to {step:.1f} mm apart, not between them; a safe direction is safe "
-    "{words}: a needle in place moves with the organ and bends"
+SAFE_WHEN = (
+    "breathing: a safe direction is safe {when}: checked at {count} positions, and clearances between them; a needle "
+    "in place moves with the organ and bends"
 )
 PLANS = "breathing: plans and rehearsals go to the target where the CT shows it (s = {s:g}), the patient at rest there"
 OPEN = "breathing: the gate is open {part:.0%} of the time, if the breath follows the curve"
@@ -26,8 +26,8 @@ def breath_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
     if breathing is None:
         return ()
     moving_weights(case, breathing, anatomy)
-    count, step = int(breathing.in_window.sum()), breathing.widest_step_mm
-    said = [BETWEEN.format(count=count, step=step, words=breathing.window_text)]
+    count = int(breathing.in_window.sum())
+    said = [SAFE_WHEN.format(when=breathing.window_text, count=count)]
     if breathing.gate is not None:
         said.append(OPEN.format(part=fraction_within(breathing.gate, breathing.exponent)))
     said.append(PLANS.format(s=breathing.scanned_at))

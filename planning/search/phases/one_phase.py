@@ -1,0 +1,201 @@
+"""Skin and organs at every phase of the breath, if the needle is inserted at that phase.
+
+At the position s the target is at t + s b d, and a structure of weight w is displaced by s w b d. Seen from the
+structure, the needle starts at t + s b (1 - w) d: the surfaces stay where they are, and the engine prepared for them is
+asked for another target. What moves with the target (w = 1) is not measured again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.anatomy.skin_entry import SkinPaths, skin_paths, view_depth
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.breathing.breathing import Breathing
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.clearance.engine import ClearanceEngine
+from puncture_twin.planning.clearance.measure import Clearances, measure
+from puncture_twin.planning.needle.deflection import DeflectionBound
+from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange
+from puncture_twin.planning.search.bending.bent_needle import bent_verdict
+from puncture_twin.planning.search.candidates import Candidates, Verdict
+from puncture_twin.planning.search.constraints import first_broken
+from puncture_twin.planning.search.phases.moving_weights import MovingWeights
+
+
+@dataclass(frozen=True, eq=False)
+class Phase:
+    """What some candidates are at one position of the breath.
+
+    Attributes:
+        s: The position.
+        rows: Shape (m,), which candidates.
+        verdict: Of these m.
+        clearance: Shape (m, k), to the k structures with a margin, mm.
+        excess: Shape (m, k), the same less the margins.
+        deflection: Shape (m,), how far the needle may bend, mm; 0 where it does not.
+    """
+
+    s: float
+    rows: Ints
+    verdict: Verdict
+    clearance: Floats
+    excess: Floats
+    deflection: Floats
+
+    @property
+    def safe(self) -> Bools:
+        """Shape (m,)."""
+        return np.asarray(self.verdict.reason == Reason.NONE.value)
+
+    @property
+    def least_excess(self) -> Floats:
+        """Shape (m,), mm; minus infinity where something else than a clearance rejects."""
+        near = np.isin(self.verdict.reason, CLEARANCES) | self.safe
+        return np.asarray(np.where(near, self.excess.min(axis=1, initial=np.inf), -np.inf))
+
+    def of(self, which: Bools) -> Phase:
+        """Of some of the candidates; ``which`` of shape (m,)."""
+        rows = np.flatnonzero(which)
+        arrays = (self.clearance[rows], self.excess[rows], self.deflection[rows])
+        return Phase(self.s, self.rows[rows], self.verdict.of(rows), *arrays)
+
+
+CLEARANCES = (Reason.TOO_CLOSE.value, Reason.UNKNOWN_REGION.value, Reason.NEEDLE_BENDS.value)
+"""Reasons whose number is a clearance, the only one that is told of a phase."""
+
+
+@dataclass(frozen=True, eq=False)
+class BreathingBody:
+    """A case that breathes, ready to be asked for any position.
+
+    Attributes:
+        case: The case.
+        breathing: Of the case.
+        anatomy: Its structures.
+        engine: Prepared for the meshes of ``anatomy.checked``, in that order.
+        weights: Of skin and structures.
+        bound: How far the needle may bend; None bends nothing.
+    """
+
+    case: Case
+    breathing: Breathing
+    anatomy: Anatomy
+    engine: ClearanceEngine
+    weights: MovingWeights
+    bound: DeflectionBound | None
+
+    @property
+    def demanding(self) -> Ints:
+        """Columns of the structures with a margin."""
+        return np.flatnonzero([one.demands_margin for one in self.anatomy.checked])
+
+    @property
+    def margins(self) -> Floats:
+        """Of these, shape (k,), mm."""
+        return np.array([self.anatomy.checked[column].margin_mm for column in self.demanding], dtype=np.float64)
+
+    def moves_mm(self, low: float, high: float) -> Floats:
+        """How far each structure with a margin moves against the target between two positions, shape (k,)."""
+        weights = self.weights.structures[self.demanding]
+        return np.asarray(abs(high - low) * self.breathing.amplitude_mm * np.abs(1 - weights))
+
+    def at(self, found: Candidates, rows: Ints, s: float) -> Phase:
+        """Some candidates at a position, as if inserted there.
+
+        Args:
+            found: Checked where the CT shows the body.
+            rows: Shape (m,), which.
+            s: The position.
+        """
+        case, checked, outward = self.case, self.anatomy.checked, found.outward_ct[rows]
+        moved = self.breathing.moved_ct(s)
+        paths = paths_at(case, self.anatomy.skin, outward, self.weights.skin, moved)
+        shifts = moved[None] * (1 - self.weights.structures)[:, None]
+        clearances = _clearances(case, self.anatomy, self.engine, found, rows, shifts)
+        limit = case.search.max_skin_angle
+        verdict = first_broken(paths, clearances, checked, needle=case.needle, max_skin_angle=limit)
+        deflection = np.zeros(len(rows)) if self.bound is None else self.bound.at(paths.path_length)
+        if self.bound is not None:
+            verdict = bent_verdict(verdict, checked, clearances.clearance, deflection)
+        clearance = clearances.clearance[:, self.demanding]
+        return Phase(s, rows, verdict, clearance, clearance - self.margins, deflection)
+
+    def excess_at(self, found: Candidates, rows: Ints, s: float, columns: Ints) -> Floats:
+        """What the surfaces of some structures leave over their margins at a position, shape (m, c), mm.
+
+        Args:
+            found: Checked where the CT shows the body.
+            rows: Shape (m,), which candidates.
+            s: The position.
+            columns: Shape (c,), which of the structures with a margin.
+        """
+        case, which, lengths = self.case, self.demanding[columns], axis_lengths(self.case, self.anatomy.checked)
+        distance, weights = np.empty((len(rows), len(columns))), self.weights.structures[which]
+        for weight in np.unique(weights):
+            group = np.flatnonzero(weights == weight)
+            origin = case.target_ct + (1 - weight) * self.breathing.moved_ct(s)
+            part, length = self.engine.of(which[group]), lengths[which[group]]
+            distance[:, group] = part.measure(origin, found.outward_ct[rows], length, shown=False).distance
+        return np.asarray(distance - case.needle.radius_mm - self.margins[columns])
+
+
+def paths_at(case: Case, skin: Skin, outward_ct: Floats, weight: float, moved_ct: Floats) -> SkinPaths:
+    """The skin along paths to a target that the breath has moved; entries in the moved skin's own coordinates.
+
+    What lies beyond the image moves by nobody knows how much: paths end at the nearest of the places that its border
+    has if it stays, follows the skin, or follows the target.
+
+    Args:
+        case: Needle, limits, and the target where the CT shows it.
+        skin: The skin, where the CT shows it.
+        outward_ct: Shape (m, 3), unit.
+        weight: Of the skin.
+        moved_ct: Shape (3,), how far the target has moved, mm.
+    """
+    needle, target = case.needle, case.target_ct
+    farthest = farthest_flange(needle, case.search.max_skin_angle)
+    if not np.any(moved_ct):
+        return skin_paths(skin, target, outward_ct, needle.length_mm, farthest)
+    origins = [target + (1 - w) * moved_ct for w in (weight, 0.0, 1.0)]
+    try:
+        paths = skin_paths(skin, origins[0], outward_ct, needle.length_mm, farthest)
+        views = np.array([view_depth(skin, origin, outward_ct) for origin in origins])
+    except InputError:  # the breath takes the target out of the image: nothing is known around it
+        return _unknown(len(outward_ct))
+    view = np.fmin.reduce(views, axis=0)
+    reached = np.where(view < needle.length_mm, view, np.nan)
+    return replace(paths, view_depth=view, unknown_depth=np.fmin(paths.unknown_depth, reached))
+
+
+def _unknown(count: int) -> SkinPaths:
+    """Paths of which nothing is known from the target on."""
+    blank, zero = np.full(count, np.nan), np.zeros(count)
+    return SkinPaths(np.full((count, 3), np.nan), blank, blank, blank, zero, zero)
+
+
+def _clearances(
+    case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates, rows: Ints, shifts_ct: Floats
+) -> Clearances:
+    """To all k structures with the target shifted for each, ``shifts_ct`` of shape (k, 3), mm."""
+    checked, lengths = anatomy.checked, axis_lengths(case, anatomy.checked)
+    clearance = found.clearance.distance[rows].copy()
+    depth, violated = np.zeros(clearance.shape), np.zeros(clearance.shape, bool)
+    demanding = np.array([one.demands_margin for one in checked], bool)
+    for shift in np.unique(shifts_ct, axis=0):
+        columns = np.flatnonzero((shifts_ct == shift).all(axis=1) & demanding)
+        if not np.any(shift) or not len(columns):
+            continue
+        structures = tuple(checked[column] for column in columns)
+        at = measure(
+            engine.of(columns), structures, case.target_ct + shift, found.outward_ct[rows],
+            length=lengths[columns], radius=case.needle.radius_mm,
+        )  # fmt: skip
+        clearance[:, columns], depth[:, columns], violated[:, columns] = at.clearance, at.depth, at.violated
+    return Clearances(clearance, depth, violated)
