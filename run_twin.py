@@ -117,8 +117,8 @@ def init(
         raise InputError("a patient's space", where="--space", allowed="LPS or RAS")
     wanted = Wanted(space or Space.LPS, naming, unit, ct, segmentation)
     with progress_display() as progress:
-        asked = Request(folder, target, target_label, region, wanted, space_stated=space is not None)
-        run = init_case(asked, force=force, watcher=progress)
+        request = Request(folder, target, target_label, region, wanted, space_stated=space is not None)
+        run = init_case(request, force=force, watcher=progress)
     for warning in run.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     _print(run.summary(), init_text(run), as_json)
@@ -612,7 +612,7 @@ def servo(
     with progress_display() as progress:
         job = run_servo(case, _out(out_dir, case, "servo"), seeds, partial(progress.count, "seeds"), progress.note)
     _print(job.summary, job.text, as_json)
-    if not job.holds:
+    if not job.passed:
         raise typer.Exit(ANSWER_IS_NO)
 
 
@@ -673,7 +673,7 @@ def reproduce(
     folder = _out(out_dir, Path(paper), "reproduce")
     result = chen2019_experiment(seeds) if experiment else PAPERS[paper](folder, seeds)
     _print(result.summary, result.text, as_json)
-    if not result.holds:
+    if not result.passed:
         raise typer.Exit(ANSWER_IS_NO)
 
 

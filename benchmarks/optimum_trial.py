@@ -40,11 +40,11 @@ class OptimumTrial(NamedTuple):
 def optimum_trial(case: ServoCase, seed: int, detector_of: DetectorOf = picture_detector) -> OptimumTrial:
     """Hold a session and bound it by all that was measured in it until each target's end."""
     session = run_session(case, seed, detector_of=detector_of)
-    room = session.room
+    workcell = session.workcell
     stays = [visit for one in session.reached for visit in one.servoed.visits]
     ends = np.cumsum([len(one.servoed.visits) for one in session.reached])
     q_true = np.concatenate([session.calibration.q_true, np.reshape([visit.q_true for visit in stays], (-1, 6))])
-    spheres = room.ball_c(q_true)
+    spheres = workcell.ball_c(q_true)
     observed = session.guide.observed()
     rows = []
     for one, end in zip(session.reached, ends, strict=True):
@@ -52,9 +52,9 @@ def optimum_trial(case: ServoCase, seed: int, detector_of: DetectorOf = picture_
             continue
         index = case.targets.names.index(one.target)
         until = len(session.calibration.q_command) + int(end)
-        floor = room_bound(room, first_stays(observed, until), spheres[:until])
+        floor = room_bound(workcell, first_stays(observed, until), spheres[:until])
         offset = floor.offset(-1, case.targets.points[index])
-        seen, ball, target = one.servoed.visits[-1].seen, spheres[until - 1], room.targets_c[index]
+        seen, ball, target = one.servoed.visits[-1].seen, spheres[until - 1], workcell.targets_c[index]
         errors = (seen.ball_c - ball, seen.target_c - target, (seen.target_c - seen.ball_c) - (target - ball))
         bounds = (offset.ball_covariance, offset.target_covariance, offset.covariance)
         rows.append([*(np.linalg.norm(e) for e in errors), one.after_mm, *(np.sqrt(np.trace(b)) for b in bounds)])
@@ -71,16 +71,16 @@ def first_stays(observed: Observed, count: int) -> Observed:
     )
 
 
-def room_bound(room: StereoWorkcell, observed: Observed, balls_c: Floats) -> Adjusted:
+def room_bound(workcell: StereoWorkcell, observed: Observed, balls_c: Floats) -> Adjusted:
     """The Cramer-Rao bound at the truth of a room, the ball having been at ``balls_c`` (s, 3)."""
-    guess = Guess(room.T_c_base, room.T_c_m, balls_c)
+    guess = Guess(workcell.T_c_base, workcell.T_c_m, balls_c)
     errors = observed.errors
     truth = Unknowns(
-        np.array([camera_errors(*pair, errors) for pair in zip(observed.planned, room.cameras, strict=True)]),
+        np.array([camera_errors(*pair, errors) for pair in zip(observed.planned, workcell.cameras, strict=True)]),
         np.zeros(6),
-        rod_errors(room, errors),
+        rod_errors(workcell, errors),
         np.zeros(6),
-        np.array(room.case.markers.points),
+        np.array(workcell.case.markers.points),
         balls_c,
     )
     return bound(observed, guess, truth)
@@ -95,11 +95,11 @@ def camera_errors(planned: Camera, true: Camera, errors: ServoErrors) -> Floats:
     return in_deviations(np.concatenate([[focal], axis, lens, turn, moved[:3, 3]]), errors.camera_deviations())
 
 
-def rod_errors(room: StereoWorkcell, errors: ServoErrors) -> Floats:
+def rod_errors(workcell: StereoWorkcell, errors: ServoErrors) -> Floats:
     """Errors of arm and ball (26,), in declared deviations: the inverse of ``rod_poses``."""
-    arm, nominal = room.arm, room.arm.nominal
+    arm, nominal = workcell.arm, workcell.arm.nominal
     lengths = np.concatenate([arm.a - nominal.a, np.delete(arm.d - nominal.d, 1)])
-    every = np.concatenate([lengths, arm.alpha - nominal.alpha, arm.joint_offsets, room.tool.ball_offset])
+    every = np.concatenate([lengths, arm.alpha - nominal.alpha, arm.joint_offsets, workcell.tool.ball_offset])
     return in_deviations(every, errors.arm_deviations())
 
 

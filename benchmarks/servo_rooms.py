@@ -37,9 +37,9 @@ from puncture_twin.twin.guidance.stereo.joint.needle_error import open_loop_erro
 from puncture_twin.twin.guidance.stereo.joint.needle_outcome import NeedleOutcome, needle_outcome
 from puncture_twin.twin.guidance.stereo.joint.optimum import Adjusted, adjust
 from puncture_twin.twin.guidance.stereo.poses import flange_poses
-from puncture_twin.twin.guidance.stereo.robot_calibration import calibrating_rod, grid_points, held_rod
+from puncture_twin.twin.guidance.stereo.robot_calibration import calibrating_rod, carried_rod, grid_points
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
-from puncture_twin.twin.guidance.stereo.servo_law import HeldRod, ball_base, ball_jacobian
+from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, ball_jacobian
 from puncture_twin.twin.guidance.stereo.session import run_session
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_workcell, planned_cameras
 
@@ -66,13 +66,13 @@ class RoomOutcome(NamedTuple):
 @cache
 def commands(case: ServoCase, branch: int) -> Floats:
     """Joints for the calibration's points, shape (12, 6), rad."""
-    held = calibrating_rod(case, draw_workcell(case, np.random.default_rng(0)))
-    return reached(held, grid_points(case), branch)
+    rod = calibrating_rod(case, draw_workcell(case, np.random.default_rng(0)))
+    return reached(rod, grid_points(case), branch)
 
 
-def reached(held: HeldRod, points_base: Floats, branch: int) -> Floats:
+def reached(rod: CarriedRod, points_base: Floats, branch: int) -> Floats:
     """Joints that put the nominal ball on points (n, 3), one branch, shape (n, 6), rad."""
-    q = inverse(held.model, flange_poses(held, points_base))[:, branch]
+    q = inverse(rod.model, flange_poses(rod, points_base))[:, branch]
     if np.isnan(q).any():
         raise NoAnswerError(f"branch {branch} does not reach")
     return q
@@ -84,16 +84,18 @@ class Room:
     def __init__(self, case: ServoCase, seed: int, branch: int) -> None:
         self.case, self.branch = case, branch
         self.rng = np.random.default_rng(seed)
-        self.room: StereoWorkcell = draw_workcell(case, self.rng)
-        self.held = held_rod(case, self.room)
+        self.workcell: StereoWorkcell = draw_workcell(case, self.rng)
+        self.rod = carried_rod(case, self.workcell)
         self.q = list(commands(case, branch))
         self.q_true = [self.arrived(q) for q in self.q]
-        self.pixels = [self.seen(self.room.ball_c(q)) for q in self.q_true]
+        self.pixels = [self.seen(self.workcell.ball_c(q)) for q in self.q_true]
         truth = case.truth_errors
-        self.measured_c = self.room.ball_c(np.array(self.q_true)) + self.rng.normal(0.0, truth.measuring_mm, (12, 3))
-        self.markers = np.array([self.seen(point) for point in self.room.markers_c])
+        self.measured_c = self.workcell.ball_c(np.array(self.q_true)) + self.rng.normal(
+            0.0, truth.measuring_mm, (12, 3)
+        )
+        self.markers = np.array([self.seen(point) for point in self.workcell.markers_c])
         self.markers_m = case.markers.points + self.rng.normal(0.0, truth.marker_mm, case.markers.points.shape)
-        self.T_base_c = fit_rigid(self.measured_c, ball_base(calibrating_rod(case, self.room), np.array(self.q)))
+        self.T_base_c = fit_rigid(self.measured_c, ball_base(calibrating_rod(case, self.workcell), np.array(self.q)))
         self.found: Adjusted | None = None
 
     def arrived(self, q: Floats) -> Floats:
@@ -102,7 +104,7 @@ class Room:
 
     def seen(self, point_c: Floats) -> Floats:
         """Pixels of a point in both cameras, shape (2, 2)."""
-        exact = np.array([camera.project(point_c) for camera in self.room.cameras])
+        exact = np.array([camera.project(point_c) for camera in self.workcell.cameras])
         return exact + self.rng.normal(0.0, self.case.truth_errors.ball_px or PIXEL_PX, exact.shape)
 
     def go(self, q: Floats) -> Floats:
@@ -113,7 +115,7 @@ class Room:
 
     def look(self) -> None:
         """See the ball where it is."""
-        self.pixels.append(self.seen(self.room.ball_c(self.q_true[-1])))
+        self.pixels.append(self.seen(self.workcell.ball_c(self.q_true[-1])))
 
     def adjusted(self) -> Adjusted:
         """The joint estimate of what was seen."""
@@ -121,12 +123,12 @@ class Room:
         pixels, markers = np.array(self.pixels).transpose(1, 0, 2), self.markers.transpose(1, 0, 2)
         round_errors = [np.broadcast_to(told**2 * np.eye(2), (*one.shape, 2)) for one in (pixels, markers)]
         observed = Observed(
-            planned_cameras(self.case), self.held, self.case.errors, np.array(self.q[:count]), pixels, round_errors[0],
+            planned_cameras(self.case), self.rod, self.case.errors, np.array(self.q[:count]), pixels, round_errors[0],
             self.measured_c, markers, round_errors[1], self.markers_m,
         )  # fmt: skip
         T_c_base = np.asarray(np.linalg.inv(self.T_base_c))
-        more = apply(T_c_base, ball_base(self.held, np.array(self.q[12:count]).reshape(-1, 6)))
-        guess = Guess(T_c_base, self.room.T_c_m, np.concatenate([self.measured_c, more]))
+        more = apply(T_c_base, ball_base(self.rod, np.array(self.q[12:count]).reshape(-1, 6)))
+        guess = Guess(T_c_base, self.workcell.T_c_m, np.concatenate([self.measured_c, more]))
         start = None
         if self.found is not None:
             before = self.found.unknowns
@@ -143,15 +145,15 @@ def room_outcome(case: ServoCase, seed: int, branch: int = BRANCH) -> RoomOutcom
     radius = case.file.target.hit_radius_mm
     found = one.adjusted()
     aim = found.offset(0, target_m).target_c
-    q = reached(one.held, apply(one.T_base_c, aim[None]), branch)[0]
-    unseen = needle_outcome(open_loop_error(found, q, target_m), one.room.needle_m(one.go(q), target), radius)
+    q = reached(one.rod, apply(one.T_base_c, aim[None]), branch)[0]
+    unseen = needle_outcome(open_loop_error(found, q, target_m), one.workcell.needle_m(one.go(q), target), radius)
     one.look()
     offset = one.adjusted().offset(-1, target_m)
     move = np.concatenate([one.T_base_c[:3, :3] @ (offset.target_c - offset.ball_c), np.zeros(3)])
-    q_true = one.go(q + np.linalg.solve(ball_jacobian(one.held, q), move))
+    q_true = one.go(q + np.linalg.solve(ball_jacobian(one.rod, q), move))
     one.look()
     found = one.adjusted()
-    seen = needle_outcome(servoed_error(found, -1, target_m), one.room.needle_m(q_true, target), radius)
+    seen = needle_outcome(servoed_error(found, -1, target_m), one.workcell.needle_m(q_true, target), radius)
     return RoomOutcome(unseen, seen, found.chi2, found.freedom)
 
 
@@ -211,9 +213,9 @@ def fast_rooms(name: str, case: ServoCase, count: int, jobs: int) -> None:
     print(line(f"{'':{len(name)}s}  servoed", [one.servoed for one in found], doubted), flush=True)
 
 
-def pixels_alone(room: StereoWorkcell, rng: np.random.Generator) -> Detector:
+def pixels_alone(workcell: StereoWorkcell, rng: np.random.Generator) -> Detector:
     """True pixels with normal errors of ``PIXEL_PX``."""
-    return pixel_detector(room, PIXEL_PX, rng)
+    return pixel_detector(workcell, PIXEL_PX, rng)
 
 
 def _session(case: ServoCase, seed: int) -> ServoTrial:

@@ -13,7 +13,7 @@ from puncture_twin.twin.guidance.stereo.joint.joint_model import Guess, Observed
 from puncture_twin.twin.guidance.stereo.poses import configurations, rod_orientation
 from puncture_twin.twin.guidance.stereo.robot_calibration import grid_points
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
-from puncture_twin.twin.guidance.stereo.servo_law import HeldRod, ball_base
+from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base
 from puncture_twin.twin.guidance.stereo.stereo_room import (
     calibration_frame,
     draw_workcell,
@@ -22,7 +22,7 @@ from puncture_twin.twin.guidance.stereo.stereo_room import (
 )
 
 CASE = load_servo_case(folder() / "head")
-HELD = HeldRod(ur_model("ur3"), CASE.file.tool.rod_mm, rod_orientation(np.radians(CASE.file.tool.tilt_deg)))
+HELD = CarriedRod(ur_model("ur3"), CASE.file.tool.rod_mm, rod_orientation(np.radians(CASE.file.tool.tilt_deg)))
 PIXEL_PX, MEASURING_MM, IMAGE_MM = 0.03, 0.01, 0.3
 
 
@@ -47,7 +47,7 @@ class Simulated(NamedTuple):
     guess: Guess
     balls_c: np.ndarray
     targets_c: np.ndarray
-    room: object
+    workcell: object
     truth: Unknowns
 
 
@@ -60,12 +60,12 @@ def start_configurations():
 def simulate(seed, stays=2):
     """A session up to the marker pictures and a few stays at targets, everything with normal errors."""
     rng = np.random.default_rng(seed)
-    room = draw_workcell(CASE, rng)
-    cameras = room.cameras
+    workcell = draw_workcell(CASE, rng)
+    cameras = workcell.cameras
     q = start_configurations()[: 12 + stays]
-    spread = np.sqrt(room.arm.repeatability_rad**2 + room.arm.backlash_rad**2 / 4)
-    spheres = room.ball_c(q + rng.normal(0.0, spread, q.shape))
-    pixels, markers = ([c.project(p) for c in cameras] for p in (spheres, room.markers_c))
+    spread = np.sqrt(workcell.arm.repeatability_rad**2 + workcell.arm.backlash_rad**2 / 4)
+    spheres = workcell.ball_c(q + rng.normal(0.0, spread, q.shape))
+    pixels, markers = ([c.project(p) for c in cameras] for p in (spheres, workcell.markers_c))
     pixels, markers = (np.array(p) + rng.normal(0.0, PIXEL_PX, np.shape(p)) for p in (pixels, markers))
     round_errors = [np.broadcast_to(PIXEL_PX**2 * np.eye(2), (*p.shape, 2)) for p in (pixels, markers)]
     measured = spheres[:12] + rng.normal(0.0, MEASURING_MM, (12, 3))
@@ -77,4 +77,4 @@ def simulate(seed, stays=2):
         planned_cameras(CASE), HELD, CASE.errors, q, pixels, round_errors[0], measured, markers, round_errors[1], image
     )  # fmt: skip
     truth = Unknowns(np.zeros((2, 13)), np.zeros(6), np.zeros(N_ROD), np.zeros(6), CASE.markers.points.copy(), spheres)
-    return Simulated(observed, guess, spheres, room.targets_c, room, truth)
+    return Simulated(observed, guess, spheres, workcell.targets_c, workcell, truth)

@@ -178,7 +178,7 @@ class ErrorBudget:
         lateral_mm: Its part across the needle, rms.
         depth_mm: Its part along the needle, rms.
         half_axes_mm: Shape (3,), of the 95 % ellipsoid, longest first.
-        share: Source to its part of rms_mm squared; they add up to 1.
+        fraction: Source to its part of rms_mm squared; they add up to 1.
     """
 
     rms_mm: float

@@ -24,19 +24,19 @@ from puncture_twin.twin.jobs.terminal import flush_output, leave_unread, reader_
 OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, INTERRUPTED, UNREAD = 0, 1, 2, 3, 130, 141
 """The last two as the shell gives them for a program that Ctrl-C, or a closed pipe, has ended."""
 
-Tell = Callable[[str], None]
+PrintLine = Callable[[str], None]
 """Shows one line, on stderr."""
 
 
-def exit_code_of(command: Callable[[], object], tell: Tell) -> int:
+def exit_code_of(command: Callable[[], object], print_line: PrintLine) -> int:
     """Run a command, which returns its exit code or None; what it raises becomes a code and a line.
 
     Args:
         command: Such as the parser with its arguments.
-        tell: Shows the line, and what was made anew.
+        print_line: Shows the line, and what was made anew.
     """
     with warnings.catch_warnings():
-        warnings.showwarning = _notes(warnings.showwarning, tell)
+        warnings.showwarning = _notes(warnings.showwarning, print_line)
         try:
             result = command()
             flush_output()
@@ -44,7 +44,7 @@ def exit_code_of(command: Callable[[], object], tell: Tell) -> int:
             result = INTERRUPTED
         except (PlanningError, ClickException) as error:
             line, code = _line_and_code(error)
-            tell(line)
+            print_line(line)
             return code
         except (BrokenPipeError, SystemExit) as error:  # click and rich end the program at any broken pipe
             return _unread(error)
@@ -52,7 +52,7 @@ def exit_code_of(command: Callable[[], object], tell: Tell) -> int:
             traceback.print_exc()
             return PROGRAM_FAILED
     if result == INTERRUPTED:  # typer itself turns Ctrl-C into this, and says nothing
-        tell("interrupted")
+        print_line("interrupted")
     return result if isinstance(result, int) else OK
 
 
@@ -74,7 +74,7 @@ def _line_and_code(error: PlanningError | ClickException) -> tuple[str, int]:
     return str(error), BAD_INPUT if isinstance(error, InputError) else PROGRAM_FAILED
 
 
-def _notes(usual: Callable[..., None], tell: Tell) -> Callable[..., None]:
+def _notes(usual: Callable[..., None], print_line: PrintLine) -> Callable[..., None]:
     """Says in one line, once, what was made anew; other warnings are Python's."""
     said: set[str] = set()
 
@@ -83,6 +83,6 @@ def _notes(usual: Callable[..., None], tell: Tell) -> Callable[..., None]:
             usual(message, category, *rest)
         elif str(message) not in said:
             said.add(str(message))
-            tell(f"note: {message}")
+            print_line(f"note: {message}")
 
     return show

@@ -13,11 +13,11 @@ def main() -> int:
     """Parse the one option and write; progress goes to stderr."""
     parser = argparse.ArgumentParser(prog="python -m puncture_twin.twin.phantoms", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder for abdomen/, carton/ and manifest.json")
-    write_phantoms(parser.parse_args().out, _tell)
+    write_phantoms(parser.parse_args().out, _print)
     return 0
 
 
-def _tell(line: str) -> None:
+def _print(line: str) -> None:
     sys.stderr.write(line + "\n")
 
 

@@ -100,6 +100,6 @@ def _box(field: Field, spacing_mm: float) -> SamplingBox:
     """A box about a body, found on a coarse grid over the trunk."""
     axes = [np.arange(low, high + 1.0, _SEARCH_STEP_MM) for low, high in zip(_SEARCH_LOW, _SEARCH_HIGH, strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    held = nodes[field(nodes) < _SEARCH_REACH_MM]
-    low, high = held.min(axis=0) - _SEARCH_STEP_MM / 2, held.max(axis=0) + _SEARCH_STEP_MM / 2
+    near = nodes[field(nodes) < _SEARCH_REACH_MM]
+    low, high = near.min(axis=0) - _SEARCH_STEP_MM / 2, near.max(axis=0) + _SEARCH_STEP_MM / 2
     return SamplingBox((low[0], low[1], low[2]), (high[0], high[1], high[2]), spacing_mm)

@@ -22,14 +22,14 @@ _LICENCE = "Apache-2.0"
 _PAPER = "DOI 10.7652/xjtuxb201904013"
 
 
-def write_phantoms(folder: Path, tell: Callable[[str], None] = lambda _: None) -> None:
+def write_phantoms(folder: Path, report: Callable[[str], None] = lambda _: None) -> None:
     """Write every mesh and point list below ``folder``, and the manifest last; case files are left alone.
 
     Everything is made in a folder beside it first, so that a failure leaves what was there.
 
     Args:
         folder: Made if it is not there.
-        tell: Called with one line per file.
+        report: Called with one line per file.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".phantoms-", dir=folder.resolve().parent) as scratch:
@@ -40,7 +40,7 @@ def write_phantoms(folder: Path, tell: Callable[[str], None] = lambda _: None) -
             target.parent.mkdir(exist_ok=True)
             target.write_bytes(data)
             entries.append({**entry, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()})
-            tell(f"{entry['path']}: {entry.get('triangles', '-')} triangles, {len(data)} bytes")
+            report(f"{entry['path']}: {entry.get('triangles', '-')} triangles, {len(data)} bytes")
         manifest = {"schema": 1, "command": _COMMAND, "licence": _LICENCE, "files": entries}
         (staging / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
         for path in [str(entry["path"]) for entry in entries] + ["manifest.json"]:

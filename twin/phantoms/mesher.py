@@ -20,7 +20,7 @@ _BAND = 1.6
 _RELAXATIONS = 14
 """Rounds of tangential smoothing; after 14 the worst angles no longer improve."""
 _STEP = 0.5
-"""Share of the way to the neighbours' mean that a vertex moves in one round."""
+"""Fraction of the way to the neighbours' mean that a vertex moves in one round."""
 _PROBE_MM = 1e-3
 """Half step of the central differences. Fields are smooth on this scale, and rounding is 1e-11 of it."""
 _PROJECTIONS = 20

@@ -22,11 +22,11 @@ class Curve:
 
     Attributes:
         points: Shape (n, 3), mm.
-        share: Shape (n,), the control points' running number at each node (0 at the first, m - 1 at the last).
+        parameter: Shape (n,), the control points' running number at each node (0 at the first, m - 1 at the last).
     """
 
     points: Floats
-    share: Floats
+    parameter: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ def smooth_curve(controls: ArrayLike) -> Curve:
         points = knots[0] + (at / chord[-1])[:, None] * (knots[1] - knots[0])
     else:
         points = CubicSpline(chord, knots)(at)
-    return Curve(points=points, share=np.interp(at, chord, np.arange(len(knots))))
+    return Curve(points=points, parameter=np.interp(at, chord, np.arange(len(knots))))
 
 
 def nearest(curve: Curve, tree: cKDTree, points: Floats) -> Foot:
@@ -77,7 +77,7 @@ def tube(controls: ArrayLike, radii_mm: ArrayLike, folds_mm: float = 0.0, fold_l
     """
     curve = smooth_curve(controls)
     wanted = np.broadcast_to(np.asarray(radii_mm, dtype=float), (len(np.asarray(controls)),))
-    radius = PchipInterpolator(np.arange(len(wanted)), wanted)(curve.share)
+    radius = PchipInterpolator(np.arange(len(wanted)), wanted)(curve.parameter)
     length = np.arange(len(radius)) * np.linalg.norm(np.diff(curve.points, axis=0), axis=1).mean()
     radius = radius - folds_mm * (0.5 + 0.5 * np.cos(2 * np.pi * length / fold_length_mm))
     tree, index = cKDTree(curve.points), np.arange(len(radius))
@@ -100,7 +100,9 @@ def ribbon(controls: ArrayLike, outward: ArrayLike, half_height_mm: float, half_
     """
     curve = smooth_curve(controls)
     knots = np.arange(len(np.asarray(controls)))
-    thin = np.stack([np.interp(curve.share, knots, column) for column in np.asarray(outward, dtype=float).T], axis=1)
+    thin = np.stack(
+        [np.interp(curve.parameter, knots, column) for column in np.asarray(outward, dtype=float).T], axis=1
+    )
     tangent = np.gradient(curve.points, axis=0)
     height = np.cross(tangent, thin)
     height /= np.linalg.norm(height, axis=1, keepdims=True)

@@ -107,7 +107,7 @@ def skin(points: Floats) -> Floats:
 
 
 def diaphragm(points: Floats) -> Floats:
-    """Field of the room below the diaphragm: a high right dome, a lower left one, and the saddle of the heart."""
+    """Field of the workcell below the diaphragm: a high right dome, a lower left one, and the saddle of the heart."""
     right = _dome(points, (-58.0, 0.0), (71.0, 80.0, 112.0))
     left = _dome(points, (64.0, 2.0), (66.0, 78.0, 94.0))
     middle = _dome(points, (-2.0, -10.0), (62.0, 84.0, 94.0))

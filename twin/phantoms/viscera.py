@@ -56,8 +56,8 @@ def gallbladder() -> Field:
 @cache
 def liver() -> Field:
     """Bounded by diaphragm, wall, and a visceral face that rises to the left and to the back."""
-    room = within(torso.diaphragm, [torso.inside_cage(8.0), _visceral_face, _left_edge], 18.0)
-    pressed = carve(room, [kidney_right(), vessels.vena_cava_inferior(), gallbladder(), oesophagus()], _GAP_MM, 4.0)
+    space = within(torso.diaphragm, [torso.inside_cage(8.0), _visceral_face, _left_edge], 18.0)
+    pressed = carve(space, [kidney_right(), vessels.vena_cava_inferior(), gallbladder(), oesophagus()], _GAP_MM, 4.0)
     return carve(pressed, [torso.spinal_mass, vessels.aorta()], 4.0, 8.0)
 
 
@@ -80,8 +80,8 @@ def spleen() -> Field:
     turn = Rotation.from_euler("x", 28.0, degrees=True)
     body = ellipsoid((94.0, 32.0, 90.0), (50.0, 45.0, 62.0), turn)
     crescent = carve(body, [torso.inside_cage(43.0)], 0.1, 14.0)
-    room = within(crescent, [torso.inside_cage(8.0), offset(torso.diaphragm, -2.0)], 6.0)
-    return carve(room, [kidney_left(), vessels.portal_vein(), torso.spinal_mass], _GAP_MM, 6.0)
+    space = within(crescent, [torso.inside_cage(8.0), offset(torso.diaphragm, -2.0)], 6.0)
+    return carve(space, [kidney_left(), vessels.portal_vein(), torso.spinal_mass], _GAP_MM, 6.0)
 
 
 @cache
@@ -133,7 +133,7 @@ def stomach() -> Field:
         (-26, -42, 14),
     ]
     body = tube(path, [33.0, 35.0, 33.0, 29.0, 25.0, 20.0, 16.0, 11.0])
-    room = within(body, [torso.inside_cage(9.0), offset(torso.diaphragm, -2.0)], 6.0)
+    space = within(body, [torso.inside_cage(9.0), offset(torso.diaphragm, -2.0)], 6.0)
     others = [
         liver(),
         spleen(),
@@ -143,7 +143,7 @@ def stomach() -> Field:
         gallbladder(),
         vessels.portal_vein(),
     ]
-    return carve(room, [*others, torso.spinal_mass], _GAP_MM, _BLEND_MM)
+    return carve(space, [*others, torso.spinal_mass], _GAP_MM, _BLEND_MM)
 
 
 @cache
@@ -175,7 +175,7 @@ def colon() -> Field:
     ]  # fmt: skip
     radii = [27, 28, 26, 24, 22, 21, 20.5, 20, 20, 19.5, 19, 18.5, 17, 16, 15.5, 15.5, 15.5]
     organ = tube(path, radii, folds_mm=2.6, fold_length_mm=27.0)
-    room = within(organ, [torso.inside_cage(11.0), offset(torso.diaphragm, -2.0)], 6.0)
+    space = within(organ, [torso.inside_cage(11.0), offset(torso.diaphragm, -2.0)], 6.0)
     solid = [
         liver(),
         stomach(),
@@ -186,7 +186,7 @@ def colon() -> Field:
         duodenum(),
         gallbladder(),
     ]
-    return carve(room, [*solid, bones.hip_right(), bones.hip_left(), torso.spinal_mass], _GAP_MM, 3.0)
+    return carve(space, [*solid, bones.hip_right(), bones.hip_left(), torso.spinal_mass], _GAP_MM, 3.0)
 
 
 @cache
@@ -197,9 +197,9 @@ def small_bowel() -> Field:
         np.stack([upper[-1], (upper[-1] + lower[0]) / 2 + [0.0, 6.0, 0.0], lower[0]]) for upper, lower in pairwise(rows)
     ]
     organ = union([tube(path, 11.0) for path in [*rows, *links]], 5.0)
-    room = within(organ, [torso.inside_cage(11.0), above(2, torso.CONTENT_BOTTOM_MM)], 4.0)
+    space = within(organ, [torso.inside_cage(11.0), above(2, torso.CONTENT_BOTTOM_MM)], 4.0)
     near = [vessels.aorta(), vessels.vena_cava_inferior(), vessels.portal_vein(), torso.spinal_mass]
-    return carve(room, [colon(), duodenum(), *near], _GAP_MM, 3.0)
+    return carve(space, [colon(), duodenum(), *near], _GAP_MM, 3.0)
 
 
 def _loop_row(row: int, z: float) -> Floats:
@@ -214,9 +214,9 @@ def heart() -> Field:
     """Lower part of the heart on the saddle of the diaphragm."""
     turn = Rotation.from_euler("zy", (24.0, 18.0), degrees=True)
     muscle = ellipsoid((22.0, -34.0, 186.0), (66.0, 44.0, 46.0), turn)
-    room = within(muscle, [torso.inside_cage(10.0), below(2, torso.CONTENT_TOP_MM)], 6.0)
+    space = within(muscle, [torso.inside_cage(10.0), below(2, torso.CONTENT_TOP_MM)], 6.0)
     near = [vessels.vena_cava_inferior(), vessels.aorta(), oesophagus(), offset(torso.diaphragm, 3.0)]
-    return carve(room, near, 1.5, 6.0)
+    return carve(space, near, 1.5, 6.0)
 
 
 def _recess(points: Floats) -> Floats:
@@ -227,9 +227,9 @@ def _recess(points: Floats) -> Floats:
 
 
 def _lung(side: Field, ribs: Field) -> Field:
-    room = within(torso.inside_cage(6.5), [side, _recess, below(2, torso.CONTENT_TOP_MM)], 8.0)
+    space = within(torso.inside_cage(6.5), [side, _recess, below(2, torso.CONTENT_TOP_MM)], 8.0)
     near = [vessels.aorta(), oesophagus(), heart(), vessels.vena_cava_inferior(), torso.spinal_mass]
-    return carve(carve(room, near, 2.5, 6.0), [torso.diaphragm, ribs], 2.0, 10.0)
+    return carve(carve(space, near, 2.5, 6.0), [torso.diaphragm, ribs], 2.0, 10.0)
 
 
 @cache

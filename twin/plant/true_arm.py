@@ -63,8 +63,8 @@ class TrueArm(NamedTuple):
             rng: For the repeatability.
         """
         half = 0.5 * self.backlash_rad
-        held = np.clip(q_before, q_command - half, q_command + half)
-        return np.asarray(held + rng.normal(0.0, self.repeatability_rad, 6))
+        settled = np.clip(q_before, q_command - half, q_command + half)
+        return np.asarray(settled + rng.normal(0.0, self.repeatability_rad, 6))
 
 
 def draw_true_arm(nominal: UrModel, errors: ArmErrors, rng: np.random.Generator) -> TrueArm:

@@ -13,7 +13,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import exp_rotation
 
 NEWTON_STEPS = 4
-"""Of a tip driven onto a point: errors of an arm are millimetres, and each step squares what is left of them."""
+"""Of a tip moved onto a point: errors of an arm are millimetres, and each step squares what is left of them."""
 
 
 class TrueNeedle(NamedTuple):

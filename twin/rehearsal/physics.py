@@ -8,7 +8,7 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.twin.rehearsal.distribution import Distribution, PhysicsRooms
-from puncture_twin.twin.rehearsal.plan_truth import room_truth, spread_rows
+from puncture_twin.twin.rehearsal.plan_truth import drawn_truth, spread_rows
 from puncture_twin.twin.rehearsal.rehearsal import rehearse
 
 
@@ -25,7 +25,7 @@ def physics_rooms(context: CaseContext, plan: Plan, found: Distribution, count: 
     rows = spread_rows(found, count)
     apart, contacts = np.empty(len(rows)), 0
     for number, row in enumerate(rows.tolist()):
-        truth = room_truth(found.puncture, found.rooms, row, found.seed, "a room")
+        truth = drawn_truth(found.puncture, found.rooms, row, found.seed, "a room")
         done = rehearse(plan, context.case, context.anatomy, truth)
         apart[number] = np.linalg.norm(done.tip_true_ct[-1] - found.rooms.tip_ct[row])
         contacts += bool(done.contacts)

@@ -31,7 +31,7 @@ TRIED = 16
 """Rooms that are drawn for one: the arm may not reach the pose that a room's registration asks for."""
 
 
-def room_truth(puncture: Puncture, rooms: Rooms, row: int, seed: int, source: str) -> Truth:
+def drawn_truth(puncture: Puncture, rooms: Rooms, row: int, seed: int, source: str) -> Truth:
     """The truth whose execution ends as one of the rooms did.
 
     Args:
@@ -66,7 +66,7 @@ def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Tru
         return draw_truth(case, plan.T_base_ct, seed=seed)
     seed = case.rehearsal.seed if seed is None else seed
     found = rehearse_rooms(context, plan.outward_ct, plan.insertion.q[-1], TRIED, seed)
-    return _of_room(found, 0, f"drawn with seed {seed} from {_declared(found)}")
+    return _of_drawn(found, 0, f"drawn with seed {seed} from {_declared(found)}")
 
 
 def median_truth(found: Distribution) -> Truth:
@@ -77,7 +77,7 @@ def median_truth(found: Distribution) -> Truth:
     """
     count = len(found) + found.unreached
     row = int(spread_rows(found, 1)[0]) if len(found) else 0
-    return _of_room(found, row, f"the median of {count:,} rooms, drawn with seed {found.seed} from {_declared(found)}")
+    return _of_drawn(found, row, f"the median of {count:,} rooms, drawn with seed {found.seed} from {_declared(found)}")
 
 
 def spread_rows(found: Distribution, count: int) -> Ints:
@@ -87,12 +87,12 @@ def spread_rows(found: Distribution, count: int) -> Ints:
     return np.asarray(np.unique(order[np.floor(places).clip(0).astype(np.int64)]))
 
 
-def _of_room(found: Distribution, row: int, source: str) -> Truth:
+def _of_drawn(found: Distribution, row: int, source: str) -> Truth:
     if len(found) == 0:
         raise NoAnswerError(
             f"in none of {found.unreached} rooms did the arm reach the pose that its registration asked for"
         )
-    return room_truth(found.puncture, found.rooms, row, found.seed, source)
+    return drawn_truth(found.puncture, found.rooms, row, found.seed, source)
 
 
 def _declared(found: Distribution) -> str:

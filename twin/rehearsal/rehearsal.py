@@ -34,7 +34,7 @@ from puncture_twin.twin.world.workcell import open_workcell
 SETTLE_S = 0.5
 """Pause between approach and insertion: ten times the time in which a motor's lag dies out."""
 
-HOLD_S = 1.0
+DWELL_S = 1.0
 """Pause at the end, before the tip is measured."""
 
 ROUNDING = 1e-6
@@ -191,14 +191,14 @@ def _executed(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Executi
     model, tool, boxes = ur_model(plan.model), case_tool(case), case_boxes(case, T_base_ct)
     down_ct = -bed_frame(case)[:3, 2]
     parts = _parts(plan)
-    with open_workcell(model, tool, anatomy.skin.mesh, T_base_ct, boxes, down_ct=down_ct) as room:
+    with open_workcell(model, tool, anatomy.skin.mesh, T_base_ct, boxes, down_ct=down_ct) as open_cell:
         if control == "position":
-            return execute(room, np.concatenate(list(parts.values())), truth.joint_offsets)
+            return execute(open_cell, np.concatenate(list(parts.values())), truth.joint_offsets)
         before = np.concatenate([parts["approach"], parts["settle"]])
-        approached = execute(room, before, truth.joint_offsets)
-        insertion = Insertion(model, tool, T_base_ct[:3, :3] @ down_ct, plan.insertion, HOLD_S)
+        approached = execute(open_cell, before, truth.joint_offsets)
+        insertion = Insertion(model, tool, T_base_ct[:3, :3] @ down_ct, plan.insertion, DWELL_S)
         start_s = TIME_STEP_S * len(before)
-        return joined(approached, insert(room, insertion, control, truth.joint_offsets, start_s=start_s))
+        return joined(approached, insert(open_cell, insertion, control, truth.joint_offsets, start_s=start_s))
 
 
 def _parts(plan: Plan) -> dict[str, Floats]:
@@ -208,7 +208,7 @@ def _parts(plan: Plan) -> dict[str, Floats]:
         "approach": approach,
         "settle": np.repeat(approach[-1:], round(SETTLE_S / TIME_STEP_S), axis=0),
         "insertion": insertion,
-        "hold": np.repeat(insertion[-1:], round(HOLD_S / TIME_STEP_S), axis=0),
+        "hold": np.repeat(insertion[-1:], round(DWELL_S / TIME_STEP_S), axis=0),
     }
 
 

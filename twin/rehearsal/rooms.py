@@ -1,4 +1,4 @@
-"""Many rooms at once, without physics: markers read and touched, registered, and the needle driven to the target.
+"""Many rooms at once, without physics: markers read and touched, registered, and the needle moved to the target.
 
 Every room draws its truth anew from one declaration of errors: what the CT shows of markers and target, the arm's 28
 parameters, its touches, what drifted since, and one arrival. The arm's motion is exact kinematics, not linearised;

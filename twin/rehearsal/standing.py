@@ -24,7 +24,7 @@ class Standing:
         return f"{ordinal(round(self.percentile))} percentile"
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """For headlines and text."""
         if self.rooms == 0:
             return f"{self.place} of the tip errors that are predicted"

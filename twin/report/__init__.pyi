@@ -1,15 +1,15 @@
 from .annotate import INK as INK, width_of as width_of, write as write
 from .map_view import MapCells as MapCells, MapView as MapView, body_directions as body_directions, step_of as step_of
-from .mount_text import direction_words as direction_words, mount_words as mount_words
+from .mount_text import direction_text as direction_text, mounting_text as mounting_text
 from .numbers import (
-    arm_words as arm_words,
+    arm_text as arm_text,
     demanding as demanding,
     nearest_structure as nearest_structure,
-    needle_words as needle_words,
+    needle_text as needle_text,
     number as number,
     percent as percent,
     reason_counts as reason_counts,
-    target_words as target_words,
+    target_text as target_text,
 )
 from .palette import (
     PNG_LEVEL as PNG_LEVEL,

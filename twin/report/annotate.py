@@ -41,7 +41,7 @@ def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
 def write(
     draw: ImageDraw.ImageDraw,
     at: tuple[float, float],
-    words: str,
+    text: str,
     *,
     size: int = 16,
     bold: bool = False,
@@ -50,12 +50,12 @@ def write(
     halo: int = 0,
 ) -> None:
     """One line of text; ``halo`` is the width of a white rim in pixels."""
-    draw.text(at, words, fill=colour, font=font(size, bold), anchor=anchor, stroke_width=halo, stroke_fill=WHITE)
+    draw.text(at, text, fill=colour, font=font(size, bold), anchor=anchor, stroke_width=halo, stroke_fill=WHITE)
 
 
-def width_of(words: str, size: int) -> float:
+def width_of(text: str, size: int) -> float:
     """Width of a line of text in pixels."""
-    return float(font(size).getlength(words))
+    return float(font(size).getlength(text))
 
 
 def body_axes(
@@ -117,7 +117,7 @@ def scale_bar(
     at_ct: NDArray[np.float64],
     left: float,
     bottom: float,
-    room: float,
+    width_px: float,
     note: str = " at the target's depth",
 ) -> None:
     """A bar of a round length, true at the depth of one point (perspective: nearer things look larger).
@@ -128,12 +128,12 @@ def scale_bar(
         at_ct: The point whose depth counts, shape (3,).
         left: Pixel column where the bar begins.
         bottom: Pixel row of the bar.
-        room: Greatest length in pixels.
+        width_px: Greatest length in pixels.
         note: What follows the length.
     """
     depth = float(camera.project(at_ct)[0, 2])
     per_mm = camera.scale / depth
-    fitting = [mm for mm in SCALE_BARS_MM if mm * per_mm <= room]
+    fitting = [mm for mm in SCALE_BARS_MM if mm * per_mm <= width_px]
     mm = fitting[-1] if fitting else SCALE_BARS_MM[0]
     right = left + mm * per_mm
     draw.line([(left, bottom), (right, bottom)], fill=INK, width=4)
@@ -146,12 +146,12 @@ def legend(draw: ImageDraw.ImageDraw, items: list[tuple[str, Rgb]], left: float,
     """Colour patches with names, line after line; returns the row below the last line."""
     x, y, size = left, top, LEGEND_SIZE
     for name, colour in items:
-        words = name.replace("_", " ")
-        need = size + 8 + width_of(words, size) + 22
+        text = name.replace("_", " ")
+        need = size + 8 + width_of(text, size) + 22
         if x + need > right and x > left:
             x, y = left, y + size + 11
         draw.rectangle([x, y, x + size, y + size], fill=colour, outline=INK)
-        write(draw, (x + size + 8, y + size / 2 + 1), words, size=size, anchor="lm")
+        write(draw, (x + size + 8, y + size / 2 + 1), text, size=size, anchor="lm")
         x += need
     return y + size + 11
 

@@ -19,7 +19,7 @@ from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, angles
 from puncture_twin.planning.search.candidates import Candidates
 
-WORDS_LPS = {
+NAMES_LPS = {
     "left": "patient's left",
     "right": "patient's right",
     "posterior": "back",
@@ -82,7 +82,7 @@ def body_directions(space: str) -> dict[str, Floats]:
     if str(space) == "local":
         names = ((f"{sign}{axis}", i, s) for i, axis in enumerate("xyz") for sign, s in (("+", 1.0), ("−", -1.0)))
         return {name: s * np.eye(3)[i] for name, i, s in names}
-    return {WORDS_LPS[name]: np.array(vector) for name, vector in ANATOMICAL_LPS.items()}
+    return {NAMES_LPS[name]: np.array(vector) for name, vector in ANATOMICAL_LPS.items()}
 
 
 def map_view(case: Any, candidates: Candidates) -> MapView:

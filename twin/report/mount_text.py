@@ -12,7 +12,7 @@ NEARLY = 0.985
 """Cosine from which a direction carries a body direction's name (10 degrees)."""
 
 
-def direction_words(direction_ct: Floats, space: str) -> str:
+def direction_text(direction_ct: Floats, space: str) -> str:
     """What a person calls a direction, such as "the patient's left"; "" where no name fits.
 
     Args:
@@ -25,10 +25,10 @@ def direction_words(direction_ct: Floats, space: str) -> str:
     return ""
 
 
-def mount_words(region: Region, T_ct_bed: Floats, space: str) -> str:
+def mounting_text(region: Region, T_ct_bed: Floats, space: str) -> str:
     """A region's name, with the patient's directions in it where they fit."""
     if not region.facing:
         return region.mount
     axis = region.axis if region.mount == "side" else (0, 1 if region.facing.startswith("+") else -1, 0)
-    words = direction_words(np.asarray(T_ct_bed[:3, :3] @ np.asarray(axis, dtype=float)), space) or region.facing
-    return f"side, base axis toward {words}" if region.mount == "side" else f"{region.mount}, on {words}"
+    text = direction_text(np.asarray(T_ct_bed[:3, :3] @ np.asarray(axis, dtype=float)), space) or region.facing
+    return f"side, base axis toward {text}" if region.mount == "side" else f"{region.mount}, on {text}"

@@ -25,15 +25,15 @@ class ReasonCount:
     """One line of the legend.
 
     Attributes:
-        words: What a person reads.
+        text: What a person reads.
         code: The reason's code, "safe" for safe.
         colour: Its colour.
         count: How many directions.
-        share: Of the grid's directions, 0..1.
+        fraction: Of the grid's directions, 0..1.
         solid_angle: Of the searched solid angle, 0..1; the grid is denser near θ = 0, this is not.
     """
 
-    words: str
+    text: str
     code: str
     colour: Rgb
     count: int
@@ -49,10 +49,10 @@ def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
         here = candidates.verdict.reason == value
         reason = reason_of(str(value))
         colour = REASON_COLOURS.get(reason, SAFE)
-        words = REASON_TEXT[reason] if reason else candidates.safe_text
+        text = REASON_TEXT[reason] if reason else candidates.safe_text
         fraction, solid = float(here.mean()), float(weights[here].sum() / weights.sum())
         count = int(here.sum())
-        lines.append(ReasonCount(words, reason.value or "safe", colour, count, fraction, solid))
+        lines.append(ReasonCount(text, reason.value or "safe", colour, count, fraction, solid))
     if not candidates.safe.any():
         lines.append(ReasonCount(candidates.safe_text, "safe", SAFE, 0, 0.0, 0.0))
     return tuple(sorted(lines, key=lambda line: (line.code != "safe", -line.count)))
@@ -67,7 +67,7 @@ def nearest_structure(candidates: Candidates, row: int) -> tuple[str, float]:
     return candidates.clearance.structures[best], float(candidates.clearance.distance[row, best])
 
 
-def needle_words(case: Any) -> str:
+def needle_text(case: Any) -> str:
     """The needle in one line."""
     n = case.needle
     return f"needle ⌀ {n.diameter_mm:g} mm, shaft {n.shaft_mm:g} mm, tip to flange {n.length_mm:g} mm"
@@ -86,14 +86,14 @@ def percent(fraction: float) -> str:
     return "<0.1 %" if 0 < fraction < 0.0005 else f"{100 * fraction:.1f} %"
 
 
-def arm_words(candidates: Candidates) -> str:
+def arm_text(candidates: Candidates) -> str:
     """Whether "safe" includes the arm."""
     if not candidates.arm_checked:
         return f"arm {candidates.arm_note}; “safe” speaks of the needle and the organs alone"
     return "“safe” includes that the arm can reach the direction and insert the needle"
 
 
-def target_words(case: Any) -> str:
+def target_text(case: Any) -> str:
     """The target's name, and the structure that holds it where the two differ."""
     if case.target_name in {"target", case.target_structure}:
         return str(case.target_structure)

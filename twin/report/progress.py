@@ -67,20 +67,20 @@ class LineDisplay:
 
     def step(self, stage: str, what: str) -> None:
         """Name what a stage is at."""
-        self._say(f"{stage}: {what}")
+        self._write(f"{stage}: {what}")
 
     def count(self, stage: str, done: int, total: int, failed: int = 0) -> None:
         """Say how far a stage is, its rate, and how long it still takes, as soon as there is time behind a rate."""
         since = self._started.setdefault(stage, (time.monotonic(), done))
         spent, more = time.monotonic() - since[0], done - since[1]
-        self._say(f"{stage}: {done}/{total}{_failed_text(failed)}{_rate_text(more, spent, total - done)}")
+        self._write(f"{stage}: {done}/{total}{_failed_text(failed)}{_rate_text(more, spent, total - done)}")
 
     def note(self, line: str) -> None:
         """Write a line now: it is said once."""
         self._stream.write(line + "\n")
         self._stream.flush()
 
-    def _say(self, line: str) -> None:
+    def _write(self, line: str) -> None:
         if time.monotonic() - self._last >= LINE_EVERY_S:
             self._last = time.monotonic()
             self._stream.write(line + "\n")

@@ -75,12 +75,12 @@ def draw_rooms_picture(found: Any, path: Path) -> None:
 def _cloud(axes: Axes, error: Floats, cov: Floats, within: Any, pair: tuple[int, int], names: tuple[str, str]) -> None:
     """The errors on two axes, and the shadow of the 95 % ellipsoid there."""
     shown = np.arange(len(error)) < MOST_POINTS
-    for rows, colour, marker, words in (
+    for rows, colour, marker, text in (
         (shown & within, WITHIN, ".", "tip inside of the ellipsoid"),
         (shown & ~within, BEYOND, "x", "outside of it, in some direction"),
     ):
         points = error[rows][:, list(pair)]
-        axes.scatter(points[:, 0], points[:, 1], s=14, c=colour, marker=marker, linewidths=0.8, alpha=0.6, label=words)
+        axes.scatter(points[:, 0], points[:, 1], s=14, c=colour, marker=marker, linewidths=0.8, alpha=0.6, label=text)
     turns = np.linspace(0, 2 * np.pi, 241)
     values, vectors = np.linalg.eigh(cov[np.ix_(pair, pair)])
     ring = vectors @ (np.sqrt(chdtri(3, 1 - REGION) * np.maximum(values, 0))[:, None] * [np.cos(turns), np.sin(turns)])

@@ -1,4 +1,4 @@
-"""The arm in the room: loaded, driven by its joint motors, and read back."""
+"""The arm in the workcell: loaded, moved by its joint motors, and read back."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ MAX_TORQUE_NM = MappingProxyType(
 """The manufacturer's joint torques; the URDF of the UR3 carries those of a UR10. The e-Series': of its URDFs."""
 
 POSITION_GAIN = 0.1
-"""Share of a joint's position error that its motor takes back per step, Bullet's default: an error falls to 1/e
+"""Fraction of a joint's position error that its motor takes back per step, Bullet's default: an error falls to 1/e
 in 9.5 steps (40 ms), slow enough that starts and stops leave a visible trace, as a real controller's do."""
 
 VELOCITY_GAIN = 1.0
-"""Share of a joint's speed error that its motor takes back per step."""
+"""Fraction of a joint's speed error that its motor takes back per step."""
 
 
 class JointState(NamedTuple):

@@ -1,4 +1,4 @@
-"""What else stands in the room: the patient's skin, boxes, and surfaces that are only seen."""
+"""What else stands in the workcell: the patient's skin, boxes, and surfaces that are only seen."""
 
 from __future__ import annotations
 

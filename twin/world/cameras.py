@@ -1,4 +1,4 @@
-"""Pictures of the room, drawn without a screen or a graphics card."""
+"""Pictures of the workcell, drawn without a screen or a graphics card."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def touches(arm: Arm) -> tuple[Touch, ...]:
 
 
 def felt_force(arm: Arm, link: str) -> Floats:
-    """What the bodies of the room press on one link with, as of the last physics step: shape (3,), N, world frame."""
+    """The force of the workcell's bodies on one link, as of the last physics step: shape (3,), N, world frame."""
     force = np.zeros(3)
     for point in pybullet.getContactPoints(bodyA=arm.body, linkIndexA=arm.links[link], physicsClientId=arm.client):
         if point[2] != arm.body:

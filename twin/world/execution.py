@@ -17,7 +17,7 @@ RECORD_S = 4 * TIME_STEP_S
 
 
 class TouchAt(NamedTuple):
-    """A contact of the arm with a body of the room, at one physics step."""
+    """A contact of the arm with a body of the workcell, at one physics step."""
 
     time_s: float
     link: str
@@ -50,7 +50,7 @@ class Recorder:
     """Looks at the arm after every physics step, and keeps a record `RECORD_S` apart and at the end.
 
     Args:
-        room: An open room.
+        workcell: An open room.
         q_command: Shape (n, 6), rad, one row a physics step.
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
         dt: The physics step, s.
@@ -58,9 +58,9 @@ class Recorder:
     """
 
     def __init__(
-        self, room: SimulatedWorkcell, q_command: Floats, joint_offsets: Floats, dt: float, start_s: float = 0.0
+        self, workcell: SimulatedWorkcell, q_command: Floats, joint_offsets: Floats, dt: float, start_s: float = 0.0
     ) -> None:
-        self._room, self._q_command, self._joint_offsets = room, q_command, joint_offsets
+        self._room, self._q_command, self._joint_offsets = workcell, q_command, joint_offsets
         self._dt, self._start_s, self._every = dt, start_s, round(RECORD_S / dt)
         self._rows: list[int] = []
         self._q: list[Floats] = []
@@ -89,20 +89,20 @@ class Recorder:
         return self._start_s + row * self._dt
 
 
-def execute(room: SimulatedWorkcell, q_command: Floats, joint_offsets: Floats) -> Execution:
+def execute(workcell: SimulatedWorkcell, q_command: Floats, joint_offsets: Floats) -> Execution:
     """Move the arm by its position motors from rest at the first command through all of them, one a physics step.
 
     Args:
-        room: An open room.
+        workcell: An open room.
         q_command: Shape (n, 6), rad, spaced by the physics time step.
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
     """
-    arm, recorder = room.arm, Recorder(room, q_command, joint_offsets, TIME_STEP_S)
+    arm, recorder = workcell.arm, Recorder(workcell, q_command, joint_offsets, TIME_STEP_S)
     speeds = np.gradient(q_command, TIME_STEP_S, axis=0) if len(q_command) > 1 else np.zeros_like(q_command)
     arm.place(q_command[0] + joint_offsets)
     for row, (angles, speed) in enumerate(zip(q_command, speeds, strict=True)):
         arm.command(angles + joint_offsets, speed)
-        step(room.client)
+        step(workcell.client)
         recorder.see(row)
     return recorder.execution()
 

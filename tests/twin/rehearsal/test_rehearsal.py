@@ -30,7 +30,7 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.registration.touch_poses import touching_configuration
 from puncture_twin.twin.plant.truth import Truth
-from puncture_twin.twin.rehearsal.plan_truth import room_truth, spread_rows
+from puncture_twin.twin.rehearsal.plan_truth import drawn_truth, spread_rows
 from puncture_twin.twin.rehearsal.rehearsal import rehearse, split_error
 from puncture_twin.twin.rehearsal.rooms import Puncture, draw_rooms
 from puncture_twin.twin.rehearsal.standing import Standing, ordinal
@@ -389,7 +389,7 @@ def test_the_simulator_ends_where_the_room_did(rooms):
     error = np.linalg.norm(drawn.tip_ct - drawn.target_ct, axis=1)
     order = np.argsort(error)
     for row in order[[0, 500, 999]]:
-        done = rehearse(plan, case(), anatomy(), room_truth(puncture, drawn, int(row), 3, "a room"))
+        done = rehearse(plan, case(), anatomy(), drawn_truth(puncture, drawn, int(row), 3, "a room"))
         assert np.linalg.norm(done.tip_true_ct[-1] - drawn.tip_ct[row]) < APART_MM
         assert done.tip_error_mm == pytest.approx(error[row], abs=APART_MM)
         along = -(np.linalg.inv(done.T_base_ct_true) @ done.T_base_flange_true[-1])[:3, 2]
@@ -413,8 +413,8 @@ def test_rows_are_spread_over_the_order_of_the_errors(count, wanted):
 
 def test_standing_in_words():
     """What headline and film say."""
-    assert Standing(50.05, 1000).words == "median of 1,000 rooms (50th percentile of their tip errors)"
-    assert Standing(2.6).words == "3rd percentile of the tip errors that are predicted"
+    assert Standing(50.05, 1000).text == "median of 1,000 rooms (50th percentile of their tip errors)"
+    assert Standing(2.6).text == "3rd percentile of the tip errors that are predicted"
     assert [ordinal(n) for n in (1, 2, 3, 4, 11, 12, 13, 21, 99)] == (
         ["1st", "2nd", "3rd", "4th", "11th", "12th", "13th", "21st", "99th"]
     )

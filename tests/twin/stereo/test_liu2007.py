@@ -32,7 +32,7 @@ DRAW = (-0.05, 0.05, -0.02, 0.02)
 def test_the_papers_means_are_those_of_its_rows_but_one():
     """Stereo, mapping and after hold to two decimals; the printed mean before, 1.47, is 1.48 by the rows."""
     columns = {column.name: column for column in paper_columns()}
-    assert [name for name, column in columns.items() if not column.holds] == ["before"]
+    assert [name for name, column in columns.items() if not column.passed] == ["before"]
     assert round(columns["before"].mean, 2) == 1.48
     assert columns["before"].printed_mean == 1.47
     assert len(TABLE_1) == 10
@@ -57,10 +57,10 @@ def tables(gains, **keys):
 
 def test_the_exit_code_stands_for_what_is_printed():
     """A gain that seeds scatter about is chance; one unconfirmed half, or an error far above the mapping's, fails."""
-    assert tables([0.5, 0.6, 0.4]).holds
-    assert [one.holds for one in tables([0.5, -0.6, 0.3]).conditions] == [False, True, True]
-    assert [one.holds for one in tables([0.5, 0.6, 0.4], after=1.6).conditions] == [True, False, True]
-    assert [one.holds for one in tables([0.5, 0.6, 0.4], stop="no_progress").conditions] == [True, True, False]
+    assert tables([0.5, 0.6, 0.4]).passed
+    assert [one.passed for one in tables([0.5, -0.6, 0.3]).conditions] == [False, True, True]
+    assert [one.passed for one in tables([0.5, 0.6, 0.4], after=1.6).conditions] == [True, False, True]
+    assert [one.passed for one in tables([0.5, 0.6, 0.4], stop="no_progress").conditions] == [True, True, False]
     text = "\n".join(_gain_lines(reproduction_facts(tables([0.5, 0.6, 0.4]))))
     assert "23 deg more" in text
     assert "paper 0.48 mm" in text
@@ -115,7 +115,8 @@ def test_a_seed_repeats_itself_and_another_does_not():
     """Every number is a function of case and seed."""
     case = load_servo_case(folder() / "head")
     first, again, other = (
-        short(case, seed, ("T1",), detector_of=lambda room, rng: pixel_detector(room, 0.03, rng)) for seed in (1, 1, 2)
+        short(case, seed, ("T1",), detector_of=lambda workcell, rng: pixel_detector(workcell, 0.03, rng))
+        for seed in (1, 1, 2)
     )
     assert first == again
     assert first.rows != other.rows

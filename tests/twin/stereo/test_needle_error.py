@@ -120,7 +120,7 @@ def test_many_rooms_are_as_predicted():
     rooms = [room_outcome(HERE, seed) for seed in range(ROOMS)]
     share = 3 * np.sqrt(0.05 * 0.95 / ROOMS)
     for way in ("open_loop", "servoed"):
-        needles = [getattr(room, way) for room in rooms]
+        needles = [getattr(workcell, way) for workcell in rooms]
         realised, predicted = (
             np.mean([getattr(one, name) ** 2 for one in needles]) for name in ("realised_mm", "predicted_rms_mm")
         )
@@ -132,22 +132,26 @@ def test_many_rooms_are_as_predicted():
         spread = np.sqrt(np.sum(chances * (1 - chances))) / ROOMS
         assert np.mean([one.hit for one in needles]) == pytest.approx(chances.mean(), abs=3 * spread)
     freedom = rooms[0].freedom
-    assert np.mean([room.chi_squared for room in rooms]) == pytest.approx(freedom, abs=3 * np.sqrt(2 * freedom / ROOMS))
+    assert np.mean([one.chi_squared for one in rooms]) == pytest.approx(freedom, abs=3 * np.sqrt(2 * freedom / ROOMS))
 
 
 def test_a_declaration_too_small_by_two_is_seen():
     """Rooms drawn twice as wide as believed: most leave the 95 % ellipsoid's size behind, and the residuals tell."""
     rooms = [room_outcome(drawn_from(HERE, 2.0), seed) for seed in range(FEW_ROOMS)]
-    assert np.mean([room.servoed.in_region for room in rooms]) < 0.7
-    assert np.mean([chdtrc(room.freedom, room.chi_squared) < DOUBTED for room in rooms]) > 0.9
+    assert np.mean([workcell.servoed.in_region for workcell in rooms]) < 0.7
+    assert np.mean([chdtrc(workcell.freedom, workcell.chi_squared) < DOUBTED for workcell in rooms]) > 0.9
     right = [room_outcome(HERE, seed) for seed in range(FEW_ROOMS)]
-    assert np.mean([chdtrc(room.freedom, room.chi_squared) < DOUBTED for room in right]) < 0.1
+    assert np.mean([chdtrc(workcell.freedom, workcell.chi_squared) < DOUBTED for workcell in right]) < 0.1
 
 
 def test_a_session_predicts_every_needle_that_it_saw():
     """Before and after the servo, by the chain; where the arm cannot start there is no prediction."""
     session = run_session(
-        HERE, 1, targets=("T1", "T6"), empty=NoContacts(), detector_of=lambda room, rng: pixel_detector(room, 0.03, rng)
+        HERE,
+        1,
+        targets=("T1", "T6"),
+        empty=NoContacts(),
+        detector_of=lambda workcell, rng: pixel_detector(workcell, 0.03, rng),
     )
     for one in session.reached:
         assert one.seen.predicted_rms_mm < one.unseen.predicted_rms_mm

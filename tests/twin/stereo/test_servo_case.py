@@ -10,7 +10,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.winding import winding_number
 from puncture_twin.twin.guidance.stereo.poses import configurations, path_upward
-from puncture_twin.twin.guidance.stereo.robot_calibration import grid_points, held_rod
+from puncture_twin.twin.guidance.stereo.robot_calibration import carried_rod, grid_points
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.stereo.servo_loop import path_contact
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_workcell, head_pose, workcell_checker
@@ -87,45 +87,48 @@ def test_the_head_is_open_and_holds_its_targets(case):
 
 def test_both_cameras_see_every_target_and_marker(case):
     """No line of sight from either camera to a ball there meets the head, and all lie well inside the pictures."""
-    room = draw_workcell(case, np.random.default_rng(0))
-    for camera in room.cameras:
-        for point in np.concatenate([room.targets_c, room.markers_c]):
-            assert room.hidden_fraction(camera, point, 4.0) == 0.0
+    workcell = draw_workcell(case, np.random.default_rng(0))
+    for camera in workcell.cameras:
+        for point in np.concatenate([workcell.targets_c, workcell.markers_c]):
+            assert workcell.hidden_fraction(camera, point, 4.0) == 0.0
             assert camera.sees(camera.project(point), 40.0)
 
 
 def test_a_ball_behind_the_head_is_hidden(case):
     """A ball beyond the far wall, below its rim, is hidden whole; one whose edge it touches in part."""
-    room = draw_workcell(case, np.random.default_rng(0))
-    behind = apply(room.T_c_m, np.array([0.0, 110.0, -60.0]))
-    assert room.hidden_fraction(room.cameras[0], behind, 4.0) == 1.0
+    workcell = draw_workcell(case, np.random.default_rng(0))
+    behind = apply(workcell.T_c_m, np.array([0.0, 110.0, -60.0]))
+    assert workcell.hidden_fraction(workcell.cameras[0], behind, 4.0) == 1.0
     heights = np.linspace(-60.0, 40.0, 60)
-    shares = [room.hidden_fraction(room.cameras[0], apply(room.T_c_m, np.array([0, 110.0, z])), 4.0) for z in heights]
+    shares = [
+        workcell.hidden_fraction(workcell.cameras[0], apply(workcell.T_c_m, np.array([0, 110.0, z])), 4.0)
+        for z in heights
+    ]
     assert any(0.0 < share < 1.0 for share in shares)
 
 
 def test_the_arm_reaches_everything_without_a_contact(case):
     """Calibration grid, every target from its hovering pose with the head there; no link before the ball."""
-    room = draw_workcell(case, np.random.default_rng(0))
-    held, T = held_rod(case, room), head_pose(case)
-    calibrated = configurations(held, grid_points(case), workcell_checker(case, None)).branch
+    workcell = draw_workcell(case, np.random.default_rng(0))
+    rod, T = carried_rod(case, workcell), head_pose(case)
+    calibrated = configurations(rod, grid_points(case), workcell_checker(case, None)).branch
     targets, checker = apply(T, case.targets.points), workcell_checker(case, T)
     q = configurations(
-        held, np.concatenate([targets, path_upward(held, targets, case.file.servo.hover_mm)]), checker, first=calibrated
+        rod, np.concatenate([targets, path_upward(rod, targets, case.file.servo.hover_mm)]), checker, first=calibrated
     ).q
     for aim, hover in zip(q[:16], q[16:], strict=True):
         assert path_contact(checker, np.stack([hover, aim])) is None
-        assert not arm_hides_ball(room, aim)
+        assert not arm_hides_ball(workcell, aim)
 
 
-def arm_hides_ball(room: StereoWorkcell, q):
+def arm_hides_ball(workcell: StereoWorkcell, q):
     """Whether some link stands between a camera and the ball, by the links' own meshes."""
-    poses = room.arm.link_poses(q)
-    for link in collision_links(room.model)[1:]:
-        T_c_link = room.T_c_base @ poses[link.frame]
+    poses = workcell.arm.link_poses(q)
+    for link in collision_links(workcell.model)[1:]:
+        T_c_link = workcell.T_c_base @ poses[link.frame]
         vertices = apply(T_c_link, np.asarray(link.mesh.vertices))
-        for camera in room.cameras:
-            pixels, ball = camera.project(vertices), camera.project(room.ball_c(q))
+        for camera in workcell.cameras:
+            pixels, ball = camera.project(vertices), camera.project(workcell.ball_c(q))
             if np.linalg.norm(pixels - ball, axis=1).min() < 30.0:
                 return True
     return False

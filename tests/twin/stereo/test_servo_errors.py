@@ -83,15 +83,18 @@ def test_the_truth_is_drawn_from_the_declaration():
     case = varied(CASE, errors=keys)
     rooms = [draw_workcell(case, np.random.default_rng(seed)) for seed in range(ROOMS)]
     errors, plan = case.errors, planned_cameras(case)[0]
-    moved = np.array([np.linalg.inv(room.T_c_m) @ room.T_c_m_after for room in rooms])
+    moved = np.array([np.linalg.inv(workcell.T_c_m) @ workcell.T_c_m_after for workcell in rooms])
     scatter = {
-        "ball": (np.array([room.tool.ball_offset for room in rooms]), errors.ball_offset_mm),
-        "tip": (np.array([room.tool.tip_offset for room in rooms]), errors.tip_offset_mm),
-        "lean": (np.array([room.tool.lean[:2] for room in rooms]), errors.needle_direction),
-        "links": (np.array([room.arm.a - room.arm.nominal.a for room in rooms]), errors.link_mm),
-        "zeros": (np.array([room.arm.joint_offsets for room in rooms]), errors.joint),
-        "axis": (np.array([room.cameras[0].cx - plan.cx for room in rooms]), errors.camera.axis_px),
-        "k1": (np.array([room.cameras[1].distortion[0] - plan.distortion[0] for room in rooms]), errors.camera.lens[0]),
+        "ball": (np.array([workcell.tool.ball_offset for workcell in rooms]), errors.ball_offset_mm),
+        "tip": (np.array([workcell.tool.tip_offset for workcell in rooms]), errors.tip_offset_mm),
+        "lean": (np.array([workcell.tool.lean[:2] for workcell in rooms]), errors.needle_direction),
+        "links": (np.array([workcell.arm.a - workcell.arm.nominal.a for workcell in rooms]), errors.link_mm),
+        "zeros": (np.array([one.arm.joint_offsets for one in rooms]), errors.joint),
+        "axis": (np.array([one.cameras[0].cx - plan.cx for one in rooms]), errors.camera.axis_px),
+        "k1": (
+            np.array([one.cameras[1].distortion[0] - plan.distortion[0] for one in rooms]),
+            errors.camera.lens[0],
+        ),
         "turn": (log_rotation(moved[:, :3, :3]), errors.head_turn),
     }
     for name, (drawn, deviation) in scatter.items():

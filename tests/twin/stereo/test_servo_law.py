@@ -7,7 +7,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.twin.guidance.stereo.servo_law import (
     MIN_SIGMA,
-    HeldRod,
+    CarriedRod,
     ServoStop,
     StepLimits,
     ball_base,
@@ -22,9 +22,9 @@ MODEL = ur_model("ur3")
 GOOD = np.radians([14.0, -73.0, -132.0, -55.0, 88.0, -76.0])
 
 
-def held_at(q, rod_mm=160.0):
+def rod_at(q, rod_mm=160.0):
     """A rod held as the arm has it at q."""
-    return HeldRod(MODEL, rod_mm, flange_pose(MODEL, q)[:3, :3])
+    return CarriedRod(MODEL, rod_mm, flange_pose(MODEL, q)[:3, :3])
 
 
 def test_jacobian_at_the_ball_is_the_slope_of_its_pose():
@@ -32,41 +32,41 @@ def test_jacobian_at_the_ball_is_the_slope_of_its_pose():
     rng = np.random.default_rng(1)
     for _ in range(20):
         q = rng.uniform(-np.pi, np.pi, 6)
-        held = held_at(q)
+        rod = rod_at(q)
         slope = np.empty((6, 6))
         for j, step in enumerate(1e-6 * np.eye(6)):
-            slope[:3, j] = (ball_base(held, q + step) - ball_base(held, q - step)) / 2e-6
-            slope[3:, j] = (orientation_error(held, q - step) - orientation_error(held, q + step)) / 2e-6
-        assert np.abs(ball_jacobian(held, q) - slope).max() < 1e-5
+            slope[:3, j] = (ball_base(rod, q + step) - ball_base(rod, q - step)) / 2e-6
+            slope[3:, j] = (orientation_error(rod, q - step) - orientation_error(rod, q + step)) / 2e-6
+        assert np.abs(ball_jacobian(rod, q) - slope).max() < 1e-5
 
 
 def test_step_moves_the_ball_straight_and_keeps_the_needle():
     """The ball arrives within 5 micrometres, never leaves the line by more, and the needle does not turn."""
-    held = held_at(GOOD)
+    rod = rod_at(GOOD)
     move = np.array([3.0, -4.0, 2.0])
-    step = servo_step(held, GOOD, move, StepLimits())
-    places = ball_base(held, step.q_path)
+    step = servo_step(rod, GOOD, move, StepLimits())
+    places = ball_base(rod, step.q_path)
     along = (places - places[0]) @ move / np.linalg.norm(move)
     aside = places - places[0] - along[:, None] * move / np.linalg.norm(move)
     assert step.stop is None
     assert not step.position_only
     assert np.linalg.norm(places[-1] - places[0] - move) < 5e-3
     assert np.linalg.norm(aside, axis=1).max() < 5e-3
-    assert max(np.linalg.norm(orientation_error(held, q)) for q in step.q_path) < 1e-4
+    assert max(np.linalg.norm(orientation_error(rod, q)) for q in step.q_path) < 1e-4
 
 
 def test_long_moves_are_cut_short():
     """A wish of 40 mm becomes a step of 10 mm in its direction."""
-    held = held_at(GOOD)
-    step = servo_step(held, GOOD, np.array([0.0, 40.0, 0.0]), StepLimits(step_mm=10.0))
-    moved = ball_base(held, step.q_path[-1]) - ball_base(held, GOOD)
+    rod = rod_at(GOOD)
+    step = servo_step(rod, GOOD, np.array([0.0, 40.0, 0.0]), StepLimits(step_mm=10.0))
+    moved = ball_base(rod, step.q_path[-1]) - ball_base(rod, GOOD)
     assert moved == pytest.approx([0.0, 10.0, 0.0], abs=5e-3)
 
 
 def test_no_joint_turns_farther_than_its_limit():
     """The way ends where the fastest joint has turned as far as it may, and not before."""
-    held = held_at(GOOD)
-    step = servo_step(held, GOOD, np.array([0.0, 9.0, 0.0]), StepLimits(joint_step_rad=0.005))
+    rod = rod_at(GOOD)
+    step = servo_step(rod, GOOD, np.array([0.0, 9.0, 0.0]), StepLimits(joint_step_rad=0.005))
     assert np.abs(step.q_path[-1] - GOOD).max() == pytest.approx(0.005)
 
 
@@ -75,9 +75,9 @@ def test_beyond_a_joint_limit_the_arm_stays():
     turns = np.zeros(6)
     turns[0] = 2 * np.pi - GOOD[0] - 1e-4  # joint 1 stands just inside its upper limit
     q = GOOD + turns
-    held = held_at(q)
+    rod = rod_at(q)
     across = np.array([-np.sin(q[0]), np.cos(q[0]), 0.0]) * 5.0
-    outcomes = [servo_step(held, q, sign * across, StepLimits()) for sign in (1.0, -1.0)]
+    outcomes = [servo_step(rod, q, sign * across, StepLimits()) for sign in (1.0, -1.0)]
     assert sorted(str(o.stop) for o in outcomes) == ["None", "joint_limit"]
     refused = next(o for o in outcomes if o.stop is ServoStop.JOINT_LIMIT)
     assert np.array_equal(refused.q_path, q[None])
@@ -93,20 +93,18 @@ def test_near_the_wrist_singularity_the_position_still_arrives():
     for _ in range(60):
         q = GOOD + rng.uniform(-0.2, 0.2, 6)
         q[4] = np.radians(0.5)
-        held, wish = held_at(q), rng.normal(size=3)
+        rod, wish = rod_at(q), rng.normal(size=3)
         wish *= 1.5 / np.linalg.norm(wish)
-        assert smallest_sigma(ball_jacobian(held, q)) < MIN_SIGMA
-        step = servo_step(held, q, wish, StepLimits())
+        assert smallest_sigma(ball_jacobian(rod, q)) < MIN_SIGMA
+        step = servo_step(rod, q, wish, StepLimits())
         assert step.stop in {None, ServoStop.SINGULAR}
-        turn = np.degrees(np.linalg.norm(orientation_error(held, step.q_path[-1])))
+        turn = np.degrees(np.linalg.norm(orientation_error(rod, step.q_path[-1])))
         assert turn <= 1.0
-        ours += (
-            step.stop is None and np.linalg.norm(ball_base(held, step.q_path[-1]) - ball_base(held, q) - wish) < 0.05
-        )
-        J = ball_jacobian(held, q) / np.array([300.0] * 3 + [1.0] * 3)[:, None]
+        ours += step.stop is None and np.linalg.norm(ball_base(rod, step.q_path[-1]) - ball_base(rod, q) - wish) < 0.05
+        J = ball_jacobian(rod, q) / np.array([300.0] * 3 + [1.0] * 3)[:, None]
         goal = np.r_[wish / 300.0, 0.0, 0.0, 0.0]
         blind = q + J.T @ np.linalg.solve(J @ J.T + 0.05**2 * np.eye(6), goal)
-        peer += np.linalg.norm(ball_base(held, blind) - ball_base(held, q) - wish) < 0.05
+        peer += np.linalg.norm(ball_base(rod, blind) - ball_base(rod, q) - wish) < 0.05
     assert ours >= 57
     assert peer <= 30
 
@@ -115,8 +113,8 @@ def test_where_the_needle_would_turn_too_far_it_stops():
     """A long way near a singularity ends with the reason, and the arm stays where it was."""
     q = GOOD.copy()
     q[4] = np.radians(0.5)
-    held = held_at(q)
-    outcomes = [servo_step(held, q, move, StepLimits()) for move in 10.0 * np.eye(3)]
+    rod = rod_at(q)
+    outcomes = [servo_step(rod, q, move, StepLimits()) for move in 10.0 * np.eye(3)]
     assert any(o.stop is ServoStop.SINGULAR and np.array_equal(o.q_path, q[None]) for o in outcomes)
 
 

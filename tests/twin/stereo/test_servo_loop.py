@@ -55,7 +55,7 @@ class Twin:
 def task(**changes):
     """A task with usual limits."""
     usual = {
-        "held": HELD,
+        "rod": HELD,
         "T_base_c": T_BASE_C,
         "tolerance_mm": 0.1,
         "max_steps": 10,
@@ -146,8 +146,8 @@ def test_a_singular_start_says_so():
     twin = Twin(ArmErrors())
     q = Q_START.copy()
     q[4] = np.radians(0.3)
-    held = HELD._replace(R_base_flange=HELD.R_base_flange)
-    far = Task(held, T_BASE_C, 0.1, 10, 3, StepLimits(), NoContacts())
+    rod = HELD._replace(R_base_flange=HELD.R_base_flange)
+    far = Task(rod, T_BASE_C, 0.1, 10, 3, StepLimits(), NoContacts())
     done = servo(far, q, q, lambda command, true: Seen(np.zeros(3), np.full(3, 30.0), np.eye(3)), twin.drive)
     assert (done.stop, twin.drives) == (ServoStop.SINGULAR, 0)
 
@@ -156,21 +156,21 @@ def test_joint_limit_is_a_reason_of_its_own():
     """Joint 1 stands just inside its range: a target on one side is beyond it, on the other side it is reached."""
     q = Q_START.copy()
     q[0] = HELD.model.joint_limits[0, 1] - 1e-4
-    held = HELD._replace(R_base_flange=flange_pose(HELD.model, q)[:3, :3])
+    rod = HELD._replace(R_base_flange=flange_pose(HELD.model, q)[:3, :3])
     ends = {}
     for sign in (1.0, -1.0):
         across = sign * 2.0 * np.array([-np.sin(q[0]), np.cos(q[0]), 0.0])
-        goal = (ball_base(held, q) + across - T_BASE_C[:3, 3]) @ T_BASE_C[:3, :3]
+        goal = (ball_base(rod, q) + across - T_BASE_C[:3, 3]) @ T_BASE_C[:3, :3]
         drives = []
 
         def look(q_command, q_true, goal=goal):
-            return Seen((ball_base(held, q_command) - T_BASE_C[:3, 3]) @ T_BASE_C[:3, :3], goal, np.eye(3))
+            return Seen((ball_base(rod, q_command) - T_BASE_C[:3, 3]) @ T_BASE_C[:3, :3], goal, np.eye(3))
 
         def drive(q_command, drives=drives):
             drives.append(q_command)
             return q_command
 
-        stop = servo(task(held=held), q, q, look, drive).stop
+        stop = servo(task(rod=rod), q, q, look, drive).stop
         ends[stop] = len(drives)
     assert ends == {ServoStop.JOINT_LIMIT: 0, ServoStop.CONVERGED: 1}
 

@@ -48,9 +48,9 @@ def trials():
         TargetRow(2, "T1", 0.10, 0.25, 0.7, 0.12, 0.04, 2, "converged"),
         TargetRow(2, "T2", 0.40, 0.25, 0.5, 0.32, 0.08, 1, "converged"),
     ]
-    held = [ServoTrial(seed, (0.01, 0.03), (0.02, 0.03), 0.4, 0.2, tuple(r for r in rows if r.seed == seed), "",
+    rod = [ServoTrial(seed, (0.01, 0.03), (0.02, 0.03), 0.4, 0.2, tuple(r for r in rows if r.seed == seed), "",
                         DeclarationTest(300.0, 200) if seed == 1 else None) for seed in (1, 2)]  # fmt: skip
-    return [*held, ServoTrial(3, (), (), float("nan"), float("nan"), (), "calibration, point 4: camera 1: few_inliers")]
+    return [*rod, ServoTrial(3, (), (), float("nan"), float("nan"), (), "calibration, point 4: camera 1: few_inliers")]
 
 
 def test_statistics_are_those_of_the_rows():

@@ -58,8 +58,8 @@ def test_the_bound_is_the_known_one():
 def test_a_number_beyond_its_limit_does_not_hold():
     """A row, the whole and the text all say so."""
     bad = AxpYbqTables((AxpYbqRow("a", 0.1, 0.2, None, "mm"), AxpYbqRow("b", None, 0.31, 0.3, "mm")), 3, 1)
-    assert not bad.holds
-    assert [row.holds for row in bad.rows] == [True, False]
+    assert not bad.passed
+    assert [row.passed for row in bad.rows] == [True, False]
     text = reproduction_text(bad)
     assert text.count("DOES NOT HOLD") == 1
     assert "NOT every limit holds" in text

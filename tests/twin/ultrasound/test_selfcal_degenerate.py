@@ -35,8 +35,8 @@ def test_every_degenerate_set_is_refused_and_named(name, noisy):
         calibrate(recording, noise=SPEC_NOISE)
     assert isinstance(refused.value, InputError)
     assert [(m.cause, m.dimensions) for m in refused.value.motions] == [DEGENERATE[name]]
-    assert refused.value.motions[0].words in str(refused.value)
-    assert refused.value.suggestion.words in str(refused.value)
+    assert refused.value.motions[0].text in str(refused.value)
+    assert refused.value.suggestion.text in str(refused.value)
 
 
 def test_the_words_are_those_of_a_person():

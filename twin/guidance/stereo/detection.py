@@ -1,4 +1,4 @@
-"""What the guidance gets to see: a ball's centre in each camera, from pictures of the true room.
+"""What the guidance gets to see: a ball's centre in each camera, from pictures of the true workcell.
 
 ``picture_detector`` draws a picture with the true camera and measures it with the believed one. Another `Detector` may
 leave the picture out: for studies of everything behind it.
@@ -22,7 +22,7 @@ from puncture_twin.twin.guidance.stereo.servo_loop import Lost
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell
 
 DIFFUSE = {"diffuse": 0.8, "lamp": 0.4}
-"""Share of the light that comes from everywhere; the rest is a lamp's."""
+"""Fraction of the light that comes from everywhere; the rest is a lamp's."""
 
 WINDOW_MARGIN_PX = 24
 """A picture, and the rod in it, are drawn this far beyond the region that is searched: the rest is never looked at."""
@@ -37,7 +37,7 @@ class LocatedPair(NamedTuple):
     rod_c: Floats | None
     """Shape (3,): along the rod; None for a marker, which has none."""
     head_there: bool = True
-    """Whether the head stands in the room and may hide it; it does not during the calibration."""
+    """Whether the head stands in the workcell and may hide it; it does not during the calibration."""
 
 
 class Spot(NamedTuple):
@@ -72,13 +72,13 @@ class Detections(NamedTuple):
     """Shape (c, 2, 2), px^2."""
 
 
-def picture_detector(room: StereoWorkcell, rng: np.random.Generator) -> Detector:
-    """Pictures of the true room, each drawn anew with noise; what the head hides is hidden."""
-    plan = room.case.file.cameras
+def picture_detector(workcell: StereoWorkcell, rng: np.random.Generator) -> Detector:
+    """Pictures of the true workcell, each drawn anew with noise; what the head hides is hidden."""
+    plan = workcell.case.file.cameras
 
     def see(number: int, ball: LocatedPair, search: Search) -> Spot | Lost:
-        true = room.cameras[number]
-        hidden = room.hidden_fraction(true, ball.center_c, ball.radius_mm) if ball.head_there else 0.0
+        true = workcell.cameras[number]
+        hidden = workcell.hidden_fraction(true, ball.center_c, ball.radius_mm) if ball.head_there else 0.0
         away = np.abs(true.project(ball.center_c) - search.camera.project(search.predicted_c)).max()
         radius = true.ball_radius_px(ball.center_c, ball.radius_mm)
         half = int(np.ceil(np.nan_to_num(away, nan=0.0) + search.search_px + 2 * radius)) + WINDOW_MARGIN_PX

@@ -19,7 +19,7 @@ from puncture_twin.twin.guidance.stereo.servo_law import ServoStop
 from puncture_twin.twin.guidance.stereo.session import Session, run_session
 from puncture_twin.twin.guidance.stereo.stereo_room import workcell_checker
 
-SHARE = 5
+BATCH = 5
 """Seeds that a process takes at a time; they share the judge of the empty room."""
 
 
@@ -80,7 +80,7 @@ class NeedleStatistics(NamedTuple):
     realised_direction_deg: float
     """Rms."""
     coverage_95: float
-    """Share of the 95 % ellipsoids that hold the true tip."""
+    """Fraction of the 95 % ellipsoids that hold the true tip."""
     hit_share: float | None
     """None where the case states no radius."""
     mean_p_hit: float | None
@@ -104,7 +104,7 @@ class Statistics(NamedTuple):
     servo_only_max: float
     median_steps: float
     not_confirmed: float
-    """Share of the targets at which the servo did not converge."""
+    """Fraction of the targets at which the servo did not converge."""
 
     @property
     def after_over_mapping(self) -> float:
@@ -132,8 +132,8 @@ def trial(session: Session) -> ServoTrial:
     )
     stereo = tuple(float(error) for error in session.stereo_mm)
     residual = float(np.mean(session.calibration.robot_residual_mm))
-    held = (session.calibration.rms_px, session.mapping.fre_mm, residual, rows, "", _declaration(session))
-    return ServoTrial(session.seed, stereo, *held)
+    figures = (session.calibration.rms_px, session.mapping.fre_mm, residual, rows, "", _declaration(session))
+    return ServoTrial(session.seed, stereo, *figures)
 
 
 def _declaration(session: Session) -> DeclarationTest | None:
@@ -158,7 +158,7 @@ def run_trial(case: ServoCase, seed: int, empty: StateChecker | None = None) -> 
     Args:
         case: The case.
         seed: Of all that is drawn.
-        empty: Judge of the room without the head, where one is at hand.
+        empty: Checker of the workcell without the head, where one is at hand.
     """
     try:
         return trial(run_session(case, seed, empty=empty))
@@ -175,19 +175,19 @@ def run_trials(case: ServoCase, seeds: Sequence[int], *, jobs: int = 1, done: Co
         jobs: Processes, at most one a core.
         done: Told how many of how many are done.
     """
-    tell = done or uncounted
+    report = done or uncounted
     found: list[ServoTrial] = []
     if jobs == 1:
         empty = workcell_checker(case, None)
         for seed in seeds:
             found.append(run_trial(case, seed, empty))
-            tell(len(found), len(seeds))
+            report(len(found), len(seeds))
         return found
-    fractions = [seeds[i : i + SHARE] for i in range(0, len(seeds), SHARE)]
+    fractions = [seeds[i : i + BATCH] for i in range(0, len(seeds), BATCH)]
     with process_pool(jobs, len(fractions)) as pool:
         for fraction in pool.map(partial(run_trials, case), fractions):
             found += fraction
-            tell(len(found), len(seeds))
+            report(len(found), len(seeds))
     return found
 
 

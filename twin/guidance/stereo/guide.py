@@ -15,16 +15,16 @@ from puncture_twin.twin.guidance.stereo.joint.joint_model import Guess, Observed
 from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleError, open_loop_error, servoed_error
 from puncture_twin.twin.guidance.stereo.joint.optimum import Adjusted, adjust
 from puncture_twin.twin.guidance.stereo.mapping import Mapping
-from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration, held_rod
+from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration, carried_rod
 from puncture_twin.twin.guidance.stereo.servo_law import ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, planned_cameras
 
 
 class Known(NamedTuple):
-    """What a session knows when the servo begins, and the room for its pictures."""
+    """What a session knows when the servo begins, and the workcell for its pictures."""
 
-    room: StereoWorkcell
+    workcell: StereoWorkcell
     """Of which only the pictures are used."""
     calibration: RobotCalibration
     mapping: Mapping
@@ -39,11 +39,11 @@ class Guide:
     """The chain: calibrated cameras triangulate the ball; the target is where the mapping put it."""
 
     def __init__(self, known: Known) -> None:
-        room, calibration, mapping, markers, markers_m, detector = known
-        self._room, self._case, self._detector = room, room.case, detector
+        workcell, calibration, mapping, markers, markers_m, detector = known
+        self._room, self._case, self._detector = workcell, workcell.case, detector
         self._calibration, self._mapping = calibration, mapping
         self._markers, self._markers_m = markers, markers_m
-        self._held = held_rod(room.case, room)
+        self._held = carried_rod(workcell.case, workcell)
         self._T_c_base = np.asarray(np.linalg.inv(calibration.T_base_c))
         self._q = [*calibration.q_command]
         self._pixels = [*calibration.pixels.transpose(1, 0, 2)]
@@ -75,9 +75,9 @@ class Guide:
         self._q.append(q_command)
         self._pixels.append(detections.pixels)
         self._covariances.append(detections.covariances)
-        return self._judge(detections)
+        return self._assess(detections)
 
-    def _judge(self, detections: Detections) -> Seen:
+    def _assess(self, detections: Detections) -> Seen:
         points = in_space(self._calibration.cameras, detections)
         self._balls.append(points.points_c[0])
         return Seen(points.points_c[0], self.target_c, points.covariance[0])
@@ -90,9 +90,9 @@ class Guide:
         """What is believed of the needle since the last look at its ball, of which there was one; None likewise."""
         return self._believed(lambda found: servoed_error(found, -1, self.target_m))
 
-    def _believed(self, ask: Callable[[Adjusted], NeedleError]) -> NeedleError | None:
+    def _believed(self, estimate: Callable[[Adjusted], NeedleError]) -> NeedleError | None:
         try:
-            return ask(self.adjusted())
+            return estimate(self.adjusted())
         except NoAnswerError:
             return None
 
@@ -104,11 +104,11 @@ class Guide:
         """
         if self._found is None or len(self._found.unknowns.balls_c) < len(self._balls):
             guess = Guess(self._T_c_base, self._mapping.T_c_m, np.array(self._balls))
-            start = None if self._found is None else self._with_new_balls(self._found.unknowns)
+            start = None if self._found is None else self._with_new_points(self._found.unknowns)
             self._found = adjust(self.observed(), guess, start)
         return self._found
 
-    def _with_new_balls(self, last: Unknowns) -> Unknowns:
+    def _with_new_points(self, last: Unknowns) -> Unknowns:
         new = np.array(self._balls[len(last.balls_c) :]).reshape(-1, 3)
         return last._replace(balls_c=np.concatenate([last.balls_c, new]))
 
@@ -128,10 +128,10 @@ class Guide:
             self._markers_m,
         )
 
-    def _of_pixels(self, told: Floats) -> Floats:
+    def _of_pixels(self, measured: Floats) -> Floats:
         """Covariances (c, n, 2, 2), px^2: what is declared, else what the tracker told of each picture."""
         declared = self._case.errors.ball_px
-        return told if declared is None else np.broadcast_to(declared**2 * np.eye(2), told.shape)
+        return measured if declared is None else np.broadcast_to(declared**2 * np.eye(2), measured.shape)
 
 
 class JointGuide(Guide):
@@ -142,8 +142,8 @@ class JointGuide(Guide):
         self.target_m = target_m
         self.target_c = self.adjusted().offset(0, target_m).target_c
 
-    def _judge(self, detections: Detections) -> Seen:
-        super()._judge(detections)
+    def _assess(self, detections: Detections) -> Seen:
+        super()._assess(detections)
         found = self.adjusted().offset(-1, self.target_m)
         self.target_c = found.target_c
         return Seen(found.ball_c, found.target_c, found.ball_covariance)

@@ -11,7 +11,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.geometry.rigid import frame_yz, pose
-from puncture_twin.twin.guidance.stereo.servo_law import HeldRod
+from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod
 
 LEAST_SINGULARITY = 0.05
 """A branch that comes nearer to a singularity (of 0..1) at some point is not used."""
@@ -27,9 +27,9 @@ def rod_orientation(tilt_rad: float) -> Floats:
     return frame_yz(y, z)
 
 
-def flange_poses(held: HeldRod, points_base: Floats) -> Floats:
+def flange_poses(rod: CarriedRod, points_base: Floats) -> Floats:
     """T_base_flange, shape (n, 4, 4), mm, that put the ball on points (n, 3)."""
-    return pose(held.R_base_flange, points_base - held.rod_mm * held.R_base_flange[:, 2])
+    return pose(rod.R_base_flange, points_base - rod.rod_mm * rod.R_base_flange[:, 2])
 
 
 class Posture(NamedTuple):
@@ -42,13 +42,13 @@ class Posture(NamedTuple):
     what was calibrated on one is to be used on it."""
 
 
-def configurations(held: HeldRod, points_base: Floats, checker: StateChecker, *, first: int | None = None) -> Posture:
+def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, *, first: int | None = None) -> Posture:
     """Joint angles that hold the ball on every point, all on one branch, free of contacts.
 
     Of the branches the one that stays farthest from every singularity is taken.
 
     Args:
-        held: The arm, its rod and its orientation.
+        rod: The arm, its rod and its orientation.
         points_base: Shape (n, 3), mm.
         checker: Judges contacts.
         first: Try this branch before the others.
@@ -56,21 +56,21 @@ def configurations(held: HeldRod, points_base: Floats, checker: StateChecker, *,
     Raises:
         NoAnswerError: No branch holds all points freely; says what the best one lacks.
     """
-    every = inverse(held.model, flange_poses(held, points_base))
-    room = np.nan_to_num(singularity(held.model, every).least(), nan=0.0).min(axis=0)
-    why = f"a {held.model.name} cannot hold the ball on all {len(points_base)} points on one branch"
-    order = sorted(range(len(room)), key=lambda branch: (branch != first, -room[branch]))
-    for branch in (branch for branch in order if room[branch] >= LEAST_SINGULARITY):
-        q = nearest_within_limits(held.model, every[:, branch], REFERENCE_RAD)
+    every = inverse(rod.model, flange_poses(rod, points_base))
+    workcell = np.nan_to_num(singularity(rod.model, every).least(), nan=0.0).min(axis=0)
+    why = f"a {rod.model.name} cannot hold the ball on all {len(points_base)} points on one branch"
+    order = sorted(range(len(workcell)), key=lambda branch: (branch != first, -workcell[branch]))
+    for branch in (branch for branch in order if workcell[branch] >= LEAST_SINGULARITY):
+        q = nearest_within_limits(rod.model, every[:, branch], REFERENCE_RAD)
         if np.isnan(q).any():
             continue
-        met = checker.first_contact(q, needle_may_touch_patient=False)
-        if met is None:
+        found = checker.first_contact(q, needle_may_touch_patient=False)
+        if found is None:
             return Posture(q, branch)
-        why = f"{met.contact.body} would touch {met.contact.other} at point {met.at + 1} of {len(points_base)}"
+        why = f"{found.contact.body} would touch {found.contact.other} at point {found.at + 1} of {len(points_base)}"
     raise NoAnswerError(why)
 
 
-def path_upward(held: HeldRod, points_base: Floats, up_mm: float) -> Floats:
+def path_upward(rod: CarriedRod, points_base: Floats, up_mm: float) -> Floats:
     """Points (n, 3) farther back along the rod by a distance, mm: where the arm hovers."""
-    return np.asarray(points_base - up_mm * held.R_base_flange[:, 2])
+    return np.asarray(points_base - up_mm * rod.R_base_flange[:, 2])

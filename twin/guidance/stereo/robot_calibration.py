@@ -21,7 +21,7 @@ from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.detection import Detector, LocatedPair, Search, look_at
 from puncture_twin.twin.guidance.stereo.poses import configurations, rod_orientation
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
-from puncture_twin.twin.guidance.stereo.servo_law import HeldRod, ball_base
+from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, path_contact
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, planned_cameras
 
@@ -61,17 +61,17 @@ class RobotCalibration:
     branch: int
 
 
-def held_rod(case: ServoCase, room: StereoWorkcell) -> HeldRod:
+def carried_rod(case: ServoCase, workcell: StereoWorkcell) -> CarriedRod:
     """The nominal arm with the case's rod, as it is held at the targets."""
     tool = case.file.tool
-    return HeldRod(room.model, tool.rod_mm, rod_orientation(float(np.radians(tool.tilt_deg))))
+    return CarriedRod(workcell.model, tool.rod_mm, rod_orientation(float(np.radians(tool.tilt_deg))))
 
 
-def calibrating_rod(case: ServoCase, room: StereoWorkcell) -> HeldRod:
+def calibrating_rod(case: ServoCase, workcell: StereoWorkcell) -> CarriedRod:
     """The same, as it is held during the calibration."""
     tilt = case.file.calibration.tilt_deg
-    held = held_rod(case, room)
-    return held if tilt is None else held._replace(R_base_flange=rod_orientation(float(np.radians(tilt))))
+    rod = carried_rod(case, workcell)
+    return rod if tilt is None else rod._replace(R_base_flange=rod_orientation(float(np.radians(tilt))))
 
 
 def grid_points(case: ServoCase) -> Floats:
@@ -82,12 +82,12 @@ def grid_points(case: ServoCase) -> Floats:
 
 
 def calibrate_by_robot(
-    room: StereoWorkcell, detector: Detector, checker: StateChecker, rng: np.random.Generator
+    workcell: StereoWorkcell, detector: Detector, checker: StateChecker, rng: np.random.Generator
 ) -> RobotCalibration:
     """Drive to the points, look, measure, and fit.
 
     Args:
-        room: The true room.
+        workcell: The true room.
         detector: Takes the pictures.
         checker: Judges contacts; the head is not there yet.
         rng: For the arm's repeatability and the measuring arm.
@@ -96,9 +96,9 @@ def calibrate_by_robot(
         NoAnswerError: The arm cannot go there, or a ball is not found.
         InputError: The points do not determine a camera.
     """
-    case, held = room.case, calibrating_rod(room.case, room)
+    case, rod = workcell.case, calibrating_rod(workcell.case, workcell)
     points = grid_points(case)
-    q_command, branch = configurations(held, points, checker)
+    q_command, branch = configurations(rod, points, checker)
     for number, (start, end) in enumerate(pairwise(q_command), start=2):
         contact = path_contact(checker, np.stack([start, end]))
         if contact is not None:
@@ -106,10 +106,10 @@ def calibrate_by_robot(
     sigma, q_true = case.truth_errors.measuring_mm, q_command[0]
     measured, detections, stood = [], [], []
     for number, q in enumerate(q_command, start=1):
-        q_true = room.arm.settle(q, q_true, rng)
+        q_true = workcell.arm.settle(q, q_true, rng)
         stood.append(q_true)
         ball = LocatedPair(
-            room.ball_c(q_true), case.file.tool.ball_diameter_mm / 2, room.rod_c(q_true), head_there=False
+            workcell.ball_c(q_true), case.file.tool.ball_diameter_mm / 2, workcell.rod_c(q_true), head_there=False
         )
         measured.append(ball.center_c + rng.normal(0.0, sigma, 3))
         searches = tuple(Search(camera, measured[-1], FIRST_SEARCH_PX) for camera in planned_cameras(case))
@@ -121,8 +121,8 @@ def calibrate_by_robot(
     pixels = np.stack([s.pixels for s in detections], axis=1)
     covariances = np.stack([s.covariances for s in detections], axis=1)
     cameras = _cameras(case, measured_c, pixels)
-    T_base_c = fit_rigid(measured_c, ball_base(held, q_command))
-    residual = np.linalg.norm(apply(T_base_c, measured_c) - ball_base(held, q_command), axis=1)
+    T_base_c = fit_rigid(measured_c, ball_base(rod, q_command))
+    residual = np.linalg.norm(apply(T_base_c, measured_c) - ball_base(rod, q_command), axis=1)
     return RobotCalibration(
         tuple(found.camera for found in cameras),
         T_base_c,

@@ -132,7 +132,7 @@ class ServoSection(Section):
 
 
 class BoxSection(Section):
-    """A box in the room, axes parallel to the base's."""
+    """A box in the workcell, axes parallel to the base's."""
 
     name: Name
     center_mm: tuple[Coordinate, Coordinate, Coordinate]

@@ -67,7 +67,7 @@ class Step(NamedTuple):
     """Whether some piece gave the orientation up."""
 
 
-class HeldRod(NamedTuple):
+class CarriedRod(NamedTuple):
     """What the arm carries and how it is to be held."""
 
     model: UrModel
@@ -76,24 +76,24 @@ class HeldRod(NamedTuple):
     """Shape (3, 3): the orientation to keep."""
 
 
-def ball_base(held: HeldRod, q: Floats) -> Floats:
+def ball_base(rod: CarriedRod, q: Floats) -> Floats:
     """Where the nominal arm has its ball, shape (..., 3), mm, base frame."""
-    flange = flange_pose(held.model, q)
-    return np.asarray(flange[..., :3, 3] + held.rod_mm * flange[..., :3, 2])
+    flange = flange_pose(rod.model, q)
+    return np.asarray(flange[..., :3, 3] + rod.rod_mm * flange[..., :3, 2])
 
 
-def ball_jacobian(held: HeldRod, q: Floats) -> Floats:
+def ball_jacobian(rod: CarriedRod, q: Floats) -> Floats:
     """The nominal Jacobian at the ball, shape (6, 6): mm and rad per rad, for q of shape (6,)."""
-    J = jacobian(held.model, q)
-    lever = held.rod_mm * flange_pose(held.model, q)[:3, 2]
+    J = jacobian(rod.model, q)
+    lever = rod.rod_mm * flange_pose(rod.model, q)[:3, 2]
     J[:3] += np.cross(J[3:].T, lever).T
     return J
 
 
-def orientation_error(held: HeldRod, q: Floats) -> Floats:
+def orientation_error(rod: CarriedRod, q: Floats) -> Floats:
     """The turn (3,), rad, base frame, that brings the flange back to the orientation to keep."""
-    R = flange_pose(held.model, q)[:3, :3]
-    return log_rotation(held.R_base_flange @ R.T)
+    R = flange_pose(rod.model, q)[:3, :3]
+    return log_rotation(rod.R_base_flange @ R.T)
 
 
 def smallest_sigma(J: Floats) -> float:
@@ -101,11 +101,11 @@ def smallest_sigma(J: Floats) -> float:
     return float(np.linalg.svd(_scaled(J), compute_uv=False)[-1])
 
 
-def servo_step(held: HeldRod, q: Floats, move_base: Floats, limits: StepLimits) -> Step:
+def servo_step(rod: CarriedRod, q: Floats, move_base: Floats, limits: StepLimits) -> Step:
     """The way that moves the ball by a vector and keeps the needle's orientation.
 
     Args:
-        held: The arm and its rod.
+        rod: The arm and its rod.
         q: Shape (6,), rad: where the arm stands, as commanded.
         move_base: Shape (3,), mm.
         limits: A longer move is cut short; the next look sees what is left.
@@ -113,14 +113,14 @@ def servo_step(held: HeldRod, q: Floats, move_base: Floats, limits: StepLimits) 
     length = float(np.linalg.norm(move_base))
     move = move_base * min(1.0, limits.step_mm / max(length, 1e-12))
     count = max(1, math.ceil(min(length, limits.step_mm) / PIECE_MM))
-    start, path, only_position = ball_base(held, q), [np.asarray(q, dtype=np.float64)], False
+    start, path, only_position = ball_base(rod, q), [np.asarray(q, dtype=np.float64)], False
     for piece in range(1, count + 1):
         here = path[-1]
-        turn, blind = _piece(held, here, start + move * (piece / count) - ball_base(held, here))
-        room = limits.joint_step_rad - np.abs(here - q).max()
-        fraction = min(1.0, max(room, 0.0) / max(float(np.abs(turn).max()), 1e-12))
+        turn, blind = _piece(rod, here, start + move * (piece / count) - ball_base(rod, here))
+        workcell = limits.joint_step_rad - np.abs(here - q).max()
+        fraction = min(1.0, max(workcell, 0.0) / max(float(np.abs(turn).max()), 1e-12))
         there = here + fraction * turn
-        stop = _refusal(held, there, blind, limits)
+        stop = _refusal(rod, there, blind, limits)
         if stop is not None:
             return Step(np.array(path[:1]), stop, only_position or blind)
         only_position = only_position or blind
@@ -130,10 +130,10 @@ def servo_step(held: HeldRod, q: Floats, move_base: Floats, limits: StepLimits) 
     return Step(np.array(path), None, only_position)
 
 
-def _piece(held: HeldRod, q: Floats, move: Floats) -> tuple[Floats, bool]:
+def _piece(rod: CarriedRod, q: Floats, move: Floats) -> tuple[Floats, bool]:
     """Joint turns (6,) of one piece, and whether the orientation was given up."""
-    J = ball_jacobian(held, q)
-    goal = np.concatenate([move / CHARACTERISTIC_MM, orientation_error(held, q)])
+    J = ball_jacobian(rod, q)
+    goal = np.concatenate([move / CHARACTERISTIC_MM, orientation_error(rod, q)])
     if smallest_sigma(J) >= MIN_SIGMA:
         return np.linalg.solve(_scaled(J), goal), False
     return damped(_scaled(J)[:3], goal[:3]), True
@@ -151,10 +151,10 @@ def damped(J: Floats, goal: Floats) -> Floats:
     return np.asarray(J.T @ np.linalg.solve(J @ J.T + squared * np.eye(len(J)), goal))
 
 
-def _refusal(held: HeldRod, q: Floats, blind: bool, limits: StepLimits) -> ServoStop | None:
-    if not held.model.within_limits(q):
+def _refusal(rod: CarriedRod, q: Floats, blind: bool, limits: StepLimits) -> ServoStop | None:
+    if not rod.model.within_limits(q):
         return ServoStop.JOINT_LIMIT
-    if blind and np.linalg.norm(orientation_error(held, q)) > limits.drift_rad:
+    if blind and np.linalg.norm(orientation_error(rod, q)) > limits.drift_rad:
         return ServoStop.SINGULAR
     return None
 

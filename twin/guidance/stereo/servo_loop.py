@@ -1,7 +1,7 @@
 """Look, move, look again: the servo on what the cameras see of the ball and of the head.
 
-The robot's own accuracy does not enter the error that is driven to zero; its kinematics only say which way to turn.
-Where the ball is not seen the arm does not move, and every way is checked for contacts before it is driven.
+The robot's own accuracy does not enter the error that is moved to zero; its kinematics only say which way to turn.
+Where the ball is not seen the arm does not move, and every way is checked for contacts before it is moved.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.state_checker import Contact, StateChecker
 from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, dense_states, first_contact
-from puncture_twin.twin.guidance.stereo.servo_law import HeldRod, ServoStop, StepLimits, servo_step
+from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ServoStop, StepLimits, servo_step
 
 DIVERGING_RATIO = 1.5
 """A step that leaves this times the error it found makes things worse."""
@@ -48,7 +48,7 @@ class Lost(NamedTuple):
 Look = Callable[[Floats, Floats], Seen | Lost]
 """Takes where the arm was sent and where it truly is, each (6,), rad; the truth is for the pictures alone."""
 
-Drive = Callable[[Floats], Floats]
+Move = Callable[[Floats], Floats]
 """Takes the commanded configuration (6,) and returns the true one, rad."""
 
 
@@ -57,7 +57,7 @@ class Task:
     """What the servo is to do.
 
     Attributes:
-        held: The arm, its rod and the orientation to keep.
+        rod: The arm, its rod and the orientation to keep.
         T_base_c: Shape (4, 4), mm: r_T_c, as calibrated.
         tolerance_mm: The servo has converged when a look sees no larger error.
         max_steps: Moves at most.
@@ -66,7 +66,7 @@ class Task:
         checker: Judges contacts, with the head where it is believed to stand.
     """
 
-    held: HeldRod
+    rod: CarriedRod
     T_base_c: Floats
     tolerance_mm: float
     max_steps: int
@@ -107,7 +107,7 @@ class Servoed:
 
     @property
     def steps(self) -> int:
-        """Corrections that were driven."""
+        """Corrections that were moved."""
         return max(0, len(self.visits) - 1)
 
     @property
@@ -116,15 +116,15 @@ class Servoed:
         return np.array([visit.error_mm for visit in self.visits])
 
 
-def servo(task: Task, q_command: Floats, q_true: Floats, look: Look, drive: Drive) -> Servoed:
-    """Drive the ball onto the target.
+def servo(task: Task, q_command: Floats, q_true: Floats, look: Look, move: Move) -> Servoed:
+    """Move the ball onto the target.
 
     Args:
         task: What to do.
         q_command: Shape (6,), rad: where the arm was sent.
         q_true: Shape (6,), rad: where it truly is; only handed on to ``look``.
         look: Takes pictures and measures.
-        drive: Moves the arm.
+        move: Moves the arm.
     """
     visits: list[Visit] = []
     blind = False
@@ -138,10 +138,10 @@ def servo(task: Task, q_command: Floats, q_true: Floats, look: Look, drive: Driv
             return ended(ServoStop.LOST_BALL, seen.reason)
         miss = seen.target_c - seen.ball_c
         visits.append(Visit(q_command, q_true, seen, float(np.linalg.norm(miss))))
-        stop = _judge(task, visits)
+        stop = _stop_reason(task, visits)
         if stop is not None:
             return ended(stop)
-        step = servo_step(task.held, q_command, task.T_base_c[:3, :3] @ miss, task.limits)
+        step = servo_step(task.rod, q_command, task.T_base_c[:3, :3] @ miss, task.limits)
         blind = blind or step.position_only
         if step.stop is not None:
             return ended(step.stop)
@@ -149,7 +149,7 @@ def servo(task: Task, q_command: Floats, q_true: Floats, look: Look, drive: Driv
         if contact is not None:
             return ended(ServoStop.CONTACT, f"{contact.body} and {contact.other}")
         q_command = step.q_path[-1]
-        q_true = drive(q_command)
+        q_true = move(q_command)
 
 
 def path_contact(checker: StateChecker, q_path: Floats) -> Contact | None:
@@ -167,7 +167,7 @@ def _look(task: Task, q_command: Floats, q_true: Floats, look: Look) -> Seen | L
     return found
 
 
-def _judge(task: Task, visits: list[Visit]) -> ServoStop | None:
+def _stop_reason(task: Task, visits: list[Visit]) -> ServoStop | None:
     """Whether to stop after the last look."""
     errors = [visit.error_mm for visit in visits]
     if errors[-1] <= task.tolerance_mm:

@@ -29,8 +29,8 @@ from puncture_twin.twin.guidance.stereo.poses import configurations, path_upward
 from puncture_twin.twin.guidance.stereo.robot_calibration import (
     RobotCalibration,
     calibrate_by_robot,
+    carried_rod,
     grid_points,
-    held_rod,
 )
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import ServoStop, StepLimits
@@ -79,7 +79,7 @@ class Session:
 
     Attributes:
         seed: What it was drawn from.
-        room: The truth.
+        workcell: The truth.
         calibration: What the robot-held points gave.
         mapping: What the markers gave.
         stereo_mm: Shape (10,): error of the stereo at points of the calibrated volume.
@@ -88,7 +88,7 @@ class Session:
     """
 
     seed: int
-    room: StereoWorkcell
+    workcell: StereoWorkcell
     calibration: RobotCalibration
     mapping: Mapping
     stereo_mm: Floats
@@ -99,7 +99,7 @@ class Session:
 class _Parts(NamedTuple):
     """Random generators, one for each part, so that one part's draws do not shift another's."""
 
-    room: np.random.Generator
+    workcell: np.random.Generator
     pictures: np.random.Generator
     arm: np.random.Generator
     image: np.random.Generator
@@ -121,38 +121,38 @@ def run_session(
         seed: Of all that is drawn.
         targets: Only these; all when None.
         detector_of: Who looks; studies of what is behind the pictures leave them out.
-        empty: Judge of the room without the head, where one is at hand.
+        empty: Checker of the workcell without the head, where one is at hand.
 
     Raises:
         NoAnswerError: The calibration, the mapping or a start pose could not be done; says what stood in the way.
         InputError: The case contradicts itself.
     """
     parts = _Parts(*(np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(len(_Parts._fields))))
-    room = draw_workcell(case, parts.room)
-    detector = detector_of(room, parts.pictures)
-    calibration = calibrate_by_robot(room, detector, empty or workcell_checker(case, None), parts.arm)
-    stereo_mm = _try_stereo(room, calibration, detector, parts.tests)
+    workcell = draw_workcell(case, parts.workcell)
+    detector = detector_of(workcell, parts.pictures)
+    calibration = calibrate_by_robot(workcell, detector, empty or workcell_checker(case, None), parts.arm)
+    stereo_mm = _try_stereo(workcell, calibration, detector, parts.tests)
     truth = case.truth_errors
     markers_m = case.markers.points + parts.image.normal(0.0, truth.marker_mm, case.markers.points.shape)
     targets_m = case.targets.points + parts.image.normal(0.0, truth.target_mm, case.targets.points.shape)
-    seen = see_markers(room, calibration, detector, parts.tests)
+    seen = see_markers(workcell, calibration, detector, parts.tests)
     mapping = _map(case, calibration, seen, markers_m, targets_m)
     joint = case.file.servo.estimate == "joint"
-    guide = (JointGuide if joint else Guide)(Known(room, calibration, mapping, seen, markers_m, detector))
-    reached = _reach_all(room, guide, mapping, targets_m, calibration, parts.arm, targets)
-    return Session(seed, room, calibration, mapping, stereo_mm, reached, guide)
+    guide = (JointGuide if joint else Guide)(Known(workcell, calibration, mapping, seen, markers_m, detector))
+    reached = _reach_all(workcell, guide, mapping, targets_m, calibration, parts.arm, targets)
+    return Session(seed, workcell, calibration, mapping, stereo_mm, reached, guide)
 
 
 def see_markers(
-    room: StereoWorkcell, calibration: RobotCalibration, detector: Detector, rng: np.random.Generator
+    workcell: StereoWorkcell, calibration: RobotCalibration, detector: Detector, rng: np.random.Generator
 ) -> list[Detections]:
     """Every marker in every camera.
 
     Raises:
         NoAnswerError: A marker is not found.
     """
-    head, servo_plan, found = room.case.file.head, room.case.file.servo, []
-    for name, point in zip(room.case.markers.names, room.markers_c, strict=True):
+    head, servo_plan, found = workcell.case.file.head, workcell.case.file.servo, []
+    for name, point in zip(workcell.case.markers.names, workcell.markers_c, strict=True):
         predicted = point + rng.normal(0.0, POINTED_MM, 3)
         searches = tuple(Search(camera, predicted, servo_plan.search_px) for camera in calibration.cameras)
         detections = look_at(
@@ -174,18 +174,18 @@ def _map(
 
 
 def _try_stereo(
-    room: StereoWorkcell, calibration: RobotCalibration, detector: Detector, rng: np.random.Generator
+    workcell: StereoWorkcell, calibration: RobotCalibration, detector: Detector, rng: np.random.Generator
 ) -> Floats:
     """Error of the stereo at points anywhere in the calibrated volume, shape (10,), mm."""
     T_c_base = np.asarray(np.linalg.inv(calibration.T_base_c), dtype=np.float64)
-    tool = room.case.file.tool
-    grid = grid_points(room.case)
-    rod_c = -T_c_base[:3, :3] @ held_rod(room.case, room).R_base_flange[:, 2]
+    tool = workcell.case.file.tool
+    grid = grid_points(workcell.case)
+    rod_c = -T_c_base[:3, :3] @ carried_rod(workcell.case, workcell).R_base_flange[:, 2]
     errors = []
     for point in rng.uniform(grid.min(axis=0), grid.max(axis=0), (TEST_POINTS, 3)):
-        ball = LocatedPair(apply(room.T_c_base, point), tool.ball_diameter_mm / 2, rod_c, head_there=False)
-        searches = _searches(room.case, calibration, apply(T_c_base, point))
-        detections = look_at(detector, ball, searches, room.case.file.servo.frames)
+        ball = LocatedPair(apply(workcell.T_c_base, point), tool.ball_diameter_mm / 2, rod_c, head_there=False)
+        searches = _searches(workcell.case, calibration, apply(T_c_base, point))
+        detections = look_at(detector, ball, searches, workcell.case.file.servo.frames)
         if isinstance(detections, Lost):
             raise NoAnswerError(f"stereo test: {detections.reason}")
         errors.append(np.linalg.norm(in_space(calibration.cameras, detections).points_c[0] - ball.center_c))
@@ -197,7 +197,7 @@ def _searches(case: ServoCase, calibration: RobotCalibration, predicted_c: Float
 
 
 def _reach_all(
-    room: StereoWorkcell,
+    workcell: StereoWorkcell,
     guide: Guide,
     mapping: Mapping,
     targets_m: Floats,
@@ -205,26 +205,26 @@ def _reach_all(
     rng: np.random.Generator,
     wanted: tuple[str, ...] | None,
 ) -> tuple[Reached, ...]:
-    case, held = room.case, held_rod(room.case, room)
+    case, rod = workcell.case, carried_rod(workcell.case, workcell)
     names = case.targets.names
     chosen = [i for i, name in enumerate(names) if wanted is None or name in wanted]
     checker = workcell_checker(case, calibration.T_base_c @ mapping.T_c_m)
     aims_base = apply(calibration.T_base_c, mapping.to_c(targets_m[chosen]))
-    hovers = path_upward(held, aims_base, case.file.servo.hover_mm)
-    q = configurations(held, np.concatenate([aims_base, hovers]), checker, first=calibration.branch).q
+    hovers = path_upward(rod, aims_base, case.file.servo.hover_mm)
+    q = configurations(rod, np.concatenate([aims_base, hovers]), checker, first=calibration.branch).q
     limits = case.file.servo
     steps = StepLimits(
         limits.max_step_mm, float(np.radians(limits.max_joint_step_deg)), float(np.radians(limits.max_drift_deg))
     )
-    task = Task(held, calibration.T_base_c, limits.tolerance_mm, limits.max_steps, limits.looks, steps, checker)
+    task = Task(rod, calibration.T_base_c, limits.tolerance_mm, limits.max_steps, limits.looks, steps, checker)
     expected = mapping.expected_tre_mm(targets_m, case.errors.target_mm)
     q_true, reached = calibration.q_true[-1], []
     for row, index in enumerate(chosen):
-        q_true = room.arm.settle(q[len(chosen) + row], q_true, rng)
+        q_true = workcell.arm.settle(q[len(chosen) + row], q_true, rng)
         guide.aim_at(targets_m[index])
-        one = _Aim(index, names[index], room.targets_c[index], float(expected[index]))
-        done = _reach(room, guide, task, q[len(chosen) + row], q[row], q_true, one, rng)
-        q_true = room.arm.settle(q[len(chosen) + row], done.servoed.q_true, rng)
+        one = _Aim(index, names[index], workcell.targets_c[index], float(expected[index]))
+        done = _reach(workcell, guide, task, q[len(chosen) + row], q[row], q_true, one, rng)
+        q_true = workcell.arm.settle(q[len(chosen) + row], done.servoed.q_true, rng)
         reached.append(done)
     return tuple(reached)
 
@@ -237,7 +237,7 @@ class _Aim(NamedTuple):
 
 
 def _reach(
-    room: StereoWorkcell,
+    workcell: StereoWorkcell,
     guide: Guide,
     task: Task,
     q_hover: Floats,
@@ -249,21 +249,21 @@ def _reach(
     """From where the arm hovers onto the target by the robot alone, then by the servo."""
     contact, unseen, seen = path_contact(task.checker, np.stack([q_hover, q_aim])), None, None
     if contact is None:
-        q_true = room.arm.settle(q_aim, q_true, rng)
-        unseen = _outcome(room, guide.needle_unseen(q_aim), q_true, aim)
-    before = float(np.linalg.norm(room.ball_c(q_true) - aim.target_c))
+        q_true = workcell.arm.settle(q_aim, q_true, rng)
+        unseen = _outcome(workcell, guide.needle_unseen(q_aim), q_true, aim)
+    before = float(np.linalg.norm(workcell.ball_c(q_true) - aim.target_c))
     if contact is None:
         state = [q_true]
 
-        def drive(q_command: Floats) -> Floats:
-            state[0] = room.arm.settle(q_command, state[0], rng)
+        def move(q_command: Floats) -> Floats:
+            state[0] = workcell.arm.settle(q_command, state[0], rng)
             return state[0]
 
-        done = servo(task, q_aim, q_true, guide.look, drive)
-        seen = _outcome(room, guide.needle_seen(), done.q_true, aim) if _was_seen(done) else None
+        done = servo(task, q_aim, q_true, guide.look, move)
+        seen = _outcome(workcell, guide.needle_seen(), done.q_true, aim) if _was_seen(done) else None
     else:
         done = Servoed(ServoStop.CONTACT, (), q_hover, q_true, f"{contact.body} and {contact.other}")
-    ball, estimated = room.ball_c(done.q_true), guide.target_c
+    ball, estimated = workcell.ball_c(done.q_true), guide.target_c
     return Reached(
         aim.name,
         done,
@@ -282,6 +282,6 @@ def _was_seen(done: Servoed) -> bool:
     return bool(done.visits) and done.visits[-1].q_true is done.q_true
 
 
-def _outcome(room: StereoWorkcell, believed: NeedleError | None, q_true: Floats, aim: _Aim) -> NeedleOutcome | None:
-    radius = room.case.file.target.hit_radius_mm
-    return None if believed is None else needle_outcome(believed, room.needle_m(q_true, aim.number), radius)
+def _outcome(workcell: StereoWorkcell, believed: NeedleError | None, q_true: Floats, aim: _Aim) -> NeedleOutcome | None:
+    radius = workcell.case.file.target.hit_radius_mm
+    return None if believed is None else needle_outcome(believed, workcell.needle_m(q_true, aim.number), radius)

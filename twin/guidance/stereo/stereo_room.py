@@ -27,7 +27,7 @@ from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, ToolSection
 from puncture_twin.twin.plant.true_arm import ArmErrors, TrueArm, draw_true_arm
 
 LINE_OF_SIGHT_RINGS = ((0.0, 1), (0.55, 6), (0.95, 12))
-"""Where on the ball's disc a line of sight ends: share of the radius, and how many around."""
+"""Where on the ball's disc a line of sight ends: fraction of the radius, and how many around."""
 
 
 class TrueTool(NamedTuple):
@@ -111,7 +111,7 @@ class StereoWorkcell:
         return np.asarray(-self.T_c_base[:3, :3] @ self.arm.flange_pose(q_true)[:3, 2])
 
     def hidden_fraction(self, camera: Camera, point_c: Floats, radius_mm: float) -> float:
-        """Share of a ball's disc that the head hides from a camera, 0 to 1, by lines of sight."""
+        """Fraction of a ball's disc that the head hides from a camera, 0 to 1, by lines of sight."""
         toward = point_c - camera.center_c
         across = tangent_axes(toward / np.linalg.norm(toward))
         angles = [(r * radius_mm, 2 * np.pi * k / n) for r, n in LINE_OF_SIGHT_RINGS for k in range(n)]

@@ -7,9 +7,9 @@ from .acquisition import (
 from .candidate_poses import CandidatePoses as CandidatePoses, drawing as drawing, find_candidates as find_candidates
 from .puncture import (
     Puncture as Puncture,
-    held_out_errors_mm as held_out_errors_mm,
     puncture_picture as puncture_picture,
     punctures as punctures,
+    unseen_errors_mm as unseen_errors_mm,
 )
 from .selfcal_case import SelfcalCase as SelfcalCase, load_selfcal_case as load_selfcal_case
 from .selfcal_truth import draw_workcell as draw_workcell

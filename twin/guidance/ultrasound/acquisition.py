@@ -92,7 +92,7 @@ class _Motion:
 
 def acquire(
     case: SelfcalCase,
-    room: TwoArms,
+    workcell: TwoArms,
     candidates: CandidatePoses,
     truth: WorkcellTruth,
     rng: np.random.Generator,
@@ -102,7 +102,7 @@ def acquire(
 
     Args:
         case: The room.
-        room: Its collision checker: the jog is checked too.
+        workcell: Its collision checker: the jog is checked too.
         candidates: Poses that can be taken.
         truth: The true room.
         rng: For the choice, if random, the arms' repeatability, what the jog leaves, and the pictures.
@@ -122,7 +122,7 @@ def acquire(
         chosen = choose(case, candidates, left, wanted - len(shots), rng, shots)
         left = np.setdiff1d(left, chosen)
         for row in chosen:
-            taken = _shot(case, room, candidates, truth, motion, int(row), rng)
+            taken = _shot(case, workcell, candidates, truth, motion, int(row), rng)
             if isinstance(taken, str):
                 given_up[taken] += 1
             elif isinstance(taken.found, Missed):
@@ -133,7 +133,7 @@ def acquire(
             count(len(shots) + tried, wanted + tried)
     play = any(arm.backlash_rad > 0.0 for arm in (truth.probe_arm, truth.needle_arm))
     reasons = Counter(shot.found.value for shot in missed if isinstance(shot.found, Missed)) + given_up
-    return Acquisition(_recording(room, shots, play=play), tuple(shots), dict(reasons), tuple(missed), left)
+    return Acquisition(_recording(workcell, shots, play=play), tuple(shots), dict(reasons), tuple(missed), left)
 
 
 def choose(
@@ -160,7 +160,7 @@ def choice_noise(case: SelfcalCase) -> Noise:
 
 def _shot(
     case: SelfcalCase,
-    room: TwoArms,
+    workcell: TwoArms,
     candidates: CandidatePoses,
     truth: WorkcellTruth,
     motion: _Motion,
@@ -174,7 +174,7 @@ def _shot(
     q_needle = jog_into_slice(truth, rest_probe, candidates.q_needle[row], wanted, float(candidates.roll[row]))
     if np.isnan(q_needle).any():
         return JOG_FAILED
-    if room.verdict(q_probe, q_needle) is not None:
+    if workcell.verdict(q_probe, q_needle) is not None:
         return JOG_TOUCHES
     rest_needle = motion.settle(1, q_needle)
     needle = truth.needle_in_image(rest_probe, rest_needle)
@@ -195,15 +195,15 @@ def _after_jog(case: SelfcalCase, poses: Recording, row: int, rng: np.random.Gen
     return NeedleInImage(tip, np.array([*(np.cos(lean) * poses.v[row]), np.sin(lean)]))
 
 
-def _recording(room: TwoArms, shots: list[ProbeShot], *, play: bool) -> Recording:
+def _recording(workcell: TwoArms, shots: list[ProbeShot], *, play: bool) -> Recording:
     """What the controllers print and the pictures show; which way the joints turned, where that decides anything."""
     found = [shot.found for shot in shots if isinstance(shot.found, Detection)]
     q_probe, q_needle = (np.array([getattr(shot, key) for shot in shots]) for key in ("q_probe", "q_needle"))
     turns = (np.array([getattr(shot, key) for shot in shots]) for key in ("turn_probe", "turn_needle"))
     turn_probe, turn_needle = turns if play else (None, None)
     return Recording(
-        flange_pose(room.probe_model, q_probe),
-        flange_pose(room.needle_model, q_needle),
+        flange_pose(workcell.probe_model, q_probe),
+        flange_pose(workcell.needle_model, q_needle),
         np.array([one.tip_image for one in found]),
         np.array([one.direction_image for one in found]),
         q_probe=q_probe,

@@ -28,13 +28,13 @@ EDGE_MM = 6.0
 LEAST_DEPTH_MM = 12.0
 
 PHANTOM_FRACTION = 0.3
-"""The face's middle is drawn within this share of the phantom's width from its middle."""
+"""The face's middle is drawn within this fraction of the phantom's width from its middle."""
 
 TIP_OUTSIDE = "tip_outside_phantom"
 PROBE_REACH = "probe_out_of_reach"
 NEEDLE_REACH = "needle_out_of_reach"
 REASONS = (TIP_OUTSIDE, PROBE_REACH, NEEDLE_REACH, *(reason.value for reason in Touching))
-"""In the order in which they are asked."""
+"""In the order in which they are queried."""
 
 
 class ImageGeometry(NamedTuple):
@@ -104,12 +104,12 @@ def _lowest_corner(case: SelfcalCase, T_base1_image: Floats) -> Floats:
     return np.asarray(heights.min(axis=1))
 
 
-def find_candidates(case: SelfcalCase, room: TwoArms, rng: np.random.Generator) -> CandidatePoses:
+def find_candidates(case: SelfcalCase, workcell: TwoArms, rng: np.random.Generator) -> CandidatePoses:
     """Draw, solve, check.
 
     Args:
         case: The room.
-        room: Its collision checker.
+        workcell: Its collision checker.
         rng: For the draws.
 
     Raises:
@@ -122,11 +122,11 @@ def find_candidates(case: SelfcalCase, room: TwoArms, rng: np.random.Generator) 
     homes = [np.radians(arm.home_deg) for arm in (case.content.probe_arm, case.content.needle_arm)]
     branches = [
         configurations(model, goal, home)
-        for model, goal, home in zip((room.probe_model, room.needle_model), goals, homes, strict=True)
+        for model, goal, home in zip((workcell.probe_model, workcell.needle_model), goals, homes, strict=True)
     ]
     tips = np.einsum("nij,nj->ni", seen.T_base1_image[:, :3, :2], seen.tip_mm) + seen.T_base1_image[:, :3, 3]
     inside = inside_phantom(case.content.phantom, tips)
-    answers = [_checked_pose(room, bool(inside[i]), branches[0][i], branches[1][i]) for i in range(n)]
+    answers = [_checked_pose(workcell, bool(inside[i]), branches[0][i], branches[1][i]) for i in range(n)]
     taken = np.array([i for i, answer in enumerate(answers) if not isinstance(answer, str)], dtype=np.int64)
     counted = Counter(answer if isinstance(answer, str) else "ok" for answer in answers)
     counts = {reason: counted.get(reason, 0) for reason in ("ok", *REASONS)}
@@ -182,7 +182,7 @@ def configurations(model: UrModel, T_base_flange: Floats, q_home: Floats) -> lis
     return [rows[near][~np.isnan(rows[near, 0])] for rows, near in zip(q, order, strict=True)]
 
 
-def _checked_pose(room: TwoArms, inside: bool, probe: Floats, needle: Floats) -> str | tuple[Floats, Floats]:
+def _checked_pose(workcell: TwoArms, inside: bool, probe: Floats, needle: Floats) -> str | tuple[Floats, Floats]:
     """The first pair of configurations that stands free, or the reason why none does."""
     if not inside:
         return TIP_OUTSIDE
@@ -190,14 +190,14 @@ def _checked_pose(room: TwoArms, inside: bool, probe: Floats, needle: Floats) ->
         return PROBE_REACH
     if len(needle) == 0:
         return NEEDLE_REACH
-    free_probe = [q for q in probe if room.probe_free(q)]
+    free_probe = [q for q in probe if workcell.probe_free(q)]
     if not free_probe:
         return Touching.PROBE_ARM.value
-    free_needle = [q for q in needle if room.needle_free(q)]
+    free_needle = [q for q in needle if workcell.needle_free(q)]
     if not free_needle:
         return Touching.NEEDLE_ARM.value
     for q_probe in free_probe:
         for q_needle in free_needle:
-            if room.apart(q_probe, q_needle):
+            if workcell.apart(q_probe, q_needle):
                 return q_probe, q_needle
     return Touching.BOTH.value

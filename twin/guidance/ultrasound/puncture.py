@@ -65,7 +65,7 @@ class Puncture(NamedTuple):
 
 def punctures(
     case: SelfcalCase,
-    room: TwoArms,
+    workcell: TwoArms,
     candidates: CandidatePoses,
     rows: NDArray[np.int_],
     truth: WorkcellTruth,
@@ -76,20 +76,20 @@ def punctures(
 
     Args:
         case: The room.
-        room: Its collision checker; a target at which something would touch is passed over.
+        workcell: Its collision checker; a target at which something would touch is passed over.
         candidates: Where probe and needle can stand.
         rows: The candidates to use: none of them was recorded.
         truth: The true room.
         calibration: What was found.
         rng: The reading of the target and the arms' repeatability.
     """
-    done = [_puncture(case, room, candidates, int(row), truth, calibration, rng) for row in rows]
+    done = [_puncture(case, workcell, candidates, int(row), truth, calibration, rng) for row in rows]
     return tuple(one for one in done if one is not None)
 
 
 def _puncture(
     case: SelfcalCase,
-    room: TwoArms,
+    workcell: TwoArms,
     candidates: CandidatePoses,
     row: int,
     truth: WorkcellTruth,
@@ -101,7 +101,7 @@ def _puncture(
     target = np.array([*candidates.poses.P[row], 0.0])
     clicked = target[:2] + rng.normal(0.0, case.content.truth.click_mm, 2)
     q_needle = aim(candidates, row, clicked, calibration, truth)
-    if np.isnan(q_needle).any() or room.verdict(q_probe, q_needle) is not None:
+    if np.isnan(q_needle).any() or workcell.verdict(q_probe, q_needle) is not None:
         return None
     rest_needle = truth.needle_arm.settle(q_needle, q_needle, rng)
     predicted = expected_error_mm(calibration, _standing(truth, q_probe, q_needle, clicked))
@@ -151,7 +151,7 @@ def _standing(truth: WorkcellTruth, q_probe: Floats, q_needle: Floats, tip_mm: F
     return Recording(A[None], B[None], tip_mm[None, :2], q_probe=q_probe[None], q_needle=q_needle[None])
 
 
-def held_out_errors_mm(
+def unseen_errors_mm(
     candidates: CandidatePoses,
     rows: NDArray[np.int_],
     truth: WorkcellTruth,

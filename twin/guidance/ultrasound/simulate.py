@@ -32,7 +32,7 @@ class PoseRanges(NamedTuple):
     lean: float = 0.0
     """Standard deviation of how far the needle leans out of the slice, rad; spec 3 has it lie in the slice."""
     at_ends: float = 0.0
-    """Share of all values that lie at an end of their range instead of anywhere in it: candidates that tell more."""
+    """Fraction of all values that lie at an end of their range instead of anywhere in it: candidates that tell more."""
 
     def draw(self, rng: np.random.Generator, low: float, high: float, size: int | tuple[int, int]) -> Floats:
         """Values of a range, shape ``size``."""
@@ -74,8 +74,8 @@ class ImagePose(NamedTuple):
 def draw_truth(rng: np.random.Generator) -> SimulatedTruth:
     """A probe, two bases 0.9 m apart and a needle of 140 to 200 mm, each at random about its usual place."""
     X = pose(exp_rotation(rng.uniform(-0.5, 0.5, 3)), np.array([0.0, 30.0, 80.0]) + rng.uniform(-20, 20, 3))
-    turned = exp_rotation(np.array([0.0, 0.0, np.pi])) @ exp_rotation(rng.uniform(-0.3, 0.3, 3))
-    Y = pose(turned, np.array([900.0, 0.0, 0.0]) + rng.uniform(-60, 60, 3))
+    R_Y = exp_rotation(np.array([0.0, 0.0, np.pi])) @ exp_rotation(rng.uniform(-0.3, 0.3, 3))
+    Y = pose(R_Y, np.array([900.0, 0.0, 0.0]) + rng.uniform(-60, 60, 3))
     direction = exp_rotation(rng.uniform(-0.3, 0.3, 3))[:, 2]
     tip = rng.uniform(140.0, 200.0) * direction + np.append(rng.uniform(-15, 15, 2), 0.0)
     A_mean = pose(

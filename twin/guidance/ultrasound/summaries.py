@@ -88,7 +88,7 @@ def trial_summary(trial: SelfcalTrial) -> dict[str, Any]:
         "seed": trial.seed,
         "residual_rms_mm": found.rms_mm,
         "predicted_tre_mm": predicted_tre(found, trial.acquisition.recording),
-        "held_out_error_rms_mm": _rms(trial.held_out_mm),
+        "held_out_error_rms_mm": _rms(trial.unseen_mm),
         "X_error_mm": float(np.linalg.norm(found.X[:3, 3] - truth.X[:3, 3])),
         "Y_error_mm": float(np.linalg.norm(found.Y[:3, 3] - truth.Y[:3, 3])),
         "tip_error_mm": float(np.linalg.norm(found.tip_end2 - truth.tip_end2)),

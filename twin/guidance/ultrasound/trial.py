@@ -22,7 +22,7 @@ class SelfcalTrial:
         truth: The room.
         acquisition: What was recorded.
         calibration: What was found.
-        held_out_mm: Predicted minus true tip at poses that were not recorded, shape (k,).
+        unseen_mm: Predicted minus true tip at poses that were not recorded, shape (k,).
         punctures: One per target.
     """
 
@@ -30,7 +30,7 @@ class SelfcalTrial:
     truth: WorkcellTruth
     acquisition: Acquisition
     calibration: Calibration
-    held_out_mm: Floats
+    unseen_mm: Floats
     punctures: tuple[Puncture, ...]
 
 

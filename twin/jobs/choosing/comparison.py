@@ -25,7 +25,7 @@ LEAST_CHANCE = 1e-4
 NOTHING = "-"
 """Where there is no number."""
 
-NOT_HELD = "as the plans state it; name their case with --case to have them checked again, with chances and windows"
+NOT_CHECKED = "as the plans state it; name their case with --case to have them checked again, with chances and windows"
 
 
 class OnGrid(NamedTuple):
@@ -144,8 +144,8 @@ class Comparison:
         return "\n".join([head, *table, *self._sentences(), *(f"warning: {one}" for one in self.warnings)])
 
     def _rows(self) -> Iterator[tuple[str, str, str]]:
-        for what, told in _ROWS:
-            yield what, told(self.a), told(self.b)
+        for what, values in _ROWS:
+            yield what, values(self.a), values(self.b)
         for name in self._structures():
             yield f"clearance to {name}, mm", _clearance(self.a, name), _clearance(self.b, name)
 
@@ -163,10 +163,10 @@ class Comparison:
                 continue
             if not side.safe:
                 yield f"  {letter} is rejected: {reason_text(side.explained.candidates, 0)}"
-            for what, told in side.explained.facts.rows():
-                yield f"  {letter} {what}: {told}"
+            for what, values in side.explained.facts.rows():
+                yield f"  {letter} {what}: {values}"
         if self.a.explained is None:
-            yield f"  {NOT_HELD}"
+            yield f"  {NOT_CHECKED}"
 
 
 def _demanding(side: Side) -> list[tuple[str, float]]:
@@ -197,20 +197,20 @@ def _percent(chance: float) -> str:
     return f"{100 * chance:.2f}" if chance >= LEAST_CHANCE else "below 0.01"
 
 
-def _of_doubt(told: Callable[[Doubt], str]) -> Callable[[Side], str]:
+def _of_doubt(values: Callable[[Doubt], str]) -> Callable[[Side], str]:
     def shown(side: Side) -> str:
         doubt = None if side.explained is None else side.explained.doubt
-        return NOTHING if doubt is None else told(doubt)
+        return NOTHING if doubt is None else values(doubt)
 
     return shown
 
 
 def _of_window(number: Callable[[Window], float], form: str) -> Callable[[Side], str]:
-    def told(side: Side) -> str:
+    def values(side: Side) -> str:
         window = None if side.grid is None else side.grid.window
         return NOTHING if window is None else _shown(number(window), form)
 
-    return told
+    return values
 
 
 def _of_plan(number: Callable[[Plan], float], form: str) -> Callable[[Side], str]:

@@ -103,8 +103,8 @@ class CheckedList:
             *(_line(row, wide) for row in self.rows),
         ]
         kept = [f"  row {row['row']}: {_why(row)}" for row in self.rows if row["verdict"] != "safe"]
-        told = [f"warning: {one}" for one in self.warnings] + [f"  {path}" for path in self.files]
-        return "\n".join([*lines, *kept, *told])
+        rest = [f"warning: {one}" for one in self.warnings] + [f"  {path}" for path in self.files]
+        return "\n".join([*lines, *kept, *rest])
 
 
 def check_entries(context: CaseContext, listed: ReadList) -> CheckedList:
@@ -170,8 +170,8 @@ def _document(context: CaseContext, row: Listed, found: Outcome) -> dict[str, An
     point = {} if row.point_mm is None else dict(zip(("x_mm", "y_mm", "z_mm"), row.point_mm, strict=True))
     stated = {"row": row.number, "name": row.name, "verdict": found.verdict, "detail": found.detail}
     counts = {"safe_directions": found.safe_directions, "windows": found.windows}
-    told = {} if found.explained is None else _explained(found.explained)
-    return {**blank, **point, **told, **stated, **counts, "detail": found.detail or told.get("detail", "")}
+    rest = {} if found.explained is None else _explained(found.explained)
+    return {**blank, **point, **rest, **stated, **counts, "detail": found.detail or rest.get("detail", "")}
 
 
 def _explained(explained: Explanation) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, Simulate
 
 SEED = 20230816
 RUNS = 200
-HELD_OUT = 200
+UNSEEN = 200
 COUNTS = (16, 20, 30, 50)
 METHODS = ("closed form", "Gauss-Newton", "weighted", "Cramer-Rao bound")
 
@@ -81,7 +81,7 @@ class AxpYbqRow:
     unit: str
 
     @property
-    def holds(self) -> bool:
+    def passed(self) -> bool:
         """Whether ours is within the limit."""
         return self.limit is None or self.ours <= self.limit
 
@@ -94,9 +94,9 @@ class AxpYbqTables(NamedTuple):
     seed: int
 
     @property
-    def holds(self) -> bool:
+    def passed(self) -> bool:
         """Whether every number that has a limit is within it."""
-        return all(row.holds for row in self.rows)
+        return all(row.passed for row in self.rows)
 
 
 class _Run(NamedTuple):
@@ -174,20 +174,20 @@ def widened(squares: Floats) -> float:
 
 def _run(rng: np.random.Generator, n: int) -> _Run:
     recording, truth = simulate_recording(rng, n)
-    held, _ = simulate_recording(rng, HELD_OUT, truth, noise=None)
+    unseen, _ = simulate_recording(rng, UNSEEN, truth, noise=None)
     start = closed_form(recording)
     active = active_columns(tip=True, scale=False, direction=False)
     plain = plain_fit(Problem(recording, UNWEIGHTED, active), start)
     weighted = plain_fit(Problem(recording, SPEC_NOISE, active), start)
-    squared = [_squared(estimate, held) for estimate in (start, plain.estimate, weighted.estimate)]
-    bound = expected_tre_mm(recording, SPEC_NOISE, truth_estimate(truth), held) ** 2
+    squared = [_squared(estimate, unseen) for estimate in (start, plain.estimate, weighted.estimate)]
+    bound = expected_tre_mm(recording, SPEC_NOISE, truth_estimate(truth), unseen) ** 2
     V = mean_direction(plain.estimate, recording)
     angle = float(np.degrees(np.arccos(np.clip(V @ truth.direction_end2, -1.0, 1.0))))
     return _Run(np.array([*squared, bound]), max(plain.iterations, weighted.iterations), angle)
 
 
-def _squared(estimate: Estimate, held: Recording) -> float:
-    return float(np.mean(np.sum(tip_residuals(estimate, held) ** 2, axis=1)))
+def _squared(estimate: Estimate, unseen: Recording) -> float:
+    return float(np.mean(np.sum(tip_residuals(estimate, unseen) ** 2, axis=1)))
 
 
 def _outliers(runs: int) -> list[AxpYbqRow]:
@@ -195,12 +195,12 @@ def _outliers(runs: int) -> list[AxpYbqRow]:
 
     def one(rng: np.random.Generator) -> list[float]:
         recording, truth = simulate_recording(rng, 30)
-        held, _ = simulate_recording(rng, HELD_OUT, truth, noise=None)
+        unseen, _ = simulate_recording(rng, UNSEEN, truth, noise=None)
         broken = with_outliers(rng, recording, OUTLIER_FRACTION, OUTLIER_MM)
         active = active_columns(tip=True, scale=False, direction=False)
         plain = plain_fit(Problem(broken, UNWEIGHTED, active), closed_form(broken))
         unweighted, weighted = (calibrate(broken, noise=noise, direction=False) for noise in (None, SPEC_NOISE))
-        return [_squared(found.estimate, held) for found in (plain, unweighted, weighted)]
+        return [_squared(found.estimate, unseen) for found in (plain, unweighted, weighted)]
 
     (plain, unweighted, weighted), widen = _rms(one, runs, 1)
     return [
@@ -210,9 +210,9 @@ def _outliers(runs: int) -> list[AxpYbqRow]:
     ]
 
 
-def with_outliers(rng: np.random.Generator, recording: Recording, share: float, size_mm: float) -> Recording:
-    """The recording with a share of its tips moved in the image, in random directions."""
-    count = max(1, round(share * len(recording)))
+def with_outliers(rng: np.random.Generator, recording: Recording, fraction: float, size_mm: float) -> Recording:
+    """The recording with a fraction of its tips moved in the image, in random directions."""
+    count = max(1, round(fraction * len(recording)))
     angle = rng.uniform(0, 2 * np.pi, count)
     P = np.array(recording.P)
     P[rng.choice(len(recording), count, replace=False)] += size_mm * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -227,8 +227,8 @@ def _scales(runs: int) -> list[AxpYbqRow]:
 
         def one(rng: np.random.Generator, size: float = size) -> list[float]:
             exact, truth = simulate_recording(rng, 30)
-            held, _ = simulate_recording(rng, HELD_OUT, truth, noise=None)
-            believed, seen = (Recording(r.A, r.B, r.P / size, r.v) for r in (exact, held))
+            unseen, _ = simulate_recording(rng, UNSEEN, truth, noise=None)
+            believed, seen = (Recording(r.A, r.B, r.P / size, r.v) for r in (exact, unseen))
             found = [calibrate(believed, direction=False, scale=estimated) for estimated in (False, True)]
             return [_squared(calibration.estimate, seen) for calibration in found]
 
@@ -259,9 +259,9 @@ def reproduction_text(result: AxpYbqTables) -> str:
     lines.append(f"{'what':64s} {'spec':>8s} {'ours':>10s} {'limit':>8s}  unit")
     for row in result.rows:
         known, limit = ("-" if value is None else f"{value:.3g}" for value in (row.known, row.limit))
-        mark = "" if row.holds else "  DOES NOT HOLD"
+        mark = "" if row.passed else "  DOES NOT HOLD"
         lines.append(f"{row.what:64.64s} {known:>8s} {row.ours:10.3g} {limit:>8s}  {row.unit}{mark}")
-    verdict = "every limit holds" if result.holds else "NOT every limit holds"
+    verdict = "every limit holds" if result.passed else "NOT every limit holds"
     wider = (
         "" if result.runs >= RUNS else f"; the limits are those of {RUNS} runs, widened by what chance adds in so few"
     )
@@ -271,8 +271,8 @@ def reproduction_text(result: AxpYbqTables) -> str:
 def reproduction_summary(result: AxpYbqTables) -> dict[str, Any]:
     """The same as plain values."""
     rows = [
-        {"what": r.what, "known": r.known, "ours": r.ours, "limit": r.limit, "unit": r.unit, "holds": r.holds}
+        {"what": r.what, "known": r.known, "ours": r.ours, "limit": r.limit, "unit": r.unit, "holds": r.passed}
         for r in result.rows
     ]
-    answer = {"rows": rows, "runs": result.runs, "seed": result.seed, "holds": result.holds}
+    answer = {"rows": rows, "runs": result.runs, "seed": result.seed, "holds": result.passed}
     return {"compared_with": COMPARED_WITH, **answer}

@@ -80,7 +80,7 @@ class Chen2019Row:
         return float(np.max(np.abs(np.subtract(self.paper, self.ours))))
 
     @property
-    def holds(self) -> bool:
+    def passed(self) -> bool:
         """Whether every number agrees to the paper's rounding."""
         return self.difference_mm <= TOLERANCE_MM + _ROUNDING
 
@@ -106,9 +106,9 @@ class Chen2019Tables:
     reach: SetupReach
 
     @property
-    def holds(self) -> bool:
+    def passed(self) -> bool:
         """Whether every number holds, and the finding too."""
-        return all(row.holds for row in self.rows) and self.reach.out_of_reach
+        return all(row.passed for row in self.rows) and self.reach.out_of_reach
 
 
 def reproduce() -> Chen2019Tables:

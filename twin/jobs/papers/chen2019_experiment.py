@@ -16,7 +16,7 @@ DRAWS, SEED = 1000, 2019
 
 @dataclass(frozen=True)
 class ExperimentReport:
-    """Two declarations held against the paper, and the skew that tells them apart."""
+    """Two declarations compared with the paper, and the skew that tells them apart."""
 
     seed: int
     stated: Experiment

@@ -14,7 +14,7 @@ def reproduction_text(result: Chen2019Tables) -> str:
     ]
     for row in result.rows:
         paper, ours = (" ".join(f"{x:8.2f}" for x in values) for values in (row.paper, row.ours))
-        mark = "" if row.holds else "  DOES NOT HOLD"
+        mark = "" if row.passed else "  DOES NOT HOLD"
         lines.append(f"{row.table:5s}  {row.what:36.36s} {paper:>27s} {ours:>27s} {row.difference_mm:8.4f}{mark}")
     reach = result.reach
     lines += [
@@ -22,7 +22,7 @@ def reproduction_text(result: Chen2019Tables) -> str:
         f"The worked pose puts the flange {reach.flange_from_shoulder_mm:.1f} mm from the shoulder of a UR3, "
         f"whose links span {reach.longest_span_mm:.1f} mm at most: "
         + ("it is out of reach." if reach.out_of_reach else "it is within reach."),
-        "every number holds" if result.holds else "NOT every number holds",
+        "every number holds" if result.passed else "NOT every number holds",
     ]
     return "\n".join(lines)
 
@@ -30,7 +30,7 @@ def reproduction_text(result: Chen2019Tables) -> str:
 def reproduction_summary(result: Chen2019Tables) -> dict[str, Any]:
     """A reproduction as plain values, mm, for ``--json``."""
     rows = [
-        {"table": r.table, "what": r.what, "paper_mm": r.paper, "ours_mm": r.ours, "holds": r.holds}
+        {"table": r.table, "what": r.what, "paper_mm": r.paper, "ours_mm": r.ours, "holds": r.passed}
         for r in result.rows
     ]
     return {
@@ -38,5 +38,5 @@ def reproduction_summary(result: Chen2019Tables) -> dict[str, Any]:
         "flange_from_shoulder_mm": result.reach.flange_from_shoulder_mm,
         "longest_span_mm": result.reach.longest_span_mm,
         "out_of_reach": result.reach.out_of_reach,
-        "holds": result.holds,
+        "holds": result.passed,
     }

@@ -21,7 +21,7 @@ from puncture_twin.twin.jobs.servo.job import reproduce_paper
 class PaperResult(NamedTuple):
     """A paper's numbers beside ours."""
 
-    holds: bool
+    passed: bool
     """Whether every number that should hold does."""
     summary: dict[str, Any]
     """Plain values, for ``--json``."""
@@ -36,7 +36,7 @@ Reproduce = Callable[[Path, int | None], PaperResult]
 def _chen2019(out_dir: Path, seeds: int | None) -> PaperResult:
     del out_dir, seeds  # arithmetic on printed tables: nothing is drawn, in either sense
     result = chen2019.reproduce()
-    return PaperResult(result.holds, reproduction_summary(result), reproduction_text(result))
+    return PaperResult(result.passed, reproduction_summary(result), reproduction_text(result))
 
 
 def chen2019_experiment(draws: int | None) -> PaperResult:
@@ -47,7 +47,7 @@ def chen2019_experiment(draws: int | None) -> PaperResult:
 
 def _axp_ybq(out_dir: Path, seeds: int | None) -> PaperResult:
     result = axp_ybq.reproduce(out_dir, seeds)
-    return PaperResult(result.holds, axp_ybq.reproduction_summary(result), axp_ybq.reproduction_text(result))
+    return PaperResult(result.passed, axp_ybq.reproduction_summary(result), axp_ybq.reproduction_text(result))
 
 
 def _liu2007(out_dir: Path, seeds: int | None) -> PaperResult:

@@ -19,7 +19,7 @@ from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
 POLE = 1e-6
 """Puncture angle below which an azimuth says nothing, rad."""
 
-TOLD_MM = 0.005
+SHOWN_MM = 0.005
 """A source that costs less is not printed: it would be 0.00."""
 
 
@@ -83,12 +83,12 @@ def budget_lines(facts: dict[str, Any] | None) -> list[str]:
     lines += [
         f"    {one['text']:34s} {one['alone_mm']:7.2f} {one['without_mm']:11.2f}"
         for one in facts["sources"]
-        if one["alone_mm"] >= TOLD_MM
+        if one["alone_mm"] >= SHOWN_MM
     ]
     lines.append("    what if (all else as it is)")
     lines += [f"    {one['text']:50s} {one['expected_mm']:7.2f}" for one in facts["changes"]]
     best = facts["best"]
-    if now - best["expected_mm"] >= TOLD_MM:
+    if now - best["expected_mm"] >= SHOWN_MM:
         lines.append(
             f"  the next {now - best['expected_mm']:.2f} mm is won by {best['text']}: {best['expected_mm']:.2f} mm"
         )

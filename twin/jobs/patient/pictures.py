@@ -108,7 +108,7 @@ def _subject(context: CaseContext, pick: Pick, plan: Plan | None = None) -> Subj
 
 
 def _uncertainty(run: Run) -> Uncertainty | None:
-    """What the page says of chances: of the plan as it is driven, or without one of the best direction."""
+    """What the page says of chances: of the plan as it is moved, or without one of the best direction."""
     context, found = run.context, run.candidates
     if context.case.errors is None:
         return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from puncture_twin.planning.place.search import RatedPlacement
 from puncture_twin.twin.jobs.patient.place_job import PlaceRun
-from puncture_twin.twin.report.mount_text import direction_words, mount_words
+from puncture_twin.twin.report.mount_text import direction_text, mounting_text
 
 HALF_A_DIGIT = 5e-4
 """Of a share that is printed in % with one digit."""
@@ -14,7 +14,7 @@ def place_text(run: PlaceRun) -> str:
     """The ranked placements, the case's own, the lines to paste, and the files."""
     case, found = run.context.case, run.found
     wanted = found.rated[0].verdict.count if found.rated else 0
-    x, y, z = (direction_words(found.T_ct_bed[:3, axis], str(case.space)) for axis in range(3))
+    x, y, z = (direction_text(found.T_ct_bed[:3, axis], str(case.space)) for axis in range(3))
     lines = [
         f"case {case.name}: {wanted} organ-safe directions; {len(found.coarse)} + {found.refined} placements estimated,"
         f" {len(found.rated)} checked",
@@ -45,6 +45,6 @@ def needle_line(possible: float) -> list[str]:
 def _line(rank: str, one: RatedPlacement, run: PlaceRun) -> str:
     verdict, space = one.verdict, str(run.context.case.space)
     where = "     -       -       -" if one.site is None else "{:6.0f}  {:6.0f}  {:6.0f}".format(*one.site.position)
-    name = one.name if one.site is None else mount_words(one.site.region, run.found.T_ct_bed, space)
+    name = one.name if one.site is None else mounting_text(one.site.region, run.found.T_ct_bed, space)
     home = f"; home: {verdict.home_contact}" if verdict.home_contact else ""
     return f"{rank}  {100 * verdict.fraction:7.1f}  {verdict.reached:5d}  {verdict.margin:6.2f}  {where}  {name}{home}"

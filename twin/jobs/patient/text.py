@@ -30,7 +30,7 @@ LEAST_SHOWN = 5e-5
 """A chance or share below it rounds to nothing in what people read."""
 
 
-CONE_WORDS = {"grid": "as far as the grid tells", "certificate": "proven by the certificate", "": "not known"}
+CONE_TEXT = {"grid": "as far as the grid tells", "certificate": "proven by the certificate", "": "not known"}
 
 
 def search_text(run: Run) -> str:
@@ -101,7 +101,7 @@ def _rehearsal(run: Run) -> list[str]:
     nearest = min(kept.items(), key=lambda item: item[1], default=("nothing", float("nan")))
     return [
         f"rehearsal (seed {done['seed']}): the tip ended {done['tip_error_mm']:.2f} mm from the true target"
-        + ("" if run.rehearsal.standing is None else f", {run.rehearsal.standing.words}"),
+        + ("" if run.rehearsal.standing is None else f", {run.rehearsal.standing.text}"),
         f"  lateral {done['lateral_mm']:.2f} mm, depth {done['depth_mm']:+.2f} mm (+ is too deep)",
         f"  least clearance of the true needle to what it must avoid: {nearest[1]:.2f} mm, {nearest[0]}",
         f"  arm contacts: {'; '.join(done['contacts']) or 'none'}",
@@ -245,7 +245,7 @@ def _best(run: Run) -> list[str]:
     head = "the best of each window"
     if summary["windows"] > len(summary["best"]):
         head += f" (the first {len(summary['best'])} of {summary['windows']})"
-    cones = CONE_WORDS[summary["safe_cone_from"]]
+    cones = CONE_TEXT[summary["safe_cone_from"]]
     lines = [
         f"{head}; cone: off by so much in any direction a needle stays safe for the organs, {cones}",
         "window  rank  theta   beta   cost  clearance  path  angle  reach   cone   window's area   on the skin",

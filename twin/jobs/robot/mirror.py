@@ -35,7 +35,7 @@ RTDE_PORT = 30004
 """On which a controller tells its state; the only port that is used."""
 
 VARIABLES = ("timestamp", "actual_q")
-"""What the controller is asked to tell."""
+"""What the controller is queried to tell."""
 
 MAX_HOST = 253
 """Characters of a name on a network (RFC 1035)."""
@@ -122,9 +122,9 @@ class Mirror:
         T = np.linalg.inv(self.T_base_ct) @ flange_pose(self.model, state.q)
         forward = T[:3, 2]
         tip = T[:3, 3] + self.needle_length_mm * forward
-        way = self.target_ct - tip
-        off = np.linalg.norm(way - (way @ forward) * forward)
-        return Mirrored(state.time_s, state.q, T, tip, float(np.linalg.norm(way)), float(off))
+        to_target = self.target_ct - tip
+        off = np.linalg.norm(to_target - (to_target @ forward) * forward)
+        return Mirrored(state.time_s, state.q, T, tip, float(np.linalg.norm(to_target)), float(off))
 
     def follow(self, states: Iterable[RecordedState]) -> Iterator[Mirrored]:
         """One after the other."""

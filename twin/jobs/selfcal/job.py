@@ -64,5 +64,5 @@ def _simulated(case: SelfcalCase, seeds: int, draft: Draft, watcher: Watcher) ->
         trial = run.trials[0]
         sheet = detection_sheet(case, trial, draft.folder / "bmode.png")
         shot = trial.acquisition.shots[0]
-        room = workcell_picture(case, shot.q_probe, shot.q_needle, draft.folder / "room.png")
-    return run.with_files(sheet, room, write_page(run, sheet, room, draft.folder / "report.html"))
+        picture = workcell_picture(case, shot.q_probe, shot.q_needle, draft.folder / "room.png")
+    return run.with_files(sheet, picture, write_page(run, sheet, picture, draft.folder / "report.html"))

@@ -12,26 +12,26 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibrati
 from puncture_twin.twin.jobs.selfcal.facts import Facts, selfcal_facts
 from puncture_twin.twin.jobs.selfcal.page_charts import puncture_chart, residual_charts
 from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun
-from puncture_twin.twin.jobs.selfcal.text import NOISE_WORDS, REASON_TEXT, counted, missed_text
+from puncture_twin.twin.jobs.selfcal.text import NOISE_TEXT, REASON_TEXT, counted, missed_text
 from puncture_twin.twin.report.numbers import number
 from puncture_twin.twin.report.page.page_tables import TIMES, faint, inputs_table, origin_section, pairs, table
 from puncture_twin.twin.report.page.template import Card, data_address, plotly_script, script_json, write_html
 
 
-def write_page(run: SelfcalRun, sheet: Path | None, room: Path | None, path: Path) -> Path:
+def write_page(run: SelfcalRun, sheet: Path | None, workcell: Path | None, path: Path) -> Path:
     """Write the page.
 
     Args:
         run: What was done.
         sheet: The B-mode pictures; None for a recording.
-        room: The picture of the room; None for a recording.
+        workcell: The picture of the workcell; None for a recording.
         path: The HTML to write; it appears whole or not at all.
     """
     facts, charts = selfcal_facts(run), residual_charts(run.calibration, run.recording)
     twin = None
-    if sheet is not None and room is not None and run.trials:
+    if sheet is not None and workcell is not None and run.trials:
         charts["targets"] = puncture_chart(run.punctures)
-        twin = _twin_section(facts, sheet, room)
+        twin = _twin_section(facts, sheet, workcell)
     write_html(
         "selfcal.html",
         path,
@@ -97,20 +97,20 @@ def _calibration(facts: Facts, sigma: dict[str, float]) -> Markup:
     ]
     if facts["arms"] is not None:
         rows.append(("χ² of the residuals over their freedom", f"{facts['arms']['chi2_per_freedom']:.2f}"))
-    rows += [(NOISE_WORDS[key], f"{value:.3f}") for key, value in facts["noise"].items()]
+    rows += [(NOISE_TEXT[key], f"{value:.3f}") for key, value in facts["noise"].items()]
     known = [(name, f"{value:.4f}") for name, value in sigma.items()]
     shown = table(("parameter", "standard deviation"), known, kind="numbers")
     note = faint("w: a small turn, R exp([w]×); t: a shift; V: the needle’s direction.")
     return pairs(rows) + Markup("<h3>How well each number is known</h3>") + shown + note
 
 
-def _twin_section(facts: Facts, sheet: Path, room: Path) -> dict[str, str]:
+def _twin_section(facts: Facts, sheet: Path, workcell: Path) -> dict[str, str]:
     counts = [(REASON_TEXT[key], f"{value:,}") for key, value in facts["candidates"].items()]
-    choice, asked, trials = facts["choice"], facts["poses"], facts["trials"]
+    choice, recorded, trials = facts["choice"], facts["poses"], facts["trials"]
     bounds = [
-        (f"expected error with the {asked} recorded poses", number(choice["chosen_bound_mm"], 3, "mm")),
+        (f"expected error with the {recorded} recorded poses", number(choice["chosen_bound_mm"], 3, "mm")),
         (
-            f"{asked} at random, median of {choice['random_sets']} choices",
+            f"{recorded} at random, median of {choice['random_sets']} choices",
             number(choice["random_bound_median_mm"], 3, "mm"),
         ),
         ("at random, the best of them", number(choice["random_bound_best_mm"], 3, "mm")),
@@ -121,7 +121,7 @@ def _twin_section(facts: Facts, sheet: Path, room: Path) -> dict[str, str]:
         "trials": _trials(facts),
         "seed": str(trials[0]["seed"]),
         "sheet": data_address(sheet),
-        "room": data_address(room),
+        "room": data_address(workcell),
         "counts": table(("what became of a draw", "draws"), counts, kind="numbers"),
         "choice": pairs(bounds) + faint("Cramér-Rao bounds over all candidates."),
     }

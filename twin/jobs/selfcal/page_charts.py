@@ -22,22 +22,24 @@ IMAGE_AXES = ("residual along u, mm", "residual along v, mm")
 
 def residual_charts(found: Calibration, recording: Recording) -> dict[str, Any]:
     """``residuals``: each pose's three components in the image frame; ``in_image``: the same, v over u."""
-    turned = np.einsum("nji,nj->ni", recording.A[:, :3, :3] @ found.X[:3, :3], found.residuals)
+    rotated = np.einsum("nji,nj->ni", recording.A[:, :3, :3] @ found.X[:3, :3], found.residuals)
     aside = np.isin(recording.names, found.outliers)
     used = list(np.flatnonzero(~aside))
     names = np.array(recording.names)
     by_pose, in_image = [], []
     for axis, label in enumerate(("u, along the face", "v, into the depth", "across the slice")):
         marks = {"color": COLOURS[axis], "size": 6}
-        by_pose.append(curve(label, names[used], _mm(turned[used, axis]), "markers") | {"marker": marks})
+        by_pose.append(curve(label, names[used], _mm(rotated[used, axis]), "markers") | {"marker": marks})
     marks = {"color": COLOURS[0], "size": 7}
-    in_image.append(curve("used", _mm(turned[used, 0]), _mm(turned[used, 1]), "markers") | {"marker": marks})
+    in_image.append(curve("used", _mm(rotated[used, 0]), _mm(rotated[used, 1]), "markers") | {"marker": marks})
     if aside.any():
         marks = {"color": SET_ASIDE, "size": 8, "symbol": "x"}
         for axis in range(3):
-            told = {"showlegend": axis == 0, "marker": marks}
-            by_pose.append(curve("set aside", names[aside], _mm(turned[aside, axis]), "markers") | told)
-        in_image.append(curve("set aside", _mm(turned[aside, 0]), _mm(turned[aside, 1]), "markers") | {"marker": marks})
+            style = {"showlegend": axis == 0, "marker": marks}
+            by_pose.append(curve("set aside", names[aside], _mm(rotated[aside, axis]), "markers") | style)
+        in_image.append(
+            curve("set aside", _mm(rotated[aside, 0]), _mm(rotated[aside, 1]), "markers") | {"marker": marks}
+        )
     pose_layout, image_layout = _layout("pose", "residual, mm"), _layout(*IMAGE_AXES)
     pose_layout["xaxis"]["type"] = "category"
     image_layout["yaxis"]["scaleanchor"] = "x"

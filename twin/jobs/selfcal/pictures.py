@@ -57,7 +57,7 @@ class Panel(NamedTuple):
 
     picture: Pixels
     title: str
-    words: str
+    text: str
     found: Detection | None
     true: NeedleInImage
     target: Floats | None = None
@@ -99,15 +99,15 @@ def _shot_panel(taken: Acquisition, index: int, title: str) -> Panel:
     shot: ProbeShot = taken.shots[index]
     assert isinstance(shot.found, Detection)  # only those are kept as shots
     steep = np.degrees(np.arcsin(abs(shot.true_needle.direction_image[1])))
-    words = f"insertion {steep:.0f}°, off the plane {shot.true_needle.tip_image[2]:+.2f} mm"
-    return Panel(shot.picture, title, words.replace("-", "−"), shot.found, shot.true_needle)
+    text = f"insertion {steep:.0f}°, off the plane {shot.true_needle.tip_image[2]:+.2f} mm"
+    return Panel(shot.picture, title, text.replace("-", "−"), shot.found, shot.true_needle)
 
 
 def _puncture_panels(case: SelfcalCase, trial: SelfcalTrial, rng: np.random.Generator) -> list[Panel]:
     def panel(one: Puncture) -> Panel:
         title = f"puncture: {one.error_mm:.2f} mm from the target"
-        words = f"lateral {one.lateral_mm:.2f} mm, depth {one.depth_mm:+.2f} mm".replace("-", "−")
-        return Panel(puncture_picture(case, one, rng), title, words, None, one.needle, one.target_image)
+        text = f"lateral {one.lateral_mm:.2f} mm, depth {one.depth_mm:+.2f} mm".replace("-", "−")
+        return Panel(puncture_picture(case, one, rng), title, text, None, one.needle, one.target_image)
 
     order = sorted(trial.punctures, key=lambda one: one.error_mm)
     wanted = 2 if trial.acquisition.missed_shots else 3
@@ -127,7 +127,7 @@ def _draw_panel(
     sheet.paste(picture, corner)
     below = corner[1] + size[1] + 6
     write(draw, (corner[0], below), panel.title, size=18, bold=True)
-    write(draw, (corner[0], below + 24), panel.words, size=15)
+    write(draw, (corner[0], below + 24), panel.text, size=15)
     bar_y = corner[1] + size[1] - 12
     draw.line([(corner[0] + 10, bar_y), (corner[0] + 10 + 10 * PX_PER_MM, bar_y)], fill=(255, 255, 255), width=3)
     write(draw, (corner[0] + 16 + 10 * PX_PER_MM, bar_y), "10 mm", size=13, colour=(255, 255, 255), anchor="lm")
@@ -141,10 +141,10 @@ def _draw_marks(draw: ImageDraw.ImageDraw, panel: Panel, imager: Imager) -> None
         return float(x), float(y)
 
     if panel.found is not None:
-        tip, way = panel.found.tip_image, panel.found.direction_image
+        tip, direction = panel.found.tip_image, panel.found.direction_image
         for side in (-1.2, 1.2):  # beside the shaft, so that it stays visible
-            start = tip + side * np.array([-way[1], way[0]])
-            draw.line([at(start), at(start - MARKED_MM * way)], fill=DETECTED, width=1)
+            start = tip + side * np.array([-direction[1], direction[0]])
+            draw.line([at(start), at(start - MARKED_MM * direction)], fill=DETECTED, width=1)
     _cross(draw, at(panel.true.tip_image[:2]), TRUE)
     if panel.target is not None:
         _ring(draw, at(panel.target[:2]), TARGET_MM * PX_PER_MM, TARGET)
@@ -171,13 +171,13 @@ def _draw_legend(draw: ImageDraw.ImageDraw, top: int) -> None:
         (TRUE, "cross: true tip"),
         (TARGET, "ring of 2 mm radius: target"),
     )
-    for colour, words in items:
+    for colour, text in items:
         if colour == TRUE:
             _cross(draw, (x, y), dark[colour])
         else:
             _ring(draw, (x, y), 8, dark[colour])
-        write(draw, (x + 16, y), words, size=15, anchor="lm")
-        x += 60 + width_of(words, 15)
+        write(draw, (x + 16, y), text, size=15, anchor="lm")
+        x += 60 + width_of(text, 15)
 
 
 def workcell_picture(case: SelfcalCase, q_probe: Floats, q_needle: Floats, path: Path) -> Path:
@@ -197,9 +197,9 @@ def workcell_picture(case: SelfcalCase, q_probe: Floats, q_needle: Floats, path:
         f"needle arm ({case.content.needle_arm.model})": case.T_base1_base2[:3, 3],
         "tissue phantom": np.array(case.content.phantom.top_mm) - [0.0, 0.0, case.content.phantom.size_mm[2]],
     }
-    for words, point in anchors.items():
+    for text, point in anchors.items():
         column, row, _ = camera.project(point[None])[0]
-        write(draw, (column, row + 26), words, size=17, bold=True, anchor="mm", halo=3)
+        write(draw, (column, row + 26), text, size=17, bold=True, anchor="mm", halo=3)
     with atomic(path) as temporary:
         picture.save(temporary)
     return path

@@ -30,7 +30,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import (
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.slips import checked_calibration
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, drawing, find_candidates
-from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, held_out_errors_mm, punctures
+from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, punctures, unseen_errors_mm
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
 from puncture_twin.twin.guidance.ultrasound.summaries import calibration_summary
@@ -43,7 +43,7 @@ VERSION = 2
 TARGETS = 6
 """Punctures per seed."""
 
-HELD_OUT = 60
+UNSEEN = 60
 """Candidates per seed at which prediction and truth are compared."""
 
 LARGEST_RATIO = 1.1
@@ -105,12 +105,12 @@ def selfcal_twin(case: SelfcalCase, seeds: int, watcher: Watcher) -> SelfcalRun:
     """
     stages = Stages()
     with stages.time("room"):
-        room = TwoArms(case)
+        workcell = TwoArms(case)
     with stages.time("candidates"):
-        candidates = find_candidates(case, room, np.random.default_rng(case.content.seed))
+        candidates = find_candidates(case, workcell, np.random.default_rng(case.content.seed))
     trials = []
     for seed in range(case.content.seed, case.content.seed + seeds):
-        trials.append(_trial(case, room, candidates, seed, stages, watcher))
+        trials.append(_trial(case, workcell, candidates, seed, stages, watcher))
     with stages.time("comparison with random choice"):
         choice = compare_choice(case, candidates, trials[0].acquisition)
     first = trials[0]
@@ -170,21 +170,26 @@ def calibrate_case(recording: Recording, case: SelfcalCase | None) -> Calibratio
 
 
 def _trial(
-    case: SelfcalCase, room: TwoArms, candidates: CandidatePoses, seed: int, stages: Stages, watcher: Watcher
+    case: SelfcalCase, workcell: TwoArms, candidates: CandidatePoses, seed: int, stages: Stages, watcher: Watcher
 ) -> SelfcalTrial:
     rng = np.random.default_rng(seed)
     truth = draw_workcell(case, rng)
     with stages.time("recording"):
         taken = acquire(
-            case, room, candidates, truth, rng, lambda done, total: watcher.count(f"seed {seed}: pictures", done, total)
+            case,
+            workcell,
+            candidates,
+            truth,
+            rng,
+            lambda done, total: watcher.count(f"seed {seed}: pictures", done, total),
         )
     with stages.time("calibrate"):
         calibration = calibrate_case(taken.recording, case)
     others = rng.permutation(taken.left)
     with stages.time("puncture"):
-        held_out = held_out_errors_mm(candidates, others[:HELD_OUT], truth, calibration, rng)
-        reached = punctures(case, room, candidates, others[:TARGETS], truth, calibration, rng)
-    return SelfcalTrial(seed, truth, taken, calibration, held_out, reached)
+        unseen = unseen_errors_mm(candidates, others[:UNSEEN], truth, calibration, rng)
+        reached = punctures(case, workcell, candidates, others[:TARGETS], truth, calibration, rng)
+    return SelfcalTrial(seed, truth, taken, calibration, unseen, reached)
 
 
 def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisition) -> Choice:

@@ -19,7 +19,7 @@ REASON_TEXT = MappingProxyType(
 )
 """Of the reasons for which a drawn pose is not taken."""
 
-NOISE_WORDS = MappingProxyType(
+NOISE_TEXT = MappingProxyType(
     {
         "robot_mm": "stated noise of each flange, mm per axis",
         "robot_deg": "stated noise of each flange, ° per axis",
@@ -55,7 +55,7 @@ def _poses(facts: Facts) -> list[str]:
 
 
 def _calibration(facts: Facts) -> list[str]:
-    noise = ", ".join(f"{NOISE_WORDS[key]} {value:.3f}" for key, value in facts["noise"].items())
+    noise = ", ".join(f"{NOISE_TEXT[key]} {value:.3f}" for key, value in facts["noise"].items())
     lines = [
         "calibration: residuals {residual_rms_mm:.3f} mm rms, {iterations} iterations, "
         "condition {condition:.1e}".format(**facts),

@@ -25,7 +25,7 @@ from puncture_twin.twin.jobs.servo.liu2007 import (
     paper_servo_only_at_least,
 )
 
-WAYS = ("open_loop", "servoed")
+PHASES = ("open_loop", "servoed")
 """By mapping and robot alone, and after the servo."""
 
 Facts = Mapping[str, Any]
@@ -51,7 +51,9 @@ def _needle(case: ServoCase, trials: Sequence[ServoTrial]) -> dict[str, Any]:
     """The needle against the anatomy, predicted beside realised, over all seeds."""
     test = declaration_test(trials)
     return {
-        **{way: _needles([getattr(row, f"needle_{way}") for one in trials for row in one.rows]) for way in WAYS},
+        **{
+            phase: _needles([getattr(row, f"needle_{phase}") for one in trials for row in one.rows]) for phase in PHASES
+        },
         "hit_radius_mm": case.file.target.hit_radius_mm,
         "wrong_belief": case.wrong_belief,
         "declared": case.errors.stated(),
@@ -69,8 +71,8 @@ def reproduction_facts(result: Liu2007Tables) -> dict[str, Any]:
     tilted = result.tilted
     calibration = tilted.case.file.calibration.tilt_deg
     return {
-        "holds": result.holds,
-        "conditions": [condition._asdict() for condition in result.conditions],
+        "holds": result.passed,
+        "conditions": [{"words": one.text, "holds": one.passed} for one in result.conditions],
         "paper_gain_mm": paper_gain_mm(),
         "gain": tilted.gain._asdict(),
         "gain_with_the_rod_tilted_alike": result.straight.gain._asdict(),
@@ -83,7 +85,7 @@ def reproduction_facts(result: Liu2007Tables) -> dict[str, Any]:
 def paper_facts() -> dict[str, Any]:
     """The paper's tables, as printed and by their rows."""
     return {
-        "paper": [{**column._asdict(), "holds": column.holds} for column in paper_columns()],
+        "paper": [{**column._asdict(), "holds": column.passed} for column in paper_columns()],
         "paper_table_1_mm": list(TABLE_1),
         "paper_table_2_mm": [list(row) for row in TABLE_2],
         "paper_servo_only_at_least_mm": list(paper_servo_only_at_least()),
@@ -91,20 +93,20 @@ def paper_facts() -> dict[str, Any]:
 
 
 def _session(one: ServoTrial) -> dict[str, Any]:
-    held = not one.refused
+    finished = not one.refused
     return {
         "seed": one.seed,
         "refused": one.refused or None,
         "stereo_mm": list(one.stereo_mm),
         "calibration_rms_px": list(one.rms_px),
-        "fre_mm": one.fre_mm if held else None,
-        "robot_residual_mm": one.robot_residual_mm if held else None,
+        "fre_mm": one.fre_mm if finished else None,
+        "robot_residual_mm": one.robot_residual_mm if finished else None,
         "targets": [_target(row) for row in one.rows],
     }
 
 
 def _target(row: TargetRow) -> dict[str, Any]:
-    needles = {f"needle_{way}": getattr(row, f"needle_{way}") for way in WAYS}
+    needles = {f"needle_{phase}": getattr(row, f"needle_{phase}") for phase in PHASES}
     return {**row._asdict(), **{key: None if one is None else _outcome(one) for key, one in needles.items()}}
 
 

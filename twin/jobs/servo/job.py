@@ -12,7 +12,7 @@ from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_
 from puncture_twin.twin.guidance.stereo.session import Session
 from puncture_twin.twin.jobs.servo import liu2007
 from puncture_twin.twin.jobs.servo.facts import Facts, reproduction_facts, servo_facts
-from puncture_twin.twin.jobs.servo.liu2007 import held_sessions
+from puncture_twin.twin.jobs.servo.liu2007 import finished_sessions
 from puncture_twin.twin.jobs.servo.page import write_servo_page
 from puncture_twin.twin.jobs.servo.pictures import draw_cameras, draw_convergence
 from puncture_twin.twin.jobs.servo.text import reproduction_text, servo_text
@@ -23,7 +23,7 @@ NAMES = ("servo.html", "convergence.png", "camera_1.png", "camera_2.png")
 class ServoJob(NamedTuple):
     """What came of a job."""
 
-    holds: bool
+    passed: bool
     """Whether every servo converged; for the paper, whether every condition that is printed holds."""
     summary: dict[str, Any]
     """Plain values."""
@@ -53,7 +53,7 @@ def run_servo(
     """
     case = load_servo_case(path)
     with writing(out_dir, "servo", inputs=case.inputs, names=NAMES, note=note) as draft:
-        result = held_sessions(case, seeds, done)
+        result = finished_sessions(case, seeds, done)
         facts = servo_facts(case, result.trials, result.ours)
         written = _files(case, result.first, facts, draft.folder)
     facts["files"] = [str(path) for path in draft.final(written)]
@@ -68,7 +68,7 @@ def reproduce_paper(out_dir: Path, seeds: int | None) -> ServoJob:
         facts = reproduction_facts(result)
         written = _files(result.tilted.case, result.tilted.first, facts, draft.folder)
     facts["files"] = [str(path) for path in draft.final(written)]
-    return ServoJob(result.holds, facts, reproduction_text(facts))
+    return ServoJob(result.passed, facts, reproduction_text(facts))
 
 
 def _files(case: ServoCase, first: Session, facts: Facts, out_dir: Path) -> list[Path]:

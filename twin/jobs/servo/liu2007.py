@@ -57,7 +57,7 @@ MOST_OVER_MAPPING = 1.1
 """After the servo, over the mapping's error, which is the floor: what is allowed beyond chance. The paper: 0.94."""
 
 MOST_NOT_CONFIRMED = 0.1
-"""Share of the targets at which the servo may end without confirming; the paper reports none of sixteen."""
+"""Fraction of the targets at which the servo may end without confirming; the paper reports none of sixteen."""
 
 CHANCE = 2.0
 """Standard errors that a condition allows for."""
@@ -76,7 +76,7 @@ class PaperMean(NamedTuple):
     max: float
 
     @property
-    def holds(self) -> bool:
+    def passed(self) -> bool:
         """Whether mean and maximum are what the rows give, to the paper's rounding."""
         wrong = max(abs(self.mean - self.printed_mean), abs(self.max - self.printed_max))
         return wrong <= ROUNDING_MM + 1e-9
@@ -92,8 +92,8 @@ class MeanOfSeeds(NamedTuple):
 class Condition(NamedTuple):
     """What must be so for the paper's finding to hold in our room."""
 
-    words: str
-    holds: bool
+    text: str
+    passed: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ class Liu2007Tables:
     """The paper's numbers, and ours.
 
     Attributes:
-        tilted: Sessions in the room like the paper's; there the rod is tilted more during the calibration than after.
+        tilted: Sessions in a workcell like the paper's: the rod is tilted more during the calibration than after.
         straight: The same rooms with the rod tilted alike.
     """
 
@@ -155,15 +155,15 @@ class Liu2007Tables:
         )
 
     @property
-    def holds(self) -> bool:
+    def passed(self) -> bool:
         """Whether every condition holds."""
-        return all(condition.holds for condition in self.conditions)
+        return all(condition.passed for condition in self.conditions)
 
 
 def _mean_of_seeds(trials: Sequence[ServoTrial], values: list[list[float]]) -> MeanOfSeeds:
     """Over the seeds whose session could be held; with one seed its targets stand for them, which is too sure."""
-    held = [np.array(rows) for one, rows in zip(trials, values, strict=True) if not one.refused]
-    means = np.array([float(rows.mean()) for rows in held]) if len(held) > 1 else held[0]
+    finished = [np.array(rows) for one, rows in zip(trials, values, strict=True) if not one.refused]
+    means = np.array([float(rows.mean()) for rows in finished]) if len(finished) > 1 else finished[0]
     error = float(np.std(means, ddof=1) / np.sqrt(len(means))) if len(means) > 1 else float("inf")
     return MeanOfSeeds(float(means.mean()), error)
 
@@ -200,10 +200,10 @@ def reproduce(seeds: int | None = None, done: Count | None = None) -> Liu2007Tab
         done: Told how many of how many are done.
     """
     tilted, count = paper_case(), seeds or DEFAULT_SEEDS
-    tell = done or (lambda at, of: None)
+    report = done or (lambda at, of: None)
     return Liu2007Tables(
-        held_sessions(tilted, count, lambda at, of: tell(at, 2 * of)),
-        held_sessions(straightened(tilted), count, lambda at, of: tell(at + of, 2 * of)),
+        finished_sessions(tilted, count, lambda at, of: report(at, 2 * of)),
+        finished_sessions(straightened(tilted), count, lambda at, of: report(at + of, 2 * of)),
     )
 
 
@@ -219,13 +219,13 @@ def paper_gain_mm() -> float:
     return float(rows[:, 1].mean() - rows[:, 2].mean())
 
 
-def held_sessions(case: ServoCase, seeds: int, done: Count | None = None) -> ServoSessions:
+def finished_sessions(case: ServoCase, seeds: int, done: Count | None = None) -> ServoSessions:
     """The sessions of a case, from its own seed on."""
     first = run_session(case, case.file.seed)
-    tell = done or (lambda at, of: None)
-    tell(1, seeds)
+    report = done or (lambda at, of: None)
+    report(1, seeds)
     others: Sequence[ServoTrial] = run_trials(
-        case, range(case.file.seed + 1, case.file.seed + seeds), done=lambda at, of: tell(at + 1, seeds)
+        case, range(case.file.seed + 1, case.file.seed + seeds), done=lambda at, of: report(at + 1, seeds)
     )
     trials = (trial(first), *others)
     return ServoSessions(case, first, trials, statistics(trials))

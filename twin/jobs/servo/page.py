@@ -139,9 +139,9 @@ def _paper(facts: Facts) -> Markup:
     ]
     head = ("target", "mapping", "before", "after", "servo-only", "ours: mapping", "before", "after", "servo-only",
             "corrections")  # fmt: skip
-    words = (
+    text = (
         "The paper's head, robot and targets are not ours: compare means, not rows. It did not measure what the servo "
         "alone leaves; by the triangle's inequality it is at least |after − mapping|. "
         f"Rows of the twin: seed {first['seed']}."
     )
-    return Markup("<h2>Liu et al. 2007, and ours</h2>") + faint(words) + two(means, table(head, body, kind="numbers"))
+    return Markup("<h2>Liu et al. 2007, and ours</h2>") + faint(text) + two(means, table(head, body, kind="numbers"))

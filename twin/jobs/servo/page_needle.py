@@ -7,7 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from puncture_twin.twin.jobs.servo.text import DOUBTED, NOT_MODELLED, WAY_WORDS
+from puncture_twin.twin.jobs.servo.text import DOUBTED, NOT_MODELLED, PHASE_TEXT
 from puncture_twin.twin.report.page.page_tables import faint, table
 
 TARGET_HEAD = (
@@ -23,9 +23,9 @@ def needle_section(needle: Mapping[str, Any], first: Mapping[str, Any]) -> Marku
         needle: Of the facts, over all seeds.
         first: The session that is shown in full.
     """
-    columns = [needle[way] for way in WAY_WORDS]
-    rows = [(words, *(_cell(one, keys) for one in columns)) for words, keys in _rows(needle["hit_radius_mm"])]
-    all_seeds = table(("realised / predicted", *WAY_WORDS.values()), rows, kind="numbers")
+    columns = [needle[phase] for phase in PHASE_TEXT]
+    rows = [(label, *(_cell(one, keys) for one in columns)) for label, keys in _rows(needle["hit_radius_mm"])]
+    all_seeds = table(("realised / predicted", *PHASE_TEXT.values()), rows, kind="numbers")
     each = table(TARGET_HEAD, [_needle(row) for row in first["targets"]], kind="numbers")
     return all_seeds + faint(" ".join(_reserves(needle))) + each
 

@@ -1,4 +1,4 @@
-"""Pictures of a session: the room through each camera, and how the servo came to rest."""
+"""Pictures of a session: the workcell through each camera, and how the servo came to rest."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def draw_cameras(session: Session, path_of: Path) -> list[Path]:
     """Write ``camera_1.png``, ``camera_2.png``: the first target's end, as each camera sees it; returns the paths."""
     reached = next((one for one in session.reached if one.servoed.visits), session.reached[0])
     paths = []
-    for number, camera in enumerate(session.room.cameras):
+    for number, camera in enumerate(session.workcell.cameras):
         picture = Image.fromarray(_workcell_picture(session, reached, camera))
         scale = WIDTH_PX / camera.width
         picture = picture.resize((WIDTH_PX, round(camera.height * scale)), Image.Resampling.LANCZOS)
@@ -57,50 +57,54 @@ def draw_cameras(session: Session, path_of: Path) -> list[Path]:
 
 def _workcell_picture(session: Session, reached: Reached, camera: Camera) -> NDArray[np.uint8]:
     """The true room by PyBullet, through the camera without its lens's distortion."""
-    room, file = session.room, session.room.case.file
-    T_base_c = np.linalg.inv(room.T_c_base)
+    workcell, file = session.workcell, session.workcell.case.file
+    T_base_c = np.linalg.inv(workcell.T_c_base)
     tool = Tool(file.tool.rod_mm, file.tool.rod_mm - file.tool.holder_mm, file.tool.rod_diameter_mm,
                 file.tool.holder_diameter_mm)  # fmt: skip
     boxes = [Box(box.name, pose(np.eye(3), box.center_mm), box.size_mm) for box in file.box]
-    with open_workcell(room.model, tool, room.case.skin, T_base_c @ room.T_c_m, boxes, down_ct=DOWN) as opened:
-        opened.arm.place(reached.servoed.q_true)
-        flange = opened.arm.flange_pose()
-        load_ball(opened.client, flange[:3, 3] + file.tool.rod_mm * flange[:3, 2], file.tool.ball_diameter_mm / 2,
+    with open_workcell(
+        workcell.model, tool, workcell.case.skin, T_base_c @ workcell.T_c_m, boxes, down_ct=DOWN
+    ) as simulated:
+        simulated.arm.place(reached.servoed.q_true)
+        flange = simulated.arm.flange_pose()
+        load_ball(simulated.client, flange[:3, 3] + file.tool.rod_mm * flange[:3, 2], file.tool.ball_diameter_mm / 2,
                   (0.95, 0.5, 0.1, 1.0))  # fmt: skip
-        for marker in apply(T_base_c, room.markers_c):
-            load_ball(opened.client, marker, file.head.marker_diameter_mm / 2, (0.2, 0.4, 0.9, 1.0))
+        for marker in apply(T_base_c, workcell.markers_c):
+            load_ball(simulated.client, marker, file.head.marker_diameter_mm / 2, (0.2, 0.4, 0.9, 1.0))
         return pinhole_picture(
-            opened.client, (camera.width, camera.height), camera.K, camera.T_camera_c @ room.T_c_base
+            simulated.client, (camera.width, camera.height), camera.K, camera.T_camera_c @ workcell.T_c_base
         )
 
 
 def _annotate(picture: Image.Image, session: Session, reached: Reached, number: int, scale: float) -> None:
-    draw, room = ImageDraw.Draw(picture), session.room
-    camera, believed = room.cameras[number].pinhole(), session.calibration.cameras[number].pinhole()
-    for name, marker in zip(room.case.markers.names, session.mapping.to_c(room.case.markers.points), strict=True):
+    draw, workcell = ImageDraw.Draw(picture), session.workcell
+    camera, believed = workcell.cameras[number].pinhole(), session.calibration.cameras[number].pinhole()
+    for name, marker in zip(
+        workcell.case.markers.names, session.mapping.to_c(workcell.case.markers.points), strict=True
+    ):
         _ring(draw, believed.project(marker) * scale, 16, MARKER, name)
-    for target, point in zip(room.case.targets.names, room.targets_c, strict=True):
+    for target, point in zip(workcell.case.targets.names, workcell.targets_c, strict=True):
         _cross(draw, camera.project(point) * scale, TARGET, 9 if target == reached.target else 3)
     if reached.servoed.visits:
         _ring(draw, believed.project(reached.servoed.visits[-1].seen.ball_c) * scale, 18, BALL, "")
     lines = (
-        (f"camera {number + 1}: {room.case.name}, seed {session.seed}, at the end of target {reached.target}", INK),
+        (f"camera {number + 1}: {workcell.case.name}, seed {session.seed}, at the end of target {reached.target}", INK),
         ("orange ring: ball as measured", BALL),
         ("green cross: true targets, the large one served now", TARGET),
         ("blue rings: markers where the mapping has them", MARKER),
         ("the room is drawn for looking at, without the lens's distortion", INK),
     )
-    for row, (words, colour) in enumerate(lines):
-        write(draw, (16, 14 + 24 * row), words, size=17, bold=row == 0, colour=colour, halo=3)
+    for row, (text, colour) in enumerate(lines):
+        write(draw, (16, 14 + 24 * row), text, size=17, bold=row == 0, colour=colour, halo=3)
     if reached.servoed.visits:
         _inset(picture, session, reached, number)
 
 
-def _ring(draw: ImageDraw.ImageDraw, at: Floats, radius: float, colour: Rgb, words: str) -> None:
+def _ring(draw: ImageDraw.ImageDraw, at: Floats, radius: float, colour: Rgb, text: str) -> None:
     x, y = (float(v) for v in at)
     draw.ellipse([x - radius, y - radius, x + radius, y + radius], outline=colour, width=3)
-    if words:
-        write(draw, (x + radius + 4, y), words, size=15, colour=colour, anchor="lm", halo=3)
+    if text:
+        write(draw, (x + radius + 4, y), text, size=15, colour=colour, anchor="lm", halo=3)
 
 
 def _cross(draw: ImageDraw.ImageDraw, at: Floats, colour: Rgb, size: float) -> None:
@@ -111,11 +115,11 @@ def _cross(draw: ImageDraw.ImageDraw, at: Floats, colour: Rgb, size: float) -> N
 
 def _inset(picture: Image.Image, session: Session, reached: Reached, number: int) -> None:
     """What is really measured: the analytic picture of the ball, enlarged, with the outline that was found."""
-    room, tool = session.room, session.room.case.file.tool
-    camera, believed = room.cameras[number], session.calibration.cameras[number]
-    seen, plan = reached.servoed.visits[-1].seen.ball_c, room.case.file.cameras
+    workcell, tool = session.workcell, session.workcell.case.file.tool
+    camera, believed = workcell.cameras[number], session.calibration.cameras[number]
+    seen, plan = reached.servoed.visits[-1].seen.ball_c, workcell.case.file.cameras
     q_true, rng = reached.servoed.q_true, np.random.default_rng(session.seed)
-    ball = LocatedPair(room.ball_c(q_true), tool.ball_diameter_mm / 2, room.rod_c(q_true))
+    ball = LocatedPair(workcell.ball_c(q_true), tool.ball_diameter_mm / 2, workcell.rod_c(q_true))
     half = round(INSET_HALF_PX * camera.width / WIDTH_PX)
     grey = render(
         camera, ball_scene(plan, ball, 0.0, rng), rng=rng, noise=plan.noise_grey, blur_px=plan.blur_px, half_px=half
@@ -130,8 +134,8 @@ def _inset(picture: Image.Image, session: Session, reached: Reached, number: int
     _cross(draw, np.array([x, y]), BALL, 6)
     corner = (picture.width - side - 16, picture.height - side - 16)
     picture.paste(inset, corner)
-    words = f"what is measured, x{zoom:.1f}"
-    write(ImageDraw.Draw(picture), (corner[0], corner[1] - 8), words, size=15, colour=BALL, anchor="lb", halo=3)
+    text = f"what is measured, x{zoom:.1f}"
+    write(ImageDraw.Draw(picture), (corner[0], corner[1] - 8), text, size=15, colour=BALL, anchor="lb", halo=3)
 
 
 def draw_convergence(session: Session, path: Path) -> None:
@@ -145,7 +149,7 @@ def draw_convergence(session: Session, path: Path) -> None:
         visits = one.servoed.visits
         if not visits:
             continue
-        true = [np.linalg.norm(session.room.ball_c(v.q_true) - v.seen.target_c) for v in visits]
+        true = [np.linalg.norm(session.workcell.ball_c(v.q_true) - v.seen.target_c) for v in visits]
         looks = np.arange(len(visits))
         longest = max(longest, len(visits) - 1)
         (line,) = axes.plot(looks, true, "-", linewidth=1.2, label=one.target)
@@ -156,7 +160,7 @@ def draw_convergence(session: Session, path: Path) -> None:
 
 
 def _finish(axes: Axes, session: Session, longest: int) -> None:
-    tolerance = session.room.case.file.servo.tolerance_mm
+    tolerance = session.workcell.case.file.servo.tolerance_mm
     axes.axhline(tolerance, color="#d6001e", linewidth=1)
     axes.annotate(f"tolerance {tolerance:g} mm", (longest, tolerance), ha="right", va="bottom", color="#d6001e")
     axes.set_yscale("log")

@@ -11,7 +11,7 @@ from puncture_twin.twin.jobs.servo.facts import Facts, our_errors
 
 NEEDLE_HEAD = "needle expected  95 % half axes      lateral  depth  direction  realised   (mm, deg; after the servo)"
 
-WAY_WORDS = {"open_loop": "by mapping and robot alone", "servoed": "after the servo"}
+PHASE_TEXT = {"open_loop": "by mapping and robot alone", "servoed": "after the servo"}
 
 NOT_MODELLED = "a rod that bends, cameras that move after the calibration, tissue"
 
@@ -75,18 +75,18 @@ def needle_lines(needle: Mapping[str, Any]) -> list[str]:
     """Tip and direction against the anatomy, before and after the servo: realised beside predicted."""
     wrong = ", drawn from [rehearsal.errors]: the belief is wrong by design" if needle["wrong_belief"] else ""
     lines = [f"needle against the anatomy{wrong}:   realised   predicted"]
-    for way, words in WAY_WORDS.items():
-        lines += _way_lines(words, needle[way], needle["hit_radius_mm"])
+    for phase, text in PHASE_TEXT.items():
+        lines += _phase_lines(text, needle[phase], needle["hit_radius_mm"])
     lines.append("  the needles of one seed share its room: seeds count, not needles")
     return [*lines, *_declaration_lines(needle["declaration"]), f"  not modelled: {NOT_MODELLED}"]
 
 
-def _way_lines(words: str, one: Mapping[str, Any] | None, radius_mm: float | None) -> list[str]:
+def _phase_lines(text: str, one: Mapping[str, Any] | None, radius_mm: float | None) -> list[str]:
     if one is None:
-        return [f"  {words}: unknown"]
+        return [f"  {text}: unknown"]
     hit = f"    hit, within {radius_mm:g} mm" if radius_mm is not None else ""
     return [
-        f"  {words}, {one['needles']} needles",
+        f"  {text}, {one['needles']} needles",
         "    tip error, rms         {realised_rms_mm:12.3f} {predicted_rms_mm:11.3f} mm".format(**one),
         "    direction, rms         {realised_direction_deg:12.3f} {predicted_direction_deg:11.3f} deg".format(**one),
         f"    in the 95 % ellipsoid  {100 * one['coverage_95']:12.1f} {95.0:11.1f} %",
@@ -98,8 +98,8 @@ def _declaration_lines(test: Mapping[str, Any] | None) -> list[str]:
     """Whether what was measured is as far apart as declared."""
     if test is None:
         return ["  declared errors: not tested, the joint estimate does not settle"]
-    told = "  declared errors: residuals {chi_squared:.0f} for {freedom} degrees of freedom, p = {p:.3f}".format(**test)
-    return [told + ("; WARNING: they are larger than declared" if test["p"] < DOUBTED else "")]
+    line = "  declared errors: residuals {chi_squared:.0f} for {freedom} degrees of freedom, p = {p:.3f}".format(**test)
+    return [line + ("; WARNING: they are larger than declared" if test["p"] < DOUBTED else "")]
 
 
 def statistics_lines(ours: Mapping[str, Any]) -> list[str]:
@@ -140,10 +140,10 @@ def reproduction_text(facts: Facts) -> str:
 def _gain_lines(facts: Facts) -> list[str]:
     """What the servo is worth, and on what that rests."""
     gains = [facts["gain"], facts["gain_with_the_rod_tilted_alike"]]
-    told = [f"{one['mean']:.2f} (standard error {one['error']:.2f})" for one in gains]
+    line = [f"{one['mean']:.2f} (standard error {one['error']:.2f})" for one in gains]
     return [
-        f"gain, before - after: {told[0]} mm with the rod tilted {facts['tilted_more_deg']:.0f} deg more during the "
-        f"calibration than at the targets; {told[1]} mm tilted alike; paper {facts['paper_gain_mm']:.2f} mm",
+        f"gain, before - after: {line[0]} mm with the rod tilted {facts['tilted_more_deg']:.0f} deg more during the "
+        f"calibration than at the targets; {line[1]} mm tilted alike; paper {facts['paper_gain_mm']:.2f} mm",
         "  the tilt is ours: the paper states none, and what gave its robot the error is not known",
     ]
 

@@ -75,8 +75,8 @@ def chance_legend(axes: Axes, candidates: Candidates, y: float) -> float:
     if chance is None:
         return y
     axes.text(0.0, y + 0.03, "chance to touch nothing forbidden", fontsize=9.5, va="center")
-    words = (f"< {LEVELS[0]:g}", *(f"{low:g}–{high:g}" for low, high in pairwise(LEVELS)))
-    for place, (name, hatch) in enumerate(zip((*words, f"> {LEVELS[-1]:g}"), HATCHES, strict=True)):
+    text = (f"< {LEVELS[0]:g}", *(f"{low:g}–{high:g}" for low, high in pairwise(LEVELS)))
+    for place, (name, hatch) in enumerate(zip((*text, f"> {LEVELS[-1]:g}"), HATCHES, strict=True)):
         x = 0.25 * place
         box = Rectangle((x, y + 0.05), 0.07, 0.028, facecolor="#cdebdc", edgecolor="0.2", hatch=hatch, lw=0.8)
         axes.add_patch(box)

@@ -25,13 +25,13 @@ from puncture_twin.twin.report.map.chance_layer import chance_legend, draw_chanc
 from puncture_twin.twin.report.map.map_raster import MapRaster, clearance_range, map_raster
 from puncture_twin.twin.report.map_view import MapView, map_view, step_of
 from puncture_twin.twin.report.numbers import (
-    arm_words,
+    arm_text,
     nearest_structure,
-    needle_words,
+    needle_text,
     number,
     percent,
     reason_counts,
-    target_words,
+    target_text,
 )
 from puncture_twin.twin.report.palette import PNG_LEVEL, safe_shades
 
@@ -46,7 +46,7 @@ RIM = 1.26
 """Half the side of the map's axes; the disc has radius 1, labels lie between."""
 
 NAMED_FRACTION = 0.006
-"""Least share of the disc that a rejected region needs to carry its structure's name."""
+"""Least fraction of the disc that a rejected region needs to carry its structure's name."""
 
 MOST_LEGEND = 0.45
 """Height of the legend's lines together, of the column's: more reasons stand closer."""
@@ -142,13 +142,13 @@ def _names(axes: Axes, raster: MapRaster, candidates: Candidates) -> None:
     coarse = codes[::4, ::4]
     free = np.ones(coarse.shape, dtype=bool)
     for depth, structure in _regions(coarse, list(map(str, every))):
-        words = structure.replace("_", " ")
-        high, wide = (round(part * len(coarse) / 2) for part in _size(words))
-        room = np.where(ndimage.minimum_filter(free, (2 * high + 1, 2 * wide + 1)), depth, 0.0)
-        row, column = np.unravel_index(int(np.where(room.any(), room, depth).argmax()), depth.shape)
+        text = structure.replace("_", " ")
+        high, wide = (round(part * len(coarse) / 2) for part in _size(text))
+        space = np.where(ndimage.minimum_filter(free, (2 * high + 1, 2 * wide + 1)), depth, 0.0)
+        row, column = np.unravel_index(int(np.where(space.any(), space, depth).argmax()), depth.shape)
         free[max(0, row - high) : row + high + 1, max(0, column - wide) : column + wide + 1] = False
         x, y = (column + 0.5) / len(coarse) * 2 - 1, 1 - (row + 0.5) / len(coarse) * 2
-        _text(axes, x, y, words, size=NAME_POINTS, style="italic")
+        _text(axes, x, y, text, size=NAME_POINTS, style="italic")
 
 
 def _regions(codes: NDArray[np.int64], names: list[str]) -> list[tuple[NDArray[np.float64], str]]:
@@ -163,10 +163,10 @@ def _regions(codes: NDArray[np.int64], names: list[str]) -> list[tuple[NDArray[n
     return [(depth, name) for _, depth, name in sorted(found, key=lambda region: -region[0])]
 
 
-def _size(words: str) -> tuple[float, float]:
+def _size(text: str) -> tuple[float, float]:
     """Half the height and half the width of a name, in the disc's radii."""
     radius_points = MAP_BOX[3] * FIGURE_INCHES[1] * 72 / (2 * RIM)
-    return 0.7 * NAME_POINTS / radius_points, 0.29 * NAME_POINTS * len(words) / radius_points
+    return 0.7 * NAME_POINTS / radius_points, 0.29 * NAME_POINTS * len(text) / radius_points
 
 
 def _marks(axes: Axes, view: MapView, candidates: Candidates, pick: Pick | None) -> None:
@@ -190,8 +190,8 @@ def _marks(axes: Axes, view: MapView, candidates: Candidates, pick: Pick | None)
 
 
 def _title(figure: Figure, case: Any, candidates: Candidates) -> None:
-    figure.text(0.02, 0.955, f"{case.name}: entry directions to {target_words(case)}", fontsize=19, fontweight="bold")
-    line = f"{len(candidates):,} directions, step {np.degrees(step_of(candidates)):g}°;  {needle_words(case)}"
+    figure.text(0.02, 0.955, f"{case.name}: entry directions to {target_text(case)}", fontsize=19, fontweight="bold")
+    line = f"{len(candidates):,} directions, step {np.degrees(step_of(candidates)):g}°;  {needle_text(case)}"
     if not candidates.arm_checked:
         line += ";  ARM NOT CHECKED"
     figure.text(0.02, 0.918, line, fontsize=12, color="0.25")
@@ -217,7 +217,7 @@ def _side(axes: Axes, case: Any, candidates: Candidates, view: MapView, pick: Pi
         "from OUTSIDE, along −z of the entry frame. A point is\n"
         "where the needle comes from: θ grows from the centre\n"
         "to the rim, β runs counter-clockwise.\n"
-        f"{toward}{_folded(arm_words(candidates), 52)}",
+        f"{toward}{_folded(arm_text(candidates), 52)}",
         fontsize=9.5,
         color="0.25",
         va="bottom",
@@ -227,24 +227,24 @@ def _side(axes: Axes, case: Any, candidates: Candidates, view: MapView, pick: Pi
 
 def _legend(axes: Axes, candidates: Candidates) -> float:
     y = 0.0
-    for x, words in ((0.62, "directions"), (0.79, "of grid"), (1.0, "of solid\nangle")):
-        axes.text(x, y + 0.012, words, fontsize=9, color="0.35", ha="right", va="bottom")
+    for x, text in ((0.62, "directions"), (0.79, "of grid"), (1.0, "of solid\nangle")):
+        axes.text(x, y + 0.012, text, fontsize=9, color="0.35", ha="right", va="bottom")
     counts = reason_counts(candidates)
     for line in counts:
         y += min(0.05, MOST_LEGEND / len(counts))
         bold = "bold" if line.code == "safe" else "normal"
         colour = np.array(line.colour) / 255
         axes.add_patch(Rectangle((0.0, y - 0.017), 0.06, 0.032, facecolor=colour, edgecolor="black", lw=0.8))
-        axes.text(0.085, y, _folded(line.words), fontsize=10.5, va="center", fontweight=bold, linespacing=0.95)
+        axes.text(0.085, y, _folded(line.text), fontsize=10.5, va="center", fontweight=bold, linespacing=0.95)
         axes.text(0.62, y, f"{line.count:,}", fontsize=10.5, ha="right", va="center", fontweight=bold)
         axes.text(0.79, y, percent(line.fraction), fontsize=10.5, ha="right", va="center", fontweight=bold)
         axes.text(1.0, y, percent(line.solid_angle), fontsize=10.5, ha="right", va="center", fontweight=bold)
     return y
 
 
-def _folded(words: str, width: int = 19) -> str:
+def _folded(text: str, width: int = 19) -> str:
     lines = [""]
-    for word in words.split():
+    for word in text.split():
         if len(lines[-1]) + len(word) + 1 > width and lines[-1]:
             lines.append("")
         lines[-1] = f"{lines[-1]} {word}".strip()
@@ -283,9 +283,9 @@ def _mark_legend(axes: Axes, candidates: Candidates, y: float) -> float:
 
 def _chosen(axes: Axes, candidates: Candidates, pick: Pick | None, y: float) -> float:
     if pick is None:
-        words = "NOTHING IS SAFE\nEvery direction of the grid is refused."
+        text = "NOTHING IS SAFE\nEvery direction of the grid is refused."
         box = {"facecolor": "#ffe9e0", "edgecolor": "#b03000", "boxstyle": "round,pad=0.5"}
-        axes.text(0.02, y + 0.03, words, fontsize=13, fontweight="bold", color="#a02000", va="top", bbox=box)
+        axes.text(0.02, y + 0.03, text, fontsize=13, fontweight="bold", color="#a02000", va="top", bbox=box)
         return y + 0.12
     word = "Best" if pick == best_pick(candidates) else "Chosen"
     candidates, row = pick
@@ -311,5 +311,5 @@ def _chances(candidates: Candidates, row: int) -> str:
     return f"; p(hit) {hit}, p(touch) {touch}"
 
 
-def _text(axes: Axes, x: float, y: float, words: str, *, size: float, style: str = "normal") -> None:
-    axes.text(x, y, words, fontsize=size, style=style, ha="center", va="center", zorder=9, path_effects=list(HALO))
+def _text(axes: Axes, x: float, y: float, text: str, *, size: float, style: str = "normal") -> None:
+    axes.text(x, y, text, fontsize=size, style=style, ha="center", va="center", zorder=9, path_effects=list(HALO))

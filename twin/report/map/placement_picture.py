@@ -27,8 +27,8 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.place.mounts import Region
 from puncture_twin.planning.place.search import PlaceSearch, RatedPlacement
-from puncture_twin.twin.report.mount_text import direction_words, mount_words
-from puncture_twin.twin.report.numbers import needle_words, target_words
+from puncture_twin.twin.report.mount_text import direction_text, mounting_text
+from puncture_twin.twin.report.numbers import needle_text, target_text
 
 DPI = 110
 PANEL_INCHES = 4.3
@@ -78,8 +78,8 @@ def draw_placements(found: PlaceSearch, case: Any, skin: TriangleMesh, path: Pat
     _legend(grid[len(panels)], figure, found, case, scale)
     for axes in grid[len(panels) + 1 :]:
         axes.set_axis_off()
-    title = f"{case.name}: where to stand the {case.robot.model.upper()} for {target_words(case)}"
-    figure.suptitle(f"{title}\n{needle_words(case)}", fontsize=14, fontweight="bold")
+    title = f"{case.name}: where to stand the {case.robot.model.upper()} for {target_text(case)}"
+    figure.suptitle(f"{title}\n{needle_text(case)}", fontsize=14, fontweight="bold")
     figure.tight_layout(rect=(0, 0.02, 1, 0.98))
     figure.text(0.99, 0.006, "research software, not a medical device", fontsize=9, color="0.4", ha="right")
     with atomic(Path(path)) as temporary:
@@ -113,8 +113,8 @@ def _panel(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any,
         colour = SHADES(scale(fraction)) if fraction > 0 else NOTHING
         axes.add_patch(Rectangle((x - step / 2, y - step / 2), step, step, facecolor=colour, edgecolor="none"))
     space = str(case.space)
-    words = mount_words(regions[0], found.T_ct_bed, space) if len(regions) == 1 else regions[0].mount
-    axes.set_title(words, fontsize=11.5, fontweight="bold")
+    text = mounting_text(regions[0], found.T_ct_bed, space) if len(regions) == 1 else regions[0].mount
+    axes.set_title(text, fontsize=11.5, fontweight="bold")
     axes.set_aspect("equal")
     axes.tick_params(labelsize=8)
     axes.xaxis.set_major_locator(MultipleLocator(TICKS_MM))
@@ -130,12 +130,12 @@ def _directions(axes: Axes, found: PlaceSearch, space: str) -> None:
     R = found.T_ct_bed[:3, :3]
     places = ((R[:, 0], 0.5, 0.985, "top"), (-R[:, 0], 0.5, 0.015, "bottom"))
     for direction, x, y, side in places:
-        words = direction_words(direction, space)
-        axes.text(x, y, words, transform=axes.transAxes, ha="center", va=side, fontsize=9, path_effects=HALO, zorder=8)
+        text = direction_text(direction, space)
+        axes.text(x, y, text, transform=axes.transAxes, ha="center", va=side, fontsize=9, path_effects=HALO, zorder=8)
     for direction, x, turn in ((R[:, 1], 0.015, 90), (-R[:, 1], 0.985, -90)):
-        words, side = direction_words(direction, space), "left" if x < 0.5 else "right"
+        text, side = direction_text(direction, space), "left" if x < 0.5 else "right"
         look: dict[str, Any] = {"fontsize": 9, "path_effects": HALO, "zorder": 8}
-        axes.text(x, 0.5, words, transform=axes.transAxes, ha=side, va="center", rotation=turn, **look)
+        axes.text(x, 0.5, text, transform=axes.transAxes, ha=side, va="center", rotation=turn, **look)
 
 
 def _marks(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any) -> None:
@@ -154,12 +154,12 @@ def _worth(one: RatedPlacement) -> str:
     return f"{100 * one.verdict.fraction:.0f} %"
 
 
-def _mark(axes: Axes, x: float, y: float, shape: str, words: str) -> None:
+def _mark(axes: Axes, x: float, y: float, shape: str, text: str) -> None:
     size = 230 if shape == "*" else 60
     axes.scatter([x], [y], s=size, marker=shape, c="white", edgecolors="black", linewidths=1.3, zorder=9)
     offset, align = ((0, -15), "center") if shape != "D" else ((8, -3), "left")
     axes.annotate(
-        words, (x, y), offset, textcoords="offset points", ha=align, fontsize=8.5, path_effects=HALO, zorder=10
+        text, (x, y), offset, textcoords="offset points", ha=align, fontsize=8.5, path_effects=HALO, zorder=10
     )
 
 
@@ -181,8 +181,8 @@ def _bed(axes: Axes, found: PlaceSearch, case: Any, skin: TriangleMesh) -> None:
 
 def _legend(axes: Axes, figure: Figure, found: PlaceSearch, case: Any, scale: Normalize) -> None:
     axes.set_axis_off()
-    up = direction_words(found.T_ct_bed[:3, 2], str(case.space))
-    words = (
+    up = direction_text(found.T_ct_bed[:3, 2], str(case.space))
+    text = (
         "HOW TO READ\n"
         f"Every panel looks down on the bed (toward you: {up or 'place.up'}).\n"
         "Ticks are mm from the target (red +). A cell is the middle\n"
@@ -195,11 +195,11 @@ def _legend(axes: Axes, figure: Figure, found: PlaceSearch, case: Any, scale: No
         + "\n\nSolid line: the patient from above. Dashed: table, gantry,\nother boxes.\n\n"
     )
     if found.possible < ALL_OF_IT:
-        words += (
+        text += (
             f"From anywhere at most {100 * found.possible:.0f} % can be held: elsewhere\n"
             "the needle itself would start too near the skin."
         )
-    axes.text(0.0, 1.0, words, transform=axes.transAxes, fontsize=9.5, va="top", linespacing=1.35)
+    axes.text(0.0, 1.0, text, transform=axes.transAxes, fontsize=9.5, va="top", linespacing=1.35)
     bar = axes.inset_axes((0.0, 0.06, 0.95, 0.05))
     figure.colorbar(ScalarMappable(scale, SHADES), cax=bar, orientation="horizontal")
     bar.set_xlabel("share of the organ-safe solid angle, 0..1", fontsize=9)

@@ -19,11 +19,11 @@ from puncture_twin.twin.report.numbers import (
     TRUTH_IS_BELIEF,
     demanding,
     nearest_structure,
-    needle_words,
+    needle_text,
     number,
     percent,
     reason_counts,
-    target_words,
+    target_text,
 )
 from puncture_twin.twin.report.page import page_tables as tables
 from puncture_twin.twin.report.page.page_chances import chance_card, chances_section, rooms_section
@@ -95,10 +95,10 @@ def write_page(
     write_html(
         "report.html",
         path,
-        title=f"{case.name}: puncture of {target_words(case)}",
-        stands=_stands(case),
+        title=f"{case.name}: puncture of {target_text(case)}",
+        stands=_location(case),
         dates=dates_text(case),
-        needle=needle_words(case),
+        needle=needle_text(case),
         sliced=bool(slices),
         tones=SHOWN_TONES if slices and slices[0].panels[0].hu is not None else (),
         methods=methods_text(case, anatomy, candidates),
@@ -153,7 +153,7 @@ def _cards(
         detail = f"{touched} contact{'s' if touched != 1 else ''}" if touched else "no contact"
         expected = f"expected (rms) {number(rehearsal.predicted_error_mm, 2, 'mm')}; {detail}"
         if rehearsal.standing is not None:
-            expected = f"{rehearsal.standing.words}; {expected}"
+            expected = f"{rehearsal.standing.text}; {expected}"
         cards.append(Card("rehearsed tip error", number(rehearsal.tip_error_mm, 2, "mm"), expected))
     return cards
 
@@ -162,10 +162,10 @@ def _counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def _stands(case: Any) -> str:
+def _location(case: Any) -> str:
     """Case, space and target in the coordinates that the case is written in."""
     point = ", ".join(f"{mm:.1f}" for mm in to_lps(np.asarray(case.target_ct)[None], case.space)[0])
-    return f"Case {case.name}; target {target_words(case)} at ({point}) mm {case.space};"
+    return f"Case {case.name}; target {target_text(case)} at ({point}) mm {case.space};"
 
 
 def _direction_card(candidates: Candidates, row: int, *, best: bool) -> Card:

@@ -13,7 +13,7 @@ MOST_STRUCTURES = 6
 MOST_POINTS = 600
 
 NAMED_PHASE = 0.07
-"""Share of the time that a phase must last to carry its name; shorter ones would overlap."""
+"""Fraction of the time that a phase must last to carry its name; shorter ones would overlap."""
 
 
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")

@@ -9,7 +9,7 @@ import numpy as np
 
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import step_of
-from puncture_twin.twin.report.numbers import needle_words
+from puncture_twin.twin.report.numbers import needle_text
 from puncture_twin.twin.report.page.page_tables import PROJECT
 
 
@@ -31,7 +31,7 @@ def methods_text(case: Any, anatomy: Any, candidates: Candidates) -> str:
     return (
         f"Straight needle paths to the target were searched with {PROJECT} {version(PROJECT)} over {len(candidates):,} "
         f"entry directions, θ {theta.min():g}° to {theta.max():g}° and every azimuth β of the case, in steps of "
-        f"{step:g}° (angles as in Chen et al. 2019, Eq. 10-15; {needle_words(case)}). For each direction the distance "
+        f"{step:g}° (angles as in Chen et al. 2019, Eq. 10-15; {needle_text(case)}). For each direction the distance "
         f"between the needle and each of {checked} structures to keep away from was computed exactly on their triangle "
         f"meshes and compared with the structure's margin; a direction through a region that the images or labels do "
         f"not show was refused as unknown. {arm} {chances} Every input is listed below with its SHA-256. "

@@ -16,7 +16,7 @@ from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.base.reasons import Reason, css
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
-from puncture_twin.twin.report.numbers import arm_words, nearest_structure, number, percent, reason_counts
+from puncture_twin.twin.report.numbers import arm_text, nearest_structure, number, percent, reason_counts
 
 PROJECT = "puncture-twin"
 
@@ -37,7 +37,7 @@ BEST_COLUMNS = (
     "on the skin cm²",
 )
 
-CONE_WORDS = {
+CONE_TEXT = {
     "grid": "by the directions of the search, to one step; a certificate proves it",
     "certificate": "proven by the certificate",
 }
@@ -105,16 +105,16 @@ def best_table(candidates: Candidates) -> Markup:
                 number(window.entry_cm2, 1),
             )
         )
-    return table(BEST_COLUMNS, lines, kind="numbers") + faint(_windows_words(candidates, len(windows)))
+    return table(BEST_COLUMNS, lines, kind="numbers") + faint(_windows_text(candidates, len(windows)))
 
 
-def _windows_words(candidates: Candidates, count: int) -> str:
+def _windows_text(candidates: Candidates, count: int) -> str:
     shown = f"{MOST_WINDOWS} of {count}" if count > MOST_WINDOWS else f"All {count}"
-    words = f"{shown} windows (connected sets of safe directions); a number chooses the window's best below."
+    text = f"{shown} windows (connected sets of safe directions); a number chooses the window's best below."
     if candidates.cone_source:
-        source = CONE_WORDS[candidates.cone_source]
-        words += f" Safe cone: off by so much in any direction a needle stays safe for the organs, {source}."
-    return words
+        source = CONE_TEXT[candidates.cone_source]
+        text += f" Safe cone: off by so much in any direction a needle stays safe for the organs, {source}."
+    return text
 
 
 def counts_table(candidates: Candidates) -> Markup:
@@ -122,7 +122,7 @@ def counts_table(candidates: Candidates) -> Markup:
     rows = [
         (
             Markup('<span class="patch {}" style="background-color:{}"></span>{}').format(
-                "hatched" if line.code == Reason.UNKNOWN_REGION.value else "", css(line.colour), line.words
+                "hatched" if line.code == Reason.UNKNOWN_REGION.value else "", css(line.colour), line.text
             ),
             percent(line.solid_angle),
             f"{line.count:,}",
@@ -130,8 +130,8 @@ def counts_table(candidates: Candidates) -> Markup:
         )
         for line in reason_counts(candidates)
     ]
-    words = faint(f"{arm_words(candidates)}.")
-    return table(("verdict", "of solid angle", "directions", "code"), rows, kind="numbers") + words
+    text = faint(f"{arm_text(candidates)}.")
+    return table(("verdict", "of solid angle", "directions", "code"), rows, kind="numbers") + text
 
 
 def registration_section(registration: Mapping[str, Any] | None, plan: Any | None) -> Markup:
@@ -151,9 +151,9 @@ def registration_section(registration: Mapping[str, Any] | None, plan: Any | Non
     rows: list[tuple[str, str]] = [
         ("expected error (TRE, rms) at the target", _bold(number(_tre(registration, plan), 2, "mm")))
     ]
-    for key, words, unit, digits in names:
+    for key, text, unit, digits in names:
         if registration.get(key) is not None:
-            rows.append((words, _value(registration[key], unit, digits)))
+            rows.append((text, _value(registration[key], unit, digits)))
     low, high = registration.get("fle_interval_mm") or (0.0, 0.0)
     if low < high:
         rows.append(("95 % interval of the FLE", f"{number(low, 2)} to {number(high, 2, 'mm')}"))
@@ -217,7 +217,7 @@ def rehearsal_section(rehearsal: Any | None, keep_away: frozenset[str], film: st
     fraction = np.max(rehearsal.max_joint_speed / rehearsal.speed_limits)
     rows = [
         ("tip error at the end", _bold(number(rehearsal.tip_error_mm, 2, "mm"))),
-        *([] if rehearsal.standing is None else [("of all", rehearsal.standing.words)]),
+        *([] if rehearsal.standing is None else [("of all", rehearsal.standing.text)]),
         ("its lateral part", number(rehearsal.lateral_mm, 2, "mm")),
         ("its depth part", depth),
         ("expected beforehand (rms)", number(rehearsal.predicted_error_mm, 2, "mm")),

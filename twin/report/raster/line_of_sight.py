@@ -39,8 +39,8 @@ def blocked(vertices, faces, eye, points, slack):
             longest = length
             across[0], across[1], across[2] = normal[0] / length, normal[1] / length, normal[2] / length
     if longest == 0.0:  # one sight line: any plane through it
-        way = points[0] - eye
-        normal = _cross(way, np.eye(3)[np.argmin(np.abs(way))])
+        direction = points[0] - eye
+        normal = _cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
         length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
         across[0], across[1], across[2] = normal[0] / length, normal[1] / length, normal[2] / length
     half = ROUNDING
@@ -65,18 +65,18 @@ def blocked(vertices, faces, eye, points, slack):
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _between(a, b, c, way, slack):
+def _between(a, b, c, direction, slack):
     """Whether the triangle a, b, c is met on a way from the origin, more than a slack before its end."""
     p, q, r = _cross(b, c), _cross(c, a), _cross(a, b)
     volume = a[0] * p[0] + a[1] * p[1] + a[2] * p[2]
-    wa = way[0] * p[0] + way[1] * p[1] + way[2] * p[2]
-    wb = way[0] * q[0] + way[1] * q[1] + way[2] * q[2]
-    wc = way[0] * r[0] + way[1] * r[1] + way[2] * r[2]
+    wa = direction[0] * p[0] + direction[1] * p[1] + direction[2] * p[2]
+    wb = direction[0] * q[0] + direction[1] * q[1] + direction[2] * q[2]
+    wc = direction[0] * r[0] + direction[1] * r[1] + direction[2] * r[2]
     if volume < 0.0:
         volume, wa, wb, wc = -volume, -wa, -wb, -wc
     if volume == 0.0 or min(wa, wb, wc) < 0.0:
         return False
-    far = np.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2)
+    far = np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
     return volume / (wa + wb + wc) * far < far - slack
 
 

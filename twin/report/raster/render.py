@@ -31,7 +31,7 @@ from puncture_twin.twin.report.raster.compositing import (
 )
 from puncture_twin.twin.report.raster.line_of_sight import blocked
 from puncture_twin.twin.report.raster.raster import depth_before, draw, outlines, sorted_by_band
-from puncture_twin.twin.report.raster.shading import corner_normals, flat_normals, shade_nearest, shade_shells, turned
+from puncture_twin.twin.report.raster.shading import corner_normals, flat_normals, rotated, shade_nearest, shade_shells
 
 Floats32 = NDArray[np.float32]
 T = TypeVar("T")
@@ -110,11 +110,11 @@ class _View:
         turn, eye = camera.axes, np.asarray(camera.eye, dtype=float)
         if T_ct_layer is not None:
             turn, eye = camera.axes @ T_ct_layer[:3, :3], (eye - T_ct_layer[:3, 3]) @ T_ct_layer[:3, :3]
-        self.points = turned(layer.vertices, turn, eye)
+        self.points = rotated(layer.vertices, turn, eye)
         self._grid = camera.scale, camera.height, camera.width
         self._layer = layer
         self._mesh = self.points, layer.faces, layer.bodies
-        normals = turned(layer.normals, turn, np.zeros(3))
+        normals = rotated(layer.normals, turn, np.zeros(3))
         self._look = normals, flat_normals(self.points, layer.faces), layer.colours
         self.spans = outlines(self.points, layer.faces, self._grid)
         self._starts, self._in_bands = sorted_by_band(self.spans, _band_rows(camera), len(_bands(camera)))

@@ -46,7 +46,7 @@ def corner_normals(vertices, faces):
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def turned(vectors, turn, shift):
+def rotated(vectors, turn, shift):
     """Vectors (n, 3) in another frame, ``turn @ (vector - shift)``, of their own precision."""
     out = np.empty_like(vectors)
     for i in range(len(vectors)):

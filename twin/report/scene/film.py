@@ -31,7 +31,7 @@ from puncture_twin.twin.report.raster.compositing import (
     compose,
 )
 from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, put_moving, translucents_of
-from puncture_twin.twin.report.scene.film_text import FrameWords, draw_words
+from puncture_twin.twin.report.scene.film_text import FrameText, draw_frame_text
 from puncture_twin.twin.report.scene.scene_parts import ArmPicture, SceneBody, needle_bodies, patient, room
 from puncture_twin.twin.report.scene.shapes import bar
 from puncture_twin.twin.report.scene.views import close_up, overview
@@ -133,7 +133,7 @@ def _frames(
     wide = _Stage(still, _wide_camera(case, still, arm, rehearsal, plan))
     near = _Stage([b for b in still if b.group != "room"], _near_camera(case, still, plan))
     tool = _tool_layer(case)
-    words = FrameWords(rehearsal, plan, times.speed, demanding(anatomy))
+    text = FrameText(rehearsal, plan, times.speed, demanding(anatomy))
     for number, moment in enumerate(times.moments):
         row = int(np.searchsorted(rehearsal.times_s, moment, side="right")) - 1
         T_ct_flange = np.linalg.inv(T_base_ct) @ rehearsal.T_base_flange_true[row]
@@ -141,7 +141,7 @@ def _frames(
         frame = Image.new("RGB", (WIDTH, HEIGHT), (255, 255, 255))
         frame.paste(Image.fromarray(wide.picture([*links, (tool, T_ct_flange)])), (0, 0))
         frame.paste(Image.fromarray(near.picture([(tool, T_ct_flange)])), (VIEW_WIDTH, 0))
-        draw_words(frame, words, row, moment, (wide.camera, near.camera), case)
+        draw_frame_text(frame, text, row, moment, (wide.camera, near.camera), case)
         if progress is not None:
             progress(number + 1, len(times.moments))
         yield np.asarray(frame)
@@ -182,8 +182,8 @@ class _Stage:
 
 def _planned_path(plan: Any) -> SceneBody:
     """The line that the tip should follow, from standoff to target."""
-    way = (plan.entry_ct - plan.target_ct) / np.linalg.norm(plan.entry_ct - plan.target_ct)
-    line = bar(plan.target_ct, plan.target_ct + plan.standoff_mm * way, PLANNED_RADIUS_MM)
+    direction = (plan.entry_ct - plan.target_ct) / np.linalg.norm(plan.entry_ct - plan.target_ct)
+    line = bar(plan.target_ct, plan.target_ct + plan.standoff_mm * direction, PLANNED_RADIUS_MM)
     return SceneBody("planned path", "safe", line, PLANNED)
 
 
@@ -198,11 +198,11 @@ def _wide_camera(case: Any, still: list[SceneBody], arm: ArmPicture, rehearsal: 
     poses = [rehearsal.q[0], plan.insertion.q[0], rehearsal.q[-1]]
     moving = [body for q in poses for body in arm.bodies(q)]
     content = [b.mesh.vertices for b in [*still, *moving] if b.group in {"skin", "arm"}]
-    way = (plan.entry_ct - plan.target_ct) / np.linalg.norm(plan.entry_ct - plan.target_ct)
-    focus = plan.target_ct + np.linspace(0, plan.standoff_mm + case.needle.length_mm, 24)[:, None] * way
+    direction = (plan.entry_ct - plan.target_ct) / np.linalg.norm(plan.entry_ct - plan.target_ct)
+    focus = plan.target_ct + np.linspace(0, plan.standoff_mm + case.needle.length_mm, 24)[:, None] * direction
     at_work = [body for q in poses[1:] for body in arm.bodies(q)]
     blockers = Layer([b.surface for b in at_work] + [b.surface for b in still if b.group == "room"])
-    return overview(case, np.concatenate(content), focus, blockers, (VIEW_WIDTH, VIEW_HEIGHT), way)
+    return overview(case, np.concatenate(content), focus, blockers, (VIEW_WIDTH, VIEW_HEIGHT), direction)
 
 
 def _near_camera(case: Any, still: list[SceneBody], plan: Any) -> ViewCamera:

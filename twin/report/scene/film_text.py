@@ -25,7 +25,7 @@ LABEL, VALUE = 13, 17
 
 
 @dataclass(frozen=True)
-class FrameWords:
+class FrameText:
     """Where the words of a frame come from: measurements, plan, playback speed, structures to keep away from."""
 
     rehearsal: Any
@@ -52,14 +52,14 @@ class FrameWords:
         return [c for c in self.rehearsal.contacts if c.time_s <= moment]
 
 
-def draw_words(
-    frame: Image.Image, words: FrameWords, row: int, moment: float, cameras: tuple[ViewCamera, ViewCamera], case: Any
+def draw_frame_text(
+    frame: Image.Image, source: FrameText, row: int, moment: float, cameras: tuple[ViewCamera, ViewCamera], case: Any
 ) -> None:
     """Write a frame's words.
 
     Args:
         frame: The picture, already with its views: the overview upper left, the close-up beside it.
-        words: Where the numbers come from.
+        source: Where the numbers come from.
         row: The rehearsal's record shown.
         moment: Its time, s.
         cameras: Of the overview and of the close-up.
@@ -72,38 +72,38 @@ def draw_words(
     draw.line([(left, below), (left, wide.height), (0, wide.height)], fill=(190, 194, 200), width=1)
     annotate.write(draw, (left + 8, 7), "close-up", size=13, bold=True, halo=2)
     annotate.scale_bar(draw, near, case.target_ct, left + 12, below - 12, 90, note="")
-    speed = "real time" if words.speed == 1 else f"playback × {words.speed:g}"
+    speed = "real time" if source.speed == 1 else f"playback × {source.speed:g}"
     annotate.write(draw, (left + 10, below + 12), str(case.name)[:26], size=17, bold=True)
-    standing = words.rehearsal.standing
+    standing = source.rehearsal.standing
     shown = "rehearsal in the twin" if standing is None else standing.short
     for line, text in enumerate((shown, f"{speed}; green: planned path")):
         annotate.write(draw, (left + 10, below + 37 + 19 * line), text, size=13)
     annotate.body_axes(draw, wide, case.space, (left + near.width / 2, wide.height - 96), 42, size=14)
     annotate.write(draw, (left + 24, wide.height - 204), "directions in the large view", size=11, colour=annotate.FAINT)
-    _strip(draw, words, row, moment, wide.height)
-    _alarm(draw, words, moment)
+    _strip(draw, source, row, moment, wide.height)
+    _alarm(draw, source, moment)
 
 
-def _strip(draw: ImageDraw.ImageDraw, words: FrameWords, row: int, moment: float, top: int) -> None:
-    phase = str(words.rehearsal.phase[row])
-    nearest = words.clearance(moment)
-    contacts = len(words.contacts(moment))
+def _strip(draw: ImageDraw.ImageDraw, source: FrameText, row: int, moment: float, top: int) -> None:
+    phase = str(source.rehearsal.phase[row])
+    nearest = source.clearance(moment)
+    contacts = len(source.contacts(moment))
     near = "– (not yet)" if nearest is None else f"{number(nearest[1], 1, 'mm')}  {_short(nearest[0])}"
     colour = annotate.RED if contacts else annotate.INK
     cells = [
         (12, "time", f"{moment:.1f} s", annotate.INK),
         (95, "phase", PHASES.get(phase, phase), annotate.INK),
-        (320, "true tip to target", number(words.distance(row), 1, "mm"), annotate.INK),
+        (320, "true tip to target", number(source.distance(row), 1, "mm"), annotate.INK),
         (470, "contacts", str(contacts), colour),
         (560, "needle to nearest structure", near, annotate.INK),
     ]
     for x, label, value, ink in cells:
         annotate.write(draw, (x, top + 6), label, size=LABEL, colour=annotate.FAINT)
         annotate.write(draw, (x, top + 22), value, size=VALUE, bold=True, colour=ink)
-    r = words.rehearsal
+    r = source.rehearsal
     if row == len(r.times_s) - 1:
-        way = "deep" if r.depth_mm >= 0 else "shallow"
-        parts = f"lateral {number(r.lateral_mm, 2)}, {number(abs(r.depth_mm), 2)} too {way}"
+        deeper = "deep" if r.depth_mm >= 0 else "shallow"
+        parts = f"lateral {number(r.lateral_mm, 2)}, {number(abs(r.depth_mm), 2)} too {deeper}"
         place = "" if r.standing is None else f"; {r.standing.place}"
         result = f"tip error at the end {number(r.tip_error_mm, 2, 'mm')}: {parts}{place}"
         annotate.write(draw, (12, top + 51), result, size=VALUE, bold=True)
@@ -112,8 +112,8 @@ def _strip(draw: ImageDraw.ImageDraw, words: FrameWords, row: int, moment: float
         annotate.write(draw, (12, top + 54), note, size=11, colour=annotate.FAINT)
 
 
-def _alarm(draw: ImageDraw.ImageDraw, words: FrameWords, moment: float) -> None:
-    fresh = [c for c in words.contacts(moment) if moment - c.time_s <= CONTACT_SHOWN_S]
+def _alarm(draw: ImageDraw.ImageDraw, source: FrameText, moment: float) -> None:
+    fresh = [c for c in source.contacts(moment) if moment - c.time_s <= CONTACT_SHOWN_S]
     for line, contact in enumerate(fresh[-3:]):
         text = f"CONTACT: {_short(contact.link)} touches {_short(contact.body)}"
         annotate.write(draw, (12, 12 + 24 * line), text, size=17, bold=True, colour=annotate.RED, halo=3)

@@ -145,12 +145,12 @@ def needle_bodies(needle: Any, tip_ct: Floats, outward_ct: Floats) -> NeedleBodi
 def chosen_direction(pick: Pick | None, plan: Any | None) -> Floats | None:
     """The outward direction of the plan, else of the picked candidate, else None; shape (3,), CT frame."""
     if plan is not None:
-        way = np.asarray(plan.entry_ct, dtype=float) - np.asarray(plan.target_ct, dtype=float)
-        return np.asarray(way / np.linalg.norm(way))
+        direction = np.asarray(plan.entry_ct, dtype=float) - np.asarray(plan.target_ct, dtype=float)
+        return np.asarray(direction / np.linalg.norm(direction))
     return None if pick is None else pick.candidates.outward_ct[pick.row]
 
 
-def needle_words(needle: Any) -> str:
+def needle_text(needle: Any) -> str:
     """The needle in the legend, honest about a drawn thickness."""
     if needle.radius_mm >= LEAST_NEEDLE_MM:
         return "needle"

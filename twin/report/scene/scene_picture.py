@@ -15,7 +15,7 @@ from puncture_twin.planning.base.reasons import SAFE, Rgb
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.twin.report import annotate, palette
-from puncture_twin.twin.report.numbers import nearest_structure, number, target_words
+from puncture_twin.twin.report.numbers import nearest_structure, number, target_text
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import BACKGROUND, Layer, picture
 from puncture_twin.twin.report.scene.scene_parts import (
@@ -23,7 +23,7 @@ from puncture_twin.twin.report.scene.scene_parts import (
     SceneBody,
     chosen_direction,
     needle_bodies,
-    needle_words,
+    needle_text,
     patient,
     room,
     safe_region,
@@ -41,7 +41,7 @@ AXES_LENGTH, AXES_CORNER = 44, 110
 CORNER_GAIN = 0.1
 """How much emptier the upper corner must be for the axes to stand there instead of below."""
 
-BODY_SHARE_MM = 700.0
+BODY_RADIUS_MM = 700.0
 """The overview shows the patient within this distance of the target, and the whole arm."""
 
 CLOSE_RADIUS_MM = 38.0
@@ -83,7 +83,7 @@ def draw_scene(
     near = _close_camera(case, bodies, path_ct)
     few = [body for body in bodies if body.name != "needle holder" and body.group not in HIDDEN_NEARBY]
     _view(image, draw, few, near, RIGHT_BOX, case, "Close-up of the path", needle)
-    bottom = _words(draw, case, candidates, plan, bool(arm), bodies, pick)
+    bottom = _text(draw, case, candidates, plan, bool(arm), bodies, pick)
     image = image.crop((0, 0, WIDTH, min(HEIGHT, round(bottom) + 8)))
     with atomic(Path(path)) as temporary:
         image.save(temporary, format="PNG", compress_level=palette.PNG_LEVEL)
@@ -108,7 +108,7 @@ def _overview_camera(case: Any, bodies: Sequence[SceneBody], path_ct: Any) -> Vi
     for body in bodies:
         vertices = body.mesh.vertices
         if body.group in {"skin", "organ"}:
-            vertices = vertices[np.linalg.norm(vertices - case.target_ct, axis=1) < BODY_SHARE_MM]
+            vertices = vertices[np.linalg.norm(vertices - case.target_ct, axis=1) < BODY_RADIUS_MM]
         if body.group != "room" and len(vertices):
             points.append(vertices)
     focus = np.stack([case.target_ct]) if path_ct is None else _needle_line(case, path_ct)
@@ -118,9 +118,9 @@ def _overview_camera(case: Any, bodies: Sequence[SceneBody], path_ct: Any) -> Vi
 
 
 def _needle_line(case: Any, path_ct: NDArray[np.float64]) -> NDArray[np.float64]:
-    way = path_ct[1] - path_ct[0]
-    way = way / np.linalg.norm(way)
-    return np.asarray(path_ct[0] + np.linspace(0, case.needle.length_mm, 24)[:, None] * way)
+    along = path_ct[1] - path_ct[0]
+    along = along / np.linalg.norm(along)
+    return np.asarray(path_ct[0] + np.linspace(0, case.needle.length_mm, 24)[:, None] * along)
 
 
 def _close_camera(case: Any, bodies: Sequence[SceneBody], path_ct: Any) -> ViewCamera:
@@ -168,7 +168,7 @@ def _empty_corner(
     return upper if emptier else lower
 
 
-def _words(
+def _text(
     draw: ImageDraw.ImageDraw,
     case: Any,
     candidates: Candidates,
@@ -178,14 +178,14 @@ def _words(
     pick: Pick | None,
 ) -> float:
     """Everything around the views; returns the row below the legend."""
-    annotate.write(draw, (18, 12), f"{case.name}: needle path to {target_words(case)}", size=28, bold=True)
+    annotate.write(draw, (18, 12), f"{case.name}: needle path to {target_text(case)}", size=28, bold=True)
     nothing = pick is None and plan is None
     if nothing:
-        words, colour = "NOTHING IS SAFE: every direction is refused; no needle is shown", annotate.RED
+        text, colour = "NOTHING IS SAFE: every direction is refused; no needle is shown", annotate.RED
     else:
-        words, colour = _path_words(plan, pick), annotate.FAINT
-    annotate.write(draw, (18, 50), words, size=18, bold=nothing, colour=colour)
-    items = [("target", palette.TARGET_POINT), (needle_words(case.needle), palette.NEEDLE)]
+        text, colour = _path_text(plan, pick), annotate.FAINT
+    annotate.write(draw, (18, 50), text, size=18, bold=nothing, colour=colour)
+    items = [("target", palette.TARGET_POINT), (needle_text(case.needle), palette.NEEDLE)]
     if candidates.safe.any():
         items.append((f"{candidates.safe_text}: where a needle may enter, and its corridor (overview)", SAFE))
     items.append(("skin (see-through)", palette.SKIN))
@@ -207,7 +207,7 @@ def _see_through(body: SceneBody) -> str:
     return body.name + (" (see-through)" if body.alpha < 1 else "")
 
 
-def _path_words(plan: Any | None, pick: Pick | None) -> str:
+def _path_text(plan: Any | None, pick: Pick | None) -> str:
     if plan is not None:
         theta, beta = np.degrees(plan.theta), np.degrees(plan.beta)
         length = float(np.linalg.norm(plan.entry_ct - plan.target_ct))
@@ -215,11 +215,11 @@ def _path_words(plan: Any | None, pick: Pick | None) -> str:
         assert pick is not None
         theta, beta = np.degrees(pick.candidates.theta[pick.row]), np.degrees(pick.candidates.beta[pick.row])
         length = float(pick.candidates.path.length[pick.row])
-    words = f"θ {theta:g}°, β {beta:g}°, {number(length, 1, 'mm')} in the body"
+    text = f"θ {theta:g}°, β {beta:g}°, {number(length, 1, 'mm')} in the body"
     if pick is not None:
         name, clearance = nearest_structure(*pick)
-        words += f", nearest {name.replace('_', ' ')} {number(clearance, 1, 'mm')}" if name else ""
-    return words + ("" if plan is not None else "  (no plan: the arm is not shown)")
+        text += f", nearest {name.replace('_', ' ')} {number(clearance, 1, 'mm')}" if name else ""
+    return text + ("" if plan is not None else "  (no plan: the arm is not shown)")
 
 
 MOST_ENTRIES = 26

@@ -33,7 +33,7 @@ TARGET_WEIGHT = 8
 
 
 def up_ct(case: Any) -> Floats:
-    """Up in the room, unit, CT frame: the entry frame's z; the front of a patient whose frame looks along the body."""
+    """Up in the workcell, unit, CT frame: the entry frame's z; the front of a patient whose frame is along the body."""
     z = np.asarray(case.T_ct_entry)[:3, 2]
     if str(case.space) != "local" and abs(z @ np.array(ANATOMICAL_LPS["head"])) > UPRIGHT:
         return np.array(ANATOMICAL_LPS["anterior"])

@@ -36,8 +36,8 @@ def draw_hu_plot(subject: Subject) -> Image.Image | None:
         return None
     figure = Figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI, facecolor="white")
     canvas = FigureCanvasAgg(figure)
-    held = (name for part in reversed(parts) for name in part.structures)
-    names = tuple(dict.fromkeys(name for name in held if name in subject.colours))
+    shown = (name for part in reversed(parts) for name in part.structures)
+    names = tuple(dict.fromkeys(name for name in shown if name in subject.colours))
     split = 0.14 + min(0.5, 0.062 * max(1, len(names)))
     units = figure.add_axes((LEFT, split + 0.02, RIGHT - LEFT, 0.96 - split))
     bars = figure.add_axes((LEFT, 0.14, RIGHT - LEFT, split - 0.14), sharex=units)
@@ -58,8 +58,8 @@ def _units(axes: Axes, subject: Subject) -> None:
     axes.set_ylabel("HU", fontsize=9)
     axes.tick_params(labelsize=8, labelbottom=False)
     axes.grid(visible=True, color="0.9")
-    for at, words in ((0.0, " target"), (subject.path_mm, " skin")):
-        axes.text(at, 0.03, words, transform=axes.get_xaxis_transform(), fontsize=8.5, va="bottom")
+    for at, text in ((0.0, " target"), (subject.path_mm, " skin")):
+        axes.text(at, 0.03, text, transform=axes.get_xaxis_transform(), fontsize=8.5, va="bottom")
 
 
 def _bars(axes: Axes, subject: Subject, parts: tuple[Stretch, ...], names: tuple[str, ...]) -> None:

@@ -42,7 +42,7 @@ BEADS = 0.025
 MOST_BEADS = 1 << 20
 """More than beads side by side; numbers their rows and columns as one."""
 
-SCALE_ROOM = 0.34
+SCALE_FRACTION = 0.34
 """Of a picture's side, the scale bar at most."""
 
 
@@ -182,7 +182,7 @@ def _directions(axes: Axes, subject: Subject, plane: Plane) -> None:
 def _scale(axes: Axes, plane: Plane) -> None:
     """A bar of a round length in the lower left corner."""
     side = 2 * plane.half_mm
-    length = max((mm for mm in SCALE_BARS_MM if mm <= SCALE_ROOM * side), default=SCALE_BARS_MM[0])
+    length = max((mm for mm in SCALE_BARS_MM if mm <= SCALE_FRACTION * side), default=SCALE_BARS_MM[0])
     left, low = plane.centre - plane.half_mm * np.array([0.94, 0.93])
     axes.plot([left, left + length], [low, low], color="white", lw=3, solid_capstyle="butt", path_effects=HALO)
     words = f"{length} mm"

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report.annotate import FAINT, legend, write
-from puncture_twin.twin.report.numbers import number, target_words
+from puncture_twin.twin.report.numbers import number, target_text
 from puncture_twin.twin.report.palette import PNG_LEVEL, TARGET_POINT
 from puncture_twin.twin.report.slices.hu_plot import draw_hu_plot
 from puncture_twin.twin.report.slices.panel import NEEDLE_COLOUR, PIXELS, REGION_COLOUR, Panel, draw_panel
@@ -59,10 +59,10 @@ class Slices:
     def legend(self) -> list[tuple[str, Rgb]]:
         """Names with colours."""
         subject = self.subject
-        holds = subject.case.target_structure
+        target = subject.case.target_structure
         first = [("needle", _rgb(NEEDLE_COLOUR)), ("target", TARGET_POINT)]
         region = [] if subject.region_ct is None else [("95 % region", _rgb(REGION_COLOUR))]
-        return [*first, *region, (holds, subject.colours[holds]), *((one.text, one.colour) for one in subject.near)]
+        return [*first, *region, (target, subject.colours[target]), *((one.text, one.colour) for one in subject.near)]
 
 
 def draw_slices(subject: Subject) -> Slices:
@@ -86,7 +86,7 @@ def write_sheet(slices: Slices, path: Path, tone: str = "abdomen") -> None:
     size = (3 * GAP + 2 * PIXELS, bottom + units + 150)
     sheet = Image.new("RGB", size, (255, 255, 255))
     draw = ImageDraw.Draw(sheet)
-    write(draw, (GAP, 12), f"{subject.case.name}: {target_words(subject.case)}, {subject.title}", size=20, bold=True)
+    write(draw, (GAP, 12), f"{subject.case.name}: {target_text(subject.case)}, {subject.title}", size=20, bold=True)
     level, width = TONES[tone]
     window = "" if subject.anatomy.scan is None else f"CT window {tone}: level {level:g}, width {width:g} HU. "
     write(draw, (GAP, 40), f"{window}{RADIOLOGICAL}", size=14, colour=FAINT)

@@ -45,7 +45,7 @@ class Insertion:
 
 
 def insert(
-    room: SimulatedWorkcell,
+    workcell: SimulatedWorkcell,
     insertion: Insertion,
     control: TipControl,
     joint_offsets: Floats,
@@ -56,7 +56,7 @@ def insert(
     """Run an insertion from where the arm is.
 
     Args:
-        room: An open room, its arm at rest at the trajectory's start.
+        workcell: An open room, its arm at rest at the trajectory's start.
         insertion: What is wanted.
         control: How the tip follows it.
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
@@ -70,9 +70,9 @@ def insert(
     with rigid_model(model, insertion.tool, insertion.down_base) as rigid:
         controller = _controller(rigid, control, insertion.trajectory.q)
         reference = reference_of(model, tip_m, insertion.trajectory, controller.dt, insertion.hold_s)
-        recorder = Recorder(room, reference.q, joint_offsets, controller.dt, start_s)
+        recorder = Recorder(workcell, reference.q, joint_offsets, controller.dt, start_s)
         around = Surroundings(joint_offsets, resistance, watch=recorder.see)
-        run(room.arm, controller, reference, lambda q: tips(model, tip_m, q[None]), around)
+        run(workcell.arm, controller, reference, lambda q: tips(model, tip_m, q[None]), around)
     return recorder.execution()
 
 

@@ -99,7 +99,7 @@ def find_edges(grey: Grey, camera: Camera, spokes: Spokes) -> Edges:
 def visible_fraction(
     grey: Grey, camera: Camera, spokes: Spokes, on_circle: NDArray[np.bool_], contrast: float
 ) -> float:
-    """Share of the disc that looks like the ball: as bright as it is next to its edges, within a part of its contrast.
+    """Fraction of the disc that looks like the ball: as bright as next to its edges, within a part of its contrast.
 
     Args:
         grey: The picture.

@@ -41,13 +41,13 @@ class BallScene:
         rod_radius_mm: The rod is a cylinder with round ends.
         rod_length_mm: From the ball's centre.
         light_c: Shape (3,): toward the lamp.
-        diffuse: Share of the light that comes from everywhere, 0 to 1; the lamp's share obeys Lambert's law.
+        diffuse: Fraction of the light that comes from everywhere, 0 to 1; the lamp's share obeys Lambert's law.
         ball_grey: Of the ball where the lamp shines straight on it.
         rod_grey: The rod's.
         background_grey: What is behind.
         texture_grey: Standard deviation of the background's pattern.
         texture_px: Size of the pattern's spots (standard deviation of the smoothing).
-        hidden_fraction: Share of the ball's disc that an occluder covers, 0 to 1.
+        hidden_fraction: Fraction of the ball's disc that an occluder covers, 0 to 1.
         hidden_from: Angle in the tangent plane from which it comes, rad.
         occluder_grey: The occluder's.
         ball: False takes the ball away.
@@ -234,7 +234,7 @@ def _rod(rays: Floats, start: Floats, rod: Floats, scene: BallScene, light: Floa
 
 
 def _occluder(rays: Floats, center: Floats, camera: Camera, scene: BallScene) -> _Layer:
-    """A flat disc just before the ball, so far over it that it hides the share asked for."""
+    """A flat disc just before the ball, so far over it that it hides the share wanted."""
     distance = float(np.linalg.norm(center))
     axes = tangent_axes(center / distance)
     flat = (rays @ axes) / (rays @ (center / distance))[..., None]
@@ -245,7 +245,7 @@ def _occluder(rays: Floats, center: Floats, camera: Camera, scene: BallScene) ->
 
 
 def disc_distance(fraction: float) -> float:
-    """How far off the centre of the occluder must be to hide a share of the disc; lengths in radii of the ball."""
+    """How far off the centre of the occluder must be to hide a fraction of the disc; lengths in radii of the ball."""
 
     def hidden(distance: float) -> float:
         r, R, d = 1.0, OCCLUDER_SIZE, distance
@@ -269,7 +269,7 @@ def _lit(grey: float, cosine: Floats, scene: BallScene) -> Floats:
 
 
 def _composite(layers: list[_Layer]) -> tuple[Floats, Floats]:
-    """Light from the bodies, and the share of the background that is left, per cell: the nearer body over the farther.
+    """Light from the bodies, and the fraction of the background that is left, per cell: nearer bodies over farther.
 
     The occluder is at depth 0. Ball and rod swap where one comes out of the other.
     """

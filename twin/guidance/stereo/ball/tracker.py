@@ -45,12 +45,12 @@ class TrackerSettings:
     """How the ball is measured and when it is believed.
 
     Attributes:
-        spokes: Edges asked for, evenly around the outline.
+        spokes: Edges wanted, evenly around the outline.
         first_reach_px: How far from Hough's circle an edge may lie.
         last_reach_px: How far from the measured circle.
         inlier_px: An edge this near votes for a circle.
-        min_inliers: Share of all spokes that must agree.
-        min_visible: Share of the disc that must look like the ball.
+        min_inliers: Fraction of all spokes that must agree.
+        min_visible: Fraction of the disc that must look like the ball.
         radius_share: How far the radius may be from the predicted one.
         min_contrast: Grey levels between ball and surroundings that make an edge.
         noise_factor: The same in parts of the picture's own noise; the larger counts.
@@ -84,7 +84,7 @@ class DetectedBall(NamedTuple):
     inliers: int
     """Edges on the circle; 0 for Hough alone."""
     n_edges: int
-    """Edges asked for."""
+    """Edges wanted."""
 
 
 class LostBall(NamedTuple):
@@ -242,8 +242,8 @@ def _away_from_others(on_circle: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _believable(edges: Edges, threshold: float) -> tuple[NDArray[np.bool_], bool]:
     """Edges that are steep enough and go the way most do, and whether most are too faint."""
     steep = edges.inside & (np.abs(edges.contrast) >= threshold)
-    way = np.sign(np.sum(np.sign(edges.contrast[steep]))) or 1.0
-    return steep & (edges.contrast * way > 0), bool(np.mean(np.abs(edges.contrast) < threshold) > 0.5)
+    majority = np.sign(np.sum(np.sign(edges.contrast[steep]))) or 1.0
+    return steep & (edges.contrast * majority > 0), bool(np.mean(np.abs(edges.contrast) < threshold) > 0.5)
 
 
 def _agree(edges: Edges, valid: NDArray[np.bool_], circle: Circle, tolerance_px: float) -> NDArray[np.bool_]:
@@ -252,5 +252,5 @@ def _agree(edges: Edges, valid: NDArray[np.bool_], circle: Circle, tolerance_px:
 
 
 def _independent(spokes: int, radius_px: float) -> float:
-    """Share of the edges that count: those closer than 1.5 px read the same pixels."""
+    """Fraction of the edges that count: those closer than 1.5 px read the same pixels."""
     return min(1.0, 2 * np.pi * radius_px / (1.5 * spokes))

@@ -2,8 +2,8 @@
 
 **What twelve points tell about the lens.** In a picture that spans 28 degrees the grid of the robot's points fills a
 radius of a tenth of the focal length. There k1 = -0.1 bends by a quarter of a pixel: a ball found to 0.02 px tells k1
-to about 0.01. But k2 = 0.1 bends by 0.003 px and cannot be told; p1, p2 can, though mostly together with the principal
-point. So each coefficient has a prior (normal, mean 0): what the points cannot tell stays near 0 and keeps the prior's
+to about 0.01. But k2 = 0.1 bends by 0.003 px and cannot be found; p1, p2 can, though mostly together with the principal
+point. So each coefficient has a prior (normal, mean 0): what the points cannot show stays near 0 and keeps the prior's
 variance, and ``identified`` names the coefficients whose standard deviation the points at least halved.
 """
 
@@ -102,8 +102,8 @@ def calibrate(
     bundle, sigma = _refine(start, points, found, distortion, sigma_px)
     _check_fit(bundle, points, names, where)
     covariance = bundle.camera_covariance(0)
-    told = np.sqrt(np.diag(covariance)[4:8]) <= IDENTIFIED * np.array(LENS_PRIOR)
-    identified = tuple(np.array(CAMERA_PARAMETERS[4:8])[told].tolist()) if distortion else ()
+    known = np.sqrt(np.diag(covariance)[4:8]) <= IDENTIFIED * np.array(LENS_PRIOR)
+    identified = tuple(np.array(CAMERA_PARAMETERS[4:8])[known].tolist()) if distortion else ()
     return CameraCalibration(bundle.cameras[0], bundle.residuals_px, bundle.rms_px, covariance, sigma, identified)
 
 
@@ -119,26 +119,26 @@ def _refine(
     """The optimum, and the pixels' standard deviation that it was found with."""
     spread = np.full((1, 14), np.inf)
     spread[0, 4:8] = LENS_PRIOR if distortion else 0.0
-    held = PixelSpreads(spread, np.zeros((1, 6)), np.zeros_like(points))
+    fixed = PixelSpreads(spread, np.zeros((1, 6)), np.zeros_like(points))
     count = np.arange(len(points))
     sigma = 0.05 if sigma_px is None else sigma_px
     for _ in range(ROUNDS):
         seen = Observations(np.zeros_like(count), np.zeros_like(count), count, pixels, sigma**2 * np.eye(2))
-        bundle = adjust([start], np.eye(4)[None], points, seen, held)
+        bundle = adjust([start], np.eye(4)[None], points, seen, fixed)
         if sigma_px is not None:
             break
-        told = _parameters_told(bundle, spread[0])
-        spare = max(2 * len(points) - told, 1.0)
+        known = _parameters_known(bundle, spread[0])
+        spare = max(2 * len(points) - known, 1.0)
         sigma = max(float(np.sqrt(np.sum(bundle.residuals_px**2) / spare)), SMALLEST_SIGMA_PX)
     return bundle, sigma
 
 
-def _parameters_told(bundle: Bundle, spread: Floats) -> float:
+def _parameters_known(bundle: Bundle, spread: Floats) -> float:
     """Parameters that the points determine: a free one counts 1, one with a prior by how much its variance fell."""
     variance = np.diag(bundle.camera_covariance(0))
     with np.errstate(divide="ignore", invalid="ignore"):
-        told = 1 - variance / spread**2
-    return float(np.sum(np.where(spread > 0, np.clip(told, 0, 1), 0)))
+        known = 1 - variance / spread**2
+    return float(np.sum(np.where(spread > 0, np.clip(known, 0, 1), 0)))
 
 
 def _check_shapes(points: Floats, pixels: Floats, names: Sequence[str] | None, where: str | Path) -> None:

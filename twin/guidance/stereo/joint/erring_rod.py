@@ -9,7 +9,7 @@ import numpy as np
 from puncture_twin.planning.arm.erring_arm import erring_arm
 from puncture_twin.planning.arm.error_jacobian import FREE_D, PARAMETERS
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.twin.guidance.stereo.servo_law import HeldRod
+from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod
 
 FLANGE_ERRORS = PARAMETERS["joint"].stop
 """Of these move the flange: 23."""
@@ -29,15 +29,15 @@ class RodPoses(NamedTuple):
     """Shape (s, 3, 3)."""
 
 
-def rod_poses(held: HeldRod, eta: Floats, q: Floats) -> RodPoses:
+def rod_poses(rod: CarriedRod, eta: Floats, q: Floats) -> RodPoses:
     """Ball and flange at configurations (s, 6), rad, of an arm with errors (26,), mm and rad.
 
     Each error shifts or turns all that follows it (Mooring, Roth, Driels 1991; `error_jacobian`).
     """
-    poses = erring_arm(held.model, eta[:FLANGE_ERRORS]).link_poses(q)
+    poses = erring_arm(rod.model, eta[:FLANGE_ERRORS]).link_poses(q)
     origins, axes = poses[..., :3, 3], poses[..., :3, :3]
     R = axes[:, 6]
-    ball = origins[:, 6] + R @ (eta[FLANGE_ERRORS:] + np.array([0.0, 0.0, held.rod_mm]))
+    ball = origins[:, 6] + R @ (eta[FLANGE_ERRORS:] + np.array([0.0, 0.0, rod.rod_mm]))
     x, z = axes[:, 1:, :, 0], axes[:, :-1, :, 2]
     twist = np.cross(x, ball[:, None] - origins[:, 1:])
     zero = np.cross(z, ball[:, None] - origins[:, :-1])

@@ -23,7 +23,7 @@ from puncture_twin.twin.guidance.stereo.cameras.lens import coefficient_slope
 from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors
 from puncture_twin.twin.guidance.stereo.joint.erring_rod import N_ROD, RodPoses, rod_poses
 from puncture_twin.twin.guidance.stereo.mapping import turn_and_shift_slopes
-from puncture_twin.twin.guidance.stereo.servo_law import HeldRod, ball_jacobian
+from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_jacobian
 
 PER_CAMERA = 13
 """Focal length, principal point, four of the lens, turn, shift: square pixels are known."""
@@ -38,7 +38,7 @@ class Observed:
 
     Attributes:
         planned: The cameras as they were planned.
-        held: The nominal arm.
+        rod: The nominal arm.
         errors: As declared.
         q_command: Shape (s, 6), rad.
         pixels: Shape (c, s, 2): the ball in each camera.
@@ -50,7 +50,7 @@ class Observed:
     """
 
     planned: tuple[Camera, ...]
-    held: HeldRod
+    rod: CarriedRod
     errors: ServoErrors
     q_command: Floats
     pixels: Floats
@@ -162,9 +162,9 @@ class JointModel:
         """Derivative (n, 3, 6) of points (n, 3) of the base by ``x.base``."""
         return _pose_slopes(points_c, self._base_center, x.base[:3], x.base[3:])
 
-    def held_at(self, x: Unknowns, q: Floats) -> RodPoses:
+    def rod_at(self, x: Unknowns, q: Floats) -> RodPoses:
         """Ball and flange at configurations (s, 6), rad, base frame."""
-        return rod_poses(self.observed.held, self.observed.errors.arm_deviations() * x.arm, q)
+        return rod_poses(self.observed.rod, self.observed.errors.arm_deviations() * x.arm, q)
 
     def linearised(self, x: Unknowns) -> System[Unknowns]:
         """Residuals and slopes at x."""
@@ -205,25 +205,25 @@ class JointModel:
         """Where the arm, with its errors, should have the ball; its play and repeatability let it stray."""
         q = self.observed.q_command
         strays, J = self.strays(x, np.arange(len(q)))
-        return _whitened(strays, J, self._stray_roots)
+        return _whitened(strays, J, self._offset_roots)
 
     def strays(self, x: Unknowns, stays: Ints) -> tuple[Floats, Floats]:
         """How far the ball is from where its arm should have it at k stays: (k, 3), mm, C, and slopes (k, 3, N)."""
-        T, held = self.pose_of_base(x), self.held_at(x, self.observed.q_command[stays])
-        balls = apply(T, held.ball)
-        J = np.zeros((len(balls), 3, x.vector().size))
+        T, rod = self.pose_of_base(x), self.rod_at(x, self.observed.q_command[stays])
+        measured = apply(T, rod.ball)
+        J = np.zeros((len(measured), 3, x.vector().size))
         for row, stay in enumerate(stays):
             start = x.span("balls_c").start + 3 * int(stay)
             J[row, :, start : start + 3] = np.eye(3)
-        J[:, :, x.span("base")] = -self.base_slopes(x, balls)
-        J[:, :, x.span("arm")] = -T[:3, :3] @ held.slopes[:, :3] * self.observed.errors.arm_deviations()
-        return x.balls_c[stays] - balls, J
+        J[:, :, x.span("base")] = -self.base_slopes(x, measured)
+        J[:, :, x.span("arm")] = -T[:3, :3] @ rod.slopes[:, :3] * self.observed.errors.arm_deviations()
+        return x.balls_c[stays] - measured, J
 
     @cached_property
-    def _stray_roots(self) -> Floats:
+    def _offset_roots(self) -> Floats:
         """Roots of the inverse covariance of where the arm has its ball, (s, 3, 3): play and repeatability."""
         o, R = self.observed, self.guess.T_c_base[:3, :3]
-        slopes = np.array([R @ ball_jacobian(o.held, q)[:3] for q in o.q_command])
+        slopes = np.array([R @ ball_jacobian(o.rod, q)[:3] for q in o.q_command])
         return _roots(o.errors.arrival**2 * slopes @ slopes.transpose(0, 2, 1) + FLOOR_MM**2 * np.eye(3))
 
     def _imaged(self, x: Unknowns) -> tuple[Floats, Floats]:

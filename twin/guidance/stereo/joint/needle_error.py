@@ -97,17 +97,17 @@ def servoed_error(found: Adjusted, stay: int, target_m: Floats) -> NeedleError:
     """
     model, x = found.model, found.unknowns
     stay = stay % len(x.balls_c)
-    stray, slopes = model.strays(x, np.array([stay]))
-    held, frame = _Held.of(found, model.observed.q_command[stay]), _Anatomy.of(found, target_m)
-    variance, Jq = model.observed.errors.arrival**2, held.arrival_slopes
+    miss, slopes = model.strays(x, np.array([stay]))
+    rod, frame = _Flange.of(found, model.observed.q_command[stay]), _Anatomy.of(found, target_m)
+    variance, Jq = model.observed.errors.arrival**2, rod.arrival_slopes
     K = variance * Jq[:3].T @ np.linalg.inv(variance * Jq[:3] @ Jq[:3].T + FLOOR_MM**2 * np.eye(3))
     rows = np.zeros((6, len(found.covariance)))
     start = x.span("balls_c").start + 3 * stay
     rows[:3, start : start + 3] = np.eye(3)
-    rows[3:] = held.rows[3:] + Jq[3:] @ K @ slopes[0]
+    rows[3:] = rod.rows[3:] + Jq[3:] @ K @ slopes[0]
     again = np.zeros((6, 6))
     again[3:, 3:] = Jq[3:] @ (variance * (np.eye(6) - K @ Jq[:3])) @ Jq[3:].T
-    R_c_flange = exp_rotation(Jq[3:] @ K @ stray[0]) @ held.R_c_flange
+    R_c_flange = exp_rotation(Jq[3:] @ K @ miss[0]) @ rod.R_c_flange
     return frame.needle(found, x.balls_c[stay], R_c_flange, rows, again)
 
 
@@ -119,14 +119,14 @@ def open_loop_error(found: Adjusted, q_command: Floats, target_m: Floats) -> Nee
         q_command: Shape (6,), rad.
         target_m: Shape (3,), mm, as the image has it.
     """
-    held, frame = _Held.of(found, q_command), _Anatomy.of(found, target_m)
-    Jq = held.arrival_slopes
+    rod, frame = _Flange.of(found, q_command), _Anatomy.of(found, target_m)
+    Jq = rod.arrival_slopes
     arrival = found.model.observed.errors.arrival**2 * Jq @ Jq.T
-    return frame.needle(found, held.ball_c, held.R_c_flange, held.rows, arrival)
+    return frame.needle(found, rod.ball_c, rod.R_c_flange, rod.rows, arrival)
 
 
 @dataclass(frozen=True, eq=False)
-class _Held:
+class _Flange:
     """Ball and flange where the arm should have them, C.
 
     Attributes:
@@ -142,9 +142,9 @@ class _Held:
     arrival_slopes: Floats
 
     @classmethod
-    def of(cls, found: Adjusted, q_command: Floats) -> _Held:
+    def of(cls, found: Adjusted, q_command: Floats) -> _Flange:
         model, x = found.model, found.unknowns
-        T, one = model.pose_of_base(x), model.held_at(x, q_command[None])
+        T, one = model.pose_of_base(x), model.rod_at(x, q_command[None])
         turn = np.kron(np.eye(2), T[:3, :3])
         ball = apply(T, one.ball)
         rows = np.zeros((6, len(found.covariance)))

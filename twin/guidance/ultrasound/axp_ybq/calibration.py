@@ -42,7 +42,7 @@ DIRECTION_SIGN = (
 )
 
 NO_NOISE = Noise(0.0, 0.0, 0.0, 0.0)
-"""What is asked is where the tip is, not where it would be seen."""
+"""What is queried is where the tip is, not where it would be seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Calibration:
         Y: T_base1_base2, shape (4, 4), mm.
         tip_end2: t_Q, the needle's tip, shape (3,), mm, frame end2.
         needle_direction_end2: V, unit, toward the tip, shape (3,), frame end2.
-        scale: mm per unit of P along u and v, shape (2,); ones where it was not asked for.
+        scale: mm per unit of P along u and v, shape (2,); ones where it was not wanted.
         residuals: Y B Q - A X P, shape (n, 3), mm, base1, of every pose.
         rms_mm: Root mean square length of the residuals of the poses that were used.
         weights: One per pose, shape (n,): 1 used, 0 set aside.
@@ -217,7 +217,7 @@ class Calibration:
 
         C is ``covariance_counts``. Chi-squared for a given noise; with declared arms ``small_sample`` says it. For a
         spread found from the residuals Fisher's F; the least-known part of that spread has one residual per pose, so
-        that only this share of the freedom counts.
+        that only this fraction of the freedom counts.
         """
         p = len(self.parameters)
         if self.small_sample is not None:

@@ -57,8 +57,8 @@ def _probe_columns(A: Floats, p: Floats) -> Floats:
 
 def _needle_columns(B: Floats) -> Floats:
     """Columns of vec(t_Q^T (x) R_Y), vec(R_Y) and t_Y: [vec(R_B)^T (x) I, t_B^T (x) I, I], shape (n, 3, 39)."""
-    turned = B[:, :3, :3].transpose(0, 2, 1).reshape(len(B), 9)  # column-major vec
-    rows = np.concatenate([turned, B[:, :3, 3] / LENGTH_MM, np.ones((len(B), 1))], axis=1)
+    transposed = B[:, :3, :3].transpose(0, 2, 1).reshape(len(B), 9)  # column-major vec
+    rows = np.concatenate([transposed, B[:, :3, 3] / LENGTH_MM, np.ones((len(B), 1))], axis=1)
     return np.einsum("nk,ij->nikj", rows, np.eye(3)).reshape(len(B), 3, 39)
 
 

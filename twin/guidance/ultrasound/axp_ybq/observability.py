@@ -34,7 +34,7 @@ LEAST_RATIO = 9e-3
 45 +- 2 deg up to 8.8e-3; usual poses 3.6e-2 and more."""
 
 IN_PLANE = 0.9
-"""Share of a weak direction that must lie in the image (or across it) to be called so."""
+"""Fraction of a weak direction that must lie in the image (or across it) to be called so."""
 
 NAMED_WITHIN = 1.5
 """A family whose own ratio is up to this much larger than the limit still is the name of a weak motion."""
@@ -47,7 +47,7 @@ class WeakMotion(NamedTuple):
     """Short key, such as ``probe_orientation``, ``tip_position``, ``insertion_angle`` or ``needle_roll``."""
     dimensions: int
     """In how many independent ways."""
-    words: str
+    text: str
     """What is wrong with the poses, and what can slide."""
 
 
@@ -103,8 +103,8 @@ def observe(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) 
         return Observability(ratio, 0, ())
     found = [*_orientation(estimate, recording, J, active, limit), *_tip(estimate, recording, J, active, limit)]
     found += _relative(estimate, recording, J, active, limit)
-    words = "the poses leave a combination of the unknowns free that has no simple name: vary everything more"
-    return Observability(ratio, int((values < limit).sum()), tuple(found) or (WeakMotion("unnamed", 1, words),))
+    text = "the poses leave a combination of the unknowns free that has no simple name: vary everything more"
+    return Observability(ratio, int((values < limit).sum()), tuple(found) or (WeakMotion("unnamed", 1, text),))
 
 
 class _Family(NamedTuple):
@@ -143,8 +143,8 @@ def _orientation(
         if weak == 3:
             found.append(WeakMotion(f"{arm}_orientation", 3, f"the {arm} hardly turns: {slides} can slide together"))
         elif weak:
-            words = f"the {arm} turns about one axis only: {slides} can slide together along it"
-            found.append(WeakMotion(f"{arm}_axis", weak, words))
+            text = f"the {arm} turns about one axis only: {slides} can slide together along it"
+            found.append(WeakMotion(f"{arm}_axis", weak, text))
     return found
 
 
@@ -157,11 +157,11 @@ def _tip(
     family[W_X], family[T_X] = np.eye(3), estimate.R_X @ skew(p)
     weak, _ = _weak_part(J, active, family, limit)
     if weak == 3:
-        words = "the tip hardly moves in the image: the image can turn about it on the probe"
-        return [WeakMotion("tip_position", 3, words)]
+        text = "the tip hardly moves in the image: the image can turn about it on the probe"
+        return [WeakMotion("tip_position", 3, text)]
     if weak:
-        words = "the tip moves along one line of the image only: the image can turn about that line on the probe"
-        return [WeakMotion("tip_line", weak, words)]
+        text = "the tip moves along one line of the image only: the image can turn about that line on the probe"
+        return [WeakMotion("tip_line", weak, text)]
     return []
 
 
@@ -175,13 +175,13 @@ def _relative(
     if weak == 0:
         return []
     if weak == 3:
-        words = "needle and image hardly turn against each other: image and tip can slide together in any direction"
-        return [WeakMotion("needle_in_image", 3, words)]
+        text = "needle and image hardly turn against each other: image and tip can slide together in any direction"
+        return [WeakMotion("needle_in_image", 3, text)]
     if weak == 1 and np.linalg.norm(a[:2]) >= IN_PLANE:
-        words = "the insertion angle in the image hardly varies: the tip can slide along the needle"
-        return [WeakMotion("insertion_angle", 1, words)]
+        text = "the insertion angle in the image hardly varies: the tip can slide along the needle"
+        return [WeakMotion("insertion_angle", 1, text)]
     if weak == 1 and abs(a[2]) >= IN_PLANE:
-        words = "the needle hardly turns about itself: image and tip can slide together across the image"
-        return [WeakMotion("needle_roll", 1, words)]
-    words = "the needle turns against the image about one axis only: image and tip can slide together along it"
-    return [WeakMotion("needle_in_image_axis", weak, words)]
+        text = "the needle hardly turns about itself: image and tip can slide together across the image"
+        return [WeakMotion("needle_roll", 1, text)]
+    text = "the needle turns against the image about one axis only: image and tip can slide together along it"
+    return [WeakMotion("needle_in_image_axis", weak, text)]

@@ -21,7 +21,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import Problem, li
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import whitener
 
 PRIOR_WEIGHT = 1e-6
-"""Information that every parameter is taken to have beforehand, as a share of a candidate's; for the first picks."""
+"""Information that every parameter is taken to have beforehand, as a fraction of a candidate's; for the first picks."""
 
 NO_INFORMATION = 1e-13
 """Least over largest eigenvalue of an information matrix below which nothing but rounding is left."""
@@ -77,7 +77,7 @@ def choose_poses(
         Indices into the candidates, ascending.
 
     Raises:
-        InputError: More poses asked for than there are candidates, or none.
+        InputError: More poses wanted than there are candidates, or none.
     """
     if not 0 < n <= len(candidates):
         raise InputError(f"{n} poses of {len(candidates)} candidates", where="pose choice", allowed="1 to all of them")
@@ -143,8 +143,8 @@ def _design(candidates: Recording, belief: _Belief, recorded: Recording | None) 
     rows = _whitened(candidates, belief)
     base = _with_prior(PRIOR_WEIGHT * np.diag((rows**2).sum(axis=1).mean(axis=0)))
     if recorded is not None:
-        held = _whitened(recorded, belief).reshape(-1, rows.shape[2])
-        base = base + held.T @ held
+        known = _whitened(recorded, belief).reshape(-1, rows.shape[2])
+        base = base + known.T @ known
     return _Design(rows, _wanted(candidates, belief), base)
 
 

@@ -73,7 +73,7 @@ class Recording:
         names: One per pose; numbers where nothing is given.
         pixels: P counts pixels, and mm per pixel is to be found.
         q_probe: Joints of the probe's arm, shape (n, 6), rad, as its controller prints them; None where they were not
-            recorded. Without them errors of the arms cannot be told from noise.
+            recorded. Without them errors of the arms cannot be identified from noise.
         q_needle: Joints of the needle's arm, shape (n, 6), rad; given if and only if the probe's are.
         turn_probe: Which way each joint of the probe's arm last turned before it stopped, shape (n, 6): 1, -1, or 0
             where nobody knows. None where it was not recorded: the play's sign is then unknown.
@@ -322,7 +322,7 @@ def _directions(v: Floats, names: tuple[str, ...]) -> Floats:
     return array
 
 
-def _refuse_first(bad: NDArray[np.bool_], names: tuple[str, ...], what: str, says: str, allowed: str) -> None:
+def _refuse_first(bad: NDArray[np.bool_], names: tuple[str, ...], what: str, problem: str, allowed: str) -> None:
     if bad.any():
         name = names[int(np.argmax(bad))]
-        raise InputError(f"{what} of pose {name} {says}", where="recording", allowed=allowed)
+        raise InputError(f"{what} of pose {name} {problem}", where="recording", allowed=allowed)

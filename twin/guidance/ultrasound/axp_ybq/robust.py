@@ -45,7 +45,7 @@ STILL_USED = 0.05
 """Tukey's weight from which on a pose counts as one that agrees."""
 
 ALARM_FRACTION = 0.6
-"""Share of the spread that is believed while outliers may be in it: a false alarm costs time, not accuracy."""
+"""Fraction of the spread that is believed while outliers may be in it: a false alarm costs time, not accuracy."""
 
 LOOKS = 5
 """How often poses may change sides before the last split is kept."""
@@ -177,9 +177,9 @@ def _facing(problem: Problem, estimate: Estimate) -> Bools:
     return np.asarray(np.einsum("ni,ni->n", m, directions_image(problem.recording, estimate)) > 0)
 
 
-def _scale(squared: Floats, block: _Block, share: float = 1.0) -> float:
+def _scale(squared: Floats, block: _Block, fraction: float = 1.0) -> float:
     """Variance over the expected one, from the median."""
-    return max(share * float(np.median(squared)) / block.median, block.least)
+    return max(fraction * float(np.median(squared)) / block.median, block.least)
 
 
 def _squared(r: Floats, S: Floats) -> Floats:

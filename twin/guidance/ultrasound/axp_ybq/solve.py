@@ -44,8 +44,8 @@ class Degenerate(InputError):  # noqa: N818 - the field's word for such poses
         self.motions: tuple[WeakMotion, ...] = observability.weak
         self.ratio = observability.ratio
         self.suggestion = suggestion
-        what = "; ".join(motion.words for motion in self.motions) + f" (singular value ratio {self.ratio:.1e})"
-        super().__init__(what, where="recording", allowed=suggestion.words)
+        what = "; ".join(motion.text for motion in self.motions) + f" (singular value ratio {self.ratio:.1e})"
+        super().__init__(what, where="recording", allowed=suggestion.text)
 
 
 class Solution(NamedTuple):
@@ -125,14 +125,14 @@ def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: E
 
 def _full_fit(problem: Problem, fit: RobustFit, seen: SeenDirection, *, robust: bool) -> tuple[Problem, RobustFit]:
     """Fit again with the directions, and with the spread that the residuals themselves show where no noise is given."""
-    told = not isinstance(problem.noise, Spread)
-    if not told:
+    declared = not isinstance(problem.noise, Spread)
+    if not declared:
         tips = problem._replace(active=problem.active[problem.active < DIRECTION.start])
         problem = problem._replace(noise=found_spreads(tips, fit).spread._replace(direction_rad=seen.spread_rad))
     for _ in range(SPREAD_ROUNDS):
         fit = settled(problem, fit, recheck=robust)
         found = found_spreads(problem, fit)
-        problem = problem._replace(noise=problem.noise if told else found.spread, lean_rad=found.lean_rad)
+        problem = problem._replace(noise=problem.noise if declared else found.spread, lean_rad=found.lean_rad)
     return problem, fit
 
 

@@ -132,10 +132,10 @@ def small_sample(problem: Problem, fit: RobustFit) -> SmallSample | None:
 
 def _by_likelihood(problem: Problem, fit: RobustFit) -> ResidualSpreads:
     """The parts' sizes at a fit, by restricted maximum likelihood."""
-    told = not isinstance(problem.noise, Spread)
+    declared = not isinstance(problem.noise, Spread)
     found = ResidualSpreads(problem.noise if isinstance(problem.noise, Spread) else UNWEIGHTED, problem.lean_rad)
     for _ in range(STEPS):
-        problem = problem._replace(noise=problem.noise if told else found.spread, lean_rad=found.lean_rad)
+        problem = problem._replace(noise=problem.noise if declared else found.spread, lean_rad=found.lean_rad)
         at_fit = weighed(problem, fit)
         found = _step(problem, fit, at_fit, found)
     return found

@@ -27,7 +27,7 @@ ROLL_RAD = float(np.radians(90.0))
 """How far the needle is turned about itself."""
 SHIFT_MM = 20.0
 """How far the tip is brought away in the image."""
-ROOM = 1.5
+SLACK = 1.5
 """The proposal reaches this many times the limit."""
 IMAGE_AXES = ("image's u axis", "image's v axis", "normal of the image")
 """As a person calls them."""
@@ -62,7 +62,7 @@ class SuggestedPoses(NamedTuple):
     poses: tuple[PoseChange, ...]
     ratio_after: float
     """Singular value ratio with these poses added, by the present estimate."""
-    words: str
+    text: str
 
 
 def propose(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> SuggestedPoses:
@@ -79,7 +79,7 @@ def propose(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) 
     for moves in (_single_moves(), _all_moves()):
         changes = [_changed(estimate, recording, reference, move) for move in moves]
         cures.append(_greedy(estimate, recording, active, changes))
-        if cures[-1].ratio_after >= ROOM * LEAST_RATIO:
+        if cures[-1].ratio_after >= SLACK * LEAST_RATIO:
             break
     return max(cures, key=lambda suggestion: suggestion.ratio_after)
 
@@ -125,14 +125,14 @@ def _changed(estimate: Estimate, recording: Recording, row: int, move: _Move) ->
     A, p = recording.A[row], np.append(recording.P[row] * estimate.scale, 0.0)
     R_AX, M = A[:3, :3] @ estimate.R_X, needle_in_image(estimate, recording)[row]
     tip_base1 = A[:3, :3] @ (estimate.R_X @ p + estimate.t_X) + A[:3, 3]
-    turned = R_AX @ exp_rotation(np.array(move.turn))
+    rotated = R_AX @ exp_rotation(np.array(move.turn))
     new_A, new_B = np.eye(4), np.eye(4)
-    new_A[:3, :3] = turned @ estimate.R_X.T
+    new_A[:3, :3] = rotated @ estimate.R_X.T
     shifted = p + np.append(move.shift, 0.0)
     new_A[:3, 3] = tip_base1 - new_A[:3, :3] @ (estimate.R_X @ p + estimate.t_X)
-    new_tip = turned @ shifted + new_A[:3, :3] @ estimate.t_X + new_A[:3, 3]
+    new_tip = rotated @ shifted + new_A[:3, :3] @ estimate.t_X + new_A[:3, 3]
     new_M = exp_rotation(np.array([0.0, 0.0, move.insertion])) @ M @ exp_rotation(move.roll * estimate.V)
-    new_B[:3, :3] = estimate.R_Y.T @ turned @ new_M
+    new_B[:3, :3] = estimate.R_Y.T @ rotated @ new_M
     new_B[:3, 3] = estimate.R_Y.T @ (new_tip - estimate.t_Y) - new_B[:3, :3] @ estimate.t_Q
     return PoseChange(
         recording.names[row], np.array(move.turn), np.array(move.shift), move.insertion, move.roll, new_A, new_B
@@ -156,11 +156,11 @@ def _greedy(
     gains = pieces.transpose(0, 2, 1) @ pieces
     H, chosen = J.T @ J, list[int]()
     floor = 1e-9 * np.trace(H) * np.eye(len(H))
-    while len(chosen) < MIN_POSES or (len(chosen) < MAX_POSES and _ratio(H) < ROOM * LEAST_RATIO):
+    while len(chosen) < MIN_POSES or (len(chosen) < MAX_POSES and _ratio(H) < SLACK * LEAST_RATIO):
         chosen.append(int(np.argmax(np.linalg.slogdet(H + gains + floor)[1])))
         H = H + gains[chosen[-1]]
     picked = tuple(changes[i] for i in chosen)
-    return SuggestedPoses(picked, _ratio(H), _words(picked))
+    return SuggestedPoses(picked, _ratio(H), _text(picked))
 
 
 def _ratio(H: Floats) -> float:
@@ -168,7 +168,7 @@ def _ratio(H: Floats) -> float:
     return float(np.sqrt(max(values[0], 0.0) / values[-1]))
 
 
-def _words(poses: tuple[PoseChange, ...]) -> str:
+def _text(poses: tuple[PoseChange, ...]) -> str:
     counted = Counter(_one(pose) for pose in poses)
     said = [f"{text} ({count} poses)" if count > 1 else text for text, count in counted.items()]
     return f"add {len(poses)} poses, each from pose {poses[0].reference}: " + "; ".join(said)
