@@ -22,6 +22,7 @@ from puncture_twin.planning.search.organs import organ_candidates
 from puncture_twin.planning.search.phases.arm_phases import with_breathing_reach
 from puncture_twin.planning.search.search import case_directions
 from puncture_twin.planning.search.table import to_table
+from puncture_twin.twin.jobs.patient.main_job import search_case
 
 SEARCH = "theta_deg = [0, 80]\nstep_deg = 10.0\nmax_skin_angle_deg = 25.0"
 WEIGHTS = {"skin": 0.4, "rib": 0.0, "vessel": 0.7, "dome": 1.4}
@@ -166,6 +167,14 @@ def test_a_certificate_refuses_a_body_that_moves(patient):
     """It proves directions for the surfaces where the CT shows them."""
     with pytest.raises(InputError, match="a body that does not move"):
         certify(replace(patient.case, breathing=breathing()), patient.anatomy, size=0.1)
+
+
+def test_a_search_that_cannot_be_certified_searches_nothing(patient, tmp_path):
+    """The refusal comes first, and leaves no file."""
+    context = replace(patient, case=replace(patient.case, breathing=breathing()))
+    with pytest.raises(InputError, match="a body that does not move"):
+        search_case(context, tmp_path / "out", certify_deg=1.0)
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_arm_is_checked_where_the_breath_puts_target_and_skin():

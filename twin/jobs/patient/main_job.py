@@ -47,7 +47,15 @@ def search_case(
     checked: CrossChecked | None = None,
     certify_deg: float | None = None,
 ) -> Run:
-    """Search; write ``candidates.parquet`` and, if wanted, the certificate, the pictures and the page."""
+    """Search; write ``candidates.parquet`` and, if wanted, the certificate, the pictures and the page.
+
+    Raises:
+        InputError: A certificate that the case cannot have; before anything is searched.
+    """
+    if certify_deg is not None:
+        from puncture_twin.planning.certify.question import question_of
+
+        question_of(context.case, context.anatomy)
     names = ("candidates.parquet", *(PICTURES if pictures else ()), *(() if certify_deg is None else (CERTIFICATE,)))
     with _writing(out, "search", context, names) as draft:
         run = Run(context, context.search(), (), checked=checked)
