@@ -272,6 +272,11 @@ def rehearse(
         int | None, typer.Option("--seeds", min=1, max=1_000_000, help="Rooms, each with a truth of its own.")
     ] = None,
     physics: Annotated[int, typer.Option("--physics", min=0, max=MOST_SEEDS, help="Of them in the simulator.")] = 0,
+    sweep: Annotated[bool, typer.Option("--sweep", help="Turn the needle about the target instead, outside.")] = False,
+    to: Annotated[
+        str | None,
+        typer.Option("--to", metavar="THETA,BETA", help="Where it ends.", show_default="its window's farthest"),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Execute a plan in the twin, where the truth differs from the belief, and say where the tip ended."""
@@ -285,6 +290,9 @@ def rehearse(
         raise InputError("--physics runs some of the rooms", where="--physics", allowed="--seeds N --physics K, K <= N")
     rooms = None if seeds is None else RoomCount(seeds, physics)
     folder = _out(out_dir, source, "rehearse")
+    if sweep or to is not None:
+        _sweep(source, folder, choice, to if sweep else "", alone=seeds is None and case is None, as_json=as_json)
+        return
     planned_case = case_of(source, case, choice)
     if planned_case is None:
         raise InputError("a plan needs its case", where=source, allowed="rehearse plan.json --case CASE")
@@ -295,6 +303,23 @@ def rehearse(
         else:
             run = main_job.rehearse_case(context, folder, rooms, choice)
     _print(run.summary(), text.rehearsal_text(run), as_json)
+
+
+def _sweep(source: Path, folder: Path, choice: Choice, to: str | None, *, alone: bool, as_json: bool) -> None:
+    from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.experiment.sweep_job import parse_angles, sweep_case, sweep_text
+    from puncture_twin.twin.jobs.patient.case_or_plan import is_plan
+
+    if to == "":
+        raise InputError("a sweep ends there", where="--to", allowed="--sweep --to THETA,BETA")
+    if is_plan(source) or not alone:
+        raise InputError("a sweep is of one case", where="--sweep", allowed="a case, no plan, no --seeds")
+    end = parse_angles(to)
+    with progress_display() as progress:
+        run = sweep_case(prepare(source, watcher=progress), folder, choice, end)
+    _print(run.summary(), sweep_text(run), as_json)
+    if not run.whole:
+        raise typer.Exit(ANSWER_IS_NO)
 
 
 @app.command()
@@ -314,6 +339,22 @@ def touch(
     with progress_display() as progress:
         run = touch_case(prepare(case, watcher=progress), folder, choice, seed)
     _print(run.summary(), touch_text(run), as_json)
+
+
+@app.command()
+def pivot(
+    case: CaseArgument,
+    joints: Annotated[Path, typer.Argument(metavar="JOINTS.csv", help="Touches of one place, as touch writes them.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Find the needle's tip on the flange from arms that touch one place in different poses; 1 if they contradict."""
+    from puncture_twin.planning.case.case import load_case
+    from puncture_twin.twin.jobs.experiment.pivot_job import pivot_case, pivot_text
+
+    run = pivot_case(load_case(case), joints)
+    _print(run.summary(), pivot_text(run), as_json)
+    if run.pivot.large:
+        raise typer.Exit(ANSWER_IS_NO)
 
 
 @app.command()

@@ -6,7 +6,8 @@ import io
 from fuzz.mutate import NUMBERS, pick
 
 COMMANDS = [
-    *["search", "verify", "check", "compare", "plan", "rehearse", "touch", "place", "mirror", "export", "register"],
+    *["search", "verify", "check", "compare", "plan", "rehearse", "place", "mirror", "export", "register"],
+    *["touch", "pivot"],
     *["batch", "batch run", "batch status", "batch merge", "batch compare"],
     *["init", "selfcal", "servo", "reproduce", "scan", "", "serch", "x" * 3000, "--help", "-h", "--version"],
 ]

@@ -1,0 +1,179 @@
+"""The planning of a sweep: as far as every direction is safe and reachable, and the arm can go on from the one before.
+
+A direction is passed only if the search calls it safe: organs, skin and the arm's straight insertion. The needle stays
+outside the body; arm, holder and needle keep their distance all the way.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.arm.insertion import away_from_singularities
+from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits
+from puncture_twin.planning.arm.speed_limits import slowed
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.progress import Count
+from puncture_twin.planning.case.entry import outward
+from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.workcell import home_configuration
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation
+from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, plan_approach
+from puncture_twin.planning.motion.follow import follow_smoothly
+from puncture_twin.planning.motion.path_check import dense_states
+from puncture_twin.planning.reach.goals import approach_goals
+from puncture_twin.planning.reach.reach import ReachRequest
+from puncture_twin.planning.reach.standoff import standoffs
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.explain import reason_text
+from puncture_twin.planning.sweep.sweep_plan import SweepPlan
+
+STEP = np.radians(1.0)
+"""Between two directions that are checked, at most: half of the search's usual grid."""
+
+MOST_JOINT_STEP = 0.2
+"""A joint that turns more from one direction to the next jumps, rad."""
+
+SWEEP_SPEED_MM_S = 30.0
+"""Of the needle's tip, in the air."""
+
+
+class _Way(NamedTuple):
+    """Directions that are passed one after the other, and why no more."""
+
+    angles: Floats
+    """Shape (k, 2), rad."""
+    standoff_mm: float
+    stopped: str
+
+
+def plan_sweep(
+    context: CaseContext, start: tuple[float, float], end: tuple[float, float], *, seed: int, progress: Count
+) -> SweepPlan:
+    """Plan from one direction to another, on the straight line in theta and beta, as far as it is allowed.
+
+    Args:
+        context: Of a case that says where the arm's base is.
+        start: Theta and beta, rad.
+        end: The same; beta goes the shorter way around.
+        seed: Of the approach's planner.
+        progress: Called with directions checked and all of them.
+
+    Raises:
+        InputError: The case does not say where the robot stands, or both directions are one.
+        NoAnswerError: The first directions are not allowed, or no approach to them was found.
+    """
+    if context.reach is None:
+        raise InputError("the case does not say where the robot stands", where=context.case.path, allowed=_BASE)
+    way = _allowed(context, _angles(start, end), progress)
+    point = apply(context.reach.T_base_ct, context.case.target_ct)
+    T_base_ct, frame = context.reach.T_base_ct, context.case.T_ct_entry[:3, :3]
+    directions = outward(way.angles[:, 0], way.angles[:, 1]) @ (T_base_ct[:3, :3] @ frame).T
+    q, stopped = _farthest(context, point, directions, way)
+    if len(q) < 2:
+        raise NoAnswerError(f"no sweep: {stopped}")
+    speeds, checker = context.case.robot.speeds, context.reach.checker
+    approach = plan_approach(checker, home_configuration(context.case), q[0], seed=seed, speeds=speeds)
+    turned = np.arccos(np.clip(np.vecdot(directions[1 : len(q)], directions[: len(q) - 1]), -1.0, 1.0))
+    arc = way.standoff_mm * np.concatenate([[0.0], np.cumsum(turned)])
+    sweep = follow_smoothly(slowed(checker.model, speeds), q, arc, max_tip_speed_mm_s=SWEEP_SPEED_MM_S)
+    contact = checker.first_contact(
+        dense_states(checker, sweep.q, RESOLUTION_RAD / FINER), needle_may_touch_patient=False
+    )
+    if contact is not None:
+        raise NoAnswerError(f"no sweep: between its directions {contact.contact.body} touches {contact.contact.other}")
+    length = context.case.needle.length_mm
+    return SweepPlan(
+        checker.model, length, way.standoff_mm, point, way.angles[: len(q)], end, approach.trajectory, sweep, stopped
+    )
+
+
+_BASE = "[registration] with markers, or [robot.mount]"
+
+
+def _angles(start: tuple[float, float], end: tuple[float, float]) -> Floats:
+    """Directions on the straight line, shape (k, 2), rad, `STEP` apart at most."""
+    change = np.array([end[0] - start[0], (end[1] - start[1] + np.pi) % (2 * np.pi) - np.pi])
+    count = int(np.ceil(np.abs(change).max() / STEP))
+    if count == 0:
+        raise InputError("a sweep to where it starts", where="--to", allowed="another direction")
+    return np.asarray(start + np.linspace(0.0, 1.0, count + 1)[:, None] * change)
+
+
+def _allowed(context: CaseContext, angles: Floats, progress: Count) -> _Way:
+    """As far as the search calls every direction safe, with the arm."""
+    standoff, passed, stopped = 0.0, 0, ""
+    for row, (theta, beta) in enumerate(angles.tolist()):
+        found = context.check(theta, beta % (2 * np.pi))
+        if not found.safe[0]:
+            stopped = f"{_place(angles[row])} is rejected: {reason_text(found, 0)}"
+            break
+        asked = standoffs(context.case.needle, found.path.length[0], found.path.skin_angle[0])
+        standoff, passed = max(standoff, float(asked)), row + 1
+        progress(passed, len(angles))
+    return _Way(angles[:passed], standoff, stopped)
+
+
+def _place(angles: Floats) -> str:
+    theta, beta = np.degrees(angles)
+    return f"theta {theta:.1f} deg, beta {beta % 360:.1f} deg"
+
+
+def _farthest(context: CaseContext, point: Floats, directions: Floats, way: _Way) -> tuple[Floats, str]:
+    """Of all rolls and branches at the first direction the one that goes farthest, shape (k, 6), and why not on."""
+    assert context.reach is not None
+    if not len(directions):
+        return np.empty((0, 6)), way.stopped
+    checker, length = context.reach.checker, context.case.needle.length_mm
+    request = ReachRequest(point, directions[0], length, way.standoff_mm)
+    best, why = np.empty((0, 6)), f"the arm cannot start at {_place(way.angles[0])}"
+    for goal in approach_goals(checker, request, home_configuration(context.case)):
+        q, stop = _followed(checker, goal.insertion_q[0], point, directions, length + way.standoff_mm)
+        if len(q) > len(best):
+            best, why = q, f"at {_place(way.angles[len(q)])} {stop}" if stop else way.stopped
+        if len(best) == len(directions):
+            break
+    return best, why
+
+
+def _followed(
+    checker: CellChecker, q_start: Floats, point: Floats, directions: Floats, reach_mm: float
+) -> tuple[Floats, str]:
+    """The arm's way through directions (k, 3) with its flange so far from the point; where it ends, and why."""
+    rows = [q_start]
+    R = flange_pose(checker.model, q_start)[:3, :3]
+    for direction in directions[1:]:
+        R = _least_turn(R, -direction)
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, point + reach_mm * direction
+        every = nearest_within_limits(checker.model, inverse(checker.model, T)[0], rows[-1])
+        away = np.where(np.isnan(every).any(axis=1), np.inf, np.abs(every - rows[-1]).max(axis=1))
+        q = every[int(np.argmin(away))]
+        why = _why_not(checker, rows[-1], q, float(away.min()))
+        if why:
+            return np.array(rows), why
+        rows.append(q)
+    return np.array(rows), ""
+
+
+def _least_turn(R: Floats, z: Floats) -> Floats:
+    """A rotation (3, 3) whose z axis is turned to another, shape (3,), unit, and no farther."""
+    axis = np.cross(R[:, 2], z)
+    sine = float(np.linalg.norm(axis))
+    angle = float(np.arctan2(sine, R[:, 2] @ z))
+    return R if sine == 0.0 else np.asarray(exp_rotation(axis / sine * angle) @ R)
+
+
+def _why_not(checker: CellChecker, before: Floats, q: Floats, step: float) -> str:
+    """What keeps the arm from the next direction, in words; empty where nothing does."""
+    if not np.isfinite(step):
+        return "the arm does not reach on, or a joint would be beyond its limits"
+    if step > MOST_JOINT_STEP:
+        return "a joint would jump"
+    if not away_from_singularities(checker.model, q):
+        return "the arm would be too near a singularity"
+    states = dense_states(checker, np.stack([before, q]), RESOLUTION_RAD / FINER)
+    contact = checker.first_contact(states, needle_may_touch_patient=False)
+    return "" if contact is None else f"{contact.contact.body} touches {contact.contact.other}"

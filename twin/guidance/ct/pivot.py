@@ -1,0 +1,77 @@
+"""Pivot calibration: where the tip is on the flange, from arms that stand differently with the tip in one place.
+
+With T_base_flange = (R_i, p_i) of pose i, the tip x in the flange frame and the place c in the base frame:
+
+    R_i x + p_i = c      for all i: linear least squares in (x, c), 3 n equations for 6 unknowns
+
+With independent noise s per axis at each touch the residuals' mean square is s^2 (3 n - 6) / n.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+
+LEAST_POSES = 3
+"""Two leave the tip free along a line."""
+
+LARGE = 2.0
+"""Residuals so many times the expected ones are not the declared noise: the arm's own errors, or a tip that slipped."""
+
+WORST_FACTOR = 30.0
+"""Of the noise in the worst direction of the tip: poses that turn too little magnify it so."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pivot:
+    """A calibrated tip.
+
+    Attributes:
+        tip_flange: Shape (3,), mm, in the flange frame.
+        place_base: Shape (3,), mm: where it stood.
+        cov_tip: Shape (3, 3), mm^2, of the tip, from the declared noise.
+        residual_mm: Root mean square distance of the n tips from their place.
+        expected_mm: The same as the declared noise leaves it.
+    """
+
+    tip_flange: Floats
+    place_base: Floats
+    cov_tip: Floats
+    residual_mm: float
+    expected_mm: float
+
+    @property
+    def large(self) -> bool:
+        """Whether the residual contradicts the declared noise."""
+        return self.residual_mm > LARGE * self.expected_mm
+
+
+def pivot_calibration(T_base_flange: Floats, noise_mm: float, *, where: str = "pivot") -> Pivot:
+    """The tip from poses that share its place.
+
+    Args:
+        T_base_flange: Shape (n, 4, 4), mm, as the controller computes them.
+        noise_mm: Standard deviation of one touch, per axis.
+        where: What errors name.
+
+    Raises:
+        InputError: Fewer than three poses, or poses that turn too little about one another.
+    """
+    count = len(T_base_flange)
+    if count < LEAST_POSES:
+        raise InputError(f"{count} poses", where=where, allowed=f"{LEAST_POSES} or more that turn about one another")
+    A = np.concatenate([T_base_flange[:, :3, :3], np.broadcast_to(-np.eye(3), (count, 3, 3))], axis=2).reshape(-1, 6)
+    factors = np.linalg.svd(A, compute_uv=False)
+    if not factors[-1] * WORST_FACTOR > 1.0:
+        what = "the poses turn too little about one another to find the tip"
+        raise InputError(what, where=where, allowed="tilts of 20 degrees or more to several sides")
+    found, *_ = np.linalg.lstsq(A, -T_base_flange[:, :3, 3].reshape(-1), rcond=None)
+    left = (A @ found + T_base_flange[:, :3, 3].reshape(-1)).reshape(-1, 3)
+    cov = noise_mm**2 * np.linalg.inv(A.T @ A)
+    residual = float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
+    expected = noise_mm * float(np.sqrt((3 * count - 6) / count))
+    return Pivot(found[:3], found[3:], cov[:3, :3], residual, expected)

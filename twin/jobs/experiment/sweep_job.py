@@ -1,0 +1,149 @@
+"""`rehearse --sweep`: the needle turned about the target from outside, as far as the planner allows it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.formats.points.raw_points import parse_coordinate
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.selection.choice import Choice, choose, chosen_angles
+from puncture_twin.planning.search.selection.windows import find_windows
+from puncture_twin.planning.sweep.sweep_plan import SweepPlan
+from puncture_twin.planning.sweep.sweep_planner import plan_sweep
+from puncture_twin.twin.rehearsal.sweeping import Swept, execute_sweep
+
+SWEEP = "sweep.json"
+
+Angles = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class SweepRun:
+    """What was planned and what was measured.
+
+    Attributes:
+        case_name: The case.
+        inputs: Every file that decided.
+        control: How it was followed.
+        plan: The motion.
+        swept: The measurement.
+        files: Written.
+    """
+
+    case_name: str
+    inputs: tuple[Input, ...]
+    control: str
+    plan: SweepPlan
+    swept: Swept
+    files: tuple[Path, ...]
+
+    @property
+    def whole(self) -> bool:
+        """Whether it reached its end without a contact."""
+        return not (self.plan.stopped or self.swept.contacts)
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        plan, off = self.plan, self.swept.off_mm
+        return {
+            "case": self.case_name,
+            "control": self.control,
+            "from_deg": np.degrees(plan.angles[0]).tolist(),
+            "reached_deg": np.degrees(plan.angles[-1]).tolist(),
+            "wanted_deg": np.degrees(plan.wanted).tolist(),
+            "stopped": plan.stopped,
+            "standoff_mm": plan.standoff_mm,
+            "seconds": plan.sweep.duration_s,
+            "off_point_mean_mm": float(off.mean()),
+            "off_point_max_mm": float(off.max()),
+            "contacts": [list(pair) for pair in self.swept.contacts],
+            "inputs": inputs_document(self.inputs),
+            "files": [str(path) for path in self.files],
+        }
+
+
+def sweep_case(context: CaseContext, out: Path, choice: Choice, to: Angles | None) -> SweepRun:
+    """Plan a sweep, execute it in the twin, write what was measured.
+
+    Args:
+        context: Of a case with an arm.
+        out: The output folder.
+        choice: Where it starts.
+        to: Theta and beta, rad, where it ends; None for the farthest direction of the start's window.
+
+    Raises:
+        InputError: The case does not say where the robot stands.
+        NoAnswerError: Nothing is safe, or the sweep cannot start; says why.
+    """
+    case, count = context.case, context.watcher.count
+    with writing(out, "sweep", inputs=case.inputs, names=(SWEEP,), note=context.watcher.note) as draft:
+        start, end = _ends(context, choice, to)
+        with context.stages.time("sweep plan"):
+            plan = plan_sweep(context, start, end, seed=case.rehearsal.seed, progress=partial(count, "directions"))
+        assert context.placement is not None
+        with context.stages.time("sweep"):
+            swept = execute_sweep(plan, case, context.anatomy, context.placement.T_base_ct)
+        files = draft.final((draft.folder / SWEEP,))
+        run = SweepRun(case.name, case.inputs, case.rehearsal.control, plan, swept, files)
+        with atomic(draft.folder / SWEEP) as temporary:
+            temporary.write_text(json.dumps(run.summary(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return run
+
+
+def parse_angles(text: str | None) -> Angles | None:
+    """Theta and beta (rad) of "THETA,BETA" in degrees.
+
+    Raises:
+        InputError: Not two numbers, or out of range.
+    """
+    if text is None:
+        return None
+    numbers = [parse_coordinate(part.strip(), "--to") for part in text.split(",")]
+    if len(numbers) != 2 or not (0 <= numbers[0] <= 180 and 0 <= numbers[1] <= 360):
+        raise InputError(f"'{text[:40]}'", where="--to", allowed="THETA,BETA in degrees, 0 to 180 and 0 to 360")
+    return float(np.radians(numbers[0])), float(np.radians(numbers[1]))
+
+
+def _ends(context: CaseContext, choice: Choice, to: Angles | None) -> tuple[Angles, Angles]:
+    """Where it starts and ends; the grid is searched only where it has to be."""
+    if to is not None and not choice.of_grid:
+        return chosen_angles(context.case, choice), to
+    with context.stages.time("search"):
+        found = context.search()
+    chosen = choose(context, found, choice)
+    row = int(chosen.rows[0])
+    start = float(chosen.candidates.theta[row]), float(chosen.candidates.beta[row])
+    if to is not None:
+        return start, to
+    windows = find_windows(found)
+    near = int(np.argmax(found.outward_ct @ chosen.candidates.outward_ct[row]))
+    if not windows.of_row[near]:
+        raise InputError("the direction lies in no window of the grid", where="--sweep", allowed="--to THETA,BETA")
+    rows = windows.rows(int(windows.of_row[near]))
+    far = int(rows[np.argmin(found.outward_ct[rows] @ found.outward_ct[near])])
+    return start, (float(found.theta[far]), float(found.beta[far]))
+
+
+def sweep_text(run: SweepRun) -> str:
+    """For the terminal."""
+    plan, off = run.plan, run.swept.off_mm
+    angles = ["theta {:.1f}, beta {:.1f}".format(*np.degrees(one)) for one in (plan.angles[0], plan.angles[-1])]
+    lines = [
+        f"swept from {angles[0]} to {angles[1]} deg in {plan.sweep.duration_s:.1f} s, "
+        f"the tip {plan.standoff_mm:.0f} mm from the target",
+        f"virtual TCP off its point: {off.mean():.4f} mm on average, {off.max():.4f} mm at most ({run.control})",
+    ]
+    if plan.stopped:
+        lines.append(f"stopped there: {plan.stopped}")
+    lines += [f"{link} touches {body}" for link, body in run.swept.contacts]
+    return "\n".join([*lines, *(f"wrote {path}" for path in run.files)])
