@@ -46,7 +46,7 @@ def draw_scan(image: CtImage, shown: Shown, path: Path) -> Path:
     k = int(np.clip(round(float(index[2])), 0, nz - 1))
     x0, y0, z = apply(T, np.array([-0.5, -0.5, k]))
     figure = Figure(figsize=(INCHES, INCHES * ny * dy / (nx * dx) + 0.6), dpi=DPI)
-    ax = figure.add_axes((0.07, 0.06, 0.91, 0.88))
+    ax = figure.add_axes((0.09, 0.1, 0.89, 0.82))
     extent = (x0, x0 + nx * dx, y0 + ny * dy, y0)
     low, high = WINDOW_HU
     ax.imshow(image.hu[:, :, k].T, cmap="gray", vmin=low, vmax=high, extent=extent, interpolation="nearest")
@@ -55,7 +55,7 @@ def draw_scan(image: CtImage, shown: Shown, path: Path) -> Path:
         _draw_needle(ax, shown.needle, shown.length_mm)
     if shown.markers is not None:
         _draw_markers(ax, shown.markers, z)
-    ax.legend(loc="lower left", fontsize=8)
+    ax.legend(loc="upper left", fontsize=8)
     ax.set(xlabel="x, mm (patient's left to the right)", ylabel="y, mm (front above)")
     ax.set_title(f"slice {k + 1} of {nz}, z {z:.1f} mm; simulated", fontsize=10)
     ax.set_xlim(extent[:2])
