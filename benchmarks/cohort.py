@@ -110,12 +110,22 @@ def overhead(here: Path, count: int = 300) -> dict[str, float]:
             prepare(row.path, arm=False, options=options, memory=memory).search()
 
     library()
-    loop = seconds(library) / count
+    loop, loop_cpu = seconds(library) / count, cpu(library) / count
     tasks = [CaseTask(row, out, out) for row in rows]
     ends = run_tasks(tasks, 1, NO_LIMITS)
     next(ends)
     worker = seconds(lambda: list(ends)) / (count - 1)
-    return {"library_s": loop, "worker_s": worker, "overhead_ms": 1000 * (worker - loop)}
+    for row in rows:
+        shutil.rmtree(out / row.id)
+    done_cpu = cpu(lambda: [run_case(task, memory) for task in tasks]) / count
+    return {
+        "library_s": loop,
+        "worker_s": worker,
+        "overhead_ms": 1000 * (worker - loop),
+        "library_cpu_s": loop_cpu,
+        "case_cpu_s": done_cpu,
+        "overhead_cpu_ms": 1000 * (done_cpu - loop_cpu),
+    }
 
 
 def targets(here: Path) -> dict[str, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.sources import Progress, StructureSources
 from puncture_twin.planning.anatomy.structure import Role as Role, Structure as Structure
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
+from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import StructureSection
@@ -129,9 +131,17 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
     _check_names(case, [*structures, *outside])
     warnings = [*loader.warnings, *loader.unnamed_warnings(), *skin.warnings]
     for structure in structures:
-        warnings.extend(mesh_warnings(structure.mesh, structure.name))
+        warnings.extend(_mesh_warnings(structure, cache.memory))
     _check_target(case, structures, skin)
     return Anatomy(tuple(structures), skin, tuple(warnings), outside, scan, tuple(loader.ignored))
+
+
+def _mesh_warnings(structure: Structure, memory: Memory) -> tuple[str, ...]:
+    mesh, name = structure.mesh, structure.name
+    if memory is NO_MEMORY:
+        return mesh_warnings(mesh, name)
+    key = (mesh_warnings.__name__, mesh.digest, name)
+    return memory.get(key, partial(mesh_warnings, mesh, name), lambda lines: sum(map(len, lines)))
 
 
 def _outside(case: Case, scan: Scan, warnings: list[str]) -> tuple[Structure, ...]:

@@ -12,6 +12,7 @@ from puncture_twin.planning.anatomy.label_grids import label_grids
 from puncture_twin.planning.anatomy.own_target import OWN_TARGET
 from puncture_twin.planning.anatomy.regions import absent_organs
 from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
@@ -41,8 +42,10 @@ MOST_AROUND = 0.5
 """An open mesh may go so far around the target: of the rays that cross it oddly, and of its winding number."""
 
 
-def check_consistency(case: Case, anatomy: Anatomy, placement: Placement | None) -> tuple[str, ...]:
-    """Hold the inputs against each other.
+def check_consistency(
+    case: Case, anatomy: Anatomy, placement: Placement | None, memory: Memory = NO_MEMORY
+) -> tuple[str, ...]:
+    """Hold the inputs against each other; ``memory`` keeps what depends on no target.
 
     Returns:
         Warnings, one sentence each.
@@ -56,7 +59,7 @@ def check_consistency(case: Case, anatomy: Anatomy, placement: Placement | None)
     _refuse_open_around_target(case, anatomy)
     return (
         *outside,
-        *_marker_warnings(case, anatomy, placement),
+        *_marker_warnings(case, anatomy, placement, memory),
         *_needle_warnings(case, anatomy.skin),
         *resolution_warnings(case, anatomy, headers),
         *_region_warnings(case, anatomy),
@@ -159,8 +162,8 @@ def _region_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
     return (f"region {case.region}: no structure is named like {like}; what has no structure counts as free",)
 
 
-def _marker_warnings(case: Case, anatomy: Anatomy, placement: Placement | None) -> tuple[str, ...]:
+def _marker_warnings(case: Case, anatomy: Anatomy, placement: Placement | None, memory: Memory) -> tuple[str, ...]:
     if placement is None or placement.registration is None:
         return ()
     weak = tuple(f"registration: {flag}" for flag in placement.registration.flags)
-    return (*weak, *check_markers(case, anatomy.skin, placement.registration).warnings)
+    return (*weak, *check_markers(case, anatomy.skin, placement.registration, memory).warnings)

@@ -211,7 +211,7 @@ def prepare(
     with stages.time("anatomy"):
         anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), replace(user_cache(), memory=memory))
         anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
-        warnings = (*case.warnings, *anatomy.warnings, *check_consistency(case, anatomy, placement))
+        warnings = (*case.warnings, *anatomy.warnings, *check_consistency(case, anatomy, placement, memory))
         warnings += breath_warnings(case, anatomy)
         check_tissues(case, anatomy)
         anatomy = replace(anatomy, warnings=warnings)

@@ -1,9 +1,11 @@
 """What a worker keeps from one case to the next never changes an answer: attacks on the sharing of meshes and trees."""
 
+import io
 import shutil
 
+import pyarrow.parquet as pq
 import pytest
-from case_world import ball
+from case_world import ball, registration_section, write_markers
 from cohort_world import plan_of, table_bytes, task_of, tiny_text, write_patient
 
 from puncture_twin.planning.base.cache.memory import Memory
@@ -136,3 +138,16 @@ def test_memory_is_bounded_and_forgets_the_least_recently_used():
     with pytest.raises(ZeroDivisionError):
         memory.get(("bad",), lambda: 1 / 0, lambda _: 1)
     assert memory.get(("bad",), lambda: 5, lambda _: 1) == 5
+
+
+def test_other_markers_on_the_same_skin(tmp_path, memory):
+    """How markers lie on the skin is kept by their coordinates: one that is moved off it is warned of again."""
+    text = tiny_text() + registration_section()
+    paths = [write_patient(tmp_path / name, text=text) for name in "abc"]
+    for path, height in zip(paths, (90, 90, 140), strict=True):
+        lines = f"A,0,0,{height}\nB,63.6,0,63.6\nC,0,54,72\nD,-36,-48,-67.1\nE,-70,20,52.9\n"
+        write_markers(path.parent, *2 * [f"name,x_mm,y_mm,z_mm\n{lines}"])
+    found = [held(path, tmp_path, memory, number) for number, path in enumerate(paths)]
+    assert found[0] == found[1] != found[2]
+    told = [pq.read_schema(io.BytesIO(table)).metadata[b"run"].decode() for table in found]
+    assert "markers far from the skin: A (50 mm)" in told[2] and "markers far" not in told[0]

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
 
 from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.rigid import apply
@@ -71,23 +73,36 @@ class MarkerList:
         return worse or not self.plausible
 
 
-def marker_list(case: Case, skin: Skin, registration: Registration, signs: Signs = (1.0, 1.0, 1.0)) -> MarkerList:
+def marker_list(
+    case: Case,
+    skin: Skin,
+    registration: Registration,
+    signs: Signs = (1.0, 1.0, 1.0),
+    memory: Memory = NO_MEMORY,
+) -> MarkerList:
     """The CT markers with some axes negated, compared with skin, couch and the robot's place."""
     points = registration.markers.points_ct * np.array(signs)
-    fit = skin_fit(points, skin)
+    key = (skin_fit.__name__, skin.mesh.digest, skin.cut_faces.tobytes(), points.tobytes())
+    fit = skin_fit(points, skin) if memory is NO_MEMORY else memory.get(key, partial(skin_fit, points, skin), _bytes)
     T_base_ct = fit_rigid(points, registration.markers.points_base)
     moved = apply(T_base_ct, case.target_ct) - apply(registration.T_base_ct, case.target_ct)
     behind = untouchable(case, points, fit.normals_ct)
     return MarkerList(fit, behind, place_excluded(case, skin.mesh, T_base_ct), float(np.linalg.norm(moved)))
 
 
-def check_axes(case: Case, skin: Skin, registration: Registration, given: MarkerList) -> tuple[str, ...]:
+def _bytes(fit: SkinFit) -> int:
+    return fit.gaps_mm.nbytes + fit.normals_ct.nbytes
+
+
+def check_axes(
+    case: Case, skin: Skin, registration: Registration, given: MarkerList, memory: Memory = NO_MEMORY
+) -> tuple[str, ...]:
     """Hold the given list against its half turns; returns warnings, one sentence each.
 
     Raises:
         InputError: The list lies on the skin, or where it can be touched, only after a half turn.
     """
-    slips = {name: marker_list(case, skin, registration, signs) for name, signs in HALF_TURNS.items()}
+    slips = {name: marker_list(case, skin, registration, signs, memory) for name, signs in HALF_TURNS.items()}
     likely = {name: slip for name, slip in slips.items() if slip.explains(given)}
     if likely:
         name = min(likely, key=lambda name: likely[name].fit.scatter_mm)
