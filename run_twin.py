@@ -134,6 +134,10 @@ def search(
     check_again: Annotated[int, typer.Option("--cross-check", min=0, help="Directions that FCL measures again.")] = 0,
     certified: Annotated[bool, typer.Option("--certify", help="Judge the angles between the grid points too.")] = False,
     certify_size: Annotated[float, typer.Option(min=0.05, max=10, help="Smallest cell of --certify, degrees.")] = 0.25,
+    certify_touch: Annotated[
+        float | None,
+        typer.Option(metavar="P", help="With --certify: no structure is touched more often, to first order."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Judge every entry direction of a case; write the table, the map, the scene and the page."""
@@ -141,11 +145,18 @@ def search(
     from puncture_twin.twin.jobs.patient import main_job, text
 
     folder = _out(out_dir, case, "search")
+    if certify_touch is not None and not certified:
+        raise InputError("a chance without a certificate", where="--certify-touch", allowed="beside --certify")
     with progress_display() as progress:
         context = prepare(case, arm=arm, engine=engine, watcher=progress)
         checked = context.cross_check(check_again) if check_again else None
         run = main_job.search_case(
-            context, folder, pictures=pictures, checked=checked, certify_deg=certify_size if certified else None
+            context,
+            folder,
+            pictures=pictures,
+            checked=checked,
+            certify_deg=certify_size if certified else None,
+            certify_touch=certify_touch,
         )
     _print(run.summary(), text.search_text(run), as_json)
     if not run.candidates.safe.any():

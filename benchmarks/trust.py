@@ -25,6 +25,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.special import chdtri, fdtri
 
+from benchmarks.scenes import DATA
 from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.arm.insertion import flange_poses
@@ -53,7 +54,7 @@ from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-REAL_CT = REPOSITORY.parent / "shared" / "data" / "totalseg_abdomen_3mm"
+REAL_CT = DATA / "totalseg_abdomen_3mm"
 REAL_ERRORS = "\n[errors]\nct_pixel_mm = 1.5\nct_spacing_mm = 3.0\n"
 MARKERS = (3, 4, 6)
 SEED = 20191104

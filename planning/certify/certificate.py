@@ -34,9 +34,10 @@ from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, nearest_
 from puncture_twin.planning.certify.html import certificate_html
 from puncture_twin.planning.certify.question import Question
 
-CERTIFICATE_VERSION = 4
+CERTIFICATE_VERSION = 5
 """Version of the file's layout and of what a cell claims. 3: lists its inputs with their roles, files that a file names
-included; a length each structure is checked to. 4: a safe cell keeps the image up to the flange at standoff."""
+included; a length each structure is checked to. 4: a safe cell keeps the image up to the flange at standoff. 5: a
+chance to touch that no safe cell exceeds."""
 
 MAX_CERTIFICATE_BYTES = 500_000_000
 """A certificate has some ten thousand cells; a larger file is something else."""
@@ -46,7 +47,7 @@ CERTIFICATE_ALLOWED = f"a certificate of version {CERTIFICATE_VERSION}, as searc
 NAMES = frozenset({
     *("version", "case", "inputs", "target_ct_mm", "R_ct_entry", "theta_rad", "beta_rad", "length_mm", "standoff_mm"),
     *("skin_gap_mm", "farthest_flange_mm", "radius_mm", "longest_path_mm", "max_skin_angle_rad", "margins_mm"),
-    *("lengths_mm", "size_rad", "queries", "summary", "tree", "witness"),
+    *("lengths_mm", "touch", "size_rad", "queries", "summary", "tree", "witness"),
 })  # fmt: skip
 """The keys of a certificate."""
 
@@ -63,7 +64,10 @@ CERTIFIED = (
 )
 """The constraints that hold all over a safe cell."""
 
-NOT_CERTIFIED = ("reach of the arm", "approach of the arm")
+TOUCH_CERTIFIED = "chance to touch each structure, to first order: at most {:g}"
+"""That too, where a chance was asked for; margins are then so wide that a cell is rejected for it."""
+
+NOT_CERTIFIED = ("reach of the arm", "approach of the arm", "limits of chances (min_hit, max_touch)")
 """What a certificate says nothing about."""
 
 SAFE, REJECTED, UNDECIDED = "SRU"
@@ -158,10 +162,12 @@ class Certificate:
             self.areas,
             {letter: int((self.verdict == letter).sum()) for letter in (SAFE, REJECTED, UNDECIDED)},
         )
+        touch = self.question.touch
         return {
             "size_deg": float(np.degrees(self.size)),
-            "certified": list(CERTIFIED),
+            "certified": [*CERTIFIED, *(() if touch is None else (TOUCH_CERTIFIED.format(touch),))],
             "not_certified": list(NOT_CERTIFIED),
+            "touch": touch,
             "safe_square_deg": areas[SAFE],
             "rejected_square_deg": areas[REJECTED],
             "undecided_square_deg": areas[UNDECIDED],
@@ -215,6 +221,7 @@ def write_certificate(certificate: Certificate, path: Path) -> None:
         "max_skin_angle_rad": question.max_skin_angle,
         "margins_mm": dict(zip(question.structures, question.margins.tolist(), strict=True)),
         "lengths_mm": dict(zip(question.structures, question.lengths.tolist(), strict=True)),
+        "touch": question.touch,
         "size_rad": certificate.size,
         "queries": certificate.queries,
         "summary": certificate.summary(),
@@ -290,7 +297,7 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
 
 
 def _question(document: dict[str, Any]) -> Question:
-    names, standoff = tuple(document["margins_mm"]), document["standoff_mm"]
+    names, standoff, touch = tuple(document["margins_mm"]), document["standoff_mm"], document["touch"]
     if set(document["lengths_mm"]) != set(names):
         raise ValueError("lengths_mm and margins_mm name other structures")
     margins, lengths = ([document[key][name] for name in names] for key in ("margins_mm", "lengths_mm"))
@@ -311,6 +318,7 @@ def _question(document: dict[str, Any]) -> Question:
         structures=names,
         margins=array(margins, (len(names),)),
         lengths=array(lengths, (len(names),)),
+        touch=None if touch is None else number(touch),
     )
 
 

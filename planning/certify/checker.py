@@ -23,6 +23,7 @@ from puncture_twin.planning.certify.plain_skin import PlainSkin, SkinFacts, leav
 from puncture_twin.planning.certify.question import question_of
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.reach.standoff import waiting_flange
+from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 CLEARANCE_PAD_MM = 1e-4
 """Within this of a margin the search leaves the verdict to FCL's capsule; the certifier keeps twice as much."""
@@ -92,7 +93,14 @@ class _Known:
     leaves: bool | None = None
 
 
-def verify(certificate: Certificate, case: Case, anatomy: Anatomy, progress: Count | None = None) -> Verification:
+def verify(
+    certificate: Certificate,
+    case: Case,
+    anatomy: Anatomy,
+    progress: Count | None = None,
+    *,
+    error: PoseError | None = None,
+) -> Verification:
     """Prove every cell of a certificate again.
 
     Args:
@@ -100,19 +108,20 @@ def verify(certificate: Certificate, case: Case, anatomy: Anatomy, progress: Cou
         case: The case that it must belong to.
         anatomy: The case's structures.
         progress: Called with (cells done, cells in all).
+        error: Of the case's needle; needed where the certificate states a chance to touch.
 
     Raises:
         InputError: Other inputs, or a cell whose claim does not follow.
     """
-    _check_question(certificate, case, anatomy)
+    _check_question(certificate, case, anatomy, error)
     return _Checker(certificate, case, anatomy).run(progress)
 
 
-def _check_question(certificate: Certificate, case: Case, anatomy: Anatomy) -> None:
+def _check_question(certificate: Certificate, case: Case, anatomy: Anatomy, error: PoseError | None) -> None:
     stated = certificate.question
     if not (np.all(np.isfinite(stated.theta)) and 0 <= stated.theta[0] <= stated.theta[1] <= np.pi + 1e-12):
         raise InputError(f"theta {stated.theta} is no range", where="certificate", allowed="0 to pi")
-    derived = question_of(case, anatomy, theta=stated.theta, beta=stated.beta)
+    derived = question_of(case, anatomy, theta=stated.theta, beta=stated.beta, touch=stated.touch, error=error)
     changed = differing_input(stated.inputs, derived.inputs)
     if changed is not None:
         what = f"input '{changed}' is not the one that the certificate was made from"

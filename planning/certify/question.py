@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtri, stdtrit
 
-from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import Input
@@ -14,6 +15,11 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.certify.cells import Cells
 from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange
 from puncture_twin.planning.search.constraints import longest_path
+from puncture_twin.planning.uncertainty.any_pose import any_pose
+from puncture_twin.planning.uncertainty.pose_error import PoseError
+
+MOST_TOUCH = 0.5
+"""Above it the bound of the deviation bounds nothing: a wider spread would make a likely touch less likely."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +40,9 @@ class Question:
         longest: The longest path.
         max_skin_angle: The largest angle at the skin.
         structures: Names of the k structures that demand a margin.
-        margins: Shape (k,), their margins.
+        margins: Shape (k,), their margins; with ``touch`` at least so wide that the chance is kept.
         lengths: Shape (k,), how far the needle's axis is checked against each.
+        touch: The chance to touch each structure, to first order, that no safe cell exceeds; None asks for none.
     """
 
     case_name: str
@@ -54,6 +61,7 @@ class Question:
     structures: tuple[str, ...]
     margins: Floats
     lengths: Floats
+    touch: float | None = None
 
     def cap(self) -> Cells:
         """The whole cap as one cell."""
@@ -66,6 +74,8 @@ def question_of(
     *,
     theta: tuple[float, float] | None = None,
     beta: tuple[float, float] | None = None,
+    touch: float | None = None,
+    error: PoseError | None = None,
 ) -> Question:
     """The question that a certificate of a case answers; see `certify`."""
     for table, declared, straight in (
@@ -94,6 +104,23 @@ def question_of(
         longest=longest_path(case.needle),
         max_skin_angle=float(case.search.max_skin_angle),
         structures=tuple(s.name for s in demanding),
-        margins=np.array([s.margin_mm for s in demanding]),
+        margins=_margins(case, demanding, touch, error),
         lengths=axis_lengths(case, demanding),
+        touch=touch,
     )
+
+
+def _margins(case: Case, demanding: list[Structure], touch: float | None, error: PoseError | None) -> Floats:
+    """The structures' margins, (k,), mm; z sigma where that is more, sigma the most that any configuration leaves."""
+    margins = np.array([s.margin_mm for s in demanding], dtype=np.float64)
+    if touch is None:
+        return margins
+    if not 0.0 < touch <= MOST_TOUCH:
+        raise InputError(f"chance to touch {touch:g}", where="certify", allowed=f"above 0, at most {MOST_TOUCH:g}")
+    if error is None:
+        message = "a chance to touch cannot be certified: only markers and [errors] give the needle's error"
+        raise InputError(message, where=case.path, allowed="[registration] with markers, and [errors]; or no chance")
+    farthest = np.array([np.linalg.norm(s.mesh.vertices - case.target_ct, axis=1).max() for s in demanding])
+    sigma = any_pose(error).of_distance(np.minimum(farthest, axis_lengths(case, demanding)))
+    z = -ndtri(touch) if error.freedom is None else -stdtrit(error.freedom, touch)
+    return np.asarray(np.maximum(margins, z * sigma))

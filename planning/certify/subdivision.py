@@ -33,6 +33,7 @@ from puncture_twin.planning.certify.skin_cones import LENGTH_PAD_MM, skin_bounds
 from puncture_twin.planning.certify.skin_surface import SkinSurface, skin_surface
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 TOO_WIDE = np.radians(80)
 """Cells with a larger radius are halved at once."""
@@ -57,6 +58,8 @@ def certify(
     size: float,
     theta: tuple[float, float] | None = None,
     beta: tuple[float, float] | None = None,
+    touch: float | None = None,
+    error: PoseError | None = None,
 ) -> Certificate:
     """Certify a cap of directions.
 
@@ -66,11 +69,14 @@ def certify(
         size: Cells of a smaller angular diameter stay undecided, rad.
         theta: The cap's puncture angles, rad; the case's own for None.
         beta: The cap's azimuths, rad; the case's own for None.
+        touch: A chance to touch each structure, to first order, that no safe cell may exceed in any configuration of
+            the arm; None asks for none.
+        error: Of the case's needle; needed for a chance.
 
     Raises:
-        InputError: The size or the cap makes no sense.
+        InputError: The size, the cap or the chance makes no sense, or nothing gives a chance.
     """
-    question = question_of(case, anatomy, theta=theta, beta=beta)
+    question = question_of(case, anatomy, theta=theta, beta=beta, touch=touch, error=error)
     if not SMALLEST_SIZE <= size <= np.pi:
         allowed = f"{np.degrees(SMALLEST_SIZE):g} to 180 degrees"
         raise InputError(f"size {np.degrees(size):g} degrees", where="certify", allowed=allowed)

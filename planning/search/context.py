@@ -42,7 +42,7 @@ from puncture_twin.planning.search.search import case_directions, one_direction,
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding
 from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.needle_chances import chances_of, passing
-from puncture_twin.planning.uncertainty.pose_error import pose_error
+from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
 
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
 """Who measures clearance: the fast exact engine, or FCL alone as the plain reference."""
@@ -77,6 +77,11 @@ class CaseContext:
         if self.reach is not None:
             return ARM_CHECKED
         return f"not checked: {NO_BASE if self.placement is None else 'switched off (--no-arm)'}"
+
+    @property
+    def pose_error(self) -> PoseError | None:
+        """Of the needle, where the case declares errors and has markers, also where the arm is not checked."""
+        return pose_error(self.case, None if self.placement is None else self.placement.registration)
 
     def search(self) -> Candidates:
         """Check the case's whole grid."""

@@ -93,6 +93,8 @@ def test_needles_are_told_beside_what_was_predicted():
     assert "p = 0.000; WARNING: they are larger than declared" in text
     assert "T2     unknown: nothing was seen at the end" in text
     assert "wrong by design" not in text
+    assert facts["needle"]["p_touch"] is None
+    assert "chance to touch: not computed: the case has no structures" in text
     assert facts["needle"]["declared"]["joint_deg"] == pytest.approx(0.05)
     assert facts["sessions"][0]["targets"][0]["needle_servoed"]["in_region"]
     json.dumps(facts, allow_nan=False)
@@ -112,6 +114,7 @@ def test_the_page_needs_no_network_and_shows_every_number(tmp_path):
     assert text.count("data:image/png;base64,") == 3
     assert "{{" not in text
     assert "25.0 %" in text
+    assert "Chance to touch: not computed: the case has no structures." in text
     assert "tolerance not reached" in text
     assert "1.47 / 2.41 (not what the rows give)" in text
     assert "1.479 / 2.41" in text

@@ -192,6 +192,7 @@ def verify_certificate(path: Path, context: CaseContext) -> dict[str, Any]:
     stated, certificate = found.input("certificate"), parse_certificate(found.data, path)
     if found.note:
         context.watcher.note(f"warning: {found.note}")
-    done = verify(certificate, context.case, context.anatomy, partial(context.watcher.count, "cells"))
+    cells, error = partial(context.watcher.count, "cells"), context.pose_error
+    done = verify(certificate, context.case, context.anatomy, cells, error=error)
     inputs = inputs_document((stated, *context.case.inputs))
     return {"certificate": str(path), "inputs": inputs, **certificate.summary(), "verified": asdict(done)}

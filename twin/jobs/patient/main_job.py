@@ -46,6 +46,7 @@ def search_case(
     pictures: bool = True,
     checked: CrossChecked | None = None,
     certify_deg: float | None = None,
+    certify_touch: float | None = None,
 ) -> Run:
     """Search; write ``candidates.parquet`` and, if wanted, the certificate, the pictures and the page.
 
@@ -60,7 +61,7 @@ def search_case(
     with _writing(out, "search", context, names) as draft:
         run = Run(context, context.search(), (), checked=checked)
         if certify_deg is not None:
-            run = _certified(run, certify_deg, draft.folder)
+            run = _certified(run, certify_deg, certify_touch, draft.folder)
         run = _with_table(run, draft.folder)
         run = _with_pictures(run, draft.folder) if pictures else run
     return _final(run, draft)
@@ -242,15 +243,16 @@ def export(
     return replace(done, path=draft.final((done.path,))[0], inputs=inputs)
 
 
-def _certified(run: Run, size_deg: float, out: Path) -> Run:
-    """Certify the cap to a cell size, and rank again with the safe cones."""
+def _certified(run: Run, size_deg: float, touch: float | None, out: Path) -> Run:
+    """Certify the cap to a cell size, and a chance to touch, and rank again with the safe cones."""
     from puncture_twin.planning.certify.certificate import write_certificate
     from puncture_twin.planning.certify.cone_column import with_safe_cone
     from puncture_twin.planning.certify.subdivision import certify
 
     context = run.context
     with context.stages.time("certify"):
-        certificate = certify(context.case, context.anatomy, size=float(np.radians(size_deg)))
+        error, size = context.pose_error, float(np.radians(size_deg))
+        certificate = certify(context.case, context.anatomy, size=size, touch=touch, error=error)
     with context.stages.time("safe cones"):
         found = with_safe_cone(context.case, run.candidates, certificate)
     write_certificate(certificate, out / CERTIFICATE)

@@ -158,7 +158,10 @@ def certificate_lines(summary: dict[str, Any]) -> list[str]:
     area = f"{summary['undecided_square_deg']:.1f} square degrees{undecided}"
     if summary["safe_cells"] == 0:
         left = f", except perhaps in {area} of undecided cells" if summary["undecided_cells"] else ""
-        said = f"proven: no direction of the cap is safe, to {summary['size_deg']:g} deg{left}"
+        held = (
+            "is safe" if summary["touch"] is None else f"keeps the margins of a chance to touch of {summary['touch']:g}"
+        )
+        said = f"proven: no direction of the cap {held}, to {summary['size_deg']:g} deg{left}"
     else:
         fraction = summary["safe_share"]
         safe = "" if fraction is None else f" ({100 * fraction:.1f} % of the cap)"

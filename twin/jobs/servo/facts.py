@@ -28,6 +28,9 @@ from puncture_twin.twin.jobs.servo.liu2007 import (
 PHASES = ("open_loop", "servoed")
 """By mapping and robot alone, and after the servo."""
 
+NO_TOUCH = "not computed: the case has no structures"
+"""Of ``p_touch``: which is something else than 0."""
+
 Facts = Mapping[str, Any]
 """What `servo_facts` or `reproduction_facts` returns: mm, shares 0..1."""
 
@@ -55,6 +58,8 @@ def _needle(case: ServoCase, trials: Sequence[ServoTrial]) -> dict[str, Any]:
             phase: _needles([getattr(row, f"needle_{phase}") for one in trials for row in one.rows]) for phase in PHASES
         },
         "hit_radius_mm": case.file.target.hit_radius_mm,
+        "p_touch": None,
+        "p_touch_note": NO_TOUCH,
         "wrong_belief": case.wrong_belief,
         "declared": case.errors.stated(),
         "declaration": None if test is None else {**test._asdict(), "p": test.p},

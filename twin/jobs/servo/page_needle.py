@@ -7,6 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from puncture_twin.twin.jobs.servo.facts import NO_TOUCH
 from puncture_twin.twin.jobs.servo.text import DOUBTED, NOT_MODELLED, PHASE_TEXT
 from puncture_twin.twin.report.page.page_tables import faint, table
 
@@ -57,7 +58,7 @@ def _reserves(needle: Mapping[str, Any]) -> list[str]:
     test = needle["declaration"]
     if test is not None and test["p"] < DOUBTED:
         said.append(f"What was measured lies farther apart than the declared errors make it (p = {test['p']:.1g}).")
-    return [*said, f"Not modelled: {NOT_MODELLED}."]
+    return [*said, f"Chance to touch: {NO_TOUCH}.", f"Not modelled: {NOT_MODELLED}."]
 
 
 def _needle(row: Mapping[str, Any]) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.twin.jobs.servo.facts import Facts, our_errors
+from puncture_twin.twin.jobs.servo.facts import NO_TOUCH, Facts, our_errors
 
 NEEDLE_HEAD = "needle expected  95 % half axes      lateral  depth  direction  realised   (mm, deg; after the servo)"
 
@@ -78,7 +78,8 @@ def needle_lines(needle: Mapping[str, Any]) -> list[str]:
     for phase, text in PHASE_TEXT.items():
         lines += _phase_lines(text, needle[phase], needle["hit_radius_mm"])
     lines.append("  the needles of one seed share its room: seeds count, not needles")
-    return [*lines, *_declaration_lines(needle["declaration"]), f"  not modelled: {NOT_MODELLED}"]
+    lines += [*_declaration_lines(needle["declaration"]), f"  chance to touch: {NO_TOUCH}"]
+    return [*lines, f"  not modelled: {NOT_MODELLED}"]
 
 
 def _phase_lines(text: str, one: Mapping[str, Any] | None, radius_mm: float | None) -> list[str]:
