@@ -24,6 +24,9 @@ COLUMNS = (
 )
 """Of ``placements.csv``; the base's coordinates are in the case's space."""
 
+EXPECTED = "expected_error_mm"
+"""A further column where the case declares errors and has markers."""
+
 
 def placement_rows(found: PlaceSearch) -> list[dict[str, Any]]:
     """One row a checked placement, best first, rank 1; the case's own comes last, without a rank."""
@@ -35,7 +38,8 @@ def _row(rank: int | None, one: RatedPlacement) -> dict[str, Any]:
     along, across, height = (None, None, None) if one.site is None else one.site.position
     values = (rank, one.name, along, across, height, one.verdict.fraction, one.verdict.reached, one.verdict.count)
     rest = (one.verdict.margin, one.verdict.home_contact, *one.mount.position_mm)
-    return dict(zip(COLUMNS, (*values, *rest), strict=True))
+    row = dict(zip(COLUMNS, (*values, *rest), strict=True))
+    return row if one.expected_mm is None else {**row, EXPECTED: round(one.expected_mm, 4)}
 
 
 def _estimate(estimate: ReachEstimate) -> dict[str, float]:
@@ -69,9 +73,10 @@ def place_document(found: PlaceSearch, provenance: Mapping[str, Any]) -> dict[st
 def write_placements(found: PlaceSearch, path: Path) -> None:
     """Write the table as CSV, whole or not at all."""
     with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, COLUMNS)
+        rows = placement_rows(found)
+        writer = csv.DictWriter(stream, (*COLUMNS, *([EXPECTED] if any(EXPECTED in row for row in rows) else [])))
         writer.writeheader()
-        writer.writerows(placement_rows(found))
+        writer.writerows(rows)
 
 
 def write_place_document(document: Mapping[str, Any], path: Path) -> None:

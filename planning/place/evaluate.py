@@ -19,7 +19,7 @@ from puncture_twin.planning.place.directions import WantedDirections
 from puncture_twin.planning.reach.reach import ReachRequest, assess_reach_all
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Verdict:
     """The exact answer for one placement.
 
@@ -30,6 +30,7 @@ class Verdict:
         margin: Mean reach margin of the reached ones, 0..1; 0 for none.
         reasons: How many of the others fell to which reason.
         home_contact: What the arm touches in its home configuration, or "".
+        q_insertion: Shape (reached, 6), rad, the tip on the target.
     """
 
     fraction: float
@@ -38,6 +39,7 @@ class Verdict:
     margin: float
     reasons: Mapping[str, int]
     home_contact: str
+    q_insertion: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +85,7 @@ class PlacementCheck:
         answers = assess_reach_all(checker, requests)
         reached = np.array([answer.reachable for answer in answers], bool)
         margins = [answer.margin for answer in answers if answer.reachable]
+        ends = [answer.insertion_q[-1] for answer in answers if answer.reachable]
         return Verdict(
             fraction=float(self.wanted.weight[reached].sum()),
             reached=int(reached.sum()),
@@ -90,6 +93,7 @@ class PlacementCheck:
             margin=float(np.mean(margins)) if margins else 0.0,
             reasons=dict(Counter(answer.reason.value for answer in answers if not answer.reachable).most_common()),
             home_contact=_contact_text(checker.contact(self.home, needle_may_touch_patient=False)),
+            q_insertion=np.array(ends).reshape(-1, 6),
         )
 
     def _checker(self, T_base_ct: Floats) -> FastChecker:

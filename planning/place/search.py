@@ -29,6 +29,7 @@ from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.place.directions import wanted_directions
 from puncture_twin.planning.place.estimate import Estimator, ReachEstimate
 from puncture_twin.planning.place.evaluate import PlacementCheck, Verdict
+from puncture_twin.planning.place.expected_error import expected_tip_error_mm
 from puncture_twin.planning.place.mount_lines import mount_section
 from puncture_twin.planning.place.mounts import Site, regions
 from puncture_twin.planning.place.needle_start import needle_can_start
@@ -54,7 +55,10 @@ FINALISTS = 6
 """Sites that are checked exactly; each mount's best is among them."""
 
 FRACTION_DIGITS = 3
-"""Shares that agree to so many digits are equal; then the margin decides."""
+"""Shares that agree to so many digits are equal; then the expected error decides, then the margin."""
+
+ERROR_DIGITS = 2
+"""Expected errors (mm) that agree to so many digits are equal."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +70,15 @@ class RatedPlacement:
         mount: The base's pose as a case states it.
         estimate: What it was chosen by; None for the case's own.
         verdict: The exact answer.
+        expected_mm: Expected (rms) error of the tip over its insertions, the markers touched anew from there; None
+            where the case declares no errors, or has no markers.
     """
 
     site: Site | None
     mount: MountSection
     estimate: ReachEstimate | None
     verdict: Verdict
+    expected_mm: float | None
 
     @property
     def name(self) -> str:
@@ -174,10 +181,20 @@ def _checked(
     own = None
     if placement is not None:
         T_ct_base = np.asarray(np.linalg.inv(placement.T_base_ct), dtype=np.float64)
-        own = RatedPlacement(None, mount_section(T_ct_base, case.space), None, verdicts.pop(0))
-    rated = [RatedPlacement(site, m, e, v) for (site, e), m, v in zip(finalists, mounts, verdicts, strict=True)]
-    rated.sort(key=lambda one: (-round(one.verdict.fraction, FRACTION_DIGITS), -one.verdict.margin))
-    return tuple(rated), own
+        verdict, pose = verdicts.pop(0), poses.pop(0)
+        expected = expected_tip_error_mm(case, placement, pose, verdict.q_insertion)
+        own = RatedPlacement(None, mount_section(T_ct_base, case.space), None, verdict, expected)
+    rated = [
+        RatedPlacement(site, mount, hoped, verdict, expected_tip_error_mm(case, placement, pose, verdict.q_insertion))
+        for (site, hoped), mount, pose, verdict in zip(finalists, mounts, poses, verdicts, strict=True)
+    ]
+    return tuple(sorted(rated, key=_worth)), own
+
+
+def _worth(one: RatedPlacement) -> tuple[float, float, float]:
+    """Less is better: most directions, then the least expected error, then the widest margin."""
+    expected = 0.0 if one.expected_mm is None else round(one.expected_mm, ERROR_DIGITS)
+    return -round(one.verdict.fraction, FRACTION_DIGITS), expected, -one.verdict.margin
 
 
 def _placement_check(case: Case, anatomy: Anatomy, found: Candidates) -> PlacementCheck:
