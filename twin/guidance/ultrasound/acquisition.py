@@ -149,8 +149,8 @@ def choose(
         return np.sort(rng.choice(left, n, replace=False))
     recorded = candidates.poses.subset(np.array([shot.candidate for shot in shots])) if shots else None
     noise = choice_noise(case)
-    poses, arms = candidates.poses.subset(left), case.declared_arms
-    return left[choose_poses(poses, n, noise, drawing(case), recorded=recorded, arms=arms)]
+    # the arms' lasting errors are not counted here: that gains 3 % of error, and costs the found region 5 % of coverage
+    return left[choose_poses(candidates.poses.subset(left), n, noise, drawing(case), recorded=recorded)]
 
 
 def choice_noise(case: SelfcalCase) -> Noise:
