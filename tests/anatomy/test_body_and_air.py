@@ -15,11 +15,13 @@ from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.formats.volumes import voxels
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.twin.phantoms import supine
 from puncture_twin.twin.phantoms.ct_image import Grid, ScannedPart, rendered
 from puncture_twin.twin.phantoms.implicit import capsule, ellipsoid
+from puncture_twin.twin.plant.scanner.image import ScanSettings, scan_solids
 
 STEP_DEG = 6.0
 KIDNEY_FIELD = ellipsoid((75.0, 40.0, 0.0), (20, 15, 40))
@@ -63,12 +65,22 @@ HUMERI = "".join(
 )
 
 
-def write_scene(folder, parts, grid, seed=3, fill=None):
+def scanned(parts, grid, seed):
+    """The scene by the scanner: surfaces, exact partial volume, blur and noise."""
+    settings = ScanSettings(grid.spacing_mm[2], grid.spacing_mm[0], noise_hu=15.0)
+    cells = VolumeGrid(grid.shape, grid.affine, {})
+    return scan_solids(supine.solids(parts), cells, settings, np.random.default_rng(seed)).hu
+
+
+def write_scene(folder, parts, grid, seed=3, fill=None, scanner=False):
     """``ct.nii.gz`` of the scene, and ``labels.nii.gz`` of lesion (1), spine (2), humeri (3, 4) and kidney (5).
 
     ``fill``: the voxels that were not scanned, and the value that is written there.
     """
-    hu = rendered(parts, grid, noise_hu=15.0, rng=np.random.default_rng(seed))
+    if scanner:
+        hu = scanned(parts, grid, seed)
+    else:
+        hu = rendered(parts, grid, noise_hu=15.0, rng=np.random.default_rng(seed))
     labels = np.zeros(grid.shape, np.uint8)
     fields = {part.name: part.field for part in parts}
     for label, name in enumerate(("lesion", "spine", "humerus_left", "humerus_right"), start=1):
@@ -120,9 +132,14 @@ def scene(tmp_path_factory):
                 "alone": supine.trunk_parts() + supine.arm_parts("up"),
                 "gap": [*supine.trunk_parts(), *supine.bed_parts(gap_mm=12.0)],
                 "plank": [*supine.trunk_parts(), PLANK],
+                "arms and bed by the scanner": [
+                    *supine.trunk_parts(),
+                    *supine.arm_parts("down"),
+                    *supine.bed_parts(),
+                ],
             }[name]
             folder = tmp_path_factory.mktemp(name)
-            write_scene(folder, parts, supine.grid())
+            write_scene(folder, parts, supine.grid(), scanner="scanner" in name)
             made[name] = folder, parts
         return made[name]
 
@@ -155,7 +172,7 @@ def through(found, case, part, first_mm=0.0):
 OUTER = ("arm_left", "arm_right", "humerus_left", "humerus_right", "mattress", "table", "line", "sheet")
 
 
-@pytest.mark.parametrize("name", ["arms", "bed", "all"])
+@pytest.mark.parametrize("name", ["arms", "bed", "all", "arms and bed by the scanner"])
 def test_no_safe_needle_passes_what_the_scan_shows_outside_of_the_trunk(scene, name):
     """Arms, table, mattress, sheet and line: none is entered by a safe needle, inserted or at its standoff."""
     folder, parts = scene(name)

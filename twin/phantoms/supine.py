@@ -6,6 +6,7 @@ along the bed, as a patient's does; the image cuts it at head and feet.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -14,6 +15,8 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.phantoms import torso
 from puncture_twin.twin.phantoms.ct_image import AIR_HU, Grid, ScannedPart
 from puncture_twin.twin.phantoms.implicit import Field, capsule, ellipsoid, offset, within
+from puncture_twin.twin.phantoms.mesher import SamplingBox, mesh_field
+from puncture_twin.twin.plant.scanner.solids import Solid
 
 LESION_LPS_MM = (-55.0, 20.0, 0.0)
 """In the right half of the trunk, nearer to the back."""
@@ -126,3 +129,16 @@ def grid(spacing_mm: float = 4.0, slice_mm: float = 4.0) -> Grid:
     size = (600.0, 380.0, 160.0)
     shape = tuple(round(length / step) for length, step in zip(size, spacing, strict=True))
     return Grid((-300.0 + spacing_mm / 2, -190.0, -80.0), spacing, (shape[0], shape[1], shape[2]))
+
+
+def solids(parts: Sequence[ScannedPart], spacing_mm: float = 6.0) -> list[Solid]:
+    """The same parts as surfaces, for the scanner; what is beyond the longest field of view is cut off.
+
+    Args:
+        parts: The scene; all of them lie within 320 mm beside the middle of the bed.
+        spacing_mm: At which the surfaces are sampled; thinner parts need less.
+    """
+    low, high = (-318.0, -250.0, -120.0), (318.0, 250.0, 120.0)
+    ends = slab(low, high)
+    box = SamplingBox((-330.0, -262.0, -132.0), (330.0, 262.0, 132.0), spacing_mm)
+    return [Solid(part.name, mesh_field(within(part.field, [ends], 0.5), box), part.hu) for part in parts]
