@@ -1,7 +1,8 @@
 """How far a bevel can take a needle off its straight line, whatever side it points to and whatever it passes.
 
 The bound is the path of a bevel that never turns, all the way in the stiffest tissue of the case: the stiffer the
-tissue, the more a bevel steers. That no other order of layers goes further is tested on random ones, not proven.
+tissue, the more a bevel steers. A stiff layer before soft ones can take it a little further: the allowance for that was
+found on random orders, not proven.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ from puncture_twin.planning.needle.bevel_path import STEP_MM, bevel_path
 from puncture_twin.planning.needle.shaft import Shaft
 from puncture_twin.planning.needle.tissue import Tissue
 
-STEP_ERROR = 0.01
-"""Added to the bevel's part: more than halving the step changes (0.6 % where the bevel acts most)."""
+ALLOWANCE = 0.15
+"""Added to the bevel's part: of 8,000 random orders of layers, gaps without tissue among them, the worst went 8.5 %
+beyond the stiffest tissue alone; and halving the step changes 0.6 % at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,4 +60,4 @@ def deflection_bound(shaft: Shaft, alpha: float, tissues: Iterable[Tissue], long
     stiffest = max((tissue.stiffness_n_mm2 for tissue in tissues), default=0.0)
     count = int(np.ceil(longest_mm / STEP_MM))
     path = bevel_path(shaft, np.full(count, stiffest), np.full(count, alpha))
-    return DeflectionBound(path.depth_mm, (1 + STEP_ERROR) * path.largest_mm, shaft.sag_mm)
+    return DeflectionBound(path.depth_mm, (1 + ALLOWANCE) * path.largest_mm, shaft.sag_mm)
