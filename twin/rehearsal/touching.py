@@ -19,7 +19,8 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.collision.workcell import case_boxes, case_tool
+from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.workcell import case_boxes, case_tool, patient_surface
 from puncture_twin.planning.geometry.rigid import frame_about, pose
 from puncture_twin.planning.motion.follow import follow_smoothly
 from puncture_twin.planning.motion.trajectory import Trajectory
@@ -72,6 +73,9 @@ PAD_MM = (12.0, 12.0, 4.0)
 MOST_ASIDE_MM = 10.0
 """A marker that lies farther beside its believed place is not the one that was planned to be touched."""
 
+LOOK_EVERY = 8
+"""Steps of the motors between two looks at where the needle is: 30 a second."""
+
 PAUSE_S = 0.25
 """Before motors and torques take over from one another."""
 
@@ -118,6 +122,7 @@ class _Cell:
     plan: TouchPlan
     truth: TouchTruth
     checkers: ApproachCheckers
+    true: CellChecker
     rng: np.random.Generator
 
 
@@ -143,13 +148,14 @@ def execute_touches(
         open_workcell(plan.model, tool, anatomy.skin.mesh, T, case_boxes(case, T), down_ct=down_ct) as room,
         rigid_model(plan.model, tool, T[:3, :3] @ down_ct) as rigid,
     ):
-        cell = _Cell(room, rigid, plan, truth, checkers, np.random.default_rng([truth.seed, 1]))
+        true = CellChecker(plan.model, tool, patient=patient_surface(anatomy).transformed(T))
+        cell = _Cell(room, rigid, plan, truth, checkers, true, np.random.default_rng([truth.seed, 1]))
         room.arm.place(plan.touches[0].come.q[0])
         readings = []
         for number, touch in enumerate(plan.touches):
             readings.append(_touch(cell, touch))
             progress(number + 1, len(plan.touches))
-        left = _moved(cell, plan.leave, np.zeros(6))
+        left = _outside(cell, plan.leave, np.zeros(6))
     return Touched(tuple(readings), sum(one.seconds for one in readings) + _seconds(left))
 
 
@@ -199,7 +205,7 @@ def _touch(cell: _Cell, touch: Touch) -> TouchReading:
     line, arrival = _line(cell, touch), cell.truth.arrival[touch.name]
     pad = _pad(cell, line)
     try:
-        come = _moved(cell, touch.come, arrival)
+        come = _outside(cell, touch.come, arrival)
         to_near = _slow(cell, np.vstack([touch.come.q[-1:], line.far]))
         there = _run(cell, Motors(), to_near, arrival, _Contact(cell, line), PAUSE_S)
         if there.stopped:
@@ -271,6 +277,20 @@ def _tip_mm(cell: _Cell, q: Floats) -> Floats:
 def _moved(cell: _Cell, way: Trajectory, arrival: Floats, *, pause_s: float = 0.0) -> Run:
     """A motion by the position motors."""
     return _run(cell, Motors(), way, arrival, None, pause_s)
+
+
+def _outside(cell: _Cell, way: Trajectory, arrival: Floats) -> Run:
+    """A motion by the motors on which the needle must stay out of the patient; the physics lets it pass their skin.
+
+    Raises:
+        NoAnswerError: It did not.
+    """
+    done = _moved(cell, way, arrival)
+    found = cell.true.first_contact(done.q[::LOOK_EVERY] + arrival, needle_may_touch_patient=False)
+    if found is not None:
+        what = f"{found.contact.body} touched {found.contact.other}"
+        raise NoAnswerError(f"on the way {what}, who does not lie where they are believed to")
+    return done
 
 
 def _run(

@@ -11,15 +11,17 @@ import pytest
 from places import ROOT
 
 from puncture_twin.planning.arm.error_jacobian import PARAMETERS, error_jacobian
-from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.formats.points.point_files import read_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.selection.choice import Choice
+from puncture_twin.planning.touch.straight_approach import line_to
 from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, approach_checkers, plan_touches
 from puncture_twin.twin.jobs.experiment.touch_job import touch_case, touch_text
 from puncture_twin.twin.plant.touch_truth import TouchTruth, nominal_tip
@@ -66,9 +68,9 @@ def exact(context, shift_base=(0.0, 0.0, 0.0)):
     return TouchTruth(0, T, np.zeros(28), aim, still)
 
 
-def executed(context, plan, truth):
-    """The readings."""
-    checkers = approach_checkers(context, TOUCHING_PADDING_MM)
+def executed(context, plan, truth, prepared=None):
+    """The readings; the workcell is believed to be that of ``prepared``."""
+    checkers = approach_checkers(prepared if prepared is not None else context, TOUCHING_PADDING_MM)
     return execute_touches(plan, context.case, context.anatomy, checkers, truth, quiet).readings
 
 
@@ -176,6 +178,26 @@ def test_a_marker_that_is_not_where_it_was_believed_stops_the_arm(context, first
     T = flange_pose(first.model, first.touches[0].q_touch)
     with pytest.raises(NoAnswerError, match=said):
         executed(context, first, exact(context, along_mm * T[:3, 2] + aside_mm * T[:3, 0]))
+
+
+def test_a_needle_that_crosses_the_patient_on_its_way_is_noticed(context, first):
+    """The physics lets it pass the skin; a motion between two markers that goes through them is no motion."""
+    touch = first.touches[0]
+    into = line_to(first.model, first.tip_mm, touch.q_touch, 20.0, -40.0)
+    there = np.vstack([into, into[::-1]])
+    way = Trajectory(0.02 * np.arange(len(there)), there)
+    crossing = dataclasses.replace(first, touches=(dataclasses.replace(touch, come=way),))
+    with pytest.raises(NoAnswerError, match="on the way needle touched patient"):
+        executed(context, crossing, exact(context))
+
+
+def test_a_box_that_nobody_knew_stops_the_arm(context, first):
+    """It stands where the forearm will be: felt by the physics, named, and nothing is read."""
+    forearm = link_poses(first.model, first.touches[0].q_touch)[3:5, :3, 3].mean(axis=0)
+    box = Obstacle("trolley", "base", forearm, np.array([150.0, 150.0, 150.0]))
+    other = dataclasses.replace(context, case=dataclasses.replace(context.case, obstacles=(box,)))
+    with pytest.raises(NoAnswerError, match=r"the arm stopped: \w+ touches trolley"):
+        executed(other, first, exact(context), prepared=context)
 
 
 def test_the_true_tip_is_on_the_true_marker(context, done):
