@@ -51,7 +51,7 @@ def along_needle(start_mm, length_mm, speed_mm_s):
     law = time_law(length_mm, Rates(speed_mm_s, 100.0, 1000.0))
     times = np.unique(np.append(np.arange(0.0, law.duration_s, SAMPLE_S), law.duration_s))
     q = [nearest(flange_poses(TARGET, OUTWARD, TIP_M * 1e3 + start_mm)[0], HOME)]
-    for distance in start_mm - law.driven(times):
+    for distance in start_mm - law.travelled(times):
         q.append(nearest(flange_poses(TARGET, OUTWARD, TIP_M * 1e3 + distance)[0], q[-1]))
     return Trajectory(times, np.array(q[1:]))
 
