@@ -22,7 +22,7 @@ def histogram(values: Sequence[float], text: str) -> Markup:
         text: What it is, with its unit.
     """
     counts, edges = np.histogram(np.asarray(values, dtype=np.float64), BARS)
-    head = f"{text}: {len(values)} case{'s' if len(values) != 1 else ''}, median {np.median(values):.3g}"
+    head = f"{text}: {len(values)} case{'s' if len(values) != 1 else ''}, median {_plain(float(np.median(values)))}"
     bars = joined(
         '<rect x="{}" y="{}" width="{}" height="{}" fill="#00684a"><title>{}</title></rect>', _bars(counts, edges)
     )
@@ -32,11 +32,16 @@ def histogram(values: Sequence[float], text: str) -> Markup:
     return Markup(form).format(WIDTH, HEIGHT, head, LEFT, head, _axes(int(counts.max()), edges), bars)
 
 
+def _plain(value: float) -> str:
+    """A number without an exponent, to three digits or more."""
+    return f"{value:,.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
+
+
 def _bars(counts: np.ndarray, edges: np.ndarray) -> Iterator[tuple[str, ...]]:
     step, high = (WIDTH - LEFT) / BARS, HEIGHT - TOP - BOTTOM
     for number, count in enumerate(counts):
         tall = high * count / counts.max()
-        told = f"{edges[number]:.4g} to {edges[number + 1]:.4g}: {count}"
+        told = f"{_plain(edges[number])} to {_plain(edges[number + 1])}: {count}"
         left, top = LEFT + number * step + 0.5, HEIGHT - BOTTOM - tall
         yield f"{left:.1f}", f"{top:.1f}", f"{step - 1:.1f}", f"{tall:.1f}", told
 
@@ -47,9 +52,9 @@ def _axes(most: int, edges: np.ndarray) -> Markup:
     line = Markup('<line x1="{}" y1="{}" x2="{}" y2="{}" stroke="#5b616b"/>').format(LEFT, base, WIDTH, base)
     middle = (edges[0] + edges[-1]) / 2
     marks = [
-        (LEFT, base + 18, "start", f"{edges[0]:.3g}"),
-        ((LEFT + WIDTH) // 2, base + 18, "middle", f"{middle:.3g}"),
-        (WIDTH, base + 18, "end", f"{edges[-1]:.3g}"),
+        (LEFT, base + 18, "start", _plain(edges[0])),
+        ((LEFT + WIDTH) // 2, base + 18, "middle", _plain(middle)),
+        (WIDTH, base + 18, "end", _plain(edges[-1])),
         (LEFT - 6, TOP + 10, "end", str(most)),
         (LEFT - 6, base, "end", "0"),
     ]

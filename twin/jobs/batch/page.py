@@ -10,6 +10,9 @@ from typing import Any
 from markupsafe import Markup
 
 from puncture_twin.planning.base.provenance import Input
+from puncture_twin.planning.batch.case_row import NO_SAFE
+from puncture_twin.planning.batch.merge import NOT_RUN
+from puncture_twin.planning.search.candidates import ARM_CHECKED
 from puncture_twin.twin.jobs.batch.histogram import histogram
 from puncture_twin.twin.report.numbers import number
 from puncture_twin.twin.report.page.page_tables import inputs_table, table
@@ -41,6 +44,10 @@ HEAD = (
     "reach",
     "page",
 )
+
+
+OUTCOMES = {1: NO_SAFE, 2: "refused", 3: "the program failed"}
+"""What a person reads for an exit code."""
 
 
 def write_cohort_page(name: str, rows: Sequence[Row], inputs: Sequence[Input], path: Path) -> None:
@@ -107,7 +114,7 @@ def _line(row: Row) -> tuple[str, ...]:
     return (
         str(row["case"]),
         str(row["name"]),
-        "safe" if row["exit_code"] == 0 and row["arm"] == "checked" else _verdict(row),
+        _verdict(row),
         _shown(row["safe"], 0),
         _shown(row["directions"], 0),
         _shown(row["best_theta_deg"], 1),
@@ -123,8 +130,10 @@ def _line(row: Row) -> tuple[str, ...]:
 
 
 def _verdict(row: Row) -> str:
-    """Never "safe" alone where the arm was not checked."""
-    return "safe for the organs" if row["exit_code"] == 0 else str(row["reason"])
+    """Never "safe" alone where the arm was not checked; why a case has none stands under the failures."""
+    if row["exit_code"] == 0:
+        return "safe" if row["arm"] == ARM_CHECKED else "safe for the organs"
+    return OUTCOMES.get(row["exit_code"], NOT_RUN)
 
 
 def _shown(value: float | None, digits: int) -> str:

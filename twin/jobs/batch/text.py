@@ -68,6 +68,7 @@ def merge_text(merged: Merged) -> str:
         f"{_cases(told['cases'])}: {told['safe']} with a safe direction, {told['no_safe']} without, "
         f"{told['refused']} refused, {told['program_failed']} failed, {told['not_run']} not run",
         *(f"wrote {path}" for path in merged.files),
+        "of the inputs as they were planned; batch status says which have changed since",
     ]
     if merged.changed is not None:
         lines.append(f"{len(merged.changed)} not as expected")

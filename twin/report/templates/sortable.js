@@ -1,10 +1,10 @@
 for (const table of document.querySelectorAll("table.sortable")) {
   const heads = [...table.tHead.rows[0].cells], body = table.tBodies[0];
   const value = (row, column) => row.cells[column].textContent;
-  const compared = (one, other) => { // numbers by size and before words; what is not there comes last
+  const compared = (one, other, sign) => { // numbers by size and before words; what is not there comes last
     const a = parseFloat(one.replace("−", "-").replaceAll(",", "")), b = parseFloat(other.replace("−", "-").replaceAll(",", ""));
-    if (isNaN(a) || isNaN(b)) return isNaN(a) - isNaN(b) || one.localeCompare(other);
-    return a - b;
+    if (isNaN(a) || isNaN(b)) return isNaN(a) - isNaN(b) || sign * one.localeCompare(other);
+    return sign * (a - b);
   };
   heads.forEach((head, column) => {
     const button = document.createElement("button");
@@ -15,8 +15,8 @@ for (const table of document.querySelectorAll("table.sortable")) {
       const down = head.getAttribute("aria-sort") === "ascending";
       for (const other of heads) other.removeAttribute("aria-sort");
       head.setAttribute("aria-sort", down ? "descending" : "ascending");
-      const rows = [...body.rows].sort((a, b) => compared(value(a, column), value(b, column)));
-      body.append(...(down ? rows.reverse() : rows));
+      const sign = down ? -1 : 1;
+      body.append(...[...body.rows].sort((a, b) => compared(value(a, column), value(b, column), sign)));
     });
   });
 }
