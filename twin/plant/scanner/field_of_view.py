@@ -6,7 +6,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.volumes.volume_header import MAX_VOXELS, VolumeGrid
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.twin.plant.scanner.case_scene import CaseScene
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 
@@ -14,8 +14,10 @@ AIR_MM = 15.0
 """Air around the body: a needle's entry is not at the image's edge."""
 TABLE_MM = 100.0
 """Beside and behind the body, so much of a table is shown: where the image cuts it, what is beyond is not known."""
-FINEST_MM = 1e-4
-"""Positions are multiples of it, so that DICOM's decimal strings hold them whole."""
+MOST_VOXELS = 200_000_000
+"""A whole trunk at 0.8 x 0.8 x 0.6 mm; each voxel takes some ten bytes while it is made."""
+DECIMALS = 4
+"""Of positions in mm, so that DICOM's decimal strings hold them whole."""
 
 
 def scan_grid(scene: CaseScene, settings: ScanSettings, rng: np.random.Generator) -> VolumeGrid:
@@ -29,15 +31,15 @@ def scan_grid(scene: CaseScene, settings: ScanSettings, rng: np.random.Generator
         rng: Draws where the grid falls.
 
     Raises:
-        InputError: No slice, or more voxels than any reader takes.
+        InputError: No slice, or more voxels than a machine holds.
     """
     low, high = _shown(scene, settings)
     spacing = np.array([settings.pixel_mm, settings.pixel_mm, settings.spacing_mm])
-    first = np.round(low + (0.5 + rng.uniform(0.0, 1.0, 3)) * spacing, 4)
+    first = np.round(low + (0.5 + rng.uniform(0.0, 1.0, 3)) * spacing, DECIMALS)
     counts = np.floor((high - first) / spacing + 0.5).astype(int)
-    if counts.min() < 2 or np.prod(counts, dtype=float) > MAX_VOXELS:
+    if counts.min() < 2 or np.prod(counts, dtype=float) > MOST_VOXELS:
         shown = " x ".join(map(str, counts))
-        allowed = f"2 voxels or more along each axis, {MAX_VOXELS:,} at most"
+        allowed = f"2 voxels or more along each axis, {MOST_VOXELS:,} at most: larger pixels, or --fov and --length"
         raise InputError(f"a scan of {shown} voxels", where="scan", allowed=allowed)
     T = np.diag([*spacing, 1.0])
     T[:3, 3] = first
