@@ -343,6 +343,7 @@ def touch(
     as_json: JsonOption = False,
 ) -> None:
     """Plan how the markers are touched for a puncture, touch them in the twin, and write touch.csv."""
+    require_extra("twin", "touch")
     from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.experiment.touch_job import touch_case, touch_text
 
