@@ -34,7 +34,9 @@ def test_the_same_patient_again_and_another_target(tmp_path, memory):
     assert kept > 0
     assert held(path, tmp_path, memory, 1) == first
     assert held(path, tmp_path, memory, 2, target={"position_mm": [4.0, 0.0, 0.0]}) != first
-    assert memory.held_bytes == kept
+    assert held(path, tmp_path, memory, 3, margins={"rib": 40.0}) != first
+    assert held(path, tmp_path, memory, 4, margins={"rib": 3.0})
+    assert memory.held_bytes < kept + 1000
 
 
 def test_two_patients_with_the_same_file_names(tmp_path, memory):
