@@ -340,8 +340,9 @@ def test_progress_in_a_log_is_a_line_now_and_then(monkeypatch):
         for done in range(1, 9):
             display.count("directions", done, 8)
     lines = stream.getvalue().splitlines()
-    assert 0 < len(lines) <= 8
-    assert all("directions: " in line and "s left" in line for line in lines)
+    assert 1 < len(lines) <= 8
+    assert lines[0] == "directions: 1/8"  # no time is behind it: a rate would be made up
+    assert all("directions: " in line and "/min, " in line and "s left" in line for line in lines[1:])
 
 
 def test_progress_on_a_terminal_is_a_bar():

@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -104,22 +104,60 @@ def touch_case(context: CaseContext, out: Path, choice: Choice, seed: int) -> To
         NoAnswerError: Nothing is safe, too few markers can be touched, or a touch stopped, with the reason.
     """
     with writing(out, "touch", inputs=context.case.inputs, names=(TOUCH, SUMMARY), note=context.watcher.note) as draft:
-        q_insertion, outward_ct = _puncture(context, choice)
-        with context.stages.time("touch plan"):
-            plan = plan_touches(context, q_insertion, seed=seed, progress=partial(context.watcher.count, "motions"))
-        truth = _truth(context, outward_ct, q_insertion, seed)
-        checkers, count = approach_checkers(context, TOUCHING_PADDING_MM), partial(context.watcher.count, "touches")
-        with context.stages.time("touches"):
-            touched = execute_touches(plan, context.case, context.anatomy, checkers, truth, count)
-        read = _by_name(plan, touched)
-        fitted = registered(context, read)
-        error = _tip_error(context, plan, truth, fitted, q_insertion)
+        planned = plan_tour(context, choice, seed)
+        touched, read, fitted, error = touch_once(context, planned, seed)
+        plan = planned.plan
         files = draft.final((draft.folder / TOUCH, draft.folder / SUMMARY))
         run = TouchRun(context.case.name, context.case.inputs, seed, plan, touched, fitted, error, files)
         write_points(draft.folder / TOUCH, read)
         with atomic(draft.folder / SUMMARY) as temporary:
             temporary.write_text(json.dumps(run.summary(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return run
+
+
+class Tour(NamedTuple):
+    """A tour of the markers and the puncture that it is for: joints (6,), rad, and its direction outward (3,)."""
+
+    plan: TouchPlan
+    q_insertion: Floats
+    outward_ct: Floats
+
+
+class TouchedOnce(NamedTuple):
+    """One executed tour: its readings, as points, what they register, and what the tip misses the target by, mm."""
+
+    touched: Touched
+    read: NamedPoints
+    registration: Registration
+    tip_error_mm: float
+
+
+def plan_tour(context: CaseContext, choice: Choice, seed: int) -> Tour:
+    """Plan the touches for a chosen puncture.
+
+    Raises:
+        InputError, NoAnswerError: See `touch_case`.
+    """
+    q_insertion, outward_ct = _puncture(context, choice)
+    with context.stages.time("touch plan"):
+        plan = plan_touches(context, q_insertion, seed=seed, progress=partial(context.watcher.count, "motions"))
+    return Tour(plan, q_insertion, outward_ct)
+
+
+def touch_once(context: CaseContext, tour: Tour, seed: int) -> TouchedOnce:
+    """Execute a tour where everything truly is, by one draw of the declared errors.
+
+    Raises:
+        NoAnswerError: A touch stopped, with the reason.
+    """
+    plan, q_insertion = tour.plan, tour.q_insertion
+    truth = _truth(context, tour.outward_ct, q_insertion, seed)
+    checkers, count = approach_checkers(context, TOUCHING_PADDING_MM), partial(context.watcher.count, "touches")
+    with context.stages.time("touches"):
+        touched = execute_touches(plan, context.case, context.anatomy, checkers, truth, count)
+    read = _by_name(plan, touched)
+    fitted = registered(context, read)
+    return TouchedOnce(touched, read, fitted, _tip_error(context, plan, truth, fitted, q_insertion))
 
 
 def _puncture(context: CaseContext, choice: Choice) -> tuple[Floats, Floats]:

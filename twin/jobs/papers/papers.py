@@ -39,10 +39,26 @@ def _chen2019(out_dir: Path, seeds: int | None) -> PaperResult:
     return PaperResult(result.passed, reproduction_summary(result), reproduction_text(result))
 
 
-def chen2019_experiment(draws: int | None) -> PaperResult:
-    """The experiment of Chen 2019 drawn anew: whether its stated errors can be its own."""
+def chen2019_experiment(out_dir: Path, draws: int | None, runs: int, watcher: Watcher) -> PaperResult:
+    """The experiment of Chen 2019 drawn anew, and so many physical runs of its second setup.
+
+    Raises:
+        InputError: A folder that cannot be written to.
+    """
     report = reproduce_experiment(DRAWS if draws is None else draws)
-    return PaperResult(report.agrees, experiment_summary(report), experiment_text(report))
+    result = PaperResult(report.agrees, experiment_summary(report), experiment_text(report))
+    if not runs:
+        return result
+    from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.experiment.physical_runs import physical_runs
+
+    done = physical_runs(prepare(folder() / SETUP_2, watcher=watcher), out_dir, runs)
+    summary = {**result.summary, "physical": done.summary()}
+    return PaperResult(result.holds, summary, f"{result.text}\n{done.text()}")
+
+
+SETUP_2 = "carton/case_m_setup2.toml"
+"""The embedded case of the paper's second setup, five markers."""
 
 
 def _axp_ybq(out_dir: Path, seeds: int | None) -> PaperResult:

@@ -1,0 +1,146 @@
+"""Many physical runs of one experiment: in each the markers are touched in the simulator where they truly are.
+
+A run is kept as soon as it is done, under the hash of all that decided it: what was interrupted goes on from there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.selection.choice import BEST
+from puncture_twin.twin.jobs.experiment.touch_job import Tour, plan_tour, touch_once
+
+FOLDER = "runs"
+
+
+@dataclass(frozen=True)
+class PhysicalRun:
+    """One experiment.
+
+    Attributes:
+        seed: Of its truth.
+        tip_error_mm: The needle's tip from the true target; NaN where a touch stopped.
+        fre_mm: Of its registration, likewise.
+        seconds_per_touch: Of the tour, home to home, likewise.
+        refused: Why it stopped; empty where it did not.
+    """
+
+    seed: int
+    tip_error_mm: float
+    fre_mm: float
+    seconds_per_touch: float
+    refused: str = ""
+
+
+@dataclass(frozen=True)
+class PhysicalRuns:
+    """All of them.
+
+    Attributes:
+        expected_mm: The tip's rms error that the declaration predicts for these touches.
+        runs: One a seed.
+        kept: So many were there already.
+    """
+
+    expected_mm: float
+    runs: tuple[PhysicalRun, ...]
+    kept: int
+
+    @property
+    def realised_mm(self) -> float:
+        """Rms over the runs that ended."""
+        ended = [run.tip_error_mm for run in self.runs if not run.refused]
+        return float(np.sqrt(np.mean(np.square(ended)))) if ended else float("nan")
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        ended = [run for run in self.runs if not run.refused]
+        return {
+            "expected_mm": self.expected_mm,
+            "realised_mm": self.realised_mm if ended else None,
+            "seconds_per_touch": float(np.mean([run.seconds_per_touch for run in ended])) if ended else None,
+            "refused": {run.seed: run.refused for run in self.runs if run.refused},
+            "runs": [asdict(run) for run in ended],
+        }
+
+    def text(self) -> str:
+        """For a person; with few runs an rms is known to one over the root of six times their number."""
+        ended = [run for run in self.runs if not run.refused]
+        if not ended:
+            return f"no physical run of {len(self.runs)} ended: {self.runs[0].refused}"
+        spread = 1.0 / np.sqrt(6.0 * len(ended))
+        seconds = np.mean([run.seconds_per_touch for run in ended])
+        kept = f", {self.kept} of them kept from before" if self.kept else ""
+        lines = [
+            f"{len(ended)} physical runs ({seconds:.1f} s a touch{kept}): the tip misses the target by "
+            f"{self.realised_mm:.2f} mm rms (known to {100 * spread:.0f} %), {self.expected_mm:.2f} predicted"
+        ]
+        lines += [f"  seed {run.seed}: {run.refused}" for run in self.runs if run.refused]
+        return "\n".join(lines)
+
+
+def physical_runs(context: CaseContext, out: Path, runs: int, first_seed: int = 0) -> PhysicalRuns:
+    """Run the experiment of a case's best candidate, each run with a truth of its own.
+
+    Args:
+        context: Of a case with declared errors, markers and an arm.
+        out: Holds the folder of the runs that are kept.
+        runs: How many.
+        first_seed: Of the first one.
+
+    Raises:
+        InputError: The case declares no errors, or has no markers.
+        NoAnswerError: Nothing is safe, or too few markers can be touched.
+    """
+    tour = plan_tour(context, BEST, seed=first_seed)
+    key = _key(context, tour)
+    found, kept = [], 0
+    for number in range(runs):
+        path = out / FOLDER / f"{first_seed + number}.json"
+        run = _read(path, key)
+        kept += run is not None
+        found.append(run or _kept(path, key, _run(context, tour, first_seed + number)))
+        context.watcher.count("runs", number + 1, runs)
+    return PhysicalRuns(tour.plan.expected_mm, tuple(found), kept)
+
+
+def _run(context: CaseContext, tour: Tour, seed: int) -> PhysicalRun:
+    try:
+        done = touch_once(context, tour, seed)
+    except NoAnswerError as error:
+        return PhysicalRun(seed, float("nan"), float("nan"), float("nan"), str(error))
+    per_touch = done.touched.seconds / len(done.touched.readings)
+    return PhysicalRun(seed, done.tip_error_mm, done.registration.fre_mm, per_touch)
+
+
+def _key(context: CaseContext, tour: Tour) -> str:
+    """The hash of all that decides a run beside its seed."""
+    stated = json.dumps([context.provenance(), inputs_document(context.case.inputs)], sort_keys=True, default=str)
+    joints = np.concatenate([tour.q_insertion, *(touch.q_touch for touch in tour.plan.touches)])
+    return hashlib.sha256(stated.encode() + joints.tobytes()).hexdigest()
+
+
+def _read(path: Path, key: str) -> PhysicalRun | None:
+    """A run that was kept, if it is whole and of the same experiment."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        return PhysicalRun(**document["run"]) if document["key"] == key else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _kept(path: Path, key: str, run: PhysicalRun) -> PhysicalRun:
+    if not run.refused:
+        with atomic(path) as temporary:
+            temporary.write_text(json.dumps({"key": key, "run": asdict(run)}) + "\n", encoding="utf-8")
+    return run
