@@ -713,6 +713,9 @@ def reproduce(
     experiment: Annotated[
         bool, typer.Option("--experiment", help="Of chen2019: draw its experiment anew, --seeds times.")
     ] = False,
+    runs: Annotated[
+        int, typer.Option("--runs", min=0, max=MOST_SEEDS, help="Of --experiment: so many in the simulator too.")
+    ] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Print a paper's numbers beside ours; exit 0 only if every one holds."""
@@ -723,8 +726,11 @@ def reproduce(
         raise InputError(f"paper '{paper}' is not known", where="reproduce", allowed=", ".join(PAPERS))
     if experiment and paper != "chen2019":
         raise InputError(f"{paper} has no such experiment", where="--experiment", allowed="reproduce chen2019")
+    if runs and not experiment:
+        raise InputError("--runs are of the experiment", where="--runs", allowed="reproduce chen2019 --experiment")
     folder = _out(out_dir, Path(paper), "reproduce")
-    result = chen2019_experiment(seeds) if experiment else PAPERS[paper](folder, seeds)
+    with progress_display() as progress:
+        result = chen2019_experiment(folder, seeds, runs, progress) if experiment else PAPERS[paper](folder, seeds)
     _print(result.summary, result.text, as_json)
     if not result.passed:
         raise typer.Exit(ANSWER_IS_NO)

@@ -7,6 +7,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from puncture_twin.meshes import folder
+from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.twin.jobs.papers import axp_ybq, chen2019
 from puncture_twin.twin.jobs.papers.chen2019_experiment import (
     DRAWS,
@@ -54,7 +56,7 @@ def chen2019_experiment(out_dir: Path, draws: int | None, runs: int, watcher: Wa
 
     done = physical_runs(prepare(folder() / SETUP_2, watcher=watcher), out_dir, runs)
     summary = {**result.summary, "physical": done.summary()}
-    return PaperResult(result.holds, summary, f"{result.text}\n{done.text()}")
+    return PaperResult(result.passed, summary, f"{result.text}\n{done.text()}")
 
 
 SETUP_2 = "carton/case_m_setup2.toml"

@@ -1,0 +1,69 @@
+"""Physical runs: what is kept, what is done again, and what a person reads of them."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.twin.jobs.experiment import physical_runs as module
+from puncture_twin.twin.jobs.experiment.physical_runs import FOLDER, PhysicalRun, PhysicalRuns, physical_runs
+
+
+class Context:
+    """Of what runs ask of a context; nothing is simulated here."""
+
+    watcher = SimpleNamespace(count=lambda *_: None)
+
+
+@pytest.fixture
+def done(monkeypatch):
+    """The seeds that were really run; seed 2 stops with a reason."""
+    seeds = []
+
+    def run(context, tour, seed):
+        seeds.append(seed)
+        if seed == 2:
+            return PhysicalRun(seed, math.nan, math.nan, math.nan, "marker A was not felt")
+        return PhysicalRun(seed, 1.0 + seed, 0.5, 12.0)
+
+    tour = type("Tour", (), {"plan": type("Plan", (), {"expected_mm": 1.8})})
+    monkeypatch.setattr(module, "plan_tour", lambda *_, **__: tour)
+    monkeypatch.setattr(module, "_key", lambda *_: "a")
+    monkeypatch.setattr(module, "_run", run)
+    return seeds
+
+
+def test_what_was_interrupted_goes_on(done, tmp_path, monkeypatch):
+    """Each run once; a refused one again; all of them where something that decides has changed."""
+    physical_runs(Context, tmp_path, 2)
+    found = physical_runs(Context, tmp_path, 4)
+    assert done == [0, 1, 2, 3]
+    assert found.kept == 2
+    (tmp_path / FOLDER / "1.json").write_text("{", encoding="utf-8")
+    again = physical_runs(Context, tmp_path, 4)
+    assert done == [0, 1, 2, 3, 1, 2]
+    assert [run.tip_error_mm for run in again.runs if not run.refused] == [1.0, 2.0, 4.0]
+    monkeypatch.setattr(module, "_key", lambda *_: "b")
+    assert physical_runs(Context, tmp_path, 2).kept == 0
+
+
+def test_the_rms_is_over_the_runs_that_ended_and_refusals_are_named():
+    """With few runs it says how well it is known."""
+    ended = (PhysicalRun(0, 3.0, 1.0, 14.0), PhysicalRun(1, 4.0, 1.0, 16.0))
+    runs = PhysicalRuns(1.8, (*ended, PhysicalRun(2, *3 * (math.nan,), "stopped")), 0)
+    assert runs.realised_mm == pytest.approx(math.sqrt(12.5))
+    assert "2 physical runs (15.0 s a touch): the tip misses the target by 3.54 mm rms" in runs.text()
+    assert "seed 2: stopped" in runs.text()
+    assert runs.summary()["refused"] == {2: "stopped"}
+
+
+def test_a_touch_that_stops_refuses_its_run_alone(monkeypatch):
+    """The others go on."""
+
+    def stop(*_):
+        raise NoAnswerError("marker A was not felt")
+
+    monkeypatch.setattr(module, "touch_once", stop)
+    run = module._run(Context, None, 7)
+    assert (run.seed, run.refused) == (7, "marker A was not felt")
