@@ -1,0 +1,43 @@
+"""The tutorial's commands, as written, one after another in an empty folder."""
+
+import re
+import shlex
+
+import pytest
+from places import ROOT
+
+from puncture_twin.run_twin import main
+
+PAGE = ROOT / "docs" / "how-to" / "chen-2019.md"
+COMMANDS = re.findall(r"^python run_twin\.py (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+
+SAID = {
+    "reproduce chen2019": "every number holds",
+    "reproduce chen2019 --experiment": "2.99 ->  1.28 mm",
+    "scan": "expected       0.29 in the plane, 1.44 along the bed",
+    "touch": "5 markers touched in 70 s, 14.0 s each",
+    "register": "1.8 degrees out of square, y against z",
+    "check": "0.62 to hit; 0.05 to touch bolt_h",
+    "rehearse": "virtual TCP off its point",
+}
+"""What the page says of each."""
+
+
+def said_by(command):
+    """What the page says of a command: of its longest name that is listed."""
+    return SAID[max((name for name in SAID if command.startswith(name)), key=len)]
+
+
+def test_the_page_has_a_command_for_each_of_its_sections():
+    """All of them are known here."""
+    assert len(COMMANDS) == 7
+    assert {said_by(command) for command in COMMANDS} == set(SAID.values())
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_says_what_the_page_says(command, tmp_path, monkeypatch, capsys):
+    """Exit code 0, and the number that is quoted."""
+    monkeypatch.chdir(tmp_path)
+    words = [str(ROOT / word) if word.startswith("meshes/") else word for word in shlex.split(command)]
+    assert main(words) == 0
+    assert said_by(command) in capsys.readouterr().out
