@@ -70,8 +70,10 @@ def main():
         for kind, pairs in rehearsed(path, factor, options.directions, options.rooms).items():
             shown = (pairs.max(axis=1) > 1e-3) & (pairs.min(axis=1) < 1 - 1e-3)
             error = calibration_error(pairs)
-            told = f"{title}: ECE of P({kind}) {error:.4f} over {len(pairs)} chances, {shown.sum()} of them not sure\n"
-            sys.stdout.write(told)
+            caption = (
+                f"{title}: ECE of P({kind}) {error:.4f} over {len(pairs)} chances, {shown.sum()} of them not sure\n"
+            )
+            sys.stdout.write(caption)
             label = f"{kind}: ECE {error:.3f}"
             axis.scatter(*pairs[shown].T, s=14, color=COLORS[kind], alpha=0.6, label=label, linewidths=0)
         axis.set(title=title, xlabel="predicted chance", xlim=(0, 1), ylim=(0, 1), aspect="equal")

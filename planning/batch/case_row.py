@@ -89,5 +89,5 @@ def _best(found: Candidates) -> dict[str, Any]:
 
 def _reach(found: Candidates) -> float | None:
     """Which fraction of the directions that the organs leave the arm reaches; None where nobody asked it."""
-    asked = found.arm.reachable >= 0
-    return float((found.arm.reachable[asked] == 1).mean()) if asked.any() else None
+    checked = found.arm.reachable >= 0
+    return float((found.arm.reachable[checked] == 1).mean()) if checked.any() else None

@@ -20,7 +20,7 @@ def arm_notes(reports: Iterable[object]) -> list[str]:
     notes: Counter[str] = Counter()
     for report in reports:
         if getattr(report, "when", "") == "call":
-            told = dict(getattr(report, "user_properties", ()))
-            if told.get(ARM_PROPERTY, CHECKED) != CHECKED:
-                notes[f"{told['case']}: arm {told[ARM_PROPERTY]}"] += 1
+            properties = dict(getattr(report, "user_properties", ()))
+            if properties.get(ARM_PROPERTY, CHECKED) != CHECKED:
+                notes[f"{properties['case']}: arm {properties[ARM_PROPERTY]}"] += 1
     return [f"{line} ({count} test{'s' if count != 1 else ''})" for line, count in notes.items()]

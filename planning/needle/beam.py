@@ -59,14 +59,14 @@ class Beam:
         if tip_mm is None:
             return _shape(solveh_banded(free, right, lower=True, check_finite=False), 0.0)
         at = free.shape[1] - 2  # the unknown that is known
-        held = free.copy()
+        clamped = free.copy()
         for below in range(1, BANDS):  # move its column to the right side
             right[at - below] -= free[below, at - below] * tip_mm
-            held[below, at - below] = 0.0
+            clamped[below, at - below] = 0.0
         right[at + 1] -= free[1, at] * tip_mm
-        held[1:, at] = 0.0
-        held[0, at], right[at] = 1.0, tip_mm
-        found = solveh_banded(held, right, lower=True, check_finite=False)
+        clamped[1:, at] = 0.0
+        clamped[0, at], right[at] = 1.0, tip_mm
+        found = solveh_banded(clamped, right, lower=True, check_finite=False)
         row = sum(free[below, at - below] * found[at - below] for below in range(1, BANDS))
         force = row + free[0, at] * found[at] + free[1, at] * found[at + 1] - load[-2]
         return _shape(found, float(force))

@@ -184,7 +184,7 @@ class Explanation:
 
     def _path(self) -> list[str]:
         row, needle = self.candidates, self.case.needle
-        described = [f"  {label:18s} {told}" for label, told in self.facts.rows()]
+        described = [f"  {label:18s} {value}" for label, value in self.facts.rows()]
         if np.isnan(row.path.length[0]):
             return ["  no skin entry on this path", *described]
         limit = np.degrees(self.case.search.max_skin_angle)

@@ -40,7 +40,7 @@ SWEEP_SPEED_MM_S = 30.0
 """Of the needle's tip, in the air."""
 
 
-class _Way(NamedTuple):
+class _SweepPath(NamedTuple):
     """Directions that are passed one after the other, and why no more."""
 
     angles: Floats
@@ -67,17 +67,17 @@ def plan_sweep(
     """
     if context.reach is None:
         raise InputError("the case does not say where the robot stands", where=context.case.path, allowed=_BASE)
-    way = _allowed(context, _angles(start, end), progress)
+    route = _allowed(context, _angles(start, end), progress)
     point = apply(context.reach.T_base_ct, context.case.target_ct)
     T_base_ct, frame = context.reach.T_base_ct, context.case.T_ct_entry[:3, :3]
-    directions = outward(way.angles[:, 0], way.angles[:, 1]) @ (T_base_ct[:3, :3] @ frame).T
-    q, stopped = _farthest(context, point, directions, way)
+    directions = outward(route.angles[:, 0], route.angles[:, 1]) @ (T_base_ct[:3, :3] @ frame).T
+    q, stopped = _farthest(context, point, directions, route)
     if len(q) < 2:
         raise NoAnswerError(f"no sweep: {stopped}")
     speeds, checker = context.case.robot.speeds, context.reach.checker
     approach = plan_approach(checker, home_configuration(context.case), q[0], seed=seed, speeds=speeds)
-    turned = np.arccos(np.clip(np.vecdot(directions[1 : len(q)], directions[: len(q) - 1]), -1.0, 1.0))
-    arc = way.standoff_mm * np.concatenate([[0.0], np.cumsum(turned)])
+    rotated = np.arccos(np.clip(np.vecdot(directions[1 : len(q)], directions[: len(q) - 1]), -1.0, 1.0))
+    arc = route.standoff_mm * np.concatenate([[0.0], np.cumsum(rotated)])
     sweep = follow_smoothly(slowed(checker.model, speeds), q, arc, max_tip_speed_mm_s=SWEEP_SPEED_MM_S)
     contact = checker.first_contact(
         dense_states(checker, sweep.q, RESOLUTION_RAD / FINER), needle_may_touch_patient=False
@@ -86,7 +86,15 @@ def plan_sweep(
         raise NoAnswerError(f"no sweep: between its directions {contact.contact.body} touches {contact.contact.other}")
     length = context.case.needle.length_mm
     return SweepPlan(
-        checker.model, length, way.standoff_mm, point, way.angles[: len(q)], end, approach.trajectory, sweep, stopped
+        checker.model,
+        length,
+        route.standoff_mm,
+        point,
+        route.angles[: len(q)],
+        end,
+        approach.trajectory,
+        sweep,
+        stopped,
     )
 
 
@@ -102,7 +110,7 @@ def _angles(start: tuple[float, float], end: tuple[float, float]) -> Floats:
     return np.asarray(start + np.linspace(0.0, 1.0, count + 1)[:, None] * change)
 
 
-def _allowed(context: CaseContext, angles: Floats, progress: Count) -> _Way:
+def _allowed(context: CaseContext, angles: Floats, progress: Count) -> _SweepPath:
     """As far as the search calls every direction safe, with the arm."""
     standoff, passed, stopped = 0.0, 0, ""
     for row, (theta, beta) in enumerate(angles.tolist()):
@@ -110,10 +118,10 @@ def _allowed(context: CaseContext, angles: Floats, progress: Count) -> _Way:
         if not found.safe[0]:
             stopped = f"{_place(angles[row])} is rejected: {reason_text(found, 0)}"
             break
-        asked = standoffs(context.case.needle, found.path.length[0], found.path.skin_angle[0])
-        standoff, passed = max(standoff, float(asked)), row + 1
+        needed = standoffs(context.case.needle, found.path.length[0], found.path.skin_angle[0])
+        standoff, passed = max(standoff, float(needed)), row + 1
         progress(passed, len(angles))
-    return _Way(angles[:passed], standoff, stopped)
+    return _SweepPath(angles[:passed], standoff, stopped)
 
 
 def _place(angles: Floats) -> str:
@@ -121,18 +129,18 @@ def _place(angles: Floats) -> str:
     return f"theta {theta:.1f} deg, beta {beta % 360:.1f} deg"
 
 
-def _farthest(context: CaseContext, point: Floats, directions: Floats, way: _Way) -> tuple[Floats, str]:
+def _farthest(context: CaseContext, point: Floats, directions: Floats, route: _SweepPath) -> tuple[Floats, str]:
     """Of all rolls and branches at the first direction the one that goes farthest, shape (k, 6), and why not on."""
     assert context.reach is not None
     if not len(directions):
-        return np.empty((0, 6)), way.stopped
+        return np.empty((0, 6)), route.stopped
     checker, length = context.reach.checker, context.case.needle.length_mm
-    request = ReachRequest(point, directions[0], length, way.standoff_mm)
-    best, why = np.empty((0, 6)), f"the arm cannot start at {_place(way.angles[0])}"
+    request = ReachRequest(point, directions[0], length, route.standoff_mm)
+    best, why = np.empty((0, 6)), f"the arm cannot start at {_place(route.angles[0])}"
     for goal in approach_goals(checker, request, home_configuration(context.case)):
-        q, stop = _followed(checker, goal.insertion_q[0], point, directions, length + way.standoff_mm)
+        q, stop = _followed(checker, goal.insertion_q[0], point, directions, length + route.standoff_mm)
         if len(q) > len(best):
-            best, why = q, f"at {_place(way.angles[len(q)])} {stop}" if stop else way.stopped
+            best, why = q, f"at {_place(route.angles[len(q)])} {stop}" if stop else route.stopped
         if len(best) == len(directions):
             break
     return best, why

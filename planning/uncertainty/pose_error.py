@@ -33,7 +33,7 @@ class Bend(NamedTuple):
     """A needle that its bevel takes off, to any side alike: by how much at the tip, held how far behind it; mm."""
 
     tip_mm: float
-    held_mm: float
+    clamped_mm: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ def _bend_covariance(model: UrModel, q: Floats, bend: Bend) -> Floats:
     by d y with the shaft about -x; each with half the variance.
     """
     R = flange_pose(model, q)[..., :3, :3]
-    x, y, turn = R[..., 0], R[..., 1], 1 / bend.held_mm
+    x, y, turn = R[..., 0], R[..., 1], 1 / bend.clamped_mm
     sides = np.stack([np.concatenate([x, turn * y], axis=-1), np.concatenate([y, -turn * x], axis=-1)], axis=-1)
     return np.asarray(bend.tip_mm**2 / 2 * sides @ np.swapaxes(sides, -1, -2))
 

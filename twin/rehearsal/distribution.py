@@ -164,9 +164,9 @@ def rehearse_rooms(
     Raises:
         InputError: The case declares no errors, or has no markers.
     """
-    asked = _asked(context, outward_ct, q_insertion)
-    rooms = draw_rooms(asked.puncture, asked.truth, count, np.random.default_rng(seed))
-    return _measured(context, asked.believed, asked.puncture, rooms, seed, asked.guessed)
+    query = _query(context, outward_ct, q_insertion)
+    rooms = draw_rooms(query.puncture, query.truth, count, np.random.default_rng(seed))
+    return _measured(context, query.believed, query.puncture, rooms, seed, query.guessed)
 
 
 def misregistered(context: CaseContext, outward_ct: Floats, q_insertion: Floats, seed: int) -> Floats:
@@ -174,12 +174,12 @@ def misregistered(context: CaseContext, outward_ct: Floats, q_insertion: Floats,
 
     Arguments and errors as of `rehearse_rooms`.
     """
-    asked = _asked(context, outward_ct, q_insertion)
-    room = draw_rooms(asked.puncture, asked.truth, 1, np.random.default_rng(seed))
-    return np.asarray(np.linalg.inv(asked.puncture.T_base_ct) @ room.T_base_ct[0])
+    query = _query(context, outward_ct, q_insertion)
+    room = draw_rooms(query.puncture, query.truth, 1, np.random.default_rng(seed))
+    return np.asarray(np.linalg.inv(query.puncture.T_base_ct) @ room.T_base_ct[0])
 
 
-class _Asked(NamedTuple):
+class _Query(NamedTuple):
     """What rooms are drawn of."""
 
     believed: PoseError
@@ -188,7 +188,7 @@ class _Asked(NamedTuple):
     guessed: bool
 
 
-def _asked(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _Asked:
+def _query(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _Query:
     case = context.case
     registration = None if context.placement is None else context.placement.registration
     error = pose_error(case, registration)
@@ -202,7 +202,7 @@ def _asked(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _As
         ur_model(case.robot.model), case.needle.length_mm, registration.method, believed.fit.noise,
         registration.markers.points_ct, q_touch, registration.T_base_ct, case.target_ct, outward_ct, q_insertion, bend,
     )  # fmt: skip
-    return _Asked(believed, puncture, truth, registration.markers.joints is None)
+    return _Query(believed, puncture, truth, registration.markers.joints is None)
 
 
 def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:

@@ -127,7 +127,7 @@ def bent(needle: TrueNeedle, bend: Bend, side: Floats) -> TrueNeedle:
     """
     x, y = needle.R_base_needle[:, :, 0], needle.R_base_needle[:, :, 1]
     c, s = np.cos(side)[:, None], np.sin(side)[:, None]
-    turn = bend.tip_mm / bend.held_mm * (c * y - s * x)
+    turn = bend.tip_mm / bend.clamped_mm * (c * y - s * x)
     return TrueNeedle(needle.tip_base + bend.tip_mm * (c * x + s * y), exp_rotation(turn) @ needle.R_base_needle)
 
 

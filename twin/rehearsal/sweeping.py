@@ -54,7 +54,7 @@ def execute_sweep(plan: SweepPlan, case: Case, anatomy: Anatomy, T_base_ct: Floa
         plan.model, tool, anatomy.skin.mesh, T_base_ct, case_boxes(case, T_base_ct), down_ct=down_ct
     ) as room:
         if control == "position":
-            done = execute(room, np.concatenate([before, _steps(plan.sweep), _held(plan.sweep)]), still)
+            done = execute(room, np.concatenate([before, _steps(plan.sweep), _with_pause(plan.sweep)]), still)
         else:
             first = execute(room, before, still)
             motion = Insertion(plan.model, tool, T_base_ct[:3, :3] @ down_ct, plan.sweep, SETTLE_S)
@@ -75,5 +75,5 @@ def _steps(trajectory: Trajectory) -> Floats:
     return trajectory.at(TIME_STEP_S * np.arange(count, dtype=np.float64))
 
 
-def _held(trajectory: Trajectory) -> Floats:
+def _with_pause(trajectory: Trajectory) -> Floats:
     return np.repeat(trajectory.q[-1:], round(SETTLE_S / TIME_STEP_S), axis=0)

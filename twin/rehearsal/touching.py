@@ -242,8 +242,8 @@ def _felt(cell: _Cell, line: _Line, arrival: Floats) -> Run:
     J = tips(cell.plan.model, cell.rigid.tip_m, line.near[:1]).J[0]
     dt = allowed_step(SPRING, J, cell.rigid.mass_matrix(line.near[0]))
     controller = Impedance(cell.rigid, SPRING, dt)
-    way = _slow(cell, line.near, TOUCH_SPEED_MM_S)
-    return _run(cell, controller, way, arrival, _Contact(cell, line))
+    trajectory = _slow(cell, line.near, TOUCH_SPEED_MM_S)
+    return _run(cell, controller, trajectory, arrival, _Contact(cell, line))
 
 
 class _Contact:
@@ -274,18 +274,18 @@ def _tip_mm(cell: _Cell, q: Floats) -> Floats:
     return 1e3 * tips(cell.plan.model, float(to_m(cell.plan.tip_mm)), q).position_m
 
 
-def _moved(cell: _Cell, way: Trajectory, arrival: Floats, *, pause_s: float = 0.0) -> Run:
+def _moved(cell: _Cell, trajectory: Trajectory, arrival: Floats, *, pause_s: float = 0.0) -> Run:
     """A motion by the position motors."""
-    return _run(cell, Motors(), way, arrival, None, pause_s)
+    return _run(cell, Motors(), trajectory, arrival, None, pause_s)
 
 
-def _outside(cell: _Cell, way: Trajectory, arrival: Floats) -> Run:
+def _outside(cell: _Cell, trajectory: Trajectory, arrival: Floats) -> Run:
     """A motion by the motors on which the needle must stay out of the patient; the physics lets it pass their skin.
 
     Raises:
         NoAnswerError: It did not.
     """
-    done = _moved(cell, way, arrival)
+    done = _moved(cell, trajectory, arrival)
     found = cell.true.first_contact(done.q[::LOOK_EVERY] + arrival, needle_may_touch_patient=False)
     if found is not None:
         what = f"{found.contact.body} touched {found.contact.other}"
@@ -296,12 +296,12 @@ def _outside(cell: _Cell, way: Trajectory, arrival: Floats) -> Run:
 def _run(
     cell: _Cell,
     controller: Controller,
-    way: Trajectory,
+    trajectory: Trajectory,
     arrival: Floats,
     stop: Callable[[Measured], bool] | None,
     pause_s: float = 0.0,
 ) -> Run:
-    reference = reference_of(cell.plan.model, cell.rigid.tip_m, way, controller.dt, pause_s)
+    reference = reference_of(cell.plan.model, cell.rigid.tip_m, trajectory, controller.dt, pause_s)
     around = Surroundings(arrival, stop=stop, watch=lambda row: _refuse_contacts(cell))
     return run(cell.room.arm, controller, reference, lambda q: tips(cell.plan.model, cell.rigid.tip_m, q[None]), around)
 

@@ -33,11 +33,11 @@ class EntryFacts:
 
     def rows(self) -> tuple[tuple[str, str], ...]:
         """What it is, and how a person reads it."""
-        told: list[tuple[str, str]] = []
+        stated: list[tuple[str, str]] = []
         if self.place is not None:
             point = ", ".join(f"{mm:.1f}" for mm in self.entry_mm)
-            told = [("skin entry", f"({point}) mm {self.space}"), ("on the skin", self.place.text(self.space))]
-        return (*told, *(() if self.planes is None else self.planes.rows()))
+            stated = [("skin entry", f"({point}) mm {self.space}"), ("on the skin", self.place.text(self.space))]
+        return (*stated, *(() if self.planes is None else self.planes.rows()))
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees; null where there is no number."""

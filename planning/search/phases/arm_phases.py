@@ -54,8 +54,8 @@ def _at_phase(
     there = ArmReach(case_checker(case, displaced, reach.T_base_ct), reach.T_base_ct)
     paths = paths_at(case, anatomy.skin, found.outward_ct, weights.skin, moved)
     path = replace(found.path, length=paths.path_length, skin_angle=paths.skin_angle)
-    asked = replace(found, path=path, arm=ArmColumns.unknown(len(found)))
-    answered = with_reach(replace(case, target_ct=case.target_ct + moved), asked, there)
+    shifted = replace(found, path=path, arm=ArmColumns.unknown(len(found)))
+    answered = with_reach(replace(case, target_ct=case.target_ct + moved), shifted, there)
     at_phase = answered.verdict.of(rows)
     return replace(found, verdict=rejected_at(found.verdict, rows, at_phase, breathing, s))
 

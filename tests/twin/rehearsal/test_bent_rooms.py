@@ -32,8 +32,8 @@ def test_a_bent_needle_ends_where_its_bevel_took_it(rng):
     off = found.tip_base - straight.tip_base
     np.testing.assert_allclose(np.linalg.norm(off, axis=1), BEND.tip_mm)
     np.testing.assert_allclose(np.einsum("na,na->n", off, straight.R_base_needle[:, :, 2]), 0.0, atol=1e-12)
-    held = [one.tip_base - BEND.held_mm * one.R_base_needle[:, :, 2] for one in (found, straight)]
-    assert np.linalg.norm(held[0] - held[1], axis=1).max() < BEND.tip_mm**2 / BEND.held_mm
+    held = [one.tip_base - BEND.clamped_mm * one.R_base_needle[:, :, 2] for one in (found, straight)]
+    assert np.linalg.norm(held[0] - held[1], axis=1).max() < BEND.tip_mm**2 / BEND.clamped_mm
     squares = found.R_base_needle @ np.swapaxes(found.R_base_needle, 1, 2)
     assert np.abs(squares - np.eye(3)).max() < 1e-9
 
@@ -44,7 +44,7 @@ def test_what_is_believed_of_the_bend_is_what_the_rooms_show(rng):
     found = bent(straight, BEND, rng.uniform(0, 2 * np.pi, COUNT))
     turned = rotation_vectors(found.R_base_needle @ np.swapaxes(straight.R_base_needle, 1, 2))
     errors = np.concatenate([found.tip_base - straight.tip_base, turned], axis=1)
-    scale = np.repeat([BEND.tip_mm, BEND.tip_mm / BEND.held_mm], 3)
+    scale = np.repeat([BEND.tip_mm, BEND.tip_mm / BEND.clamped_mm], 3)
     realised, believed = np.cov((errors / scale).T), _bend_covariance(ur_model("ur3"), Q[None], BEND)[0]
     np.testing.assert_allclose(realised, believed / np.outer(scale, scale), atol=0.01)
     assert np.trace(believed[:3, :3]) == pytest.approx(BEND.tip_mm**2)

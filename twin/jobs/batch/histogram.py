@@ -41,9 +41,9 @@ def _bars(counts: np.ndarray, edges: np.ndarray) -> Iterator[tuple[str, ...]]:
     step, high = (WIDTH - LEFT) / BARS, HEIGHT - TOP - BOTTOM
     for number, count in enumerate(counts):
         tall = high * count / counts.max()
-        told = f"{_plain(edges[number])} to {_plain(edges[number + 1])}: {count}"
+        label = f"{_plain(edges[number])} to {_plain(edges[number + 1])}: {count}"
         left, top = LEFT + number * step + 0.5, HEIGHT - BOTTOM - tall
-        yield f"{left:.1f}", f"{top:.1f}", f"{step - 1:.1f}", f"{tall:.1f}", told
+        yield f"{left:.1f}", f"{top:.1f}", f"{step - 1:.1f}", f"{tall:.1f}", label
 
 
 def _axes(most: int, edges: np.ndarray) -> Markup:

@@ -28,11 +28,12 @@ def plan_text(run: PlanRun, jobs: int) -> str:
         return "\n".join([*lines, f"plan: {run.out / 'plan.parquet'}", f"next: batch run --out {run.out}"])
     if run.guess.sample is None:
         return "\n".join([*lines, "nothing to measure: no case can be read"])
-    told = estimate_summary(run.guess, jobs)
+    estimate = estimate_summary(run.guess, jobs)
     lines += [
-        f"measured at {told['sample']}: {told['seconds_per_case']:.2f} s a case",
-        f"{jobs} worker{'s' * (jobs > 1)}: about {duration_text(told['seconds'])}, {told['memory_mb']} MB of memory, "
-        f"{told['disk_mb']:.1f} MB of disk, as if every case were like it; nothing was written",
+        f"measured at {estimate['sample']}: {estimate['seconds_per_case']:.2f} s a case",
+        f"{jobs} worker{'s' * (jobs > 1)}: about {duration_text(estimate['seconds'])}, "
+        f"{estimate['memory_mb']} MB of memory, {estimate['disk_mb']:.1f} MB of disk, "
+        "as if every case were like it; nothing was written",
     ]
     return "\n".join(lines)
 
@@ -63,10 +64,10 @@ def state_text(state: CohortState) -> str:
 
 def merge_text(merged: Merged) -> str:
     """How many of which kind, the files, and what is not as expected."""
-    told = merged.summary()
+    estimate = merged.summary()
     lines = [
-        f"{_cases(told['cases'])}: {told['safe']} with a safe direction, {told['no_safe']} without, "
-        f"{told['refused']} refused, {told['program_failed']} failed, {told['not_run']} not run",
+        f"{_cases(estimate['cases'])}: {estimate['safe']} with a safe direction, {estimate['no_safe']} without, "
+        f"{estimate['refused']} refused, {estimate['program_failed']} failed, {estimate['not_run']} not run",
         *(f"wrote {path}" for path in merged.files),
         "of the inputs as they were planned; batch status says which have changed since",
     ]

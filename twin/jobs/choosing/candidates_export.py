@@ -61,8 +61,8 @@ def table_of(source: Path, choice: Choice) -> Path | None:
         raise InputError("a table holds all candidates", where=source, allowed=f"{ALLOWED}; no choice")
     if source.suffix.lower() == ".parquet":
         return source
-    held = source / TABLE
-    return held if held.is_file() and not (source / "case.toml").is_file() else None
+    table = source / TABLE
+    return table if table.is_file() and not (source / "case.toml").is_file() else None
 
 
 def export_candidates(table_path: Path, format_name: str, out: Path, note: Callable[[str], None]) -> ExportedTable:

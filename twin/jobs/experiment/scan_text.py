@@ -36,13 +36,13 @@ def _marker_lines(facts: dict[str, Any]) -> list[str]:
     lines += [
         f"  {one['name']:<15}{_vector(one['rule_error_mm'])}    {_vector(one['error_mm'])}" for one in facts["markers"]
     ]
-    told = facts["theory_mm"]
+    theory = facts["theory_mm"]
     rms = [np.sqrt(np.mean(np.square([one[key] for one in facts["markers"]]), axis=0)) for key in _KEYS]
-    expected = f"{told['rule_in_plane']:.2f} in the plane, {told['rule_along_bed']:.2f} along the bed"
+    expected = f"{theory['rule_in_plane']:.2f} in the plane, {theory['rule_along_bed']:.2f} along the bed"
     return [
         *lines,
         f"  {'rms':<15}{_vector(rms[0])}    {_vector(rms[1])}",
-        f"  expected       {expected}; at most {told['along_bed_at_most']:.2f} along the bed",
+        f"  expected       {expected}; at most {theory['along_bed_at_most']:.2f} along the bed",
     ]
 
 

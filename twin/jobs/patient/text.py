@@ -70,7 +70,7 @@ def _plan(run: Run) -> list[str]:
     error = plan["expected_target_error_mm"]
     return [
         f"plan: theta {plan['theta_deg']:g} deg, beta {plan['beta_deg']:g} deg, standoff {plan['standoff_mm']:.1f} mm",
-        *(f"  {label:18s} {told}" for label, told in (() if run.facts is None else run.facts.rows())),
+        *(f"  {label:18s} {value}" for label, value in (() if run.facts is None else run.facts.rows())),
         f"  approach {plan['approach_s']:.1f} s, insertion {plan['insertion_s']:.1f} s",
         "  expected error at the target: "
         + ("unknown (no markers)" if error is None else f"{error:.2f} mm (rms){_straight(run)}"),
@@ -158,10 +158,10 @@ def certificate_lines(summary: dict[str, Any]) -> list[str]:
     area = f"{summary['undecided_square_deg']:.1f} square degrees{undecided}"
     if summary["safe_cells"] == 0:
         left = f", except perhaps in {area} of undecided cells" if summary["undecided_cells"] else ""
-        held = (
+        reached = (
             "is safe" if summary["touch"] is None else f"keeps the margins of a chance to touch of {summary['touch']:g}"
         )
-        said = f"proven: no direction of the cap {held}, to {summary['size_deg']:g} deg{left}"
+        said = f"proven: no direction of the cap {reached}, to {summary['size_deg']:g} deg{left}"
     else:
         fraction = summary["safe_share"]
         safe = "" if fraction is None else f" ({100 * fraction:.1f} % of the cap)"

@@ -129,9 +129,9 @@ def scan_frame(case: Case, turn: float) -> Floats:
     if case.space is Space.LOCAL:
         bed = bed_frame(case)[:3, :3]
         R = np.stack([-bed[:, 1], -bed[:, 2], bed[:, 0]])
-    turned = exp_rotation(np.array([0.0, 0.0, turn]))
+    rotation = exp_rotation(np.array([0.0, 0.0, turn]))
     middle = R @ case.target_ct
-    return pose(turned @ R, middle - turned @ middle)
+    return pose(rotation @ R, middle - rotation @ middle)
 
 
 def label_layers(case: Case, anatomy: Anatomy) -> tuple[tuple[str, ...], ...]:

@@ -140,16 +140,16 @@ def _needle(axes: Axes, subject: Subject, plane: Plane) -> None:
 def _cut(axes: Axes, subject: Subject, cosine: float, turn_deg: float) -> None:
     """The needle's cut at the target, an ellipse, and dashed the same with the greatest margin."""
     radius = subject.needle_radius_mm
-    turned: Any = {"angle": turn_deg, "lw": 1.0}
+    style: Any = {"angle": turn_deg, "lw": 1.0}
     long = 1 / max(cosine, STEEP)
-    axes.add_patch(Ellipse((0, 0), 2 * radius * long, 2 * radius, color=NEEDLE_COLOUR, zorder=3, **turned))
+    axes.add_patch(Ellipse((0, 0), 2 * radius * long, 2 * radius, color=NEEDLE_COLOUR, zorder=3, **style))
     if subject.bent_mm is not None:
         off = 2 * float(subject.bent_mm[-1, 1])
-        axes.add_patch(Ellipse((0, 0), off * long, off, fill=False, edgecolor=BENT_COLOUR, **turned))
+        axes.add_patch(Ellipse((0, 0), off * long, off, fill=False, edgecolor=BENT_COLOUR, **style))
     if subject.margin_mm > 0:
         wide = 2 * (radius + subject.margin_mm)
         look: Any = {"fill": False, "linestyle": "--", "edgecolor": NEEDLE_COLOUR}
-        axes.add_patch(Ellipse((0, 0), wide * long, wide, **turned, **look))
+        axes.add_patch(Ellipse((0, 0), wide * long, wide, **style, **look))
 
 
 def _target(axes: Axes, subject: Subject, plane: Plane) -> None:
