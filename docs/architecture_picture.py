@@ -97,7 +97,7 @@ def places(graph):
 def draw(graph, sizes):
     """The figure."""
     edges, at = needed(graph), places(graph)
-    figure, ax = plt.subplots(figsize=(16, 12.5), dpi=90)
+    figure, ax = plt.subplots(figsize=(25, 13), dpi=72)
     for room, other in sorted(edges):
         arrow(ax, at[room], at[other], room)
     for room in graph:
@@ -124,7 +124,7 @@ def box(ax, x, y, room, size):
     ax.add_patch(FancyBboxPatch((x - 1.02, y - 0.36), 2.04, 0.72, zorder=3, **style))
     name = (room.partition("/")[2] or room).replace("guidance/", "guidance/\n").replace("collision_", "collision_\n")
     middle = {"ha": "center", "va": "center", "zorder": 4}
-    ax.text(x, y + 0.09, name, fontsize=12, weight="bold", color=line, linespacing=0.85, **middle)
+    ax.text(x, y + 0.09, name, fontsize=11, weight="bold", color=line, linespacing=0.85, **middle)
     count = "data" if size == 0 else f"{size} module{'s' * (size > 1)}"
     ax.text(x, y - 0.25, count, fontsize=8, **middle)
 
