@@ -74,11 +74,11 @@ class PhysicalRuns:
         }
 
     def text(self) -> str:
-        """For a person; with few runs an rms is known to one over the root of six times their number."""
+        """For a person; where one axis errs most, an rms is known to one over the root of twice their number."""
         ended = [run for run in self.runs if not run.refused]
         if not ended:
             return f"no physical run of {len(self.runs)} ended: {self.runs[0].refused}"
-        spread = 1.0 / np.sqrt(6.0 * len(ended))
+        spread = 1.0 / np.sqrt(2.0 * len(ended))
         seconds = np.mean([run.seconds_per_touch for run in ended])
         kept = f", {self.kept} of them kept from before" if self.kept else ""
         lines = [

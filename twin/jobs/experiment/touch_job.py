@@ -16,6 +16,7 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.formats.points.point_files import NamedPoints, write_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.registration import Registration
@@ -173,9 +174,8 @@ def _puncture(context: CaseContext, choice: Choice) -> tuple[Floats, Floats]:
 
 def _truth(context: CaseContext, outward_ct: Floats, q_insertion: Floats, seed: int) -> TouchTruth:
     """Where everything truly is: the belief is one registration that the declared errors allow."""
-    case = context.case
-    errors = case.truth_errors or case.errors
-    assert errors is not None and context.placement is not None and context.placement.registration is not None
+    errors = _true_errors(context)
+    assert context.placement is not None and context.placement.registration is not None
     E = misregistered(context, outward_ct, q_insertion, seed)
     markers = context.placement.registration.markers
     T_base_ct = context.placement.T_base_ct @ np.linalg.inv(E)
@@ -192,15 +192,29 @@ def _by_name(plan: TouchPlan, touched: Touched) -> NamedPoints:
 def _tip_error(
     context: CaseContext, plan: TouchPlan, truth: TouchTruth, fitted: Registration, q_insertion: Floats
 ) -> float:
-    """Tip to true target of the erring arm, sent to where the new registration puts the target, mm."""
+    """Tip to true target of the erring arm, sent to where the new registration puts the target, mm.
+
+    The target was read with an error of its own, the joints drifted since the touches, and arrive with their own.
+    """
     target_ct = context.case.target_ct
     T = flange_pose(plan.model, q_insertion)
     T[:3, 3] = apply(fitted.T_base_ct, target_ct) - plan.tip_mm * T[:3, 2]
     every = nearest_within_limits(plan.model, inverse(plan.model, T)[0], q_insertion)
     away = np.abs(every - q_insertion).max(axis=1)
     q = every[int(np.argmin(np.where(np.isnan(away), np.inf, away)))]
-    tip = true_needle(plan.model, q, truth.eta, plan.tip_mm).tip_base
-    return float(np.linalg.norm(tip - apply(truth.T_base_ct, target_ct)))
+    errors, rng = _true_errors(context), np.random.default_rng([truth.seed, 2])
+    arrival = rng.normal(size=6) * np.hypot(errors.arm.repeatability, errors.arm.drift)
+    values, axes = np.linalg.eigh(errors.target_cov_ct)
+    true_target_ct = target_ct + axes @ (rng.normal(size=3) * np.sqrt(np.maximum(values, 0.0)))
+    tip = true_needle(plan.model, q + arrival, truth.eta, plan.tip_mm).tip_base
+    return float(np.linalg.norm(tip - apply(truth.T_base_ct, true_target_ct)))
+
+
+def _true_errors(context: CaseContext) -> ErrorModel:
+    """What the truth is drawn from."""
+    errors = context.case.truth_errors or context.case.errors
+    assert errors is not None
+    return errors
 
 
 def touch_text(run: TouchRun) -> str:
