@@ -64,8 +64,15 @@ class Breathing:
         return f"s = {s:.2f}, {s * self.amplitude_mm:.1f} mm from exhale"
 
     @property
+    def whole(self) -> bool:
+        """Whether `positions` reach full inhale, or nothing moves: one phase alone says nothing of the others."""
+        return self.amplitude_mm == 0 or bool(self.positions[-1] >= 1.0)
+
+    @property
     def window_text(self) -> str:
         """When a safe candidate is safe. It never says that a needle may stay while the patient breathes."""
+        if self.gate is None and not self.whole:
+            return "at exhale, if inserted there; no other phase was looked at"
         if self.gate is None:
             return "at each phase if inserted at that phase"
         return f"when gated to this window (s <= {self.gate:g})"

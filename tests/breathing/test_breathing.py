@@ -119,3 +119,18 @@ def test_a_breath_that_cannot_be_meant_is_refused(tmp_path, keys, text, space, m
 def test_a_case_without_the_table_declares_none(tmp_path):
     """Nothing changes for it."""
     assert case_with(tmp_path, text="").breathing is None
+
+
+@pytest.mark.parametrize(
+    ("keys", "whole", "text"),
+    [
+        ({}, True, "at each phase if inserted at that phase"),
+        ({"phases": 1}, False, "at exhale, if inserted there; no other phase was looked at"),
+        ({"phases": 1, "gate": 0.25}, False, "when gated to this window (s <= 0.25)"),
+        ({"phases": 1, "amplitude_mm": 0.0}, True, "at each phase if inserted at that phase"),
+    ],
+)
+def test_one_phase_does_not_speak_for_the_others(keys, whole, text):
+    """Only positions up to full inhale are the whole breath; one phase alone was called safe at each."""
+    found = breathing(**keys)
+    assert (found.whole, found.window_text) == (whole, text)

@@ -50,6 +50,6 @@ def with_breathing(
     excess = np.array([phase.least_excess for phase in phases[:within]])
     worst[rows] = breathing.positions[excess.argmin(axis=0)]
     clearance[rows] = np.min([phase.clearance.min(axis=1, initial=np.inf) for phase in phases[:within]], axis=0)
-    safe_all = np.asarray(through.reason == Reason.NONE.value)
+    safe_all = np.asarray(through.reason == Reason.NONE.value) & breathing.whole
     columns = BreathingColumns(safe_all, worst, clearance, breathing.window_text)
     return replace(found, verdict=verdict, breathing=columns)
