@@ -78,7 +78,7 @@ def _best(found: Candidates) -> dict[str, Any]:
     return {
         "best_theta_deg": float(np.degrees(found.theta[row])),
         "best_beta_deg": float(np.degrees(found.beta[row])),
-        "best_clearance_mm": or_null(found.clearance.least[row]),
+        "best_clearance_mm": or_null(found.least_clearance[row]),
         "best_path_length_mm": or_null(found.path.length[row]),
         "best_skin_angle_deg": or_null(float(np.degrees(found.path.skin_angle[row]))),
         **{f"best_entry_{axis}_mm": or_null(found.path.entry_ct[row, k]) for k, axis in enumerate("xyz")},

@@ -54,7 +54,7 @@ def _clearances(check: CheckSection, found: Explanation) -> Iterator[Difference]
 
 
 def _least(check: CheckSection, found: Explanation) -> Iterator[Difference]:
-    want, got = check.min_clearance_mm, float(found.candidates.clearance.least[0])
+    want, got = check.min_clearance_mm, float(found.candidates.least_clearance[0])
     if want is None or got >= want:
         return
     line = f"min_clearance_mm: expected at least {want:g} mm, found {got:.4f} mm, {found.nearest_demanding()}"

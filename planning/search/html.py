@@ -36,7 +36,7 @@ def _facts(candidates: Any) -> Facts:
         theta, beta = np.degrees(candidates.theta[best]), np.degrees(candidates.beta[best])
         yield "best direction", f"θ {theta:g}°, β {beta:g}°"
         yield "its path, target to skin", f"{candidates.path.length[best]:.1f} mm"
-        yield "its least clearance", f"{candidates.clearance.least[best]:.1f} mm"
+        yield "its least clearance", f"{candidates.least_clearance[best]:.1f} mm"
     for code, count in candidates.counts().items():
         text = candidates.safe_text if code == "safe" else REASON_TEXT[Reason(code)]
         yield text, f"{count:,}"

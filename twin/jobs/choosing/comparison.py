@@ -274,6 +274,6 @@ _ROWS: tuple[tuple[str, Callable[[Side], str]], ...] = (
     ("needle to the nearest, mm", _of_plan(lambda plan: plan.clearance_mm.get("needle", np.nan), "{:.2f}")),
     ("arm on the approach, mm", _of_plan(lambda plan: plan.clearance_mm.get("approach", np.nan), "{:.2f}")),
     ("arm on the insertion, mm", _of_plan(lambda plan: plan.clearance_mm.get("insertion", np.nan), "{:.2f}")),
-    ("least clearance, mm", _checked(lambda one: one.candidates.clearance.least[0], "{:.2f}")),
+    ("least clearance, mm", _checked(lambda one: one.candidates.least_clearance[0], "{:.2f}")),
 )
 """What stands in each row; rows that neither side has are left out."""

@@ -187,7 +187,7 @@ def _explained(explained: Explanation) -> dict[str, Any]:
         "on_the_skin": "" if place is None else place.text(explained.case.space),
         "path_length_mm": finite(one.path.length[0]),
         "skin_angle_deg": finite(np.degrees(one.path.skin_angle[0])),
-        "min_clearance_mm": finite(one.clearance.least[0]),
+        "min_clearance_mm": finite(one.least_clearance[0]),
         "nearest": explained.nearest_demanding(),
         "reachable": None if one.arm.reachable[0] < 0 else bool(one.arm.reachable[0]),
         "p_hit": None if doubt is None else doubt.p_hit,

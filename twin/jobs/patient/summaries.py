@@ -65,7 +65,7 @@ def window_summary(found: Candidates, window: Window) -> dict[str, Any]:
         "rank": int(found.ranking.rank[row]),
         **found.at(row),
         "cost": finite(found.ranking.cost[row]),
-        "min_clearance_mm": finite(found.clearance.least[row]),
+        "min_clearance_mm": finite(found.least_clearance[row]),
         "path_length_mm": finite(found.path.length[row]),
         "skin_angle_deg": finite(np.degrees(found.path.skin_angle[row])),
         "tissue_mm": finite(found.path.tissue[row]),

@@ -39,7 +39,7 @@ class MapRaster:
 
 def clearance_range(candidates: Candidates) -> tuple[float, float]:
     """Least and greatest clearance among the safe directions, mm; (0, 1) when there is none to speak of."""
-    values = candidates.clearance.least[candidates.safe]
+    values = candidates.least_clearance[candidates.safe]
     values = values[np.isfinite(values)]
     if len(values) == 0:
         return 0.0, 1.0
@@ -56,7 +56,7 @@ def row_colours(candidates: Candidates) -> NDArray[np.uint8]:
             colours[candidates.verdict.reason == value] = REASON_COLOURS[reason]
     low, high = clearance_range(candidates)
     safe = candidates.safe
-    colours[safe] = safe_shades((candidates.clearance.least[safe] - low) / (high - low))
+    colours[safe] = safe_shades((candidates.least_clearance[safe] - low) / (high - low))
     return colours
 
 
