@@ -27,7 +27,6 @@ PLANT_IN_GUIDANCE = {
 WITHOUT_WORK = {
     "puncture_twin.twin.phantoms.ct_image",
     "puncture_twin.twin.phantoms.supine",
-    "puncture_twin.twin.plant.scanner.readings",
 }
 """Devices, and patients in a scanner, that no command uses yet."""
 

@@ -34,7 +34,7 @@ class Grid:
 
     Attributes:
         low_mm: Centre of the first voxel, LPS.
-        spacing_mm: Along each axis, such as `puncture_twin.twin.plant.scanner.readings.Scanner.cell_mm`.
+        spacing_mm: Along each axis.
         shape: Voxels along each axis.
     """
 
