@@ -1,7 +1,8 @@
 """Which of many possible poses to record: those that tell most about the error at the tip.
 
-Errors of the arms that all poses share stand behind the parameters as unknowns with a prior (their deviations are 1):
-poses that repeat one of them do not average it out, and poses that show it correct the aim.
+The bound can count errors of the arms that all poses share, as unknowns with a prior behind the parameters (their
+deviations are 1): poses that repeat one of them do not average it out, and poses that show it correct the aim. The
+choice does not count them: so chosen, a region from found noise holds the truth less often than it says.
 """
 
 from __future__ import annotations
@@ -59,7 +60,6 @@ def choose_poses(
     prior: Calibration | Estimate,
     *,
     recorded: Recording | None = None,
-    arms: DeclaredArms | None = None,
 ) -> NDArray[np.int_]:
     """Choose poses by Fisher information: greedily, then by exchange until no single exchange helps.
 
@@ -71,7 +71,6 @@ def choose_poses(
         noise: Of both arms and the image.
         prior: A rough calibration, such as the drawing's: 10 deg and 20 mm off will do.
         recorded: Poses that are recorded already and count.
-        arms: Both arms' lasting errors; every recording then needs joints. None takes all errors of flanges for noise.
 
     Returns:
         Indices into the candidates, ascending.
@@ -82,7 +81,7 @@ def choose_poses(
     if not 0 < n <= len(candidates):
         raise InputError(f"{n} poses of {len(candidates)} candidates", where="pose choice", allowed="1 to all of them")
     prior = prior.estimate if isinstance(prior, Calibration) else prior
-    design = _design(candidates, _Belief(noise, prior, arms), recorded)
+    design = _design(candidates, _Belief(noise, prior, None), recorded)
     chosen: list[int] = []
     H = design.base
     for _ in range(n):
@@ -104,7 +103,8 @@ def expected_tre_mm(
 ) -> float:
     """Cramer-Rao bound of the rms error at the tip over a workspace, mm, if these poses are recorded.
 
-    Infinite where they leave a combination of the unknowns free. ``arms`` as in `choose_poses`.
+    Infinite where they leave a combination of the unknowns free. ``arms``: both arms' lasting errors; every
+    recording then needs joints. None takes all errors of flanges for noise.
     """
     belief = _Belief(noise, prior, arms)
     rows = _whitened(poses, belief)
