@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import sys
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
@@ -404,6 +403,7 @@ def mirror(
     """Show a running arm's needle in the CT: tip, distance to the target. Writes nothing to the robot."""
     from puncture_twin.planning.base.provenance import inputs_document
     from puncture_twin.planning.case.case import load_case
+    from puncture_twin.twin.jobs.interrupt import ended_by_ctrl_c
     from puncture_twin.twin.jobs.robot.mirror import Mirror, RecordedJoints, connect, live_states, mirror_text
 
     if (host is None) == (recorded is None):
@@ -418,7 +418,7 @@ def mirror(
     else:
         states = live_states(connect(str(host)), period_s=1.0 / rate, seconds=seconds)
     shown = []
-    with suppress(KeyboardInterrupt):
+    with ended_by_ctrl_c():
         for one in mirrored.follow(states):
             shown.append(one.summary()) if as_json else print(mirror_text(one), flush=True)
     if as_json:

@@ -19,6 +19,7 @@ from puncture_twin.planning.base.errors import (
     PlanningError,
     one_line,
 )
+from puncture_twin.twin.jobs.interrupt import insistent_ctrl_c
 from puncture_twin.twin.jobs.terminal import flush_output, leave_unread, reader_is_gone
 
 OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, INTERRUPTED, UNREAD = 0, 1, 2, 3, 130, 141
@@ -38,8 +39,9 @@ def exit_code_of(command: Callable[[], object], print_line: PrintLine) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = _notes(warnings.showwarning, print_line)
         try:
-            result = command()
-            flush_output()
+            with insistent_ctrl_c():
+                result = command()
+                flush_output()
         except (KeyboardInterrupt, typer.Abort):
             result = INTERRUPTED
         except (PlanningError, ClickException) as error:

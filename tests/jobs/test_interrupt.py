@@ -1,0 +1,124 @@
+"""Ctrl-C where Python drops what it raises: in a callback, a destructor, a block that puts it off."""
+
+import ctypes
+import signal
+import sys
+import threading
+import time
+
+import pytest
+
+from puncture_twin.twin.jobs.exit_codes import INTERRUPTED, exit_code_of
+from puncture_twin.twin.jobs.interrupt import ended_by_ctrl_c, insistent_ctrl_c
+
+
+@pytest.fixture(autouse=True)
+def hears():
+    """As a shell in the foreground starts it; all as it was afterwards."""
+    before, hook = signal.signal(signal.SIGINT, signal.default_int_handler), sys.unraisablehook
+    yield
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler and sys.unraisablehook is hook
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    signal.signal(signal.SIGINT, before)
+
+
+def in_a_callback(work):
+    """As a compiler's library calls back: ctypes drops what is raised."""
+    ctypes.CFUNCTYPE(None)(work)()
+
+
+def in_a_destructor(work):
+    """As an object in C is closed."""
+
+    class Closing:
+        def __del__(self):
+            work()
+
+    Closing()
+
+
+@pytest.mark.parametrize("place", [in_a_callback, in_a_destructor])
+def test_an_interruption_that_was_dropped_comes_again(place, capfd):
+    """Else the command runs on to its end, and ends with 0."""
+    came = []
+
+    def swallowed():
+        came.append(1)
+        signal.raise_signal(signal.SIGINT)
+
+    def command():
+        place(swallowed)
+        deadline = time.monotonic() + 20
+        while time.monotonic() < deadline:
+            time.sleep(0.01)
+
+    told = []
+    started = time.monotonic()
+    assert exit_code_of(command, told.append) == INTERRUPTED and came == [1]
+    assert told == ["interrupted"] and time.monotonic() - started < 10
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_cleans_up_is_not_interrupted_again():
+    """Not by an interruption that it is the answer to, and whatever it raises and handles itself."""
+    cleaned = []
+
+    def command():
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            time.sleep(0.3)
+            try:
+                raise FileNotFoundError
+            except FileNotFoundError:
+                time.sleep(0.3)
+            cleaned.append(1)
+
+    assert exit_code_of(command, lambda _: None) == INTERRUPTED
+    assert cleaned == [1]
+
+
+def test_a_block_that_puts_the_signal_off_is_left_whole():
+    """The renames of a folder take the signal's place while they last."""
+    renamed, came = [], []
+
+    def command():
+        in_a_callback(lambda: signal.raise_signal(signal.SIGINT))
+        before = signal.signal(signal.SIGINT, lambda *_: came.append(1))
+        time.sleep(0.3)
+        renamed.append(1)
+        signal.signal(signal.SIGINT, before)
+        time.sleep(5)
+
+    assert exit_code_of(command, lambda _: None) == INTERRUPTED
+    assert renamed == [1] and came
+
+
+def test_a_command_goes_on_after_the_block_that_ctrl_c_ends():
+    """As ``mirror`` prints what it saw."""
+
+    def command():
+        with ended_by_ctrl_c():
+            signal.raise_signal(signal.SIGINT)
+        time.sleep(0.5)
+        return 7
+
+    assert exit_code_of(command, lambda _: None) == 7
+
+
+def test_who_hears_the_signal_otherwise_keeps_it():
+    """Another thread, and a program that was started deaf to it."""
+    heard = []
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with insistent_ctrl_c():
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def elsewhere():
+        with insistent_ctrl_c():
+            heard.append(signal.getsignal(signal.SIGINT))
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join()
+    assert heard == [signal.default_int_handler]

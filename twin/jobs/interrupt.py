@@ -1,0 +1,74 @@
+"""Ctrl-C that arrives: raised again where compiled code has swallowed it.
+
+Python raises ``KeyboardInterrupt`` at whatever line runs when the signal comes. Where that line is called from a
+library's callback, a destructor or a lookup in C, the exception is dropped there, and the command would run to its end.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+AGAIN_S = 0.2
+"""How soon an interruption that was swallowed comes again."""
+
+
+@contextmanager
+def insistent_ctrl_c() -> Iterator[None]:
+    """Raise ``KeyboardInterrupt`` again until some code of the block handles it.
+
+    It does nothing outside the main thread, nor where another handler than Python's own is set (a shell starts what
+    is in the background deaf to the signal).
+    """
+    heard = signal.default_int_handler
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not heard:
+        yield
+        return
+    alarm, unraisable = signal.getsignal(signal.SIGALRM), sys.unraisablehook
+    signal.signal(signal.SIGINT, _first)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGINT, heard)
+        signal.signal(signal.SIGALRM, alarm)
+        sys.unraisablehook = unraisable
+
+
+@contextmanager
+def ended_by_ctrl_c() -> Iterator[None]:
+    """A block that Ctrl-C ends, and after which the command goes on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+def _first(*_: object) -> None:
+    """The signal: from now on what is dropped is a consequence of it, and not worth a traceback."""
+    sys.unraisablehook = _silent
+    signal.signal(signal.SIGALRM, _again)
+    signal.setitimer(signal.ITIMER_REAL, AGAIN_S, AGAIN_S)
+    raise KeyboardInterrupt
+
+
+def _again(*_: object) -> None:
+    """By way of the signal: a block that puts Ctrl-C off, such as the renames of a folder, puts this off too."""
+    if not _is_handled():
+        signal.raise_signal(signal.SIGINT)
+
+
+def _is_handled() -> bool:
+    """Whether a ``finally``, ``except`` or ``with`` that the interruption reached runs now."""
+    error = sys.exc_info()[1]
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return error is not None
+
+
+def _silent(_: Any) -> None:
+    """In place of the traceback of an exception that nobody can catch."""
