@@ -7,11 +7,10 @@ A command imports what it needs itself: the help and a wrong argument answer at 
 
 from __future__ import annotations
 
-import json
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
@@ -19,12 +18,12 @@ from puncture_twin.meshes import folder as meshes_folder
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import check_writable
 from puncture_twin.planning.geometry.spaces import Space, Unit
-from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, PROGRAM_FAILED, exit_code_of
+from puncture_twin.twin.jobs.batch.commands import batch_app
+from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, exit_code_of
 from puncture_twin.twin.jobs.extras import require_extra
 from puncture_twin.twin.jobs.options import (
     ArmOption,
     CaseArgument,
-    CohortOption,
     EngineOption,
     JobsOption,
     JsonOption,
@@ -34,7 +33,7 @@ from puncture_twin.twin.jobs.options import (
     SourceArgument,
     with_choice,
 )
-from puncture_twin.twin.jobs.terminal import default_out
+from puncture_twin.twin.jobs.terminal import default_out, print_answer
 from puncture_twin.twin.report.progress import progress_display
 
 if TYPE_CHECKING:
@@ -45,9 +44,6 @@ MOST_SEEDS = 10_000
 
 app = typer.Typer(add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 """Plain help: in boxes, a terminal of 40 columns shows names of options cut off."""
-batch_app = typer.Typer(
-    add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None
-)
 app.add_typer(batch_app, name="batch", help="Many cases: plan, run, status, merge, compare.")
 
 
@@ -81,7 +77,7 @@ def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> 
 
     with progress_display() as progress:
         run = main_job.demo_case(prepare(meshes_folder() / "abdomen", watcher=progress), out_dir)
-    _print(run.summary(), text.rehearsal_text(run), as_json)
+    print_answer(run.summary(), text.rehearsal_text(run), as_json)
 
 
 @app.command()
@@ -120,7 +116,7 @@ def init(
         run = init_case(request, force=force, watcher=progress)
     for warning in run.warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    _print(run.summary(), init_text(run), as_json)
+    print_answer(run.summary(), init_text(run), as_json)
 
 
 @app.command()
@@ -157,7 +153,7 @@ def search(
             certify_deg=certify_size if certified else None,
             certify_touch=certify_touch,
         )
-    _print(run.summary(), text.search_text(run), as_json)
+    print_answer(run.summary(), text.search_text(run), as_json)
     if not run.candidates.safe.any():
         raise typer.Exit(ANSWER_IS_NO)
 
@@ -174,7 +170,7 @@ def verify(
 
     with progress_display() as progress:
         report = answers.verify_certificate(certificate, prepare(case, arm=False, watcher=progress))
-    _print(report, text.certificate_text(report), as_json)
+    print_answer(report, text.certificate_text(report), as_json)
 
 
 @app.command()
@@ -207,7 +203,7 @@ def check(
     if lists_of(entries, targets, choice, picture=picture, out_dir=out_dir):
         with progress_display() as progress:
             listed = check_list(case, entries, targets, choice, out_dir=out_dir, arm=arm, watcher=progress)
-        _print(listed.summary(), listed.text(), as_json)
+        print_answer(listed.summary(), listed.text(), as_json)
         if not listed.safe:
             raise typer.Exit(ANSWER_IS_NO)
         return
@@ -218,7 +214,7 @@ def check(
             from puncture_twin.twin.jobs.patient.pictures import write_check_picture
 
             write_check_picture(context, explained, picture)
-    _print(explained.summary(), explained.text(None if every else NEAREST), as_json)
+    print_answer(explained.summary(), explained.text(None if every else NEAREST), as_json)
     if not explained.safe:
         raise typer.Exit(ANSWER_IS_NO)
 
@@ -248,7 +244,7 @@ def compare(
             compared = compare_choices(prepare(source, arm=arm, watcher=progress), choices)
         else:
             compared = compare_plans(plans, None if case is None else prepare(case, watcher=progress))
-    _print(compared.summary(), compared.text(), as_json)
+    print_answer(compared.summary(), compared.text(), as_json)
     if not compared.safe:
         raise typer.Exit(ANSWER_IS_NO)
 
@@ -268,7 +264,7 @@ def plan(
     folder = _out(out_dir, case, "plan")
     with progress_display() as progress:
         run = main_job.plan_case(prepare(case, watcher=progress), folder, choice)
-    _print(run.summary(), text.plan_text(run), as_json)
+    print_answer(run.summary(), text.plan_text(run), as_json)
 
 
 @app.command()
@@ -312,7 +308,7 @@ def rehearse(
             run = main_job.rehearse_plan(context, source, folder, rooms)
         else:
             run = main_job.rehearse_case(context, folder, rooms, choice)
-    _print(run.summary(), text.rehearsal_text(run), as_json)
+    print_answer(run.summary(), text.rehearsal_text(run), as_json)
 
 
 def _sweep(source: Path, folder: Path, choice: Choice, to: str | None, *, alone: bool, as_json: bool) -> None:
@@ -327,7 +323,7 @@ def _sweep(source: Path, folder: Path, choice: Choice, to: str | None, *, alone:
     end = parse_angles(to)
     with progress_display() as progress:
         run = sweep_case(prepare(source, watcher=progress), folder, choice, end)
-    _print(run.summary(), sweep_text(run), as_json)
+    print_answer(run.summary(), sweep_text(run), as_json)
     if not run.whole:
         raise typer.Exit(ANSWER_IS_NO)
 
@@ -349,7 +345,7 @@ def touch(
     folder = _out(out_dir, case, "touch")
     with progress_display() as progress:
         run = touch_case(prepare(case, watcher=progress), folder, choice, seed)
-    _print(run.summary(), touch_text(run), as_json)
+    print_answer(run.summary(), touch_text(run), as_json)
 
 
 @app.command()
@@ -363,7 +359,7 @@ def pivot(
     from puncture_twin.twin.jobs.experiment.pivot_job import pivot_case, pivot_text
 
     run = pivot_case(load_case(case), joints)
-    _print(run.summary(), pivot_text(run), as_json)
+    print_answer(run.summary(), pivot_text(run), as_json)
     if run.pivot.large:
         raise typer.Exit(ANSWER_IS_NO)
 
@@ -384,7 +380,7 @@ def place(
     folder = _out(out_dir, case, "place")
     with progress_display() as progress:
         run = place_case(prepare(case, arm=False, watcher=progress), folder, jobs=jobs, pictures=pictures)
-    _print(run.summary(), place_text(run), as_json)
+    print_answer(run.summary(), place_text(run), as_json)
 
 
 @app.command()
@@ -422,7 +418,7 @@ def mirror(
         for one in mirrored.follow(states):
             shown.append(one.summary()) if as_json else print(mirror_text(one), flush=True)
     if as_json:
-        _print({"case": str(case), "inputs": inputs_document(inputs), "states": shown}, "", as_json)
+        print_answer({"case": str(case), "inputs": inputs_document(inputs), "states": shown}, "", as_json)
 
 
 @app.command()
@@ -474,7 +470,7 @@ def export(
         else:
             done = main_job.export_case(context, format_name, folder, choice)
     checked = context is not None
-    _print(export_summary(done, checked), text.export_text(done, checked), as_json)
+    print_answer(export_summary(done, checked), text.export_text(done, checked), as_json)
 
 
 def _export_candidates(source: Path, format_name: str, out_dir: Path, choice: Choice, as_json: bool) -> None:
@@ -488,7 +484,7 @@ def _export_candidates(source: Path, format_name: str, out_dir: Path, choice: Ch
             search_case(prepare(source, watcher=progress), out_dir, pictures=False)
             table = out_dir / TABLE
         done = export_candidates(table, format_name, out_dir, progress.note)
-    _print(done.summary(), done.text(), as_json)
+    print_answer(done.summary(), done.text(), as_json)
 
 
 def _export_to_slicer(source: Path, out_dir: Path, choice: Choice, as_json: bool) -> None:
@@ -501,7 +497,7 @@ def _export_to_slicer(source: Path, out_dir: Path, choice: Choice, as_json: bool
         raise InputError("slicer shows a case", where=source, allowed=allowed)
     with progress_display() as progress:
         done = export_to_slicer(prepare(source, watcher=progress), out_dir, choice)
-    _print(done.summary(), done.text(), as_json)
+    print_answer(done.summary(), done.text(), as_json)
 
 
 @app.command()
@@ -533,102 +529,7 @@ def register(
         from puncture_twin.twin.jobs.patient.pictures import write_budget_picture
 
         write_budget_picture(report, picture)
-    _print(report, text.registration_text(report), as_json)
-
-
-@batch_app.command("plan")
-def batch_plan(
-    cohort: Annotated[Path, typer.Argument(metavar="COHORT", help="A folder, a CSV with 'case', or cohort.toml.")],
-    out_dir: CohortOption,
-    no_arm: Annotated[bool, typer.Option("--no-arm", help="Leave the arm out of every case.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say how many, how long, how much.")] = False,
-    jobs: JobsOption = 1,
-    as_json: JsonOption = False,
-) -> None:
-    """Write down every case of a cohort, with the hash of its inputs, options and version."""
-    from puncture_twin.twin.jobs.batch.plan_job import plan_cohort
-    from puncture_twin.twin.jobs.batch.text import plan_text
-
-    with progress_display() as progress:
-        run = plan_cohort(cohort, out_dir, arm=False if no_arm else None, dry=dry_run, watcher=progress)
-    _print(run.summary(jobs), plan_text(run, jobs), as_json)
-
-
-@batch_app.command("run")
-def batch_run(
-    out_dir: CohortOption,
-    part: Annotated[
-        str | None, typer.Option("--part", metavar="i/n", help="Only this part; else SLURM's array task, else all.")
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A Dask scheduler whose workers run the cases.")
-    ] = None,
-    jobs: JobsOption = 1,
-    memory_mb: Annotated[int | None, typer.Option("--memory-mb", min=100, help="Most that a worker may hold.")] = None,
-    timeout_s: Annotated[float | None, typer.Option("--timeout-s", min=0.1, help="Most that a case may take.")] = None,
-    pages: Annotated[bool, typer.Option("--pages", help="Draw the pictures and the page of each case too.")] = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Run the cases that have no result yet; what is done is kept, whatever stops the run."""
-    from puncture_twin.planning.batch.workers import Limits
-    from puncture_twin.twin.jobs.batch.run_job import Where, run_part, run_summary
-    from puncture_twin.twin.jobs.batch.text import run_text
-
-    where = Where(part, scheduler, jobs, pages, Limits(memory_mb, timeout_s))
-    with progress_display() as progress:
-        counts = run_part(out_dir, where, progress)
-    _print(run_summary(out_dir, counts), run_text(out_dir, counts), as_json)
-    if counts.ended[PROGRAM_FAILED] or counts.stale:
-        raise typer.Exit(PROGRAM_FAILED if counts.ended[PROGRAM_FAILED] else ANSWER_IS_NO)
-
-
-@batch_app.command("status")
-def batch_status(out_dir: CohortOption, as_json: JsonOption = False) -> None:
-    """Count the cases that are done, failed, missing and stale; every input is hashed again."""
-    from puncture_twin.planning.batch.state import cohort_state
-    from puncture_twin.twin.jobs.batch.text import state_text
-
-    with progress_display() as progress:
-        state = cohort_state(out_dir, partial(progress.count, "cases"))
-    _print(state.summary(), state_text(state), as_json)
-
-
-@batch_app.command("merge")
-def batch_merge(
-    out_dir: CohortOption,
-    expect: Annotated[
-        Path | None, typer.Option("--expect", metavar="FILE", help="An earlier cases.parquet: exit 1 where it differs.")
-    ] = None,
-    tolerance: Annotated[
-        float, typer.Option("--tolerance-mm", min=0, help="By so much a best clearance may differ from --expect.")
-    ] = 0.01,
-    as_json: JsonOption = False,
-) -> None:
-    """Write one table of all cases, one dataset of all candidates, and one page."""
-    from puncture_twin.twin.jobs.batch.merge_job import merge_cohort
-    from puncture_twin.twin.jobs.batch.text import merge_text
-
-    with progress_display() as progress:
-        merged = merge_cohort(out_dir, expect, tolerance, progress)
-    _print(merged.summary(), merge_text(merged), as_json)
-    if not merged.as_expected:
-        raise typer.Exit(ANSWER_IS_NO)
-
-
-@batch_app.command("compare")
-def batch_compare(
-    before: Annotated[Path, typer.Argument(metavar="A", help="A merged cohort: its folder, or its cases.parquet.")],
-    after: Annotated[Path, typer.Argument(metavar="B", help="Another, of the same cases.")],
-    as_json: JsonOption = False,
-) -> None:
-    """Say what became safe, what was lost, and how far best entries moved, from A to B."""
-    from puncture_twin.planning.batch.compare import compare, read_cases
-    from puncture_twin.twin.jobs.batch.merge_job import change_summary
-    from puncture_twin.twin.jobs.batch.text import compare_text
-
-    found = compare(read_cases(before), read_cases(after))
-    summary = {"counts": dict(found.counts), "cases": [change_summary(one) for one in found.changes]}
-    _print(summary, compare_text(found), as_json)
+    print_answer(report, text.registration_text(report), as_json)
 
 
 @app.command()
@@ -648,7 +549,7 @@ def selfcal(
     case = meshes_folder() / "selfcal" if case is None and recording is None else case
     with progress_display() as progress:
         facts = selfcal_facts(run_selfcal(case, recording, seeds, out_dir, progress))
-    _print(facts, selfcal_text(facts), as_json)
+    print_answer(facts, selfcal_text(facts), as_json)
 
 
 @app.command()
@@ -664,7 +565,7 @@ def servo(
 
     with progress_display() as progress:
         job = run_servo(case, _out(out_dir, case, "servo"), seeds, partial(progress.count, "seeds"), progress.note)
-    _print(job.summary, job.text, as_json)
+    print_answer(job.summary, job.text, as_json)
     if not job.passed:
         raise typer.Exit(ANSWER_IS_NO)
 
@@ -702,7 +603,7 @@ def scan(
     request = ScanRequest(settings, parse_marker(marker), rehearsal)
     with progress_display() as progress:
         run = scan_case(prepare(case, arm=False, watcher=progress), _out(out_dir, case, "scan"), request)
-    _print(run.summary(), scan_text(run), as_json)
+    print_answer(run.summary(), scan_text(run), as_json)
 
 
 @app.command()
@@ -731,20 +632,13 @@ def reproduce(
     folder = _out(out_dir, Path(paper), "reproduce")
     with progress_display() as progress:
         result = chen2019_experiment(folder, seeds, runs, progress) if experiment else PAPERS[paper](folder, seeds)
-    _print(result.summary, result.text, as_json)
+    print_answer(result.summary, result.text, as_json)
     if not result.passed:
         raise typer.Exit(ANSWER_IS_NO)
 
 
 def _out(named: Path | None, source: Path, command: str) -> Path:
     return check_writable(named or default_out(source, command))
-
-
-def _print(summary: dict[str, Any], text: str, as_json: bool) -> None:
-    if as_json:
-        print(json.dumps(summary, allow_nan=False))
-    else:
-        print(text)
 
 
 def main(arguments: list[str] | None = None) -> int:

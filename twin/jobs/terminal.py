@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import select
 import sys
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 UNNAMED_CASES = frozenset({"case.toml", "servo.toml", "selfcal.toml", "plan.json"})
 """Files that are named by their folder."""
@@ -27,6 +28,11 @@ def default_out(source: Path, command: str) -> Path:
     else:
         name = f"{place.parent.name}-{place.stem}"
     return Path("out") / f"{name or 'case'}-{command}"
+
+
+def print_answer(summary: dict[str, Any], text: str, as_json: bool) -> None:
+    """Print what a command found: one JSON object, or the text for a person."""
+    sys.stdout.write((json.dumps(summary, allow_nan=False) if as_json else text) + "\n")
 
 
 def reader_is_gone(stream: TextIO) -> bool:

@@ -1,0 +1,113 @@
+"""The commands below ``batch``: they parse, call and print, and load what they need themselves."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, PROGRAM_FAILED
+from puncture_twin.twin.jobs.options import CohortOption, JobsOption, JsonOption
+from puncture_twin.twin.jobs.terminal import print_answer
+from puncture_twin.twin.report.progress import progress_display
+
+batch_app = typer.Typer(
+    add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None
+)
+
+
+@batch_app.command("plan")
+def _plan(
+    cohort: Annotated[Path, typer.Argument(metavar="COHORT", help="A folder, a CSV with 'case', or cohort.toml.")],
+    out_dir: CohortOption,
+    no_arm: Annotated[bool, typer.Option("--no-arm", help="Leave the arm out of every case.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say how many, how long, how much.")] = False,
+    jobs: JobsOption = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Write down every case of a cohort, with the hash of its inputs, options and version."""
+    from puncture_twin.twin.jobs.batch.plan_job import plan_cohort
+    from puncture_twin.twin.jobs.batch.text import plan_text
+
+    with progress_display() as progress:
+        run = plan_cohort(cohort, out_dir, arm=False if no_arm else None, dry=dry_run, watcher=progress)
+    print_answer(run.summary(jobs), plan_text(run, jobs), as_json)
+
+
+@batch_app.command("run")
+def _run(
+    out_dir: CohortOption,
+    part: Annotated[
+        str | None, typer.Option("--part", metavar="i/n", help="Only this part; else SLURM's array task, else all.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A Dask scheduler whose workers run the cases.")
+    ] = None,
+    jobs: JobsOption = 1,
+    memory_mb: Annotated[int | None, typer.Option("--memory-mb", min=100, help="Most that a worker may hold.")] = None,
+    timeout_s: Annotated[float | None, typer.Option("--timeout-s", min=0.1, help="Most that a case may take.")] = None,
+    pages: Annotated[bool, typer.Option("--pages", help="Draw the pictures and the page of each case too.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run the cases that have no result yet; what is done is kept, whatever stops the run."""
+    from puncture_twin.planning.batch.workers import Limits
+    from puncture_twin.twin.jobs.batch.run_job import Where, run_part, run_summary
+    from puncture_twin.twin.jobs.batch.text import run_text
+
+    where = Where(part, scheduler, jobs, pages, Limits(memory_mb, timeout_s))
+    with progress_display() as progress:
+        counts = run_part(out_dir, where, progress)
+    print_answer(run_summary(out_dir, counts), run_text(out_dir, counts), as_json)
+    if counts.ended[PROGRAM_FAILED] or counts.stale:
+        raise typer.Exit(PROGRAM_FAILED if counts.ended[PROGRAM_FAILED] else ANSWER_IS_NO)
+
+
+@batch_app.command("status")
+def _status(out_dir: CohortOption, as_json: JsonOption = False) -> None:
+    """Count the cases that are done, failed, missing and stale; every input is hashed again."""
+    from puncture_twin.planning.batch.state import cohort_state
+    from puncture_twin.twin.jobs.batch.text import state_text
+
+    with progress_display() as progress:
+        state = cohort_state(out_dir, partial(progress.count, "cases"))
+    print_answer(state.summary(), state_text(state), as_json)
+
+
+@batch_app.command("merge")
+def _merge(
+    out_dir: CohortOption,
+    expect: Annotated[
+        Path | None, typer.Option("--expect", metavar="FILE", help="An earlier cases.parquet: exit 1 where it differs.")
+    ] = None,
+    tolerance: Annotated[
+        float, typer.Option("--tolerance-mm", min=0, help="By so much a best clearance may differ from --expect.")
+    ] = 0.01,
+    as_json: JsonOption = False,
+) -> None:
+    """Write one table of all cases, one dataset of all candidates, and one page."""
+    from puncture_twin.twin.jobs.batch.merge_job import merge_cohort
+    from puncture_twin.twin.jobs.batch.text import merge_text
+
+    with progress_display() as progress:
+        merged = merge_cohort(out_dir, expect, tolerance, progress)
+    print_answer(merged.summary(), merge_text(merged), as_json)
+    if not merged.as_expected:
+        raise typer.Exit(ANSWER_IS_NO)
+
+
+@batch_app.command("compare")
+def _compare(
+    before: Annotated[Path, typer.Argument(metavar="A", help="A merged cohort: its folder, or its cases.parquet.")],
+    after: Annotated[Path, typer.Argument(metavar="B", help="Another, of the same cases.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Say what became safe, what was lost, and how far best entries moved, from A to B."""
+    from puncture_twin.planning.batch.compare import compare, read_cases
+    from puncture_twin.twin.jobs.batch.merge_job import change_summary
+    from puncture_twin.twin.jobs.batch.text import compare_text
+
+    found = compare(read_cases(before), read_cases(after))
+    summary = {"counts": dict(found.counts), "cases": [change_summary(one) for one in found.changes]}
+    print_answer(summary, compare_text(found), as_json)
