@@ -337,7 +337,7 @@ def touch(
     seed: Annotated[int, typer.Option("--seed", min=0, max=2**31 - 1, help="Of the motions and of the truth.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Plan how the markers are touched for a puncture, touch them in the twin, and write touch.csv."""
+    """Plan how markers are touched for a puncture, touch them in the twin, write touch.csv; 1 if too few were."""
     require_extra("twin", "touch")
     from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.experiment.touch_job import touch_case, touch_text
@@ -346,6 +346,8 @@ def touch(
     with progress_display() as progress:
         run = touch_case(prepare(case, watcher=progress), folder, choice, seed)
     print_answer(run.summary(), touch_text(run), as_json)
+    if not run.suffices:
+        raise typer.Exit(ANSWER_IS_NO)
 
 
 @app.command()

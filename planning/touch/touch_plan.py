@@ -28,23 +28,32 @@ class Touch:
 
 
 @dataclass(frozen=True, eq=False)
-class TouchPlan:
-    """A tour of the markers.
+class TouchTour:
+    """Touches one after another.
 
     Attributes:
         model: The arm.
         tip_mm: Flange to tip.
         touches: In the order in which they are touched.
         leave: From the last standoff home.
-        left_out: Marker to why it is not touched, in words.
-        expected_mm: Of the tip at the target when the registration comes from these touches (rms), mm.
-        worst_mm: The same with the worst of the poses that could be taken, mm.
     """
 
     model: UrModel
     tip_mm: float
     touches: tuple[Touch, ...]
     leave: Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class TouchPlan(TouchTour):
+    """A tour of the markers for a puncture.
+
+    Attributes:
+        left_out: Marker to why it is not touched, in words.
+        expected_mm: Of the tip at the target when the registration comes from these touches (rms), mm.
+        worst_mm: The same with the worst of the poses that could be taken, mm.
+    """
+
     left_out: Mapping[str, str]
     expected_mm: float
     worst_mm: float

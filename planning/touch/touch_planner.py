@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple, cast
@@ -104,6 +104,20 @@ class _Open(NamedTuple):
     candidates: tuple[Floats, ...]
     left_out: dict[str, str]
 
+    def without(self, place: int, name: str, why: str) -> _Open:
+        """The same but for the marker at a place of ``rows``."""
+        rows, kept = list(self.rows), list(self.candidates)
+        del rows[place], kept[place]
+        return _Open(tuple(rows), tuple(kept), {**self.left_out, name: why})
+
+
+class _NoMotionError(NoAnswerError):
+    """No motion leads to the standoff of a marker."""
+
+    def __init__(self, place: int, why: str) -> None:
+        self.place = place
+        super().__init__(why)
+
 
 def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progress: Count) -> TouchPlan:
     """Plan to touch every marker that can be touched.
@@ -116,27 +130,51 @@ def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progre
 
     Raises:
         InputError: The case declares no errors, or has no markers, or too many.
-        NoAnswerError: Fewer than three markers can be touched, or no motion to one was found.
+        NoAnswerError: The markers that can be touched are fewer than three or lie on a line, or no motion home was
+            found.
+    """
+    every = _task(context, q_insertion)
+    found = _open(every)
+    while True:
+        task = every.of(found.rows)
+        error = _error(task, every, found.left_out)
+        chosen, worst = (least_error(error, found.candidates, q_insertion, worst=worst) for worst in (False, True))
+        try:
+            touches, leave = _motions(task, chosen, seed, progress)
+        except _NoMotionError as none:
+            found = found.without(none.place, task.markers.names[none.place], str(none))
+            continue
+        expected, of_worst = task.expected_mm(chosen), task.expected_mm(worst)
+        return TouchPlan(task.model, task.tip_mm, touches, leave, found.left_out, expected, of_worst)
+
+
+def _error(task: _Task, every: _Task, left_out: Mapping[str, str]) -> PoseError:
+    """After touches as in the insertion.
+
+    Raises:
+        NoAnswerError: The markers that are left do not suffice.
+    """
+    why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
+    count = f"{len(task.markers)} of {len(every.markers)} markers can be touched"
+    if len(task.markers) < MIN_MARKERS:
+        raise NoAnswerError(f"{count}, {MIN_MARKERS} are needed: {why}")
+    try:
+        return task.error(task.q_insertion)
+    except InputError as error:
+        raise NoAnswerError(f"{count}, which do not suffice: {error.what}" + (f"; {why}" if why else "")) from error
+
+
+def expected_of_touches(context: CaseContext, q_insertion: Floats, read: NamedPoints) -> float:
+    """Of the tip at the target (rms), mm, when these touches are all that there are.
+
+    Args:
+        context: Of the case.
+        q_insertion: Shape (6,), rad, the tip on the target.
+        read: Names and joints of the touches.
     """
     task = _task(context, q_insertion)
-    found = _open(task)
-    if len(found.rows) < MIN_MARKERS:
-        why = "; ".join(f"{name}: {reason}" for name, reason in found.left_out.items())
-        count = f"{len(found.rows)} of {len(task.markers)} markers can be touched, {MIN_MARKERS} are needed"
-        raise NoAnswerError(f"{count}: {why}")
-    task = task.of(found.rows)
-    error = task.error(q_insertion)
-    chosen, worst = (least_error(error, found.candidates, q_insertion, worst=worst) for worst in (False, True))
-    touches, leave = _motions(task, chosen, seed, progress)
-    return TouchPlan(
-        model=task.model,
-        tip_mm=task.tip_mm,
-        touches=touches,
-        leave=leave,
-        left_out=found.left_out,
-        expected_mm=task.expected_mm(chosen),
-        worst_mm=task.expected_mm(worst),
-    )
+    assert read.joints is not None
+    return task.of([task.markers.names.index(name) for name in read.names]).expected_mm(read.joints)
 
 
 def registered(context: CaseContext, read: NamedPoints) -> Registration:
@@ -216,7 +254,12 @@ def _free(checkers: ApproachCheckers, tip_mm: float, found: Candidates) -> tuple
 
 
 def _motions(task: _Task, q_touch: Floats, seed: int, progress: Count) -> tuple[tuple[Touch, ...], Trajectory]:
-    """The touches in the order of the shortest tour, and the motion home."""
+    """The touches in the order of the shortest tour, and the motion home.
+
+    Raises:
+        _NoMotionError: None to a marker.
+        NoAnswerError: None home.
+    """
     context, markers = task.context, task.markers
     assert context.reach is not None
     checker, home = context.reach.checker, home_configuration(context.case)
@@ -225,7 +268,12 @@ def _motions(task: _Task, q_touch: Floats, seed: int, progress: Count) -> tuple[
     order = shortest_tour((np.abs(places[:, None] - places) / checker.model.max_speeds).max(axis=2))
     stops, legs = pairwise([len(places) - 1, *order, len(places) - 1]), []
     for start, end in stops:
-        found = plan_approach(checker, places[start], places[end], seed=seed, speeds=context.case.robot.speeds)
+        try:
+            found = plan_approach(checker, places[start], places[end], seed=seed, speeds=context.case.robot.speeds)
+        except NoAnswerError as error:
+            if end in order:
+                raise _NoMotionError(end, str(error)) from error
+            raise
         legs.append(found.trajectory)
         progress(len(legs), len(places))
     touched = zip(order, legs, strict=False)

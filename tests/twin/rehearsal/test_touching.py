@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import re
 import shutil
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from places import ROOT
+from typer.testing import CliRunner
 
 from puncture_twin.planning.arm.error_jacobian import PARAMETERS, error_jacobian
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.settings import Obstacle
-from puncture_twin.planning.formats.points.point_files import read_points
+from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.registration.placement import load_placement
@@ -23,14 +26,18 @@ from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.selection.choice import Choice
 from puncture_twin.planning.touch.straight_approach import line_to
 from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, approach_checkers, plan_touches
+from puncture_twin.run_twin import app
+from puncture_twin.twin.jobs.experiment import touch_job
 from puncture_twin.twin.jobs.experiment.touch_job import touch_case, touch_text
 from puncture_twin.twin.plant.touch_truth import TouchTruth, nominal_tip
 from puncture_twin.twin.rehearsal import touching
-from puncture_twin.twin.rehearsal.touching import execute_touches
+from puncture_twin.twin.rehearsal.one_touch import TouchReading
+from puncture_twin.twin.rehearsal.touching import Touched, execute_touches
 from puncture_twin.twin.world.engine import pybullet
 from puncture_twin.twin.world.workcell import open_workcell
 
 CASE = ROOT / "meshes" / "carton" / "case_m.toml"
+SETUP_2 = ROOT / "meshes" / "carton" / "case_m_setup2.toml"
 CHOICE = Choice(angles=(np.radians(18.0), np.radians(232.0)))
 
 
@@ -68,10 +75,15 @@ def exact(context, shift_base=(0.0, 0.0, 0.0)):
     return TouchTruth(0, T, np.zeros(28), aim, still)
 
 
-def executed(context, plan, truth, prepared=None):
-    """The readings; the workcell is believed to be that of ``prepared``."""
+def toured(context, plan, truth, prepared=None):
+    """The executed tour; the workcell is believed to be that of ``prepared``."""
     checkers = approach_checkers(prepared if prepared is not None else context, TOUCHING_PADDING_MM)
-    return execute_touches(plan, context.case, context.anatomy, checkers, truth, quiet).readings
+    return execute_touches(plan, context.case, context.anatomy, checkers, truth, quiet)
+
+
+def executed(context, plan, truth):
+    """The readings."""
+    return toured(context, plan, truth).readings
 
 
 def test_touches_are_slow_soft_and_exact(done):
@@ -98,10 +110,10 @@ def test_a_case_registers_what_was_written(done, tmp_path):
     shutil.copytree(CASE.parent, tmp_path / "carton")
     shutil.copy(out / "touch.csv", tmp_path / "carton" / "touch.csv")
     placed = load_placement(load_case(tmp_path / "carton" / CASE.name))
-    order = [placed.registration.markers.names.index(name) for name in run.registration.markers.names]
-    np.testing.assert_allclose(placed.registration.markers.points_base[order], run.registration.markers.points_base)
+    order = [placed.registration.markers.names.index(name) for name in run.use.registration.markers.names]
+    np.testing.assert_allclose(placed.registration.markers.points_base[order], run.use.registration.markers.points_base)
     assert placed.registration.markers.joints is not None
-    assert placed.registration.fre_mm == pytest.approx(run.registration.fre_mm, rel=0.5)
+    assert placed.registration.fre_mm == pytest.approx(run.use.registration.fre_mm, rel=0.5)
 
 
 def test_times_add_up(done):
@@ -168,16 +180,84 @@ def test_masses_that_err_by_a_tenth_move_no_reading(context, first, monkeypatch,
 @pytest.mark.parametrize(
     ("along_mm", "aside_mm", "said"),
     [
-        (8.0, 0.0, "no contact at marker .*: the tip went 5 mm past where it was believed and stopped"),
-        (-9.0, 0.0, "felt more than 5 mm before where it was believed: the arm stopped"),
-        (0.0, 15.0, "lies 15.0 mm beside where it was believed, at most 10 are allowed"),
+        (8.0, 0.0, "no contact: the tip went 5 mm past where it was believed and came back"),
+        (-9.0, 0.0, "it was felt more than 5 mm before where it was believed, and given up"),
+        (0.0, 15.0, "it lies 15.0 mm beside where it was believed, at most 10 are allowed"),
     ],
 )
-def test_a_marker_that_is_not_where_it_was_believed_stops_the_arm(context, first, along_mm, aside_mm, said):
-    """Deeper, nearer, beside: with the reason, and never pushed on."""
+def test_a_marker_that_is_not_where_it_was_believed_is_given_up(context, first, along_mm, aside_mm, said):
+    """Deeper, nearer, beside: with the reason, never pushed on, and the arm is back at the standoff."""
     T = flange_pose(first.model, first.touches[0].q_touch)
-    with pytest.raises(NoAnswerError, match=said):
-        executed(context, first, exact(context, along_mm * T[:3, 2] + aside_mm * T[:3, 0]))
+    done = toured(context, first, exact(context, along_mm * T[:3, 2] + aside_mm * T[:3, 0]))
+    assert done.failed == {first.touches[0].name: said}
+    assert not done.readings
+
+
+def test_one_marker_that_fails_leaves_the_others(context, done):
+    """The second of three lies 15 mm aside: the first and third are read as if it were not there."""
+    plan, truth = done[0].plan, exact(context)
+    missed = plan.touches[1]
+    R = flange_pose(plan.model, missed.q_touch)[:3, :3]
+    away = context.placement.T_base_ct[:3, :3].T @ (15.0 * R[:, 0])
+    moved = {**truth.aim_ct, missed.name: truth.aim_ct[missed.name] + away}
+    found = toured(context, plan, dataclasses.replace(truth, aim_ct=moved))
+    assert [one.name for one in found.readings] == [plan.touches[0].name, plan.touches[2].name]
+    assert list(found.failed) == [missed.name]
+    for one, touch in zip(found.readings, (plan.touches[0], plan.touches[2]), strict=True):
+        assert np.linalg.norm(one.point_base - touch.point_base) < 0.03
+
+
+def test_a_run_errs_as_its_drawn_twin(context, done):
+    """The same truth without physics: what contact costs, some hundredths of a millimetre, is all between them."""
+    run = done[0]
+    q, outward = touch_job._puncture(context, CHOICE)
+    drawn = touch_job.drawn_once(context, touch_job.Tour(run.plan, q, outward), run.seed)
+    assert drawn.tip_error_mm == pytest.approx(run.use.tip_error_mm, abs=0.05)
+    assert drawn.expected_mm == pytest.approx(run.use.expected_mm, rel=0.01)
+
+
+def test_drawn_truths_err_as_the_plan_predicts(context, done):
+    """Their rms is known to 6 % (150 of them, one axis errs most); three of those are allowed."""
+    run = done[0]
+    q, outward = touch_job._puncture(context, CHOICE)
+    tour = touch_job.Tour(run.plan, q, outward)
+    errors = [touch_job.drawn_once(context, tour, seed).tip_error_mm for seed in range(150)]
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(run.plan.expected_mm, rel=0.17)
+
+
+def readings(plan, names):
+    """What a faultless arm reads at some of the markers."""
+    kept = [touch for touch in plan.touches if touch.name in names]
+    read = [TouchReading(t.name, t.point_base, t.q_touch, 10.0, 1.0, 0.0, 1.0, 0.0) for t in kept]
+    failed = {touch.name: "no contact" for touch in plan.touches if touch not in kept}
+    return Touched(tuple(read), failed, 10.0 * len(read))
+
+
+@pytest.mark.parametrize(("kept", "code"), [("ABCDE", 0), ("ABE", 0), ("AB", 1), ("", 1)])
+def test_the_answer_says_whether_the_rest_suffices(monkeypatch, tmp_path, kept, code):
+    """Three markers or more register; with fewer the exit code is 1, and what was read is written all the same."""
+    monkeypatch.setattr(touch_job, "execute_touches", lambda plan, *_: readings(plan, kept))
+    run = CliRunner().invoke(app, ["touch", str(SETUP_2), "--theta=18", "--beta=232", "--out", str(tmp_path), "--json"])
+    said = json.loads(run.stdout)
+    assert run.exit_code == code
+    assert said["suffices"] is (code == 0)
+    assert sorted(said["failed"]) == sorted(set("ABCDE") - set(kept))
+    assert (tmp_path / "touch.csv").exists() is bool(kept)
+    if code:
+        assert said["why_not"] == f"{len(kept)} of 5 markers were touched, 3 are needed"
+        return
+    expected, of_all = said["expected_tip_error_mm"], said["expected_of_best_poses_mm"]
+    assert expected == pytest.approx(of_all) if kept == "ABCDE" else expected > of_all
+
+
+def test_markers_in_line_do_not_suffice(context, done):
+    """Three were touched, but a rotation about their line is left open: said, not thrown."""
+    plan = done[0].plan
+    tour, truth = touch_job.Tour(plan, plan.touches[0].q_touch, np.array([0.0, 0.0, 1.0])), exact(context)
+    line = plan.touches[0].point_base + np.outer([0.0, 30.0, 60.0], [0.0, 1.0, 0.0])
+    q = np.array([touch.q_touch for touch in plan.touches])
+    read = NamedPoints(tuple(touch.name for touch in plan.touches), line, None, joints=q)
+    assert "collinear on the base side" in touch_job._use(context, tour, truth, read)
 
 
 def test_a_needle_that_crosses_the_patient_on_its_way_is_noticed(context, first):
@@ -187,8 +267,8 @@ def test_a_needle_that_crosses_the_patient_on_its_way_is_noticed(context, first)
     there = np.vstack([into, into[::-1]])
     way = Trajectory(0.02 * np.arange(len(there)), there)
     crossing = dataclasses.replace(first, touches=(dataclasses.replace(touch, come=way),))
-    with pytest.raises(NoAnswerError, match="on the way needle touched patient"):
-        executed(context, crossing, exact(context))
+    why = toured(context, crossing, exact(context)).failed[touch.name]
+    assert why.startswith("the tour was stopped: on the way needle touched patient")
 
 
 def test_a_box_that_nobody_knew_stops_the_arm(context, first):
@@ -196,8 +276,9 @@ def test_a_box_that_nobody_knew_stops_the_arm(context, first):
     forearm = link_poses(first.model, first.touches[0].q_touch)[3:5, :3, 3].mean(axis=0)
     box = Obstacle("trolley", "base", forearm, np.array([150.0, 150.0, 150.0]))
     other = dataclasses.replace(context, case=dataclasses.replace(context.case, obstacles=(box,)))
-    with pytest.raises(NoAnswerError, match=r"the arm stopped: \w+ touches trolley"):
-        executed(other, first, exact(context), prepared=context)
+    done = toured(other, first, exact(context), prepared=context)
+    assert not done.readings
+    assert re.fullmatch(r"the tour was stopped: \w+ touches trolley", done.failed[first.touches[0].name])
 
 
 def test_the_true_tip_is_on_the_true_marker(context, done):

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.selection.choice import BEST
+from puncture_twin.twin.jobs.experiment.drawn_runs import DrawnRuns, drawn_runs
 from puncture_twin.twin.jobs.experiment.touch_job import Tour, plan_tour, touch_once
 
 FOLDER = "runs"
@@ -50,11 +50,13 @@ class PhysicalRuns:
         expected_mm: The tip's rms error that the declaration predicts for these touches.
         runs: One a seed.
         kept: So many were there already.
+        drawn: Truths without physics, the same ones and many more.
     """
 
     expected_mm: float
     runs: tuple[PhysicalRun, ...]
     kept: int
+    drawn: DrawnRuns
 
     @property
     def realised_mm(self) -> float:
@@ -69,6 +71,11 @@ class PhysicalRuns:
             "expected_mm": self.expected_mm,
             "realised_mm": self.realised_mm if ended else None,
             "seconds_per_touch": float(np.mean([run.seconds_per_touch for run in ended])) if ended else None,
+            "drawn": {
+                "realised_mm": self.drawn.realised_mm,
+                "draws": self.drawn.draws,
+                "realised_in_the_same_truths_mm": self.drawn.alike_mm if ended else None,
+            },
             "refused": {run.seed: run.refused for run in self.runs if run.refused},
             "runs": [asdict(run) for run in ended],
         }
@@ -85,6 +92,7 @@ class PhysicalRuns:
             f"{len(ended)} physical runs ({seconds:.1f} s a touch{kept}): the tip misses the target by "
             f"{self.realised_mm:.2f} mm rms (known to {100 * spread:.0f} %), {self.expected_mm:.2f} predicted"
         ]
+        lines.append(self.drawn.text(len(ended)))
         lines += [f"  seed {run.seed}: {run.refused}" for run in self.runs if run.refused]
         return "\n".join(lines)
 
@@ -111,16 +119,18 @@ def physical_runs(context: CaseContext, out: Path, runs: int, first_seed: int = 
         kept += run is not None
         found.append(run or _kept(path, key, _run(context, tour, first_seed + number)))
         context.watcher.count("runs", number + 1, runs)
-    return PhysicalRuns(tour.plan.expected_mm, tuple(found), kept)
+    drawn = drawn_runs(context, tour, [run.seed for run in found if not run.refused], first_seed)
+    return PhysicalRuns(tour.plan.expected_mm, tuple(found), kept, drawn)
 
 
 def _run(context: CaseContext, tour: Tour, seed: int) -> PhysicalRun:
-    try:
-        done = touch_once(context, tour, seed)
-    except NoAnswerError as error:
-        return PhysicalRun(seed, float("nan"), float("nan"), float("nan"), str(error))
-    per_touch = done.touched.seconds / len(done.touched.readings)
-    return PhysicalRun(seed, done.tip_error_mm, done.registration.fre_mm, per_touch)
+    """One run; refused where a marker was not touched, for the prediction is that of all of them."""
+    touched, use = touch_once(context, tour, seed)
+    if touched.failed or isinstance(use, str):
+        why = "; ".join(f"marker {name}: {reason}" for name, reason in touched.failed.items())
+        return PhysicalRun(seed, float("nan"), float("nan"), float("nan"), why or str(use))
+    per_touch = touched.seconds / len(touched.readings)
+    return PhysicalRun(seed, use.tip_error_mm, use.registration.fre_mm, per_touch)
 
 
 def _key(context: CaseContext, tour: Tour) -> str:

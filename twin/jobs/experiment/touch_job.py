@@ -12,29 +12,55 @@ import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.formats.points.point_files import NamedPoints, write_points
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.registration.registration import MIN_MARKERS, Registration
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.selection.choice import Choice, choose, chosen_angles
 from puncture_twin.planning.touch.touch_plan import TouchPlan
 from puncture_twin.planning.touch.touch_planner import (
     TOUCHING_PADDING_MM,
     approach_checkers,
+    expected_of_touches,
     plan_touches,
     registered,
 )
-from puncture_twin.twin.plant.touch_truth import TouchTruth, draw_touch_truth
+from puncture_twin.twin.plant.touch_truth import TouchTruth, draw_touch_truth, nominal_tip
 from puncture_twin.twin.plant.true_needle import true_needle
 from puncture_twin.twin.rehearsal.distribution import misregistered
 from puncture_twin.twin.rehearsal.touching import Touched, execute_touches
 
 TOUCH, SUMMARY = "touch.csv", "touch.json"
+
+
+class Use(NamedTuple):
+    """What readings are good for."""
+
+    registration: Registration
+    expected_mm: float
+    """Of the tip at the target (rms)."""
+    tip_error_mm: float
+    """Where the erring arm, sent to the target by that registration, puts its tip."""
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "why_not": "",
+            "expected_tip_error_mm": self.expected_mm,
+            "tip_error_mm": self.tip_error_mm,
+            "fre_mm": self.registration.fre_mm,
+            "flags": list(self.registration.flags),
+        }
+
+
+def _no_use(why: str) -> dict[str, Any]:
+    """The same of readings that register nothing."""
+    return {"why_not": why, "expected_tip_error_mm": None, "tip_error_mm": None, "fre_mm": None, "flags": []}
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +73,7 @@ class TouchRun:
         seed: Of the truth.
         plan: The tour.
         touched: Its readings.
-        registration: Of the readings.
-        tip_error_mm: Where the erring arm, sent to the target by that registration, puts its tip.
+        use: What the readings are good for; in words why not, where they do not suffice for a registration.
         files: Written.
     """
 
@@ -57,9 +82,13 @@ class TouchRun:
     seed: int
     plan: TouchPlan
     touched: Touched
-    registration: Registration
-    tip_error_mm: float
+    use: Use | str
     files: tuple[Path, ...] = ()
+
+    @property
+    def suffices(self) -> bool:
+        """Whether the readings register."""
+        return not isinstance(self.use, str)
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -80,12 +109,13 @@ class TouchRun:
                 for one in self.touched.readings
             ],
             "left_out": dict(self.plan.left_out),
+            "failed": dict(self.touched.failed),
+            "suffices": self.suffices,
             "seconds": self.touched.seconds,
-            "seconds_per_touch": self.touched.seconds / len(self.touched.readings),
-            "expected_tip_error_mm": self.plan.expected_mm,
+            "seconds_per_touch": _per_touch(self.touched),
+            "expected_of_best_poses_mm": self.plan.expected_mm,
             "expected_of_worst_poses_mm": self.plan.worst_mm,
-            "tip_error_mm": self.tip_error_mm,
-            "fre_mm": self.registration.fre_mm,
+            **(_no_use(self.use) if isinstance(self.use, str) else self.use.summary()),
             "inputs": inputs_document(self.inputs),
             "files": [str(path) for path in self.files],
         }
@@ -102,15 +132,16 @@ def touch_case(context: CaseContext, out: Path, choice: Choice, seed: int) -> To
 
     Raises:
         InputError: The case declares no errors, or has no markers.
-        NoAnswerError: Nothing is safe, too few markers can be touched, or a touch stopped, with the reason.
+        NoAnswerError: Nothing is safe, or too few markers can be touched, with the reasons.
     """
     with writing(out, "touch", inputs=context.case.inputs, names=(TOUCH, SUMMARY), note=context.watcher.note) as draft:
         planned = plan_tour(context, choice, seed)
-        touched, read, fitted, error = touch_once(context, planned, seed)
-        plan = planned.plan
-        files = draft.final((draft.folder / TOUCH, draft.folder / SUMMARY))
-        run = TouchRun(context.case.name, context.case.inputs, seed, plan, touched, fitted, error, files)
-        write_points(draft.folder / TOUCH, read)
+        touched, use = touch_once(context, planned, seed)
+        names = (TOUCH, SUMMARY) if touched.readings else (SUMMARY,)
+        files = draft.final(tuple(draft.folder / name for name in names))
+        run = TouchRun(context.case.name, context.case.inputs, seed, planned.plan, touched, use, files)
+        if touched.readings:
+            write_points(draft.folder / TOUCH, _points(touched))
         with atomic(draft.folder / SUMMARY) as temporary:
             temporary.write_text(json.dumps(run.summary(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return run
@@ -125,12 +156,10 @@ class Tour(NamedTuple):
 
 
 class TouchedOnce(NamedTuple):
-    """One executed tour: its readings, as points, what they register, and what the tip misses the target by, mm."""
+    """One executed tour, and what its readings are good for, or why not."""
 
     touched: Touched
-    read: NamedPoints
-    registration: Registration
-    tip_error_mm: float
+    use: Use | str
 
 
 def plan_tour(context: CaseContext, choice: Choice, seed: int) -> Tour:
@@ -146,19 +175,33 @@ def plan_tour(context: CaseContext, choice: Choice, seed: int) -> Tour:
 
 
 def touch_once(context: CaseContext, tour: Tour, seed: int) -> TouchedOnce:
-    """Execute a tour where everything truly is, by one draw of the declared errors.
-
-    Raises:
-        NoAnswerError: A touch stopped, with the reason.
-    """
-    plan, q_insertion = tour.plan, tour.q_insertion
-    truth = _truth(context, tour.outward_ct, q_insertion, seed)
+    """Execute a tour where everything truly is, by one draw of the declared errors."""
+    truth = _truth(context, tour.outward_ct, tour.q_insertion, seed)
     checkers, count = approach_checkers(context, TOUCHING_PADDING_MM), partial(context.watcher.count, "touches")
     with context.stages.time("touches"):
-        touched = execute_touches(plan, context.case, context.anatomy, checkers, truth, count)
-    read = _by_name(plan, touched)
-    fitted = registered(context, read)
-    return TouchedOnce(touched, read, fitted, _tip_error(context, plan, truth, fitted, q_insertion))
+        touched = execute_touches(tour.plan, context.case, context.anatomy, checkers, truth, count)
+    return TouchedOnce(touched, _use(context, tour, truth, _points(touched)))
+
+
+def drawn_once(context: CaseContext, tour: Tour, seed: int) -> Use | str:
+    """What the same tour in the same truth is good for where every touch reads its joints exactly: no physics."""
+    plan, truth = tour.plan, _truth(context, tour.outward_ct, tour.q_insertion, seed)
+    joints = np.array([truth.q_contact(plan.model, plan.tip_mm, touch) for touch in plan.touches])
+    points = np.array([nominal_tip(plan.model, plan.tip_mm, q) for q in joints])
+    names = tuple(touch.name for touch in plan.touches)
+    return _use(context, tour, truth, NamedPoints(names, points, None, joints=joints))
+
+
+def _use(context: CaseContext, tour: Tour, truth: TouchTruth, read: NamedPoints) -> Use | str:
+    """What readings are good for; in words why they do not suffice."""
+    if len(read.names) < MIN_MARKERS:
+        return f"{len(read.names)} of {len(tour.plan.touches)} markers were touched, {MIN_MARKERS} are needed"
+    try:
+        fitted = registered(context, read)
+    except InputError as error:
+        return error.what
+    expected = expected_of_touches(context, tour.q_insertion, read)
+    return Use(fitted, expected, _tip_error(context, tour.plan, truth, fitted, tour.q_insertion))
 
 
 def _puncture(context: CaseContext, choice: Choice) -> tuple[Floats, Floats]:
@@ -182,10 +225,11 @@ def _truth(context: CaseContext, outward_ct: Floats, q_insertion: Floats, seed: 
     return draw_touch_truth(T_base_ct, markers.names, markers.points_ct, errors, seed)
 
 
-def _by_name(plan: TouchPlan, touched: Touched) -> NamedPoints:
+def _points(touched: Touched) -> NamedPoints:
     """The readings in the order in which they were made."""
     readings = touched.readings
-    points, joints = np.array([one.point_base for one in readings]), np.array([one.q for one in readings])
+    points = np.array([one.point_base for one in readings]).reshape(-1, 3)
+    joints = np.array([one.q for one in readings]).reshape(-1, 6)
     return NamedPoints(tuple(one.name for one in readings), points, None, joints=joints)
 
 
@@ -220,20 +264,33 @@ def _true_errors(context: CaseContext) -> ErrorModel:
 def touch_text(run: TouchRun) -> str:
     """For the terminal."""
     plan, touched = run.plan, run.touched
-    lines = [f"{len(touched.readings)} markers touched in {touched.seconds:.0f} s, {_per_touch(run):.1f} s each"]
+    each = f", {_per_touch(touched):.1f} s each" if touched.readings else ""
+    every = len(touched.readings) + len(touched.failed)
+    of = f" of {every}" if touched.failed else ""
+    lines = [f"{len(touched.readings)}{of} markers touched in {touched.seconds:.0f} s{each}"]
     lines += [
         f"  {one.name:<12} {one.seconds:5.1f} s  felt {one.bias_mm:.3f} mm deep at {one.speed_mm_s:.1f} mm/s, "
         f"{one.force_n:.2f} N at most; line moved {one.aside_mm:.1f} mm at the standoff"
         for one in touched.readings
     ]
-    lines += [f"  {name:<12} not touched: {why}" for name, why in plan.left_out.items()]
-    lines += [
-        f"expected error at the target: {plan.expected_mm:.2f} mm rms; of the worst poses {plan.worst_mm:.2f} mm",
-        f"error of this truth (seed {run.seed}): {run.tip_error_mm:.2f} mm; FRE {run.registration.fre_mm:.2f} mm",
-        *(f"wrote {path}" for path in run.files),
+    lines += [f"  {name:<12} not touched: {why}" for name, why in (*plan.left_out.items(), *touched.failed.items())]
+    return "\n".join([*lines, *_use_lines(run), *(f"wrote {path}" for path in run.files)])
+
+
+def _use_lines(run: TouchRun) -> list[str]:
+    plan, use = run.plan, run.use
+    if isinstance(use, str):
+        return [f"no registration: {use}"]
+    failed = ", ".join(run.touched.failed)
+    without = f" without {failed}, {plan.expected_mm:.2f} with" if failed else ""
+    worst = f"of the worst poses {plan.worst_mm:.2f} mm"
+    return [
+        f"expected error at the target: {use.expected_mm:.2f} mm rms{without}; {worst}",
+        f"error of this truth (seed {run.seed}): {use.tip_error_mm:.2f} mm; FRE {use.registration.fre_mm:.2f} mm",
+        *(f"  {flag}" for flag in use.registration.flags),
     ]
-    return "\n".join(lines)
 
 
-def _per_touch(run: TouchRun) -> float:
-    return run.touched.seconds / len(run.touched.readings)
+def _per_touch(touched: Touched) -> float | None:
+    """Seconds for each that was read."""
+    return touched.seconds / len(touched.readings) if touched.readings else None
