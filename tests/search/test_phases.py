@@ -11,8 +11,10 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.breathing.breathing import Breathing
+from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.collision.surroundings import with_surroundings
 from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.formats.labels.by_name import ByName
 from puncture_twin.planning.geometry.rigid import pose
@@ -200,3 +202,33 @@ def test_the_arm_is_checked_where_the_breath_puts_target_and_skin():
     new = static.safe & ~found.safe
     assert set(found.verdict.reason[new]) == {"unsafe_when_breathing"}
     assert all("arm" in detail or "insertion" in detail for detail in found.verdict.detail[new])
+
+
+@pytest.mark.parametrize("frame", ["ct", "base"])
+def test_the_arm_is_checked_against_an_obstacle_where_its_stated_weight_puts_it(frame):
+    """A box that moves twice as far as the target: as in a case whose box truly stands there."""
+    context = prepare(folder() / "carton" / "case_m.toml")
+    base, by = context.placement.T_base_ct, np.array([60.0, 0.0, 0.0])
+    weights = ByName({"*": 1.0, "box": 2.0})
+    breath = breathing(amplitude_mm=60.0, weights=weights, direction_ct=by / 60, phases=2)
+    at = np.array([-150.0, 130.0, 400.0])
+    center, shift = (at, 2 * by) if frame == "ct" else (base[:3, :3] @ at + base[:3, 3], 2 * base[:3, :3] @ by)
+    box = Obstacle("box", frame, center, np.array([60.0, 200.0, 200.0]))
+    search = replace(context.case.search, step=np.radians(15.0))
+    bare = replace(context.case, breathing=breath, search=search)
+    case = replace(bare, obstacles=(*bare.obstacles, box))
+    anatomy = with_surroundings(replace(context.anatomy, surroundings=()), case, base)
+    organs = organ_candidates(replace(bare, breathing=None), context.anatomy, context.engine, case_directions(bare))
+    static = with_reach(case, organs, ArmReach(case_checker(case, anatomy, base), base))
+    found = with_breathing_reach(case, anatomy, static, ArmReach(case_checker(case, anatomy, base), base))
+    skin = anatomy.skin
+    body = replace(anatomy, skin=replace(skin, mesh=skin.mesh.transformed(pose(np.eye(3), by))))
+
+    def with_box_at(center_mm):
+        there = replace(case, target_ct=case.target_ct + by)
+        there = replace(there, obstacles=(*bare.obstacles, replace(box, center_mm=center_mm)))
+        return static.safe & with_reach(there, static, ArmReach(case_checker(there, body, base), base)).safe
+
+    np.testing.assert_array_equal(found.safe, with_box_at(center + shift))
+    assert np.any(with_box_at(center) & ~found.safe)  # a box that stayed would have left them safe
+    assert found.safe.any()

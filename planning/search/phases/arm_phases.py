@@ -11,6 +11,8 @@ from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.settings import Obstacle
+from puncture_twin.planning.collision.surroundings import GANTRY
 from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
@@ -51,7 +53,8 @@ def _at_phase(
 ) -> Candidates:
     rows, moved = np.flatnonzero(found.safe), breathing.moved_ct(s)
     displaced = _displaced(anatomy, weights, breathing, s)
-    there = ArmReach(case_checker(case, displaced, reach.T_base_ct), reach.T_base_ct)
+    solids = _with_moved_solids(case, anatomy, weights, breathing, s, reach.T_base_ct)
+    there = ArmReach(case_checker(solids, displaced, reach.T_base_ct), reach.T_base_ct)
     paths = paths_at(case, anatomy.skin, found.outward_ct, weights.skin, moved)
     path = replace(found.path, length=paths.path_length, skin_angle=paths.skin_angle)
     shifted = replace(found, path=path, arm=ArmColumns.unknown(len(found)))
@@ -72,6 +75,24 @@ def _displaced(anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s
             for one, weight in zip(anatomy.surroundings, outside, strict=True)
         ),
     )
+
+
+def _with_moved_solids(
+    case: Case, anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s: float, T_base_ct: Floats
+) -> Case:
+    """The case with its obstacles and gantry, which the arm's checker takes from there, where their weights say."""
+    names = [one.name for one in anatomy.checked]
+    of = dict(zip(names, weights.structures.tolist(), strict=True))
+
+    def moved(obstacle: Obstacle) -> Obstacle:
+        by_ct = breathing.moved_ct(s, of[obstacle.name])
+        by = T_base_ct[:3, :3] @ by_ct if obstacle.frame == "base" else by_ct
+        return replace(obstacle, center_mm=obstacle.center_mm + by)
+
+    gantry = case.gantry
+    if gantry is not None:
+        gantry = replace(gantry, T_ct_gantry=pose(np.eye(3), breathing.moved_ct(s, of[GANTRY])) @ gantry.T_ct_gantry)
+    return replace(case, obstacles=tuple(moved(one) for one in case.obstacles), gantry=gantry)
 
 
 def _moved_structure(structure: Structure, by_ct: Floats) -> Structure:
