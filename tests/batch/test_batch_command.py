@@ -60,7 +60,7 @@ def test_ctrl_c_stops_with_130_and_a_second_run_continues(planned):
     assert process.returncode == 130, err
     assert out == "" and [line for line in err.splitlines() if not line.startswith("cases: ")] == ["interrupted"]
     assert not list(planned.glob(f"{WORK_PREFIX}*"))
-    assert main(["batch", "run", "--out", str(planned)]) == 0
+    assert main(["batch", "run", "--out", str(planned)]) == 1  # one is refused
     assert main(["batch", "merge", "--out", str(planned)]) == 0
     assert all(row["exit_code"] is not None for row in merged(planned).values())
 
@@ -75,7 +75,7 @@ def test_the_part_of_a_slurm_array_is_taken_and_told(planned, monkeypatch, capfd
     for name, value in (("ID", "7"), ("COUNT", "3"), ("MIN", "5")):
         monkeypatch.setenv(f"SLURM_ARRAY_TASK_{name}", value)
     assert slurm_part(os.environ).text == "3/3"
-    found = said(capfd, 0, "batch", "run", "--out", planned)
+    found = said(capfd, 1, "batch", "run", "--out", planned)
     assert "part 3/3, from SLURM's array" in found.err and found.out.startswith(
         "1 case: 0 had their row, 0 done, 1 failed"
     )

@@ -25,7 +25,7 @@ def plan_text(run: PlanRun, jobs: int) -> str:
     lines = [f"{_cases(len(run.cases))}, {run.known} with a row already"]
     lines += _listed(f"{one.case}: {one.refusal}" for one in run.refused)
     if run.guess is None:
-        return "\n".join([*lines, f"plan: {run.out / 'plan.parquet'}", f"next: batch run --out {run.out}"])
+        return "\n".join([*lines, f"plan: {run.out / 'plan.parquet'}", f"next: run-twin batch run --out {run.out}"])
     if run.guess.sample is None:
         return "\n".join([*lines, "nothing to measure: no case can be read"])
     estimate = estimate_summary(run.guess, jobs)
@@ -46,7 +46,7 @@ def run_text(out: Path, counts: RunCounts) -> str:
     lines += _reasons(counts.reasons)
     if counts.stale:
         lines.append(f"{counts.stale:6d}  not run: the inputs have changed since the plan; batch plan again")
-    return "\n".join([*lines, f"next: batch status --out {out}, batch merge --out {out}"])
+    return "\n".join([*lines, f"next: run-twin batch status --out {out}", f"      run-twin batch merge --out {out}"])
 
 
 def state_text(state: CohortState) -> str:
@@ -67,7 +67,8 @@ def merge_text(merged: Merged) -> str:
     estimate = merged.summary()
     lines = [
         f"{_cases(estimate['cases'])}: {estimate['safe']} with a safe direction, {estimate['no_safe']} without, "
-        f"{estimate['refused']} refused, {estimate['program_failed']} failed, {estimate['not_run']} not run",
+        f"{estimate['refused'] + estimate['program_failed']} failed ({estimate['refused']} of them refused), "
+        f"{estimate['not_run']} not run",
         *(f"wrote {path}" for path in merged.files),
         "of the inputs as they were planned; batch status says which have changed since",
     ]
