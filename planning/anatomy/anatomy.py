@@ -16,11 +16,12 @@ from puncture_twin.planning.anatomy.own_target import own_target
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.anatomy.skin import Skin
-from puncture_twin.planning.anatomy.sources import Progress, StructureSources
+from puncture_twin.planning.anatomy.sources import StructureSources
 from puncture_twin.planning.anatomy.structure import Role as Role, Structure as Structure
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import StructureSection
 from puncture_twin.planning.case.case_schema import count_difference
@@ -94,7 +95,7 @@ class Anatomy:
         raise InputError(f"no structure '{name}'", where="anatomy", allowed=names)
 
 
-def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO_CACHE) -> Anatomy:
+def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE) -> Anatomy:
     """Read every structure of a case, and hold the target against them.
 
     Args:
@@ -105,7 +106,7 @@ def load_anatomy(case: Case, progress: Progress | None = None, cache: Cache = NO
     Raises:
         InputError: A file that cannot be trusted, a label that no rule names, or a target that contradicts them.
     """
-    loader = StructureSources(case, progress or (lambda _: None), cache)
+    loader = StructureSources(case, progress, cache)
     structures = [loader.one(section) for section in case.structure if section.role != "skin"]
     for section in case.structures:
         structures.extend(loader.many(section))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.progress import Names
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import StructureSection, StructuresSection
 from puncture_twin.planning.formats.labels.mask_folder import check_one_grid
@@ -21,8 +22,6 @@ from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
 from puncture_twin.planning.formats.volumes.volume_files import NRRD_ENDINGS
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit, parse_space, parse_unit
-
-Progress = Callable[[str], None]
 
 UNNAMED_SHOWN = 8
 """Labels that a warning lists; a person looks at the map for the rest."""
@@ -33,7 +32,7 @@ EMPTY_MASKS = "{folder}: {count} masks are empty, so that nothing is there: {nam
 class StructureSources:
     """Reads the sources of one case, each volume at most once."""
 
-    def __init__(self, case: Case, progress: Progress, cache: Cache) -> None:
+    def __init__(self, case: Case, progress: Names, cache: Cache) -> None:
         self._case = case
         self._progress = progress
         self._cache = cache

@@ -12,6 +12,14 @@ Count = Callable[[int, int], None]
 """Called with (done, to do), as often as something is done."""
 
 
+Names = Callable[[str], None]
+"""Called with the name of each thing as it is come to."""
+
+
+def unnamed(name: str) -> None:
+    """A `Names` that tells nobody."""
+
+
 def uncounted(done: int, total: int) -> None:
     """A `Count` that tells nobody."""
 

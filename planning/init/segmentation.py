@@ -14,6 +14,7 @@ from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.formats.dicom.choose_series import choose_series
 from puncture_twin.planning.formats.dicom.ct_series import parse_series
 from puncture_twin.planning.formats.dicom.magic import is_series
@@ -68,10 +69,11 @@ class Segmentation(Protocol):
 
 @dataclass(frozen=True)
 class Place:
-    """The folder of the case, and where surfaces are kept."""
+    """The folder of the case, where surfaces are kept, and who is told the name of each file that is read."""
 
     folder: Path
     cache: Cache
+    progress: Names = unnamed
 
     def volume(self, name: str) -> VolumeSurfaces:
         """A volume file of the folder, or a DICOM series.
@@ -91,6 +93,7 @@ class Place:
 
     def content(self, name: str) -> bytes:
         """The bytes of a file of the folder."""
+        self.progress(name)
         return read_input(self.folder / name, max_bytes=MAX_FILE_BYTES, where=str(self.folder / name))
 
     def _series(self, name: str, read: Content) -> VolumeSurfaces:

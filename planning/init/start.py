@@ -13,6 +13,7 @@ from puncture_twin.planning.anatomy.default_roles import BODY
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError, InputListError
+from puncture_twin.planning.base.progress import Names
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.rigid import apply
@@ -63,19 +64,20 @@ class Start:
     notes: tuple[str, ...]
 
 
-def start_case(request: Request, cache: Cache) -> Start:
+def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     """Find the files of a folder, and write the text of a case with them.
 
     Args:
         request: What the user wants.
         cache: Where surfaces are kept.
+        progress: Called with the name of each file that is read.
 
     Raises:
         InputError: All that keeps a case from being made, in one line.
     """
     space = request.wanted.space
     point = None if request.target is None else parse_point(request.target, space)
-    found = find(Place(request.folder, cache), request.wanted)
+    found = find(Place(request.folder, cache, progress), request.wanted)
     ct = _checked(found, point, request)
     if point is not None and ct is not None:
         _refuse_outside(point, ct, space)

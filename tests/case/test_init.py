@@ -137,7 +137,7 @@ def test_every_kind_of_segmentation_becomes_the_same_case(tmp_path, capfd, kind)
     assert any("default roles" in line and "odd thing" in line for line in said)
     assert all(line.startswith("warning: ") for line in said)
     assert ("spleen" in " ".join(said)) == kind.startswith("masks")
-    assert "next: search" in out
+    assert "next: run-twin search" in out
     assert ".case-" not in out + " ".join(said)
     assert list(tmp_path.glob(".case*")) == []
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +66,7 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
         raise InputError("there is a case already", where=path, allowed="--force to replace it")
     if (request.target is None) == (request.target_label is None):
         raise InputError("one target", where="init", allowed="either --target X,Y,Z or --target-label NAME")
-    start = start_case(request, user_cache())
+    start = start_case(request, user_cache(), partial(watcher.step, "reading"))
     with atomic(path) as draft:
         draft.write_text(start.text, encoding="utf-8")
         try:
@@ -89,6 +90,6 @@ def init_text(run: InitRun) -> str:
         f"  target         {position} mm {parts.space}, in {parts.structure or 'no structure'}",
         f"  region         {parts.region}",
         "  needle         200 mm, shaft 150 mm, diameter 1.2 mm",
-        f"next: search {run.path.parent}",
+        f"next: run-twin search {run.path.parent}",
     ]
     return "\n".join(lines)
