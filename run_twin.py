@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 MOST_SEEDS = 10_000
 """Rooms or draws of one command; each takes seconds."""
 
+CERTIFY_DEG = 0.25
+"""Smallest cell of a certificate where nobody says."""
+
 app = typer.Typer(add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 """Plain help: in boxes, a terminal of 40 columns shows names of options cut off."""
 app.add_typer(batch_app, name="batch", help="Many cases: plan, run, status, merge, compare.")
@@ -128,7 +131,10 @@ def search(
     engine: EngineOption = "fast",
     check_again: Annotated[int, typer.Option("--cross-check", min=0, help="Directions that FCL measures again.")] = 0,
     certified: Annotated[bool, typer.Option("--certify", help="Judge the angles between the grid points too.")] = False,
-    certify_size: Annotated[float, typer.Option(min=0.05, max=10, help="Smallest cell of --certify, degrees.")] = 0.25,
+    certify_size: Annotated[
+        float | None,
+        typer.Option(min=0.05, max=10, help="Smallest cell of --certify, degrees.", show_default=f"{CERTIFY_DEG:g}"),
+    ] = None,
     certify_touch: Annotated[
         float | None,
         typer.Option(metavar="P", help="With --certify: no structure is touched more often, to first order."),
@@ -140,8 +146,9 @@ def search(
     from puncture_twin.twin.jobs.patient import main_job, text
 
     folder = _out(out_dir, case, "search")
-    if certify_touch is not None and not certified:
-        raise InputError("a chance without a certificate", where="--certify-touch", allowed="beside --certify")
+    for option, value in (("--certify-touch", certify_touch), ("--certify-size", certify_size)):
+        if value is not None and not certified:
+            raise InputError("of a certificate that nobody asked for", where=option, allowed="beside --certify")
     with progress_display() as progress:
         context = prepare(case, arm=arm, engine=engine, watcher=progress)
         checked = context.cross_check(check_again) if check_again else None
@@ -150,7 +157,7 @@ def search(
             folder,
             pictures=pictures,
             checked=checked,
-            certify_deg=certify_size if certified else None,
+            certify_deg=(certify_size or CERTIFY_DEG) if certified else None,
             certify_touch=certify_touch,
         )
     print_answer(run.summary(), text.search_text(run), as_json)
@@ -292,7 +299,7 @@ def rehearse(
     from puncture_twin.twin.jobs.patient.case_or_plan import case_of, is_plan
     from puncture_twin.twin.jobs.patient.run import RoomCount
 
-    if physics and seeds is None:
+    if physics > (seeds or 0):
         raise InputError("--physics runs some of the rooms", where="--physics", allowed="--seeds N --physics K, K <= N")
     rooms = None if seeds is None else RoomCount(seeds, physics)
     folder = _out(out_dir, source, "rehearse")
@@ -451,7 +458,7 @@ def export(
     formats = (*FORMATS, MOVEIT, SLICER, *CANDIDATE_FORMATS)
     if format_name not in formats:
         raise InputError(f"format '{format_name}' is not known", where="--format", allowed=", ".join(formats))
-    folder = _out(out_dir, source, "export")
+    folder = _out(out_dir, source, f"export-{format_name}")
     if format_name in CANDIDATE_FORMATS:
         _export_candidates(source, format_name, folder, choice, as_json)
         return

@@ -169,12 +169,12 @@ def budget_summary(budget: ErrorBudget) -> dict[str, Any]:
 
 
 def chance_text(chance: float) -> str:
-    """A chance for people: what is not sure never reads as 0 or 1."""
-    if 0 < chance < 5e-5:
+    """A chance for people: never 0 nor 1, not even where a float can no longer tell the difference."""
+    if chance < 5e-5:
         return "<0.0001"
-    if 1 > chance > 1 - 5e-5:
+    if chance > 1 - 5e-5:
         return ">0.9999"
-    digits = 2 if 0.0095 <= chance <= 0.99 or chance in (0.0, 1.0) else 4
+    digits = 2 if 0.0095 <= chance <= 0.99 else 4
     return f"{chance:.{digits}f}"
 
 

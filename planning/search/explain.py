@@ -312,9 +312,18 @@ def reason_text(candidates: Candidates, row: int) -> str:
         parts.append(f"at {candidates.verdict.depth[row]:.1f} mm from the target")
     if np.isfinite(candidates.verdict.amount[row]):
         parts.append(f"with {candidates.verdict.amount[row]:.2f} {_unit(str(candidates.verdict.reason[row]))}")
+        parts += _wanted(candidates, row)
     if candidates.verdict.detail[row]:
         parts.append(f"- {candidates.verdict.detail[row]}")
     return " ".join(parts)
+
+
+def _wanted(candidates: Candidates, row: int) -> list[str]:
+    """The margin that was not kept."""
+    if candidates.verdict.reason[row] != Reason.TOO_CLOSE.value:
+        return []
+    at = candidates.clearance.structures.index(str(candidates.verdict.structure[row]))
+    return [f"where {candidates.clearance.margins[at]:g} mm is demanded"]
 
 
 def _unit(reason: str) -> str:

@@ -388,13 +388,21 @@ def test_there_are_enough_ways_to_be_wrong():
         (["reproduce", "chen2020"], "chen2020"),
         (["plan", "CASE"], "where the robot stands"),
         (["rehearse", "plan.json"], "a plan needs its case"),
+        (["rehearse", "CASE", "--seeds", "2", "--physics", "3"], "K <= N"),
+        (["search", "CASE", "--certify-size", "1"], "beside --certify"),
+        (["search", "CASE", "--certify-touch", "0.1"], "beside --certify"),
+        (["compare", "CASE", "--rank", "1"], "the same direction twice"),
+        (["check", "CASE", "--theta", "0", "--beta", "0", "--picture", "no/such/a.png"], "no such folder"),
+        (["verify", "MANIFEST", "--case", "CASE"], "is none of them"),
     ],
 )
 def test_a_wrong_command_line_is_refused(arguments, message, folder, capfd):
     """Missing, misspelled and impossible arguments: the same exit code and form."""
     text = (folder / "case.toml").read_text()
     (folder / "case.toml").write_text(text[: text.index("[registration]")])
-    assert message in refused([folder if a == "CASE" else a for a in arguments], capfd)
+    (folder / "manifest.json").write_text("{}")
+    named = {"CASE": folder, "MANIFEST": folder / "manifest.json"}
+    assert message in refused([named.get(a, a) for a in arguments], capfd)
 
 
 def test_open_and_inverted_meshes_work_with_a_warning(folder, tmp_path, capfd):

@@ -85,7 +85,15 @@ def test_reading_is_split_by_slices():
     assert list(reading_parts(0.25 * np.eye(3))) == ["markers_ct"]
 
 
-SHOWN = {1.0: "1.00", 0.0: "0.00", 0.93: "0.93", 1e-9: "<0.0001", 1 - 1e-9: ">0.9999", 0.002: "0.0020", 0.996: "0.9960"}
+SHOWN = {
+    1.0: ">0.9999",
+    0.0: "<0.0001",
+    0.93: "0.93",
+    1e-9: "<0.0001",
+    1 - 1e-9: ">0.9999",
+    0.002: "0.0020",
+    0.996: "0.9960",
+}
 
 
 @pytest.mark.parametrize(("chance", "words"), SHOWN.items())

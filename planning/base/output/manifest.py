@@ -128,6 +128,8 @@ def read_output(path: Path, *, max_bytes: int) -> Output:
     data = read_input(path, max_bytes=max_bytes, where=str(path))
     digest = hashlib.sha256(data).hexdigest()
     home = path.resolve()
+    if home.name == MANIFEST_NAME:
+        raise InputError("lists the files of a command and is none of them", where=path, allowed="one that it lists")
     manifest = _set_of(home.parent)
     if manifest is None:
         return Output(path, data, digest, f"{path} lies outside of any output set: nothing tells whether it is whole")

@@ -49,6 +49,8 @@ def parse_two(
     choices += [parse_choice(None, None, None, None, one) for one in entry]
     if len(choices) == 1:
         choices = [BEST_OF_ALL, *choices]
+    if len(choices) == 2 and choices[0] == choices[1]:
+        raise InputError("the same direction twice", where="compare", allowed="two, or one that is not the best")
     if len(choices) != 2:
         allowed = "two, such as --rank 1 --window 2, or one, which is compared with the best"
         raise InputError(f"{len(choices)} choices", where="compare", allowed=allowed)

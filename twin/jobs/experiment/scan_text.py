@@ -24,7 +24,7 @@ def scan_text(run: ScanRun) -> str:
             *_marker_lines(facts),
             f"  {'lesion':<15}{_vector(facts['lesion']['error_mm'])}   read against true",
             *_needle_lines(facts["needle"]),
-            f"next: init {folder} --ct {SERIES} --target={target}",
+            f"next: run-twin init {folder} --ct {SERIES} --target={target}",
         ]
     )
 

@@ -144,6 +144,7 @@ def sweep_text(run: SweepRun) -> str:
         f"virtual TCP off its point: {off.mean():.4f} mm on average, {off.max():.4f} mm at most ({run.control})",
     ]
     if plan.stopped:
-        lines.append(f"stopped there: {plan.stopped}")
+        headed = "theta {:.1f}, beta {:.1f}".format(*np.degrees(plan.wanted))
+        lines.append(f"stopped there, on the way to {headed} deg: {plan.stopped}")
     lines += [f"{link} touches {body}" for link, body in run.swept.contacts]
     return "\n".join([*lines, *(f"wrote {path}" for path in run.files)])

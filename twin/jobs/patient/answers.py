@@ -118,6 +118,7 @@ def lists_report(
     registration = register(pairs, method="rigid", target_ct=target_ct, fle_mm=fle_mm, where=str(markers_base))
     report = registration_summary(registration)
     report["case"] = f"{markers_ct} and {markers_base}"
+    report["target_mm"], report["space"] = numbers, str(space)
     named = zip(("markers_ct", "markers_base"), (markers_ct, markers_base), content, strict=True)
     report["inputs"] = inputs_document(
         tuple(Input(role, str(path), hashlib.sha256(data).hexdigest()) for role, path, data in named)

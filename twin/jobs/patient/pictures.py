@@ -125,3 +125,5 @@ def _uncertainty(run: Run) -> Uncertainty | None:
 def _check_png(path: Path) -> None:
     if path.suffix.lower() != ".png":
         raise InputError(f"'{path.name}' is no PNG's name", where="--picture", allowed="FILE.png")
+    if not path.parent.is_dir():
+        raise InputError("there is no such folder", where=path.parent, allowed="a folder that is there")

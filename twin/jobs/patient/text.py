@@ -192,6 +192,9 @@ def export_text(done: Exported, case_checked: bool) -> str:
 def registration_text(report: dict[str, Any]) -> str:
     """Residuals, expected error and weak points of a registration."""
     lines = [f"case {report['case']}: registration by {report['method']}"]
+    if "target_mm" in report:
+        place = ", ".join(f"{mm:g}" for mm in report["target_mm"])
+        lines.append(f"  target ({place}) mm {report['space']}")
     lines += [f"  marker {name}: residual {mm:.3f} mm" for name, mm in report["residual_mm"].items()]
     lines += [
         f"  FRE {report['fre_mm']:.3f} mm, mean residual {report['mean_error_mm']:.3f} mm",
