@@ -126,7 +126,7 @@ class Case:
         return case_html(self)
 
     def aimed_at(self, target_ct: Floats) -> Case:
-        """The same with another target, shape (3,), mm: in the same structure, with the entry frame about it."""
+        """This case with another target, shape (3,), mm: in the same structure, with the entry frame about it."""
         target = _read_only(target_ct)
         return replace(self, target_ct=target, T_ct_entry=view_frame(self.T_ct_entry[:3, :3], target))
 

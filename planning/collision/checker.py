@@ -194,7 +194,7 @@ class CellChecker:
         return np.asarray(self._swept.bounds_mm(q_path).max(axis=1))
 
     def body_sweeps_mm(self, q_path: Floats) -> dict[str, Floats]:
-        """The same for each moving body by name; the tool counts with wrist 3 as one."""
+        """Bound on each moving body's motion along each segment, by name; the tool counts with wrist 3 as one."""
         bounds = self._swept.bounds_mm(q_path)
         return {body.name: bounds[:, body.frame - 1] for body in self._bodies[1:]}
 

@@ -1,4 +1,4 @@
-"""The same verdicts as :class:`CellChecker`, sooner: FCL is queried only where spheres and planes prove nothing."""
+"""The verdicts of :class:`CellChecker`, sooner: FCL is queried only where spheres and planes prove nothing."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ class FastChecker(CellChecker):
 
     Args:
         model: See :class:`CellChecker`.
-        tool: The same.
-        boxes: The same.
-        patient: The same.
-        skin: The same.
-        padding_mm: The same.
+        tool: Needle and holder, likewise.
+        boxes: Obstacles, likewise.
+        patient: The body's surface, likewise.
+        skin: Names contacts, likewise.
+        padding_mm: Of contacts with patient and boxes, likewise.
         cache: Where the enclosures of the arm's bodies are kept.
 
     Raises:
-        InputError: The same.
+        InputError: As :class:`CellChecker` does.
     """
 
     def __init__(

@@ -85,4 +85,4 @@ class StateChecker(Protocol):
         """Bound on every body's motion along each segment of ``q_path`` (m, 6): shape (m - 1,), mm."""
 
     def body_sweeps_mm(self, q_path: Floats) -> dict[str, Floats]:
-        """The same for each moving body by name."""
+        """Bound on each moving body's motion along each segment, by name."""

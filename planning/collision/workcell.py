@@ -84,7 +84,7 @@ def check_gantry(case: Case, skin: TriangleMesh) -> None:
         skin: CT frame.
 
     Raises:
-        InputError: Its wall stands in him.
+        InputError: Its wall cuts the patient.
     """
     deep = 0.0 if case.gantry is None else gantry_in_patient_mm(case.gantry, skin)
     if deep > 0.0:

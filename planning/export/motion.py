@@ -17,7 +17,7 @@ ANGLE_TOLERANCE_RAD = 1e-9
 """How far an angle that was read back may be from the plan's."""
 
 TIME_TOLERANCE_S = 1e-9
-"""The same for times: ROS counts whole nanoseconds, which is half of one at most."""
+"""How far a time that was read back may be from the plan's: ROS counts nanoseconds, which is half of one at most."""
 
 
 class SampledMotion(NamedTuple):

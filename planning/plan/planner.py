@@ -69,7 +69,7 @@ def make_plan(context: CaseContext, candidates: Candidates, *, seed: int, rows: 
 
 
 def _without(context: CaseContext, candidates: Candidates, row: int, why: str) -> Candidates:
-    """The same candidates with one marked ``approach_not_found``, ranked anew."""
+    """These candidates with one marked ``approach_not_found``, ranked anew."""
     reason, detail = candidates.verdict.reason.copy(), candidates.verdict.detail.copy()
     reason[row], detail[row] = Reason.APPROACH_NOT_FOUND.value, why
     verdict = replace(candidates.verdict, reason=reason, detail=detail)

@@ -152,7 +152,7 @@ class Registration:
         return np.sqrt([np.trace(self.uncertainty.cov_at(point)[:3, :3]) for point in points_base])
 
     def expected_tre_interval_mm(self, point_ct: Floats) -> Interval:
-        """The same at one point (3,), at both ends of the noise's 95 % interval, mm."""
+        """Expected target registration error (rms) at one point (3,), at both ends of the noise's 95 % interval, mm."""
         if self.uncertainty is None:
             lever = float(leverage(self.markers.points_ct, point_ct[None])[0])
             return Interval(*(fle * lever for fle in self.fle_interval_mm))

@@ -60,7 +60,7 @@ class Verdict(Columns):
         return Verdict(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
     def rejected(self, rows: Ints, reason: Reason, structure: Texts, amount: Floats) -> Verdict:
-        """The same with some rows rejected: each by a structure, shape (m,), and a number, shape (m,)."""
+        """These candidates with some rows rejected: each by a structure, shape (m,), and a number, shape (m,)."""
         arrays = {field.name: getattr(self, field.name).copy() for field in fields(self)}
         arrays["reason"][rows], arrays["structure"][rows], arrays["amount"][rows] = reason.value, structure, amount
         return Verdict(**arrays)
@@ -148,7 +148,8 @@ class BreathingColumns(Columns):
         safe_all_phases: Shape (n,), safe for the organs at every phase, if inserted at that phase.
         worst_phase: Shape (n,), the position s in the gate's window (without a gate: of all) with the least clearance
             beyond a margin; NaN for what was rejected before.
-        clearance: Shape (n,), the least to any structure with a margin, in the window, mm; NaN for the same.
+        clearance: Shape (n,), the least to any structure with a margin, in the window, mm; NaN for what was
+            rejected before.
         safe_when: At each phase, or in the gate's window, if inserted then; never that a needle may stay.
     """
 

@@ -151,7 +151,7 @@ class Explanation:
         return [head, *self._reason()]
 
     def text(self, most: int | None = NEAREST) -> str:
-        """The same for a person.
+        """All of it for a person.
 
         Args:
             most: How many structures are listed, the nearest first; None lists all.

@@ -1,4 +1,4 @@
-"""A plan, executed in the twin: the arm moves under its motors, the patient lies where he truly lies.
+"""A plan, executed in the twin: the arm moves under its motors, the patient lies at their true place.
 
 What is modelled: rigid bodies, gravity, motor lag and torque limits, joint offsets, a registration that errs; the
 insertion by the motors too, or by a spring at the tip (``[rehearsal] control``). What is not: tissue that resists or

@@ -1,4 +1,4 @@
-"""The whole room: the arm with its needle, the patient where he truly lies, and the boxes around them.
+"""The whole workcell: the arm with its needle, the patient at their true place, and the boxes around them.
 
 The world frame is the controller's base frame.
 """

@@ -39,7 +39,7 @@ most 550 mm wide and an image at least 350; along the bed table and mattress go 
 EDGE_MM = 40.0
 """The edge of a table or cradle is no thicker."""
 BEYOND_LONG_MM = (*BEYOND_MM[:2], 1000.0)
-"""The same where an image is so long that the surface would be larger than any that is plausible."""
+"""`BEYOND_MM` where an image is so long that the surface would be larger than any that is plausible."""
 RIM_MM = 50.0
 """Where what is dense ends at voxels that were not scanned, they count as dense so far from it."""
 

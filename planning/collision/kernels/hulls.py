@@ -48,7 +48,7 @@ class Hulls(NamedTuple):
     starts: Ints
     """Shape (h + 1,): where each hull's corners begin."""
     few: tuple[Floats, Floats, Floats]
-    """The same as ``axes`` for some outer corners of each."""
+    """x, y and z of some outer corners of each hull, as in ``axes``."""
     few_starts: Ints
     slack: Floats
     """Shape (h,): no corner lies farther outside the hull of the few."""
@@ -100,7 +100,7 @@ def _nearest_of_segment(S, i, j):
 
 @nb.njit(cache=True)
 def _nearest_of_triangle(S, i, j, k):
-    """The same of the triangle of three rows."""
+    """The corner rows and the point of the triangle of three rows that is nearest to the origin."""
     ax, ay, az = S[i, 0], S[i, 1], S[i, 2]
     bx, by, bz = S[j, 0], S[j, 1], S[j, 2]
     cx, cy, cz = S[k, 0], S[k, 1], S[k, 2]
@@ -137,7 +137,7 @@ def _outside(S, p, q, r, opposite):
 
 @nb.njit(cache=True)
 def _nearest_of_tetrahedron(S):
-    """The same of all four rows; all -1 where the origin lies inside."""
+    """The rows and the point of the tetrahedron of all four that is nearest; rows -1 where the origin lies inside."""
     best, i, j, k, x, y, z = math.inf, -1, -1, -1, 0.0, 0.0, 0.0
     for opposite in range(4):
         p, q, r = (opposite + 1) % 4, (opposite + 2) % 4, (opposite + 3) % 4
@@ -266,11 +266,11 @@ def hull_gap(hulls, first, second, M, axis, at, needed, S):
         hulls: See :class:`Hulls`.
         first: The one.
         second: The other.
-        M: See :func:`distance_bounds`; so are the others.
-        axis: Where it is zero the search begins anew.
-        at: The same.
-        needed: The same.
-        S: The same.
+        M: See :func:`distance_bounds`.
+        axis: As there; where it is zero the search begins anew.
+        at: As there.
+        needed: As there.
+        S: Scratch, as there.
     """
     if axis[0] == 0.0 and axis[1] == 0.0 and axis[2] == 0.0:
         at[0], at[1] = hulls.starts[first], hulls.starts[second]

@@ -167,7 +167,7 @@ def check_segment(scene, movers, lengths, start, end, fractions, begin, fine_mm,
         movers: See :class:`Movers`.
         lengths: Of the arm, see :mod:`puncture_twin.planning.arm.kernels`.
         start: Shape (6,), rad.
-        end: The same.
+        end: Shape (6,), rad.
         fractions: Shape (m,): of the segment, where states are that are looked at first.
         begin: 0; after a query whose answer was no, where the answer says to go on.
         fine_mm: Where the bodies of a check move no farther than this within a part, its middle decides.

@@ -164,7 +164,7 @@ def _mark(axes: Axes, x: float, y: float, shape: str, text: str) -> None:
 
 
 def _bed(axes: Axes, found: PlaceSearch, case: Any, skin: TriangleMesh) -> None:
-    """Outlines of the patient, of the boxes that stand with him, and of the gantry; the target."""
+    """Outlines of the patient, of the boxes beside them, and of the gantry; the target."""
     T_bed_ct = np.linalg.inv(found.T_ct_bed)
     carried = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"}
     parts: dict[str, list[Floats]] = defaultdict(list)
