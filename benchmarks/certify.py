@@ -12,7 +12,6 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numba
@@ -20,6 +19,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, beside the package
 
+from benchmarks.timing import least_seconds
 from puncture_twin.meshes import folder
 from puncture_twin.planning.case.entry import Directions, grid, outward
 from puncture_twin.planning.certify.certificate import Certificate
@@ -59,11 +59,11 @@ def _row(name: str, context: CaseContext, size_deg: float, step_deg: float, repe
     case, meshes = context.case, tuple(s.mesh for s in context.anatomy.structures)
     R, length = case.T_ct_entry[:3, :3], case.needle.length_mm
     coarse, fine = (grid(case.search.theta, case.search.beta, np.radians(step), R) for step in (1.0, step_deg))
-    own = _best(lambda: certify(case, context.anatomy, size=np.radians(size_deg)), repeats)
+    own = least_seconds(lambda: certify(case, context.anatomy, size=np.radians(size_deg)), repeats)
     found = certify(case, context.anatomy, size=np.radians(size_deg))
     engine = FastEngine(meshes)
-    trees = _best(lambda: FastEngine(meshes), repeats)
-    dense = _best(lambda: engine.measure(case.target_ct, coarse.outward_ct, length), repeats)
+    trees = least_seconds(lambda: FastEngine(meshes), repeats)
+    dense = least_seconds(lambda: engine.measure(case.target_ct, coarse.outward_ct, length), repeats)
     fewer, triangles = 100 * (1 - found.queries / len(fine)), sum(len(mesh.faces) for mesh in meshes)
     shares = 100 * (found.fraction("S") or 0), 100 * (found.fraction("U") or 0), 100 * _mixed(context, found)
     cells = " | ".join(
@@ -148,16 +148,6 @@ def _areas(name: str, found: Certificate) -> None:
         f"{name}: safe {summary['safe_square_deg']:.0f} square deg ({100 * summary['safe_share']:.2f} %), "
         f"undecided {100 * summary['undecided_share']:.2f} %, {len(found.leaves)} cells, {found.queries} queries"
     )
-
-
-def _best(work: Callable[[], object], repeats: int) -> float:
-    """Least processor time, s: others share the machine."""
-    seconds = []
-    for _ in range(repeats + 1):
-        start = time.thread_time()
-        work()
-        seconds.append(time.thread_time() - start)
-    return min(seconds)
 
 
 def main() -> int:

@@ -21,6 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, beside the package
 
 from benchmarks.scenes import Scene, scenes
+from benchmarks.timing import least_seconds
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 
 RADIUS_MM = 0.6
@@ -260,7 +261,7 @@ def optional(scene: Scene, directions: np.ndarray) -> None:
             print(f"{peer.name}: not installed")
             continue
         ask = peer.prepare(scene)
-        each = _best(lambda ask=ask: ask(directions), 2) / len(directions)
+        each = least_seconds(lambda ask=ask: ask(directions), 2) / len(directions)
         print(f"{peer.name} ({peer.answers}): {1e6 * each:.3g} us per direction")
 
 
@@ -269,7 +270,7 @@ def compare(scene: Scene, step_deg: float) -> None:
     directions = np.random.default_rng(SEED).permutation(scene.hemisphere(step_deg))
     engine = FastEngine(scene.meshes)
     engine.measure(scene.target, directions[:50], scene.length)
-    exact = _best(lambda: engine.measure(scene.target, directions, scene.length)) / len(directions)
+    exact = least_seconds(lambda: engine.measure(scene.target, directions, scene.length), 3) / len(directions)
     ours = engine.measure(scene.target, directions, scene.length).distance
     asked = f"{len(directions):,}"
     print(f"\n## {scene.name}: {scene.triangles:,} triangles, {len(scene.meshes)} surfaces, {asked} directions")
@@ -284,7 +285,7 @@ def compare(scene: Scene, step_deg: float) -> None:
         ask = peer.prepare(scene)
         build, some = time.thread_time() - start, directions[: peer.most]
         found = np.asarray(ask(some))
-        each = _best(lambda ask=ask, some=some: ask(some), 2) / len(some)
+        each = least_seconds(lambda ask=ask, some=some: ask(some), 2) / len(some)
         agrees = _agreement(found, ours[: len(some)], thin="thin" in peer.answers)
         cells = f"{each / exact:.3g}x | {1e6 * each:.3g} | {build:.2f} | {len(some):,} | {peer.answers} | {agrees}"
         print(f"| {peer.name} | {cells} |", flush=True)
@@ -297,16 +298,6 @@ def _agreement(found: np.ndarray, axis_mm: np.ndarray, *, thin: bool) -> str:
         return f"{100 * np.mean(found == (hit if found.ndim == 2 else hit.any(axis=1))):.2f} %"
     clear = axis_mm > RADIUS_MM + 0.01
     return f"to {np.abs(found - (axis_mm - RADIUS_MM))[clear].max():.1e} mm"
-
-
-def _best(work: Callable[[], object], repeats: int = 3) -> float:
-    """Least processor time of a few runs, s: others share the machine."""
-    times = []
-    for _ in range(repeats):
-        start = time.thread_time()
-        work()
-        times.append(time.thread_time() - start)
-    return min(times)
 
 
 def main() -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 import numba as nb
 import numpy as np
 
 from benchmarks.scenes import Scene
+from benchmarks.timing import least_seconds
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.kernels.bare import bare
 from puncture_twin.planning.clearance.kernels.bounds import disc_bounds, line_distances
@@ -47,17 +47,6 @@ def _triangles(triangles, pairs, turns):
         measure_beside(pairs, 16, 210.0)
 
 
-def _least(work: Callable[[], object]) -> float:
-    """Least processor time of one turn, s."""
-    work()
-    times = []
-    for _ in range(REPEATS):
-        start = time.thread_time()
-        work()
-        times.append(time.thread_time() - start)
-    return min(times) / TURNS
-
-
 def unit_costs() -> tuple[float, float, float]:
     """Seconds for the bounds of 16 discs, for a block of 16 triangles in float32, and for one triangle in float64."""
     rng = np.random.default_rng(0)
@@ -66,9 +55,9 @@ def unit_costs() -> tuple[float, float, float]:
     beside = rng.normal(0, 1, (256, 9)) + np.tile([30.0, 5.0, 40.0], 3)
     bounds, squares = np.empty((32, LANES), Single), np.empty((32, LANES), Single)
     return (
-        _least(lambda: _discs(nodes, bounds, TURNS)),
-        _least(lambda: _blocks(local, squares, TURNS)),
-        _least(lambda: _triangles(beside, np.empty((ROWS, 24)), TURNS)),
+        least_seconds(lambda: _discs(nodes, bounds, TURNS), REPEATS) / TURNS,
+        least_seconds(lambda: _blocks(local, squares, TURNS), REPEATS) / TURNS,
+        least_seconds(lambda: _triangles(beside, np.empty((ROWS, 24)), TURNS), REPEATS) / TURNS,
     )
 
 

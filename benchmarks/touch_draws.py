@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from scipy.special import ndtr
 
+from benchmarks.timing import least_seconds
 from benchmarks.trust import Scene, punctures, scenes
 from puncture_twin.planning.clearance.near_faces import NearFaces
 from puncture_twin.planning.geometry.rigid import exp_rotation
@@ -132,19 +133,9 @@ def cost(scene: Scene, model: ChanceModel) -> tuple[float, float, float, float]:
         lambda: model.hit.chance(model.error, model.error.covariance_ct(q)),
         lambda: model.error.covariance_ct(q),
     )
-    search, on_top, alone, hit, covariance = (_least(work) / len(q) * 1e6 for work in works)
+    search, on_top, alone, hit, covariance = (least_seconds(work, REPEATS) / len(q) * 1e6 for work in works)
     hit -= covariance
     return search, on_top - hit, alone - hit, hit
-
-
-def _least(work) -> float:  # type: ignore[no-untyped-def]
-    work()
-    times = []
-    for _ in range(REPEATS):
-        start = time.thread_time()
-        work()
-        times.append(time.thread_time() - start)
-    return min(times)
 
 
 def main() -> None:
