@@ -360,16 +360,45 @@ def touch(
 @app.command()
 def pivot(
     case: CaseArgument,
-    joints: Annotated[Path, typer.Argument(metavar="JOINTS.csv", help="Touches of one place, as touch writes them.")],
+    joints: Annotated[
+        Path | None,
+        typer.Argument(metavar="JOINTS.csv", help="Touches of one place: a line a pose, with q1_deg to q6_deg."),
+    ] = None,
+    out_dir: OutOfCaseOption = None,
+    poses: Annotated[
+        int | None, typer.Option("--poses", help="How many, in the twin: 4 to 12.", show_default="8")
+    ] = None,
+    at: Annotated[
+        str | None,
+        typer.Option("--at", metavar="X,Y,Z", help="Where, mm, base frame.", show_default="beside the patient"),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, max=2**31 - 1, help="Of the truth.", show_default="0")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the needle's tip on the flange from arms that touch one place in different poses; 1 if they contradict."""
-    from puncture_twin.planning.case.case import load_case
+    """Find the needle's tip on the flange: from touches of one place, or executed in the twin; 1 if they contradict."""
     from puncture_twin.twin.jobs.experiment.pivot_job import pivot_case, pivot_text
 
-    run = pivot_case(load_case(case), joints)
-    print_answer(run.summary(), pivot_text(run), as_json)
-    if run.pivot.large:
+    if joints is not None:
+        if any(option is not None for option in (out_dir, poses, at, seed)):
+            raise InputError("touches that were read", where="pivot", allowed="JOINTS.csv alone, or the twin's options")
+        from puncture_twin.planning.case.case import load_case
+
+        read = pivot_case(load_case(case), joints)
+        print_answer(read.summary(), pivot_text(read), as_json)
+        large = read.pivot.large
+    else:
+        require_extra("twin", "pivot")
+        from puncture_twin.planning.search.context import prepare
+        from puncture_twin.twin.jobs.experiment.pivot_tour import parse_place, pivot_tour, pivot_tour_text
+
+        place, folder = parse_place(at), _out(out_dir, case, "pivot")
+        with progress_display() as progress:
+            run = pivot_tour(prepare(case, watcher=progress), folder, 8 if poses is None else poses, place, seed or 0)
+        print_answer(run.summary(), pivot_tour_text(run), as_json)
+        large = run.found.pivot.large
+    if large:
         raise typer.Exit(ANSWER_IS_NO)
 
 

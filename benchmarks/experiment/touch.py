@@ -11,6 +11,7 @@ from puncture_twin.planning.geometry.rigid import exp_rotation, pose
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.selection.choice import Choice
 from puncture_twin.twin.guidance.ct.pivot import pivot_calibration
+from puncture_twin.twin.jobs.experiment.pivot_tour import pivot_tour
 from puncture_twin.twin.jobs.experiment.touch_job import touch_case
 
 TIP, PLACE = np.array([1.5, -0.8, 210.0]), np.array([350.0, 60.0, 40.0])
@@ -22,7 +23,8 @@ def rows() -> list[Row]:
     context = prepare(folder() / "carton" / "case_m.toml")
     with tempfile.TemporaryDirectory() as out:
         found = [touch_case(context, Path(out) / str(seed), CHOICE, seed) for seed in range(3)]
-    return [*_touches(found), *_pivots()]
+        executed = [pivot_tour(context, Path(out) / f"pivot{seed}", 8, None, seed) for seed in range(3)]
+    return [*_touches(found), *_pivots(), *_executed(executed)]
 
 
 def _touches(found):
@@ -49,6 +51,17 @@ def _pivots():
         found.append(Row(f"pivot, {count} poses: tip, rms, mm", f"{rms:.3f}", demand, met))
         found.append(Row.between(f"pivot, {count} poses: residual^2 over noise^2 (3n - 6) / n", square, 0.9, 1.1))
     return found
+
+
+def _executed(runs):
+    """Eight poses touched in the twin, three truths: the tip's error and the residual beside the declared ones."""
+    error = float(np.sqrt(np.mean([run.error_mm**2 for run in runs])))
+    residual = float(np.sqrt(np.mean([run.found.pivot.residual_mm**2 for run in runs])))
+    expected, left = runs[0].expected_error_mm, runs[0].found.pivot.expected_whole_mm
+    return [
+        Row("pivot executed, 8 poses, 3 arms: tip, rms, mm", f"{error:.3f}", f"{expected:.3f} expected", True),
+        Row("the same: residual, rms, mm", f"{residual:.3f}", f"{left:.3f} expected", True),
+    ]
 
 
 def pivot_poses(count, rng):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -19,20 +18,17 @@ from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.workcell import (
     case_boxes,
     case_tool,
-    home_configuration,
     patient_surface,
 )
 from puncture_twin.planning.formats.points.point_files import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.motion.approach import plan_approach
-from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.registration.placement import marker_noise
 from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.registration.registration import MIN_MARKERS, MarkerPairs, Method, Registration, register
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.touch.order import shortest_tour
-from puncture_twin.planning.touch.straight_approach import STANDOFF_MM, TIP_MM, ApproachCheckers, line_to, why_not
-from puncture_twin.planning.touch.touch_plan import Touch, TouchPlan
+from puncture_twin.planning.touch.straight_approach import TIP_MM, ApproachCheckers, why_not
+from puncture_twin.planning.touch.touch_plan import TouchPlan
+from puncture_twin.planning.touch.tour_motions import NoMotionError, Stops, tour_through
 from puncture_twin.planning.uncertainty.pose_error import PoseError, expected_error_mm
 from puncture_twin.planning.uncertainty.touch_choice import Candidates, least_error, touch_candidates
 
@@ -111,14 +107,6 @@ class _Open(NamedTuple):
         return _Open(tuple(rows), tuple(kept), {**self.left_out, name: why})
 
 
-class _NoMotionError(NoAnswerError):
-    """No motion leads to the standoff of a marker."""
-
-    def __init__(self, place: int, why: str) -> None:
-        self.place = place
-        super().__init__(why)
-
-
 def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progress: Count) -> TouchPlan:
     """Plan to touch every marker that can be touched.
 
@@ -139,13 +127,18 @@ def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progre
         task = every.of(found.rows)
         error = _error(task, every, found.left_out)
         chosen, worst = (least_error(error, found.candidates, q_insertion, worst=worst) for worst in (False, True))
+        stops = Stops(task.markers.names, task.markers.points_base, chosen)
         try:
-            touches, leave = _motions(task, chosen, seed, progress)
-        except _NoMotionError as none:
+            tour = tour_through(context, stops, seed=seed, progress=progress)
+        except NoMotionError as none:
             found = found.without(none.place, task.markers.names[none.place], str(none))
             continue
-        expected, of_worst = task.expected_mm(chosen), task.expected_mm(worst)
-        return TouchPlan(task.model, task.tip_mm, touches, leave, found.left_out, expected, of_worst)
+        return TouchPlan(
+            **vars(tour),
+            left_out=found.left_out,
+            expected_mm=task.expected_mm(chosen),
+            worst_mm=task.expected_mm(worst),
+        )
 
 
 def _error(task: _Task, every: _Task, left_out: Mapping[str, str]) -> PoseError:
@@ -251,31 +244,3 @@ def _free(checkers: ApproachCheckers, tip_mm: float, found: Candidates) -> tuple
             return free, ""
         reasons += said
     return np.empty((0, 6)), max(set(reasons), key=reasons.count) if reasons else "out of the arm's reach"
-
-
-def _motions(task: _Task, q_touch: Floats, seed: int, progress: Count) -> tuple[tuple[Touch, ...], Trajectory]:
-    """The touches in the order of the shortest tour, and the motion home.
-
-    Raises:
-        _NoMotionError: None to a marker.
-        NoAnswerError: None home.
-    """
-    context, markers = task.context, task.markers
-    assert context.reach is not None
-    checker, home = context.reach.checker, home_configuration(context.case)
-    lines = [line_to(checker.model, task.tip_mm, q, STANDOFF_MM, 0.0) for q in q_touch]
-    places = np.array([*(line[0] for line in lines if line is not None), home])
-    order = shortest_tour((np.abs(places[:, None] - places) / checker.model.max_speeds).max(axis=2))
-    stops, legs = pairwise([len(places) - 1, *order, len(places) - 1]), []
-    for start, end in stops:
-        try:
-            found = plan_approach(checker, places[start], places[end], seed=seed, speeds=context.case.robot.speeds)
-        except NoAnswerError as error:
-            if end in order:
-                raise _NoMotionError(end, str(error)) from error
-            raise
-        legs.append(found.trajectory)
-        progress(len(legs), len(places))
-    touched = zip(order, legs, strict=False)
-    touches = (Touch(markers.names[at], markers.points_base[at], q_touch[at], leg) for at, leg in touched)
-    return tuple(touches), legs[-1]

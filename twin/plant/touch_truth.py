@@ -62,6 +62,26 @@ def draw_touch_truth(
     return TouchTruth(seed, T_base_ct, eta, dict(zip(names, aim, strict=True)), dict(zip(names, arrival, strict=True)))
 
 
+def draw_pivot_truth(
+    T_base_ct: Floats, names: tuple[str, ...], place_base: Floats, errors: ErrorModel, seed: int
+) -> TouchTruth:
+    """Draw what is wrong with an arm that sets its tip onto one place n times; the patient lies as believed.
+
+    Args:
+        T_base_ct: Shape (4, 4), mm.
+        names: Of the touches.
+        place_base: Shape (3,), mm.
+        errors: As declared.
+        seed: Of all draws.
+    """
+    rng = np.random.default_rng(seed)
+    eta = rng.normal(size=28) * np.sqrt(parameter_variances(errors.arm))
+    aim_base = place_base + rng.normal(0.0, errors.touch_mm, (len(names), 3))
+    aim = apply(np.linalg.inv(T_base_ct), aim_base)
+    arrival = rng.normal(size=(len(names), 6)) * errors.arm.repeatability
+    return TouchTruth(seed, T_base_ct, eta, dict(zip(names, aim, strict=True)), dict(zip(names, arrival, strict=True)))
+
+
 def nominal_tip(model: UrModel, tip_mm: float, q: Floats) -> Floats:
     """Where the controller says that the tip is, shape (3,), mm, at encoders (6,), rad."""
     T = flange_pose(model, q)

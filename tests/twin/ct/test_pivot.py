@@ -13,8 +13,9 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.formats.points.point_files import NamedPoints, write_points
+from puncture_twin.twin.guidance.ct.one_place import check_one_place
 from puncture_twin.twin.guidance.ct.pivot import pivot_calibration
-from puncture_twin.twin.jobs.experiment.pivot_job import pivot_case, pivot_text
+from puncture_twin.twin.jobs.experiment.pivot_job import PivotRun, pivot_case, pivot_text
 
 TIP = np.array([1.5, -0.8, 210.0])
 PLACE = np.array([350.0, 60.0, 40.0])
@@ -107,3 +108,39 @@ def test_the_command_reads_a_list_of_touches(tmp_path):
     (tmp_path / "bare.csv").write_text("name,x_mm,y_mm,z_mm\nA,0,0,0\n")
     with pytest.raises(InputError, match="no joints"):
         pivot_case(case, tmp_path / "bare.csv")
+
+
+def test_touches_of_several_places_are_named(tmp_path):
+    """What `touch` writes of three markers is no pivot: said by names and distance, whatever the tilts."""
+    case = load_case(ROOT / "meshes" / "carton" / "case_m.toml")
+    model = ur_model("ur3")
+    T = np.tile(np.eye(4), (4, 1, 1))
+    T[:, :3, :3] = Rotation.from_rotvec([[0.0, 0.0, 0.0], [0.3, 0, 0], [0, 0.3, 0], [-0.3, 0.2, 0]]).as_matrix()
+    at = np.array([420.0, -290.0, 530.0]) + [[0, 0, 0], [0, 60, 0], [0, 0, 0], [0, 0, 0]]
+    T[:, :3, 3] = at - 401.0 * T[:, :3, 2]
+    q = inverse(model, T)
+    q = np.array([rows[~np.isnan(rows).any(axis=1)][0] for rows in q])
+    write_points(tmp_path / "touch.csv", NamedPoints(("A", "B", "C", "D"), at, None, joints=q))
+    with pytest.raises(InputError, match=r"touches of different places: A and B are 60 mm apart"):
+        pivot_case(case, tmp_path / "touch.csv")
+
+
+@pytest.mark.parametrize("off_mm", [[0.0, 0.0, 45.0], [30.0, -30.0, 0.0]])
+def test_a_tip_that_is_far_off_is_still_one_place(off_mm):
+    """Another needle than the case states: its touches lie centimetres apart by the stated length."""
+    rng = np.random.default_rng(8)
+    T = poses(12, 45, 0.3, rng)
+    stated = T[:, :3, 3] + (T[:, :3, :3] @ (TIP - off_mm))
+    check_one_place([f"P{row}" for row in range(12)], stated, T[:, :3, :3], where="pivot")
+
+
+def test_one_touch_that_slipped_is_named():
+    """It misses by more than twice what the others do; where all miss alike the arm is named."""
+    T = poses(10, 45, 0.02, np.random.default_rng(5))
+    T[3, :3, 3] += [0.0, 4.0, 0.0]
+    names = tuple(f"P{row}" for row in range(10))
+    case = load_case(ROOT / "meshes" / "carton" / "case_m.toml")
+    slipped = pivot_text(PivotRun(case, pivot_calibration(T, 0.02), names, ()))
+    assert "P3 misses by" in slipped and "the tip slipped there" in slipped
+    alike = pivot_text(PivotRun(case, pivot_calibration(poses(10, 45, 0.5, np.random.default_rng(6)), 0.02), names, ()))
+    assert "all touches alike: the arm errs by more than it declares" in alike

@@ -4,7 +4,9 @@ With T_base_flange = (R_i, p_i) of pose i, the tip x in the flange frame and the
 
     R_i x + p_i = c      for all i: linear least squares in (x, c), 3 n equations for 6 unknowns
 
-With independent noise s per axis at each touch the residuals' mean square is s^2 (3 n - 6) / n.
+With independent noise s per axis at each touch the residuals' mean square is s^2 (3 n - 6) / n. Where the arm errs too,
+with C the covariance of what all n touches miss by and M the projection off A's columns, it is trace(M C M) / n, and
+the found tip's covariance is that of A^+ C A^+'.
 """
 
 from __future__ import annotations
@@ -33,29 +35,39 @@ class Pivot:
     Attributes:
         tip_flange: Shape (3,), mm, in the flange frame.
         place_base: Shape (3,), mm: where it stood.
-        cov_tip: Shape (3, 3), mm^2, of the tip, from the declared noise.
-        residual_mm: Root mean square distance of the n tips from their place.
-        expected_mm: The same as the declared noise leaves it.
+        cov_tip: Shape (3, 3), mm^2, of the tip, from all that is declared.
+        misses_mm: Shape (n,): the distance of each tip from their place.
+        expected_mm: Their root mean square as the declared touch noise leaves it.
+        expected_whole_mm: The same with what the arm errs by, where that was declared.
     """
 
     tip_flange: Floats
     place_base: Floats
     cov_tip: Floats
-    residual_mm: float
+    misses_mm: Floats
     expected_mm: float
+    expected_whole_mm: float
+
+    @property
+    def residual_mm(self) -> float:
+        """Root mean square distance of the n tips from their place."""
+        return float(np.sqrt(np.mean(self.misses_mm**2)))
 
     @property
     def large(self) -> bool:
-        """Whether the residual contradicts the declared noise."""
-        return self.residual_mm > LARGE * self.expected_mm
+        """Whether the residual contradicts what was declared."""
+        return self.residual_mm > LARGE * self.expected_whole_mm
 
 
-def pivot_calibration(T_base_flange: Floats, noise_mm: float, *, where: str = "pivot") -> Pivot:
+def pivot_calibration(
+    T_base_flange: Floats, noise_mm: float, *, arm_cov: Floats | None = None, where: str = "pivot"
+) -> Pivot:
     """The tip from poses that share its place.
 
     Args:
         T_base_flange: Shape (n, 4, 4), mm, as the controller computes them.
         noise_mm: Standard deviation of one touch, per axis.
+        arm_cov: Shape (3 n, 3 n), mm^2: of what the arm misses the place by, beside that noise; None for nothing.
         where: What errors name.
 
     Raises:
@@ -71,7 +83,10 @@ def pivot_calibration(T_base_flange: Floats, noise_mm: float, *, where: str = "p
         raise InputError(what, where=where, allowed="tilts of 20 degrees or more to several sides")
     found, *_ = np.linalg.lstsq(A, -T_base_flange[:, :3, 3].reshape(-1), rcond=None)
     left = (A @ found + T_base_flange[:, :3, 3].reshape(-1)).reshape(-1, 3)
-    cov = noise_mm**2 * np.linalg.inv(A.T @ A)
-    residual = float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
+    whole = noise_mm**2 * np.eye(3 * count) + (0.0 if arm_cov is None else arm_cov)
+    back = np.linalg.pinv(A)
+    off = np.eye(3 * count) - A @ back
     expected = noise_mm * float(np.sqrt((3 * count - 6) / count))
-    return Pivot(found[:3], found[3:], cov[:3, :3], residual, expected)
+    expected_whole = float(np.sqrt(np.trace(off @ whole @ off) / count))
+    cov = (back @ whole @ back.T)[:3, :3]
+    return Pivot(found[:3], found[3:], cov, np.linalg.norm(left, axis=1), expected, expected_whole)
