@@ -124,3 +124,43 @@ def test_a_scanned_case_has_the_verdicts_of_its_meshes(truth, tmp_path, capsys, 
     assert np.array_equal(found.safe[clear & ~at_skin], wanted.safe[clear & ~at_skin])
     assert (wanted.safe & clear).sum() > 30
     assert (~wanted.safe & ~found.safe).sum() > 60
+
+
+THIN = {"colon": 'role = "avoid"\nmargin_mm = 3.0', "ganglion": 'role = "avoid"\nmargin_mm = 9.0'}
+
+
+def test_what_is_thinner_than_a_voxel_is_not_lost(tmp_path, capsys):
+    """A sheet of 0.3 mm and a ball of 1 mm before the target: none is safe that breaks a margin by a voxel."""
+    sheet = trimesh.creation.box([50.0, 0.3, 50.0])
+    sheet.apply_transform(trimesh.transformations.rotation_matrix(0.4, [1.0, 0.3, -0.2]))
+    sheet.apply_translation([-30.0, -25.0, -15.0])
+    speck = trimesh.creation.icosphere(2, 0.5)
+    speck.apply_translation([11.3, -24.2, 22.1])
+    parts = {name: mesh for name, mesh in meshes().items() if name in ("skin", "lesion", "spine")}
+    text = CASE
+    for name, mesh in {**parts, "colon": sheet, "ganglion": speck}.items():
+        mesh.export(tmp_path / f"{name}.ply")
+        role = THIN.get(name) or ROLES[name]
+        text += f'[[structure]]\nname = "{name}"\nmesh = "{name}.ply"\nunit = "mm"\n{role}\n'
+    (tmp_path / "case.toml").write_text(text)
+    context = prepare(tmp_path, arm=False)
+    wanted = _answers(context, context.case.T_ct_entry[:3, :3])
+    out = tmp_path / "ct"
+    assert main(["scan", str(tmp_path), "--out", str(out), "--spacing", "2.5", "--pixel", "1.5", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["thin_voxels"]["colon"] > 50 and report["thin_voxels"]["ganglion"] >= 1
+    target = ",".join(str(round(one, 3)) for one in report["target_mm"])
+    assert main(["init", str(out), "--ct", "dicom", f"--target={target}"]) == 0
+    text = (out / "case.toml").read_text()
+    (out / "case.toml").write_text(text[: text.index("[needle]")] + NEEDLE + text[text.index("[search]") :])
+    scanned = prepare(out, arm=False)
+    found = _answers(scanned, context.case.T_ct_entry[:3, :3])
+    names = [one.name for one in scanned.anatomy.structures]
+    margin = {one.name: one.margin_mm for one in scanned.anatomy.structures}
+    voxel = np.linalg.norm([1.5, 1.5, 2.5])
+    for name in THIN:
+        column = [one.name for one in context.anatomy.structures].index(name)
+        lack = margin[name] - wanted.clearance.distance[:, column]
+        assert name in names and lack.max() > voxel
+        assert not np.any(found.safe & (lack > voxel))
+    assert found.safe.sum() > 50

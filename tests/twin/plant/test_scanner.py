@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
+import trimesh
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import InputError
@@ -170,3 +171,32 @@ def test_a_frame_of_its_own_is_laid_on_the_bed_by_a_rotation():
     assert np.allclose(R @ [1, 0, 0], [0, 0, 1])
     assert np.allclose(R @ [0, 0, 1], [0, -1, 0])
     assert np.allclose(scan_frame(load_case(folder() / "abdomen"), 0.0), np.eye(4))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_part_of_a_whole_solid_is_far_from_its_label(seed):
+    """A turned sheet, a rod and a ball, all thinner than a voxel: each point of them has their label within a diagonal.
+
+    A ball as thick as the voxels keeps the label of the centres.
+    """
+    rng = np.random.default_rng(seed)
+    sheet, _ = turned_box(rng.uniform(16, 18, 3), (18.0, 0.2, 14.0), rng.normal(size=3))
+    middle, along = rng.uniform(12, 16, 3), rng.normal(size=3)
+    thin = {"sheet": sheet, "rod": rod(middle, middle + 9 * along / np.linalg.norm(along), 0.3)}
+    thin["ball"] = ball(rng.uniform(8, 24, 3), 0.6)
+    solids = [Solid(name, mesh, 50.0, number, whole=True) for number, (name, mesh) in enumerate(thin.items(), start=1)]
+    solids.append(Solid("organ", ball(np.array([25.0, 8.0, 20.0]), 9.0), 50.0, 4, whole=True))
+    T = np.diag([1.0, 1.3, 2.0, 1.0])
+    image = scan_solids(solids, VolumeGrid((34, 26, 17), T, {}), STILL, np.random.default_rng(0))
+    bare = [solid._replace(whole=False) for solid in solids]
+    plain = scan_solids(bare, VolumeGrid((34, 26, 17), T, {}), STILL, np.random.default_rng(0))
+    for solid in solids[:3]:
+        mesh = trimesh.Trimesh(solid.mesh.vertices, solid.mesh.faces)
+        points = np.asarray(trimesh.sample.sample_surface(mesh, 2000, seed=seed)[0])
+        voxel = np.diag(T)[:3]
+        shown = np.argwhere(np.isin(image.labels[0], range(solid.label, 5))) * voxel  # what fills its place counts
+        beyond = np.maximum(np.abs(points[:, None] - shown) - voxel / 2, 0.0)  # of each voxel's box
+        assert np.linalg.norm(beyond, axis=2).min(axis=1).max() < np.linalg.norm(voxel)
+    assert image.thin["sheet"] > 20 and "organ" not in image.thin
+    np.testing.assert_array_equal(image.labels[0] == 4, plain.labels[0] == 4)
+    np.testing.assert_array_equal(image.hu, plain.hu)

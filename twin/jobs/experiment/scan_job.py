@@ -104,6 +104,7 @@ class ScanRun:
             "markers": list(self._markers()),
             "lesion": {"true_mm": true.tolist(), "found_mm": found.tolist(), "error_mm": (found - true).tolist()},
             "needle": None if self.control is None else control_summary(self.control),
+            "thin_voxels": dict(self.image.thin),
             "inputs": inputs_document(self.inputs),
             "files": [str(path) for path in self.files],
         }

@@ -24,6 +24,7 @@ def scan_text(run: ScanRun) -> str:
             *_marker_lines(facts),
             f"  {'lesion':<15}{_vector(facts['lesion']['error_mm'])}   read against true",
             *_needle_lines(facts["needle"]),
+            *_thin_lines(facts["thin_voxels"]),
             f"next: run-twin init {folder} --ct {SERIES} --target={target}",
         ]
     )
@@ -60,6 +61,11 @@ def _needle_lines(needle: dict[str, Any] | None) -> list[str]:
         "so that the "
         f"tip was read {needle['tip_reading_error_mm']:.2f} mm and {needle['angle_reading_error_deg']:.2f}° off",
     ]
+
+
+def _thin_lines(thin: dict[str, int]) -> list[str]:
+    parts = ", ".join(f"{name} ({count})" for name, count in thin.items())
+    return [f"  thin           parts thinner than a voxel have whole voxels of the labels: {parts}"] if thin else []
 
 
 def _vector(numbers: list[float]) -> str:

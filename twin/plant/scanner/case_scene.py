@@ -163,7 +163,8 @@ def _body(case: Case, anatomy: Anatomy) -> list[Solid]:
     region = case.region or "other"
     ordered = sorted((one for one in anatomy.structures if one.name in places), key=_filling)
     skin = Solid("skin", anatomy.skin.mesh, stated.get(_skin_name(case), SOFT_TISSUE_HU))
-    solids = [Solid(s.name, s.mesh, stated.get(s.name, default_hu(s.name, region)), *places[s.name]) for s in ordered]
+    hu = {s.name: stated.get(s.name, default_hu(s.name, region)) for s in ordered}
+    solids = [Solid(s.name, s.mesh, hu[s.name], *places[s.name], whole=s.demands_margin) for s in ordered]
     return [check_closed(one, str(case.path)) for one in (skin, *solids)]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.plant.scanner.coverage import cut_solids
 from puncture_twin.twin.plant.scanner.solids import Solid
+from puncture_twin.twin.plant.scanner.thin_parts import missed_voxels
 
 AIR_HU = -1000.0
 """By the scale's definition."""
@@ -56,13 +57,16 @@ class CtImage:
 
     Attributes:
         hu: Shape (nx, ny, nz), int16.
-        labels: Shape (layers, nx, ny, nz): what is labelled at each voxel's centre, in each label map.
+        labels: Shape (layers, nx, ny, nz): what is labelled at each voxel's centre, in each label map, and the parts of
+            whole solids that the centres miss.
         grid: Where the voxels lie, LPS mm.
+        thin: Name of a solid to the number of voxels whose label its thin parts got.
     """
 
     hu: NDArray[np.int16]
     labels: NDArray[Any]
     grid: VolumeGrid
+    thin: Mapping[str, int]
 
 
 def scan_solids(solids: Sequence[Solid], grid: VolumeGrid, settings: ScanSettings, rng: np.random.Generator) -> CtImage:
@@ -75,12 +79,32 @@ def scan_solids(solids: Sequence[Solid], grid: VolumeGrid, settings: ScanSetting
         rng: Draws the noise.
     """
     T_index_ct = np.linalg.inv(grid.T_ct_index)
-    corners = np.concatenate([apply(T_index_ct, solid.mesh.vertices)[solid.mesh.faces] for solid in solids])
+    each = [apply(T_index_ct, solid.mesh.vertices)[solid.mesh.faces] for solid in solids]
+    corners = np.concatenate(each)
     owners = np.repeat(np.arange(len(solids)), [len(solid.mesh.faces) for solid in solids])
     fills = np.array([solid.hu for solid in solids])
     labels = _label_table(solids)
     cut = cut_solids(corners, owners, fills, labels, grid.shape, spacing_mm=grid.spacing_mm, empty=AIR_HU)
-    return CtImage(_stored(cut.values, grid.spacing_mm, settings, rng), cut.labels, grid)
+    thin = _label_thin_parts(solids, each, labels, cut.labels)
+    return CtImage(_stored(cut.values, grid.spacing_mm, settings, rng), cut.labels, grid, thin)
+
+
+def _label_thin_parts(
+    solids: Sequence[Solid], corners: Sequence[Floats], table: NDArray[Any], labels: NDArray[Any]
+) -> dict[str, int]:
+    """Label what the centres of voxels miss of whole solids, in place; which, and how many voxels."""
+    counts: dict[str, int] = {}
+    for number, solid in enumerate(solids):
+        if solid.whole and solid.label:
+            layer = labels[solid.layer]
+            later = np.zeros(int(table[solid.layer].max()) + 1, bool)
+            later[table[solid.layer, number + 1 :]] = True
+            later[0] = False
+            missed = missed_voxels(layer, solid.label, corners[number], later)
+            layer[tuple(missed.T)] = solid.label
+            if len(missed):
+                counts[solid.name] = len(missed)
+    return counts
 
 
 def _label_table(solids: Sequence[Solid]) -> NDArray[Any]:

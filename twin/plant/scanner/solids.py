@@ -25,6 +25,7 @@ class Solid(NamedTuple):
         hu: What it is made of, Hounsfield units.
         label: Its number in its label map; 0 for what no segmentation names.
         layer: Which label map shows it: bodies that hold others have one of their own.
+        whole: Its label leaves out no part of it, however thin.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Solid(NamedTuple):
     hu: float
     label: int = 0
     layer: int = 0
+    whole: bool = False
 
 
 def check_closed(solid: Solid, where: str) -> Solid:
