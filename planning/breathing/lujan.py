@@ -38,3 +38,26 @@ def fraction_within(position: float, exponent: int) -> float:
         exponent: n of the curve.
     """
     return float(2 / np.pi * np.arcsin(np.clip(position, 0.0, 1.0) ** (1 / (2 * exponent))))
+
+
+def mean_square_within(position: float, exponent: int, about: float) -> float:
+    """Mean of (s - about)^2 over the time that the breath is at this position or nearer to exhale.
+
+    Without a gate it is C(4n, 2n) / 2^4n - 2 about C(2n, n) / 2^2n + about^2, of the powers of a sine.
+
+    Args:
+        position: s, 0 at exhale, 1 at full inhale.
+        exponent: n of the curve.
+        about: s of the place that is compared with.
+
+    >>> round(12 * mean_square_within(1.0, 4, 0.0) ** 0.5, 1)
+    5.3
+    """
+    end = np.arcsin(np.clip(position, 0.0, 1.0) ** (1 / (2 * exponent)))
+    nodes, weights = np.polynomial.legendre.leggauss(NODES)
+    s = np.sin(end * (nodes + 1) / 2) ** (2 * exponent)
+    return float(np.sum(weights * (s - about) ** 2) / 2)
+
+
+NODES = 32
+"""Of Gauss and Legendre: powers of a sine up to the 24th are exact to 1e-12 over a quarter of its period."""

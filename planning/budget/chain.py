@@ -10,6 +10,8 @@ from puncture_twin.planning.arm.insertion import away_from_singularities, flange
 from puncture_twin.planning.arm.kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.budget.bent_path import BentPath
+from puncture_twin.planning.budget.breath import Breath
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.case.errors import ErrorModel
@@ -42,6 +44,8 @@ class Chain:
         T_base_ct: Shape (4, 4), mm.
         target_ct: Shape (3,), mm.
         q_insertion: Shape (6,), rad, the tip on the target.
+        path: Of a needle that bends; None for a straight one.
+        breath: None where nobody declares it.
     """
 
     model: UrModel
@@ -54,17 +58,25 @@ class Chain:
     T_base_ct: Floats
     target_ct: Floats
     q_insertion: Floats
+    path: BentPath | None = None
+    breath: Breath | None = None
 
     def pose_error(self) -> PoseError:
         """Of this chain, its errors taken for declared."""
         noise = reading_noise(self.errors, self.model, self.tip_mm, self.q_touch, known=True)
         points_base = apply(self.T_base_ct, self.points_ct)
         fit = fit_uncertainty(self.method, fit_triad, self.T_base_ct, self.points_ct, points_base, noise, found=False)
-        return PoseError(self.model, self.tip_mm, apply(self.T_base_ct, self.target_ct), self.errors, fit)
+        bend = None if self.path is None else self.path.bend
+        return PoseError(self.model, self.tip_mm, apply(self.T_base_ct, self.target_ct), self.errors, fit, bend)
+
+    def tip_mean_square(self) -> Floats:
+        """Of the tip against the point that was meant, shape (3, 3), mm^2, base axes."""
+        still = self.pose_error().tip_covariance(self.q_insertion[None])[0]
+        return still if self.breath is None else still + self.breath.mean_square_base()
 
     def expected_mm(self) -> float:
         """Tip against the point that was meant, rms."""
-        return float(np.sqrt(np.trace(self.pose_error().tip_covariance(self.q_insertion[None])[0])))
+        return float(np.sqrt(np.trace(self.tip_mean_square())))
 
     def with_errors(self, errors: ErrorModel) -> Chain:
         """With other errors; weighted again as they ask for, unless the method is a triad."""
@@ -72,13 +84,14 @@ class Chain:
         return replace(self, errors=errors, method=method)
 
 
-def chain_of(case: Case, registration: Registration, q_insertion: Floats) -> Chain:
-    """The chain of a case.
+def chain_of(case: Case, registration: Registration, q_insertion: Floats, path: BentPath | None = None) -> Chain:
+    """The chain of a case, with its breathing.
 
     Args:
         case: With declared errors.
         registration: Of its markers, with the case's own declaration, to whose residuals the errors are scaled.
         q_insertion: Shape (6,), rad, the tip on the target.
+        path: Of the needle there, where it bends.
     """
     assert case.errors is not None and registration.uncertainty is not None
     scale = registration.uncertainty.test.scale
@@ -93,6 +106,8 @@ def chain_of(case: Case, registration: Registration, q_insertion: Floats) -> Cha
         registration.T_base_ct,
         case.target_ct,
         q_insertion,
+        path,
+        None if case.breathing is None else Breath(case.breathing, registration.T_base_ct[:3, :3]),
     )
 
 

@@ -10,6 +10,9 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.breathing.lujan import fraction_within
+from puncture_twin.planning.budget.bent_path import other_gauges
+from puncture_twin.planning.budget.breath import GATES
 from puncture_twin.planning.budget.chain import Chain
 from puncture_twin.planning.case.errors import ARM_KINDS, UNIFORM, ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
@@ -49,7 +52,7 @@ class Change:
     """Something that could be done differently.
 
     Attributes:
-        group: slices, markers, touches, arm or tip.
+        group: slices, markers, touches, arm, tip, needle or breath.
         what: In words.
         rms_mm: The tip's expected error then, all else as it is.
         point_ct: Shape (3,), mm, where the last of further markers sits; None for other changes.
@@ -65,9 +68,13 @@ def source_costs(chain: Chain) -> tuple[SourceCost, ...]:
     """Every source, the dearest first; their squares alone add up to the whole's."""
     outward_base = -flange_pose(chain.model, chain.q_insertion)[:3, 2]
     budget = error_budget(chain.pose_error(), chain.q_insertion, outward_base)
+    squares = {source: budget.rms_mm**2 * part for source, part in budget.fraction.items()}
+    if chain.breath is not None:
+        squares["breathing"] = float(np.trace(chain.breath.mean_square_base()))
+    whole = sum(squares.values())
     costs = [
-        SourceCost(source, budget.rms_mm * float(np.sqrt(part)), budget.rms_mm * float(np.sqrt(max(1.0 - part, 0.0))))
-        for source, part in budget.fraction.items()
+        SourceCost(source, float(np.sqrt(square)), float(np.sqrt(max(whole - square, 0.0))))
+        for source, square in squares.items()
     ]
     return tuple(sorted(costs, key=lambda one: -one.alone_mm))
 
@@ -84,6 +91,8 @@ def changes(chain: Chain, skin_points_ct: Floats, bed_ct: Floats | None) -> tupl
         *([] if bed_ct is None else _slices(chain, bed_ct)),
         *_touches(chain),
         *_arms(chain),
+        *_needles(chain),
+        *_gates(chain),
         *_fewer_markers(chain),
         *_more_markers(chain, skin_points_ct),
     )
@@ -128,6 +137,31 @@ def _arms(chain: Chain) -> Iterator[Change]:
         yield Change("arm", f"a {name} arm", chain.with_errors(replace(chain.errors, arm=of_kind)).expected_mm())
     pivoted = replace(chain.errors, arm=replace(arm, tip_offset_mm=chain.scale * PIVOTED_MM))
     yield Change("tip", f"a tip known to {PIVOTED_MM:g} mm", chain.with_errors(pivoted).expected_mm())
+
+
+def _needles(chain: Chain) -> Iterator[Change]:
+    path = chain.path
+    if path is None:
+        return
+    for number, shaft in other_gauges(path.bending.shaft).items():
+        other = path.with_shaft(shaft)
+        bends = f"bends by {other.bend.tip_mm:.1f} mm"
+        yield Change("needle", f"a {number}G needle ({bends})", replace(chain, path=other).expected_mm())
+    if path.bending.alpha > 0:
+        yield Change("needle", "a needle without a bevel", replace(chain, path=path.without_bevel()).expected_mm())
+
+
+def _gates(chain: Chain) -> Iterator[Change]:
+    if chain.breath is None:
+        return
+    declared = chain.breath.breathing
+    for gate in GATES:
+        if gate == declared.gate:
+            continue
+        breath = replace(chain.breath, breathing=replace(declared, gate=gate))
+        part = 1.0 if gate is None else fraction_within(gate, declared.exponent)
+        when = "at any phase" if gate is None else f"at s <= {gate:g} ({100 * part:.0f} % of the time)"
+        yield Change("breath", f"inserted {when}", replace(chain, breath=breath).expected_mm())
 
 
 def _fewer_markers(chain: Chain) -> Iterator[Change]:

@@ -63,6 +63,7 @@ SOURCES: Mapping[str, Source] = MappingProxyType(
         "tip_offset": Source("offset of the needle's tip", "tip_offset_mm", "mm"),
         "needle_direction": Source("direction of the needle", "needle_direction_deg", "deg"),
         "bend": Source("bending of the needle", "bevel_deg", "deg"),
+        "breathing": Source("breathing while it is inserted", "amplitude_mm", "mm"),
         "surface": Source("surfaces of the structures", "surface_mm", "mm"),
     }
 )

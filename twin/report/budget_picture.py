@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,13 @@ from matplotlib.figure import Figure
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.twin.report.palette import PNG_LEVEL
 
-FIGURE_INCHES, DPI = (13.2, 5.6), 110
+WIDTH_INCHES, HEAD_INCHES, ROW_INCHES, DPI = 13.2, 1.6, 0.25, 110
+LEAST_ROWS = 16
+"""Of changes; more of them make the picture higher."""
+
+ROOM_FOR_NUMBERS = 1.12
+"""Beside the longest bar."""
+
 ALONE, BETTER, WORSE = "#0072b2", "#009e73", "#d55e00"
 """Okabe and Ito's blue, green and vermilion; better and worse lie on two sides of a line besides."""
 
@@ -27,7 +34,18 @@ def draw_budget(facts: Mapping[str, Any], path: Path) -> None:
         facts: As ``register --json`` has them under ``budget``.
         path: The PNG to write; it appears whole or not at all.
     """
-    figure = Figure(figsize=FIGURE_INCHES, dpi=DPI, facecolor="white", layout="constrained")
+    with atomic(path) as temporary:
+        temporary.write_bytes(budget_png(facts))
+
+
+def budget_png(facts: Mapping[str, Any]) -> bytes:
+    """The picture as a PNG.
+
+    Args:
+        facts: As of `draw_budget`.
+    """
+    inches = (WIDTH_INCHES, HEAD_INCHES + ROW_INCHES * max(LEAST_ROWS, len(facts["changes"])))
+    figure = Figure(figsize=inches, dpi=DPI, facecolor="white", layout="constrained")
     sources, what_if = figure.subplots(1, 2)
     _sources(sources, facts)
     _changes(what_if, facts)
@@ -37,9 +55,10 @@ def draw_budget(facts: Mapping[str, Any], path: Path) -> None:
         f"{best['expected_mm']:.2f} mm",
         fontsize=11.5,
     )
-    with atomic(path) as temporary:
-        FigureCanvasAgg(figure)
-        figure.savefig(temporary, format="png", pil_kwargs={"compress_level": PNG_LEVEL})
+    FigureCanvasAgg(figure)
+    held = BytesIO()
+    figure.savefig(held, format="png", pil_kwargs={"compress_level": PNG_LEVEL})
+    return held.getvalue()
 
 
 def _sources(axes: Axes, facts: Mapping[str, Any]) -> None:
@@ -48,6 +67,7 @@ def _sources(axes: Axes, facts: Mapping[str, Any]) -> None:
     for at, one in enumerate(rows):
         axes.text(one["alone_mm"], at, f" {one['alone_mm']:.2f}", va="center", fontsize=9)
     axes.invert_yaxis()
+    axes.set_xlim(right=ROOM_FOR_NUMBERS * max(one["alone_mm"] for one in rows))
     axes.set_xlabel("the tip's error (rms), were there no other source, mm")
     axes.set_title("each source alone: their squares add up", fontsize=10)
     _plain(axes)

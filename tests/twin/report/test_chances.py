@@ -96,6 +96,36 @@ def test_the_page_says_how_sure_it_is(shown, tmp_path):
     assert "p_touch_any" in known and "p_touch_any" not in unknown
 
 
+BUDGET = {
+    "expected_mm": 2.0,
+    "sources": [
+        {"text": "touch noise", "alone_mm": 1.6, "without_mm": 1.2},
+        {"text": "no", "alone_mm": 0.001, "without_mm": 2.0},
+    ],
+    "changes": [{"group": "slices", "text": "slices of 1 mm", "expected_mm": 1.25}],
+    "best": {"group": "slices", "text": "slices of 1 mm", "expected_mm": 1.25},
+    "not_modelled": "tissue that moves",
+}
+
+
+def test_the_page_says_where_the_next_millimetre_is_won(shown, tmp_path):
+    """The picture in the page itself, its numbers below, and nothing where there is no budget."""
+    case, found = shown
+    told, plain = tmp_path / "told.html", tmp_path / "plain.html"
+    parts = (case, world.make_anatomy(), found, world.make_plan(case, found), None, world.make_registration())
+    write_page(*parts, told, uncertainty=Uncertainty(DOUBT, None, None, BUDGET))
+    write_page(*parts, plain, uncertainty=Uncertainty(DOUBT, None, None))
+    text = told.read_text()
+    section = text[text.index('<h2 id="budget">') : text.index('<h2 id="windows">')]
+    assert "The next 0.75 mm is won by slices of 1 mm." in section
+    assert "data:image/png;base64,iVBOR" in section
+    for number in ("1.60", "1.20", "1.25"):
+        assert f"{number}</td>" in section
+    assert "0.00" not in section.replace(section[section.index("base64,") : section.index('" style')], "")
+    assert 'href="#budget"' in text and "budget" not in plain.read_text().split("<h2")[1]
+    assert 'id="budget"' not in plain.read_text()
+
+
 def test_a_truth_that_equals_the_belief_is_said_above_all(shown, tmp_path):
     """Before the cards."""
     case, found = shown

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.anatomy import load_skin
+from puncture_twin.planning.anatomy.anatomy import load_anatomy, load_skin
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
@@ -165,7 +165,7 @@ def _advice(case: Case, registration: Registration) -> dict[str, Any]:
     touchable = touchable_points(case, skin.mesh, registration.T_base_ct)
     more = one_more(registration, case.target_ct, touchable)
     return {
-        "budget": budget_facts(case, registration, touchable),
+        "budget": budget_facts(case, registration, touchable, partial(load_anatomy, case, cache=user_cache())),
         "half_axes_95_mm": (uncertainty.test.region_factor * np.sqrt(np.linalg.eigvalsh(cov)[::-1])).tolist(),
         "share": {"markers_ct": float(read / (read + touched)), "touch": float(touched / (read + touched))},
         "without": {

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.budget.chain import chain_of, reached_insertion
+from puncture_twin.planning.budget.bent_path import bent_path
+from puncture_twin.planning.budget.chain import Chain, chain_of, reached_insertion
 from puncture_twin.planning.budget.what_if import Change, best_change, changes, source_costs
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
@@ -23,21 +27,32 @@ SHOWN_MM = 0.005
 """A source that costs less is not printed: it would be 0.00."""
 
 
-def budget_facts(case: Case, registration: Registration, skin_points_ct: Floats) -> dict[str, Any] | None:
-    """The budget of an insertion that the arm reaches, mm; None where it reaches none, or no errors are declared.
+def budget_facts(
+    case: Case,
+    registration: Registration,
+    skin_points_ct: Floats,
+    anatomy: Callable[[], Anatomy],
+    q_insertion: Floats | None = None,
+) -> dict[str, Any] | None:
+    """The budget of one insertion, mm; None where the arm reaches none, or no errors are declared.
 
     Args:
         case: The case.
         registration: Of its markers.
         skin_points_ct: Shape (n, 3), mm, where a further marker could sit.
+        anatomy: Its structures; called where they bend a needle alone.
+        q_insertion: Shape (6,), rad, the tip on the target; None takes one that the arm reaches.
     """
-    q = reached_insertion(case, registration.T_base_ct) if registration.uncertainty is not None else None
+    if registration.uncertainty is None:
+        return None
+    q = reached_insertion(case, registration.T_base_ct) if q_insertion is None else q_insertion
     if q is None:
         return None
-    chain = chain_of(case, registration, q)
+    outward_ct = -(registration.T_base_ct[:3, :3].T @ flange_pose(ur_model(case.robot.model), q)[:3, 2])
+    path = None if case.bending is None else bent_path(case, anatomy(), outward_ct)
+    chain = chain_of(case, registration, q, path)
     found = changes(chain, skin_points_ct, _bed_ct(case, chain.errors.marker_cov_ct))
     best = best_change(found)
-    outward_ct = -(registration.T_base_ct[:3, :3].T @ flange_pose(chain.model, q)[:3, 2])
     theta, beta = angles(outward_ct @ case.T_ct_entry[:3, :3])
     return {
         "theta_deg": float(np.degrees(theta)),
@@ -49,8 +64,15 @@ def budget_facts(case: Case, registration: Registration, skin_points_ct: Floats)
         ],
         "changes": [_change(case, one) for one in found],
         "best": _change(case, best),
-        "not_modelled": NOT_MODELLED,
+        "not_modelled": _not_modelled(chain),
     }
+
+
+def _not_modelled(chain: Chain) -> str:
+    """What no source of this budget stands for."""
+    counted = (chain.breath is not None, chain.path is not None)
+    breath, bend, *others = NOT_MODELLED.split(", ")
+    return ", ".join([*(text for text, in_it in zip((breath, bend), counted, strict=True) if not in_it), *others])
 
 
 def _change(case: Case, one: Change) -> dict[str, Any]:

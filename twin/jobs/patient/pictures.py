@@ -6,14 +6,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import read_inputs
 from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.registration.touching import touchable_points
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
+from puncture_twin.twin.jobs.patient.budget import budget_facts
 from puncture_twin.twin.jobs.patient.names import FILM, PAGE, ROOMS, SLICES
 from puncture_twin.twin.jobs.patient.run import Run
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
@@ -115,11 +120,24 @@ def _uncertainty(run: Run) -> Uncertainty | None:
     picture = next((path for path in run.files if path.name == ROOMS), None)
     rooms = None if run.distribution is None else run.distribution.summary()
     if run.plan is not None:
-        return Uncertainty(context.doubt_at(run.plan.outward_ct, run.plan.insertion.q[-1]), rooms, picture)
+        q = run.plan.insertion.q[-1]
+        return Uncertainty(context.doubt_at(run.plan.outward_ct, q), rooms, picture, _budget(context, q))
     if not len(found.ranked):
         return Uncertainty(None, rooms, picture)
     row = found.ranked[0]
-    return Uncertainty(context.explain(found.theta[row], found.beta[row]).doubt, rooms, picture)
+    doubt = context.explain(found.theta[row], found.beta[row]).doubt
+    return Uncertainty(doubt, rooms, picture, _budget(context, found.arm.q_insertion[row]))
+
+
+def _budget(context: CaseContext, q_insertion: Floats) -> Mapping[str, Any] | None:
+    """Of one insertion; None where markers or the arm do not say."""
+    registration = context.placement.registration if context.placement is not None else None
+    if registration is None or not np.isfinite(q_insertion).all():
+        return None
+    case, anatomy = context.case, context.anatomy
+    touchable = touchable_points(case, anatomy.skin.mesh, registration.T_base_ct)
+    with context.stages.time("budget"):
+        return budget_facts(case, registration, touchable, lambda: anatomy, q_insertion)
 
 
 def _check_png(path: Path) -> None:

@@ -26,6 +26,7 @@ from puncture_twin.twin.report.numbers import (
     target_text,
 )
 from puncture_twin.twin.report.page import page_tables as tables
+from puncture_twin.twin.report.page.page_budget import budget_section
 from puncture_twin.twin.report.page.page_chances import chance_card, chances_section, rooms_section
 from puncture_twin.twin.report.page.page_charts import rehearsal_charts
 from puncture_twin.twin.report.page.page_dates import dates_text
@@ -44,11 +45,13 @@ class Uncertainty(NamedTuple):
         doubt: Of the chosen direction, or None where it has no chances.
         rooms: A `Distribution` as plain values, or None.
         picture: ``rooms.png``, or None.
+        budget: Of the chosen direction, as ``register --json`` has it, or None.
     """
 
     doubt: Doubt | None
     rooms: Mapping[str, Any] | None = None
     picture: Path | None = None
+    budget: Mapping[str, Any] | None = None
 
 
 def write_page(
@@ -106,6 +109,7 @@ def write_page(
         refused=_refused(candidates),
         cards=_cards(candidates, pick, plan, rehearsal, None if uncertainty is None else uncertainty.doubt),
         chances=None if uncertainty is None else chances_section(uncertainty.doubt, registration),
+        budget=None if uncertainty is None or uncertainty.budget is None else budget_section(uncertainty.budget),
         rooms=None if uncertainty is None else rooms_section(uncertainty.rooms, uncertainty.picture),
         counts=tables.counts_table(candidates),
         best=tables.best_table(candidates),

@@ -79,4 +79,9 @@ def packed(text: str) -> Markup:
 
 def data_address(picture: Path) -> str:
     """A PNG as an address that carries it."""
-    return "data:image/png;base64," + base64.b64encode(picture.read_bytes()).decode("ascii")
+    return png_address(picture.read_bytes())
+
+
+def png_address(picture: bytes) -> str:
+    """The same of a PNG that is no file."""
+    return "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
