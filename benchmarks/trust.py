@@ -37,11 +37,13 @@ from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.reach.standoff import axis_lengths
+from puncture_twin.planning.registration.aim import aim_at
+from puncture_twin.planning.registration.aim_correction import aimed
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
 from puncture_twin.planning.registration.noise_test import NoiseTest
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.reading_noise import reading_noise
-from puncture_twin.planning.registration.registration import MarkerPairs, fit_rigid, register
+from puncture_twin.planning.registration.registration import MarkerPairs, Method, fit_rigid, register
 from puncture_twin.planning.registration.touch_poses import touching_configuration
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.organs import organ_candidates
@@ -176,23 +178,32 @@ def _reached(context: CaseContext, T_base_ct: np.ndarray, count: int) -> tuple[n
     return np.array(outward), np.array(kept)
 
 
-def punctures(of: Scene, markers: int) -> Iterator[tuple[Puncture, PoseError]]:
-    """Each direction's puncture, and the belief that the declaration gives of it."""
+def punctures(of: Scene, markers: int, *, corrected: bool = False) -> Iterator[tuple[Puncture, PoseError]]:
+    """Each direction's puncture, and the belief that the declaration gives of it; its aim corrected, or not."""
     case, T = of.context.case, of.T_base_ct
     model, tip, points = ur_model(case.robot.model), case.needle.length_mm, of.points_ct[:markers]
     there, down = apply(T, points), -(T[:3, :3] @ case.T_ct_entry[:3, 2])
     q_touch = np.array([touching_configuration(model, tip, point, down) for point in there])
     noise = reading_noise(of.errors, model, tip, q_touch, known=True)
     pairs = MarkerPairs(tuple(f"M{i}" for i in range(markers)), points, there)
-    fitted = register(pairs, method="weighted", target_ct=case.target_ct, noise=noise)
-    assert fitted.uncertainty is not None
-    error = PoseError(model, tip, apply(T, case.target_ct), of.errors, fitted.uncertainty)
+    method: Method = "joint" if corrected else "weighted"
+    fitted, target = register(pairs, method=method, target_ct=case.target_ct, noise=noise), case.target_ct
     for outward, q in zip(of.outward_ct, of.q, strict=True):
-        yield Puncture(model, tip, "weighted", noise, points, q_touch, T, case.target_ct, outward, q), error
+        done = aimed(fitted, aim_at(model, tip, target, q)) if corrected else fitted
+        assert done.uncertainty is not None
+        error = PoseError(model, tip, apply(T, target), of.errors, done.uncertainty)
+        yield Puncture(model, tip, method, noise, points, q_touch, T, target, outward, q, aim=done.aim), error
 
 
 def tally(
-    of: Scene, markers: int, rooms: int, *, truth: float = 1.0, found: bool = True, seed: int = SEED
+    of: Scene,
+    markers: int,
+    rooms: int,
+    *,
+    truth: float = 1.0,
+    found: bool = True,
+    seed: int = SEED,
+    corrected: bool = False,
 ) -> dict[str, Tally]:
     """Rooms of one anatomy and set of markers, by what is known of the noise.
 
@@ -207,10 +218,11 @@ def tally(
         truth: The true errors over the declared ones.
         found: Whether rooms of found noise are drawn too.
         seed: Of all draws.
+        corrected: Whether each direction's aim is corrected by what the residuals tell of the arm.
     """
     rng, each, freedom = np.random.default_rng(seed), max(rooms // len(of.q), 1), 3 * markers - 6
     sums = {"known": _Sums.empty(), "found": _Sums.empty(), "found, size 1": _Sums.empty()}
-    for puncture, error in punctures(of, markers):
+    for puncture, error in punctures(of, markers, corrected=corrected):
         drawn = draw_rooms(puncture, of.errors.scaled(truth), each, rng).reached_alone()
         came, sizes = _came(of, puncture, error, drawn), np.sqrt(drawn.chi_squared / freedom)
         sums["known"].add(_predicted(of, error, puncture, None), np.ones(len(sizes)), drawn, came)
@@ -413,6 +425,9 @@ def main() -> None:
                 right, wrong = tally(of, markers, rooms), tally(of, markers, rooms // 4, truth=2.0, found=False)
                 rows = list(right.items())
                 rows.append(("known, true errors twice the declared", wrong["known"]))
+                for truth, name in ((1.0, "known, aim corrected"), (2.0, "aim corrected, true errors twice")):
+                    aimed_at = tally(of, markers, rooms // 4, truth=truth, found=False, corrected=True)
+                    rows.append((name, aimed_at["known"]))
                 for noise, figures in rows:
                     lines.append(f"| {of.name} | {markers} | {noise} | {figures.text()} |")
                     print(lines[-1], flush=True)

@@ -13,6 +13,8 @@ from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.errors_section import ErrorsSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.aim import aim_at
+from puncture_twin.planning.registration.aim_correction import aimed
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.registration.registration import MarkerPairs, fit_rigid, register
@@ -55,7 +57,7 @@ def world(case_file, method, errors, *, touch_like_insertion=False, moved=None):
 
     Args:
         case_file: Below the embedded meshes.
-        method: Of the registration.
+        method: Of the registration, or ``corrected``: the joint one, corrected for the direction.
         errors: As declared.
         touch_like_insertion: Whether markers are touched with the insertion's own orientation and branch.
         moved: T_base_base, by which the patient is moved for the arm.
@@ -76,11 +78,15 @@ def world(case_file, method, errors, *, touch_like_insertion=False, moved=None):
         q_touch = np.array([touching_configuration(model, tip, point, down) for point in there])
     noise = reading_noise(errors, model, tip, q_touch, known=True)
     markers = MarkerPairs(found.names, found.points_ct, there)
-    fitted = register(markers, method=method, target_ct=case.target_ct, noise=noise)
+    fit = "joint" if method == "corrected" else method
+    fitted = register(markers, method=fit, target_ct=case.target_ct, noise=noise)
+    if method == "corrected":
+        fitted = aimed(fitted, aim_at(model, tip, case.target_ct, q))
     error = PoseError(model, tip, target, errors, fitted.uncertainty)
     puncture = Puncture(
-        model, tip, method, noise, found.points_ct, q_touch, fitted.T_base_ct, case.target_ct, outward_ct, q
-    )
+        model, tip, fit, noise, found.points_ct, q_touch, fitted.T_base_ct, case.target_ct, outward_ct, q,
+        aim=fitted.aim,
+    )  # fmt: skip
     return World(errors, error, puncture)
 
 

@@ -6,27 +6,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from puncture_twin.planning.arm.insertion import away_from_singularities, flange_poses
-from puncture_twin.planning.arm.kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.budget.bent_path import BentPath
 from puncture_twin.planning.budget.breath import Breath
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.aim import Aim
+from puncture_twin.planning.registration.aim_correction import aimed_uncertainty
 from puncture_twin.planning.registration.fit_uncertainty import fit_uncertainty
 from puncture_twin.planning.registration.placement import default_method, touches
 from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.registration.registration import Registration, fit_triad
 from puncture_twin.planning.uncertainty.pose_error import PoseError
-
-TILTS_DEG = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)
-"""Puncture angles that are tried for an insertion that the arm reaches, in this order."""
-
-AZIMUTHS = 12
-"""Directions tried at each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +29,7 @@ class Chain:
     Attributes:
         model: The arm.
         tip_mm: Flange to tip.
-        method: Of the registration: triad, rigid or weighted.
+        method: Of the registration: triad, rigid, weighted or joint.
         errors: As declared, times ``scale``.
         scale: By which the markers' residuals multiply every declared error: 1 where they agree.
         points_ct: Shape (N, 3), mm, the markers.
@@ -46,6 +39,7 @@ class Chain:
         q_insertion: Shape (6,), rad, the tip on the target.
         path: Of a needle that bends; None for a straight one.
         breath: None where nobody declares it.
+        aim: The insertion that a joint registration is corrected for.
     """
 
     model: UrModel
@@ -60,14 +54,18 @@ class Chain:
     q_insertion: Floats
     path: BentPath | None = None
     breath: Breath | None = None
+    aim: Aim | None = None
 
     def pose_error(self) -> PoseError:
         """Of this chain, its errors taken for declared."""
         noise = reading_noise(self.errors, self.model, self.tip_mm, self.q_touch, known=True)
         points_base = apply(self.T_base_ct, self.points_ct)
         fit = fit_uncertainty(self.method, fit_triad, self.T_base_ct, self.points_ct, points_base, noise, found=False)
+        target = apply(self.T_base_ct, self.target_ct)
+        if self.aim is not None:
+            fit = aimed_uncertainty(fit, self.points_ct, self.T_base_ct, target, self.aim)
         bend = None if self.path is None else self.path.bend
-        return PoseError(self.model, self.tip_mm, apply(self.T_base_ct, self.target_ct), self.errors, fit, bend)
+        return PoseError(self.model, self.tip_mm, target, self.errors, fit, bend)
 
     def tip_mean_square(self) -> Floats:
         """Of the tip against the point that was meant, shape (3, 3), mm^2, base axes."""
@@ -79,8 +77,8 @@ class Chain:
         return float(np.sqrt(np.trace(self.tip_mean_square())))
 
     def with_errors(self, errors: ErrorModel) -> Chain:
-        """With other errors; weighted again as they ask for, unless the method is a triad."""
-        method = self.method if self.method == "triad" else default_method(errors)
+        """With other errors; weighted again as they ask for, unless the method is a triad, or joint with the arm."""
+        method = self.method if self.method in {"triad", "joint"} else default_method(errors)
         return replace(self, errors=errors, method=method)
 
 
@@ -108,25 +106,5 @@ def chain_of(case: Case, registration: Registration, q_insertion: Floats, path: 
         q_insertion,
         path,
         None if case.breathing is None else Breath(case.breathing, registration.T_base_ct[:3, :3]),
+        registration.aim,
     )
-
-
-def reached_insertion(case: Case, T_base_ct: Floats) -> Floats | None:
-    """Joints (6,), rad, that hold the tip on the target at the least puncture angle tried; None where none reach.
-
-    Only an arm's kinematics are looked at: organs and collisions are the search's.
-    """
-    model = ur_model(case.robot.model)
-    target = apply(T_base_ct, case.target_ct)
-    home = np.zeros(6)
-    for tilt in np.radians(TILTS_DEG):
-        azimuths = np.linspace(0, 2 * np.pi, AZIMUTHS if tilt else 1, endpoint=False)
-        local = np.array([outward(float(tilt), float(azimuth)) for azimuth in azimuths])
-        directions = local @ (T_base_ct[:3, :3] @ case.T_ct_entry[:3, :3]).T
-        q = inverse(model, flange_poses(target, directions, case.needle.length_mm)).reshape(-1, 6)
-        q = nearest_within_limits(model, q, home)
-        q = q[~np.isnan(q).any(axis=1)]
-        q = q[away_from_singularities(model, q)]
-        if len(q):
-            return np.asarray(q[0])
-    return None

@@ -196,7 +196,7 @@ def _more_markers(chain: Chain, skin_points_ct: Floats) -> Iterator[Change]:
 def _with_one_more(chain: Chain, point_ct: Floats, q: Floats) -> Chain:
     """A triad takes three: with more markers the fit is that of the declared errors."""
     grown = replace(chain, points_ct=np.vstack([chain.points_ct, point_ct]), q_touch=np.vstack([chain.q_touch, q]))
-    return replace(grown, method="rigid").with_errors(chain.errors)
+    return (replace(grown, method="rigid") if chain.method == "triad" else grown).with_errors(chain.errors)
 
 
 def _touch_like_insertion(chain: Chain, points_ct: Floats) -> Floats:

@@ -411,6 +411,10 @@ class CaseFile(Section):
             raise ValueError("[registration] and [robot.mount] both say where the base is; keep one")
         if self.errors is None and self.rehearsal.errors is not None:
             raise ValueError("[rehearsal.errors] is a truth that differs from [errors], which is not there")
+        if self.errors is None and self.registration is not None and self.registration.correct:
+            raise ValueError(
+                "registration.correct needs [errors]: it tells the arm's errors by what is declared of them"
+            )
         chances = (self.search.min_hit, self.search.max_touch, self.search.max_touch_of or None)
         if self.errors is None and any(chance is not None for chance in chances):
             raise ValueError("search.min_hit and max_touch need [errors]: without declared errors there is no chance")

@@ -8,14 +8,14 @@ import numpy as np
 from pydantic import model_validator
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.case.toml_types import Positive, Section, Text, Yes
+from puncture_twin.planning.case.toml_types import Positive, Section, Sextuple, Text, Yes
 from puncture_twin.planning.geometry.rigid import inverse, pose
 
 RAS_OF_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Its own inverse."""
 NO_RESIDUALS = "stated transform {file}: no residuals, expected error unknown"
 
-_OF_MARKERS = ("method", "use", "fle_mm", "accept_residuals", "accept_symmetry")
+_OF_MARKERS = ("method", "use", "fle_mm", "correct", "correct_joints_deg", "accept_residuals", "accept_symmetry")
 
 
 class RegistrationSection(Section):
@@ -26,11 +26,21 @@ class RegistrationSection(Section):
     markers_base: str | None = None
     use: tuple[Text, ...] | None = None
     fle_mm: Positive | None = None
+    correct: Yes = False
+    correct_joints_deg: Sextuple | None = None
     accept_residuals: Yes = False
     accept_symmetry: Yes = False
     transform: str | None = None
     transform_maps: Literal["base_to_ct", "ct_to_base"] | None = None
     base_axes: Literal["LPS", "RAS"] | None = None
+
+    @model_validator(mode="after")
+    def _corrected(self) -> Self:
+        if self.correct_joints_deg is not None and not self.correct:
+            raise ValueError("correct_joints_deg is the insertion that correct = true corrects for")
+        if self.correct and self.method not in {None, "weighted"}:
+            raise ValueError(f'correct = true has a fit of its own; method "{self.method}" has another')
+        return self
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:

@@ -57,6 +57,27 @@ def fit_weighted(points_ct: Floats, points_base: Floats, noise: ReadingNoise, T_
     return pose(U @ Vt, t)
 
 
+def fit_joint(points_ct: Floats, points_base: Floats, noise: ReadingNoise, T_start: Floats) -> Floats:
+    """T_base_ct, shape (..., 4, 4), that minimises z' C^-1 z: the arm's errors, common to all markers, count too.
+
+    The arguments are those of `fit_weighted`. C is taken at T_start, from which the fit turns by little.
+    """
+    R, t, center = T_start[..., :3, :3], T_start[..., :3, 3], points_base.mean(axis=-2)
+    weights = np.linalg.inv(noise.whole(R))
+    for _ in range(STEPS):
+        fitted = points_ct @ _transposed(R) + t[..., None, :]
+        blocks = _blocks(fitted, center)
+        A = blocks.reshape(*blocks.shape[:-3], -1, 6)
+        weighted = np.swapaxes(A, -1, -2) @ weights
+        residuals = (points_base - fitted).reshape(*A.shape[:-1], 1)
+        step = np.linalg.solve(weighted @ A, weighted @ residuals)[..., 0]
+        turn = exp_rotation(step[..., 3:])
+        t = (turn @ (t - center)[..., None])[..., 0] + center + step[..., :3]
+        R = turn @ R
+    U, _, Vt = np.linalg.svd(R)  # as in `fit_weighted`
+    return pose(U @ Vt, t)
+
+
 def _blocks(points: Floats, center: Floats) -> Floats:
     """A_i = [I, -[p_i - c]x], shape (..., N, 3, 6)."""
     eye = np.broadcast_to(np.eye(3), (*points.shape, 3))

@@ -71,7 +71,7 @@ def fit_uncertainty(
     """The uncertainty of a pose that a method fitted.
 
     Args:
-        method: ``rigid`` and ``weighted`` have a formula; of others ``fit`` is differenced.
+        method: ``rigid``, ``weighted`` and ``joint`` have a formula; of others ``fit`` is differenced.
         fit: From points (N, 3) in both frames to T_base_ct.
         T_base_ct: Shape (4, 4), what it gave.
         points_ct: Shape (N, 3), mm.
@@ -82,8 +82,9 @@ def fit_uncertainty(
     R, center = T_base_ct[:3, :3], points_base.mean(axis=0)
     fitted = points_ct @ R.T + T_base_ct[:3, 3]
     A, omega = design(fitted, center), noise.independent(R)
-    if method == "weighted":
-        L = least_squares_map(A, np.asarray(np.linalg.inv(omega), dtype=np.float64))
+    if method in {"weighted", "joint"}:
+        cov = omega if method == "weighted" else omega + noise.shared()
+        L = least_squares_map(A, np.asarray(np.linalg.inv(cov), dtype=np.float64))
     elif method == "rigid":
         L = least_squares_map(A)
     else:

@@ -15,7 +15,11 @@ from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.aim import aim_at
+from puncture_twin.planning.registration.aim_correction import aimed
+from puncture_twin.planning.registration.reached_insertion import reached_insertion
 from puncture_twin.planning.registration.reading_noise import ReadingNoise, reading_noise
 from puncture_twin.planning.registration.registration import (
     MarkerPairs,
@@ -29,6 +33,9 @@ from puncture_twin.planning.registration.touch_poses import touching_configurati
 
 MAX_JOINTS_OFF_MM = 5.0
 """A controller with its own calibration puts the tip up to some mm from where the data sheet's arm does."""
+
+MAX_AIM_OFF_MM = 20.0
+"""A plan's joints are at the target as it was corrected then: no nominal arm errs by so much."""
 
 GUESSED_HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 """An arm bent at the elbow, its needle down."""
@@ -69,7 +76,7 @@ def load_placement(case: Case) -> Placement | None:
     errors = case.errors
     registration = register(
         markers,
-        method=settings.method or default_method(errors),
+        method="joint" if settings.correct else settings.method or default_method(errors),
         target_ct=case.target_ct,
         fle_mm=settings.fle_mm if errors is None else None,
         noise=None if errors is None else marker_noise(case, errors, markers, where=where),
@@ -77,8 +84,48 @@ def load_placement(case: Case) -> Placement | None:
         accept_residuals=settings.accept_residuals,
         where=where,
     )
+    if settings.correct:
+        registration = corrected(case, registration, where=where)
     error = float(registration.expected_tre_mm(case.target_ct[None])[0])
     return Placement(registration.T_base_ct, registration, error)
+
+
+def corrected(case: Case, registration: Registration, *, where: str | Path) -> Registration:
+    """A joint registration whose aim is corrected for the insertion that the case states, or for one that is reached.
+
+    Raises:
+        InputError: Nobody says how the arm stood at the touches, the stated insertion is not at the target, or none is
+            reached.
+    """
+    if registration.markers.joints is None:
+        message = "correct = true, but the touches do not say how the arm stood: they tell nothing of its errors"
+        raise InputError(message, where=where, allowed="q1_deg to q6_deg in markers_base; or correct = false")
+    model, tip = ur_model(case.robot.model), case.needle.length_mm
+    q = _aimed_insertion(case, registration.T_base_ct, where)
+    return aimed(registration, aim_at(model, tip, case.target_ct, q))
+
+
+def _aimed_insertion(case: Case, T_base_ct: Floats, where: str | Path) -> Floats:
+    """Joints (6,), rad, of the insertion that is corrected for."""
+    assert case.registration is not None  # its markers were registered
+    if case.registration.correct_joints_deg is None:
+        reached = reached_insertion(case, T_base_ct)
+        if reached is None:
+            message = "correct = true, but the arm reaches the target in none of the directions tried"
+            raise InputError(
+                message, where=where, allowed="correct_joints_deg, how the arm stands at the insertion's end"
+            )
+        return reached
+    q = np.radians(np.asarray(case.registration.correct_joints_deg))
+    T = flange_pose(ur_model(case.robot.model), q)
+    away = float(np.linalg.norm(T[:3, 3] + case.needle.length_mm * T[:3, 2] - apply(T_base_ct, case.target_ct)))
+    if away > MAX_AIM_OFF_MM:
+        raise InputError(
+            f"correct_joints_deg put the tip {away:.1f} mm from the target",
+            where=where,
+            allowed=f"within {MAX_AIM_OFF_MM:g} mm: joints at an insertion's end, with this needle",
+        )
+    return q
 
 
 def default_method(errors: ErrorModel | None) -> Literal["rigid", "weighted"]:

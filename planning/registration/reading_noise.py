@@ -45,11 +45,12 @@ class ReadingNoise:
     touches_known: bool
 
     def independent(self, R_base_ct: Floats) -> Floats:
-        """Omega, shape (3 N, 3 N): what errs anew at each marker, CT axes turned by (3, 3)."""
+        """Omega, shape (..., 3 N, 3 N): what errs anew at each marker, CT axes turned by (..., 3, 3)."""
         blocks = self.blocks(R_base_ct)
-        omega = np.zeros((3 * len(blocks), 3 * len(blocks)))
-        for row, block in enumerate(blocks):
-            omega[3 * row : 3 * row + 3, 3 * row : 3 * row + 3] = block
+        count = blocks.shape[-3]
+        omega = np.zeros((*blocks.shape[:-3], 3 * count, 3 * count))
+        for row in range(count):
+            omega[..., 3 * row : 3 * row + 3, 3 * row : 3 * row + 3] = blocks[..., row, :, :]
         return omega
 
     def blocks(self, R_base_ct: Floats) -> Floats:
@@ -62,7 +63,7 @@ class ReadingNoise:
         return np.asarray((self.arm_jacobian * self.eta_variances) @ self.arm_jacobian.T)
 
     def whole(self, R_base_ct: Floats) -> Floats:
-        """C, shape (3 N, 3 N): both."""
+        """C, shape (..., 3 N, 3 N): both."""
         return self.independent(R_base_ct) + self.shared()
 
 

@@ -13,8 +13,9 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.points.point_files import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply, frame_of_points, pose
+from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.conditioning import Conditioning, conditioning, leverage
-from puncture_twin.planning.registration.fit_map import fit_weighted
+from puncture_twin.planning.registration.fit_map import fit_joint, fit_weighted
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, fit_uncertainty
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.registration.residual_test import Interval, OddMarker, ResidualTest, odd_marker
@@ -39,7 +40,10 @@ LEAST_FOUND_MM = 0.01
 SINGULAR = 1e-12
 """Least over greatest variance of the readings below which some of them count as free of error."""
 
-Method = Literal["triad", "rigid", "weighted", "affine"]
+Method = Literal["triad", "rigid", "weighted", "joint", "affine"]
+
+WEIGHING = frozenset({"weighted", "joint"})
+"""Methods that cannot do without declared errors."""
 
 MIRROR_GAIN = 2.0
 """A mirrored fit that is better than the proper one by this factor (and 1 mm) says that one side is mirrored."""
@@ -73,6 +77,8 @@ class Registration:
         residual_test: The residuals of the rigid fit against the noise.
         conditioning: The three flags of a weak set, for the target given.
         uncertainty: What the declared errors make of it; None where none are declared.
+        aim: The insertion for which the pose was corrected by what the residuals tell of the arm; None where it was
+            not. The residuals are those before.
     """
 
     method: str
@@ -82,6 +88,7 @@ class Registration:
     residual_test: ResidualTest
     conditioning: Conditioning
     uncertainty: FitUncertainty | None = None
+    aim: Aim | None = None
 
     @property
     def fle_mm(self) -> float:
@@ -214,8 +221,8 @@ def register(
 
     Args:
         markers: At least three, matched.
-        method: ``triad`` (Chen 2019, Eq. 1-9, three markers in the order given), ``rigid`` (least squares) or
-            ``weighted`` (by the declared noise).
+        method: ``triad`` (Chen 2019, Eq. 1-9, three markers in the order given), ``rigid`` (least squares),
+            ``weighted`` (by the declared noise) or ``joint`` (by that and what the arm does wrong at all markers).
         target_ct: Shape (3,), where the error matters.
         fle_mm: Known localisation error (rms, both sides together); None estimates it from FRE. Not beside ``noise``.
         noise: What is declared of each marker, in the order of ``markers``.
@@ -225,7 +232,7 @@ def register(
 
     Raises:
         InputError: Fewer than three markers, collinear, mirrored, a unit slip, a marker far off, ``affine``,
-            ``weighted`` without noise, noise that is none, or residuals that the noise does not explain.
+            ``weighted`` or ``joint`` without noise, noise that is none, or residuals that the noise does not explain.
     """
     _check_method(method, noise, where)
     check_pairs(markers, where)
@@ -263,16 +270,16 @@ def _check_method(method: Method, noise: ReadingNoise | None, where: str | Path)
             where=where,
             allowed="triad, rigid or weighted; affine only reproduces the paper's Table 6",
         )
-    if method == "weighted" and noise is None:
+    if method in WEIGHING and noise is None:
         raise InputError(
-            "method 'weighted' weighs by declared errors", where=where, allowed="[errors], or method rigid"
+            f"method '{method}' weighs by declared errors", where=where, allowed="[errors], or method rigid"
         )
 
 
 def _check_noise(markers: MarkerPairs, method: Method, noise: ReadingNoise, *, found: bool, where: str | Path) -> None:
     """Refuse noise that cannot be weighed, and residuals in which there is none to be found."""
     R = fit_rigid(markers.points_ct, markers.points_base)[:3, :3]
-    values = np.linalg.eigvalsh(noise.independent(R) if method == "weighted" else noise.whole(R))
+    values = np.linalg.eigvalsh(noise.independent(R) if method in WEIGHING else noise.whole(R))
     if not values[0] > SINGULAR * values[-1]:
         message = "the declared errors leave readings of the markers without any"
         raise InputError(message, where=where, allowed="ct_in_plane_mm, ct_slice_mm or touch_mm above 0")
@@ -284,6 +291,8 @@ def _check_noise(markers: MarkerPairs, method: Method, noise: ReadingNoise, *, f
 def _fit(method: Method, noise: ReadingNoise | None) -> Callable[[Floats, Floats], Floats]:
     if method == "weighted" and noise is not None:
         return lambda ct, base: fit_weighted(ct, base, noise, fit_rigid(ct, base))
+    if method == "joint" and noise is not None:
+        return lambda ct, base: fit_joint(ct, base, noise, fit_rigid(ct, base))
     return fit_triad if method == "triad" else fit_rigid
 
 

@@ -22,6 +22,8 @@ from puncture_twin.planning.collision.workcell import (
 )
 from puncture_twin.planning.formats.points.point_files import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.aim import aim_at
+from puncture_twin.planning.registration.aim_correction import aimed
 from puncture_twin.planning.registration.placement import marker_noise
 from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.registration.registration import MIN_MARKERS, MarkerPairs, Method, Registration, register
@@ -84,9 +86,16 @@ class _Task:
         noise = reading_noise(case.errors, self.model, self.tip_mm, q, known=True)
         target_ct = case.target_ct
         fitted = register(self.markers, method=self.method, target_ct=target_ct, noise=noise, accept_residuals=True)
+        fitted = self._aimed(fitted)
         assert fitted.uncertainty is not None
         target = apply(fitted.T_base_ct, target_ct)
         return PoseError(self.model, self.tip_mm, target, case.errors, fitted.uncertainty)
+
+    def _aimed(self, fitted: Registration) -> Registration:
+        """Corrected for the insertion, where the case's pose is corrected."""
+        if self.method != "joint":
+            return fitted
+        return aimed(fitted, aim_at(self.model, self.tip_mm, self.context.case.target_ct, self.q_insertion))
 
     def expected_mm(self, q_touch: Floats) -> float:
         """Of the tip at the target (rms)."""
@@ -184,7 +193,9 @@ def registered(context: CaseContext, read: NamedPoints) -> Registration:
     pairs = MarkerPairs(read.names, found.points_ct[rows], read.points, read.joints)
     noise = marker_noise(case, case.errors, pairs, where="touched markers")
     method = cast(Method, placement.registration.method)
-    return register(pairs, method=method, target_ct=case.target_ct, noise=noise, accept_residuals=True)
+    fitted = register(pairs, method=method, target_ct=case.target_ct, noise=noise, accept_residuals=True)
+    aim = placement.registration.aim
+    return fitted if aim is None else aimed(fitted, aim)
 
 
 def _task(context: CaseContext, q_insertion: Floats) -> _Task:

@@ -17,12 +17,13 @@ from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.breathing.lujan import fraction_within, mean_square_within
 from puncture_twin.planning.budget.bent_path import other_gauges
 from puncture_twin.planning.budget.breath import Breath
-from puncture_twin.planning.budget.chain import chain_of, reached_insertion
+from puncture_twin.planning.budget.chain import chain_of
 from puncture_twin.planning.budget.what_if import changes, source_costs
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.formats.labels.by_name import ByName
 from puncture_twin.planning.needle.shaft import GAUGES, Shaft
 from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.registration.reached_insertion import reached_insertion
 from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.uncertainty.pose_error import Bend
 from puncture_twin.run_twin import app

@@ -11,12 +11,13 @@ from typer.testing import CliRunner
 from puncture_twin.planning.anatomy.anatomy import load_skin
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.budget.chain import chain_of, reached_insertion
+from puncture_twin.planning.budget.chain import chain_of
 from puncture_twin.planning.budget.what_if import MOST_MARKERS, best_change, changes, source_costs
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.errors import ArmUncertainty
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.registration.reached_insertion import reached_insertion
 from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.uncertainty.sources import reading_parts
 from puncture_twin.run_twin import app

@@ -21,6 +21,7 @@ CASES = [
     ("carton/case_m.toml", "rigid", SLICES | NO_ARM),
     ("carton/case_m.toml", "triad", SLICES | NO_ARM),
     ("carton/case_m.toml", "weighted", SLICES | NOMINAL),
+    ("carton/case_m.toml", "corrected", SLICES | NOMINAL),
 ]
 
 

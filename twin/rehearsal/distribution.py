@@ -201,6 +201,7 @@ def _query(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _Qu
     puncture = Puncture(
         ur_model(case.robot.model), case.needle.length_mm, registration.method, believed.fit.noise,
         registration.markers.points_ct, q_touch, registration.T_base_ct, case.target_ct, outward_ct, q_insertion, bend,
+        registration.aim,
     )  # fmt: skip
     return _Query(believed, puncture, truth, registration.markers.joints is None)
 

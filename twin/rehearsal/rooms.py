@@ -17,7 +17,9 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation
-from puncture_twin.planning.registration.fit_map import design, fit_weighted, least_squares_map
+from puncture_twin.planning.registration.aim import Aim
+from puncture_twin.planning.registration.aim_correction import aimed_fit
+from puncture_twin.planning.registration.fit_map import design, fit_joint, fit_weighted, least_squares_map
 from puncture_twin.planning.registration.reading_noise import ReadingNoise, parameter_variances
 from puncture_twin.planning.registration.registration import fit_rigid, fit_triad
 from puncture_twin.planning.uncertainty.pose_error import Bend
@@ -40,6 +42,7 @@ class Puncture:
         outward_ct: Shape (3,), unit, from the target along the needle.
         q_insertion: Shape (6,), rad, the tip on the target.
         bend: Of the needle; None where it is straight.
+        aim: Of the method ``joint``: the insertion that every room's pose is corrected for; None where it is not.
     """
 
     model: UrModel
@@ -53,6 +56,7 @@ class Puncture:
     outward_ct: Floats
     q_insertion: Floats
     bend: Bend | None = None
+    aim: Aim | None = None
 
 
 class Rooms(NamedTuple):
@@ -163,7 +167,10 @@ def _fitted(puncture: Puncture, read_ct: Floats, touched: Floats) -> Floats:
     if puncture.method == "triad":
         return fit_triad(read_ct, touched)
     fitted = fit_rigid(read_ct, touched)
-    return fit_weighted(read_ct, touched, puncture.noise, fitted) if puncture.method == "weighted" else fitted
+    if puncture.aim is not None:
+        return aimed_fit(read_ct, touched, puncture.noise, fitted, puncture.aim)
+    weigh = {"weighted": fit_weighted, "joint": fit_joint}.get(puncture.method)
+    return fitted if weigh is None else weigh(read_ct, touched, puncture.noise, fitted)
 
 
 def _commanded(puncture: Puncture, T_base_ct: Floats) -> tuple[Floats, Bools]:

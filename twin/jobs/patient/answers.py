@@ -41,6 +41,7 @@ from puncture_twin.planning.search.selection.choice import (
     with_file_read,
 )
 from puncture_twin.twin.jobs.patient.budget import budget_facts
+from puncture_twin.twin.jobs.patient.correction import correction_facts
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
 
 
@@ -166,6 +167,7 @@ def _advice(case: Case, registration: Registration) -> dict[str, Any]:
     more = one_more(registration, case.target_ct, touchable)
     return {
         "budget": budget_facts(case, registration, touchable, partial(load_anatomy, case, cache=user_cache())),
+        **({} if registration.aim is None else {"correction": correction_facts(case, registration)}),
         "half_axes_95_mm": (uncertainty.test.region_factor * np.sqrt(np.linalg.eigvalsh(cov)[::-1])).tolist(),
         "share": {"markers_ct": float(read / (read + touched)), "touch": float(touched / (read + touched))},
         "without": {

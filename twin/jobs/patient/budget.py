@@ -12,11 +12,12 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.budget.bent_path import bent_path
-from puncture_twin.planning.budget.chain import Chain, chain_of, reached_insertion
+from puncture_twin.planning.budget.chain import Chain, chain_of
 from puncture_twin.planning.budget.what_if import Change, best_change, changes, source_costs
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.registration.reached_insertion import reached_insertion
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
 
@@ -45,7 +46,7 @@ def budget_facts(
     """
     if registration.uncertainty is None:
         return None
-    q = reached_insertion(case, registration.T_base_ct) if q_insertion is None else q_insertion
+    q = _insertion(case, registration) if q_insertion is None else q_insertion
     if q is None:
         return None
     outward_ct = -(registration.T_base_ct[:3, :3].T @ flange_pose(ur_model(case.robot.model), q)[:3, 2])
@@ -53,10 +54,8 @@ def budget_facts(
     chain = chain_of(case, registration, q, path)
     found = changes(chain, skin_points_ct, _bed_ct(case, chain.errors.marker_cov_ct))
     best = best_change(found)
-    theta, beta = angles(outward_ct @ case.T_ct_entry[:3, :3])
     return {
-        "theta_deg": float(np.degrees(theta)),
-        "beta_deg": float(np.degrees(beta)) if theta > POLE else 0.0,
+        **needle_angles(case, registration, q),
         "expected_mm": chain.expected_mm(),
         "sources": [
             {"text": SOURCES[one.source].text, "alone_mm": one.alone_mm, "without_mm": one.without_mm}
@@ -73,6 +72,21 @@ def _not_modelled(chain: Chain) -> str:
     counted = (chain.breath is not None, chain.path is not None)
     breath, bend, *others = NOT_MODELLED.split(", ")
     return ", ".join([*(text for text, in_it in zip((breath, bend), counted, strict=True) if not in_it), *others])
+
+
+def _insertion(case: Case, registration: Registration) -> Floats | None:
+    """The insertion that the aim is corrected for, or one that the arm reaches."""
+    return reached_insertion(case, registration.T_base_ct) if registration.aim is None else registration.aim.q
+
+
+def needle_angles(case: Case, registration: Registration, q: Floats) -> dict[str, Any]:
+    """Of the direction from which the needle comes in a configuration (6,), rad."""
+    outward_ct = -(registration.T_base_ct[:3, :3].T @ flange_pose(ur_model(case.robot.model), q)[:3, 2])
+    theta, beta = angles(outward_ct @ case.T_ct_entry[:3, :3])
+    return {
+        "theta_deg": float(np.degrees(theta)),
+        "beta_deg": float(np.degrees(beta)) if theta > POLE else 0.0,
+    }
 
 
 def _change(case: Case, one: Change) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.explain import needle_warnings, reason_text
 from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
 from puncture_twin.twin.jobs.patient.budget import budget_lines
+from puncture_twin.twin.jobs.patient.correction import correction_lines
 from puncture_twin.twin.jobs.patient.run import Run
 from puncture_twin.twin.jobs.patient.summaries import plan_summary, rehearsal_summary
 from puncture_twin.twin.report.numbers import TRUTH_IS_BELIEF
@@ -25,6 +26,9 @@ LEAST_SOURCE = 0.005
 
 NOTABLE = 0.05
 """Of an expected error: by as much two configurations' differ before people are told."""
+
+SAME_AIM = 0.02
+"""rad: joints that differ by less are of one insertion; an arm's errors do the same there within a fiftieth."""
 
 LEAST_SHOWN = 5e-5
 """A chance or share below it rounds to nothing in what people read."""
@@ -75,6 +79,7 @@ def _plan(run: Run) -> list[str]:
         "  expected error at the target: "
         + ("unknown (no markers)" if error is None else f"{error:.2f} mm (rms){_straight(run)}"),
         *_otherwise(run.candidates, run.plan),
+        *_other_aim(run),
     ]
 
 
@@ -92,6 +97,17 @@ def _otherwise(found: Candidates, plan: Plan) -> list[str]:
     if not abs(other - plan.expected_target_error_mm) > NOTABLE * plan.expected_target_error_mm:
         return []
     return [f"    in the configuration of the table and of check {other:.2f} mm: an approach may end in another one"]
+
+
+def _other_aim(run: Run) -> list[str]:
+    """That the pose was corrected for another insertion, and what would correct it for this one."""
+    assert run.plan is not None
+    registration = None if run.context.placement is None else run.context.placement.registration
+    q = run.plan.insertion.q[-1]
+    if registration is None or registration.aim is None or np.abs(q - registration.aim.q).max() < SAME_AIM:
+        return []
+    joints = ", ".join(f"{angle:.2f}" for angle in np.degrees(q))
+    return [f"    the aim is corrected for another insertion; for this one: correct_joints_deg = [{joints}]"]
 
 
 def _rehearsal(run: Run) -> list[str]:
@@ -191,7 +207,8 @@ def export_text(done: Exported, case_checked: bool) -> str:
 
 def registration_text(report: dict[str, Any]) -> str:
     """Residuals, expected error and weak points of a registration."""
-    lines = [f"case {report['case']}: registration by {report['method']}"]
+    method = "joint fit of pose and arm" if report["method"] == "joint" else report["method"]
+    lines = [f"case {report['case']}: registration by {method}"]
     if "target_mm" in report:
         place = ", ".join(f"{mm:g}" for mm in report["target_mm"])
         lines.append(f"  target ({place}) mm {report['space']}")
@@ -236,7 +253,7 @@ def _declared_lines(report: dict[str, Any]) -> list[str]:
         more = report["one_more"]
         place = ", ".join(f"{mm:.0f}" for mm in more["point_mm"])
         lines.append(f"  one more marker helps most at ({place}) mm {more['space']}: {more['rms_mm']:.3f} mm")
-    return [*lines, *budget_lines(report["budget"])]
+    return [*lines, *correction_lines(report.get("correction")), *budget_lines(report["budget"])]
 
 
 def _interval(bounds: Sequence[float]) -> str:

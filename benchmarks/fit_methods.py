@@ -1,0 +1,156 @@
+"""What each way to fit the markers leaves at the target: predicted beside rooms drawn with exact kinematics.
+
+python -m benchmarks.fit_methods               20,000 rooms a cell, minutes
+python -m benchmarks.fit_methods --rooms N
+
+Least squares, weights by the declared readings, and pose and arm estimated together with the aim corrected. The
+markers are touched in three ways: as an arm that stands far from singular does, rolled by 60 degrees from marker to
+marker, and as the needle is inserted later. The last column has rooms whose arm errs twice as much as is declared.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.insertion import flange_poses
+from puncture_twin.planning.arm.kinematics import inverse, singularity
+from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.case.case import Case, load_case
+from puncture_twin.planning.case.errors import ErrorModel, error_model
+from puncture_twin.planning.case.errors_section import ErrorsSection
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.aim import aim_at
+from puncture_twin.planning.registration.aim_correction import aimed
+from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.registration.reading_noise import reading_noise
+from puncture_twin.planning.registration.registration import MarkerPairs, Method, fit_rigid, register
+from puncture_twin.planning.uncertainty.pose_error import PoseError
+from puncture_twin.twin.rehearsal.rooms import Puncture, draw_rooms
+
+ROLLS = np.radians(np.arange(0.0, 360.0, 2.0))
+APART = np.radians(60.0)
+"""By how much the needle is rolled from one marker to the next."""
+
+NOMINAL = {"arm": "nominal", "tip_offset_mm": 1.0, "needle_direction_deg": 0.5, "joint_drift_deg": 0.0}
+FINE = {"ct_in_plane_mm": 0.2, "ct_slice_mm": 0.2, "touch_mm": 0.1, "joint_drift_deg": 0.0}
+SLICES = {"ct_pixel_mm": 1.0, "ct_spacing_mm": 5.0, "bed_axis": (1.0, 0.0, 0.0)}
+ROWS = (
+    ("abdomen, calibrated arm", "abdomen/case.toml", (62.0, 96.0), FINE),
+    ("abdomen, nominal arm", "abdomen/case.toml", (62.0, 96.0), FINE | NOMINAL),
+    ("carton, nominal arm", "carton/case_m.toml", (18.0, 232.0), SLICES | NOMINAL),
+)
+"""Name, case, direction (degrees) and declaration; a nominal arm has its tip known to 1 mm and 0.5 degrees."""
+
+SVD: Method = "rigid"
+
+
+class Cell(NamedTuple):
+    """Predicted and realised rms of the tip, mm, and how often the 95 % region holds it."""
+
+    predicted: float
+    realised: float
+    coverage: float
+
+    def text(self) -> str:
+        """For a table."""
+        return f"{self.predicted:.3f}/{self.realised:.3f} ({self.realised / self.predicted:.3f}) {self.coverage:.3f}"
+
+
+class Stand(NamedTuple):
+    """What does not depend on the fit: arm, markers as they lie, and the insertion."""
+
+    model: UrModel
+    tip_mm: float
+    case: Case
+    markers: MarkerPairs
+    T_base_ct: np.ndarray
+    outward_ct: np.ndarray
+    q: np.ndarray
+
+
+def stand_of(path: Path, theta_deg: float, beta_deg: float) -> Stand:
+    """A case's markers where they were touched, free of errors, and the insertion farthest from singular."""
+    case = load_case(path)
+    placement = load_placement(case)
+    assert placement is not None and placement.registration is not None
+    found, model, tip = placement.registration.markers, ur_model(case.robot.model), case.needle.length_mm
+    T = fit_rigid(found.points_ct, found.points_base)
+    theta, beta = np.radians([theta_deg, beta_deg])
+    outward = case.T_ct_entry[:3, :3] @ [np.sin(theta) * np.cos(beta), np.sin(theta) * np.sin(beta), np.cos(theta)]
+    reached = _reached(model, tip, apply(T, case.target_ct), T[:3, :3] @ outward, ROLLS)
+    q = reached[np.argmax(singularity(model, reached).least())]
+    return Stand(model, tip, case, MarkerPairs(found.names, found.points_ct, apply(T, found.points_ct)), T, outward, q)
+
+
+def touches(of: Stand) -> dict[str, np.ndarray]:
+    """Joints (N, 6), rad, at the touches, by how they are chosen."""
+    up, along = of.T_base_ct[:3, :3] @ of.case.T_ct_entry[:3, 2], of.T_base_ct[:3, :3] @ of.outward_ct
+    far, rolled, alike = [], [], []
+    for row, point in enumerate(of.markers.points_base):
+        for kept, rolls in ((far, np.zeros(1)), (rolled, np.array([row * APART]))):
+            q = _reached(of.model, of.tip_mm, point, up, rolls)
+            q = q if len(q) else _reached(of.model, of.tip_mm, point, along, ROLLS)
+            kept.append(q[np.argmax(singularity(of.model, q).least())])
+        q = _reached(of.model, of.tip_mm, point, along, ROLLS)
+        turns = (q - of.q + np.pi) % (2 * np.pi) - np.pi
+        alike.append(of.q + turns[np.abs(turns).max(axis=1).argmin()])
+    ways = {"far from singular": far, "rolled": rolled, "as inserted": alike}
+    return {name: np.array(q) for name, q in ways.items()}
+
+
+def _reached(model: UrModel, tip: float, point: np.ndarray, outward: np.ndarray, rolls: np.ndarray) -> np.ndarray:
+    q = inverse(model, flange_poses(point, outward, tip, rolls)).reshape(-1, 6)
+    return np.asarray(q[~np.isnan(q).any(axis=1)])
+
+
+def cell(of: Stand, errors: ErrorModel, q_touch: np.ndarray, method: Method, rooms: int, arm: float = 1.0) -> Cell:
+    """One fit, in rooms whose arm errs so many times as much as is declared."""
+    noise = reading_noise(errors, of.model, of.tip_mm, q_touch, known=True)
+    target = of.case.target_ct
+    fitted = register(of.markers, method=method, target_ct=target, noise=noise)
+    done = aimed(fitted, aim_at(of.model, of.tip_mm, target, of.q)) if method == "joint" else fitted
+    assert done.uncertainty is not None
+    error = PoseError(of.model, of.tip_mm, apply(of.T_base_ct, target), errors, done.uncertainty)
+    puncture = Puncture(
+        of.model, of.tip_mm, method, noise, of.markers.points_ct, q_touch, of.T_base_ct, target, of.outward_ct, of.q,
+        aim=done.aim,
+    )  # fmt: skip
+    truth = replace(errors, arm=errors.arm.scaled(arm))
+    drawn = draw_rooms(puncture, truth, rooms, np.random.default_rng(0)).reached_alone()
+    off, cov = drawn.tip_ct - drawn.target_ct, error.tip_covariance_ct(of.q[None])[0]
+    inside = np.einsum("na,ab,nb->n", off, np.linalg.inv(cov), off) <= chdtri(3, 0.05)
+    return Cell(float(np.sqrt(np.trace(cov))), float(np.sqrt(np.mean(np.sum(off**2, axis=1)))), float(inside.mean()))
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rooms", type=int, default=20_000)
+    rooms = parser.parse_args().rooms
+    print("tip rms predicted/realised mm (ratio), 95 % region; twice: the true arm errs twice as much as declared")
+    print("| | touched | least squares | weighted | corrected | weighted, twice | corrected, twice |")
+    print("|" + "---|" * 7)
+    for name, path, angles, keys in ROWS:
+        of, errors = stand_of(folder() / path, *angles), error_model(ErrorsSection(**keys), space=Space.LOCAL)
+        for how, q in touches(of).items():
+            fits: tuple[tuple[Method, float], ...] = (
+                (SVD, 1),
+                ("weighted", 1),
+                ("joint", 1),
+                ("weighted", 2),
+                ("joint", 2),
+            )
+            cells = [cell(of, errors, q, method, rooms, arm).text() for method, arm in fits]
+            print(f"| {name} | {how} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
