@@ -28,7 +28,6 @@ from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding
 from puncture_twin.planning.uncertainty.line_sampling import NeedleDoubt, line_chance, needle_doubt
-from puncture_twin.planning.uncertainty.needle_chances import chances_of, passing
 from puncture_twin.planning.uncertainty.needle_lines import walked
 from puncture_twin.planning.uncertainty.touch import touch_chance
 
@@ -45,7 +44,7 @@ REPEATS = 3
 def model_of(scene: Scene, size: float) -> ChanceModel:
     """Of the scene's declaration, its errors so many times as large."""
     _, error = next(iter(punctures(replace(scene, errors=scene.errors.scaled(size)), MARKERS)))
-    model = chance_model(scene.context.case, scene.context.anatomy, error)
+    model = chance_model(scene.context.case, scene.context.anatomy, scene.context.engine, error)
     assert model is not None
     return model
 
@@ -55,7 +54,7 @@ def pairs_of(scene: Scene, model: ChanceModel, draws: int) -> np.ndarray:
     case, anatomy, engine, rng = scene.context.case, scene.context.anatomy, scene.context.engine, _rng()
     columns, lengths = demanding(anatomy.checked), axis_lengths(case, anatomy.checked)
     cov_ct, rows = model.error.covariance_ct(scene.q), []
-    near = passing(case, anatomy, engine, model, scene.outward_ct, cov_ct)
+    near = model.passing(scene.outward_ct, cov_ct)
     for i, outward in enumerate(scene.outward_ct):
         errors = rng.multivariate_normal(np.zeros(6), cov_ct[i], draws, method="eigh")
         origins, along = case.target_ct + errors[:, :3], exp_rotation(errors[:, 3:]) @ outward
@@ -128,8 +127,8 @@ def cost(scene: Scene, model: ChanceModel) -> tuple[float, float, float, float]:
     axes = engine.measure(case.target_ct, outward, lengths, shown=False)
     works = (
         lambda: engine.measure(case.target_ct, outward, lengths, shown=False),
-        lambda: chances_of(case, anatomy, engine, model, outward, q, axes.at(rows)),
-        lambda: chances_of(case, anatomy, engine, model, outward, q),
+        lambda: model.chances(outward, q, axes.at(rows)),
+        lambda: model.chances(outward, q),
         lambda: model.hit.chance(model.error, model.error.covariance_ct(q)),
         lambda: model.error.covariance_ct(q),
     )

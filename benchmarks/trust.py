@@ -27,13 +27,10 @@ from scipy.special import chdtri, fdtri
 
 from benchmarks.scenes import DATA
 from puncture_twin.meshes import folder
-from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.kinematics import inverse, singularity
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
-from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.reach.standoff import axis_lengths
@@ -51,7 +48,6 @@ from puncture_twin.planning.search.search import case_directions
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, demanding
 from puncture_twin.planning.uncertainty.chances import HitModel, hit_model
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
-from puncture_twin.planning.uncertainty.needle_chances import chances_of, refined_chances
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
 
@@ -284,26 +280,23 @@ def _predicted(of: Scene, error: PoseError, puncture: Puncture, freedom: int | N
     outward, q = puncture.outward_ct[None], puncture.q_insertion[None]
     hit, touch = [], []
     for size in SIZES if freedom else (1.0,):
-        _, asked = _believed(of, error, size, freedom)
-        first = chances_of(*asked, outward, q)
-        every = np.ones(first["touch"].shape, bool)
-        touch.append(refined_chances(*asked, (outward, q), (first["touch"], first["margin"]), every)["touch"][0])
+        asked = _believed(of, error, size, freedom)
+        first = asked.chances(outward, q)
+        touch.append(asked.refined(outward, q, first, np.ones(first.touch.shape, bool)).touch[0])
     for size in np.geomspace(*FOUND, 8 * len(SIZES)) if freedom else (1.0,):
-        told, _ = _believed(of, error, size, freedom)
+        told = _believed(of, error, size, freedom).error
         cov, tip = told.covariance_ct(q), told.tip_covariance(q)
         balls = [hit_in_ball(tip, radius, freedom)[0] for radius in _radii(error, q)]
         hit.append([of.hit.chance(told, cov)[0], *balls])
     return Told(error.tip_covariance_ct(q)[0] / error.fit.test.scale**2, np.array(hit), np.array(touch))
 
 
-def _believed(
-    of: Scene, error: PoseError, size: float, freedom: int | None
-) -> tuple[PoseError, tuple[Case, Anatomy, ClearanceEngine, ChanceModel]]:
-    """The pose's error where the residuals have a size, and what chances are computed from."""
+def _believed(of: Scene, error: PoseError, size: float, freedom: int | None) -> ChanceModel:
+    """What chances are computed from where the residuals have a size."""
     fit, count = error.fit, error.fit.noise.cov_base.shape[0]
     test = NoiseTest(count, float(size**2 * (3 * count - 6)), found=freedom is not None)
     told = replace(error, fit=FitUncertainty(fit.noise, fit.R_base_ct, fit.center_base, fit.fit_map, test))
-    return told, (of.context.case, of.context.anatomy, of.context.engine, ChanceModel(told, of.hit))
+    return ChanceModel(of.context.case, of.context.anatomy, of.context.engine, told, of.hit)
 
 
 def _radii(error: PoseError, q: np.ndarray) -> np.ndarray:

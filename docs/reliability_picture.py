@@ -47,7 +47,7 @@ def scaled(context, factor):
 
     case = replace(load_case(context.case.path), errors=context.case.errors.scaled(factor))
     where = placement.load_placement(case)
-    chance = chance_model(case, context.anatomy, pose_error(case, where.registration))
+    chance = chance_model(case, context.anatomy, context.engine, pose_error(case, where.registration))
     return replace(context, case=case, placement=where, chance=chance)
 
 

@@ -22,7 +22,6 @@ from puncture_twin.planning.search.arm_reach import reach_request
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.ranking import ranked
-from puncture_twin.planning.uncertainty.needle_chances import keeps_limits
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
 
 MAX_TRIES = 20
@@ -137,7 +136,7 @@ def _within_limits(
         return goals
     q = np.array([goal.insertion_q[-1] for goal in goals])
     outward = np.tile(candidates.outward_ct[row], (len(goals), 1))
-    kept = keeps_limits(context.case, context.anatomy, context.engine, context.chance, outward, q)
+    kept = context.chance.keeps_limits(outward, q)
     if not kept.any():
         raise NoAnswerError("no configuration that an approach may end in keeps search.min_hit and max_touch")
     return [goal for goal, keeps in zip(goals, kept, strict=True) if keeps]

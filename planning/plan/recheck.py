@@ -16,7 +16,6 @@ from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
-from puncture_twin.planning.uncertainty.needle_chances import keeps_limits
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
 
 SAME_DIRECTION = 1e-6
@@ -67,8 +66,7 @@ def _check_limits(plan: Plan, context: CaseContext, path: Path) -> None:
     """Refuse a plan that ends in a configuration beyond the case's limits of chances: the search's may be another."""
     if context.chance is None:
         return
-    settings = context.case, context.anatomy, context.engine, context.chance
-    if not keeps_limits(*settings, plan.outward_ct[None], plan.insertion.q[-1:]).all():
+    if not context.chance.keeps_limits(plan.outward_ct[None], plan.insertion.q[-1:]).all():
         what = "the configuration in which it ends does not keep search.min_hit and max_touch"
         raise InputError(what, where=path, allowed="plan again")
 

@@ -5,6 +5,7 @@ To first order for all; by line sampling where that may decide: near a limit, an
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -13,13 +14,11 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
-from puncture_twin.planning.reach.standoff import axis_lengths
+from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, check_limits, demanding, touch_limit
 from puncture_twin.planning.uncertainty.chances import Chances
-from puncture_twin.planning.uncertainty.needle_chances import chances_of, needles_of, refined_chances
 from puncture_twin.planning.uncertainty.touch import joint_touch_chance, touch_bound
 
 BEST = 200
@@ -36,7 +35,6 @@ ROWS_AT_ONCE = 4096
 def with_chances(
     case: Case,
     anatomy: Anatomy,
-    engine: ClearanceEngine,
     found: Candidates,
     model: ChanceModel | None,
     axes: AxisDistances | None = None,
@@ -46,10 +44,9 @@ def with_chances(
     Args:
         case: Declares errors; else nothing is computed.
         anatomy: Its structures.
-        engine: Prepared for the meshes of ``anatomy.checked``.
         found: Checked against organs and arm.
         model: None where the pose's error is not known: the chances are blank.
-        axes: What ``engine`` measured of the candidates; None measures those that are left again.
+        axes: What the engine measured of the candidates; None measures those that are left again.
 
     Raises:
         InputError: A limit that nothing can be compared with.
@@ -57,92 +54,64 @@ def with_chances(
     if case.errors is None:
         return found
     check_limits(case, anatomy, model)
-    columns = demanding(anatomy.checked)
-    names = tuple(anatomy.checked[column].name for column in columns)
-    blank = Chances.unknown(names, len(found))
+    names = tuple(anatomy.checked[column].name for column in demanding(anatomy.checked))
+    chances = Chances.unknown(names, len(found))
     rows = np.flatnonzero(found.safe & np.isfinite(found.arm.q_insertion).all(axis=1))
     if model is None or not len(rows):
-        return replace(found, chances=blank)
-    parts = [rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)]
-    outward, q = found.outward_ct, found.arm.q_insertion
-    measured = (None if axes is None else axes.at(part) for part in parts)
-    pairs = zip(parts, measured, strict=True)
-    arrays = [chances_of(case, anatomy, engine, model, outward[part], q[part], known) for part, known in pairs]
-    values = {name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]}
-    filled = {name: getattr(blank, name).copy() for name in values}
-    for name, value in values.items():
-        filled[name][rows] = value
-    found = replace(found, chances=Chances(names, **filled, touch_joint=blank.touch_joint))
-    return _limited(case, _refined_near_limits(case, anatomy, engine, found, model))
+        return replace(found, chances=chances)
+    for part in _parts(rows):
+        known = None if axes is None else axes.at(part)
+        chances = chances.put(part, model.chances(found.outward_ct[part], found.arm.q_insertion[part], known))
+    return _limited(case, _refined_near_limits(replace(found, chances=chances), model))
 
 
-def _refined_near_limits(
-    case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates, model: ChanceModel
-) -> Candidates:
+def _parts(rows: Ints) -> Iterator[Ints]:
+    """Some rows at a time."""
+    return (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE))
+
+
+def _refined_near_limits(found: Candidates, model: ChanceModel) -> Candidates:
     """Refine the chances to touch that first order puts near a limit, or that may be there if the needle leans."""
-    chances = found.chances
+    chances, limits = found.chances, model.limits
     assert chances is not None
-    limits = np.array([touch_limit(case, name) for name in chances.structures])
     if not np.isfinite(limits).any():
         return found
-    greatest = np.fmax(chances.touch, _touch_bounds(case, anatomy, found, model))
+    greatest = np.fmax(chances.touch, _touch_bounds(found, model))
     wanted = (greatest >= REFINED_FROM * limits) & (chances.touch <= REFINED_TO * limits)
     rows = np.flatnonzero(wanted.any(axis=1) & found.safe)
-    return _with_refined(case, anatomy, engine, found, model, rows, wanted[rows]) if len(rows) else found
+    return _with_refined(found, model, rows, wanted[rows]) if len(rows) else found
 
 
-def _with_refined(
-    case: Case,
-    anatomy: Anatomy,
-    engine: ClearanceEngine,
-    found: Candidates,
-    model: ChanceModel,
-    rows: Ints,
-    wanted: Bools | None = None,
-) -> Candidates:
-    """Refine some rows; ``wanted`` as in `refined_chances`."""
+def _with_refined(found: Candidates, model: ChanceModel, rows: Ints, wanted: Bools | None = None) -> Candidates:
+    """Refine some rows; ``wanted`` as in `ChanceModel.refined`."""
     chances = found.chances
     assert chances is not None
-    needles, first = (found.outward_ct[rows], found.arm.q_insertion[rows]), (chances.touch[rows], chances.margin[rows])
-    values = refined_chances(case, anatomy, engine, model, needles, first, wanted)
-    filled = {name: getattr(chances, name).copy() for name in values}
-    for name, value in values.items():
-        filled[name][rows] = value
-    return replace(found, chances=replace(chances, **filled))
+    better = model.refined(found.outward_ct[rows], found.arm.q_insertion[rows], chances.at(rows), wanted)
+    return replace(found, chances=chances.put(rows, better))
 
 
-def _touch_bounds(case: Case, anatomy: Anatomy, found: Candidates, model: ChanceModel) -> Floats:
+def _touch_bounds(found: Candidates, model: ChanceModel) -> Floats:
     """Shape (n, k), of the safe candidates' chances to touch; NaN for others."""
-    error, columns = model.error, demanding(anatomy.checked)
-    length = float(axis_lengths(case, anatomy.checked)[columns].max())
+    error, columns, length = model.error, model.columns, float(model.lengths.max())
     bounds, rows = np.full((len(found), len(columns)), np.nan), np.flatnonzero(found.safe)
-    for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
+    for part in _parts(rows):
         slack, cov_ct = found.clearance.distance[part][:, columns], error.covariance_ct(found.arm.q_insertion[part])
         bounds[part] = touch_bound(slack, found.outward_ct[part], cov_ct, length, error.surface_mm, error.freedom)
     return bounds
 
 
-def with_best_refined(
-    case: Case,
-    anatomy: Anatomy,
-    engine: ClearanceEngine,
-    found: Candidates,
-    model: ChanceModel | None,
-) -> Candidates:
+def with_best_refined(found: Candidates, model: ChanceModel | None) -> Candidates:
     """Refine the best candidates, reject those that break a limit then, and rank again until no new one is among them.
 
     Args:
-        case: The case.
-        anatomy: Its structures.
-        engine: Prepared for the meshes of ``anatomy.checked``.
         found: Ranked, with chances.
         model: As in `with_chances`.
     """
     if model is None or found.chances is None:
         return found
-    done = np.zeros(len(found), bool)
+    done, case = np.zeros(len(found), bool), model.case
     while len(rows := (best := found.ranked[:BEST])[~done[best]]):
-        found = ranked(case, _limited(case, _with_refined(case, anatomy, engine, found, model, rows)))
+        found = ranked(case, _limited(case, _with_refined(found, model, rows)))
         done[rows] = True
     return found
 
@@ -166,17 +135,15 @@ def _limited(case: Case, found: Candidates) -> Candidates:
     return replace(found, verdict=found.verdict.rejected(rows, Reason.TOUCH_LIKELY, names, amounts))
 
 
-def with_joint_chances(
-    case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates, model: ChanceModel | None
-) -> Candidates:
+def with_joint_chances(found: Candidates, model: ChanceModel | None) -> Candidates:
     """Add, for the best candidates, the chance to touch anything, all structures linearised together.
 
-    The candidates are ranked; the arguments are those of `with_chances`.
+    The candidates are ranked; ``model`` as in `with_chances`.
     """
     rows = found.ranked[:BEST]
     if model is None or found.chances is None or not len(rows):
         return found
-    needles = needles_of(case, anatomy, engine, model, found.outward_ct[rows], found.arm.q_insertion[rows])
+    needles = model.needles(found.outward_ct[rows], found.arm.q_insertion[rows])
     joint = found.chances.touch_joint.copy()
-    joint[rows] = joint_touch_chance(needles.near, needles.cov_ct, case.needle.radius_mm, needles.freedom)
+    joint[rows] = joint_touch_chance(needles.near, needles.cov_ct, model.case.needle.radius_mm, needles.freedom)
     return replace(found, chances=replace(found.chances, touch_joint=joint))

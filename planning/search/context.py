@@ -39,9 +39,7 @@ from puncture_twin.planning.search.doubt import Doubt, doubt_of
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases.breath_warnings import breath_warnings
 from puncture_twin.planning.search.search import case_directions, one_direction, search
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding
-from puncture_twin.planning.uncertainty.chances import Chances
-from puncture_twin.planning.uncertainty.needle_chances import chances_of, passing
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
 
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
@@ -122,21 +120,14 @@ class CaseContext:
         if self.chance is None or found.chances is None or not np.isfinite(found.chances.hit[0]):
             return None
         q, outward = found.arm.q_insertion, found.outward_ct
-        near = passing(self.case, self.anatomy, self.engine, self.chance, outward, self.chance.error.covariance_ct(q))
-        return doubt_of(self.case, self.chance, near, found.chances, outward[0], q[0])
+        return doubt_of(self.chance, found.chances, outward[0], q[0])
 
     def doubt_at(self, outward_ct: Floats, q: Floats) -> Doubt | None:
         """How sure one direction (3,) is in one configuration (6,), rad, as of a plan; None without declared errors."""
         model = self.chance
         if model is None:
             return None
-        values = chances_of(self.case, self.anatomy, self.engine, model, outward_ct[None], q[None])
-        names = tuple(self.anatomy.checked[column].name for column in demanding(self.anatomy.checked))
-        near = passing(
-            self.case, self.anatomy, self.engine, model, outward_ct[None], model.error.covariance_ct(q[None])
-        )
-        chances = Chances(names, **values, touch_joint=np.full(1, np.nan))
-        return doubt_of(self.case, model, near, chances, outward_ct, q)
+        return doubt_of(model, model.chances(outward_ct[None], q[None]), outward_ct, q)
 
     def region_ct(self, q: Floats) -> Floats | None:
         """Within x' inv(region) x <= 1 about the target the tip is expected in 95 of 100, shape (3, 3), mm^2, CT axes.
@@ -229,5 +220,5 @@ def prepare(
         if arm is not False and placement is not None:
             reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct, memory), placement.T_base_ct)
         error = None if reach is None or placement is None else pose_error(case, placement.registration)
-        chance = chance_model(case, anatomy, error)
+        chance = chance_model(case, anatomy, measurer, error)
     return CaseContext(case, anatomy, placement, measurer, reach, chance, watcher, stages)

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, touch_limit
 from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.hit import hit_in_ball, hit_in_mesh
@@ -178,19 +177,18 @@ def chance_text(chance: float) -> str:
     return f"{chance:.{digits}f}"
 
 
-def doubt_of(case: Case, model: ChanceModel, near: Proximity, chances: Chances, outward_ct: Floats, q: Floats) -> Doubt:
+def doubt_of(model: ChanceModel, chances: Chances, outward_ct: Floats, q: Floats) -> Doubt:
     """The doubt of one candidate.
 
     Args:
-        case: The case.
         model: Of the case.
-        near: How the candidate passes what must not be touched.
         chances: Of it alone, all finite.
         outward_ct: Shape (3,), unit, from the target along the needle.
         q: Shape (6,), rad, the tip on the target.
     """
     touch = dict(zip(chances.structures, map(float, chances.touch[0]), strict=True))
-    needle = shrinkable(case, model, near, chances.structures, q)
+    near = model.passing(outward_ct[None], model.error.covariance_ct(q[None]))
+    needle = shrinkable(model, near, q)
     return Doubt(
         float(chances.hit[0]),
         MappingProxyType(touch),
@@ -198,7 +196,7 @@ def doubt_of(case: Case, model: ChanceModel, near: Proximity, chances: Chances, 
         error_budget(model.error, q, model.error.fit.R_base_ct @ outward_ct),
         model.error.fit.test.text(),
         tuple(goals_of(needle, float(chances.hit[0]), touch)),
-        not_modelled(case),
+        not_modelled(model.case),
     )
 
 
@@ -230,10 +228,8 @@ def _parts(model: ChanceModel, q: Floats) -> dict[str, _Part]:
 class ShrinkableNeedle(NamedTuple):
     """One candidate whose sources can be shrunk: `shrinkable` makes one."""
 
-    case: Case
     model: ChanceModel
     near: Proximity
-    structures: tuple[str, ...]
     parts: Mapping[str, _Part]
 
     def chance(self, structure: str, factors: Mapping[str, float]) -> float:
@@ -254,31 +250,27 @@ class ShrinkableNeedle(NamedTuple):
         return float(hit_in_mesh(hit.rays, cov[None], freedom)[0])
 
     def _touch(self, structure: str, cov6: Floats, surface: float) -> float:
-        at = [self.structures.index(structure)]
+        at = [self.model.structures.index(structure)]
         gradient = self.near.gradient[:, at]
         variance = np.einsum("nka,ab,nkb->nk", gradient, cov6, gradient) + surface
         near = Proximity(self.near.distance[:, at], gradient, np.sqrt(np.maximum(variance, 0.0)))
-        return float(touch_chance(near, self.case.needle.radius_mm, self.model.error.freedom)[0, 0])
+        return float(touch_chance(near, self.model.case.needle.radius_mm, self.model.error.freedom)[0, 0])
 
 
-def shrinkable(
-    case: Case, model: ChanceModel, near: Proximity, structures: tuple[str, ...], q: Floats
-) -> ShrinkableNeedle:
+def shrinkable(model: ChanceModel, near: Proximity, q: Floats) -> ShrinkableNeedle:
     """One candidate whose sources can be shrunk.
 
     Args:
-        case: For its needle and its limits.
         model: Of the case.
-        near: How the candidate passes the k structures.
-        structures: Their names.
+        near: How the candidate passes its k structures.
         q: Shape (6,), rad, the tip on the target.
     """
-    return ShrinkableNeedle(case, model, near, structures, _parts(model, q))
+    return ShrinkableNeedle(model, near, _parts(model, q))
 
 
 def goals_of(needle: ShrinkableNeedle, p_hit: float, p_touch: Mapping[str, float]) -> list[Goal]:
     """What does not hold, and what would mend it."""
-    case, goals = needle.case, []
+    case, goals = needle.model.case, []
     least = WISHED_HIT if case.search.min_hit is None else case.search.min_hit
     if p_hit < least:
         goals.append(_goal(needle, "", least, stated=case.search.min_hit is not None))

@@ -53,6 +53,5 @@ def search(
     found = with_grid_cone(organ_candidates(case, anatomy, engine, directions, axes))
     if reach is not None:
         found = with_breathing_reach(case, anatomy, with_reach(case, found, reach, progress), reach)
-    found = ranked(case, with_chances(case, anatomy, engine, found, chance, axes))
-    found = with_best_refined(case, anatomy, engine, found, chance)
-    return with_joint_chances(case, anatomy, engine, found, chance)
+    found = ranked(case, with_chances(case, anatomy, found, chance, axes))
+    return with_joint_chances(with_best_refined(found, chance), chance)

@@ -1,4 +1,8 @@
-"""What the chances of a case are computed from, and the limits that a case puts on them."""
+"""The chances of any needles that reach a case's target, to hit, to touch and to break margins, and the case's limits.
+
+To first order, or by line sampling where it is wanted. The model is made once for a case; whoever asks has needles
+alone: directions, and how the arm stands with the tip on the target.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
-from puncture_twin.planning.base.arrays import Ints
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.uncertainty.chances import HitModel, hit_model
+from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
+from puncture_twin.planning.reach.standoff import axis_lengths
+from puncture_twin.planning.uncertainty.chances import Chances, HitModel, hit_model, touching_any
 from puncture_twin.planning.uncertainty.pose_error import PoseError
+from puncture_twin.planning.uncertainty.refined_touch import Needles, Surroundings, refined
+from puncture_twin.planning.uncertainty.touch import Proximity, proximity, touch_chance
 
 TAKEN = frozenset({"any", "joint"})
 """Names whose column ``p_touch_<name>`` says something else than one structure's chance."""
@@ -19,18 +27,127 @@ TAKEN = frozenset({"any", "joint"})
 
 @dataclass(frozen=True, eq=False)
 class ChanceModel:
-    """What the chances of a case's candidates are computed from.
+    """Answers for the chances of a case's needles.
 
     Attributes:
+        case: The case.
+        anatomy: Its structures.
+        engine: Prepared for the meshes of ``anatomy.checked``.
         error: Of the needle's pose.
         hit: When the tip hits.
     """
 
+    case: Case
+    anatomy: Anatomy
+    engine: ClearanceEngine
     error: PoseError
     hit: HitModel
 
+    @property
+    def columns(self) -> Ints:
+        """Places in ``anatomy.checked`` of the k structures that must not be touched."""
+        return demanding(self.anatomy.checked)
 
-def chance_model(case: Case, anatomy: Anatomy, error: PoseError | None) -> ChanceModel | None:
+    @property
+    def structures(self) -> tuple[str, ...]:
+        """Their names."""
+        return tuple(self.anatomy.checked[column].name for column in self.columns)
+
+    @property
+    def lengths(self) -> Floats:
+        """Of the needle's axis for each of them, shape (k,), mm."""
+        return axis_lengths(self.case, self.anatomy.checked)[self.columns]
+
+    @property
+    def limits(self) -> Floats:
+        """The greatest chance to touch each of them that the case allows, shape (k,)."""
+        return np.array([touch_limit(self.case, name) for name in self.structures])
+
+    @property
+    def touching(self) -> Floats:
+        """How near a needle's axis touches each of them, shape (k,), mm."""
+        return np.full(len(self.columns), self.case.needle.radius_mm)
+
+    @property
+    def breaking(self) -> Floats:
+        """How near it breaks each one's margin, shape (k,), mm."""
+        margins = np.array([self.anatomy.checked[column].margin_mm for column in self.columns], dtype=np.float64)
+        return self.case.needle.radius_mm + margins
+
+    def passing(self, outward_ct: Floats, cov_ct: Floats, axes: AxisDistances | None = None) -> Proximity:
+        """How some needles (n, 3) of given Sigma6 (n, 6, 6), CT axes, pass them; ``axes`` as in `chances`."""
+        case, columns = self.case, self.columns
+        if axes is None:
+            lengths = axis_lengths(case, self.anatomy.checked)
+            axes = self.engine.measure(case.target_ct, outward_ct, lengths, shown=False)
+        normal = self.engine.normals(case.target_ct, outward_ct, axes)[:, columns]
+        distance, depth = axes.distance[:, columns], axes.depth[:, columns]
+        return proximity(distance, depth, normal, outward_ct, cov_ct, self.error.surface_mm)
+
+    def needles(self, outward_ct: Floats, q: Floats, axes: AxisDistances | None = None) -> Needles:
+        """Some needles and the doubt about them; arguments as of `chances`."""
+        cov_ct = self.error.covariance_ct(q)
+        near = self.passing(outward_ct, cov_ct, axes)
+        return Needles(outward_ct, cov_ct, near, self.error.surface_mm, self.error.freedom)
+
+    def chances(self, outward_ct: Floats, q: Floats, axes: AxisDistances | None = None) -> Chances:
+        """The chances of some needles to first order, the joint one unknown.
+
+        Args:
+            outward_ct: Shape (n, 3), unit.
+            q: Shape (n, 6), rad, the tip on the target.
+            axes: What the engine has measured of the needles already; None measures them.
+        """
+        needles = self.needles(outward_ct, q, axes)
+        touch = touch_chance(needles.near, self.touching, self.error.freedom)
+        tip = needles.cov_ct[:, :3, :3] + self.error.target_covariance_ct
+        along = np.einsum("na,nab,nb->n", outward_ct, tip, outward_ct)
+        return Chances(
+            structures=self.structures,
+            hit=self.hit.chance(self.error, needles.cov_ct),
+            touch=touch,
+            margin=touch_chance(needles.near, self.breaking, self.error.freedom),
+            touch_any=touching_any(touch),
+            touch_joint=np.full(len(q), np.nan),
+            lateral_mm=np.sqrt(np.maximum(np.trace(tip, axis1=1, axis2=2) - along, 0.0)),
+            depth_mm=np.sqrt(along),
+        )
+
+    def refined(self, outward_ct: Floats, q: Floats, first: Chances, wanted: Bools | None = None) -> Chances:
+        """Chances to touch, to break a margin and to touch any, by line sampling; the others as they are.
+
+        Args:
+            outward_ct: Shape (n, 3), as in `chances`.
+            q: Shape (n, 6).
+            first: Of these needles, to first order.
+            wanted: Shape (n, k), which chances to touch are refined, those of margins not; None refines all of both.
+        """
+        every = np.ones(first.touch.shape, bool)
+        around = Surroundings(self.engine, self.columns, self.lengths, self.case.target_ct)
+        needles = self.needles(outward_ct, q)
+        touch = refined(around, needles, self.touching, first.touch, every if wanted is None else wanted)
+        if wanted is not None:
+            return first.refined(touch, first.margin)
+        return first.refined(touch, refined(around, needles, self.breaking, first.margin, every))
+
+    def keeps_limits(self, outward_ct: Floats, q: Floats) -> Bools:
+        """Whether needles keep the case's limits, shape (n,), in any configurations that reach the target.
+
+        Args:
+            outward_ct: Shape (n, 3), unit.
+            q: Shape (n, 6), rad, the tip on the target.
+        """
+        kept, least, limits = np.ones(len(q), bool), self.case.search.min_hit, self.limits
+        if least is not None:
+            kept &= self.hit.chance(self.error, self.error.covariance_ct(q)) >= least
+        if not np.isfinite(limits).any():
+            return kept
+        first = self.chances(outward_ct, q)
+        touch = self.refined(outward_ct, q, first, np.broadcast_to(np.isfinite(limits), first.touch.shape)).touch
+        return np.asarray(kept & (np.where(np.isnan(touch), np.inf, touch) <= limits).all(axis=1))
+
+
+def chance_model(case: Case, anatomy: Anatomy, engine: ClearanceEngine, error: PoseError | None) -> ChanceModel | None:
     """The model of a case; None where it declares no errors, or nothing ties its frames.
 
     Raises:
@@ -47,7 +164,7 @@ def chance_model(case: Case, anatomy: Anatomy, error: PoseError | None) -> Chanc
     if case.hit_radius_mm is None and not mesh.closed:
         message = f"the mesh of '{case.target_structure}' is open: what lies in it, and is hit, is not known"
         raise InputError(message, where=case.path, allowed="target.hit_radius_mm, or a closed mesh")
-    return ChanceModel(error, hit_model(case.hit_radius_mm, mesh, case.target_ct))
+    return ChanceModel(case, anatomy, engine, error, hit_model(case.hit_radius_mm, mesh, case.target_ct))
 
 
 def demanding(structures: tuple[Structure, ...]) -> Ints:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.uncertainty.hit import TargetRays, hit_in_ball, hit_in_mesh, target_rays
 from puncture_twin.planning.uncertainty.pose_error import PoseError
@@ -48,6 +48,27 @@ class Chances:
         blank = [np.full(count, np.nan) for _ in range(5)]
         wide = [np.full((count, len(structures)), np.nan) for _ in range(2)]
         return cls(structures, blank[0], wide[0], wide[1], *blank[1:])
+
+    def at(self, rows: Ints) -> Chances:
+        """Of some candidates."""
+        values = {field.name: getattr(self, field.name)[rows] for field in fields(self) if field.name != "structures"}
+        return Chances(self.structures, **values)
+
+    def put(self, rows: Ints, known: Chances) -> Chances:
+        """With those of some candidates replaced."""
+        values = {field.name: getattr(self, field.name).copy() for field in fields(self) if field.name != "structures"}
+        for name, value in values.items():
+            value[rows] = getattr(known, name)
+        return Chances(self.structures, **values)
+
+    def refined(self, touch: Floats, margin: Floats) -> Chances:
+        """With better chances (n, k) to touch and to break margins."""
+        return replace(self, touch=touch, margin=margin, touch_any=touching_any(touch))
+
+
+def touching_any(touch: Floats) -> Floats:
+    """Shape (n,), from chances to touch each structure (n, k)."""
+    return np.asarray(np.minimum(1.0, touch.sum(axis=1)))
 
 
 @dataclass(frozen=True, eq=False)

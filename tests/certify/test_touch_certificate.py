@@ -14,7 +14,6 @@ from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.uncertainty.any_pose import any_pose
-from puncture_twin.planning.uncertainty.needle_chances import chances_of
 
 CASES = {"abdomen/case.toml": 0.05, "carton/case_m.toml": 0.4}
 """Each with its chance: three markers with 5 mm slices, 877 mm from the base, leave nothing proven below .3."""
@@ -60,7 +59,7 @@ def test_no_configuration_touches_more_often(certified, rng):
     context, _, found = certified
     _, _, outward = inside(found, rng)
     rows, q = every_configuration(context, outward)
-    touch = chances_of(context.case, context.anatomy, context.engine, context.chance, outward[rows], q)["touch"]
+    touch = context.chance.chances(outward[rows], q).touch
     assert len(rows) > DRAWN
     assert 1e-4 * found.question.touch < touch.max() <= found.question.touch  # and the bound is not idle
 

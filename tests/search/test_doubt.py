@@ -1,5 +1,8 @@
 """What an explanation says of chances: the numbers of the table, and which error would have to shrink, and to what."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from places import ROOT
@@ -21,14 +24,15 @@ def asked(radius_mm, **keys):
     """A puncture of the abdomen with declared errors, and the sources of its needle."""
     made = world("abdomen/case.toml", "rigid", declared(**keys))
     case, q = load_case(ROOT / "meshes" / "abdomen"), made.puncture.q_insertion
-    model = ChanceModel(made.error, HitModel(radius_mm, None))
+    anatomy = SimpleNamespace(checked=(SimpleNamespace(name="rib", demands_margin=True, margin_mm=1.0),))
+    model = ChanceModel(case, anatomy, None, made.error, HitModel(radius_mm, None))
     outward = made.puncture.outward_ct[None]
     normal = np.cross(outward, [0.0, 0.0, 1.0])
     normal /= np.linalg.norm(normal)
     near = proximity(
         np.array([[2.0]]), np.array([[30.0]]), normal[:, None], outward, made.error.covariance_ct(q[None]), 0.0
     )
-    return made, shrinkable(case, model, near, ("rib",), q)
+    return made, shrinkable(model, near, q)
 
 
 def test_parts_add_up_to_the_chance_of_the_table():
@@ -66,8 +70,9 @@ def test_a_limit_for_touching_is_mended_too():
     _, needle = asked(50.0, **KEYS)
     touched = needle.chance("rib", {})
     limit = touched / 3
-    search = needle.case.search.__class__(**{**vars(needle.case.search), "max_touch": limit})
-    needle = needle._replace(case=needle.case.__class__(**{**vars(needle.case), "search": search}))
+    case = needle.model.case
+    case = replace(case, search=replace(case.search, max_touch=limit))
+    needle = needle._replace(model=replace(needle.model, case=case))
     (goal,) = goals_of(needle, 1.0, {"rib": touched})
     assert goal.stated and goal.remedies and "touch rib" in goal.text()
     first = goal.remedies[0]

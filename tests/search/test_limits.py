@@ -13,7 +13,6 @@ from puncture_twin.planning.search import chance
 from puncture_twin.planning.search.chance import _limited
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.uncertainty.chances import Chances
-from puncture_twin.planning.uncertainty.needle_chances import keeps_limits
 from puncture_twin.planning.uncertainty.touch import proximity, touch_bound, touch_chance
 
 CASE = """schema = 2
@@ -138,7 +137,7 @@ def test_limits_are_kept_in_a_configuration_or_not_as_the_search_says(tmp_path, 
     case = replace(context.case, search=replace(context.case.search, **{limit: value}))
     said = _limited(case, found).safe[rows]
     q = found.arm.q_insertion[rows]
-    kept = keeps_limits(case, context.anatomy, context.engine, context.chance, found.outward_ct[rows], q)
+    kept = replace(context.chance, case=case).keeps_limits(found.outward_ct[rows], q)
     assert said.any() and not said.all()
     np.testing.assert_array_equal(kept, said)
 

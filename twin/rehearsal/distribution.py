@@ -24,7 +24,6 @@ from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
 from puncture_twin.planning.uncertainty.chance_model import chance_model, demanding
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE
-from puncture_twin.planning.uncertainty.needle_chances import chances_of, refined_chances
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
 from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, not_modelled
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
@@ -239,14 +238,11 @@ def _measured(
     unreached = int((~rooms.reached).sum())
     rooms = rooms.reached_alone()
     cov_ct, error_ct = believed.tip_covariance_ct(q)[0], rooms.tip_ct - rooms.target_ct
-    model = chance_model(case, context.anatomy, believed)
+    model = chance_model(case, context.anatomy, context.engine, believed)
     assert model is not None
-    settings = (case, context.anatomy, context.engine, model)
-    chances = chances_of(*settings, puncture.outward_ct[None], q)
-    chances |= refined_chances(*settings, (puncture.outward_ct[None], q), (chances["touch"], chances["margin"]))
+    chances = model.refined(puncture.outward_ct[None], q, model.chances(puncture.outward_ct[None], q))
     inverse = np.linalg.inv(cov_ct + LEAST_VARIANCE * np.eye(3))
     square = np.einsum("na,ab,nb->n", error_ct, inverse, error_ct)
-    columns = demanding(context.anatomy.checked)
     return Distribution(
         seed=seed,
         unreached=unreached,
@@ -255,10 +251,10 @@ def _measured(
         cov_ct=cov_ct,
         in_region=square <= chdtri(3, 1 - REGION),
         hit=_hits(context, rooms),
-        p_hit=float(chances["hit"][0]),
-        structures=tuple(context.anatomy.checked[column].name for column in columns),
+        p_hit=float(chances.hit[0]),
+        structures=chances.structures,
         touched=_touches(context, puncture, rooms),
-        p_touch=chances["touch"][0],
+        p_touch=chances.touch[0],
         wrong_belief=case.truth_errors is not None,
         budget=error_budget(believed, q[0], puncture.T_base_ct[:3, :3] @ puncture.outward_ct),
         guessed_touches=guessed,
