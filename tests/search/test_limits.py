@@ -204,6 +204,31 @@ def test_a_needle_that_leans_is_refined_where_it_is_most_doubtful(tmp_path, monk
     assert (found.verdict.reason == "touch_likely").any() and not found.safe.any()
 
 
+@pytest.mark.parametrize("limited", [True, False])
+def test_what_may_decide_is_line_sampled(tmp_path, monkeypatch, limited):
+    """Every chance within a factor of 3 of the limit, and the best candidates; the rest keeps first order."""
+    limit = 0.05
+    path = ball(tmp_path, search=f"max_touch = {limit}" if limited else "", errors="touch_mm = 2.0\n")
+    path.write_text(
+        path.read_text().replace("theta_deg = [20, 20]", "theta_deg = [10, 50]").replace("[0, 80]", "[0, 40]")
+    )
+    monkeypatch.setattr(chance, "BEST", 2)
+    context = prepare(path)
+    found = context.search()
+    rows = np.flatnonzero(np.isfinite(found.chances.hit))
+    outward, q = found.outward_ct[rows], found.arm.q_insertion[rows]
+    first = context.chance.chances(outward, q)
+    lines, table = context.chance.refined(outward, q, first).touch, found.chances.touch[rows]
+    near = (first.touch >= limit / 3) & (first.touch <= 3 * limit)
+    must = near & limited
+    must[np.isin(rows, found.ranked[:2])] = True
+    assert near.any() and must.any() and (lines != first.touch)[must].any()
+    np.testing.assert_array_equal(table[must], lines[must])
+    kept = table != lines
+    np.testing.assert_array_equal(table[kept], first.touch[kept])
+    assert (kept & (lines != first.touch)).any()
+
+
 def test_the_bound_is_never_below_first_order(rng):
     """Whatever the pose's error, and wherever on the axis the nearest point is."""
     root = rng.normal(size=(50, 6, 6)) * np.array([1, 1, 1, 0.01, 0.01, 0.01])[:, None]
