@@ -1,32 +1,17 @@
 """The page on a phone, a tablet and a desk, by Playwright in headless Chromium; skipped where there is no browser."""
 
-import shutil
-from importlib.resources import files
-
 import pytest
 import report_world as world
-
-sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: make install brings it")
-
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-"""The machine's own; without one, Playwright's, which ``playwright install chromium`` brings."""
+from page_browser import chromium, opened, serious_findings
 
 WIDTHS = [390, 900, 1440]
-PATIENCE_MS = 120_000
-FLAGS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]
-SERIOUS = {"serious", "critical"}
 
 
 @pytest.fixture(scope="module")
 def browser():
     """One browser for all widths."""
-    with sync_api.sync_playwright() as playwright:
-        try:
-            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS, timeout=PATIENCE_MS)
-        except sync_api.Error as error:
-            pytest.skip(f"no browser: {error.message.splitlines()[0]}")
+    with chromium() as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
@@ -39,23 +24,15 @@ def address(tmp_path_factory):
 
 @pytest.fixture(params=WIDTHS)
 def page(request, browser, address):
-    """The page, open and drawn, at one width; the check's own script is let in."""
-    context = browser.new_context(viewport={"width": request.param, "height": 900}, bypass_csp=True)
-    context.set_default_timeout(PATIENCE_MS)
-    page = context.new_page()
-    page.goto(address)
-    page.wait_for_function("document.body.dataset.ready === 'true'")
-    yield page
-    context.close()
+    """The page, open and drawn, at one width."""
+    with opened(browser, address, request.param) as page:
+        page.wait_for_function("document.body.dataset.ready === 'true'")
+        yield page
 
 
 def test_axe_finds_nothing_serious(page):
     """Names, contrasts, landmarks, nesting: by axe-core's own rules, none of them left out."""
-    page.evaluate((files("axe_playwright_python") / "axe.min.js").read_text(encoding="utf-8"))
-    found = page.evaluate("axe.run()")
-    assert len(found["passes"]) > 15  # it did look
-    told = [(one["impact"], one["id"], [node["target"] for node in one["nodes"]][:3]) for one in found["violations"]]
-    assert [one for one in told if one[0] in SERIOUS] == []
+    assert serious_findings(page) == []
 
 
 def test_a_click_chooses_and_everything_follows(page):

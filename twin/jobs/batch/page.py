@@ -13,6 +13,7 @@ from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.batch.case_row import NO_SAFE
 from puncture_twin.planning.batch.merge import NOT_RUN
 from puncture_twin.planning.search.candidates import ARM_CHECKED
+from puncture_twin.planning.search.doubt import chance_text
 from puncture_twin.twin.jobs.batch.histogram import histogram
 from puncture_twin.twin.report.numbers import number
 from puncture_twin.twin.report.page.page_tables import inputs_table, table
@@ -121,7 +122,7 @@ def _line(row: Row) -> tuple[str, ...]:
         _shown(row["best_beta_deg"], 1),
         _shown(row["best_clearance_mm"], 2),
         _shown(row["best_path_length_mm"], 1),
-        _shown(row["best_p_hit"], 4),
+        "–" if row["best_p_hit"] is None else chance_text(row["best_p_hit"]),
         _shown(row["safe_square_deg"], 0),
         _shown(row["safe_entry_cm2"], 1),
         _shown(row["reach_fraction"], 2),

@@ -7,6 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from puncture_twin.planning.search.doubt import chance_text
 from puncture_twin.twin.jobs.servo.facts import NO_TOUCH
 from puncture_twin.twin.jobs.servo.text import DOUBTED, NOT_MODELLED, PHASE_TEXT
 from puncture_twin.twin.report.page.page_tables import faint, table
@@ -71,6 +72,6 @@ def _needle(row: Mapping[str, Any]) -> tuple[str, ...]:
         f"{one['predicted_rms_mm']:.2f}",
         " x ".join(f"{mm:.2f}" for mm in one["half_axes_mm"]),
         *(f"{value:.2f}" for value in numbers),
-        "" if one["p_hit"] is None else f"{one['p_hit']:.2f}",
+        "" if one["p_hit"] is None else chance_text(one["p_hit"]),
         f"{one['realised_mm']:.2f}",
     )

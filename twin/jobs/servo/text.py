@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from puncture_twin.planning.search.doubt import chance_text
 from puncture_twin.twin.jobs.servo.facts import NO_TOUCH, Facts, our_errors
 
 NEEDLE_HEAD = "needle expected  95 % half axes      lateral  depth  direction  realised   (mm, deg; after the servo)"
@@ -63,7 +64,7 @@ def _needle_row(row: Mapping[str, Any]) -> str:
     if one is None:
         return f"{row['target']:6s} unknown: nothing was seen at the end, or the measurements contradict each other"
     axes = " x ".join(f"{mm:.2f}" for mm in one["half_axes_mm"])
-    chance = "" if one["p_hit"] is None else f"{one['p_hit']:.2f} to hit"
+    chance = "" if one["p_hit"] is None else f"{chance_text(one['p_hit'])} to hit"
     return (
         f"{row['target']:6s} "
         + "{predicted_rms_mm:9.2f}  {axes:18s} {lateral_mm:8.2f} {depth_mm:6.2f} {predicted_direction_deg:10.2f}"

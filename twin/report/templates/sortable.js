@@ -1,8 +1,9 @@
 for (const table of document.querySelectorAll("table.sortable")) {
   const heads = [...table.tHead.rows[0].cells], body = table.tBodies[0];
   const value = (row, column) => row.cells[column].textContent;
+  const size = (text) => parseFloat(text.replace("−", "-").replace(/[<>,]/g, ""));
   const compared = (one, other, sign) => { // numbers by size and before words; what is not there comes last
-    const a = parseFloat(one.replace("−", "-").replaceAll(",", "")), b = parseFloat(other.replace("−", "-").replaceAll(",", ""));
+    const a = size(one), b = size(other);
     if (isNaN(a) || isNaN(b)) return isNaN(a) - isNaN(b) || sign * one.localeCompare(other);
     return sign * (a - b);
   };

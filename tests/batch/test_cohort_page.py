@@ -1,0 +1,49 @@
+"""The cohort's page on a phone and a desk, in headless Chromium; skipped where there is no browser."""
+
+import pytest
+from page_browser import chromium, opened, serious_findings
+
+from puncture_twin.planning.batch.case_row import SCHEMA
+from puncture_twin.twin.jobs.batch.page import write_cohort_page
+
+HITS = [0.5, 1.0, None, 1e-9, 0.93]
+"""Chances of five cases, the third without a safe direction."""
+
+
+def row(at, hit):
+    """One case of the table."""
+    values = dict.fromkeys([*SCHEMA.names, "page"])
+    safe = 0 if hit is None else 12
+    known = {"case": f"p{at}/case.toml", "name": f"p{at}", "id": f"{at:032x}", "safe": safe, "arm": "checked"}
+    return {**values, **known, "exit_code": int(hit is None), "directions": 100, "best_p_hit": hit, "page": at == 0}
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    """The page's; one case was refused."""
+    path = tmp_path_factory.mktemp("cohort") / "cohort.html"
+    rows = [row(at, hit) for at, hit in enumerate(HITS)]
+    rows.append({**row(9, None), "exit_code": 2, "reason": "case.toml: no such structure", "safe": None})
+    write_cohort_page("study", rows, (), path)
+    return path.as_uri()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """One browser for both widths."""
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.mark.parametrize("width", [390, 1200])
+def test_the_page_reads_and_sorts(browser, address, width):
+    """No serious finding, never wider than its window; a chance sorts by its size, however it is written."""
+    with opened(browser, address, width) as page:
+        assert serious_findings(page) == []
+        assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+        page.get_by_role("button", name="p hit").click()
+        cells = page.locator("table.sortable tbody tr").evaluate_all(
+            "rows => rows.map(row => row.cells[9].textContent)"
+        )
+        assert cells[:4] in (["<0.0001", "0.50", "0.93", ">0.9999"], [">0.9999", "0.93", "0.50", "<0.0001"])
+        assert page.locator("table.sortable a").count() == 1
