@@ -42,12 +42,21 @@ def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
     for mesh in robot.iter("mesh"):
         mesh.set("filename", str(resolve_package(mesh.get("filename", ""))))
     _replace_collisions(robot, model, folder)
+    _weigh_frames(robot)
     if tool.holder_length_mm > 0:
         _add_cylinder(robot, "holder", 0.0, tool.holder_length_mm, tool.holder_diameter_mm, HOLDER_DENSITY_KG_M3)
     _add_cylinder(robot, "needle", tool.holder_length_mm, tool.shaft_mm, tool.needle_diameter_mm, NEEDLE_DENSITY_KG_M3)
     path = folder / "arm.urdf"
     ET.ElementTree(robot).write(path, encoding="utf-8", xml_declaration=True)
     return path
+
+
+def _weigh_frames(robot: ET.Element) -> None:
+    """Say of links without inertia, which are mere frames, that they weigh nothing: PyBullet would give them 1 kg."""
+    for link in robot.findall("link"):
+        if link.find("inertial") is None:
+            nothing = '<mass value="0"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>'
+            link.append(ET.fromstring(f"<inertial>{nothing}</inertial>"))
 
 
 def _replace_collisions(robot: ET.Element, model: UrModel, folder: Path) -> None:

@@ -123,6 +123,15 @@ def test_needle_ends_where_the_tool_says():
     assert abs(nearest - tip[along]) < 5.0  # Bullet's boxes are a few mm larger than the body
 
 
+@pytest.mark.parametrize("name", ["ur3", "ur3e", "ur5", "ur5e", "ur10", "ur10e"])
+def test_the_flange_is_a_frame_and_weighs_nothing(name):
+    """PyBullet gives a link without inertia 1 kg and 1 kg m^2: no arm carries that between wrist and holder."""
+    with physics_client() as client:
+        arm = load_arm(client, ur_model(name), TOOL)
+        mass, _, inertia = pybullet.getDynamicsInfo(arm.body, arm.links["tool0"], physicsClientId=client)[:3]
+    assert mass == 0.0 and inertia == (0.0, 0.0, 0.0)
+
+
 def test_links_have_the_planners_names():
     """Contacts of physics and of FCL speak of the same bodies."""
     with physics_client() as client:
@@ -233,9 +242,10 @@ def test_picture_shows_what_stands_there():
     np.testing.assert_array_equal(seen[0, 0], empty[0, 0])
 
 
-def test_loading_prints_nothing_on_stdout(capfd):
+@pytest.mark.parametrize("name", ["ur3", "ur3e"])
+def test_loading_prints_nothing_on_stdout(capfd, name):
     """Standard output belongs to the caller: a table or a JSON object may be on its way there."""
-    with open_workcell(ur_model("ur3"), TOOL, sphere(50.0), at(400, 0, 0), down_ct=DOWN) as room:
+    with open_workcell(ur_model(name), TOOL, sphere(50.0), at(400, 0, 0), down_ct=DOWN) as room:
         execute(room, HOME[None].repeat(10, axis=0), np.zeros(6))
     assert capfd.readouterr().out == ""
 
