@@ -13,16 +13,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eigh
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.world.execution import RECORD_S
 
 MOST_RATIO = 0.8
 """Of sqrt(K / m) dt over every mode of the tip: five sixths of where the loop diverges."""
 
-STEPS_S = (1e-3, 5e-4, 2.5e-4)
-"""Of a controller, the longest first."""
+STEPS_S = (RECORD_S / 17, RECORD_S / 34, RECORD_S / 68)
+"""Of a controller, the longest first: about 1, .5 and .25 ms, and records fall on steps."""
 
 
 @dataclass(frozen=True)
@@ -47,17 +47,22 @@ class Stiffness:
         return np.repeat([self.translation_n_m, self.rotation_nm_rad], 3)
 
 
+SLOWEST = 1e-6
+"""Of the fastest mode: a slower one is damped as if it were so fast. At a singular pose the tip cannot move along it,
+its mass is infinite, and J' takes whatever its damping is to nothing."""
+
+
 def damping(stiffness: Stiffness, J: Floats, M: Floats) -> Floats:
     """D that gives every mode of the tip the same damping ratio, shape (6, 6).
 
     With Lambda the tip's mass and B its factor such that Lambda = B B', K = B diag(w^2) B': D = 2 zeta B diag(w) B'.
+    From Lambda^-1 = J M^-1 J' alone: with U diag(w^2) U' = K^1/2 Lambda^-1 K^1/2, B = K^1/2 U diag(1/w).
     """
-    inverse_mass = J @ np.linalg.solve(M, J.T)
-    squares, V = eigh(
-        np.diag(stiffness.diagonal), np.linalg.inv((inverse_mass + inverse_mass.T) / 2)
-    )  # V' Lambda V = 1
-    B = np.linalg.inv(V).T
-    return np.asarray(2.0 * stiffness.damping_ratio * (B * np.sqrt(squares)) @ B.T)
+    root = np.sqrt(stiffness.diagonal)
+    squares, U = np.linalg.eigh(root[:, None] * (J @ np.linalg.solve(M, J.T)) * root)
+    modes = root[:, None] * U
+    w = np.sqrt(np.maximum(squares, SLOWEST**2 * squares[-1]))
+    return np.asarray(2.0 * stiffness.damping_ratio * (modes / w) @ modes.T)
 
 
 def stability_ratio(stiffness: Stiffness, J: Floats, M: Floats, dt: float) -> float:

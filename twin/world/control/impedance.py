@@ -2,7 +2,7 @@
 
     tau = ID(q, qd, qdd_ref) + J' (K e + D de/dt + K_i K int e dt)
 
-e is the reference's tip minus the measured one: position, then the rotation vector between them, in base axes. Without
+e is the reference's tip minus the measured one: position, then the rotation between them, in base axes. Without
 contact the model's torque alone follows the reference and the spring corrects what the masses err by; in contact the
 tip yields by F / K. The integral takes the rest away, and with it, in 1/K_i seconds, the compliance: it stands still
 while contact is felt, where the compliance is to be kept.
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from puncture_twin.planning.geometry.rigid import log_rotation
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.world.control.gains import Stiffness, damping, refuse_unstable
 from puncture_twin.twin.world.control.reference import Reference
 from puncture_twin.twin.world.control.rigid_model import RigidModel
@@ -57,7 +57,7 @@ class Impedance:
             refuse_unstable(self._stiffness, J, M, self.dt)
             self._D = damping(self._stiffness, J, M)
         self._steps += 1
-        turn = log_rotation(reference.R_base_tip[row] @ tip.R_base_tip[0].T)
+        turn = rotation_error(reference.R_base_tip[row], tip.R_base_tip[0])
         error = np.concatenate([reference.position_m[row] - tip.position_m[0], turn])
         if not (self._keep_compliance and np.linalg.norm(measured.force_n) > CONTACT_N):
             self._integral = self._integral + self.dt * error
@@ -65,3 +65,12 @@ class Impedance:
         wrench = spring + self._D @ (reference.twist[row] - J @ measured.speed)
         feedforward = self._model.inverse_dynamics(measured.q, measured.speed, reference.acceleration[row])
         return Torques(feedforward + J.T @ wrench)
+
+
+def rotation_error(R_reference: Floats, R: Floats) -> Floats:
+    """From R to the reference, shape (3,), rad: sin(angle) along the axis, half the sum of r_i x r_reference_i.
+
+    Source: Luh, Walker, Paul 1980, "Resolved-acceleration control of mechanical manipulators".
+    """
+    skewed = R_reference @ R.T
+    return 0.5 * np.array([skewed[2, 1] - skewed[1, 2], skewed[0, 2] - skewed[2, 0], skewed[1, 0] - skewed[0, 1]])
