@@ -38,7 +38,7 @@ class BentPath:
     @cached_property
     def bend(self) -> Bend:
         """By how much, if its bevel never turns."""
-        insertion = insertion_along(self.case, self.bending, self.anatomy, self.outward_ct, self.path_length)
+        insertion = insertion_along(self.bending, self.anatomy, self.case.target_ct, self.outward_ct, self.path_length)
         return Bend(insertion.tip_mm, self.bending.shaft.length_mm)
 
     def with_shaft(self, shaft: Shaft) -> BentPath:

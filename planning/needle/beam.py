@@ -22,11 +22,16 @@ BANDS = 4
 
 
 class Shape(NamedTuple):
-    """Of n nodes: deflection (mm) and slope (rad), shape (n,); and the force that held the tip, N."""
+    """Of n nodes: deflection (mm) and slope (rad), shape (n,), and forces, N and N mm.
+
+    The tip's is what held it; the clamp's are what it bears of all that presses on the shaft, a moment about itself.
+    """
 
     deflection: Floats
     slope: Floats
     tip_force: float
+    clamp_force: float
+    clamp_moment: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +62,7 @@ class Beam:
         free = bands[:, 2:]  # the first node is clamped
         right = load[2:].copy()
         if tip_mm is None:
-            return _shape(solveh_banded(free, right, lower=True, check_finite=False), 0.0)
+            return _shape(solveh_banded(free, right, lower=True, check_finite=False), 0.0, (bands, load))
         at = free.shape[1] - 2  # the unknown that is known
         clamped = free.copy()
         for below in range(1, BANDS):  # move its column to the right side
@@ -69,7 +74,7 @@ class Beam:
         found = solveh_banded(clamped, right, lower=True, check_finite=False)
         row = sum(free[below, at - below] * found[at - below] for below in range(1, BANDS))
         force = row + free[0, at] * found[at] + free[1, at] * found[at + 1] - load[-2]
-        return _shape(found, float(force))
+        return _shape(found, float(force), (bands, load))
 
     def _bands(self, foundation: Floats) -> Floats:
         """The stiffness matrix in lower banded form, shape (BANDS, 2 (elements + 1))."""
@@ -111,6 +116,10 @@ class Beam:
         return load
 
 
-def _shape(found: Floats, force: float) -> Shape:
-    """With the clamped node in front."""
-    return Shape(np.concatenate([[0.0], found[0::2]]), np.concatenate([[0.0], found[1::2]]), force)
+def _shape(found: Floats, force: float, system: tuple[Floats, Floats]) -> Shape:
+    """With the clamped node in front, whose two rows of the system say what the clamp must hold against."""
+    bands, load = system
+    bears = load[0] - bands[2, 0] * found[0] - bands[3, 0] * found[1]
+    moment = load[1] - bands[1, 1] * found[0] - bands[2, 1] * found[1]
+    shape = np.concatenate([[0.0], found[0::2]]), np.concatenate([[0.0], found[1::2]])
+    return Shape(*shape, force, float(bears), float(moment))

@@ -204,7 +204,7 @@ class Explanation:
         row, bending = self.candidates, self.case.bending
         if bending is None or np.isnan(row.path.length[0]):
             return None
-        return insertion_along(self.case, bending, self.anatomy, row.outward_ct[0], float(row.path.length[0]))
+        return insertion_along(bending, self.anatomy, self.case.target_ct, row.outward_ct[0], float(row.path.length[0]))
 
     def _bending(self) -> list[str]:
         if self.insertion is None or self.candidates.deflection is None:

@@ -8,7 +8,6 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.needle.bending import Bending
 from puncture_twin.planning.needle.bevel_path import STEP_MM, BevelPath, bevel_path
 from puncture_twin.planning.needle.insertion_force import InsertionForce, insertion_force
@@ -43,18 +42,18 @@ class Insertion(NamedTuple):
 
 
 def insertion_along(
-    case: Case, bending: Bending, anatomy: Anatomy, outward_ct: Floats, path_length: float
+    bending: Bending, anatomy: Anatomy, end_ct: Floats, outward_ct: Floats, path_length: float
 ) -> Insertion:
     """The insertion along one direction.
 
     Args:
-        case: The case.
         bending: Of the case.
         anatomy: Its structures.
+        end_ct: Shape (3,), mm, where the path ends: the target.
         outward_ct: Shape (3,), unit.
-        path_length: Target to skin, mm.
+        path_length: From there to the skin, mm.
     """
-    layers = path_layers(bending, anatomy, case.target_ct, outward_ct, path_length)
+    layers = path_layers(bending, anatomy, end_ct, outward_ct, path_length)
     count = max(1, round(path_length / STEP_MM))
     middles = (np.arange(count) + 0.5) * path_length / count
     ends = np.array([layer.end_mm for layer in layers])

@@ -94,7 +94,9 @@ class Subject:
         """
         if self.case.bending is None or not np.isfinite(self.path_mm):
             return None
-        found = insertion_along(self.case, self.case.bending, self.anatomy, self.outward_ct, self.path_mm).path
+        found = insertion_along(
+            self.case.bending, self.anatomy, self.case.target_ct, self.outward_ct, self.path_mm
+        ).path
         return np.stack([self.path_mm - found.depth_mm, found.needle_mm], axis=1)
 
     @property
