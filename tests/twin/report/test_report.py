@@ -4,6 +4,7 @@ import json
 import os
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import imageio_ffmpeg
 import numpy as np
@@ -34,6 +35,7 @@ from puncture_twin.twin.report.raster.compositing import RasterShot, compose, em
 from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, put_moving, translucents_of
 from puncture_twin.twin.report.scene import film, lighter_mesh, scene_picture
 from puncture_twin.twin.report.scene.film import draw_film
+from puncture_twin.twin.report.scene.film_text import model_note
 from puncture_twin.twin.report.scene.scene_parts import SceneBody, needle_bodies, patient
 from puncture_twin.twin.report.scene.scene_picture import draw_scene, families, render_bodies
 from puncture_twin.twin.report.scene.shapes import LIFT_MM, corridor_mouth, corridor_walls
@@ -454,6 +456,24 @@ def test_a_film_has_the_same_bytes_on_any_number_of_cores(rng, tmp_path):
     finally:
         os.sched_setaffinity(0, cores)
     assert (tmp_path / "1.mp4").read_bytes() == (tmp_path / f"{len(cores)}.mp4").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("bending", "breathing", "said"),
+    [
+        (None, None, "needle and tissue are rigid; nothing breathes; "),
+        (
+            "declared",
+            None,
+            "tissue pushes on the needle; its bend is in where it ends, drawn straight; nothing breathes; ",
+        ),
+        (None, "declared", "needle and tissue are rigid; the body stands still as in the CT; "),
+    ],
+)
+def test_the_film_says_what_it_does_not_show(bending, breathing, said):
+    """Rigid where nothing else is declared; what is declared is computed, and drawn as if it were not."""
+    case = SimpleNamespace(bending=bending, breathing=breathing)
+    assert model_note(case) == said + "research software, not a medical device"
 
 
 @pytest.mark.parametrize("total_s", [0.5, 5.0, 11.0, 31.0, 400.0])

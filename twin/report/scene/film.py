@@ -31,7 +31,7 @@ from puncture_twin.twin.report.raster.compositing import (
     compose,
 )
 from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, put_moving, translucents_of
-from puncture_twin.twin.report.scene.film_text import FrameText, draw_frame_text
+from puncture_twin.twin.report.scene.film_text import FrameText, draw_frame_text, model_note
 from puncture_twin.twin.report.scene.scene_parts import ArmPicture, SceneBody, needle_bodies, patient, room
 from puncture_twin.twin.report.scene.shapes import bar
 from puncture_twin.twin.report.scene.views import close_up, overview
@@ -133,7 +133,7 @@ def _frames(
     wide = _Stage(still, _wide_camera(case, still, arm, rehearsal, plan))
     near = _Stage([b for b in still if b.group != "room"], _near_camera(case, still, plan))
     tool = _tool_layer(case)
-    text = FrameText(rehearsal, plan, times.speed, demanding(anatomy))
+    text = FrameText(rehearsal, plan, times.speed, demanding(anatomy), model_note(case))
     for number, moment in enumerate(times.moments):
         row = int(np.searchsorted(rehearsal.times_s, moment, side="right")) - 1
         T_ct_flange = np.linalg.inv(T_base_ct) @ rehearsal.T_base_flange_true[row]

@@ -26,12 +26,13 @@ LABEL, VALUE = 13, 17
 
 @dataclass(frozen=True)
 class FrameText:
-    """Where the words of a frame come from: measurements, plan, playback speed, structures to keep away from."""
+    """Where a frame's words come from: measurements, plan, speed, structures to keep away from, what is not drawn."""
 
     rehearsal: Any
     plan: Any
     speed: float
     demanding: frozenset[str]
+    note: str
 
     def clearance(self, moment: float) -> tuple[str, float] | None:
         """Nearest structure to keep away from, and its clearance, at the latest sample; None before the first."""
@@ -84,6 +85,17 @@ def draw_frame_text(
     _alarm(draw, source, moment)
 
 
+def model_note(case: Any) -> str:
+    """What a film shows of needle, tissue and breath: what the case declares of them is computed, not drawn."""
+    needle = (
+        "needle and tissue are rigid"
+        if case.bending is None
+        else "tissue pushes on the needle; its bend is in where it ends, drawn straight"
+    )
+    breath = "nothing breathes" if case.breathing is None else "the body stands still as in the CT"
+    return f"{needle}; {breath}; research software, not a medical device"
+
+
 def _strip(draw: ImageDraw.ImageDraw, source: FrameText, row: int, moment: float, top: int) -> None:
     phase = str(source.rehearsal.phase[row])
     nearest = source.clearance(moment)
@@ -108,8 +120,7 @@ def _strip(draw: ImageDraw.ImageDraw, source: FrameText, row: int, moment: float
         result = f"tip error at the end {number(r.tip_error_mm, 2, 'mm')}: {parts}{place}"
         annotate.write(draw, (12, top + 51), result, size=VALUE, bold=True)
     else:
-        note = "rigid tissue and needle; research software, not a medical device"
-        annotate.write(draw, (12, top + 54), note, size=11, colour=annotate.FAINT)
+        annotate.write(draw, (12, top + 54), source.note, size=11, colour=annotate.FAINT)
 
 
 def _alarm(draw: ImageDraw.ImageDraw, source: FrameText, moment: float) -> None:
