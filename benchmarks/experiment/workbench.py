@@ -12,7 +12,13 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.geometry.rigid import frame_about, pose
 from puncture_twin.planning.motion.timing import Rates, time_law
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
+from puncture_twin.planning.needle.bevel_path import bevel_path
+from puncture_twin.planning.needle.insertion_force import insertion_force
+from puncture_twin.planning.needle.shaft import Shaft
+from puncture_twin.planning.needle.tissue import Layer, Tissue
 from puncture_twin.planning.registration.registration import fit_rigid
+from puncture_twin.planning.search.bending.insertion import Insertion
+from puncture_twin.twin.plant.true_tissue import StraightPath, TrueTissue
 from puncture_twin.twin.world.arm import load_arm
 from puncture_twin.twin.world.bodies import load_box
 from puncture_twin.twin.world.client import physics_client
@@ -20,7 +26,7 @@ from puncture_twin.twin.world.control.gains import Stiffness
 from puncture_twin.twin.world.control.impedance import Impedance
 from puncture_twin.twin.world.control.reference import reference_of
 from puncture_twin.twin.world.control.rigid_model import rigid_model
-from puncture_twin.twin.world.control.run import Goals, Surroundings, run
+from puncture_twin.twin.world.control.run import Goals, Push, Surroundings, run
 from puncture_twin.twin.world.control.tip import tips
 from puncture_twin.twin.world.engine import pybullet
 
@@ -36,6 +42,11 @@ OUTWARD = T_BASE_CT[:3, :3] @ [np.sin(THETA) * np.cos(BETA), np.sin(THETA) * np.
 TARGET = T_BASE_CT[:3, :3] @ [50.0, 130, 63] + T_BASE_CT[:3, 3]
 DOWN = -T_BASE_CT[:3, 2]
 EXACT = np.zeros(6)
+SHAFT = Shaft(200.0, 1.27)
+LAYERS = (
+    Layer(0.0, 25.0, Tissue(0.1, 0.9, 0.02, 4.0, 4.0)),
+    Layer(25.0, 50.0, Tissue(0.1, 0.9, 0.02, 2.0, 3.0)),
+)
 FRICTION_NM = np.array([0.3, 0.3, 0.15, 0.05, 0.05, 0.05])
 
 
@@ -152,22 +163,14 @@ def press(controller_of, wall_n_m=None, *, ahead_mm=2.0, over_mm=3.0, speed_mm_s
     return Pressed(times, force, steady, float(force.max()), int((force[first:] == 0).sum()), depth)
 
 
-class Layers:
-    """Skin that ruptures at 4 N, a capsule at 25 mm, cutting and shaft friction: along the needle, N over mm."""
+def pressed_by(force_n):
+    """A force (3,), N, on the tip, wherever it is."""
+    return lambda tip: [Push(force_n, tip.position_m[0])]
 
-    def __init__(self, entry_m):
-        self._entry, self._skin, self._capsule = entry_m, False, False
 
-    def __call__(self, tip, velocity):
-        """The force on the tip, (3,), N."""
-        into = tip.R_base_tip[0, :, 2]
-        depth = 1e3 * float((tip.position_m[0] - self._entry) @ into)
-        return -self._force(depth) * np.clip((velocity @ into) / 1e-3, -1, 1) * into if depth > 0 else np.zeros(3)
-
-    def _force(self, depth):
-        self._skin = self._skin or depth > 4.0
-        self._capsule = self._capsule or depth > 28.0
-        if not self._skin:
-            return 1.0 * depth
-        capsule = 0.0 if self._capsule else max(0.0, depth - 25.0) * 0.7
-        return 0.9 + 0.02 * depth + capsule
+def tissue(entry_base, into_base, degrees=1.0):
+    """Skin that ruptures at 4 N, a capsule at 25 mm, cutting and friction; a bevel that cuts to the flange's x."""
+    count = 50
+    path = bevel_path(SHAFT, np.full(count, 0.1), np.full(count, np.radians(degrees)))
+    passed = Insertion(path, insertion_force(LAYERS), np.inf, np.inf)
+    return TrueTissue(passed, StraightPath(entry_base, into_base), 0.0, SHAFT.length_mm)

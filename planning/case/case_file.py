@@ -342,7 +342,7 @@ class RehearsalSection(Section):
     fle_ct_mm: NotNegative = 0.5
     fle_touch_mm: NotNegative = 0.1
     joint_offset_deg: NotNegative = 0.02
-    control: Literal["position", "impedance", "admittance"] = "position"
+    control: Literal["impedance", "admittance", "position"] = "impedance"
     errors: ErrorsSection | None = None
 
 

@@ -44,6 +44,7 @@ class Truth:
         seed: What the random part was drawn from.
         source: How it was found, in words for the report.
         target_ct: Shape (3,), mm: where the target truly is in the CT; None where it was read without error.
+        bevel_side: Whereto the bevel points about the needle's z, rad; of a needle that bends.
     """
 
     T_base_ct_true: Floats
@@ -51,6 +52,7 @@ class Truth:
     seed: int
     source: str
     target_ct: Floats | None = None
+    bevel_side: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("T_base_ct_true", "joint_offsets", *(() if self.target_ct is None else ("target_ct",))):

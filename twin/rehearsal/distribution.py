@@ -219,7 +219,7 @@ def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:
     length = float(paths.path_length[0])
     if not np.isfinite(length):
         return None
-    insertion = insertion_along(case, case.bending, anatomy, outward_ct, length)
+    insertion = insertion_along(case.bending, anatomy, case.target_ct, outward_ct, length)
     return Bend(insertion.tip_mm, case.bending.shaft.length_mm)
 
 

@@ -16,15 +16,18 @@ from dataclasses import replace
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.pose_error import pose_error
+from puncture_twin.twin.plant.true_needle import TrueNeedle
 from puncture_twin.twin.plant.truth import Truth, draw_truth
 from puncture_twin.twin.rehearsal.distribution import Distribution, bend_along, rehearse_rooms
-from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms
+from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, bent
 from puncture_twin.twin.rehearsal.standing import Standing
 
 TRIED = 16
@@ -45,7 +48,8 @@ def drawn_truth(puncture: Puncture, rooms: Rooms, row: int, seed: int, source: s
     T_base_tip[:3, 3] += puncture.tip_mm * T_base_tip[:3, 2]
     T_ct_tip = np.eye(4)
     T_ct_tip[:3, :3], T_ct_tip[:3, 3] = rooms.R_ct_needle[row], rooms.tip_ct[row]
-    return Truth(T_base_tip @ np.linalg.inv(T_ct_tip), np.zeros(6), seed, source, rooms.target_ct[row])
+    T_base_ct, side = T_base_tip @ np.linalg.inv(T_ct_tip), float(rooms.bevel_side[row])
+    return Truth(T_base_ct, np.zeros(6), seed, source, rooms.target_ct[row], side)
 
 
 def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Truth:
@@ -63,10 +67,24 @@ def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Tru
     case = context.case
     drawn = case.errors is not None and case.registration is not None and case.rehearsal.truth_base is None
     if not drawn:
-        return draw_truth(case, plan.T_base_ct, seed=seed)
+        return _bent_truth(context, plan, draw_truth(case, plan.T_base_ct, seed=seed))
     seed = case.rehearsal.seed if seed is None else seed
     found = rehearse_rooms(context, plan.outward_ct, plan.insertion.q[-1], TRIED, seed)
     return _of_drawn(found, 0, f"drawn with seed {seed} from {_declared(found)}")
+
+
+def _bent_truth(context: CaseContext, plan: Plan, truth: Truth) -> Truth:
+    """The same truth with a needle that bends to a drawn side: the patient moved by what a straight one misses."""
+    bend = bend_along(context, plan.outward_ct)
+    if bend is None:
+        return truth
+    T = np.array(flange_pose(ur_model(plan.model), plan.insertion.q[-1]))
+    T[:3, 3] += plan.needle_length_mm * T[:3, 2]
+    side = float(np.random.default_rng([truth.seed, 3]).uniform(0, 2 * np.pi))
+    end = bent(TrueNeedle(T[None, :3, 3], T[None, :3, :3]), bend, np.array([side]))
+    moved = T @ np.linalg.inv(pose(end.R_base_needle[0], end.tip_base[0])) @ truth.T_base_ct_true
+    source = f"{truth.source}; the needle bends by {bend.tip_mm:.2f} mm, to a drawn side"
+    return replace(truth, T_base_ct_true=moved, bevel_side=side, source=source)
 
 
 def median_truth(found: Distribution) -> Truth:

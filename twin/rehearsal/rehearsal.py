@@ -1,8 +1,8 @@
 """A plan, executed in the twin: the arm moves under its motors, the patient lies at their true place.
 
 What is modelled: rigid bodies, gravity, motor lag and torque limits, joint offsets, a registration that errs; the
-insertion by the motors too, or by a spring at the tip (``[rehearsal] control``). What is not: tissue that resists or
-moves, a needle that bends, breathing.
+insertion by a spring at the tip, or by the motors (``[rehearsal] control``); where ``[tissue]`` is declared, its force
+on the needle, and how far the needle bends, in where the patient lies. What is not: tissue that moves, breathing.
 """
 
 from __future__ import annotations
@@ -19,26 +19,23 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.collision.workcell import case_boxes, case_checker, case_tool
+from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.geometry.containment import Side, side_of
-from puncture_twin.planning.motion.trajectory import Trajectory
-from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.twin.plant.true_tissue import NOT_FELT, Felt
 from puncture_twin.twin.plant.truth import Truth
+from puncture_twin.twin.rehearsal.executed import executed
 from puncture_twin.twin.rehearsal.standing import Standing
-from puncture_twin.twin.world.client import TIME_STEP_S
-from puncture_twin.twin.world.control.insertion import Insertion, insert
-from puncture_twin.twin.world.execution import Execution, execute, joined
-from puncture_twin.twin.world.workcell import open_workcell
+from puncture_twin.twin.world.execution import Execution
 
-SETTLE_S = 0.5
-"""Pause between approach and insertion: ten times the time in which a motor's lag dies out."""
-
-DWELL_S = 1.0
-"""Pause at the end, before the tip is measured."""
-
-ROUNDING = 1e-6
-"""Of a time over the physics step: a whole number of steps must not fall short of itself."""
+CONTROLS = MappingProxyType(
+    {
+        "impedance": "by a spring at the tip (impedance)",
+        "admittance": "by moved goals of the motors (admittance)",
+        "position": "by the position motors",
+    }
+)
+"""How an insertion is followed, in words."""
 
 CLEARANCE_SAMPLES = 48
 """Moments of the insertion at which the needle's clearance is measured, the last one included."""
@@ -86,6 +83,9 @@ class Rehearsal:
         predicted_error_mm: What the plan expected (rms), NaN without markers.
         target_true_ct: Shape (3,), where the target truly was in the CT.
         truth_is_belief: Whether the patient lay exactly where it was believed, so that the error says little.
+        control: How the insertion was followed: "impedance", "admittance" or "position".
+        off_path_mm: The tip from its commanded path, by the encoders, at most from the insertion on.
+        felt: The greatest forces of the tissue on the needle; None where the case declares none.
         standing: Where the error stands among others; None where the case declares no errors.
     """
 
@@ -109,7 +109,20 @@ class Rehearsal:
     predicted_error_mm: float
     target_true_ct: Floats
     truth_is_belief: bool
+    control: str
+    off_path_mm: float
+    felt: Felt | None
     standing: Standing | None = None
+
+    @property
+    def followed_text(self) -> str:
+        """How the insertion was followed, for a person."""
+        return f"{CONTROLS[self.control]}, at most {self.off_path_mm:.3f} mm off its commanded path"
+
+    @property
+    def force_text(self) -> str:
+        """What the tissue did, for a person."""
+        return NOT_FELT if self.felt is None else self.felt.text
 
     def __post_init__(self) -> None:
         for value in (*vars(self).values(), *self.clearance_mm.values()):
@@ -140,8 +153,9 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
     """
     T_base_ct = truth.T_base_ct_true
     model = ur_model(plan.model)
-    done = _executed(plan, case, anatomy, truth)
-    times, phase = done.times_s, _phases(plan, done.times_s)
+    seen = executed(plan, case, anatomy, truth)
+    done, phase = seen.execution, seen.phase
+    times = done.times_s
     T_ct_flange = np.linalg.inv(T_base_ct) @ done.T_base_flange
     forward_ct = T_ct_flange[:, :3, 2]
     tip_ct = T_ct_flange[:, :3, 3] + plan.needle_length_mm * forward_ct
@@ -169,6 +183,9 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
         predicted_error_mm=plan.expected_target_error_mm,
         target_true_ct=target_ct.copy(),
         truth_is_belief=bool(np.array_equal(T_base_ct, plan.T_base_ct)),
+        control=case.rehearsal.control,
+        off_path_mm=seen.off_path_mm,
+        felt=seen.felt,
     )
 
 
@@ -183,47 +200,6 @@ def split_error(tip: Floats, forward: Floats, target: Floats) -> TipError:
     error = tip - target
     depth = float(error @ forward)
     return TipError(float(np.linalg.norm(error)), float(np.linalg.norm(error - depth * forward)), depth)
-
-
-def _executed(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Execution:
-    """The approach by position motors, and after a pause the insertion as the case wants it controlled."""
-    T_base_ct, control = truth.T_base_ct_true, case.rehearsal.control
-    model, tool, boxes = ur_model(plan.model), case_tool(case), case_boxes(case, T_base_ct)
-    down_ct = -bed_frame(case)[:3, 2]
-    parts = _parts(plan)
-    with open_workcell(model, tool, anatomy.skin.mesh, T_base_ct, boxes, down_ct=down_ct) as open_cell:
-        if control == "position":
-            return execute(open_cell, np.concatenate(list(parts.values())), truth.joint_offsets)
-        before = np.concatenate([parts["approach"], parts["settle"]])
-        approached = execute(open_cell, before, truth.joint_offsets)
-        insertion = Insertion(model, tool, T_base_ct[:3, :3] @ down_ct, plan.insertion, DWELL_S)
-        start_s = TIME_STEP_S * len(before)
-        return joined(approached, insert(open_cell, insertion, control, truth.joint_offsets, start_s=start_s))
-
-
-def _parts(plan: Plan) -> dict[str, Floats]:
-    """Joint commands of each phase, one row a physics step, shape (n, 6)."""
-    approach, insertion = _steps(plan.approach), _steps(plan.insertion)
-    return {
-        "approach": approach,
-        "settle": np.repeat(approach[-1:], round(SETTLE_S / TIME_STEP_S), axis=0),
-        "insertion": insertion,
-        "hold": np.repeat(insertion[-1:], round(DWELL_S / TIME_STEP_S), axis=0),
-    }
-
-
-def _phases(plan: Plan, times_s: Floats) -> NDArray[np.str_]:
-    """The phase of each time, shape (m,)."""
-    parts = _parts(plan)
-    ends = np.cumsum([len(part) for part in parts.values()])
-    row = np.floor(times_s / TIME_STEP_S + ROUNDING).astype(np.int64)
-    return np.array(list(parts))[np.searchsorted(ends[:-1], row, side="right")]
-
-
-def _steps(trajectory: Trajectory) -> Floats:
-    """A trajectory at every physics step, shape (n, 6), its end included."""
-    count = int(np.ceil(trajectory.duration_s / TIME_STEP_S)) + 1
-    return trajectory.at(TIME_STEP_S * np.arange(count, dtype=np.float64))
 
 
 def _clearance_samples(phase: NDArray[np.str_]) -> NDArray[np.int64]:

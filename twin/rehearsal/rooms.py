@@ -70,6 +70,7 @@ class Rooms(NamedTuple):
         reached: Shape (n,), whether the arm could reach the pose that followed.
         R_ct_needle: Shape (n, 3, 3), the needle's axes as columns; z points to the tip.
         chi_squared: Shape (n,), of the weighted residuals of each room's markers against the believed noise.
+        bevel_side: Shape (n,), rad, whereto the bevel points about the needle's z; 0 where it has none.
     """
 
     tip_ct: Floats
@@ -79,6 +80,7 @@ class Rooms(NamedTuple):
     reached: Bools
     R_ct_needle: Floats
     chi_squared: Floats
+    bevel_side: Floats
 
     def of(self, rows: Bools | Ints) -> Rooms:
         """Some of the rooms."""
@@ -90,6 +92,7 @@ class Rooms(NamedTuple):
             self.reached[rows],
             self.R_ct_needle[rows],
             self.chi_squared[rows],
+            self.bevel_side[rows],
         )
 
     def reached_alone(self) -> Rooms:
@@ -113,12 +116,14 @@ def draw_rooms(puncture: Puncture, errors: ErrorModel, count: int, rng: np.rando
     needle = true_needle(puncture.model, q + arrival, eta, puncture.tip_mm)
     T_ct_base = np.linalg.inv(puncture.T_base_ct)
     target_ct = puncture.target_ct + _normal(rng, errors.target_cov_ct, (count,))
+    side = np.zeros(count)
     if puncture.bend is not None:
-        needle = bent(needle, puncture.bend, rng.uniform(0, 2 * np.pi, count))
+        side = rng.uniform(0, 2 * np.pi, count)
+        needle = bent(needle, puncture.bend, side)
     outward_ct = -needle.R_base_needle[:, :, 2] @ T_ct_base[:3, :3].T
     R_ct_needle = T_ct_base[:3, :3] @ needle.R_base_needle
     tip_ct, squares = apply(T_ct_base, needle.tip_base), _chi_squared(puncture, residuals)
-    return Rooms(tip_ct, outward_ct, target_ct, T_base_ct, reached, R_ct_needle, squares)
+    return Rooms(tip_ct, outward_ct, target_ct, T_base_ct, reached, R_ct_needle, squares, side)
 
 
 def bent(needle: TrueNeedle, bend: Bend, side: Floats) -> TrueNeedle:

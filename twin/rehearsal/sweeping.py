@@ -10,12 +10,12 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.workcell import case_boxes, case_tool
-from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.sweep.sweep_plan import SweepPlan
+from puncture_twin.twin.rehearsal.executed import steps
 from puncture_twin.twin.world.client import TIME_STEP_S
 from puncture_twin.twin.world.control.insertion import Insertion, insert
-from puncture_twin.twin.world.execution import Execution, TouchAt, execute
+from puncture_twin.twin.world.execution import execute
 from puncture_twin.twin.world.workcell import open_workcell
 
 SETTLE_S = 0.5
@@ -47,33 +47,14 @@ def execute_sweep(plan: SweepPlan, case: Case, anatomy: Anatomy, T_base_ct: Floa
         T_base_ct: Shape (4, 4), mm: where the patient lies.
     """
     tool, down_ct, still = case_tool(case), -bed_frame(case)[:3, 2], np.zeros(6)
-    approach = _steps(plan.approach)
+    approach = steps(plan.approach)
     pause = np.repeat(approach[-1:], round(SETTLE_S / TIME_STEP_S), axis=0)
-    before, control = np.concatenate([approach, pause]), case.rehearsal.control
+    before = np.concatenate([approach, pause])
     with open_workcell(
         plan.model, tool, anatomy.skin.mesh, T_base_ct, case_boxes(case, T_base_ct), down_ct=down_ct
     ) as room:
-        if control == "position":
-            done = execute(room, np.concatenate([before, _steps(plan.sweep), _with_pause(plan.sweep)]), still)
-        else:
-            first = execute(room, before, still)
-            motion = Insertion(plan.model, tool, T_base_ct[:3, :3] @ down_ct, plan.sweep, SETTLE_S)
-            done = insert(room, motion, control, still, start_s=len(before) * TIME_STEP_S)
-            return _swept(plan, done, 0.0, (*first.touches, *done.touches))
-    return _swept(plan, done, len(before) * TIME_STEP_S, done.touches)
-
-
-def _swept(plan: SweepPlan, done: Execution, start_s: float, touches: tuple[TouchAt, ...]) -> Swept:
-    sweeping = done.times_s >= start_s
-    contacts = tuple(dict.fromkeys((one.link, one.body) for one in touches))
-    return Swept(done.times_s[sweeping], plan.off_point_mm(done.T_base_flange[sweeping]), contacts)
-
-
-def _steps(trajectory: Trajectory) -> Floats:
-    """A trajectory at every physics step, shape (n, 6), its end included."""
-    count = int(np.ceil(trajectory.duration_s / TIME_STEP_S)) + 1
-    return trajectory.at(TIME_STEP_S * np.arange(count, dtype=np.float64))
-
-
-def _with_pause(trajectory: Trajectory) -> Floats:
-    return np.repeat(trajectory.q[-1:], round(SETTLE_S / TIME_STEP_S), axis=0)
+        first = execute(room, before, still)
+        motion = Insertion(plan.model, tool, T_base_ct[:3, :3] @ down_ct, plan.sweep, SETTLE_S)
+        done = insert(room, motion, case.rehearsal.control, still, start_s=len(before) * TIME_STEP_S).execution
+    contacts = tuple(dict.fromkeys((one.link, one.body) for one in (*first.touches, *done.touches)))
+    return Swept(done.times_s, plan.off_point_mm(done.T_base_flange), contacts)

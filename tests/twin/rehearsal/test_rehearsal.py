@@ -21,16 +21,21 @@ from puncture_twin.planning.case.case_file import RankingSection, RehearsalSecti
 from puncture_twin.planning.case.case_volumes import CaseVolumes
 from puncture_twin.planning.case.entry import view_frame
 from puncture_twin.planning.case.settings import Needle, Obstacle, RobotSettings, SearchSettings
+from puncture_twin.planning.formats.labels.by_name import ByName
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.needle.bending import Bending
+from puncture_twin.planning.needle.shaft import Shaft
+from puncture_twin.planning.needle.tissue import Tissue
 from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.registration.touch_poses import touching_configuration
 from puncture_twin.twin.plant.truth import Truth
-from puncture_twin.twin.rehearsal.plan_truth import drawn_truth, spread_rows
+from puncture_twin.twin.rehearsal.distribution import bend_along
+from puncture_twin.twin.rehearsal.plan_truth import drawn_truth, plan_truth, spread_rows
 from puncture_twin.twin.rehearsal.rehearsal import rehearse, split_error
 from puncture_twin.twin.rehearsal.rooms import Puncture, draw_rooms
 from puncture_twin.twin.rehearsal.standing import Standing, ordinal
@@ -181,7 +186,9 @@ def test_phases_come_in_order_and_time_runs(exact):
     """Approach, settle, insertion, hold; 60 records a second; every array has the same length."""
     changes = [str(exact.phase[0])] + [str(b) for a, b in zip(exact.phase, exact.phase[1:], strict=False) if a != b]
     assert changes == ["approach", "settle", "insertion", "hold"]
-    assert np.diff(exact.times_s)[:-1] == pytest.approx(1 / 60)
+    between = np.diff(exact.times_s)
+    odd = ~np.isclose(between, 1 / 60)
+    assert odd.sum() <= 2 and (between[odd] < 1 / 60).all()  # the ends of both motions
     assert exact.times_s[-1] == pytest.approx(3 + 0.5 + 6 + 1, abs=0.05)
     records = (exact.q, exact.q_command, exact.phase, exact.tip_true_ct, exact.T_base_flange_true)
     assert {len(a) for a in records} == {len(exact.times_s)}
@@ -202,8 +209,8 @@ def test_tip_path_is_the_straight_line_of_the_plan(exact):
     assert np.all(np.diff(along) < 0.05)
 
 
-@pytest.mark.parametrize("control", ["impedance", "admittance"])
-def test_control_of_the_tip_ends_where_the_motors_do(exact, control):
+@pytest.mark.parametrize("control", ["position", "admittance"])
+def test_the_motors_and_admittance_end_where_the_spring_at_the_tip_does(exact, control):
     """In the air there is nothing to yield to; phases and times stay, and the hand-over moves nothing."""
     controlled = dataclasses.replace(case(), rehearsal=RehearsalSection(control=control))
     done = rehearse(PLAN, controlled, anatomy(vessel=ball(10.0, 60.0, 0.0, 0.0)), truth())
@@ -212,11 +219,49 @@ def test_control_of_the_tip_ends_where_the_motors_do(exact, control):
     starts = [[run.times_s[run.phase == name][0] for name in ("settle", "insertion", "hold")] for run in (done, exact)]
     np.testing.assert_allclose(*starts, atol=0.03)
     np.testing.assert_allclose(done.clearance_mm["vessel"][-1], exact.clearance_mm["vessel"][-1], atol=APART_MM)
-    handed_over = np.flatnonzero(done.phase == "insertion")[0]
-    asked = flange_pose(UR3, done.q_command[handed_over - 1 : handed_over + 1])
-    tips = asked[:, :3, 3] + NEEDLE.length_mm * asked[:, :3, 2]
-    tips_ct = (tips - T_BASE_CT[:3, 3]) @ T_BASE_CT[:3, :3]
-    np.testing.assert_allclose(done.tip_true_ct[handed_over - 1 : handed_over + 1], tips_ct, atol=0.02)
+    for run in (exact, done):
+        handed_over = np.flatnonzero(run.phase == "insertion")[0]
+        asked = flange_pose(UR3, run.q_command[handed_over - 1 : handed_over + 1])
+        tips = asked[:, :3, 3] + NEEDLE.length_mm * asked[:, :3, 2]
+        tips_ct = (tips - T_BASE_CT[:3, 3]) @ T_BASE_CT[:3, :3]
+        np.testing.assert_allclose(run.tip_true_ct[handed_over - 1 : handed_over + 1], tips_ct, atol=0.02)
+
+
+TISSUE = Bending(Shaft(150.0, 1.27, 0.84), np.radians(1.0), ByName({"*": Tissue(0.1, 0.9, 0.02, 4.0, 4.0)}))
+
+
+def through_tissue(control: str):
+    """The same puncture where skin ruptures at 4 N."""
+    soft = dataclasses.replace(case(), bending=TISSUE, rehearsal=RehearsalSection(control=control))
+    return rehearse(PLAN, soft, anatomy(), truth())
+
+
+def test_the_tissues_force_acts_on_the_needle_while_it_goes_in(exact):
+    """A skin that ruptures at 4 N takes the tip .15 mm off its path at most; who yields to it, is off by F / K."""
+    assert exact.felt is None and exact.off_path_mm < 0.05 and "declares none" in exact.force_text
+    done, yielding = through_tissue("impedance"), through_tissue("admittance")
+    assert done.felt.along_n == pytest.approx(4.0, rel=0.02) and done.felt.across_n > 0.05
+    assert 0.02 < done.off_path_mm <= 0.15
+    assert np.linalg.norm(done.tip_true_ct[-1] - exact.tip_true_ct[-1]) < 0.02
+    assert yielding.off_path_mm > 3.0
+    assert "3.99 N along" in done.force_text and "impedance" in done.followed_text
+
+
+def test_a_needle_bends_without_declared_errors_too():
+    """By what the layers of its path say, across itself, to the side where the bevel is drawn to point."""
+    soft = dataclasses.replace(case(), bending=TISSUE, rehearsal=RehearsalSection(joint_offset_deg=0.0))
+    context = SimpleNamespace(case=soft, anatomy=anatomy())
+    bend, sides = bend_along(context, OUTWARD), []
+    for seed in (0, 1):
+        drawn = plan_truth(context, PLAN, seed)
+        done = rehearse(PLAN, soft, context.anatomy, drawn)
+        assert done.lateral_mm == pytest.approx(bend.tip_mm, abs=0.02) and abs(done.depth_mm) < 0.05
+        assert not done.truth_is_belief and f"bends by {bend.tip_mm:.2f} mm" in done.truth_source
+        R = T_BASE_CT[:3, :3].T @ done.T_base_flange_true[-1, :3, :3]
+        off = (done.tip_true_ct[-1] - TARGET) / done.tip_error_mm
+        np.testing.assert_allclose(R.T @ off, [np.cos(drawn.bevel_side), np.sin(drawn.bevel_side), 0.0], atol=0.03)
+        sides.append(drawn.bevel_side)
+    assert sides[0] != sides[1]
 
 
 def test_same_truth_same_numbers(exact):

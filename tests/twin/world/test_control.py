@@ -6,11 +6,22 @@ import numpy as np
 import pytest
 
 from benchmarks.experiment import control, workbench
-from benchmarks.experiment.workbench import Position, along_needle, bench, follow, impedance, press, true_tip
+from benchmarks.experiment.workbench import (
+    Position,
+    along_needle,
+    bench,
+    follow,
+    impedance,
+    press,
+    pressed_by,
+    true_tip,
+)
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.twin.world.client import STANDARD_GRAVITY_MM_S2
 from puncture_twin.twin.world.control.admittance import Admittance, VirtualMass
-from puncture_twin.twin.world.control.gains import Stiffness, allowed_step, damping, stability_ratio
+from puncture_twin.twin.world.control.gains import STEPS_S, Stiffness, allowed_step, damping, stability_ratio
+from puncture_twin.twin.world.control.impedance import rotation_error
 from puncture_twin.twin.world.control.tip import tips
 from puncture_twin.twin.world.engine import pybullet
 
@@ -92,6 +103,27 @@ def test_every_mode_of_the_tip_is_damped_alike():
     assert np.abs(roots).max() * 1e-3 == pytest.approx(stability_ratio(stiffness, J, M, 1e-3))
 
 
+def test_a_singular_pose_is_damped_too():
+    """Straight wrist: the tip cannot turn one way, and the joints' damping goes on smoothly from poses beside it."""
+    with bench() as world:
+        felt = []
+        for q5 in (1e-3, 0.0):
+            q = np.array([0.4, -1.1, 0.9, -0.7, q5, 0.3])
+            J, M = pose_terms(world, q)
+            felt.append(J.T @ damping(Stiffness(), J, M) @ J)
+    assert np.linalg.matrix_rank(J, tol=1e-9) == 5
+    assert np.isfinite(felt[1]).all() and np.linalg.eigvalsh(felt[1])[0] > -1e-9 * np.abs(felt[1]).max()
+    np.testing.assert_allclose(felt[0], felt[1], atol=2e-3 * np.abs(felt[1]).max())
+
+
+def test_the_rotations_error_is_its_vector_while_it_is_small(rng):
+    """Beside the logarithm; a reference that is met has none."""
+    R = exp_rotation(rng.normal(size=3))
+    turn = 1e-3 * rng.normal(size=3)
+    np.testing.assert_allclose(rotation_error(exp_rotation(turn) @ R, R), turn, atol=1e-8)
+    np.testing.assert_allclose(rotation_error(R, R), 0.0, atol=1e-15)
+
+
 @pytest.mark.parametrize(("ratio", "stable"), [(0.8, True), (0.95, True), (0.97, False), (1.2, False)])
 def test_the_step_diverges_where_the_rule_says(ratio, stable):
     """One mode of damping .8, integrated as the simulator does: speed first, then place."""
@@ -109,7 +141,7 @@ def test_a_stiffness_that_would_diverge_is_refused():
     assert control.refusal(5e4, 5e-4) == ""
     with bench() as world:
         J, M = pose_terms(world, along_needle(60.0, 1.0, 5.0).q[0])
-        assert allowed_step(Stiffness(5e4), J, M) == 5e-4
+        assert allowed_step(Stiffness(5e4), J, M) == STEPS_S[1]
         with pytest.raises(InputError, match="would diverge"):
             allowed_step(Stiffness(1e7), J, M)
 
@@ -190,7 +222,7 @@ def test_the_compliance_is_kept_in_contact():
     for keep in (True, False):
         with bench() as world:
             controller = impedance(world, 1e4, K_i=20.0, keep=keep)
-            done, _ = follow(world, controller, still, hold_s=0.4, resistance=lambda tip, velocity: -5.0 * along)
+            done, _ = follow(world, controller, still, hold_s=0.4, resistance=pressed_by(-5.0 * along))
         moved[keep] = 1e3 * float((done.tip_m[-1] - start.position_m[0]) @ along)
     assert moved[True] == pytest.approx(-0.5, rel=0.03)
     assert abs(moved[False]) < 0.1

@@ -119,6 +119,8 @@ def _rehearsal(run: Run) -> list[str]:
         f"rehearsal (seed {done['seed']}): the tip ended {done['tip_error_mm']:.2f} mm from the true target"
         + ("" if run.rehearsal.standing is None else f", {run.rehearsal.standing.text}"),
         f"  lateral {done['lateral_mm']:.2f} mm, depth {done['depth_mm']:+.2f} mm (+ is too deep)",
+        f"  insertion {run.rehearsal.followed_text}",
+        f"  {run.rehearsal.force_text}",
         f"  least clearance of the true needle to what it must avoid: {nearest[1]:.2f} mm, {nearest[0]}",
         f"  arm contacts: {'; '.join(done['contacts']) or 'none'}",
     ]

@@ -222,6 +222,8 @@ def rehearsal_section(rehearsal: Any | None, keep_away: frozenset[str], film: st
         ("its depth part", depth),
         ("expected beforehand (rms)", number(rehearsal.predicted_error_mm, 2, "mm")),
         ("contacts", listed(touched) if touched else "none"),
+        ("insertion", rehearsal.followed_text),
+        ("force", rehearsal.force_text),
         ("fastest joint", f"{100 * fraction:.0f} % of its limit{'' if fraction <= 1 else ' (too fast)'}"),
         ("joint speeds, °/s", ", ".join(f"{v:.0f}" for v in np.degrees(rehearsal.max_joint_speed))),
         ("their limits, °/s", ", ".join(f"{v:.0f}" for v in np.degrees(rehearsal.speed_limits))),

@@ -1,9 +1,11 @@
-"""The insertion under a controller of the tip, taken over from the position motors while the arm is at rest."""
+"""A motion of the tip under one of the controllers, taken over from the position motors while the arm is at rest."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
+
+import numpy as np
 
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
@@ -13,16 +15,17 @@ from puncture_twin.twin.world.client import TIME_STEP_S
 from puncture_twin.twin.world.control.admittance import Admittance, VirtualMass
 from puncture_twin.twin.world.control.gains import Stiffness, allowed_step
 from puncture_twin.twin.world.control.impedance import Impedance
+from puncture_twin.twin.world.control.motors import Motors
 from puncture_twin.twin.world.control.reference import reference_of
 from puncture_twin.twin.world.control.rigid_model import RigidModel, rigid_model
 from puncture_twin.twin.world.control.run import Controller, Resistance, Surroundings, run
 from puncture_twin.twin.world.control.tip import tips
 from puncture_twin.twin.world.execution import Execution, Recorder
-from puncture_twin.twin.world.units import to_m
+from puncture_twin.twin.world.units import to_m, to_mm
 from puncture_twin.twin.world.workcell import SimulatedWorkcell
 
-TipControl = Literal["impedance", "admittance"]
-"""A spring at the tip by joint torques, or by moved goals of the position motors."""
+TipControl = Literal["impedance", "admittance", "position"]
+"""A spring at the tip by joint torques, or by moved goals of the position motors; or those motors alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +47,13 @@ class Insertion:
     hold_s: float
 
 
+class Inserted(NamedTuple):
+    """What happened, and how far the tip was from where it should be, as the encoders say, at most, mm."""
+
+    execution: Execution
+    off_path_mm: float
+
+
 def insert(
     workcell: SimulatedWorkcell,
     insertion: Insertion,
@@ -52,7 +62,7 @@ def insert(
     *,
     start_s: float = 0.0,
     resistance: Resistance | None = None,
-) -> Execution:
+) -> Inserted:
     """Run an insertion from where the arm is.
 
     Args:
@@ -72,12 +82,15 @@ def insert(
         reference = reference_of(model, tip_m, insertion.trajectory, controller.dt, insertion.hold_s)
         recorder = Recorder(workcell, reference.q, joint_offsets, controller.dt, start_s)
         around = Surroundings(joint_offsets, resistance, watch=recorder.see)
-        run(workcell.arm, controller, reference, lambda q: tips(model, tip_m, q[None]), around)
-    return recorder.execution()
+        done = run(workcell.arm, controller, reference, lambda q: tips(model, tip_m, q[None]), around)
+    off_m = np.linalg.norm(tips(model, tip_m, done.q).position_m - reference.position_m, axis=1)
+    return Inserted(recorder.execution(), float(to_mm(off_m.max())))
 
 
 def _controller(rigid: RigidModel, control: TipControl, q_path: Floats) -> Controller:
     """The controller with the longest step that the whole path allows."""
+    if control == "position":
+        return Motors()
     if control == "admittance":
         return Admittance(rigid.kinematics, rigid.tip_m, VirtualMass(), TIME_STEP_S)
     stiffness = Stiffness()

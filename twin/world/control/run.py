@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -54,8 +54,17 @@ class Controller(Protocol):
         """What the joints shall do in the next step."""
 
 
-Resistance = Callable[[Tip, Floats], Floats]
-"""What tissue presses on the tip with, (3,), N, base frame: of the tip (one row) and its velocity (3,), m/s."""
+class Push(NamedTuple):
+    """A force on the needle, which is rigid here: where it acts along the shaft decides its moment on the arm."""
+
+    force_n: Floats
+    """Shape (3,), base frame."""
+    point_m: Floats
+    """Shape (3,), base frame."""
+
+
+Resistance = Callable[[Tip], Sequence[Push]]
+"""What tissue presses on the needle with, now that its tip is there (one row). It may remember where the tip was."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,10 +125,9 @@ def run(
         state = arm.state()
         tip = tip_of(state.q)
         force = felt_force(arm, TIP_LINK)
-        if around.resistance is not None:
-            pushed = around.resistance(tip, tip.J[0, :3] @ state.speed)
-            arm.push(TIP_LINK, pushed, tip.position_m[0])
-            force = force + pushed
+        for push in () if around.resistance is None else around.resistance(tip):
+            arm.push(TIP_LINK, push.force_n, push.point_m)
+            force = force + push.force_n
         measured = Measured(state.q - around.joint_offsets, state.speed, force)
         q.append(measured.q)
         places.append(tip.position_m[0])
