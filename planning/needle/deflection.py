@@ -17,9 +17,13 @@ from puncture_twin.planning.needle.bevel_path import STEP_MM, bevel_path
 from puncture_twin.planning.needle.shaft import Shaft
 from puncture_twin.planning.needle.tissue import Tissue
 
-ALLOWANCE = 0.15
-"""Added to the bevel's part: of 8,000 random orders of layers, gaps without tissue among them, the worst went 8.5 %
-beyond the stiffest tissue alone; and halving the step changes 0.6 % at most."""
+ALLOWANCE = 0.25
+"""Added to the bevel's part: of 20,000 orders of layers, gaps without tissue among them and most of them found by
+climbing from worse to worse, the worst went 18.7 % beyond the stiffest tissue alone, a thin layer before a gap."""
+
+SHORTEST_BEND_MM = 2.0
+"""1/lambda, over which a foundation bends a shaft. Two steps of an insertion; below it steps are too long, and orders
+went 44 % beyond the stiffest alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,3 +65,8 @@ def deflection_bound(shaft: Shaft, alpha: float, tissues: Iterable[Tissue], long
     count = int(np.ceil(longest_mm / STEP_MM))
     path = bevel_path(shaft, np.full(count, stiffest), np.full(count, alpha))
     return DeflectionBound(path.depth_mm, (1 + ALLOWANCE) * path.largest_mm, shaft.sag_mm)
+
+
+def stiffest_resolved(shaft: Shaft) -> float:
+    """Of tissues whose foundation bends a shaft over `SHORTEST_BEND_MM` or more, the stiffest, N/mm^2."""
+    return 4 * shaft.bending_stiffness / SHORTEST_BEND_MM**4

@@ -174,3 +174,12 @@ def test_a_solid_shaft_of_the_stated_diameter_stands_for_a_gauge(tmp_path):
     assert (plain.outer_mm, plain.inner_mm, plain.length_mm) == (1.27, 0.0, 150.0)
     assert solid.bending_stiffness / 193.0 == pytest.approx(plain.bending_stiffness / 200.0)
     assert tube.bending_stiffness < plain.bending_stiffness
+
+
+def test_a_tissue_too_stiff_for_so_thin_a_shaft_is_refused(tmp_path):
+    """It bends the shaft within two steps of an insertion: no bound of its bending is known."""
+    stiff = TISSUE.replace("stiffness_n_mm2 = 0.2", "stiffness_n_mm2 = 60.0")
+    prepare(written(tmp_path, tissue=stiff), arm=False)
+    thin = NEEDLE.replace("1.27", "0.3") + "bevel_deg = 2.0"
+    with pytest.raises(InputError, match=r"tissue.organ: 60 N/mm2 bends this shaft within 2 mm.*at most 19.9 N/mm2"):
+        prepare(written(tmp_path, needle=thin, tissue=stiff), arm=False)

@@ -9,9 +9,11 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.labels.naming import REST
 from puncture_twin.planning.needle.bending import Bending
+from puncture_twin.planning.needle.deflection import SHORTEST_BEND_MM, stiffest_resolved
 from puncture_twin.planning.needle.tissue import Layer
 from puncture_twin.planning.search.along_path import inside_at
 
@@ -20,13 +22,20 @@ STEP_MM = 0.5
 
 
 def check_tissues(case: Case, anatomy: Anatomy) -> None:
-    """Refuse tissues that match no structure, or contradict each other.
+    """Refuse tissues that match no structure, contradict each other, or are too stiff for so thin a needle.
 
     Raises:
         InputError: One of them.
     """
-    if case.bending is not None:
-        case.bending.tissues.check([one.name for one in anatomy.structures], "tissue", case.path)
+    if case.bending is None:
+        return
+    tissues, most = case.bending.tissues, stiffest_resolved(case.bending.shaft)
+    tissues.check([one.name for one in anatomy.structures], "tissue", case.path)
+    for pattern, tissue in tissues.of_pattern.items():
+        if tissue.stiffness_n_mm2 > most:
+            what = f"tissue.{pattern}: {tissue.stiffness_n_mm2:g} N/mm2 bends this shaft within {SHORTEST_BEND_MM:g} mm"
+            allowed = f"at most {most:.3g} N/mm2 for it: beyond, no bound of its bending is known"
+            raise InputError(what, where=case.path, allowed=allowed)
 
 
 def path_layers(
