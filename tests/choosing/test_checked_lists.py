@@ -136,3 +136,13 @@ def test_what_does_not_go_together_is_refused(context, arguments, capsys):
     """Before anything is read."""
     assert main(["check", str(context.case.path), *arguments]) == BAD_INPUT
     assert "allowed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("end", "warned"), [("\n", False), ("", True)])
+def test_a_list_that_may_be_cut_within_a_number_is_told(context, tmp_path, capsys, end, warned):
+    """`30,100` cut to `30,10` is another direction, and looks whole."""
+    path = tmp_path / "entries.csv"
+    path.write_text("theta_deg,beta_deg\n10,20\n30,10" + end)
+    _, told = run(capsys, context.case.path, "--entries", path)
+    assert [row["beta_deg"] for row in told["rows"]] == [20.0, 10.0]
+    assert any("entries.csv: its last line does not end with a line break" in one for one in told["warnings"]) == warned

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.base.provenance import Input, content_input
+from puncture_twin.planning.base.whole_lines import unfinished_warnings
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.points.point_files import MAX_FILE_BYTES, parse_points
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
@@ -40,10 +41,11 @@ class Listed(NamedTuple):
 
 
 class ReadList(NamedTuple):
-    """A file's rows, and the file."""
+    """A file's rows, the file, and what is odd about it."""
 
     rows: tuple[Listed, ...]
     input: Input
+    warnings: tuple[str, ...]
 
 
 def read_entries(path: Path, case: Case) -> ReadList:
@@ -55,9 +57,10 @@ def read_entries(path: Path, case: Case) -> ReadList:
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     source = content_input("entries", str(path), data)
     if path.suffix.lower() == ".csv" and set(ANGLES) & set(_header(data, path)):
-        return ReadList(_angle_rows(data, path), source)
+        return ReadList(_angle_rows(data, path), source, _unfinished(data, path))
     rows = _points(data, path, case)
-    return ReadList(tuple(one._replace(choice=Choice(entry_mm=one.point_mm)) for one in rows), source)
+    rows = tuple(one._replace(choice=Choice(entry_mm=one.point_mm)) for one in rows)
+    return ReadList(rows, source, _unfinished(data, path))
 
 
 def read_targets(path: Path, case: Case, choice: Choice) -> ReadList:
@@ -68,7 +71,12 @@ def read_targets(path: Path, case: Case, choice: Choice) -> ReadList:
     """
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     rows = tuple(one._replace(choice=choice) for one in _points(data, path, case))
-    return ReadList(rows, content_input("targets", str(path), data))
+    return ReadList(rows, content_input("targets", str(path), data), _unfinished(data, path))
+
+
+def _unfinished(data: bytes, path: Path) -> tuple[str, ...]:
+    """Of a list that is read line by line and may be cut within a number."""
+    return unfinished_warnings(data, path.name) if path.suffix.lower() in (".csv", ".fcsv") else ()
 
 
 def _points(data: bytes, path: Path, case: Case) -> tuple[Listed, ...]:

@@ -66,7 +66,7 @@ class CheckedList:
         arm: Whether the arm was checked: see `Candidates.arm_note`.
         inputs: The list, then what the case names.
         rows: In the order of the list, by `COLUMNS`.
-        warnings: Of the case.
+        warnings: Of the list and of the case.
         files: What was written.
     """
 
@@ -161,7 +161,9 @@ def _checked(context: CaseContext, listed: ReadList, outcome: Callable[[Listed],
             rows.append(_document(context, row, Outcome(None, REFUSED, str(error))))
         context.watcher.count("rows", done, len(listed.rows))
     inputs = (listed.input, *context.case.inputs)
-    return CheckedList(context.case.name, context.arm, inputs, tuple(rows), tuple(context.anatomy.warnings))
+    return CheckedList(
+        context.case.name, context.arm, inputs, tuple(rows), (*listed.warnings, *context.anatomy.warnings)
+    )
 
 
 def _document(context: CaseContext, row: Listed, found: Outcome) -> dict[str, Any]:
