@@ -1,0 +1,150 @@
+"""How long a person waits, and for what: ``python -m benchmarks.wait``; beside an older state: ``--against CHECKOUT``.
+
+Every command runs in a new process, in three states: with nothing compiled and an empty cache folder (first use), with
+an empty cache folder (cold), and with everything there (warm, the median of ``--times``). What is printed is processor
+time, which other work on the machine changes less than the clock; `benchmarks.wait_probe` divides it. Two checkouts
+take turns. The real CT (61 structures, 1 degree, with the arm) is left out where it is not on this machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+DATA = REPOSITORY.parent / "shared" / "data" / "totalseg_abdomen_3mm"
+PROBE = Path(__file__).with_name("wait_probe.py")
+
+Seconds = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command line, under the name that the table has for it."""
+
+    name: str
+    words: tuple[str, ...]
+
+
+def commands(folder: Path) -> Iterator[Command]:
+    """What is waited for; paths of cases and outputs lie in the folder."""
+    abdomen, out = str(folder / "abdomen"), str(folder / "out")
+    yield Command("help", ("--help",))
+    yield Command("check", ("check", abdomen, "--theta", "30", "--beta", "100", "--json"))
+    yield Command("search", ("search", abdomen, "--no-pictures", "--json", "--out", out))
+    if DATA.is_dir():
+        yield Command("real", ("search", str(real_case(folder)), "--no-pictures", "--json", "--out", out))
+    yield Command("demo", ("demo", "--json", "--out", out))
+
+
+def real_case(folder: Path) -> Path:
+    """The real CT at 1 degree, with its data beside it."""
+    for file in (REPOSITORY / "tests" / "real").iterdir():
+        shutil.copy(file, folder)
+    for file in DATA.glob("*.nii.gz"):
+        (folder / file.name).symlink_to(file)
+    case = folder / "case_v2.toml"
+    case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 1.0"))
+    return case
+
+
+@dataclass(frozen=True)
+class Side:
+    """One checkout, with folders of its own for what it keeps and compiles."""
+
+    name: str
+    checkout: Path
+    folder: Path
+
+    def run(self, command: Command) -> Seconds:
+        """Seconds of one run in a new process, by what was waited for."""
+        answer = self.folder / "answer.json"
+        words = [sys.executable, str(PROBE), str(self.checkout), str(answer), *command.words]
+        done = subprocess.run(words, env=self._environment(), capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise SystemExit(done.stderr)
+        found = json.loads(answer.read_text())
+        if found["exit_code"] > 1:
+            raise SystemExit(f"{self.name}: {command.name} ended with {found['exit_code']}\n{done.stderr}")
+        seconds: Seconds = found["seconds"]
+        return seconds
+
+    def forget(self, *, compiled: bool) -> None:
+        """Empty the cache folder, and that of compiled kernels too."""
+        for name in ("kept", *(["kernels"] if compiled else [])):
+            shutil.rmtree(self.folder / name, ignore_errors=True)
+
+    def _environment(self) -> dict[str, str]:
+        unset = ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE")
+        environment = {key: value for key, value in os.environ.items() if key not in unset}
+        kept, kernels = str(self.folder / "kept"), str(self.folder / "kernels")
+        return environment | {"PUNCTURE_TWIN_CACHE": kept, "NUMBA_CACHE_DIR": kernels}
+
+
+def measured(command: Command, sides: list[Side], times: int, *, first_use: bool) -> dict[str, Seconds]:
+    """Seconds by checkout and state."""
+    found: dict[str, Seconds] = {}
+    for side in sides:
+        side.run(Command("help", ("--help",)))  # Python compiles its modules once
+        if first_use:
+            side.forget(compiled=True)
+            found[f"{side.name} first use"] = side.run(command)
+        else:
+            side.run(command)
+        side.forget(compiled=False)
+        found[f"{side.name} cold"] = side.run(command)
+    runs: dict[str, list[Seconds]] = {side.name: [] for side in sides}
+    for _ in range(times):
+        for side in sides:
+            runs[side.name].append(side.run(command))
+    for name, some in runs.items():
+        stages = dict.fromkeys(stage for run in some for stage in run)
+        found[f"{name} warm"] = {stage: median(run.get(stage, 0.0) for run in some) for stage in stages}
+    return found
+
+
+def print_table(command: Command, found: Mapping[str, Seconds]) -> None:
+    """One row a stage, one column a checkout and state."""
+    print(f"\n{command.name}: `{' '.join(Path(word).name for word in command.words)}`\n")
+    print(f"| processor, s | {' | '.join(found)} |\n|{'---|' * (1 + len(found))}")
+    stages = dict.fromkeys(stage for seconds in found.values() for stage in seconds if stage != "all")
+    for stage in (*stages, "all"):
+        values = [seconds.get(stage, 0.0) for seconds in found.values()]
+        if stage == "all" or max(values) >= 0.005:
+            print(f"| {stage} | {' | '.join(f'{value:.2f}' for value in values)} |", flush=True)
+
+
+def main() -> None:
+    """Parse, run, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--against", type=Path, help="another checkout, run in turn with this one")
+    parser.add_argument("--only", help="some of help,check,search,real,demo")
+    parser.add_argument("--times", type=int, default=3, help="warm runs")
+    parser.add_argument("--first-use", action="store_true", help="with nothing compiled too: minutes")
+    chosen = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        shutil.copytree(REPOSITORY / "meshes" / "abdomen", folder / "abdomen")
+        sides = [Side("this", REPOSITORY, folder / "this")]
+        if chosen.against is not None:
+            sides.insert(0, Side("before", chosen.against.resolve(), folder / "before"))
+        for side in sides:
+            side.folder.mkdir()
+        only = None if chosen.only is None else set(chosen.only.split(","))
+        print(f"load of the machine {os.getloadavg()[0]:.1f} on {os.cpu_count()} processors")
+        for command in commands(folder):
+            if only is None or command.name in only:
+                print_table(command, measured(command, sides, chosen.times, first_use=chosen.first_use))
+
+
+if __name__ == "__main__":
+    main()
