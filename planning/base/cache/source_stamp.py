@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -86,28 +86,30 @@ def _imported(path: Path) -> tuple[Path, ...]:
     found: list[Path] = []
     for module, names, modules in IMPORTED.findall(_source(path)):
         if module:
-            for name in NAME.findall(names):
-                found += _files_of_name(module.decode(), name.decode())
+            found += [file for name in NAME.findall(names) for file in _files_of_name(module.decode(), name.decode())]
         else:
             found += [file for name in NAME.findall(modules) for file in _files_of(name.decode())]
     return tuple(found)
 
 
-def _files_of_name(module: str, name: str) -> Iterator[Path]:
+def _files_of_name(module: str, name: str) -> tuple[Path, ...]:
     """The files behind ``from module import name``: a module, or a name of a module.
 
     A package may hand on the names of its modules without an import statement; then any of them may be meant.
     """
     if module.partition(".")[0] != PACKAGE.name:
-        return
-    inner = list(_files_of(f"{module}.{name}"))
-    yield from inner or _files_of(module)
-    package = PROJECT / module.replace(".", "/")
-    if not inner and package.is_dir():
-        yield from sorted(package.glob("*.py"))
+        return ()
+    return _files_of(f"{module}.{name}") or (*_files_of(module), *_files_in(module))
 
 
-def _files_of(module: str) -> Iterator[Path]:
-    if module.partition(".")[0] == PACKAGE.name:
-        place = PROJECT / module.replace(".", "/")
-        yield from (file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file())
+@cache
+def _files_in(package: str) -> tuple[Path, ...]:
+    return tuple(sorted((PROJECT / package.replace(".", "/")).glob("*.py")))
+
+
+@cache
+def _files_of(module: str) -> tuple[Path, ...]:
+    if module.partition(".")[0] != PACKAGE.name:
+        return ()
+    place = PROJECT / module.replace(".", "/")
+    return tuple(file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file())
