@@ -5,6 +5,7 @@ Source: the URDFs and collision meshes of ``ur_description`` in ``meshes/ur``, w
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,8 +22,10 @@ from puncture_twin import meshes
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.cache.array_cache import Arrays, user_cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh_list import packed_meshes, unpacked_meshes
 from puncture_twin.planning.geometry.rigid import exp_rotation, pose
 
 LINK_NAMES = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -96,10 +99,29 @@ def collision_links(model: UrModel) -> tuple[Link, ...]:
     Raises:
         InputError: If no meshes ship for this model, or one cannot be used.
     """
-    meshes = _link_meshes(model)
-    pieces = [_convex_pieces(mesh, SLABS.get(name, 1)) for name, mesh in meshes]
+    files = (urdf_path(model), *_mesh_files(model))
+    lengths = (model.d1, model.a2, model.a3, model.d4, model.d5, model.d6)
+    made_from = {"what": "collision links", "lengths": lengths, "files": [_sha256(file) for file in files]}
+    kept = user_cache().arrays(made_from, lambda: _packed(_convex_links(model)), by=__name__, check=unpacked_meshes)
+    pieces, ends = unpacked_meshes(kept), np.cumsum(kept["pieces"])
+    parts = zip(LINK_NAMES, [0, *ends], ends, strict=False)
+    return tuple(Link(name, i, pieces[start:end]) for i, (name, start, end) in enumerate(parts))
+
+
+def _convex_links(model: UrModel) -> list[tuple[TriangleMesh, ...]]:
+    """The pieces of each link."""
+    pieces = [_convex_pieces(mesh, SLABS.get(name, 1)) for name, mesh in _link_meshes(model)]
     pins = _joint_pins(model, [joined(parts) for parts in pieces])
-    return tuple(Link(name, i, pieces[i] + pins[i]) for i, (name, _) in enumerate(meshes))
+    return [some + pin for some, pin in zip(pieces, pins, strict=True)]
+
+
+def _packed(links: Sequence[Sequence[TriangleMesh]]) -> Arrays:
+    """The links' pieces for the cache, and how many each link has."""
+    return {**packed_meshes([piece for link in links for piece in link]), "pieces": np.array([*map(len, links)])}
+
+
+def _sha256(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
@@ -160,24 +182,37 @@ def urdf_link_poses(model: UrModel, q: Floats) -> Floats:
 def _link_meshes(model: UrModel) -> list[tuple[str, TriangleMesh]]:
     """The collision meshes as they ship, turned from the URDF's link frames to ours: a constant motion per link."""
     T_link_urdflink = np.linalg.inv(link_poses(model, np.zeros(6))) @ urdf_link_poses(model, np.zeros(6))
+    origins = [_origin(collision) for collision in _collisions(model)]
+    moved = zip(LINK_NAMES, T_link_urdflink, origins, _mesh_files(model), strict=True)
+    return [(name, _load(file).transformed(T @ origin)) for name, T, origin, file in moved]
+
+
+def _collisions(model: UrModel) -> list[ElementTree.Element]:
+    """The URDF's collision bodies, in the order of `LINK_NAMES`."""
     root = ElementTree.parse(urdf_path(model)).getroot()
     links = {link.get("name"): link for link in root.findall("link")}
-    meshes = []
-    for name, T in zip(LINK_NAMES, T_link_urdflink, strict=True):
+    found = []
+    for name in LINK_NAMES:
         collision = links[f"{name}_link"].find("collision")
-        file = None if collision is None else collision.find("geometry/mesh")
-        if collision is None or file is None:
+        if collision is None or collision.find("geometry/mesh") is None:
             raise InputError(f"link {name} has no collision mesh", where=urdf_path(model), allowed="one mesh a link")
-        mesh = _load(resolve_package(file.get("filename", "")))
-        meshes.append((name, mesh.transformed(T @ _origin(collision))))
-    return meshes
+        found.append(collision)
+    return found
+
+
+def _mesh_files(model: UrModel) -> list[Path]:
+    """The files of the collision meshes, in the order of `LINK_NAMES`."""
+    named = [collision.find("geometry/mesh") for collision in _collisions(model)]
+    files = [resolve_package("" if mesh is None else mesh.get("filename", "")) for mesh in named]
+    for file in files:
+        if not file.is_file():
+            raise InputError("mesh file is missing", where=file, allowed="the file that the URDF names")
+    return files
 
 
 def _load(path: Path) -> TriangleMesh:
     import trimesh  # here: it costs a third of a second, and few need it
 
-    if not path.is_file():
-        raise InputError("mesh file is missing", where=path, allowed="the file that the URDF names")
     mesh = trimesh.load_mesh(path, process=False)
     vertices = 1000.0 * np.asarray(mesh.vertices)  # URDF meshes are in metres
     if len(mesh.faces) == 0 or not np.isfinite(vertices).all():

@@ -8,7 +8,7 @@ from .checker import (
 )
 from .fast_checker import FastChecker as FastChecker
 from .segments import halving_order as halving_order
-from .shapes import skin_surface as skin_surface, touch as touch
+from .shapes import FclSkin as FclSkin, touch as touch
 from .state_checker import PATIENT as PATIENT
 from .surroundings import with_surroundings as with_surroundings
 from .workcell import (

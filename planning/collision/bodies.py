@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -14,8 +15,10 @@ from puncture_twin.planning.arm.links import LINK_NAMES, Link, collision_links, 
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.cache.array_cache import Arrays, user_cache
 from puncture_twin.planning.collision.bounding_spheres import prism
 from puncture_twin.planning.collision.shapes import convex, padded, surface
+from puncture_twin.planning.geometry.mesh_list import packed_meshes, unpacked_meshes
 from puncture_twin.planning.geometry.rigid import pose
 
 BODY_NAMES = (*LINK_NAMES, "holder", "needle")
@@ -92,24 +95,38 @@ def arm_bodies(model: UrModel, tool: Tool, padding_mm: float) -> tuple[Body, ...
     Raises:
         InputError: If the model's meshes do not ship.
     """
+    links = collision_links(model)
+    full = padded_links(links, padding_mm) if padding_mm else links
     return (
-        *(_link_body(link, padding_mm) for link in collision_links(model)),
+        *(_link_body(bare, more) for bare, more in zip(links, full, strict=True)),
         _round_body("holder", tool.holder_diameter_mm, tool.holder_span_mm, padding_mm),
         _round_body("needle", tool.needle_diameter_mm, tool.needle_span_mm, padding_mm),
     )
 
 
-def _link_body(link: Link, padding_mm: float) -> Body:
-    bare = _link_shape(link, 0.0)
-    full = _link_shape(link, padding_mm) if padding_mm else bare
+def padded_links(links: Sequence[Link], padding_mm: float) -> tuple[Link, ...]:
+    """The links with every piece grown by the padding, from the user's cache where they are there."""
+    pieces = [piece for link in links for piece in link.pieces]
+    made_from = {"what": "padded", "padding_mm": padding_mm, "pieces": [piece.digest for piece in pieces]}
+
+    def grown() -> Arrays:
+        return packed_meshes([padded(piece, padding_mm) for piece in pieces])
+
+    kept = user_cache().arrays(made_from, grown, by=__name__, check=unpacked_meshes)
+    following = iter(unpacked_meshes(kept))
+    return tuple(Link(link.name, link.frame, tuple(islice(following, len(link.pieces)))) for link in links)
+
+
+def _link_body(link: Link, grown: Link) -> Body:
+    bare = _link_shape(link)
+    full = bare if grown is link else _link_shape(grown)
     return Body(link.name, link.frame, np.eye(4), bare, full, float(np.linalg.norm(link.mesh.vertices, axis=1).max()))
 
 
-def _link_shape(link: Link, padding_mm: float) -> Shape:
-    pieces = [padded(piece, padding_mm) for piece in link.pieces]
-    solids = tuple(fcl.CollisionObject(convex(piece)) for piece in pieces)
-    hulls = tuple(np.asarray(piece.vertices) for piece in pieces)
-    return Shape(solids, fcl.CollisionObject(surface(joined(pieces))), hulls)
+def _link_shape(link: Link) -> Shape:
+    solids = tuple(fcl.CollisionObject(convex(piece)) for piece in link.pieces)
+    hulls = tuple(np.asarray(piece.vertices) for piece in link.pieces)
+    return Shape(solids, fcl.CollisionObject(surface(joined(link.pieces))), hulls)
 
 
 def _round_body(name: str, diameter_mm: float, span_mm: tuple[float, float], padding_mm: float) -> Body:

@@ -24,7 +24,7 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies import BODY_NAMES, NEVER_TESTED, Body, arm_bodies
-from puncture_twin.planning.collision.shapes import skin_surface, touch
+from puncture_twin.planning.collision.shapes import FclSkin, touch
 from puncture_twin.planning.collision.state_checker import (
     DISTANCE_PAIRS,
     NEEDLE_IN_PATIENT,
@@ -61,7 +61,7 @@ class Check(NamedTuple):
 
     contact: Contact
     """What it means if they do."""
-    first: fcl.CollisionObject
+    first: fcl.CollisionObject | FclSkin
     """The skin, a box, or a piece of a body."""
     second: fcl.CollisionObject
     first_body: Body | None
@@ -69,6 +69,11 @@ class Check(NamedTuple):
     second_body: Body
     hulls: tuple[Floats | None, Floats] | None
     """Corners that enclose either, in the frames of their shapes; None for a box, and for the pair with the skin."""
+
+    def touches(self) -> bool:
+        """Whether the two shapes touch where they are."""
+        first = self.first.object if isinstance(self.first, FclSkin) else self.first
+        return touch(first, self.second)
 
 
 class CellChecker:
@@ -110,13 +115,18 @@ class CellChecker:
         self._swept = SweptBodies.of(model, tool)
         self._boxes = _boxes(boxes)
         self._bounds = {box.name: box.bounds for box in boxes}
-        self._patient = None if patient is None else skin_surface(patient, PATIENT)
-        self._skin = None if skin is None else skin_surface(skin, PATIENT)
-        self.patient_closed = patient is not None and patient.closed
+        self._patient = None if patient is None else FclSkin(patient, PATIENT)
+        self._skin = None if skin is None else FclSkin(skin, PATIENT)
+        self._surface = patient
         if patient is not None:
             self._bounds[PATIENT] = patient.bounds
-            self._refuse_base_in(patient, patient if skin is None else skin)
+            self._refuse_base_in(patient, skin)
         self._checks = tuple(self._workcell_checks()) + tuple(self._self_checks())
+
+    @property
+    def patient_closed(self) -> bool:
+        """Whether there is a patient, and its surface has an inside."""
+        return self._surface is not None and self._surface.closed
 
     def contact(self, q: Floats, *, needle_may_touch_patient: bool) -> Contact | None:
         """The first contact found, or None when the arm is clear.
@@ -131,7 +141,7 @@ class CellChecker:
         self._place(q)
         for check in self._checks:
             allowed = needle_may_touch_patient and check.contact == NEEDLE_IN_PATIENT
-            if not allowed and touch(check.first, check.second):
+            if not allowed and check.touches():
                 return self._named(check)
         return None
 
@@ -168,7 +178,7 @@ class CellChecker:
             raise InputError("no such distance", where=where, allowed=allowed)
         self._place(q)
         bodies = [b for b in self._bodies if (b.name in names if body is None else b.name == body)]
-        skin = {} if self._patient is None else {PATIENT: self._patient}
+        skin = {} if self._patient is None else {PATIENT: self._patient.object}
         return _nearest(bodies, self._boxes if pair == "boxes" else skin, self._bounds)
 
     def distances(self, q: Floats) -> Distances:
@@ -200,7 +210,7 @@ class CellChecker:
 
     def _named(self, check: Check) -> Contact:
         """The contact of a check whose shapes are placed and touch: ``outside_body`` where the skin is not touched."""
-        if check.contact.other != PATIENT or self._skin is None or touch(self._skin, check.second):
+        if check.contact.other != PATIENT or self._skin is None or touch(self._skin.object, check.second):
             return check.contact
         return check.contact._replace(other=OUTSIDE_BODY)
 
@@ -228,19 +238,23 @@ class CellChecker:
         for body in self._bodies[1:]:
             body.place(poses)
 
-    def _refuse_base_in(self, patient: TriangleMesh, skin: TriangleMesh) -> None:
-        base = self._bodies[0]
-        centre = collision_links(self.model)[0].mesh.bounds.mean(axis=0)
-        surface = skin_surface(skin, PATIENT)
-        if touch(surface, base.bare.surface) or _encloses(skin, centre):
+    def _refuse_base_in(self, patient: TriangleMesh, skin: TriangleMesh | None) -> None:
+        base, bounds = self._bodies[0].bare.surface, collision_links(self.model)[0].mesh.bounds
+        surface = self._patient if self._skin is None else self._skin
+        assert surface is not None  # there is a patient
+        centre = bounds.mean(axis=0)
+        if surface.touches_still(base, bounds) or _encloses(patient if skin is None else skin, centre):
             raise InputError("the robot's base stands in the patient", where="cell", allowed="a base outside the skin")
-        if patient is not skin and _encloses(patient, centre):
+        if skin is not None and _encloses(patient, centre):
             what = "the robot's base stands in what the CT shows outside of the body (its table?)"
             raise InputError(what, where="cell", allowed="a base outside of it")
 
 
 def _encloses(mesh: TriangleMesh, point: Floats) -> bool:
     """Whether a point lies inside a surface; more than half around an open one counts too."""
+    low, high = mesh.bounds
+    if not np.all((point >= low) & (point <= high)) and abs(winding_number(mesh, point)) <= 0.5:
+        return False  # outside, or an open surface that goes less than half around: whether it is open need not be told
     side = side_of(mesh, point)
     return side is Side.INSIDE or (side is Side.UNKNOWN and abs(winding_number(mesh, point)) > 0.5)
 

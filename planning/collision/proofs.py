@@ -29,7 +29,7 @@ from puncture_twin.planning.collision.kernels import proofs as proof_kernels
 from puncture_twin.planning.collision.kernels.hulls import Hulls
 from puncture_twin.planning.collision.kernels.proofs import Movers, ProofScene, SkinTree, scratch
 from puncture_twin.planning.collision.kernels.surfaces import CELL_MM
-from puncture_twin.planning.collision.shapes import touch
+from puncture_twin.planning.collision.shapes import FclSkin
 from puncture_twin.planning.collision.triangle_tree import TriangleTree
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
@@ -99,7 +99,7 @@ class Proofs:
                 pair = (hulls.add(check.hulls[0], check.first_body), hulls.add(check.hulls[1], check.second_body))
                 row = (proof_kernels.PAIR, *pair, check.first_body.frame, frame)
             rows.append(row)
-        self.scene = ProofScene(np.array(rows, dtype=np.int64), _skin(patient), spheres, *hulls.packed(cache))
+        self.scene = ProofScene(np.array(rows, dtype=np.int64), _skin(patient, cache), spheres, *hulls.packed(cache))
         self._levers = np.array([_levers(model, check) for check in checks])
         self.movers = _moving(checks)
         self._work = scratch(len(rows), len(self.scene.hulls.radii))
@@ -151,8 +151,9 @@ def fcl_touches(check: Check, frames: Floats) -> bool:
     """Whether the shapes of a check touch where ``link_poses`` (7, 4, 4) has them."""
     check.second.setTransform(check.second_body.pose(frames))
     if check.first_body is not None:
+        assert not isinstance(check.first, FclSkin)  # it belongs to no body
         check.first.setTransform(check.first_body.pose(frames))
-    return touch(check.first, check.second)
+    return check.touches()
 
 
 def _levers(model: UrModel, check: Check) -> Floats:
@@ -273,19 +274,20 @@ def _axes(points: Floats) -> _Axes:
     return x, y, z
 
 
-def _skin(patient: TriangleMesh | None) -> SkinTree:
+def _skin(patient: TriangleMesh | None, cache: Cache) -> SkinTree:
     """The skin's tree and its field, of which nothing is known yet; or some that no check wants."""
     if patient is None:
         nothing = (np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 1, 3, 3)))
         return SkinTree(nothing, np.zeros((1, 1, 1), np.float32), np.zeros(3))
-    tree, (low, high) = TriangleTree.of(patient), patient.bounds
+    made_from, (low, high) = {"what": "skin", "surface": patient.digest}, patient.bounds
+    kept = cache.arrays(made_from, lambda: vars(TriangleTree.of(patient)), by=__name__)
     margin = FIELD_MARGIN_MM
     while np.prod(cells := np.ceil((high - low + 2.0 * margin) / CELL_MM).astype(np.int64)) > MOST_CELLS:
         margin = margin / 2.0 if margin > 1.0 else 0.0
         if margin == 0.0:
             cells = np.ones(3, np.int64)
             break
-    return SkinTree((tree.lows, tree.highs, tree.corners), np.full(cells, np.nan, np.float32), low - margin)
+    return SkinTree((kept["lows"], kept["highs"], kept["corners"]), np.full(cells, np.nan, np.float32), low - margin)
 
 
 def _tree_arrays(pieces: Sequence[Floats]) -> Arrays:
