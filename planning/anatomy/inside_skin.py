@@ -11,6 +11,7 @@ import scipy
 from puncture_twin.planning.anatomy.skin import FieldOfView, Skin
 from puncture_twin.planning.anatomy.skin_entry import settled_crossings
 from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
@@ -62,6 +63,26 @@ def inside_skin(meshes: Sequence[TriangleMesh], skin: Skin, inner_ct: Floats, to
     lost = np.bincount(outside[~beyond] // SAMPLES, minlength=len(meshes))
     cut = np.bincount(outside[beyond] // SAMPLES, minlength=len(meshes))
     return [Inside(SAMPLES - int(o) - int(c), int(o), int(c)) for o, c in zip(lost, cut, strict=True)]
+
+
+def kept_inside_skin(
+    meshes: Sequence[TriangleMesh], skin: Skin, inner_ct: Floats, tolerance_mm: Floats, cache: Cache
+) -> list[Inside]:
+    """`inside_skin`, from the cache where it is there."""
+    view = skin.field_of_view
+    seen = None if view is None else [view.T_ct_box.tolist(), view.size_mm.tolist(), view.cut.tolist()]
+    made_from = {
+        "what": "inside the skin",
+        "skin": [skin.mesh.digest, seen],
+        "meshes": [mesh.digest for mesh in meshes],
+        "at": [inner_ct.tolist(), np.asarray(tolerance_mm).tolist()],
+    }
+
+    def make() -> Arrays:
+        found = inside_skin(meshes, skin, inner_ct, tolerance_mm)
+        return {"counts": np.array([(one.inside, one.outside, one.beyond) for one in found], np.int64).reshape(-1, 3)}
+
+    return [Inside(*counts) for counts in cache.arrays(made_from, make, by=__name__)["counts"].tolist()]
 
 
 def spread_points(mesh: TriangleMesh, count: int) -> Floats:

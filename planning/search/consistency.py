@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
-from puncture_twin.planning.anatomy.inside_skin import LEAST_TOLERANCE_MM, inside_skin
+from puncture_twin.planning.anatomy.inside_skin import LEAST_TOLERANCE_MM, kept_inside_skin
 from puncture_twin.planning.anatomy.label_grids import label_grids
 from puncture_twin.planning.anatomy.own_target import OWN_TARGET
 from puncture_twin.planning.anatomy.regions import absent_organs
 from puncture_twin.planning.anatomy.skin import Skin
-from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
@@ -43,9 +43,9 @@ MOST_AROUND = 0.5
 
 
 def check_consistency(
-    case: Case, anatomy: Anatomy, placement: Placement | None, memory: Memory = NO_MEMORY
+    case: Case, anatomy: Anatomy, placement: Placement | None, cache: Cache = NO_CACHE
 ) -> tuple[str, ...]:
-    """Hold the inputs against each other; ``memory`` keeps what depends on no target.
+    """Hold the inputs against each other; ``cache`` keeps what takes long.
 
     Returns:
         Warnings, one sentence each.
@@ -55,18 +55,18 @@ def check_consistency(
             markers whose names or axes have likely slipped.
     """
     headers = volume_headers(case)
-    outside = _outside_warnings(case, anatomy, headers)
+    outside = _outside_warnings(case, anatomy, headers, cache)
     _refuse_open_around_target(case, anatomy)
     return (
         *outside,
-        *_marker_warnings(case, anatomy, placement, memory),
+        *_marker_warnings(case, anatomy, placement, cache),
         *_needle_warnings(case, anatomy.skin),
         *resolution_warnings(case, anatomy, headers),
         *_region_warnings(case, anatomy),
     )
 
 
-def _outside_warnings(case: Case, anatomy: Anatomy, headers: Headers) -> tuple[str, ...]:
+def _outside_warnings(case: Case, anatomy: Anatomy, headers: Headers, cache: Cache) -> tuple[str, ...]:
     """An organ that is elsewhere protects nothing; what is `unknown`, or a ball about the target, may lie anywhere."""
     known = [structure for structure in anatomy.structures if structure.role is not Role.UNKNOWN]
     placed = [structure for structure in known if structure.source != OWN_TARGET]
@@ -75,7 +75,8 @@ def _outside_warnings(case: Case, anatomy: Anatomy, headers: Headers) -> tuple[s
         return ("the skin mesh is open: how much of each structure lies inside the body is not known",)
     skin_volume = next(section.ct or section.labelmap for section in case.structure if section.role == "skin")
     tolerances = np.array([_surface_tolerance_mm(structure, skin_volume, headers) for structure in placed])
-    parts = inside_skin([structure.mesh for structure in placed], anatomy.skin, case.target_ct, tolerances)
+    meshes = [structure.mesh for structure in placed]
+    parts = kept_inside_skin(meshes, anatomy.skin, case.target_ct, tolerances, cache)
     warnings = []
     for structure, part in zip(placed, parts, strict=True):
         outside = f"{100 * (1 - part.fraction):.1f} % of its surface lies outside the skin"
@@ -162,8 +163,8 @@ def _region_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
     return (f"region {case.region}: no structure is named like {like}; what has no structure counts as free",)
 
 
-def _marker_warnings(case: Case, anatomy: Anatomy, placement: Placement | None, memory: Memory) -> tuple[str, ...]:
+def _marker_warnings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: Cache) -> tuple[str, ...]:
     if placement is None or placement.registration is None:
         return ()
     weak = tuple(f"registration: {flag}" for flag in placement.registration.flags)
-    return (*weak, *check_markers(case, anatomy.skin, placement.registration, memory).warnings)
+    return (*weak, *check_markers(case, anatomy.skin, placement.registration, cache).warnings)

@@ -205,9 +205,10 @@ def prepare(
     if arm and placement is None:
         raise InputError(f"the arm is to be checked, but {NO_BASE}", where=case.path, allowed=ALLOWED_BASE)
     with stages.time("anatomy"):
-        anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), replace(user_cache(), memory=memory))
+        cache = replace(user_cache(), memory=memory)
+        anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), cache)
         anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
-        warnings = (*case.warnings, *anatomy.warnings, *check_consistency(case, anatomy, placement, memory))
+        warnings = (*case.warnings, *anatomy.warnings, *check_consistency(case, anatomy, placement, cache))
         warnings += breath_warnings(case, anatomy)
         check_tissues(case, anatomy)
         anatomy = replace(anatomy, warnings=warnings)

@@ -9,17 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from types import MappingProxyType
 
 import numpy as np
 
 from puncture_twin.planning.anatomy.skin import Skin
-from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.checks.skin_fit import SkinFit, skin_fit
+from puncture_twin.planning.registration.checks.skin_fit import SkinFit, kept_skin_fit
 from puncture_twin.planning.registration.registration import Registration, fit_rigid
 from puncture_twin.planning.registration.touching import place_excluded, untouchable
 
@@ -78,31 +77,26 @@ def marker_list(
     skin: Skin,
     registration: Registration,
     signs: Signs = (1.0, 1.0, 1.0),
-    memory: Memory = NO_MEMORY,
+    cache: Cache = NO_CACHE,
 ) -> MarkerList:
     """The CT markers with some axes negated, compared with skin, couch and the robot's place."""
     points = registration.markers.points_ct * np.array(signs)
-    key = (skin_fit.__name__, skin.mesh.digest, skin.cut_faces.tobytes(), points.tobytes())
-    fit = skin_fit(points, skin) if memory is NO_MEMORY else memory.get(key, partial(skin_fit, points, skin), _bytes)
+    fit = kept_skin_fit(points, skin, cache)
     T_base_ct = fit_rigid(points, registration.markers.points_base)
     moved = apply(T_base_ct, case.target_ct) - apply(registration.T_base_ct, case.target_ct)
     behind = untouchable(case, points, fit.normals_ct)
     return MarkerList(fit, behind, place_excluded(case, skin.mesh, T_base_ct), float(np.linalg.norm(moved)))
 
 
-def _bytes(fit: SkinFit) -> int:
-    return fit.gaps_mm.nbytes + fit.normals_ct.nbytes
-
-
 def check_axes(
-    case: Case, skin: Skin, registration: Registration, given: MarkerList, memory: Memory = NO_MEMORY
+    case: Case, skin: Skin, registration: Registration, given: MarkerList, cache: Cache = NO_CACHE
 ) -> tuple[str, ...]:
     """Hold the given list against its half turns; returns warnings, one sentence each.
 
     Raises:
         InputError: The list lies on the skin, or where it can be touched, only after a half turn.
     """
-    slips = {name: marker_list(case, skin, registration, signs, memory) for name, signs in HALF_TURNS.items()}
+    slips = {name: marker_list(case, skin, registration, signs, cache) for name, signs in HALF_TURNS.items()}
     likely = {name: slip for name, slip in slips.items() if slip.explains(given)}
     if likely:
         name = min(likely, key=lambda name: likely[name].fit.scatter_mm)

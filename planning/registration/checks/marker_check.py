@@ -8,8 +8,7 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import load_skin
 from puncture_twin.planning.anatomy.skin import Skin
-from puncture_twin.planning.base.cache.array_cache import Cache
-from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.checks.axis_slips import MarkerList, check_axes, marker_list
@@ -50,22 +49,22 @@ def checked_placement(case: Case, cache: Cache) -> CheckedPlacement | None:
     placement = load_placement(case)
     if placement is None or placement.registration is None:
         return None if placement is None else CheckedPlacement(placement, MarkerFindings((), ()))
-    return CheckedPlacement(placement, check_markers(case, load_skin(case, cache), placement.registration))
+    return CheckedPlacement(placement, check_markers(case, load_skin(case, cache), placement.registration, cache))
 
 
-def check_markers(case: Case, skin: Skin, registration: Registration, memory: Memory = NO_MEMORY) -> MarkerFindings:
+def check_markers(case: Case, skin: Skin, registration: Registration, cache: Cache = NO_CACHE) -> MarkerFindings:
     """Hold a registration's markers against permuted names, half turns, skin and couch.
 
-    How the markers lie on the skin depends on no target: ``memory`` keeps it.
+    How the markers lie on the skin depends on no target: ``cache`` keeps it.
 
     Raises:
         InputError: Names that fit much better permuted, or as well where nothing tells them apart; a list that lies on
             the skin only after a half turn.
     """
     names = check_names(case, skin, registration)
-    given = marker_list(case, skin, registration, memory=memory)
+    given = marker_list(case, skin, registration, cache=cache)
     local = case.space is Space.LOCAL
-    axes = () if local else check_axes(case, skin, registration, given, memory)
+    axes = () if local else check_axes(case, skin, registration, given, cache)
     warnings = (*names, *axes, *_off_the_skin(registration, given))
     return MarkerFindings(warnings, (LOCAL_AXES, BASE_AXES) if local else (BASE_AXES,))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.special import fdtri
 
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
@@ -81,6 +83,14 @@ def skin_fit(points_ct: Floats, skin: Skin) -> SkinFit:
         gaps[row] = np.sqrt(squares.min()) * (-1.0 if inside else 1.0)
         normals[row] = outward * _normal(near[int(np.argmin(squares))])
     return SkinFit(gaps, normals)
+
+
+def kept_skin_fit(points_ct: Floats, skin: Skin, cache: Cache) -> SkinFit:
+    """`skin_fit`, from the cache where it is there; no target decides it."""
+    cut = hashlib.sha256(skin.cut_faces.tobytes()).hexdigest()
+    made_from = {"what": "skin fit", "skin": skin.mesh.digest, "cut": cut, "points": points_ct.tolist()}
+    stored = cache.arrays(made_from, lambda: vars(skin_fit(points_ct, skin)), by=__name__)
+    return SkinFit(**stored)
 
 
 def _orientation(skin: Skin) -> float:
