@@ -18,8 +18,9 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ import scipy
 from scipy.special import chdtri, ndtr, ndtri, stdtr
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.cache.array_cache import Arrays, user_cache
 from puncture_twin.planning.clearance.kernels.displaced_axis import displaced_distance
 from puncture_twin.planning.clearance.near_faces import NearFaces
 from puncture_twin.planning.geometry.rigid import frame_about, skew
@@ -48,6 +50,9 @@ WIDEST = 4.0
 DISAGREE = 0.1
 """Standard deviation of the lines' chances up to which few are trusted with .003: against 4,096 lines they err by that
 at most, and by .013 where it is .2 (three anatomies; beside a lung and between ribs)."""
+
+SCRAMBLED_WITH = 20191104
+"""Seed of the lines' spread."""
 
 SIZES = 16
 """Of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
@@ -73,13 +78,26 @@ class NeedleDoubt:
 
     def reach(self, length: float, threshold: float) -> tuple[float, float]:
         """How near a face must be to matter, mm, at the tip and at the axis' other end: farther than any line leads."""
-        size = math.hypot(FARTHEST, WIDEST + 1.0) * (1.0 if self.freedom is None else float(_sizes(self.freedom).max()))
+        tip, top, turn = self._widths(length)
+        start, end = threshold + self._size * (self.surface_mm + tip), threshold + self._size * (self.surface_mm + top)
+        return start, end + 0.5 * length * (self._size * turn) ** 2
+
+    @cached_property
+    def _size(self) -> float:
+        """Standard deviations, and more than any line has."""
+        return math.hypot(FARTHEST, WIDEST + 1.0) * (1.0 if self.freedom is None else float(_sizes(self.freedom).max()))
+
+    @cached_property
+    def _widths(self) -> Callable[[float], tuple[float, float, float]]:
+        """Of an axis as long as told: how far tip (mm), other end (mm) and direction (rad) may lie off, at most."""
         shift, lean = self.root[:3], self.root[3:]
-        top = shift - length * skew(self.outward) @ lean
-        turn = size * np.linalg.norm(lean, 2)
-        start = threshold + size * (self.surface_mm + float(np.linalg.norm(shift, 2)))
-        end = threshold + size * (self.surface_mm + float(np.linalg.norm(top, 2))) + 0.5 * length * float(turn) ** 2
-        return start, end
+        tip, turn = float(np.linalg.norm(shift, 2)), float(np.linalg.norm(lean, 2))
+
+        @cache  # many structures are measured from axes of one length
+        def of(length: float) -> tuple[float, float, float]:
+            return tip, float(np.linalg.norm(shift - length * skew(self.outward) @ lean, 2)), turn
+
+        return of
 
 
 def needle_doubt(
@@ -243,13 +261,23 @@ def _few_lines(surface: bool) -> Lines:
 def _many_lines(surface: bool, count: int, freedom: int | None) -> Lines:
     """Spread evenly over a normal, and over the sizes that are as likely."""
     mixed = 1 if surface else 0
-    drawn = scipy.stats.qmc.Sobol(4 + mixed + (freedom is not None), scramble=True, seed=20191104).random(count)
+    drawn = _sobol(4 + mixed + (freedom is not None), count)
     normal = ndtri(np.clip(drawn[:, : 4 + mixed], 1e-12, 1 - 1e-12))
     length = np.linalg.norm(normal, axis=1)[:, None]
     offsets = np.zeros((count, 5))
     offsets[:, : 4 + mixed] = normal * np.minimum(1.0, WIDEST / length)
     sizes = np.ones(count) if freedom is None else _sizes(freedom)[(drawn[:, -1] * SIZES).astype(np.int64)]
     return Lines(offsets, sizes, np.full(count, 1.0 / count))
+
+
+def _sobol(dimensions: int, count: int) -> Floats:
+    """Points spread evenly over the unit cube, shape (count, dimensions), from the user's cache if they are there."""
+
+    def make() -> Arrays:
+        return {"points": scipy.stats.qmc.Sobol(dimensions, scramble=True, seed=SCRAMBLED_WITH).random(count)}
+
+    made_from = {"what": "sobol", "dimensions": dimensions, "count": count, "seed": SCRAMBLED_WITH}
+    return user_cache().arrays(made_from, make, by=__name__)["points"]
 
 
 def _basis(slope: Floats, by_surface: float, by_pose: float) -> Floats:
