@@ -7,6 +7,7 @@ A command imports what it needs itself: the help and a wrong argument answer at 
 
 from __future__ import annotations
 
+import os
 import sys
 from functools import partial
 from pathlib import Path
@@ -681,6 +682,7 @@ def _out(named: Path | None, source: Path, command: str) -> Path:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: more threads only wait for one another
     return exit_code_of(partial(app, arguments, standalone_mode=False), partial(print, file=sys.stderr))
 
 

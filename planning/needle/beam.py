@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solveh_banded
+import scipy
 
 from puncture_twin.planning.base.arrays import Floats
 
@@ -62,7 +62,7 @@ class Beam:
         free = bands[:, 2:]  # the first node is clamped
         right = load[2:].copy()
         if tip_mm is None:
-            return _shape(solveh_banded(free, right, lower=True, check_finite=False), 0.0, (bands, load))
+            return _shape(scipy.linalg.solveh_banded(free, right, lower=True, check_finite=False), 0.0, (bands, load))
         at = free.shape[1] - 2  # the unknown that is known
         clamped = free.copy()
         for below in range(1, BANDS):  # move its column to the right side
@@ -71,7 +71,7 @@ class Beam:
         right[at + 1] -= free[1, at] * tip_mm
         clamped[1:, at] = 0.0
         clamped[0, at], right[at] = 1.0, tip_mm
-        found = solveh_banded(clamped, right, lower=True, check_finite=False)
+        found = scipy.linalg.solveh_banded(clamped, right, lower=True, check_finite=False)
         row = sum(free[below, at - below] * found[at - below] for below in range(1, BANDS))
         force = row + free[0, at] * found[at] + free[1, at] * found[at + 1] - load[-2]
         return _shape(found, float(force), (bands, load))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,7 +14,9 @@ from puncture_twin.planning.geometry.spaces import to_lps
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.selection.choice import BEST, Choice
 from puncture_twin.planning.search.selection.listed import Listed, read_entries, read_targets
-from puncture_twin.twin.jobs.choosing.row_by_row import CheckedList, check_entries, check_targets, write_checked
+
+if TYPE_CHECKING:
+    from puncture_twin.twin.jobs.choosing.row_by_row import CheckedList
 
 
 def lists_of(
@@ -50,6 +53,8 @@ def check_list(
     Raises:
         InputError: A case, list or folder that cannot be used. A row that cannot be checked is a row that says so.
     """
+    from puncture_twin.twin.jobs.choosing.row_by_row import check_entries, check_targets, write_checked
+
     out = None if out_dir is None else check_writable(out_dir)
     context = prepare(path, arm=arm, watcher=watcher)
 
