@@ -15,7 +15,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.direction_tiles import Tiles, bundle
 from puncture_twin.planning.clearance.engine import AxisDistances
-from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.clearance.fcl_engine import capsule_touches_any
 from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
 from puncture_twin.planning.clearance.kernels.lanes import LANES
 from puncture_twin.planning.clearance.kernels.nearest_triangle import nearest_triangle
@@ -27,6 +27,9 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 COORDINATE_SLACK = 1e-6
 """Share of a coordinate by which float32 arithmetic of a few terms may err: 8 times its rounding."""
+
+FCL_BEYOND_MM = 1.0
+"""Farther from a capsule FCL sees nothing: its tolerance is 1e-6 mm, and the bounds' rounding 1e-5 mm."""
 
 LONGEST_MM = 1e9
 """A needle that could reach the nodes that only fill a level up would be measured from them."""
@@ -46,7 +49,7 @@ class FastEngine:
     """Exact distances by bundles of directions over trees of discs; FCL where a verdict hangs on rounding.
 
     Answers what `FclEngine` answers, to rounding of float64. Prepared once for a patient's surfaces, wanted any
-    target; FCL's own tree of a structure is built when `collides` is first called for it.
+    target.
 
     Args:
         meshes: The k surfaces, in the CT frame, mm.
@@ -60,9 +63,7 @@ class FastEngine:
     def __init__(
         self, meshes: Sequence[TriangleMesh], progress: Count | None = None, memory: Memory = NO_MEMORY
     ) -> None:
-        self._meshes = tuple(meshes)
-        self._blocks = tuple(_packed(mesh, memory) for mesh in self._meshes)
-        self._references: dict[int, FclEngine] = {}
+        self._blocks = tuple(_packed(mesh, memory) for mesh in meshes)
         self._seen: tuple[Floats, list[_Placed]] | None = None
         self._progress = progress
         self.counts = np.zeros(len(COUNTED), np.int64)
@@ -73,7 +74,7 @@ class FastEngine:
         """Exact distances of n axes from all k structures; see `ClearanceEngine`."""
         target = np.ascontiguousarray(target_ct, dtype=np.float64)
         outward = np.ascontiguousarray(outward_ct, dtype=np.float64).reshape(-1, 3)
-        shape = (len(self._meshes), len(outward))
+        shape = (len(self._blocks), len(outward))
         lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), shape[:1])
         sound = np.isfinite(target).all() and np.isfinite(outward).all()
         if not (sound and np.all((lengths >= 0.0) & (lengths <= LONGEST_MM))):
@@ -103,17 +104,22 @@ class FastEngine:
             yield kept[row]
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
-        """FCL collision of a capsule with one structure; see `ClearanceEngine`."""
-        if structure not in self._references:
-            self._references[structure] = FclEngine([self._meshes[structure]])
-        return self._references[structure].collides(0, target_ct, outward_ct, length, radius)
+        """FCL collision of a capsule with one structure; see `ClearanceEngine`.
+
+        FCL is asked about the triangles near the axis alone, which is what it answers of all of them: a surface touches
+        a capsule where one of its triangles does, FCL tests each triangle by itself, and one that is farther from the
+        axis than the radius by more than FCL's tolerance it calls free. `near_faces` leaves out no block whose distance
+        from the axis is, by its lower bound, within the radius and `FCL_BEYOND_MM`.
+        """
+        reach = radius + FCL_BEYOND_MM
+        near = self.near(structure, target_ct, outward_ct, length, (reach, reach))
+        return len(near) > 0 and capsule_touches_any(near.triangles, target_ct, outward_ct, length, radius)
 
     def of(self, columns: Ints) -> FastEngine:
         """The same engine for some of its structures; see `ClearanceEngine`."""
         part = copy(self)
-        part._meshes = tuple(self._meshes[column] for column in columns)
         part._blocks = tuple(self._blocks[column] for column in columns)
-        part._references, part._seen, part._progress = {}, None, None
+        part._seen, part._progress = None, None
         return part
 
     def near(

@@ -12,7 +12,7 @@ from puncture_twin import meshes
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.clearance.measure import ROUNDING_MM, too_near
+from puncture_twin.planning.clearance.measure import NEAR_THRESHOLD_MM, ROUNDING_MM, too_near
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 LENGTH = 210.0
@@ -123,6 +123,23 @@ def test_an_engine_in_which_everything_is_a_tie_asks_fcl_every_time(ball):
     judge = FclEngine([mesh])
     assert engine.asked == len(directions)
     assert verdicts[:, 0].tolist() == [judge.collides(0, np.zeros(3), u, LENGTH, distance) for u in directions]
+
+
+def test_fcl_says_of_the_near_triangles_what_it_says_of_the_whole_surface(abdomen):
+    """At and about every axis' distance, where FCL alone decides: the whole tree's word, of a few triangles."""
+    rng = np.random.default_rng(11)
+    target, directions = np.array([-85.0, -15.0, 30.0]), units(rng, 40)
+    engine, whole = FastEngine(abdomen), FclEngine(abdomen)
+    found = engine.measure(target, directions, LENGTH).distance
+    off = (-NEAR_THRESHOLD_MM, -2e-6, -1e-6, -1e-9, 0.0, 1e-9, 1e-6, 2e-6, NEAR_THRESHOLD_MM)
+    said = []
+    for row, column in np.argwhere((found > 0) & (found < 60)):
+        for radius in found[row, column] + np.array(off):
+            asked = (int(column), target, directions[row], LENGTH, float(radius))
+            said.append(engine.collides(*asked))
+            assert said[-1] == whole.collides(*asked)
+    assert 0.3 < np.mean(said) < 0.7
+    assert len(said) > 500
 
 
 def test_fcl_trees_are_built_when_first_asked(ball, monkeypatch):
