@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.output.columns import column, truths
 from puncture_twin.planning.search.candidates import ANGLE_DIGITS, Candidates
 from puncture_twin.planning.search.selection.windows import find_windows
 from puncture_twin.planning.uncertainty.chances import Chances
@@ -25,7 +26,7 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
         candidates: The search's result.
         provenance: Case name, input hashes, version, seed, step; stored under the key ``run`` as JSON.
     """
-    reachable = [None if one < 0 else bool(one) for one in candidates.arm.reachable]
+    reachable = candidates.arm.reachable
     columns: dict[str, Any] = {
         "theta_deg": np.round(np.degrees(candidates.theta), ANGLE_DIGITS),
         "beta_deg": np.round(np.degrees(candidates.beta), ANGLE_DIGITS),
@@ -42,11 +43,11 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
         "skin_angle_deg": np.degrees(candidates.path.skin_angle),
         "min_clearance_mm": candidates.clearance.least,
     }
-    for column, name in enumerate(candidates.clearance.structures):
-        columns[f"clearance_{name}_mm"] = candidates.clearance.distance[:, column]
+    for at, name in enumerate(candidates.clearance.structures):
+        columns[f"clearance_{name}_mm"] = candidates.clearance.distance[:, at]
     columns |= {
         "tissue_mm": candidates.path.tissue,
-        "reachable": pa.array(reachable, pa.bool_()),
+        "reachable": truths(reachable > 0, reachable >= 0),
         "reach_margin": candidates.arm.margin,
         "safe_cone_deg": np.degrees(candidates.safe_cone),
         "cost": candidates.ranking.cost,
@@ -65,16 +66,17 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
             "breathing_clearance_mm": candidates.breathing.clearance,
         }
     run = {**provenance, "safe_cone_from": candidates.cone_source}
-    table = pa.table({name: _array(value) for name, value in columns.items()})
+    named = {name: one if isinstance(one, pa.Array) else column(np.asarray(one)) for name, one in columns.items()}
+    table = pa.table(named)
     return table.replace_schema_metadata({"run": json.dumps(run, sort_keys=True)})
 
 
 def chance_columns(chances: Chances) -> dict[str, Floats]:
     """The columns of a case that declares errors, after all others."""
     wide = {
-        f"p_{kind}_{name}": getattr(chances, kind)[:, column]
+        f"p_{kind}_{name}": getattr(chances, kind)[:, at]
         for kind in ("touch", "margin")
-        for column, name in enumerate(chances.structures)
+        for at, name in enumerate(chances.structures)
     }
     return {
         "p_hit": chances.hit,
@@ -84,11 +86,6 @@ def chance_columns(chances: Chances) -> dict[str, Floats]:
         "sigma_lateral_mm": chances.lateral_mm,
         "sigma_depth_mm": chances.depth_mm,
     }
-
-
-def _array(value: Any) -> pa.Array:
-    """NaN becomes null: "no number" is not a number."""
-    return value if isinstance(value, pa.Array) else pa.array(value, from_pandas=True)
 
 
 def write_table(candidates: Candidates, provenance: Mapping[str, Any], path: Path) -> None:
