@@ -34,6 +34,9 @@ def side_of(mesh: TriangleMesh, point: NDArray[np.float64]) -> Side:
     """
     if not mesh.closed:
         return Side.UNKNOWN
+    low, high = mesh.bounds
+    if np.any(point < low) or np.any(point > high):
+        return Side.OUTSIDE
     inside = round(winding_number(mesh, point)) != 0 if mesh.wound_alike else _leaves_oddly(mesh, point)
     return Side.INSIDE if inside else Side.OUTSIDE
 

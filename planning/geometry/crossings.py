@@ -21,6 +21,9 @@ POLAR_BINS = 120
 SAME_CROSSING_MM = 1e-6
 """Crossings of one ray closer than this are one: the ray runs through an edge or a corner."""
 
+USUAL_CROSSINGS = 4
+"""Of a ray: room for so many is made before they are counted; where there are more, they are found once again."""
+
 CONE_SLACK = 1e-9
 """Radians by which a bounding cone is widened against rounding."""
 
@@ -56,11 +59,12 @@ def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: fl
     corners = mesh.triangles - origin
     order, starts = _binned(directions)
     directions = np.ascontiguousarray(directions)
-    total = _visit(
-        corners, directions, order, starts, length, np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64)
-    )
-    ray, depth, face = np.empty(total, np.int64), np.empty(total), np.empty(total, np.int64)
-    _visit(corners, directions, order, starts, length, ray, depth, face)
+    room, total = 0, USUAL_CROSSINGS * len(directions)
+    while total > room:
+        room = total
+        ray, depth, face = np.empty(room, np.int64), np.empty(room), np.empty(room, np.int64)
+        total = _visit(corners, directions, order, starts, length, ray, depth, face)
+    ray, depth, face = ray[:total], depth[:total], face[:total]
     rows = np.lexsort((depth, ray))
     ray, depth, face = ray[rows], depth[rows], face[rows]
     fresh = np.ones(total, bool)

@@ -6,7 +6,7 @@ Retraction is the same motion backwards, so what may be inserted may be withdraw
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -151,9 +151,9 @@ class _Surveyed(NamedTuple):
     margins: Floats
     turns: Floats
 
-    def insertions(self) -> Iterator[_Insertion]:
+    def insertions(self, without: Container[int] = ()) -> Iterator[_Insertion]:
         """The motions that kinematics allows, see :func:`_insertions`."""
-        return _insertions(self.line, self.margins, self.turns, self.rolls)
+        return _insertions(self.line, self.margins, self.turns, self.rolls, without)
 
 
 def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> Iterator[_Surveyed]:
@@ -178,7 +178,7 @@ def _answers(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: i
     answers = []
     for found in _surveyed(checker, requests, n_rolls):
         if not np.isnan(found.margins).all():
-            answers.append(_first_clear(checker, found.request, found.depths, found.insertions()))
+            answers.append(_first_clear(checker, found))
         else:
             answers.append(_why_none(checker.model, found.request, found.line, found.depths, found.stop_at))
     return answers
@@ -210,25 +210,26 @@ def _distances(request: ReachRequest, depths_mm: Floats) -> Floats:
     return request.needle_length_mm + request.standoff_mm - depths_mm
 
 
-def _insertions(line: NeedleLine, margins: Floats, turns: Floats, rolls: Floats) -> Iterator[_Insertion]:
-    """The motions that kinematics allows, the best margin first; of equals the first branch, then the first roll."""
+def _insertions(
+    line: NeedleLine, margins: Floats, turns: Floats, rolls: Floats, without: Container[int] = ()
+) -> Iterator[_Insertion]:
+    """The motions that kinematics allows, the best margin first; of equals the first branch, then the first roll.
+
+    Branches that ``without`` has come to hold are passed over.
+    """
     branches, rolled = np.nonzero(~np.isnan(margins))
     order = np.argsort(-np.round(margins[branches, rolled], MARGIN_DIGITS), kind="stable")
-    for i in order:
-        branch, roll = int(branches[i]), int(rolled[i])
-        yield _Insertion(line, branch, float(rolls[roll]), turns[branch, roll])
+    for branch, roll in zip(branches[order].tolist(), rolled[order].tolist(), strict=True):
+        if branch not in without:
+            yield _Insertion(line, branch, float(rolls[roll]), turns[branch, roll])
 
 
-def _first_clear(
-    checker: StateChecker, request: ReachRequest, depths: Floats, insertions: Iterable[_Insertion]
-) -> ReachAnswer:
-    """The first of several motions that touches nothing; else a refusal with the one that came farthest."""
+def _first_clear(checker: StateChecker, surveyed: _Surveyed) -> ReachAnswer:
+    """The first of a request's motions that touches nothing; else a refusal with the one that came farthest."""
     blocks: list[_Blocked] = []
     hopeless: set[int] = set()
-    for insertion in insertions:
-        if insertion.branch in hopeless:
-            continue
-        tried = _try(checker, request, insertion, depths)
+    for insertion in surveyed.insertions(without=hopeless):
+        tried = _try(checker, surveyed.request, insertion, surveyed.depths)
         if tried.block is None:
             return _success(checker.model, insertion, tried)
         blocks.append(tried.block)
