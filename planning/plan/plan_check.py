@@ -104,15 +104,20 @@ def check_angles(plan: Plan, path: Path) -> None:
     for name, angle, turn in (("theta_deg", plan.theta, np.pi), ("beta_deg", plan.beta, 2 * np.pi)):
         if not 0.0 <= angle <= turn * (1 + ANGLE_ROUNDING):
             raise InputError(f"{name} = {np.degrees(angle):g}", where=path, allowed=f"0 to {np.degrees(turn):g}")
-    R, t = plan.T_base_ct[:3, :3], plan.T_base_ct[:3, 3]
-    line = needle_lines((R @ plan.target_ct + t)[None], (R @ plan.outward_ct)[None])[0]
-    unrolled = flange_at(line, plan.needle_length_mm + plan.standoff_mm)[:3, :3]
-    x_axis = unrolled.T @ flange_pose(ur_model(plan.model), plan.insertion.q[0])[:3, 0]
-    roll = float(np.arctan2(x_axis[1], x_axis[0])) % (2 * np.pi)
+    roll = roll_of(plan)
     off = abs((plan.roll - roll + np.pi) % (2 * np.pi) - np.pi)
     if off > ROLL_TOLERANCE_RAD or not 0.0 <= plan.roll < 2 * np.pi:
         what = f"roll_deg is {np.degrees(plan.roll):g}, the joint angles at standoff give {np.degrees(roll):.4g}"
         raise InputError(what, where=path, allowed="plan again")
+
+
+def roll_of(plan: Plan) -> float:
+    """About the needle, rad, 0 to 2 pi: what the joint angles at standoff give, whatever the plan states."""
+    R, t = plan.T_base_ct[:3, :3], plan.T_base_ct[:3, 3]
+    line = needle_lines((R @ plan.target_ct + t)[None], (R @ plan.outward_ct)[None])[0]
+    unrolled = flange_at(line, plan.needle_length_mm + plan.standoff_mm)[:3, :3]
+    x_axis = unrolled.T @ flange_pose(ur_model(plan.model), plan.insertion.q[0])[:3, 0]
+    return float(np.arctan2(x_axis[1], x_axis[0])) % (2 * np.pi)
 
 
 def _check_straight(plan: Plan, path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -80,6 +81,27 @@ def draw_pivot_truth(
     aim = apply(np.linalg.inv(T_base_ct), aim_base)
     arrival = rng.normal(size=(len(names), 6)) * errors.arm.repeatability
     return TouchTruth(seed, T_base_ct, eta, dict(zip(names, aim, strict=True)), dict(zip(names, arrival, strict=True)))
+
+
+class AtTarget(NamedTuple):
+    """What is true when the needle arrives: joints minus encoders, (6,), rad; and where the target is, (3,), mm."""
+
+    arrival: Floats
+    target_ct: Floats
+
+
+def draw_at_target(target_ct: Floats, errors: ErrorModel, seed: int) -> AtTarget:
+    """The joints drifted since the touches and arrive with their own error; the target was read with one.
+
+    Args:
+        target_ct: Shape (3,), mm, as read.
+        errors: As declared.
+        seed: Of the truth.
+    """
+    rng = np.random.default_rng([seed, 2])
+    arrival = rng.normal(size=6) * np.hypot(errors.arm.repeatability, errors.arm.drift)
+    values, axes = np.linalg.eigh(errors.target_cov_ct)
+    return AtTarget(arrival, target_ct + axes @ (rng.normal(size=3) * np.sqrt(np.maximum(values, 0.0))))
 
 
 def nominal_tip(model: UrModel, tip_mm: float, q: Floats) -> Floats:

@@ -67,14 +67,20 @@ def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Tru
     case = context.case
     drawn = case.errors is not None and case.registration is not None and case.rehearsal.truth_base is None
     if not drawn:
-        return _bent_truth(context, plan, draw_truth(case, plan.T_base_ct, seed=seed))
+        return bent_truth(context, plan, draw_truth(case, plan.T_base_ct, seed=seed))
     seed = case.rehearsal.seed if seed is None else seed
     found = rehearse_rooms(context, plan.outward_ct, plan.insertion.q[-1], TRIED, seed)
     return _of_drawn(found, 0, f"drawn with seed {seed} from {_declared(found)}")
 
 
-def _bent_truth(context: CaseContext, plan: Plan, truth: Truth) -> Truth:
-    """The same truth with a needle that bends to a drawn side: the patient moved by what a straight one misses."""
+def bent_truth(context: CaseContext, plan: Plan, truth: Truth) -> Truth:
+    """The same truth with a needle that bends to a drawn side: the patient moved by what a straight one misses.
+
+    Args:
+        context: The plan's case; where it declares no tissue, nothing bends.
+        plan: What is executed.
+        truth: Of a straight needle; the side is drawn by its seed.
+    """
     bend = bend_along(context, plan.outward_ct)
     if bend is None:
         return truth

@@ -1,6 +1,7 @@
 """Physical runs: what is kept, what is done again, and what a person reads of them."""
 
 import math
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
@@ -29,8 +30,8 @@ def done(monkeypatch):
     def run(context, tour, seed):
         seeds.append(seed)
         if seed == 2:
-            return PhysicalRun(seed, math.nan, math.nan, math.nan, "marker A was not felt")
-        return PhysicalRun(seed, 1.0 + seed, 0.5, 12.0)
+            return PhysicalRun(seed, *4 * (math.nan,), "marker A was not felt")
+        return PhysicalRun(seed, 1.0 + seed, 0.5, 12.0, 0.1)
 
     tour = type("Tour", (), {"plan": type("Plan", (), {"expected_mm": 1.8})})
     monkeypatch.setattr(module, "plan_tour", lambda *_, **__: tour)
@@ -56,13 +57,27 @@ def test_what_was_interrupted_goes_on(done, tmp_path, monkeypatch):
 
 def test_the_rms_is_over_the_runs_that_ended_and_refusals_are_named():
     """With few runs it says how well it is known."""
-    ended = (PhysicalRun(0, 3.0, 1.0, 14.0), PhysicalRun(1, 4.0, 1.0, 16.0))
-    runs = PhysicalRuns(1.8, (*ended, PhysicalRun(2, *3 * (math.nan,), "stopped")), 0, DRAWN)
+    ended = (PhysicalRun(0, 3.0, 1.0, 14.0, 0.02), PhysicalRun(1, 4.0, 1.0, 16.0, 0.01))
+    runs = PhysicalRuns(1.8, (*ended, PhysicalRun(2, *4 * (math.nan,), "stopped")), 0, DRAWN)
     assert runs.realised_mm == pytest.approx(math.sqrt(12.5))
     assert "2 physical runs (15.0 s a touch): the tip misses the target by 3.54 mm rms" in runs.text()
     assert "without physics the same 2 truths give 3.50 mm, 400 truths 1.90 (known to 3.5 %)" in runs.text()
+    assert "at most 0.020 mm off the path" in runs.text()
     assert "seed 2: stopped" in runs.text()
     assert runs.summary()["refused"] == {2: "stopped"}
+
+
+def test_a_contact_on_the_way_to_the_target_refuses_its_run_alone(monkeypatch):
+    """It is named."""
+    context = SimpleNamespace(stages=SimpleNamespace(time=lambda _: nullcontext()))
+    touched, use = SimpleNamespace(failed={}), SimpleNamespace(registration=None)
+    contact = SimpleNamespace(link="holder", body="patient")
+    monkeypatch.setattr(module, "touch_once", lambda *_: (touched, use))
+    for name in ("plan_puncture", "true_touches", "true_at_target"):
+        monkeypatch.setattr(module, name, lambda *_: None)
+    monkeypatch.setattr(module, "rehearse_touched", lambda *_: SimpleNamespace(contacts=(contact,)))
+    run = module._run(context, SimpleNamespace(outward_ct=None, q_insertion=None), 7)
+    assert run.refused == "the arm stopped on its way to the target: holder touches patient"
 
 
 def test_a_marker_that_is_not_touched_refuses_its_run_alone(monkeypatch):

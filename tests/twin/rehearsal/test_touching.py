@@ -15,15 +15,18 @@ from typer.testing import CliRunner
 
 from puncture_twin.planning.arm.error_jacobian import PARAMETERS, error_jacobian
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.settings import Obstacle
+from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points
-from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.plan.plan_check import check_angles, check_geometry
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.selection.choice import Choice
+from puncture_twin.planning.touch.puncture import plan_puncture
 from puncture_twin.planning.touch.straight_approach import line_to
 from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, approach_checkers, plan_touches
 from puncture_twin.run_twin import app
@@ -32,6 +35,7 @@ from puncture_twin.twin.jobs.experiment.touch_job import touch_case, touch_text
 from puncture_twin.twin.plant.touch_truth import TouchTruth, nominal_tip
 from puncture_twin.twin.rehearsal import touching
 from puncture_twin.twin.rehearsal.one_touch import TouchReading
+from puncture_twin.twin.rehearsal.touched_puncture import rehearse_touched
 from puncture_twin.twin.rehearsal.touching import Touched, execute_touches
 from puncture_twin.twin.world.engine import pybullet
 from puncture_twin.twin.world.workcell import open_workcell
@@ -223,6 +227,29 @@ def test_drawn_truths_err_as_the_plan_predicts(context, done):
     tour = touch_job.Tour(run.plan, q, outward)
     errors = [touch_job.drawn_once(context, tour, seed).tip_error_mm for seed in range(150)]
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(run.plan.expected_mm, rel=0.17)
+
+
+def test_the_puncture_after_touches_ends_in_the_simulator_where_kinematics_say(context, done):
+    """Planned by the registration of the touches, from home, free of contact, straight to the target; then executed."""
+    run, (q, outward) = done[0], touch_job._puncture(context, CHOICE)
+    tour, registration = touch_job.Tour(run.plan, q, outward), run.use.registration
+    plan = plan_puncture(context, outward, q, registration)
+    check_geometry(plan, CASE)
+    check_angles(plan, CASE)
+    assert [np.degrees(plan.theta), np.degrees(plan.beta)] == pytest.approx([18.0, 232.0])
+    np.testing.assert_allclose(plan.approach.q[0], home_configuration(context.case))
+    truth, at_target = touch_job.true_touches(context, tour, run.seed), touch_job.true_at_target(context, run.seed)
+    inserted = rehearse_touched(context, plan, truth, at_target)
+    assert inserted.tip_error_mm == pytest.approx(run.use.tip_error_mm, abs=0.003)
+    assert inserted.contacts == () and inserted.control == "impedance" and inserted.off_path_mm < 0.02
+
+
+def test_a_registration_out_of_reach_is_no_puncture(context, done):
+    """Said in one line, before anything moves."""
+    (q, outward), found = touch_job._puncture(context, CHOICE), done[0].use.registration
+    far = dataclasses.replace(found, T_base_ct=pose(found.T_base_ct[:3, :3], found.T_base_ct[:3, 3] + 2000.0))
+    with pytest.raises(NoAnswerError, match="does not reach the target where the touches put it"):
+        plan_puncture(context, outward, q, far)
 
 
 def readings(plan, names):

@@ -1,4 +1,4 @@
-"""Many physical runs of one experiment: in each the markers are touched in the simulator where they truly are.
+"""Many physical runs of one experiment: markers touched, and the needle inserted, in the simulator.
 
 A run is kept as soon as it is done, under the hash of all that decided it: what was interrupted goes on from there.
 """
@@ -13,12 +13,17 @@ from typing import Any
 
 import numpy as np
 
+from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.selection.choice import BEST
+from puncture_twin.planning.touch.puncture import plan_puncture
 from puncture_twin.twin.jobs.experiment.drawn_runs import DrawnRuns, drawn_runs
-from puncture_twin.twin.jobs.experiment.touch_job import Tour, plan_tour, touch_once
+from puncture_twin.twin.jobs.experiment.touch_job import Tour, plan_tour, touch_once, true_at_target, true_touches
+from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
+from puncture_twin.twin.rehearsal.touched_puncture import rehearse_touched
 
 FOLDER = "runs"
 
@@ -29,9 +34,10 @@ class PhysicalRun:
 
     Attributes:
         seed: Of its truth.
-        tip_error_mm: The needle's tip from the true target; NaN where a touch stopped.
+        tip_error_mm: The needle's tip from the true target; NaN where a touch or the puncture stopped.
         fre_mm: Of its registration, likewise.
         seconds_per_touch: Of the tour, home to home, likewise.
+        off_path_mm: Of the tip from its commanded path, at most while it went in, likewise.
         refused: Why it stopped; empty where it did not.
     """
 
@@ -39,6 +45,7 @@ class PhysicalRun:
     tip_error_mm: float
     fre_mm: float
     seconds_per_touch: float
+    off_path_mm: float
     refused: str = ""
 
 
@@ -90,7 +97,9 @@ class PhysicalRuns:
         kept = f", {self.kept} of them kept from before" if self.kept else ""
         lines = [
             f"{len(ended)} physical runs ({seconds:.1f} s a touch{kept}): the tip misses the target by "
-            f"{self.realised_mm:.2f} mm rms (known to {100 * spread:.0f} %), {self.expected_mm:.2f} predicted"
+            f"{self.realised_mm:.2f} mm rms (known to {100 * spread:.0f} %), {self.expected_mm:.2f} predicted",
+            f"  touched and inserted in the simulator, the tip at most {max(run.off_path_mm for run in ended):.3f} mm "
+            "off the path that it was sent on",
         ]
         lines.append(self.drawn.text(len(ended)))
         lines += [f"  seed {run.seed}: {run.refused}" for run in self.runs if run.refused]
@@ -128,9 +137,32 @@ def _run(context: CaseContext, tour: Tour, seed: int) -> PhysicalRun:
     touched, use = touch_once(context, tour, seed)
     if touched.failed or isinstance(use, str):
         why = "; ".join(f"marker {name}: {reason}" for name, reason in touched.failed.items())
-        return PhysicalRun(seed, float("nan"), float("nan"), float("nan"), why or str(use))
+        return _refused(seed, why or str(use))
+    try:
+        inserted = _inserted(context, tour, seed, use.registration)
+    except NoAnswerError as error:
+        return _refused(seed, str(error))
     per_touch = touched.seconds / len(touched.readings)
-    return PhysicalRun(seed, use.tip_error_mm, use.registration.fre_mm, per_touch)
+    return PhysicalRun(seed, inserted.tip_error_mm, use.registration.fre_mm, per_touch, inserted.off_path_mm)
+
+
+def _refused(seed: int, why: str) -> PhysicalRun:
+    return PhysicalRun(seed, *4 * (float("nan"),), refused=why)
+
+
+def _inserted(context: CaseContext, tour: Tour, seed: int, registration: Registration) -> Rehearsal:
+    """The puncture planned by what was touched, and executed where everything truly is.
+
+    Raises:
+        NoAnswerError: There is no such plan, or the arm touched something.
+    """
+    with context.stages.time("puncture"):
+        plan = plan_puncture(context, tour.outward_ct, tour.q_insertion, registration)
+        truth, at_target = true_touches(context, tour, seed), true_at_target(context, seed)
+        inserted = rehearse_touched(context, plan, truth, at_target)
+    for contact in inserted.contacts:
+        raise NoAnswerError(f"the arm stopped on its way to the target: {contact.link} touches {contact.body}")
+    return inserted
 
 
 def _key(context: CaseContext, tour: Tour) -> str:

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.files import atomic
@@ -22,6 +21,7 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.registration import MIN_MARKERS, Registration
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.selection.choice import Choice, choose, chosen_angles
+from puncture_twin.planning.touch.puncture import registered_joints
 from puncture_twin.planning.touch.touch_plan import TouchPlan
 from puncture_twin.planning.touch.touch_planner import (
     TOUCHING_PADDING_MM,
@@ -30,7 +30,7 @@ from puncture_twin.planning.touch.touch_planner import (
     plan_touches,
     registered,
 )
-from puncture_twin.twin.plant.touch_truth import TouchTruth, draw_touch_truth, nominal_tip
+from puncture_twin.twin.plant.touch_truth import AtTarget, TouchTruth, draw_at_target, draw_touch_truth, nominal_tip
 from puncture_twin.twin.plant.true_needle import true_needle
 from puncture_twin.twin.rehearsal.distribution import misregistered
 from puncture_twin.twin.rehearsal.touching import Touched, execute_touches
@@ -176,7 +176,7 @@ def plan_tour(context: CaseContext, choice: Choice, seed: int) -> Tour:
 
 def touch_once(context: CaseContext, tour: Tour, seed: int) -> TouchedOnce:
     """Execute a tour where everything truly is, by one draw of the declared errors."""
-    truth = _truth(context, tour.outward_ct, tour.q_insertion, seed)
+    truth = true_touches(context, tour, seed)
     checkers, count = approach_checkers(context, TOUCHING_PADDING_MM), partial(context.watcher.count, "touches")
     with context.stages.time("touches"):
         touched = execute_touches(tour.plan, context.case, context.anatomy, checkers, truth, count)
@@ -185,7 +185,7 @@ def touch_once(context: CaseContext, tour: Tour, seed: int) -> TouchedOnce:
 
 def drawn_once(context: CaseContext, tour: Tour, seed: int) -> Use | str:
     """What the same tour in the same truth is good for where every touch reads its joints exactly: no physics."""
-    plan, truth = tour.plan, _truth(context, tour.outward_ct, tour.q_insertion, seed)
+    plan, truth = tour.plan, true_touches(context, tour, seed)
     joints = np.array([truth.q_contact(plan.model, plan.tip_mm, touch) for touch in plan.touches])
     points = np.array([nominal_tip(plan.model, plan.tip_mm, q) for q in joints])
     names = tuple(touch.name for touch in plan.touches)
@@ -198,10 +198,12 @@ def _use(context: CaseContext, tour: Tour, truth: TouchTruth, read: NamedPoints)
         return f"{len(read.names)} of {len(tour.plan.touches)} markers were touched, {MIN_MARKERS} are needed"
     try:
         fitted = registered(context, read)
+        expected = expected_of_touches(context, tour.q_insertion, read)
+        return Use(fitted, expected, _tip_error(context, tour.plan, truth, fitted, tour.q_insertion))
     except InputError as error:
         return error.what
-    expected = expected_of_touches(context, tour.q_insertion, read)
-    return Use(fitted, expected, _tip_error(context, tour.plan, truth, fitted, tour.q_insertion))
+    except NoAnswerError as error:
+        return str(error)
 
 
 def _puncture(context: CaseContext, choice: Choice) -> tuple[Floats, Floats]:
@@ -215,11 +217,11 @@ def _puncture(context: CaseContext, choice: Choice) -> tuple[Floats, Floats]:
     return chosen.candidates.arm.q_insertion[rows[0]], chosen.candidates.outward_ct[rows[0]]
 
 
-def _truth(context: CaseContext, outward_ct: Floats, q_insertion: Floats, seed: int) -> TouchTruth:
+def true_touches(context: CaseContext, tour: Tour, seed: int) -> TouchTruth:
     """Where everything truly is: the belief is one registration that the declared errors allow."""
     errors = _true_errors(context)
     assert context.placement is not None and context.placement.registration is not None
-    E = misregistered(context, outward_ct, q_insertion, seed)
+    E = misregistered(context, tour.outward_ct, tour.q_insertion, seed)
     markers = context.placement.registration.markers
     T_base_ct = context.placement.T_base_ct @ np.linalg.inv(E)
     return draw_touch_truth(T_base_ct, markers.names, markers.points_ct, errors, seed)
@@ -238,20 +240,20 @@ def _tip_error(
 ) -> float:
     """Tip to true target of the erring arm, sent to where the new registration puts the target, mm.
 
-    The target was read with an error of its own, the joints drifted since the touches, and arrive with their own.
+    Raises:
+        NoAnswerError: The arm does not reach there.
     """
-    target_ct = context.case.target_ct
-    T = flange_pose(plan.model, q_insertion)
-    T[:3, 3] = apply(fitted.T_base_ct, target_ct) - plan.tip_mm * T[:3, 2]
-    every = nearest_within_limits(plan.model, inverse(plan.model, T)[0], q_insertion)
-    away = np.abs(every - q_insertion).max(axis=1)
-    q = every[int(np.argmin(np.where(np.isnan(away), np.inf, away)))]
-    errors, rng = _true_errors(context), np.random.default_rng([truth.seed, 2])
-    arrival = rng.normal(size=6) * np.hypot(errors.arm.repeatability, errors.arm.drift)
-    values, axes = np.linalg.eigh(errors.target_cov_ct)
-    true_target_ct = target_ct + axes @ (rng.normal(size=3) * np.sqrt(np.maximum(values, 0.0)))
-    tip = true_needle(plan.model, q + arrival, truth.eta, plan.tip_mm).tip_base
-    return float(np.linalg.norm(tip - apply(truth.T_base_ct, true_target_ct)))
+    assert context.placement is not None
+    target_ct, beliefs = context.case.target_ct, (context.placement.T_base_ct, fitted.T_base_ct)
+    q = registered_joints(plan.model, plan.tip_mm, q_insertion, target_ct, beliefs)
+    at_target = true_at_target(context, truth.seed)
+    tip = true_needle(plan.model, q + at_target.arrival, truth.eta, plan.tip_mm).tip_base
+    return float(np.linalg.norm(tip - apply(truth.T_base_ct, at_target.target_ct)))
+
+
+def true_at_target(context: CaseContext, seed: int) -> AtTarget:
+    """What is true when the needle arrives, by one draw of the declared errors."""
+    return draw_at_target(context.case.target_ct, _true_errors(context), seed)
 
 
 def _true_errors(context: CaseContext) -> ErrorModel:
