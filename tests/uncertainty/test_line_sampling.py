@@ -150,11 +150,11 @@ def test_near_faces_answer_as_the_engine_does(rng, kind):
     """Displaced needles, asked of the faces near the nominal one and of the whole engine."""
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=25.0)
     mesh.vertices = mesh.vertices * rng.normal(1, 0.05, (len(mesh.vertices), 1))
-    engine = kind([moved(mesh, 30.0, 5.0, 70.0)])
+    surface = moved(mesh, 30.0, 5.0, 70.0)
     origins, outward = displaced(4 * LEAN, 300)
     reach = (5.0, 12.0)
-    quick = engine.near(0, np.zeros(3), UP, LENGTH, reach).distance(origins, outward, LENGTH)
-    whole = measure_displaced(FastEngine(engine._meshes), origins, outward, LENGTH)[:, 0]
+    quick = kind([surface]).near(0, np.zeros(3), UP, LENGTH, reach).distance(origins, outward, LENGTH)
+    whole = measure_displaced(FastEngine([surface]), origins, outward, LENGTH)[:, 0]
     shift = np.linalg.norm(origins, axis=1) + LENGTH * np.linalg.norm(outward - UP, axis=1)
     sure = whole + shift < min(reach)
     assert sure.any() or (whole < 3).any()
