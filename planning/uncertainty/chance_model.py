@@ -16,10 +16,10 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
 from puncture_twin.planning.reach.standoff import axis_lengths
-from puncture_twin.planning.uncertainty.chances import Chances, HitModel, hit_model, touching_any
+from puncture_twin.planning.uncertainty.chances import Chances, HitModel, hit_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.planning.uncertainty.refined_touch import Needles, Surroundings, refined
-from puncture_twin.planning.uncertainty.touch import Proximity, proximity, touch_chance
+from puncture_twin.planning.uncertainty.touch import Proximity, proximity, touch_chance, touching_any
 
 TAKEN = frozenset({"any", "joint"})
 """Names whose column ``p_touch_<name>`` says something else than one structure's chance."""
@@ -99,15 +99,18 @@ class ChanceModel:
             axes: What the engine has measured of the needles already; None measures them.
         """
         needles = self.needles(outward_ct, q, axes)
-        touch = touch_chance(needles.near, self.touching, self.error.freedom)
+        touch, margin = (
+            touch_chance(needles.near, near, self.error.freedom) for near in (self.touching, self.breaking)
+        )
+        touch_any = touching_any(touch)
         tip = needles.cov_ct[:, :3, :3] + self.error.target_covariance_ct
         along = np.einsum("na,nab,nb->n", outward_ct, tip, outward_ct)
         return Chances(
             structures=self.structures,
             hit=self.hit.chance(self.error, needles.cov_ct),
             touch=touch,
-            margin=touch_chance(needles.near, self.breaking, self.error.freedom),
-            touch_any=touching_any(touch),
+            margin=margin,
+            touch_any=touch_any,
             touch_joint=np.full(len(q), np.nan),
             lateral_mm=np.sqrt(np.maximum(np.trace(tip, axis1=1, axis2=2) - along, 0.0)),
             depth_mm=np.sqrt(along),

@@ -10,6 +10,7 @@ from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.uncertainty.hit import TargetRays, hit_in_ball, hit_in_mesh, target_rays
 from puncture_twin.planning.uncertainty.pose_error import PoseError
+from puncture_twin.planning.uncertainty.touch import touching_any
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +65,6 @@ class Chances:
     def refined(self, touch: Floats, margin: Floats) -> Chances:
         """With better chances (n, k) to touch and to break margins."""
         return replace(self, touch=touch, margin=margin, touch_any=touching_any(touch))
-
-
-def touching_any(touch: Floats) -> Floats:
-    """Shape (n,), from chances to touch each structure (n, k)."""
-    return np.asarray(np.minimum(1.0, touch.sum(axis=1)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,6 +92,11 @@ def touch_chance(near: Proximity, threshold_mm: Floats | float, freedom: int | N
     return np.asarray(np.where(np.isnan(near.gradient[..., 0]), np.nan, chance))
 
 
+def touching_any(touch: Floats) -> Floats:
+    """At most the chance to touch any of k structures, shape (n,), from the chances (n, k) to touch each."""
+    return np.asarray(np.minimum(1.0, touch.sum(axis=1)))
+
+
 def touch_bound(
     slack_mm: Floats,
     outward_ct: Floats,
