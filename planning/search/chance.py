@@ -5,7 +5,6 @@ To first order for all; by line sampling where that may decide: near a limit, an
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -59,15 +58,10 @@ def with_chances(
     rows = np.flatnonzero(found.safe & np.isfinite(found.arm.q_insertion).all(axis=1))
     if model is None or not len(rows):
         return replace(found, chances=chances)
-    for part in _parts(rows):
+    for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
         known = None if axes is None else axes.at(part)
         chances = chances.put(part, model.chances(found.outward_ct[part], found.arm.q_insertion[part], known))
     return _limited(case, _refined_near_limits(replace(found, chances=chances), model))
-
-
-def _parts(rows: Ints) -> Iterator[Ints]:
-    """Some rows at a time."""
-    return (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE))
 
 
 def _refined_near_limits(found: Candidates, model: ChanceModel) -> Candidates:
@@ -94,7 +88,7 @@ def _touch_bounds(found: Candidates, model: ChanceModel) -> Floats:
     """Shape (n, k), of the safe candidates' chances to touch; NaN for others."""
     error, columns, length = model.error, model.columns, float(model.lengths.max())
     bounds, rows = np.full((len(found), len(columns)), np.nan), np.flatnonzero(found.safe)
-    for part in _parts(rows):
+    for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
         slack, cov_ct = found.clearance.distance[part][:, columns], error.covariance_ct(found.arm.q_insertion[part])
         bounds[part] = touch_bound(slack, found.outward_ct[part], cov_ct, length, error.surface_mm, error.freedom)
     return bounds

@@ -6,7 +6,7 @@ alone: directions, and how the arm stands with the tip on the target.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -129,9 +129,8 @@ class ChanceModel:
         around = Surroundings(self.engine, self.columns, self.lengths, self.case.target_ct)
         needles = self.needles(outward_ct, q)
         touch = refined(around, needles, self.touching, first.touch, every if wanted is None else wanted)
-        if wanted is not None:
-            return first.refined(touch, first.margin)
-        return first.refined(touch, refined(around, needles, self.breaking, first.margin, every))
+        margin = first.margin if wanted is not None else refined(around, needles, self.breaking, first.margin, every)
+        return replace(first, touch=touch, margin=margin, touch_any=touching_any(touch))
 
     def keeps_limits(self, outward_ct: Floats, q: Floats) -> Bools:
         """Whether needles keep the case's limits, shape (n,), in any configurations that reach the target.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -10,7 +10,6 @@ from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.uncertainty.hit import TargetRays, hit_in_ball, hit_in_mesh, target_rays
 from puncture_twin.planning.uncertainty.pose_error import PoseError
-from puncture_twin.planning.uncertainty.touch import touching_any
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +60,6 @@ class Chances:
         for name, value in values.items():
             value[rows] = getattr(known, name)
         return Chances(self.structures, **values)
-
-    def refined(self, touch: Floats, margin: Floats) -> Chances:
-        """With better chances (n, k) to touch and to break margins."""
-        return replace(self, touch=touch, margin=margin, touch_any=touching_any(touch))
 
 
 @dataclass(frozen=True, eq=False)

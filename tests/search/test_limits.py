@@ -218,7 +218,8 @@ def test_what_may_decide_is_line_sampled(tmp_path, monkeypatch, limited):
     rows = np.flatnonzero(np.isfinite(found.chances.hit))
     outward, q = found.outward_ct[rows], found.arm.q_insertion[rows]
     first = context.chance.chances(outward, q)
-    lines, table = context.chance.refined(outward, q, first).touch, found.chances.touch[rows]
+    lines = context.chance.refined(outward, q, first, np.ones(first.touch.shape, bool)).touch
+    table = found.chances.touch[rows]
     near = (first.touch >= limit / 3) & (first.touch <= 3 * limit)
     must = near & limited
     must[np.isin(rows, found.ranked[:2])] = True
