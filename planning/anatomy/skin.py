@@ -59,13 +59,16 @@ class FieldExit:
 
 @dataclass(frozen=True, eq=False)
 class FieldOfView:
-    """The box that was imaged, up to the outer faces of its border voxels.
+    """What lies between the faces at which the body was cut, and is open to all other sides.
+
+    Beyond the plane of such a face nothing is known, wherever a path passes it: also one that has left the image
+    before, through the air in front of the belly. An image that shows less of that air must make nothing safe.
 
     Attributes:
         T_ct_box: Shape (4, 4), rigid; the box frame's origin is its low corner, its axes run mostly to the
             patient's left, back and head.
-        size_mm: Shape (3,).
-        cut: Shape (3, 2), which low and high face the body reaches.
+        size_mm: Shape (3,). A side that is not cut lies ``OPEN_AIR_MM`` beyond the image or the mesh.
+        cut: Shape (3, 2), which low and high face the body reaches: those of the image, or of a mesh that was cut.
     """
 
     T_ct_box: NDArray[np.float64]
@@ -202,9 +205,7 @@ def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
         if not in_plane.any():
             raise InputError(f"no flat end at its {name}", where="skin mesh", allowed="a side where the body was cut")
         cut_faces |= in_plane
-    T_ct_box = pose(np.eye(3), np.where(sides[:, 0], low, low - OPEN_AIR_MM))
-    size = np.where(sides[:, 1], high, high + OPEN_AIR_MM) - T_ct_box[:3, 3]
-    view = FieldOfView(T_ct_box, size, sides)
+    view = _open_to_air(pose(np.eye(3), low), high - low, sides)
     return Skin(mesh, cut_faces, view, warnings + _cut_warnings(view))
 
 
@@ -242,11 +243,19 @@ def _skin(
 
 
 def _field_of_view(body: NDArray[np.bool_], oriented: Oriented) -> FieldOfView:
+    """Up to the outer faces of the border voxels that the body reaches."""
     spacing = oriented.spacing_mm
     axes, origin = oriented.T_ct_index[:3, :3], oriented.T_ct_index[:3, 3]
-    T_ct_box = pose(axes / spacing, origin - 0.5 * axes.sum(axis=1))
+    T_ct_image = pose(axes / spacing, origin - 0.5 * axes.sum(axis=1))
     cut = [[bool(body.take(side, axis=axis).any()) for side in (0, -1)] for axis in range(3)]
-    return FieldOfView(T_ct_box, spacing * body.shape, np.array(cut))
+    return _open_to_air(T_ct_image, spacing * body.shape, np.array(cut))
+
+
+def _open_to_air(T_ct_image: Floats, size_mm: Floats, cut: NDArray[np.bool_]) -> FieldOfView:
+    """A box from its low corner, opened to the sides at which it does not cut the body."""
+    low = np.where(cut[:, 0], 0.0, -OPEN_AIR_MM)
+    high = np.where(cut[:, 1], size_mm, size_mm + OPEN_AIR_MM)
+    return FieldOfView(T_ct_image @ pose(np.eye(3), low), high - low, cut)
 
 
 def _on_cut_border(

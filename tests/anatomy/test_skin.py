@@ -11,6 +11,7 @@ import pytest
 from places import REAL_CT
 
 from puncture_twin.planning.anatomy.skin import FieldOfView, Skin, skin_from_ct, skin_from_label, skin_from_mesh
+from puncture_twin.planning.anatomy.skin_entry import view_depth
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.volumes.volume_files import Volume, read_volume
@@ -73,8 +74,8 @@ def test_ends_that_the_field_of_view_cuts_are_not_skin(skin: Skin) -> None:
     view = skin.field_of_view
     assert view is not None
     assert view.cut.tolist() == [[False, False], [False, False], [True, True]]
-    assert np.allclose(view.size_mm, SPACING * SHAPE)
-    assert np.allclose(view.T_ct_box[:3, 3], -SPACING / 2)
+    assert view.size_mm[2] == pytest.approx(SPACING[2] * SHAPE[2])
+    assert view.T_ct_box[2, 3] == pytest.approx(-SPACING[2] / 2)
     centres = skin.mesh.triangles.mean(axis=1)
     assert np.array_equal(skin.cut_faces, (centres[:, 2] < 0.0) | (centres[:, 2] > 145.0))
     assert skin.mesh.bounds[:, 2].tolist() == pytest.approx([-2.5, 147.5])
@@ -107,7 +108,35 @@ def test_a_body_cut_at_its_side_is_marked_there() -> None:
     assert np.count_nonzero(np.abs(centres[:, 0] + 1.5) < 1e-6) > 100
     found = view.exit(np.array([30.0, 70.0, 75.0]), np.array([[-1.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, -1]]))
     assert found.cut.tolist() == [True, False, False, True]
-    assert found.depth_mm.tolist() == pytest.approx([31.5, 148.5, 96.5, 77.5])
+    assert found.depth_mm[found.cut].tolist() == pytest.approx([31.5, 77.5])
+
+
+def rays(count: int) -> np.ndarray:
+    """Directions to all sides."""
+    turned = np.random.default_rng(9).normal(size=(count, 3))
+    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
+
+
+def test_an_image_with_less_air_knows_no_more() -> None:
+    """Rows of air in front of the body and beside it cut off: every path passes the planes of its ends where it did."""
+    hu, target = cylinder_ct(), np.array([88.5, 70.0, 70.0])
+    whole, narrow = skin_from_ct(ct_of(hu)), skin_from_ct(ct_of(hu[:, 3:]))
+    shifted = target - [0.0, 3 * SPACING[1], 0.0]
+    depth = view_depth(whole, target, rays(2000))
+    np.testing.assert_allclose(view_depth(narrow, shifted, rays(2000)), depth, rtol=1e-12)
+    assert np.isfinite(depth).mean() > 0.95  # the others are nearly square to the bed, and go on for two metres
+    slanted = np.array([[0.0, -np.sin(1.2), np.cos(1.2)]])  # it leaves the image in front before it passes the end
+    assert view_depth(whole, target, slanted)[0] == pytest.approx((147.5 - 70.0) / np.cos(1.2))
+
+
+def test_a_mesh_that_was_cut_knows_as_much_as_its_image(skin: Skin) -> None:
+    """The body's surface alone, its ends named: the same planes, to the half voxel by which the mesh is cut shorter."""
+    target = np.array([88.5, 70.0, 70.0])
+    mesh = skin_from_mesh(skin.mesh, ("feet", "head"))
+    of_image, of_mesh = (view_depth(one, target, rays(2000)) for one in (skin, mesh))
+    assert np.array_equal(np.isnan(of_image), np.isnan(of_mesh))
+    along = np.abs(rays(2000)[:, 2])
+    assert np.nanmax(np.abs(of_image - of_mesh) * along) <= 0.5 * SPACING[2] + 1e-6
 
 
 def test_a_lung_that_a_side_face_cuts_stays_inside_the_body() -> None:
