@@ -12,6 +12,9 @@ from puncture_twin.planning.formats.points.point_files import read_points
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.run_twin import main
+from puncture_twin.twin.jobs.experiment.scan_job import Control, control_summary
+from puncture_twin.twin.jobs.experiment.scan_text import _needle_lines
+from puncture_twin.twin.plant.scanner.case_scene import TrueRod
 
 CARTON = folder() / "carton" / "case_m.toml"
 COARSE = ("--spacing", "5", "--pixel", "0.9")
@@ -128,3 +131,13 @@ def test_what_a_structure_is_made_of_can_be_stated(tmp_path):
     assert main(["scan", str(of_wood(tmp_path)), "--out", str(tmp_path / "ct"), *COARSE]) == 0
     ct, labels = read_volume(tmp_path / "ct" / "ct.nii.gz"), read_volume(tmp_path / "ct" / "labels.nii.gz")
     assert -430 < np.median(ct.values[labels.values == 3]) < -250  # 8 mm wide in slices of 5 mm
+
+
+def test_a_needle_that_cannot_be_read_is_no_reason_for_no_scan():
+    """Its summary and the text have the reason, and the truth beside it."""
+    true = TrueRod(np.array([0.0, 0.0, 2.0]), np.array([0.0, 0.0, -1.0]))
+    why = "the needle ends at other metal, which hides its tip; its axis passes the target by 0.0 mm"
+    summary = control_summary(Control(true, None, np.zeros(3), why))
+    assert summary["found"] is None and summary["why_not"] == why
+    assert summary["true"]["depth_mm"] == pytest.approx(-2.0)
+    assert _needle_lines(summary) == [f"  needle         not read: {why}"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -106,3 +107,43 @@ def test_without_a_needle_none_is_found():
     volume, _ = scanned([BLOCK, bone], 2.5, size=(40.0, 40.0, 40.0), centre=(0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="no needle"):
         find_needle(volume, np.zeros(3), 1.2)
+
+
+BOLTS = [
+    Solid("bolt", rod(np.array([0.0, 8.0 * side, -40.0]), np.array([0.0, 8.0 * side, top]), 8.0), 8000.0)
+    for side, top in ((-1, 13.0), (0, 0.0), (1, -24.0))
+]
+"""Three bolts side by side, as in the embedded carton; a needle comes to the end of the middle one."""
+
+
+def beside_bolts(seed, spacing, gap_mm):
+    """A scan of a needle of 2 mm that ends so far from the middle bolt's end, its tip and direction."""
+    rng = np.random.default_rng(seed)
+    forward = np.array([0.25, -0.2, -1.0]) + rng.normal(0, 0.06, 3)
+    forward /= np.linalg.norm(forward)
+    tip = np.array([0.0, 0.0, 0.0]) - gap_mm * forward + rng.normal(0, 0.4, 3)
+    needle = Solid("needle", rod(tip - 50.0 * forward, tip, 2.0), 8000.0)
+    volume, _ = scanned([*BOLTS, needle], spacing, seed=seed, centre=(0.0, 0.0, 5.0), size=(50.0, 50.0, 90.0))
+    return volume, tip, forward
+
+
+@pytest.mark.parametrize("spacing", [1.0, 2.5])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_needle_is_found_beside_bolts(spacing, seed):
+    """They are larger and nearer to the target; its tip is six millimetres clear of them."""
+    volume, tip, forward = beside_bolts(seed, spacing, 12.0)
+    found = find_needle(volume, np.zeros(3), 2.0)
+    assert np.linalg.norm(found.tip_ct - tip) < 0.5
+    assert np.degrees(np.arccos(found.forward_ct @ forward)) < 1.0
+
+
+@pytest.mark.parametrize("spacing", [1.0, 2.5])
+@pytest.mark.parametrize("gap_mm", [0.5, 4.0])
+def test_a_tip_at_a_bolt_is_refused_and_its_axis_said(spacing, gap_mm):
+    """Where the metal ends nobody sees where the needle does; by how much it passes the target is seen."""
+    volume, tip, forward = beside_bolts(5, spacing, gap_mm)
+    beside = np.linalg.norm(tip - (tip @ forward) * forward)
+    with pytest.raises(InputError, match="ends at other metal, which hides its tip") as refused:
+        find_needle(volume, np.zeros(3), 2.0)
+    said = float(re.search(r"passes the target by ([0-9.]+) mm", str(refused.value))[1])
+    assert said == pytest.approx(beside, abs=0.5)

@@ -20,6 +20,9 @@ AROUND_MM = 3.0
 BLUR_MM = 1.5
 """So far from its voxels a piece of metal still blurs into others; beyond, they show what it lies in."""
 
+EDGE_MM = 1.5
+"""By which the edges of wide metal stand out of the balls that fit into it."""
+
 SOLID_HU = 8000.0
 """Assumed of a voxel that is wholly metal, whose value the range of the image clips. It only decides at which part of
 metal a voxel in air and one in tissue count as full: alike, so that a marker on the skin is not drawn to one side."""
@@ -50,9 +53,27 @@ def spacing_mm(volume: Volume) -> Floats:
     return np.asarray(np.linalg.norm(volume.T_ct_index[:3, :3], axis=0))
 
 
-def metal_pieces(volume: Volume, level_hu: float = METAL_HU) -> Iterator[Metal]:
-    """Every connected piece of metal, diagonal neighbours included, from a level on."""
-    labels, _ = ndimage.label(volume.values > level_hu, structure=np.ones((3, 3, 3)))
+def wide_metal(volume: Volume, diameter_mm: float) -> Bools:
+    """Voxels of metal that is wider than a rod, and those into which it blurs; shape of the image.
+
+    Wide is what a ball fits into that is wider than the rod's own image.
+
+    Args:
+        volume: The CT.
+        diameter_mm: Of the rod.
+    """
+    metal, spacing = volume.values > METAL_HU, spacing_mm(volume)
+    radius = diameter_mm / 2 + BLUR_MM
+    core = ndimage.distance_transform_edt(np.pad(metal, 1), spacing)[1:-1, 1:-1, 1:-1] > radius
+    if not core.any():
+        return np.zeros_like(metal)
+    return np.asarray(ndimage.distance_transform_edt(~core, spacing) <= radius + EDGE_MM + BLUR_MM)
+
+
+def metal_pieces(volume: Volume, level_hu: float = METAL_HU, without: Bools | None = None) -> Iterator[Metal]:
+    """Every connected piece of metal, diagonal neighbours included, from a level on, but for some voxels."""
+    metal = volume.values > level_hu
+    labels, _ = ndimage.label(metal if without is None else metal & ~without, structure=np.ones((3, 3, 3)))
     spacing = spacing_mm(volume)
     around = np.ceil(AROUND_MM / spacing).astype(int)
     for number, found in enumerate(ndimage.find_objects(labels), start=1):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.special import ndtr
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
@@ -23,6 +23,7 @@ from puncture_twin.twin.guidance.ct.metal import (
     metal_pieces,
     metal_weights,
     spacing_mm,
+    wide_metal,
 )
 
 SHORTEST_MM = 20.0
@@ -47,6 +48,8 @@ FITTED_MM = 80.0
 """Behind the tip, so much of a needle is held to be straight."""
 GROWTHS = 2
 """The first line through a short piece is not yet the needle's."""
+SEEN_MM = 3.0
+"""So far before and beyond a tip the needle's axis is clear of other metal: else the tip is not seen."""
 LARGEST_GAP_MM = 6.0
 """Along a needle, between voxels that show it."""
 
@@ -76,32 +79,55 @@ class FoundNeedle(NamedTuple):
 def find_needle(volume: Volume, target_ct: Floats, diameter_mm: float | None = None) -> FoundNeedle:
     """Find the needle of a control CT.
 
+    Metal that is wider than the needle (bolts, plates) is not looked at, nor what it blurs into: the axis is that of
+    the thin metal beside it. A tip there cannot be told from it and is refused.
+
     Args:
         volume: The CT.
         target_ct: Shape (3,), LPS mm: its tip is the end nearer to this.
         diameter_mm: Of the needle; None for a rod that is wider than three pixels.
 
     Raises:
-        InputError: No long piece of metal.
+        InputError: No long piece of metal, or a needle that ends at other metal.
     """
+    hidden = np.zeros(volume.values.shape, np.bool_) if diameter_mm is None else wide_metal(volume, diameter_mm)
     for level in LEVELS_HU[: 1 if diameter_mm is None else None]:
-        rods = [piece for piece in metal_pieces(volume, level) if piece.size_mm >= SHORTEST_MM]
+        rods = [piece for piece in metal_pieces(volume, level, hidden) if piece.size_mm >= SHORTEST_MM]
         for metal in sorted(rods, key=lambda piece: _gap(piece, volume, target_ct)):
             line = _axis(volume, metal, target_ct)
             if diameter_mm is None:
                 return FoundNeedle(_tip(volume, metal, line, None), line.forward, line.width_mm)
             widest = diameter_mm / 2 + 0.5 * float(spacing_mm(volume).max()) + BLUR_SIGMA_MM
             if line.width_mm < min(widest, metal.size_mm / SLENDER):
-                metal, line = _whole(volume, metal, line, target_ct)
-                return _fitted(volume, metal, line, diameter_mm)
+                metal, line = _whole(volume, metal, line, target_ct, hidden)
+                found = _fitted(volume, metal, line, diameter_mm, hidden)
+                _check_tip(volume, found, target_ct, hidden)
+                return found
     allowed = f"a straight piece of metal of {SHORTEST_MM:g} mm or more"
     raise InputError("no needle in the image", where=volume.path, allowed=allowed)
 
 
-def _whole(volume: Volume, metal: Metal, line: _Line, target_ct: Floats) -> tuple[Metal, _Line]:
+def _check_tip(volume: Volume, found: FoundNeedle, target_ct: Floats, hidden: Bools) -> None:
+    """Refuse a tip at other metal: what is found there is where that begins, not where the needle ends.
+
+    Raises:
+        InputError: It is.
+    """
+    beyond = found.tip_ct + np.arange(-SEEN_MM, SEEN_MM + 0.1, 0.25)[:, None] * found.forward_ct
+    at = np.rint(apply(np.linalg.inv(volume.T_ct_index), beyond)).astype(int)
+    inside = ((at >= 0) & (at < hidden.shape)).all(axis=1)
+    if not hidden[tuple(at[inside].T)].any():
+        return
+    away = target_ct - found.tip_ct
+    beside = float(np.linalg.norm(away - (away @ found.forward_ct) * found.forward_ct))
+    what = f"the needle ends at other metal, which hides its tip; its axis passes the target by {beside:.1f} mm"
+    raise InputError(what, where=volume.path, allowed=f"a tip {SEEN_MM:g} mm clear of wider metal and its blur")
+
+
+def _whole(volume: Volume, metal: Metal, line: _Line, target_ct: Floats, hidden: Bools) -> tuple[Metal, _Line]:
     """All of a needle of which thick slices, between which it is diluted, show only pieces at first."""
     for _ in range(GROWTHS):
-        at = np.argwhere(volume.values > LEVELS_HU[-1])
+        at = np.argwhere((volume.values > LEVELS_HU[-1]) & ~hidden)
         points = apply(volume.T_ct_index, at.astype(float)) - line.middle
         along = points @ line.forward
         across = np.linalg.norm(points - along[:, None] * line.forward, axis=1)
@@ -167,7 +193,7 @@ def _tip(volume: Volume, metal: Metal, line: _Line, diameter_mm: float | None) -
     return line.middle + float(found.x) * line.forward
 
 
-def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float) -> FoundNeedle:
+def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidden: Bools) -> FoundNeedle:
     """Tip and direction of the thin rod whose blurred and clipped image is nearest to the voxels about it."""
     start, full, blur = _tip(volume, metal, line, diameter_mm), full_part(volume), _blur(volume)
     parts = np.minimum(metal_parts(volume, metal), full).ravel()
@@ -176,7 +202,7 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float) -> Fo
     along = points @ line.forward
     across = np.linalg.norm(points - along[:, None] * line.forward, axis=1)
     reach = WIDE_MM + WIDEST_SLICE * float(spacing_mm(volume).max())
-    near = (across <= reach) & (along > -FITTED_MM) & (along < SHAFT_MM)
+    near = (across <= reach) & (along > -FITTED_MM) & (along < SHAFT_MM) & ~hidden[tuple(index.T)]
     side = np.linalg.svd(line.forward[None])[2][1:]
 
     def rod(change: Floats) -> tuple[Floats, Floats]:

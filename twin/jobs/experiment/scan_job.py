@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from puncture_twin.twin.guidance.ct.lesion import read_lesion
 from puncture_twin.twin.guidance.ct.markers import READING_MM, Markers, find_markers
 from puncture_twin.twin.guidance.ct.metal import METAL_HU
 from puncture_twin.twin.guidance.ct.needle import FoundNeedle, find_needle, needle_error
+from puncture_twin.twin.jobs.experiment.result_file import write_result
 from puncture_twin.twin.jobs.experiment.scan_picture import Shown, draw_scan
 from puncture_twin.twin.plant.scanner.case_scene import CaseScene, MarkerKind, TrueRod, case_scene, label_layers
 from puncture_twin.twin.plant.scanner.dicom_writer import write_series
@@ -65,11 +65,15 @@ def parse_marker(text: str) -> MarkerKind:
 
 @dataclass(frozen=True, eq=False)
 class Control:
-    """A needle in a control CT: where it truly is, where it was found, and the target that it was meant for."""
+    """A needle in a control CT: where it truly is, where it was found, and the target that it was meant for.
+
+    ``found`` is None where it cannot be read; ``why_not`` says why.
+    """
 
     true: TrueRod
-    found: FoundNeedle
+    found: FoundNeedle | None
     target: Floats
+    why_not: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +95,7 @@ class ScanRun:
         grid, settings = self.image.grid, self.request.settings
         true, found = self.lesion
         return {
-            "case": str(self.context.case.path),
+            "case": self.context.case.name,
             "settings": {
                 **{key: value for key, value in asdict(settings).items() if key != "turn"},
                 "turn_deg": float(np.degrees(settings.turn)),
@@ -139,14 +143,15 @@ def theory(settings: ScanSettings) -> dict[str, float]:
 
 def control_summary(control: Control) -> dict[str, Any]:
     """A needle as found and as it is, mm and degrees; errors from the target, as clinical papers state them."""
-    found = needle_error(control.found.tip_ct, control.found.forward_ct, control.target)
-    true = needle_error(control.true.tip_ct, control.true.forward_ct, control.target)
-    cosine = np.clip(control.found.forward_ct @ control.true.forward_ct, -1.0, 1.0)
+    true, needle = needle_error(control.true.tip_ct, control.true.forward_ct, control.target), control.found
+    if needle is None:
+        return {"found": None, "true": true._asdict(), "why_not": control.why_not}
+    cosine = np.clip(needle.forward_ct @ control.true.forward_ct, -1.0, 1.0)
     return {
-        "tip_mm": control.found.tip_ct.tolist(),
-        "found": found._asdict(),
+        "tip_mm": needle.tip_ct.tolist(),
+        "found": needle_error(needle.tip_ct, needle.forward_ct, control.target)._asdict(),
         "true": true._asdict(),
-        "tip_reading_error_mm": float(np.linalg.norm(control.found.tip_ct - control.true.tip_ct)),
+        "tip_reading_error_mm": float(np.linalg.norm(needle.tip_ct - control.true.tip_ct)),
         "angle_reading_error_deg": float(np.degrees(np.arccos(cosine))),
     }
 
@@ -166,7 +171,7 @@ def scan_case(context: CaseContext, out: Path, request: ScanRequest) -> ScanRun:
             files = list(_write(run, draft.folder))
         run = replace(run, files=draft.final(files))
         report = draft.folder / REPORT
-        report.write_text(json.dumps(run.summary(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        write_result(run.summary(), report, out)
     return replace(run, files=(*run.files, out / REPORT))
 
 
@@ -219,7 +224,10 @@ def _control(scene: CaseScene, volume: Volume, diameter_mm: float, true: TrueRod
     T = scene.T_scan_ct
     target = apply(T, target_ct)
     moved = TrueRod(apply(T, true.tip_ct), T[:3, :3] @ true.forward_ct)
-    return Control(moved, find_needle(volume, target, diameter_mm), target)
+    try:
+        return Control(moved, find_needle(volume, target, diameter_mm), target)
+    except InputError as error:
+        return Control(moved, None, target, error.what)
 
 
 def _write(run: ScanRun, folder: Path) -> Iterator[Path]:

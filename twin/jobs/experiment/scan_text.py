@@ -54,6 +54,8 @@ def _needle_lines(needle: dict[str, Any] | None) -> list[str]:
     if needle is None:
         return []
     found, true = needle["found"], needle["true"]
+    if found is None:
+        return [f"  needle         not read: {needle['why_not']}"]
     return [
         f"  needle         tip {found['tip_to_target_mm']:.2f} mm from the target in the control CT "
         f"({found['lateral_mm']:.2f} across, {found['depth_mm']:+.2f} along)",
