@@ -22,7 +22,7 @@ from puncture_twin.planning.arm.gantry import gantry_boxes
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, slowed
 from puncture_twin.planning.arm.tip_speed import TipLimit
-from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
@@ -121,10 +121,10 @@ def gantry(context: CaseContext, T_base_ct: np.ndarray) -> np.ndarray:
 
 
 def build(
-    model_name: str, tool: Tool, boxes: tuple[Box, ...], patient: TriangleMesh | None
+    model: UrModel, tool: Tool, boxes: tuple[Box, ...], patient: TriangleMesh | None
 ) -> tuple[FastChecker, CellChecker, tuple[float, float, float]]:
     """Both checkers, and the CPU seconds of: the fast one anew, the same from the cache, the plain one."""
-    room = (ur_model(model_name), tool, boxes, patient)
+    room = (model, tool, boxes, patient)
     with tempfile.TemporaryDirectory() as here:
         cache, times = Cache(Path(here)), list[float]()
         for _ in range(2):

@@ -112,7 +112,7 @@ def reach(name: str, case_file: Path, step_deg: float, n_states: int) -> None:
     found = organ_candidates(case, anatomy, context.engine, case_directions(case))
     requests = [reach_request(case, found, int(row), placed.T_base_ct) for row in np.flatnonzero(found.safe)]
     skin = anatomy.skin.mesh.transformed(placed.T_base_ct)
-    room = (ur_model(case.robot.model), case_tool(case), case_boxes(case, placed.T_base_ct), skin)
+    room = (case.robot.model, case_tool(case), case_boxes(case, placed.T_base_ct), skin)
     begin = process_time()
     slow = CellChecker(*room, padding_mm=ARM_PADDING_MM)
     middle = process_time()

@@ -21,7 +21,7 @@ from scipy.special import chdtri
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.kinematics import inverse, singularity
-from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.case.errors import ErrorModel, error_model
 from puncture_twin.planning.case.errors_section import ErrorsSection
@@ -81,7 +81,7 @@ def stand_of(path: Path, theta_deg: float, beta_deg: float) -> Stand:
     case = load_case(path)
     placement = load_placement(case)
     assert placement is not None and placement.registration is not None
-    found, model, tip = placement.registration.markers, ur_model(case.robot.model), case.needle.length_mm
+    found, model, tip = placement.registration.markers, case.robot.model, case.needle.length_mm
     T = fit_rigid(found.points_ct, found.points_base)
     theta, beta = np.radians([theta_deg, beta_deg])
     outward = case.T_ct_entry[:3, :3] @ [np.sin(theta) * np.cos(beta), np.sin(theta) * np.sin(beta), np.cos(theta)]

@@ -29,7 +29,6 @@ from benchmarks.scenes import DATA
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.kinematics import inverse, singularity
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.geometry.rigid import apply
@@ -162,7 +161,7 @@ def _reached(context: CaseContext, T_base_ct: np.ndarray, count: int) -> tuple[n
     rows = np.flatnonzero(judged.safe)
     nearest = rows[np.argsort(judged.clearance.least[rows])]
     order = [row for pair in zip(nearest, rng.permutation(rows), strict=True) for row in pair]
-    model, tip, rolls = ur_model(case.robot.model), case.needle.length_mm, np.radians(np.arange(0, 360, 30))
+    model, tip, rolls = case.robot.model, case.needle.length_mm, np.radians(np.arange(0, 360, 30))
     outward, kept = [], []
     for row in order:
         along = judged.outward_ct[row]
@@ -177,7 +176,7 @@ def _reached(context: CaseContext, T_base_ct: np.ndarray, count: int) -> tuple[n
 def punctures(of: Scene, markers: int, *, corrected: bool = False) -> Iterator[tuple[Puncture, PoseError]]:
     """Each direction's puncture, and the belief that the declaration gives of it; its aim corrected, or not."""
     case, T = of.context.case, of.T_base_ct
-    model, tip, points = ur_model(case.robot.model), case.needle.length_mm, of.points_ct[:markers]
+    model, tip, points = case.robot.model, case.needle.length_mm, of.points_ct[:markers]
     there, down = apply(T, points), -(T[:3, :3] @ case.T_ct_entry[:3, 2])
     q_touch = np.array([touching_configuration(model, tip, point, down) for point in there])
     noise = reading_noise(of.errors, model, tip, q_touch, known=True)

@@ -107,7 +107,7 @@ def bounding_spheres():
 def approach(plan_file):
     """Joint speeds over time."""
     plan = read_plan(plan_file)
-    limit = 0.5 * np.degrees(ur_model(plan.model).max_speeds)
+    limit = 0.5 * np.degrees(plan.model.max_speeds)
     figure, axes = plt.subplots(1, 2, figsize=(11, 4), sharey=True)
     for ax, motion, title in zip(axes, (plan.approach, plan.insertion), ("approach", "insertion"), strict=True):
         speeds = np.degrees(np.diff(motion.q, axis=0) / np.diff(motion.times_s)[:, None])

@@ -7,7 +7,6 @@ from places import ROOT
 
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.kinematics import inverse, singularity
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.errors_section import ErrorsSection
@@ -64,7 +63,7 @@ def world(case_file, method, errors, *, touch_like_insertion=False, moved=None):
     """
     case = load_case(ROOT / "meshes" / case_file)
     found = load_placement(case).registration.markers
-    model, tip = ur_model(case.robot.model), case.needle.length_mm
+    model, tip = case.robot.model, case.needle.length_mm
     T = fit_rigid(found.points_ct, found.points_base)
     T = T if moved is None else moved @ T
     outward_ct = _direction(case, *DIRECTIONS[case_file])

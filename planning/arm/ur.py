@@ -6,6 +6,7 @@ dynamics"; joint ranges and speeds: the data sheets. An old manual prints d1 = 1
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -38,6 +39,7 @@ class UrModel:
         d6: From wrist 2 to the flange, mm.
         joint_limits: Shape (6, 2), rad: lowest and highest angle of each joint.
         max_speeds: Shape (6,), rad/s.
+        max_torques: Shape (6,), N m: what each joint's motor can give.
         max_acceleration: rad/s^2, for every joint.
     """
 
@@ -50,13 +52,26 @@ class UrModel:
     d6: float
     joint_limits: NDArray[np.float64]
     max_speeds: NDArray[np.float64]
+    max_torques: NDArray[np.float64]
     max_acceleration: float = DEFAULT_MAX_ACCELERATION
 
     def __post_init__(self) -> None:
-        for name in ("joint_limits", "max_speeds"):
+        for name in ("joint_limits", "max_speeds", "max_torques"):
             array = np.array(getattr(self, name), dtype=np.float64)
             array.setflags(write=False)
             object.__setattr__(self, name, array)
+
+    @cached_property
+    def digest(self) -> str:
+        """Hexadecimal SHA-256 of all that the arm is: two of one digest are the same arm, to the bit."""
+        numbers = (self.lengths, self.joint_limits, self.max_speeds, self.max_torques, np.array(self.max_acceleration))
+        return hashlib.sha256(self.name.encode() + b"".join(one.tobytes() for one in numbers)).hexdigest()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, UrModel) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
 
     @property
     def a(self) -> tuple[float, ...]:
@@ -97,28 +112,36 @@ class UrModel:
         return np.asarray(np.all((q >= self.joint_limits[:, 0]) & (q <= self.joint_limits[:, 1]), axis=-1))
 
 
-def _model(name: str, lengths_mm: tuple[float, ...], max_speeds_deg: tuple[float, ...]) -> UrModel:
+def _model(
+    name: str, lengths_mm: tuple[float, ...], max_speeds_deg: tuple[float, ...], max_torques: tuple[float, ...]
+) -> UrModel:
     d1, a2, a3, d4, d5, d6 = lengths_mm
     turns = np.full(6, 2 * math.pi)
     turns[ELBOW] = math.pi
     limits = np.stack([-turns, turns], axis=1)
-    return UrModel(name, d1, a2, a3, d4, d5, d6, joint_limits=limits, max_speeds=np.radians(max_speeds_deg))
+    speeds, torques = np.radians(max_speeds_deg), np.array(max_torques)
+    return UrModel(name, d1, a2, a3, d4, d5, d6, joint_limits=limits, max_speeds=speeds, max_torques=torques)
 
 
 _SMALL = (180.0, 180.0, 180.0, 360.0, 360.0, 360.0)
 _MEDIUM = (180.0,) * 6
 _LARGE = (120.0, 120.0, 180.0, 180.0, 180.0, 180.0)
 
+_WEAK = (56.0, 56.0, 28.0, 12.0, 12.0, 12.0)
+_STRONG = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)
+_STRONGEST = (330.0, 330.0, 150.0, 56.0, 56.0, 56.0)
+"""The manufacturer's joint torques; the URDF of the UR3 carries those of a UR10. The e-Series': of its URDFs."""
+
 UR_MODELS: Mapping[str, UrModel] = MappingProxyType(
     {
         model.name: model
         for model in (
-            _model("ur3", (151.9, -243.65, -213.25, 112.35, 85.35, 81.9), _SMALL),
-            _model("ur3e", (151.85, -243.55, -213.2, 131.05, 85.35, 92.1), _SMALL),
-            _model("ur5", (89.159, -425.0, -392.25, 109.15, 94.65, 82.3), _MEDIUM),
-            _model("ur5e", (162.5, -425.0, -392.2, 133.3, 99.7, 99.6), _MEDIUM),
-            _model("ur10", (127.3, -612.0, -572.3, 163.941, 115.7, 92.2), _LARGE),
-            _model("ur10e", (180.7, -612.7, -571.55, 174.15, 119.85, 116.55), _LARGE),
+            _model("ur3", (151.9, -243.65, -213.25, 112.35, 85.35, 81.9), _SMALL, _WEAK),
+            _model("ur3e", (151.85, -243.55, -213.2, 131.05, 85.35, 92.1), _SMALL, _WEAK),
+            _model("ur5", (89.159, -425.0, -392.25, 109.15, 94.65, 82.3), _MEDIUM, _STRONG),
+            _model("ur5e", (162.5, -425.0, -392.2, 133.3, 99.7, 99.6), _MEDIUM, _STRONG),
+            _model("ur10", (127.3, -612.0, -572.3, 163.941, 115.7, 92.2), _LARGE, _STRONGEST),
+            _model("ur10e", (180.7, -612.7, -571.55, 174.15, 119.85, 116.55), _LARGE, _STRONGEST),
         )
     }
 )

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.budget.bent_path import BentPath
 from puncture_twin.planning.budget.breath import Breath
@@ -94,7 +94,7 @@ def chain_of(case: Case, registration: Registration, q_insertion: Floats, path: 
     assert case.errors is not None and registration.uncertainty is not None
     scale = registration.uncertainty.test.scale
     return Chain(
-        ur_model(case.robot.model),
+        case.robot.model,
         case.needle.length_mm,
         registration.method,
         case.errors.scaled(scale),

@@ -307,8 +307,8 @@ def _robot(content: CaseFile, space: Space, path: Path, files: InputFiles) -> Ro
     if stated is not None and stated.transform is not None:
         T_file = itk_transform.parse_transform(files.content(stated.transform), path.parent / stated.transform)
         mount = _read_only(stated_base_ct(stated, T_file))
-        return RobotSettings(ur_model(robot.model).name, home, mount, stated.transform, speeds)
-    return RobotSettings(ur_model(robot.model).name, home, mount, speeds=speeds)
+        return RobotSettings(ur_model(robot.model), home, mount, stated.transform, speeds)
+    return RobotSettings(ur_model(robot.model), home, mount, speeds=speeds)
 
 
 def _gantry(gantry: GantrySection, space: Space, path: Path) -> Gantry:

@@ -26,7 +26,7 @@ def _facts(case: Any) -> Facts:
     (low, high), (first, last) = np.degrees(case.search.theta), np.degrees(case.search.beta)
     step = np.degrees(case.search.step)
     yield "search", f"θ {low:g}° to {high:g}°, β {first:g}° to {last:g}°, every {step:g}°"
-    yield "robot", case.robot.model
+    yield "robot", case.robot.model.name
     yield "its base", _base(case)
     yield "inputs", f"{len(case.inputs)} files, {case.path}"
     for warning in case.warnings:

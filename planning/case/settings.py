@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case_file import AIR_HU, DENSE_HU
 
@@ -98,14 +99,14 @@ class RobotSettings:
     """The arm.
 
     Attributes:
-        model: Its name.
+        model: Which arm it is.
         home: Shape (6,), rad, or None for the model's own.
         T_base_ct_mount: Shape (4, 4), mm, where a mount or a transform is stated, or None.
         transform: The file that states it, or None.
         speeds: How fast its plans may move.
     """
 
-    model: str
+    model: UrModel
     home: Floats | None
     T_base_ct_mount: Floats | None
     transform: str | None = None

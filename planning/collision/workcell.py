@@ -8,7 +8,6 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy, Role
 from puncture_twin.planning.anatomy.body.outside_body import joined
 from puncture_twin.planning.arm.gantry import gantry_boxes
 from puncture_twin.planning.arm.tool import Box, Tool
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
@@ -109,7 +108,7 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
     check_gantry(case, anatomy.skin.mesh)
     surface, alone = patient_surface(anatomy), anatomy.skin.mesh
     boxes = case_boxes(case, T_base_ct)
-    model, tool = ur_model(case.robot.model), case_tool(case)
+    model, tool = case.robot.model, case_tool(case)
 
     def make() -> FastChecker:
         patient, skin = surface.transformed(T_base_ct), None if surface is alone else alone.transformed(T_base_ct)
@@ -119,7 +118,7 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
         return make()
     stated = tuple((box.name, box.T_base_box.tobytes(), box.size_mm) for box in boxes)
     surfaces = (surface.digest, alone.digest, np.ascontiguousarray(T_base_ct, np.float64).tobytes())
-    key = (__name__, model.name, tool, stated, surfaces, ARM_PADDING_MM)
+    key = (__name__, model, tool, stated, surfaces, ARM_PADDING_MM)
     return memory.get(key, make, lambda _: CHECKER_BYTES + TREE_COPIES * (surface.nbytes + alone.nbytes))
 
 

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import Input
@@ -103,7 +102,7 @@ def _urscript(plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:
 
 
 def _ros2(plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:
-    text, model = ros2_text(plan, case_checked=checker is not None), ur_model(plan.model)
+    text, model = ros2_text(plan, case_checked=checker is not None), plan.model
     check_sampled(read_ros2(text, model, where=source), plan, time_resolution_s=TIME_RESOLUTION_S, where=source)
     return _Draft(text, ("two messages: send 'insertion' only when the operator says so",))
 

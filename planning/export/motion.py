@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.export.limits import check_trajectory
 from puncture_twin.planning.motion.trajectory import Trajectory
@@ -48,4 +47,4 @@ def check_sampled(motion: SampledMotion, plan: Plan, *, time_resolution_s: float
         )
         if not same:
             raise InputError(f"the {name} does not read back as the plan's", where=where, allowed="the plan's samples")
-        check_trajectory(ur_model(plan.model), read, time_resolution_s=time_resolution_s, what=name, where=where)
+        check_trajectory(plan.model, read, time_resolution_s=time_resolution_s, what=name, where=where)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, wrap_to_pi
-from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.export.corners import STRAIGHT_RAD, corner_rows, rests_at
@@ -86,7 +86,7 @@ def waypoint_rows(plan: Plan) -> NDArray[np.intp]:
     if np.abs(plan.approach.q - plan.approach.q[0]).max() <= STRAIGHT_RAD:
         return np.zeros(1, dtype=np.intp)
     rows = corner_rows(plan.approach.q)
-    straight = rests_at(ur_model(plan.model), plan.approach, rows[1:-1])
+    straight = rests_at(plan.model, plan.approach, rows[1:-1])
     return rows if straight else rows[:0]
 
 
@@ -187,7 +187,7 @@ def stream_times(steps: int) -> Floats:
 
 def tip_poses(plan: Plan) -> Floats:
     """T_base_tip of every sample of the insertion, shape (m, 4, 4), mm."""
-    poses = flange_pose(ur_model(plan.model), plan.insertion.q)
+    poses = flange_pose(plan.model, plan.insertion.q)
     poses[:, :3, 3] += plan.needle_length_mm * poses[:, :3, 2]
     return poses
 

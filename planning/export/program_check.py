@@ -10,7 +10,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.tip_speed import tip_rates
-from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.export.limits import check_positions, check_rates, check_trajectory
@@ -50,7 +50,7 @@ def check_program(program: Program, plan: Plan, blends_mm: Floats | None = None,
     Raises:
         InputError: Says what differs or which limit is broken.
     """
-    model = ur_model(plan.model)
+    model = plan.model
     for name, read, planned in (
         ("start", program.start_q, plan.approach.q[0]),
         ("standoff", program.standoff_q, plan.insertion.q[0]),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from puncture_twin.planning.arm.links import JOINT_NAMES
-from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.export.corners import corner_rows, rests_at
@@ -45,7 +45,7 @@ def ros2_text(plan: Plan, *, case_checked: bool) -> str:
     """One YAML mapping with the messages ``approach`` and ``insertion``."""
     lines = heading(plan, NOTES, case_checked=case_checked)
     for phase in SampledMotion._fields:
-        lines += [f"{phase}:", *_message(ur_model(plan.model), getattr(plan, phase))]
+        lines += [f"{phase}:", *_message(plan.model, getattr(plan, phase))]
     return "\n".join(lines) + "\n"
 
 

@@ -38,7 +38,7 @@ def heading(plan: Plan, notes: Iterable[str], *, case_checked: bool) -> list[str
         f"made by puncture-twin {version('puncture-twin')} from a plan of version {PLAN_VERSION}, seed {plan.seed}",
         f"case: {plain_text(plan.case_name)}",
         *(f"input: {plain_text(f'{one.role}: {one.path}')} sha256 {plain_text(one.sha256)}" for one in plan.inputs),
-        f"robot: {plain_text(plan.model)}",
+        f"robot: {plain_text(plan.model.name)}",
         "this plan was " + ("checked against its case again" if case_checked else "NOT checked against its case again"),
         *notes,
     ]

@@ -11,7 +11,7 @@ import numpy as np
 from puncture_twin.planning.arm.insertion import MIN_SINGULARITY, flange_poses
 from puncture_twin.planning.arm.kinematics import N_BRANCHES, inverse, link_poses, singularity
 from puncture_twin.planning.arm.tool import Tool
-from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.collision.fast_checker import FastChecker
@@ -72,7 +72,7 @@ class Estimator:
     """Estimates placements of one arm about one target. Its values can be sent to another process.
 
     Attributes:
-        model: Name of the arm.
+        model: The arm.
         tool: What its flange carries.
         surroundings: Patient and boxes around it.
         T_ct_bed: Shape (4, 4), mm, its origin the target.
@@ -80,7 +80,7 @@ class Estimator:
         itself: Whether the arm must keep clear of itself, which takes as long as all the rest.
     """
 
-    model: str
+    model: UrModel
     tool: Tool
     surroundings: Surroundings
     T_ct_bed: Floats
@@ -89,7 +89,7 @@ class Estimator:
 
     def estimate(self, site: Site) -> ReachEstimate:
         """The fractions at one site; ``NOTHING`` where the base would lie in something."""
-        model, spheres = ur_model(self.model), _spheres(self.model, self.tool)
+        model, spheres = self.model, _spheres(self.model, self.tool)
         T_ct_base = self.T_ct_bed @ site.T_bed_base()
         if not base_is_clear(spheres, self.surroundings, T_ct_base):
             return NOTHING
@@ -112,7 +112,7 @@ class Estimator:
         The branches of each direction are tested in the order of their margins. Where the arm itself does not
         count, those after the first clear one are left at 0: no answer depends on them.
         """
-        model, spheres = ur_model(self.model), _spheres(self.model, self.tool)
+        model, spheres = self.model, _spheres(self.model, self.tool)
         open_margin = np.zeros_like(found_branches.margin)
         order = np.argsort(-found_branches.margin, axis=1, kind="stable")
         rows = np.arange(len(order))
@@ -145,11 +145,11 @@ class Estimator:
 
 
 @cache
-def _spheres(model: str, tool: Tool) -> ArmSpheres:
-    return ArmSpheres.of(ur_model(model), tool)
+def _spheres(model: UrModel, tool: Tool) -> ArmSpheres:
+    return ArmSpheres.of(model, tool)
 
 
 @cache
-def _alone(model: str, tool: Tool) -> FastChecker:
+def _alone(model: UrModel, tool: Tool) -> FastChecker:
     """The arm in an empty workcell: it can touch nothing but itself."""
-    return FastChecker(ur_model(model), tool, cache=user_cache())
+    return FastChecker(model, tool, cache=user_cache())

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from puncture_twin.planning.arm.tool import Box, Tool
-from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.collision.fast_checker import FastChecker
@@ -47,7 +47,7 @@ class PlacementCheck:
     """Checks placements. Its values can be sent to another process.
 
     Attributes:
-        model: Name of the arm.
+        model: The arm.
         tool: What its flange carries.
         skin: CT frame.
         patient: CT frame, the skin and what the CT shows outside of it.
@@ -59,7 +59,7 @@ class PlacementCheck:
         home: Shape (6,), rad.
     """
 
-    model: str
+    model: UrModel
     tool: Tool
     skin: TriangleMesh
     patient: TriangleMesh
@@ -99,7 +99,7 @@ class PlacementCheck:
     def _checker(self, T_base_ct: Floats) -> FastChecker:
         boxes = [Box(box.name, T_base_ct @ box.T_base_box, box.size_mm) for box in self.fixed]
         patient, skin = (mesh.transformed(T_base_ct) for mesh in (self.patient, self.skin))
-        model, everything = ur_model(self.model), (*boxes, *self.carried)
+        model, everything = self.model, (*boxes, *self.carried)
         return FastChecker(
             model, self.tool, everything, patient, skin=skin, padding_mm=self.padding_mm, cache=user_cache()
         )

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.rigid import apply
@@ -40,7 +39,7 @@ def pose_error_from(case: Case, registration: Registration, T_base_ct: Floats) -
     assert case.errors is not None  # the caller has looked
     errors, old = replace(case.errors, found=False), registration.markers
     markers = MarkerPairs(old.names, old.points_ct, apply(T_base_ct, old.points_ct))
-    model, tip = ur_model(case.robot.model), case.needle.length_mm
+    model, tip = case.robot.model, case.needle.length_mm
     noise = reading_noise(errors, model, tip, touches(case, markers), known=False)
     method = (None if case.registration is None else case.registration.method) or default_method(errors)
     fitted = register(markers, method=method, target_ct=case.target_ct, noise=noise)

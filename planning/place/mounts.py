@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
@@ -112,7 +112,7 @@ def regions(case: Case, T_ct_bed: Floats) -> tuple[Region, ...]:
     Raises:
         InputError: A rail is wanted, and there is no table to which it belongs.
     """
-    settings, model = case.place, ur_model(case.robot.model)
+    settings, model = case.place, case.robot.model
     table = next((o for o in case.obstacles if o.name == settings.table and o.frame == "ct"), None)
     mounts = settings.mounts or ("floor", "rail", "ceiling", "side")
     if table is None and settings.mounts is not None and "rail" in mounts:

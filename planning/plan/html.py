@@ -26,7 +26,7 @@ def _facts(plan: Any) -> Facts:
         "expected target error",
         f"{error:.2f} mm (rms)" if np.isfinite(error) else "not known: a stated base",
     )
-    yield "robot", plan.model
+    yield "robot", plan.model.name
     for name in ("approach", "insertion"):
         phase = getattr(plan, name)
         yield name, f"{phase.times_s[-1]:.1f} s, {len(phase.times_s):,} samples"

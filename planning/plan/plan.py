@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.motion.trajectory import Trajectory
@@ -41,7 +42,7 @@ class Plan:
     case_name: str
     inputs: tuple[Input, ...]
     seed: int
-    model: str
+    model: UrModel
     T_base_ct: Floats
     expected_target_error_mm: float
     theta: float

@@ -10,7 +10,7 @@ from puncture_twin.planning.arm.insertion import flange_at, needle_lines
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.speed_limits import slowed
 from puncture_twin.planning.arm.tip_speed import tip_speeds
-from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import differing_input
@@ -47,12 +47,8 @@ SPEED_ROUNDING = 1e-3
 AGREE = "T_base_ct, target_ct_mm, outward_ct, needle_length_mm, standoff_mm and joint angles must agree"
 
 
-def rate_limits(model_name: str) -> Peaks:
+def rate_limits(model: UrModel) -> Peaks:
     """The highest rates of an arm's joints in a plan, rad and s."""
-    return _rates(ur_model(model_name))
-
-
-def _rates(model: UrModel) -> Peaks:
     return Peaks(model.max_speeds, np.full(6, model.max_acceleration), np.full(6, MAX_JERK))
 
 
@@ -77,7 +73,7 @@ def check_geometry(plan: Plan, path: Path) -> None:
         raise InputError("the insertion does not start where the approach ends", where=path, allowed="joined phases")
     _check_straight(plan, path)
     _check_speeds(plan, path)
-    model = ur_model(plan.model)
+    model = plan.model
     for name, q, standoff in (
         ("standoff", plan.insertion.q[0], plan.standoff_mm),
         ("target", plan.insertion.q[-1], 0.0),
@@ -116,7 +112,7 @@ def roll_of(plan: Plan) -> float:
     R, t = plan.T_base_ct[:3, :3], plan.T_base_ct[:3, 3]
     line = needle_lines((R @ plan.target_ct + t)[None], (R @ plan.outward_ct)[None])[0]
     unrolled = flange_at(line, plan.needle_length_mm + plan.standoff_mm)[:3, :3]
-    x_axis = unrolled.T @ flange_pose(ur_model(plan.model), plan.insertion.q[0])[:3, 0]
+    x_axis = unrolled.T @ flange_pose(plan.model, plan.insertion.q[0])[:3, 0]
     return float(np.arctan2(x_axis[1], x_axis[0])) % (2 * np.pi)
 
 
@@ -125,7 +121,7 @@ def _check_straight(plan: Plan, path: Path) -> None:
 
     Between two stored rows the joints turn evenly, so the motion is looked at there too.
     """
-    model = ur_model(plan.model)
+    model = plan.model
     poses = flange_pose(model, _between(plan.insertion.q, path))
     forward = poses[:, :3, 2]
     tips = poses[:, :3, 3] + plan.needle_length_mm * forward
@@ -160,7 +156,7 @@ def _between(q: Floats, path: Path) -> Floats:
 
 def _check_speeds(plan: Plan, path: Path) -> None:
     """Refuse joints beyond their limits, rates beyond the plan's own limits, or a tip that is too fast."""
-    model = ur_model(plan.model)
+    model = plan.model
     for phase, part, limit in (
         ("approach", plan.approach, plan.speeds.tip_speed_mm_s),
         ("insertion", plan.insertion, plan.speeds.insertion_speed_mm_s),
@@ -173,7 +169,7 @@ def _check_speeds(plan: Plan, path: Path) -> None:
             raise InputError(
                 f"the {phase} leaves the joint limits", where=path, allowed="angles within the arm's limits"
             )
-        peaks, limits = part.peaks(), _rates(slowed(model, plan.speeds))
+        peaks, limits = part.peaks(), rate_limits(slowed(model, plan.speeds))
         for rate in ("speed", "acceleration"):  # a jerk wears the arm, and does not stop it
             most = float((getattr(peaks, rate) / getattr(limits, rate)).max())
             if not most <= 1 + SPEED_ROUNDING:

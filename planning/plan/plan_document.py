@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, HIGHEST, SpeedLimits
+from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
@@ -65,7 +66,7 @@ def write_plan(plan: Plan, path: Path) -> None:
         "case": plan.case_name,
         "inputs": inputs_document(plan.inputs),
         "seed": plan.seed,
-        "robot": plan.model,
+        "robot": plan.model.name,
         "T_base_ct": plan.T_base_ct.tolist(),
         "expected_target_error_mm": or_null(plan.expected_target_error_mm),
         "theta_deg": float(np.degrees(plan.theta)),
@@ -166,7 +167,7 @@ def _plan(document: dict[str, Any], path: Path) -> Plan:
         case_name=field(document, "case", text),
         inputs=field(document, "inputs", read_inputs),
         seed=field(document, "seed", whole),
-        model=field(document, "robot", text),
+        model=ur_model(field(document, "robot", text)),
         T_base_ct=guard_transform(document["T_base_ct"], where=f"{path}: T_base_ct"),
         expected_target_error_mm=field(document, "expected_target_error_mm", number_or_nan),
         theta=float(np.radians(field(document, "theta_deg", number))),

@@ -79,7 +79,7 @@ def _check_labels(plan: Plan, context: CaseContext, candidates: Candidates, path
         error = expected_error_mm(context.chance.error, plan.insertion.q[-1])
     stated: tuple[tuple[str, Any, Any], ...] = (
         ("case", plan.case_name, case.name),
-        ("robot", plan.model, case.robot.model),
+        ("robot", plan.model.name, case.robot.model.name),
         ("needle_length_mm", plan.needle_length_mm, case.needle.length_mm),
         ("target_ct_mm", plan.target_ct, case.target_ct),
         ("entry_ct_mm", plan.entry_ct, candidates.path.entry_ct[0]),

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.case.case import Case
@@ -100,7 +100,7 @@ def corrected(case: Case, registration: Registration, *, where: str | Path) -> R
     if registration.markers.joints is None:
         message = "correct = true, but the touches do not say how the arm stood: they tell nothing of its errors"
         raise InputError(message, where=where, allowed="q1_deg to q6_deg in markers_base; or correct = false")
-    model, tip = ur_model(case.robot.model), case.needle.length_mm
+    model, tip = case.robot.model, case.needle.length_mm
     q = _aimed_insertion(case, registration.T_base_ct, where)
     return aimed(registration, aim_at(model, tip, case.target_ct, q))
 
@@ -117,7 +117,7 @@ def _aimed_insertion(case: Case, T_base_ct: Floats, where: str | Path) -> Floats
             )
         return reached
     q = np.radians(np.asarray(case.registration.correct_joints_deg))
-    T = flange_pose(ur_model(case.robot.model), q)
+    T = flange_pose(case.robot.model, q)
     away = float(np.linalg.norm(T[:3, 3] + case.needle.length_mm * T[:3, 2] - apply(T_base_ct, case.target_ct)))
     if away > MAX_AIM_OFF_MM:
         raise InputError(
@@ -139,7 +139,7 @@ def marker_noise(case: Case, errors: ErrorModel, markers: MarkerPairs, *, where:
     Raises:
         InputError: Too few markers to fit, or joints that do not put the tip where the file says that it touched.
     """
-    model, tip = ur_model(case.robot.model), case.needle.length_mm
+    model, tip = case.robot.model, case.needle.length_mm
     check_pairs(markers, where)
     if markers.joints is not None:
         _check_joints(model, tip, markers, where)
@@ -150,7 +150,7 @@ def touches(case: Case, markers: MarkerPairs) -> Floats:
     """How the arm stood when it touched each marker, shape (N, 6), rad: as the file says, or as it may have stood."""
     if markers.joints is not None:
         return markers.joints
-    model, tip = ur_model(case.robot.model), case.needle.length_mm
+    model, tip = case.robot.model, case.needle.length_mm
     needle = -(fit_rigid(markers.points_ct, markers.points_base)[:3, :3] @ case.T_ct_entry[:3, 2])
     return np.array([_guessed(model, tip, point, needle) for point in markers.points_base])
 

@@ -6,7 +6,6 @@ import numpy as np
 
 from puncture_twin.planning.arm.insertion import away_from_singularities, flange_poses
 from puncture_twin.planning.arm.kinematics import inverse, nearest_within_limits
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import outward
@@ -24,7 +23,7 @@ def reached_insertion(case: Case, T_base_ct: Floats) -> Floats | None:
 
     Only an arm's kinematics are looked at: organs and collisions are the search's.
     """
-    model = ur_model(case.robot.model)
+    model = case.robot.model
     target = apply(T_base_ct, case.target_ct)
     home = np.zeros(6)
     for tilt in np.radians(TILTS_DEG):

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.kinematics import inverse
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Obstacle
@@ -36,7 +35,7 @@ def place_excluded(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
         skin: CT frame.
         T_base_ct: Shape (4, 4), mm.
     """
-    model = ur_model(case.robot.model)
+    model = case.robot.model
     T_ct_base = np.linalg.inv(T_base_ct)
     column = apply(T_ct_base, np.stack([np.zeros(3), model.shoulder_base]))
     if any(side_of(skin, point) is Side.INSIDE for point in column):
@@ -81,7 +80,7 @@ def touchable_points(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> Float
     a, b, c = np.moveaxis(skin.triangles[:: max(1, len(skin.triangles) // SKIN_POINTS)], 1, 0)
     normals = np.cross(b - a, c - a) * (1.0 if _winds_outward(skin) else -1.0)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
-    points, model, length = (a + b + c) / 3, ur_model(case.robot.model), case.needle.length_mm
+    points, model, length = (a + b + c) / 3, case.robot.model, case.needle.length_mm
     poses = flange_poses(apply(T_base_ct, points), normals @ T_base_ct[:3, :3].T, length)
     reached = ~np.isnan(inverse(model, poses)).all(axis=(1, 2))
     blocked = {row for row, _ in untouchable(case, points, normals)}

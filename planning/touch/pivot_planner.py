@@ -12,7 +12,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.insertion import away_from_singularities, flange_poses
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits
-from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.progress import Count
@@ -97,7 +97,7 @@ def spread_poses(R_base_flange: Floats, count: int) -> list[int]:
 def _places(context: CaseContext) -> Iterator[Floats]:
     """Places about the base, base frame, mm: those across from the patient first."""
     assert context.reach is not None
-    model, up = ur_model(context.case.robot.model), _up_base(context)
+    model, up = context.case.robot.model, _up_base(context)
     reach = abs(model.a2) + abs(model.a3)
     target = apply(context.reach.T_base_ct, context.case.target_ct)
     away = (target @ up) * up - target

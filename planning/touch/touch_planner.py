@@ -9,7 +9,7 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from puncture_twin.planning.arm.tool import Tool
-from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
@@ -65,7 +65,7 @@ class _Task:
     @property
     def model(self) -> UrModel:
         """The arm."""
-        return ur_model(self.context.case.robot.model)
+        return self.context.case.robot.model
 
     @property
     def tip_mm(self) -> float:
@@ -220,7 +220,7 @@ def approach_checkers(context: CaseContext, needle_padding_mm: float) -> Approac
     case, anatomy, T_base_ct = context.case, context.anatomy, context.reach.T_base_ct
     surface, alone = patient_surface(anatomy), anatomy.skin.mesh
     blunted = FastChecker(
-        ur_model(case.robot.model),
+        case.robot.model,
         short,
         case_boxes(case, T_base_ct),
         surface.transformed(T_base_ct),

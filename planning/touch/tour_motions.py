@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.progress import Count
@@ -66,4 +65,4 @@ def tour_through(context: CaseContext, stops: Stops, *, seed: int, progress: Cou
         progress(len(legs), len(places))
     touched = zip(order, legs, strict=False)
     touches = (Touch(stops.names[at], stops.points_base[at], stops.q_touch[at], leg) for at, leg in touched)
-    return TouchTour(ur_model(case.robot.model), tip_mm, tuple(touches), legs[-1])
+    return TouchTour(case.robot.model, tip_mm, tuple(touches), legs[-1])

@@ -19,7 +19,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.error_jacobian import PARAMETERS, error_jacobian
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
@@ -166,7 +166,7 @@ def pose_error(case: Case, registration: Registration | None) -> PoseError | Non
     if case.errors is None or registration is None or registration.uncertainty is None:
         return None
     target = apply(registration.T_base_ct, case.target_ct)
-    return PoseError(ur_model(case.robot.model), case.needle.length_mm, target, case.errors, registration.uncertainty)
+    return PoseError(case.robot.model, case.needle.length_mm, target, case.errors, registration.uncertainty)
 
 
 @dataclass(frozen=True, eq=False)

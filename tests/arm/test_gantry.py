@@ -172,7 +172,7 @@ def test_the_physics_feels_the_gantry(in_gantry):
     further = (("[0.0, 0.0, 60.0]", "[0.0, 0.0, 330.0]"), ("wall_mm = 150.0", "wall_mm = 400.0"))
     path.write_text(path.read_text().replace(*further[0]).replace(*further[1]))
     case = load_case(path)
-    T_base_ct, model = load_placement(case).T_base_ct, ur_model(case.robot.model)
+    T_base_ct, model = load_placement(case).T_base_ct, case.robot.model
     skin = trimesh.creation.icosphere(radius=50.0)
     patient = TriangleMesh(skin.vertices, skin.faces)
     away, home = np.radians([0.0, -165.0, -90.0, 0.0, 90.0, 0.0]), home_configuration(case)

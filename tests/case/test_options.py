@@ -23,7 +23,7 @@ def test_each_kind_changes_its_table_alone(tmp_path):
     path = write_patient(tmp_path / "a")
     case = loaded(path, needle={"length_mm": 200.0}, arm={"model": "ur5"}, search={"step_deg": 15.0})
     assert (case.needle.length_mm, case.needle.shaft_mm) == (200.0, 150.0)
-    assert case.robot.model == "ur5" and round(case.search.step, 6) == 0.261799
+    assert case.robot.model.name == "ur5" and round(case.search.step, 6) == 0.261799
     assert loaded(path, target={"position_mm": [1.0, 2.0, 3.0]}).target_ct.tolist() == [1.0, 2.0, 3.0]
 
 

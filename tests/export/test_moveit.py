@@ -166,7 +166,7 @@ def test_the_attached_needle_ends_on_the_target(room):
     holder, needle = scene_message(case, anatomy, plan)["robot_state"]["attached_collision_objects"]
     height, radius = needle["object"]["primitives"][0]["dimensions"]
     T = matrix(needle["object"]["primitive_poses"][0])
-    T_base_flange = flange_pose(ur_model(plan.model), plan.insertion.q[-1:])[0]
+    T_base_flange = flange_pose(plan.model, plan.insertion.q[-1:])[0]
     tip = (T_base_flange @ T @ matrix_at([0, 0, 500 * height]))[:3, 3]
     assert np.allclose(tip, (plan.T_base_ct @ [*case.target_ct, 1.0])[:3], atol=1e-3)
     assert (height, radius) == pytest.approx((0.15, 0.0006))

@@ -249,7 +249,7 @@ def straight_plan():
         case_name=case.name,
         inputs=(Input("case", "case.toml", "0" * 64),),
         seed=1,
-        model="ur3",
+        model=ur_model("ur3"),
         T_base_ct=T,
         expected_target_error_mm=0.5,
         theta=0.3,

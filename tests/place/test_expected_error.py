@@ -8,7 +8,6 @@ import pytest
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.kinematics import inverse, singularity
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.place.expected_error import expected_tip_error_mm, pose_error_from
@@ -28,7 +27,7 @@ def insertion(case, T_base_ct):
     """The configuration farthest from singular along the entry frame's axis, shape (1, 6)."""
     outward = T_base_ct[:3, :3] @ case.T_ct_entry[:3, 2]
     target, rolls = apply(T_base_ct, case.target_ct), np.radians(np.arange(0, 360, 30))
-    model = ur_model(case.robot.model)
+    model = case.robot.model
     q = inverse(model, flange_poses(target, outward, case.needle.length_mm, rolls)).reshape(-1, 6)
     return q[[np.nanargmax(singularity(model, q).least())]]
 

@@ -22,7 +22,7 @@ def test_a_ur3e_plans_to_the_abdomens_lesion(tmp_path):
     case.write_text(text.replace("step_deg = 2.0", "step_deg = 12.0"), encoding="utf-8")
     context = prepare(case)
     plan = make_plan(context, context.search(), seed=1).plan
-    assert plan.model == "ur3e" and check_plan(plan, context, tmp_path / "plan.json").safe.all()
+    assert plan.model.name == "ur3e" and check_plan(plan, context, tmp_path / "plan.json").safe.all()
     assert context.reach is not None
     checker = context.reach.checker
     assert checker.model is ur_model("ur3e")

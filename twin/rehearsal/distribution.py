@@ -9,7 +9,6 @@ import numpy as np
 from scipy.special import chdtri
 
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.errors import ErrorModel
@@ -198,7 +197,7 @@ def _query(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _Qu
     believed = replace(_as_rehearsed(error, q_touch), bend=bend)
     truth = (case.truth_errors or case.errors or error.errors).scaled(error.fit.test.scale)
     puncture = Puncture(
-        ur_model(case.robot.model), case.needle.length_mm, registration.method, believed.fit.noise,
+        case.robot.model, case.needle.length_mm, registration.method, believed.fit.noise,
         registration.markers.points_ct, q_touch, registration.T_base_ct, case.target_ct, outward_ct, q_insertion, bend,
         registration.aim,
     )  # fmt: skip

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.workcell import case_boxes, case_tool
@@ -59,7 +58,7 @@ class Executed:
 def executed(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Executed:
     """Execute a plan; arguments and errors as of `rehearse`."""
     T_base_ct, tissue = truth.T_base_ct_true, true_tissue(plan, case, anatomy, truth)
-    model, tool, boxes = ur_model(plan.model), case_tool(case), case_boxes(case, T_base_ct)
+    model, tool, boxes = plan.model, case_tool(case), case_boxes(case, T_base_ct)
     down_ct = -bed_frame(case)[:3, 2]
     approach = steps(plan.approach)
     before = np.concatenate([approach, np.repeat(approach[-1:], round(SETTLE_S / TIME_STEP_S), axis=0)])
@@ -94,7 +93,7 @@ def true_tissue(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> TrueT
     """
     if case.bending is None:
         return None
-    T_base_flange = flange_pose(ur_model(plan.model), plan.insertion.q[-1] + truth.joint_offsets)
+    T_base_flange = flange_pose(plan.model, plan.insertion.q[-1] + truth.joint_offsets)
     T_ct_base = np.linalg.inv(truth.T_base_ct_true)
     into_base = T_base_flange[:3, 2]
     end_ct = apply(T_ct_base, T_base_flange[:3, 3] + plan.needle_length_mm * into_base)

@@ -16,7 +16,6 @@ from dataclasses import replace
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.geometry.rigid import pose
@@ -84,7 +83,7 @@ def bent_truth(context: CaseContext, plan: Plan, truth: Truth) -> Truth:
     bend = bend_along(context, plan.outward_ct)
     if bend is None:
         return truth
-    T = np.array(flange_pose(ur_model(plan.model), plan.insertion.q[-1]))
+    T = np.array(flange_pose(plan.model, plan.insertion.q[-1]))
     T[:3, 3] += plan.needle_length_mm * T[:3, 2]
     side = float(np.random.default_rng([truth.seed, 3]).uniform(0, 2 * np.pi))
     end = bent(TrueNeedle(T[None, :3, 3], T[None, :3, :3]), bend, np.array([side]))

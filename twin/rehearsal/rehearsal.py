@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
@@ -152,7 +151,7 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
         InputError: The twin has no body of this arm, or its base stands in the patient.
     """
     T_base_ct = truth.T_base_ct_true
-    model = ur_model(plan.model)
+    model = plan.model
     seen = executed(plan, case, anatomy, truth)
     done, phase = seen.execution, seen.phase
     times = done.times_s

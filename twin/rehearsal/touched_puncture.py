@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.context import CaseContext
@@ -35,7 +34,7 @@ def rehearse_touched(context: CaseContext, plan: Plan, truth: TouchTruth, at_tar
 
 def puncture_truth(plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Truth:
     """The truth of touches for a simulated arm that is nominal but for its joints; arguments as above."""
-    model, q = ur_model(plan.model), plan.insertion.q[-1] + at_target.arrival
+    model, q = plan.model, plan.insertion.q[-1] + at_target.arrival
     nominal = np.array(flange_pose(model, q))
     nominal[:3, 3] += plan.needle_length_mm * nominal[:3, 2]
     needle = true_needle(model, q, truth.eta, plan.needle_length_mm)

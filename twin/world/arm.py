@@ -14,25 +14,12 @@ from puncture_twin.planning.arm.links import T_BASE_URDFBASE
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.world.arm_file import write_arm_urdf
 from puncture_twin.twin.world.engine import pybullet
 from puncture_twin.twin.world.units import pose_to_m, pose_to_mm
 
 FLANGE = "tool0"
 """The URDF's link whose frame is the controller's flange."""
-
-MAX_TORQUE_NM = MappingProxyType(
-    {
-        "ur3": (56.0, 56.0, 28.0, 12.0, 12.0, 12.0),
-        "ur3e": (56.0, 56.0, 28.0, 12.0, 12.0, 12.0),
-        "ur5": (150.0, 150.0, 150.0, 28.0, 28.0, 28.0),
-        "ur5e": (150.0, 150.0, 150.0, 28.0, 28.0, 28.0),
-        "ur10": (330.0, 330.0, 150.0, 56.0, 56.0, 56.0),
-        "ur10e": (330.0, 330.0, 150.0, 56.0, 56.0, 56.0),
-    }
-)
-"""The manufacturer's joint torques; the URDF of the UR3 carries those of a UR10. The e-Series': of its URDFs."""
 
 POSITION_GAIN = 0.1
 """Fraction of a joint's position error that its motor takes back per step, Bullet's default: an error falls to 1/e
@@ -138,17 +125,13 @@ def load_arm(client: int, model: UrModel, tool: Tool, T_world_base: Floats | Non
 
     Args:
         client: Physics client id.
-        model: A UR3, UR5 or UR10.
+        model: The arm.
         tool: What the flange carries.
         T_world_base: Pose of the controller's base, shape (4, 4), mm; None for the world's origin.
 
     Raises:
         InputError: There is no body of that model.
     """
-    if model.name not in MAX_TORQUE_NM:
-        raise InputError(
-            f"the twin has no body of a {model.name}", where="robot.model", allowed=", ".join(MAX_TORQUE_NM)
-        )
     T_world_urdf = T_BASE_URDFBASE if T_world_base is None else T_world_base @ T_BASE_URDFBASE
     position, quaternion = pose_to_m(T_world_urdf)
     with tempfile.TemporaryDirectory() as folder:
@@ -169,4 +152,4 @@ def load_arm(client: int, model: UrModel, tool: Tool, T_world_base: Floats | Non
         pybullet.changeDynamics(
             body, index, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, physicsClientId=client
         )
-    return Arm(client, body, tuple(joints), MappingProxyType(links), MAX_TORQUE_NM[model.name])
+    return Arm(client, body, tuple(joints), MappingProxyType(links), tuple(model.max_torques.tolist()))

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.arm.links import JOINT_NAMES
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.export.motion import SampledMotion, check_sampled
@@ -29,7 +28,7 @@ def goal_messages(plan: Plan) -> dict[str, Any]:
 
 
 def _goal(plan: Plan, trajectory: Trajectory) -> dict[str, Any]:
-    speeds = velocities(ur_model(plan.model), trajectory)
+    speeds = velocities(plan.model, trajectory)
     points = [_point(*row) for row in zip(trajectory.times_s, trajectory.q, speeds, strict=True)]
     return {
         "trajectory": {"header": {"frame_id": ""}, "joint_names": list(JOINT_NAMES), "points": points},

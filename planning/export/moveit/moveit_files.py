@@ -8,7 +8,6 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.workcell import case_tool
@@ -64,7 +63,7 @@ def moveit_files(plan: Plan, case: Case, anatomy: Anatomy, *, source: Path) -> M
     names = moveit_names(source.stem)
     goals = _json(goal_messages(plan))
     check_goals(json.loads(goals), plan, where=source)
-    urdf = urdf_with_needle(ur_model(plan.model), case_tool(case))
+    urdf = urdf_with_needle(plan.model, case_tool(case))
     if not ElementTree.fromstring(urdf).findall("link"):
         raise InputError("the URDF does not read back", where=source, allowed="links and joints")
     sender = SENDER_TEXT.format(sender=names[3], scene=names[0], goals=names[1])

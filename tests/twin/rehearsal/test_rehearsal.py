@@ -134,7 +134,7 @@ def make_plan() -> Plan:
         case_name="ball",
         inputs=(),
         seed=0,
-        model="ur3",
+        model=ur_model("ur3"),
         T_base_ct=T_BASE_CT,
         expected_target_error_mm=float("nan"),
         theta=0.3,

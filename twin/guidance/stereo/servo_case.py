@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, Strict, model_validator
 
-from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
 from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
@@ -187,6 +187,7 @@ class ServoCase:
     Attributes:
         path: The case file.
         file: Its content.
+        model: The arm.
         skin: The head's surface, image frame, mm.
         markers: The markers' centres, image frame, as they truly are.
         targets: The targets, likewise.
@@ -195,6 +196,7 @@ class ServoCase:
 
     path: Path
     file: ServoFile
+    model: UrModel
     skin: TriangleMesh
     markers: NamedPoints
     targets: NamedPoints
@@ -232,7 +234,7 @@ def load_servo_case(path: Path | str) -> ServoCase:
     files = InputFiles(path.parent)
     stated = files.add(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE))
     file = parse_toml(stated, path, ServoFile, allowed=ALLOWED_CASE, keys="docs/reference/servo-case.md")
-    ur_model(file.robot.model)
+    model = ur_model(file.robot.model)
     surface = _read(files, file.head, "mesh", meshes.MAX_FILE_BYTES, path)
     named = {key: _read(files, file.head, key, points.MAX_FILE_BYTES, path) for key in ("markers", "targets")}
     skin = parse_mesh(surface, path.parent / file.head.mesh, unit=Unit(file.head.unit), space=Space.LOCAL)
@@ -240,7 +242,7 @@ def load_servo_case(path: Path | str) -> ServoCase:
     targets = parse_points(named["targets"], path.parent / file.head.targets, default_space=Space.LOCAL)
     if len(markers.names) < MIN_MARKERS:
         raise InputError(f"head.markers: {len(markers.names)} markers", where=path, allowed="3 or more")
-    return ServoCase(path, file, skin, markers, targets, files.inputs)
+    return ServoCase(path, file, model, skin, markers, targets, files.inputs)
 
 
 def _read(files: InputFiles, head: HeadSection, role: str, max_bytes: int, path: Path) -> bytes:

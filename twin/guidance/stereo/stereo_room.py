@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.tool import Box, Tool
-from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.crossings import crossings
@@ -148,9 +148,9 @@ def draw_workcell(case: ServoCase, rng: np.random.Generator) -> StereoWorkcell:
     Raises:
         InputError: Cameras or arm that cannot be.
     """
-    file, errors = case.file, case.truth_errors
+    errors = case.truth_errors
     spread = ArmErrors(errors.link_mm, errors.twist, errors.joint, errors.backlash, errors.repeatability)
-    arm = draw_true_arm(ur_model(file.robot.model), spread, rng)
+    arm = draw_true_arm(case.model, spread, rng)
     T_base_c = calibration_frame(case)
     T_c_base = np.asarray(np.linalg.inv(T_base_c), dtype=np.float64)
     cameras = tuple(_misplaced(camera, errors.camera, rng) for camera in planned_cameras(case))
@@ -217,5 +217,5 @@ def workcell_checker(case: ServoCase, T_base_m: Floats | None) -> FastChecker:
     for box in case.file.box:
         boxes.append(Box(box.name, pose(np.eye(3), box.center_mm), box.size_mm))
     skin = None if T_base_m is None else case.skin.transformed(T_base_m)
-    model, padding = ur_model(case.file.robot.model), case.file.servo.padding_mm
+    model, padding = case.model, case.file.servo.padding_mm
     return FastChecker(model, rod_tool(case.file.tool), boxes, skin, padding_mm=padding)

@@ -233,6 +233,7 @@ class SelfcalCase:
         path: The case file.
         content: What it says.
         inputs: The case file, with role and hash.
+        models: The probe's arm and the needle's.
         T_end1_image: The drawing's X, shape (4, 4), mm: the face's middle on the flange's z axis, the depth along it.
         T_base1_base2: The drawing's Y, shape (4, 4), mm.
         tip_end2: The drawing's tip, shape (3,), mm.
@@ -241,6 +242,7 @@ class SelfcalCase:
     path: Path
     content: SelfcalFile
     inputs: tuple[Input, ...]
+    models: tuple[UrModel, UrModel] = field(init=False)
     T_end1_image: Floats = field(init=False)
     T_base1_base2: Floats = field(init=False)
     tip_end2: Floats = field(init=False)
@@ -249,10 +251,13 @@ class SelfcalCase:
     def declared_arms(self) -> DeclaredArms:
         """What the calibration is told of both arms."""
         arms = (self.content.probe_arm, self.content.needle_arm)
-        return DeclaredArms(*(arm.errors.declared(ur_model(arm.model)) for arm in arms))
+        declared = (arm.errors.declared(model) for arm, model in zip(arms, self.models, strict=True))
+        return DeclaredArms(*declared)
 
     def __post_init__(self) -> None:
         content = self.content
+        models = ur_model(content.probe_arm.model), ur_model(content.needle_arm.model)
+        object.__setattr__(self, "models", models)
         width, _ = content.image.imager().size_mm
         drawn = {
             "T_end1_image": _probe_mount(content.probe, width),
@@ -283,6 +288,4 @@ def load_selfcal_case(path: Path | str) -> SelfcalCase:
     path = find_toml(path, CASE_NAME)
     stated = read_toml_bytes(path, ALLOWED_CASE)
     content = parse_toml(stated, path, SelfcalFile, allowed=ALLOWED_CASE, keys="docs/reference/selfcal-case.md")
-    for arm in (content.probe_arm, content.needle_arm):
-        ur_model(arm.model)
     return SelfcalCase(path, content, (content_input(CASE_ROLE, path.name, stated),))

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import tangent_basis
@@ -49,8 +48,8 @@ def draw_workcell(case: SelfcalCase, rng: np.random.Generator) -> WorkcellTruth:
     """A room whose differences from the drawing are drawn from the case's standard deviations."""
     content, off = case.content, case.content.truth
     arms = [
-        draw_true_arm(ur_model(arm.model), arm.errors.arm_errors(), rng)
-        for arm in (content.probe_arm, content.needle_arm)
+        draw_true_arm(model, arm.errors.arm_errors(), rng)
+        for model, arm in zip(case.models, (content.probe_arm, content.needle_arm), strict=True)
     ]
     X, Y = (_shifted(T, off.mount_mm, np.radians(off.mount_deg), rng) for T in (case.T_end1_image, case.T_base1_base2))
     V = np.array([0.0, 0.0, 1.0])

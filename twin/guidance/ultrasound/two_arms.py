@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.tool import Box, Tool
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.bodies import Body, Shape, arm_bodies
 from puncture_twin.planning.collision.fast_checker import FastChecker
@@ -57,9 +56,8 @@ class BetweenArms:
     """
 
     def __init__(self, case: SelfcalCase, T_end1_image: Floats, T_base1_base2: Floats, clearance_mm: float) -> None:
-        content = case.content
         self.T_base1_base2 = T_base1_base2
-        self._models = (ur_model(content.probe_arm.model), ur_model(content.needle_arm.model))
+        self._models = case.models
         head = _head_body(case, T_end1_image, clearance_mm)
         self.probe_bodies = (*arm_bodies(self._models[0], probe_tool(case), clearance_mm), head)
         self.needle_bodies = arm_bodies(self._models[1], needle_tool(case), 0.0)
@@ -89,7 +87,7 @@ class TwoArms:
 
     def __init__(self, case: SelfcalCase) -> None:
         content = case.content
-        self.probe_model, self.needle_model = ur_model(content.probe_arm.model), ur_model(content.needle_arm.model)
+        self.probe_model, self.needle_model = case.models
         clearance = content.poses.clearance_mm
         phantom, table = phantom_mesh(content.phantom), table_box(content.phantom)
         T_base2_base1 = np.asarray(np.linalg.inv(case.T_base1_base2), dtype=np.float64)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
@@ -86,7 +85,7 @@ def calibrated(case: Case, names: tuple[str, ...], q: Floats, *, where: str) -> 
     """
     if case.errors is None:
         raise InputError("no noise is declared", where=case.path, allowed="[errors] touch_mm")
-    model, tip_mm = ur_model(case.robot.model), case.needle.length_mm
+    model, tip_mm = case.robot.model, case.needle.length_mm
     poses = flange_pose(model, q)
     check_one_place(names, poses[:, :3, 3] + tip_mm * poses[:, :3, 2], poses[:, :3, :3], where=where)
     arm_cov = arm_covariance(case.errors, model, tip_mm, q)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import load_anatomy, load_skin
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
@@ -148,7 +147,7 @@ def _squareness(found: Squareness | None) -> dict[str, Any] | None:
 
 
 def _branch_warning(case: Case, registration: Registration) -> tuple[str, ...]:
-    odd = odd_branches(registration, ur_model(case.robot.model))
+    odd = odd_branches(registration, case.robot.model)
     if not odd:
         return ()
     return (f"{', '.join(odd)} touched in another branch of the arm than the others: its errors do not cancel there",)

@@ -9,7 +9,6 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.budget.bent_path import bent_path
 from puncture_twin.planning.budget.chain import Chain, chain_of
@@ -49,7 +48,7 @@ def budget_facts(
     q = _insertion(case, registration) if q_insertion is None else q_insertion
     if q is None:
         return None
-    outward_ct = -(registration.T_base_ct[:3, :3].T @ flange_pose(ur_model(case.robot.model), q)[:3, 2])
+    outward_ct = -(registration.T_base_ct[:3, :3].T @ flange_pose(case.robot.model, q)[:3, 2])
     path = None if case.bending is None else bent_path(case, anatomy(), outward_ct)
     chain = chain_of(case, registration, q, path)
     found = changes(chain, skin_points_ct, _bed_ct(case, chain.errors.marker_cov_ct))
@@ -81,7 +80,7 @@ def _insertion(case: Case, registration: Registration) -> Floats | None:
 
 def needle_angles(case: Case, registration: Registration, q: Floats) -> dict[str, Any]:
     """Of the direction from which the needle comes in a configuration (6,), rad."""
-    outward_ct = -(registration.T_base_ct[:3, :3].T @ flange_pose(ur_model(case.robot.model), q)[:3, 2])
+    outward_ct = -(registration.T_base_ct[:3, :3].T @ flange_pose(case.robot.model, q)[:3, 2])
     theta, beta = angles(outward_ct @ case.T_ct_entry[:3, :3])
     return {
         "theta_deg": float(np.degrees(theta)),

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
@@ -115,7 +115,7 @@ class Mirror:
         if checked is None:
             allowed = "[registration] with markers, or [robot.mount]"
             raise InputError("the case does not say where the robot stands", where=case.path, allowed=allowed)
-        return cls(ur_model(case.robot.model), checked.placement.T_base_ct, case.needle.length_mm, case.target_ct)
+        return cls(case.robot.model, checked.placement.T_base_ct, case.needle.length_mm, case.target_ct)
 
     def show(self, state: RecordedState) -> Mirrored:
         """One joint state."""

@@ -12,7 +12,6 @@ from PIL import Image, ImageDraw
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import visual_links
 from puncture_twin.planning.arm.tool import Tool
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Rgb
@@ -208,11 +207,10 @@ def workcell_picture(case: SelfcalCase, q_probe: Floats, q_needle: Floats, path:
 def workcell_surfaces(case: SelfcalCase, q_probe: Floats, q_needle: Floats) -> tuple[list[Surface], list[Surface]]:
     """Table, arms, probe and needle; and, see-through, the phantom and the slice. base1, mm."""
     table = table_box(case.content.phantom)
-    models = (ur_model(case.content.probe_arm.model), ur_model(case.content.needle_arm.model))
-    T1 = link_poses(models[0], q_probe)
-    T2 = case.T_base1_base2 @ link_poses(models[1], q_needle)
+    T1 = link_poses(case.models[0], q_probe)
+    T2 = case.T_base1_base2 @ link_poses(case.models[1], q_needle)
     opaque = [Surface(box(table.T_base_box, table.size_mm), palette.TABLE)]
-    for model, poses in zip(models, (T1, T2), strict=True):
+    for model, poses in zip(case.models, (T1, T2), strict=True):
         opaque += [Surface(link.mesh.transformed(poses[link.frame]), palette.ARM) for link in visual_links(model)]
     handle, needle = probe_tool(case), needle_tool(case)
     opaque.append(Surface(_cylinder(T1[6], 0.0, handle.needle_length_mm, handle.holder_diameter_mm), (235, 236, 240)))

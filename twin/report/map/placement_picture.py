@@ -78,7 +78,7 @@ def draw_placements(found: PlaceSearch, case: Any, skin: TriangleMesh, path: Pat
     _legend(grid[len(panels)], figure, found, case, scale)
     for axes in grid[len(panels) + 1 :]:
         axes.set_axis_off()
-    title = f"{case.name}: where to stand the {case.robot.model.upper()} for {target_text(case)}"
+    title = f"{case.name}: where to stand the {case.robot.model.name.upper()} for {target_text(case)}"
     figure.suptitle(f"{title}\n{needle_text(case)}", fontsize=14, fontweight="bold")
     figure.tight_layout(rect=(0, 0.02, 1, 0.98))
     figure.text(0.99, 0.006, "research software, not a medical device", fontsize=9, color="0.4", ha="right")

@@ -17,8 +17,9 @@ def methods_text(case: Any, anatomy: Any, candidates: Candidates) -> str:
     """What was checked, by what, and what was not."""
     theta, step = np.degrees(candidates.theta), np.degrees(step_of(candidates))
     checked = sum(1 for one in anatomy.checked if str(one.role) in {"avoid", "unknown"})
+    arm_name = case.robot.model.name.upper()
     arm = (
-        f"For each remaining direction it was checked whether a {case.robot.model.upper()} reaches it and inserts the "
+        f"For each remaining direction it was checked whether a {arm_name} reaches it and inserts the "
         "needle without contact."
         if candidates.arm_checked
         else "The arm was not checked."

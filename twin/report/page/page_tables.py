@@ -189,7 +189,7 @@ def plan_section(plan: Any | None, at_patient: Iterable[tuple[str, str]] = ()) -
         return Markup("<p>No plan was made.</p>{}").format(pairs(best) if len(best) > 1 else "")
     rows = [
         ("direction", f"θ {np.degrees(plan.theta):g}°, β {np.degrees(plan.beta):g}°"),
-        ("arm", str(plan.model)),
+        ("arm", str(plan.model.name)),
         ("roll about the needle", f"{np.degrees(plan.roll):.1f}°"),
         ("standoff (tip to target)", number(plan.standoff_mm, 1, "mm")),
         *at_patient,

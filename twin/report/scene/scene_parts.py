@@ -9,7 +9,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import visual_links
-from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import SAFE, Rgb
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -161,12 +161,12 @@ class ArmPicture:
     """The arm's links ready to be drawn at any configuration.
 
     Args:
-        model: The arm's name, such as "ur3".
+        model: The arm.
         T_base_ct: Shape (4, 4), where the patient is believed (or known) to be.
     """
 
-    def __init__(self, model: str, T_base_ct: Floats) -> None:
-        self._model = ur_model(model)
+    def __init__(self, model: UrModel, T_base_ct: Floats) -> None:
+        self._model = model
         self._links = visual_links(self._model)
         self._T_ct_base = np.linalg.inv(T_base_ct)
         self.layers = tuple(Layer([Surface(link.mesh, palette.ARM)]) for link in self._links)

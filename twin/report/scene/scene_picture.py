@@ -191,7 +191,7 @@ def _text(
     items.append(("skin (see-through)", palette.SKIN))
     if arm:
         items += [
-            (f"arm ({plan.model})" if plan is not None else "arm", palette.ARM),
+            (f"arm ({plan.model.name})" if plan is not None else "arm", palette.ARM),
             ("needle holder", palette.HOLDER),
             ("where its base stands", palette.TABLE),
         ]
