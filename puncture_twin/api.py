@@ -174,12 +174,13 @@ def read_plan(path: Path | str, context: CaseContext) -> Plan:
     Raises:
         InputError: It cannot be read, or it does not hold any more.
     """
+    from puncture_twin.planning.plan.plan_check import with_case_arm
     from puncture_twin.planning.plan.plan_document import read_plan
     from puncture_twin.planning.plan.recheck import check_plan
 
     plan = read_plan(Path(path))
     check_plan(plan, context, Path(path))
-    return plan
+    return with_case_arm(plan, context.case)
 
 
 def read_certificate(path: Path | str) -> Certificate:

@@ -26,16 +26,15 @@ from .kinematics import (
     wrapped_solutions as wrapped_solutions,
 )
 from .links import (
-    JOINT_NAMES as JOINT_NAMES,
     LINK_NAMES as LINK_NAMES,
-    T_BASE_URDFBASE as T_BASE_URDFBASE,
     Link as Link,
     collision_links as collision_links,
     joined as joined,
-    resolve_package as resolve_package,
-    urdf_link_poses as urdf_link_poses,
-    urdf_path as urdf_path,
     visual_links as visual_links,
 )
+from .model_urdf import (
+    T_BASE_URDFBASE as T_BASE_URDFBASE,
+    model_urdf as model_urdf,
+)
 from .tool import Box as Box, Tool as Tool
-from .ur import UrModel as UrModel, ur_model as ur_model
+from .ur import JOINT_NAMES as JOINT_NAMES, UrModel as UrModel, ur_model as ur_model

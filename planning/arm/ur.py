@@ -16,10 +16,21 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.arm.urdf.arm_urdf import ArmUrdf
 from puncture_twin.planning.base.errors import InputError
 
 ELBOW = 2
 """Index of the elbow among the six joints."""
+
+JOINT_NAMES = (
+    "shoulder_pan_joint",
+    "shoulder_lift_joint",
+    "elbow_joint",
+    "wrist_1_joint",
+    "wrist_2_joint",
+    "wrist_3_joint",
+)
+"""The joints as a UR's URDF (and ROS) names them."""
 
 DEFAULT_MAX_ACCELERATION = 1.4
 """rad/s^2: what the controller itself takes for a joint move when the program names none (URScript ``movej``)."""
@@ -41,6 +52,9 @@ class UrModel:
         max_speeds: Shape (6,), rad/s.
         max_torques: Shape (6,), N m: what each joint's motor can give.
         max_acceleration: rad/s^2, for every joint.
+        joint_names: As ROS has them.
+        shipped: Whether its shapes are those that ship under its name.
+        urdf: Its own URDF, if it has one; an arm that neither ships nor has one is known by its numbers alone.
     """
 
     name: str
@@ -54,6 +68,9 @@ class UrModel:
     max_speeds: NDArray[np.float64]
     max_torques: NDArray[np.float64]
     max_acceleration: float = DEFAULT_MAX_ACCELERATION
+    joint_names: tuple[str, ...] = JOINT_NAMES
+    shipped: bool = True
+    urdf: ArmUrdf | None = None
 
     def __post_init__(self) -> None:
         for name in ("joint_limits", "max_speeds", "max_torques"):
@@ -65,7 +82,8 @@ class UrModel:
     def digest(self) -> str:
         """Hexadecimal SHA-256 of all that the arm is: two of one digest are the same arm, to the bit."""
         numbers = (self.lengths, self.joint_limits, self.max_speeds, self.max_torques, np.array(self.max_acceleration))
-        return hashlib.sha256(self.name.encode() + b"".join(one.tobytes() for one in numbers)).hexdigest()
+        words = (self.name, *self.joint_names, str(self.shipped), "" if self.urdf is None else self.urdf.digest)
+        return hashlib.sha256("\n".join(words).encode() + b"".join(one.tobytes() for one in numbers)).hexdigest()
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, UrModel) and self.digest == other.digest

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from puncture_twin.planning.arm.speed_limits import SpeedLimits
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
@@ -42,6 +41,7 @@ from puncture_twin.planning.case.registration_section import (
     RegistrationSection,
     stated_base_ct,
 )
+from puncture_twin.planning.case.sections.arm import arm_of
 from puncture_twin.planning.case.sections.bend import bending_of
 from puncture_twin.planning.case.sections.breath import breathing_of
 from puncture_twin.planning.case.settings import (
@@ -170,7 +170,7 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
     _read_files(content, path, files, case_volumes)
     space = Space(content.space)
     target = _target(content, path, space, files)
-    settings = content.search
+    settings, robot = content.search, _robot(content, space, path, files)
     return Case(
         path=path,
         name=content.name,
@@ -186,7 +186,7 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
         structure=content.structure,
         structures=content.structures,
         registration=_markers(content.registration),
-        robot=_robot(content, space, path, files),
+        robot=robot,
         obstacles=tuple(_obstacle(one, space) for one in content.obstacle),
         rehearsal=content.rehearsal,
         files=files,
@@ -196,7 +196,7 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
         place=content.place,
         stated_structures=content.stated_structures,
         region=content.region,
-        warnings=(*wholeness_warnings(content, files, path), *_of_transform(content), *_of_robot(content)),
+        warnings=(*wholeness_warnings(content, files, path), *_of_transform(content), *_of_robot(content, robot)),
         hit_radius_mm=content.target.hit_radius_mm,
         errors=_errors(content, content.errors, case_volumes, path),
         truth_errors=_errors(content, content.rehearsal.errors, case_volumes, path, truth=True),
@@ -286,12 +286,11 @@ def _of_transform(content: CaseFile) -> tuple[str, ...]:
     return (f"registration: {NO_RESIDUALS.format(file=stated.transform)}",)
 
 
-def _of_robot(content: CaseFile) -> tuple[str, ...]:
+def _of_robot(content: CaseFile, robot: RobotSettings) -> tuple[str, ...]:
     """That a robot is named, and nothing said of where it is located: then no verdict is about it."""
     located = content.registration is not None or content.robot.mount is not None
-    return (
-        () if located or "robot" not in content.model_fields_set else (ROBOT_NOWHERE.format(robot=content.robot.model),)
-    )
+    nowhere = not located and "robot" in content.model_fields_set
+    return (ROBOT_NOWHERE.format(robot=robot.model.name),) if nowhere else ()
 
 
 def _markers(section: RegistrationSection | None) -> MarkerSection | None:
@@ -300,15 +299,15 @@ def _markers(section: RegistrationSection | None) -> MarkerSection | None:
 
 
 def _robot(content: CaseFile, space: Space, path: Path, files: InputFiles) -> RobotSettings:
-    robot, stated = content.robot, content.registration
+    robot, stated, model = content.robot, content.registration, arm_of(content.robot, files, path)
     home = None if robot.home_deg is None else _read_only(np.radians(np.asarray(robot.home_deg)))
     mount = None if robot.mount is None else mount_pose(robot.mount, space, path)
     speeds = SpeedLimits(*(getattr(robot, name) for name in SpeedLimits._fields))
     if stated is not None and stated.transform is not None:
         T_file = itk_transform.parse_transform(files.content(stated.transform), path.parent / stated.transform)
         mount = _read_only(stated_base_ct(stated, T_file))
-        return RobotSettings(ur_model(robot.model), home, mount, stated.transform, speeds)
-    return RobotSettings(ur_model(robot.model), home, mount, speeds=speeds)
+        return RobotSettings(model, home, mount, stated.transform, speeds)
+    return RobotSettings(model, home, mount, speeds=speeds)
 
 
 def _gantry(gantry: GantrySection, space: Space, path: Path) -> Gantry:

@@ -8,11 +8,13 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, Strict, model_validator
 
 from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, HIGHEST
+from puncture_twin.planning.arm.urdf.arm_urdf import FLANGE
 from puncture_twin.planning.base.text_names import unprintable_texts
 from puncture_twin.planning.case.case_schema import CaseSchema, Region, check_statement, count_difference, with_count
 from puncture_twin.planning.case.errors_section import ErrorsSection
 from puncture_twin.planning.case.registration_section import RegistrationSection
 from puncture_twin.planning.case.sections.breathing_section import BreathingSection
+from puncture_twin.planning.case.sections.limits_section import LimitsSection
 from puncture_twin.planning.case.sections.tissue_section import TissueSection
 from puncture_twin.planning.case.toml_types import (
     Anatomical,
@@ -249,9 +251,12 @@ class MountSection(Section):
 
 
 class RobotSection(Section):
-    """The arm."""
+    """The arm: one of the table, by its name, or one's own, by a URDF."""
 
     model: str = "ur3"
+    urdf: str | None = None
+    flange: Text = FLANGE
+    limits: LimitsSection | None = None
     home_deg: Sextuple | None = None
     mount: MountSection | None = None
     tip_speed_mm_s: Annotated[Number, Field(ge=1, le=HIGHEST.tip_speed_mm_s)] = DEFAULT_SPEEDS.tip_speed_mm_s
@@ -260,6 +265,14 @@ class RobotSection(Section):
     )
     joint_speed_fraction: Annotated[Number, Field(ge=0.01, le=1)] = DEFAULT_SPEEDS.joint_speed_fraction
     joint_acceleration_fraction: Annotated[Number, Field(ge=0.01, le=1)] = DEFAULT_SPEEDS.joint_acceleration_fraction
+
+    @model_validator(mode="after")
+    def _one_arm(self) -> Self:
+        if self.urdf is not None and "model" in self.model_fields_set:
+            raise ValueError("model and urdf both say which arm it is; keep one")
+        if self.urdf is None and "flange" in self.model_fields_set:
+            raise ValueError("flange names a link of urdf, which is not there")
+        return self
 
     @model_validator(mode="after")
     def _insertion_is_the_slower(self) -> Self:

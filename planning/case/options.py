@@ -29,8 +29,11 @@ MOUNT, MARGINS, ADDED = "mount", "margins", "add_mm"
 SECTIONS = (*TABLES, MARGINS, MOUNT)
 """Every kind of option."""
 
-POSITIONS = ("position_mm", "points")
-"""Keys of a target of which one takes the other's place."""
+ALTERNATIVES = (
+    *(("position_mm", "points"), ("points", "position_mm")),
+    *(("model", "urdf"), ("model", "flange"), ("model", "limits"), ("urdf", "model"), ("urdf", "limits")),
+)
+"""Keys of a table of which the first takes the place of the second: a target's, and an arm's."""
 
 WITH_MARGIN = ("avoid", "unknown")
 """Roles that demand a margin."""
@@ -110,9 +113,9 @@ def _table(data: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _lay_over(table: dict[str, Any], values: Mapping[str, Any]) -> None:
-    for key in values:
-        if key in POSITIONS:
-            table.pop(POSITIONS[1 - POSITIONS.index(key)], None)
+    for one, other in ALTERNATIVES:
+        if one in values:
+            table.pop(other, None)
     table.update(values)
 
 

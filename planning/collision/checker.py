@@ -18,12 +18,13 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.links import collision_links
+from puncture_twin.planning.arm.links import LINK_NAMES, collision_links
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies import BODY_NAMES, NEVER_TESTED, Body, arm_bodies
+from puncture_twin.planning.collision.neighbours import check_neighbours
 from puncture_twin.planning.collision.shapes import FclSkin, touch
 from puncture_twin.planning.collision.state_checker import (
     DISTANCE_PAIRS,
@@ -93,8 +94,8 @@ class CellChecker:
             more than 2 mm prove that the path between them meets neither patient nor box.
 
     Raises:
-        InputError: If the padding is negative, two boxes share a name, the patient's mesh is unusable, or the base
-            stands in the patient.
+        InputError: If the padding is negative, two boxes share a name, the patient's mesh is unusable, the base
+            stands in the patient, or the shapes of an own arm leave a gap at a joint.
     """
 
     def __init__(
@@ -112,6 +113,8 @@ class CellChecker:
         self.model = model
         self.tool = tool
         self._bodies = arm_bodies(model, tool, padding_mm)
+        if model.urdf is not None:
+            check_neighbours(model, self._bodies[: len(LINK_NAMES)])
         self._swept = SweptBodies.of(model, tool)
         self._boxes = _boxes(boxes)
         self._bounds = {box.name: box.bounds for box in boxes}

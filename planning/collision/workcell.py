@@ -123,7 +123,13 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
 
 
 def home_configuration(case: Case) -> Floats:
-    """Where the arm waits, shape (6,), rad: the case's, or arm up and wrist down."""
-    if case.robot.home is not None:
-        return case.robot.home
-    return np.radians([0.0, -90.0, 0.0, -90.0, 0.0, 0.0])
+    """Where the arm waits, shape (6,), rad: the case's, or arm up and wrist down.
+
+    Raises:
+        InputError: It is beyond the arm's limits.
+    """
+    home = np.radians([0.0, -90.0, 0.0, -90.0, 0.0, 0.0]) if case.robot.home is None else case.robot.home
+    if not case.robot.model.within_limits(home):
+        what = f"robot.home_deg: home ({', '.join(f'{angle:g}' for angle in np.degrees(home))}) is beyond the limits"
+        raise InputError(what, where=case.path, allowed="home_deg within the arm's limits")
+    return home

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from puncture_twin.planning.arm.links import JOINT_NAMES
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
@@ -39,7 +38,7 @@ def check_positions(model: UrModel, q: Floats, *, what: str, where: Path) -> Non
         row, joint = np.argwhere(~inside)[0]
         low, high = np.degrees(model.joint_limits[joint])
         raise InputError(
-            f"{what}: {JOINT_NAMES[joint]} at {np.degrees(q[row, joint]):.3f} deg",
+            f"{what}: {model.joint_names[joint]} at {np.degrees(q[row, joint]):.3f} deg",
             where=where,
             allowed=f"{low:.0f} to {high:.0f} deg",
         )
@@ -66,7 +65,7 @@ def check_rates(model: UrModel, speeds: Floats, accelerations: Floats, *, what: 
         if not kept.all():
             row, joint = np.argwhere(~kept)[0]
             raise InputError(
-                f"{what}: {JOINT_NAMES[joint]} at {abs(rates[row, joint]):.6g} {unit}",
+                f"{what}: {model.joint_names[joint]} at {abs(rates[row, joint]):.6g} {unit}",
                 where=where,
                 allowed=f"at most {limits[joint]:.6g} {unit}",
             )

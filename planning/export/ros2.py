@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from puncture_twin.planning.arm.links import JOINT_NAMES
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
@@ -52,7 +51,7 @@ def ros2_text(plan: Plan, *, case_checked: bool) -> str:
 def _message(model: UrModel, trajectory: Trajectory) -> list[str]:
     lines = [
         "  header: {stamp: {sec: 0, nanosec: 0}, frame_id: ''}",
-        f"  joint_names: [{', '.join(JOINT_NAMES)}]",
+        f"  joint_names: [{', '.join(model.joint_names)}]",
         "  points:",
     ]
     for time, q, speeds in zip(trajectory.times_s, trajectory.q, velocities(model, trajectory), strict=True):
@@ -125,7 +124,10 @@ def read_ros2(text: str, model: UrModel, *, where: Path) -> SampledMotion:
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     parts: dict[str, Trajectory] = {}
     for phase in SampledMotion._fields:
-        if lines[:1] != [f"{phase}:"] or lines[2:4] != [f"  joint_names: [{', '.join(JOINT_NAMES)}]", "  points:"]:
+        if lines[:1] != [f"{phase}:"] or lines[2:4] != [
+            f"  joint_names: [{', '.join(model.joint_names)}]",
+            "  points:",
+        ]:
             raise InputError(f"no message '{phase}' of the six joints", where=where, allowed="approach, insertion")
         lines = lines[4:]
         points = []

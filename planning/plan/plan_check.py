@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import needle_pose
 from puncture_twin.planning.motion.follow import MAX_JERK
 from puncture_twin.planning.motion.trajectory import Peaks
+from puncture_twin.planning.plan.arm_document import same_arm
 from puncture_twin.planning.plan.plan import Plan
 
 POSE_TOLERANCE_MM = 0.01
@@ -50,6 +52,11 @@ AGREE = "T_base_ct, target_ct_mm, outward_ct, needle_length_mm, standoff_mm and 
 def rate_limits(model: UrModel) -> Peaks:
     """The highest rates of an arm's joints in a plan, rad and s."""
     return Peaks(model.max_speeds, np.full(6, model.max_acceleration), np.full(6, MAX_JERK))
+
+
+def with_case_arm(plan: Plan, case: Case) -> Plan:
+    """A plan that was read, with its case's arm: a plan's file states the arm's numbers, and not its shapes."""
+    return replace(plan, model=case.robot.model) if same_arm(plan.model, case.robot.model) else plan
 
 
 def check_inputs(plan: Plan, case: Case, path: Path) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, HIGHEST, SpeedLimits
-from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
@@ -30,6 +29,7 @@ from puncture_twin.planning.base.strict_json import (
 )
 from puncture_twin.planning.formats.guard import guard_transform
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Peaks, Trajectory
+from puncture_twin.planning.plan.arm_document import arm_document, read_arm
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_geometry, rate_limits
 
@@ -40,7 +40,18 @@ its inputs with their roles, files that a file names included."""
 PLAN_ALLOWED = f"a plan.json of version {PLAN_VERSION}; plan again"
 
 NAMES = (
-    *("version", "case", "inputs", "seed", "robot", "T_base_ct", "expected_target_error_mm", "theta_deg", "beta_deg"),
+    *(
+        "version",
+        "case",
+        "inputs",
+        "seed",
+        "robot",
+        "arm",
+        "T_base_ct",
+        "expected_target_error_mm",
+        "theta_deg",
+        "beta_deg",
+    ),
     *("entry_ct_mm", "target_ct_mm", "outward_ct", "roll_deg", "standoff_mm", "needle_length_mm", "limits"),
     *("speed_limits", "approach", "insertion", "clearance_mm"),
 )
@@ -67,6 +78,7 @@ def write_plan(plan: Plan, path: Path) -> None:
         "inputs": inputs_document(plan.inputs),
         "seed": plan.seed,
         "robot": plan.model.name,
+        **({} if (arm := arm_document(plan.model)) is None else {"arm": arm}),
         "T_base_ct": plan.T_base_ct.tolist(),
         "expected_target_error_mm": or_null(plan.expected_target_error_mm),
         "theta_deg": float(np.degrees(plan.theta)),
@@ -151,7 +163,7 @@ def _check_names(document: dict[str, Any], path: Path) -> None:
         *((f"inputs.{at}.", one, INPUT_NAMES) for at, one in enumerate(document["inputs"])),
     ):
         # a phase whose clearance is not stated is for whoever has the case to miss
-        optional = set(known) if part is document["clearance_mm"] else {"speed_limits"}
+        optional = set(known) if part is document["clearance_mm"] else {"speed_limits", "arm"}
         for name in sorted(set(part) ^ set(known) - (optional - set(part))):
             what = "is not known" if name in part else "is missing"
             raise InputError(f"key '{where}{name}' {what}", where=path, allowed=", ".join(known))
@@ -167,7 +179,7 @@ def _plan(document: dict[str, Any], path: Path) -> Plan:
         case_name=field(document, "case", text),
         inputs=field(document, "inputs", read_inputs),
         seed=field(document, "seed", whole),
-        model=ur_model(field(document, "robot", text)),
+        model=read_arm(field(document, "robot", text), document.get("arm")),
         T_base_ct=guard_transform(document["T_base_ct"], where=f"{path}: T_base_ct"),
         expected_target_error_mm=field(document, "expected_target_error_mm", number_or_nan),
         theta=float(np.radians(field(document, "theta_deg", number))),

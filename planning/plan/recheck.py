@@ -9,6 +9,7 @@ import numpy as np
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.workcell import home_configuration
+from puncture_twin.planning.plan.arm_document import same_arm
 from puncture_twin.planning.plan.motion import motion_contact, phase_clearances
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_angles, check_inputs
@@ -42,6 +43,8 @@ def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None
         InputError: The inputs changed, the direction is not safe any more, or the motion touches something.
     """
     check_inputs(plan, context.case, path)
+    if not same_arm(plan.model, context.case.robot.model):
+        raise InputError("its arm is not the case's", where=path, allowed="plan again")
     if context.reach is None or not np.array_equal(plan.T_base_ct, context.reach.T_base_ct):
         raise InputError("T_base_ct is not the case's", where=path, allowed="plan again")
     candidates = context.check(plan.theta, plan.beta)

@@ -20,7 +20,8 @@ from puncture_twin.planning.arm.kinematics import (
     wrap_to_pi,
     wrapped_solutions,
 )
-from puncture_twin.planning.arm.links import LINK_NAMES, collision_links, urdf_link_poses, visual_links
+from puncture_twin.planning.arm.links import LINK_NAMES, collision_links, visual_links
+from puncture_twin.planning.arm.model_urdf import model_urdf
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
 from puncture_twin.planning.base.errors import InputError
 
@@ -203,9 +204,9 @@ def test_link_frames_agree_with_the_urdf(name: str) -> None:
     The URDFs write pi with eleven decimals, those of the e-Series with nine: 1e-9 rad over a metre, several times.
     """
     model = ur_model(name)
-    constant = np.linalg.inv(link_poses(model, np.zeros(6))) @ urdf_link_poses(model, np.zeros(6))
+    constant = np.linalg.inv(link_poses(model, np.zeros(6))) @ model_urdf(model).body_poses(np.zeros(6))
     for q in np.random.default_rng(6).uniform(-2 * np.pi, 2 * np.pi, (20, 6)):
-        assert np.abs(link_poses(model, q) @ constant - urdf_link_poses(model, q)).max() < (
+        assert np.abs(link_poses(model, q) @ constant - model_urdf(model).body_poses(q)).max() < (
             5e-7 if name.endswith("e") else 5e-8
         )
 

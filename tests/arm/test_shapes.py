@@ -3,13 +3,15 @@
 import hashlib
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from puncture_twin import meshes
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.links import LINK_NAMES, urdf_link_poses, urdf_path, visual_links
+from puncture_twin.planning.arm.links import LINK_NAMES, visual_links
+from puncture_twin.planning.arm.model_urdf import model_urdf
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 
@@ -56,14 +58,14 @@ def test_the_urdf_is_the_table(name):
     The older URDFs have their links' axes otherwise: there it is the same motion at every angle.
     """
     model = ur_model(name)
-    urdf, table = (poses(model, np.zeros(6))[6] for poses in (urdf_link_poses, link_poses))
+    urdf, table = (poses(np.zeros(6))[6] for poses in (model_urdf(model).body_poses, partial(link_poses, model)))
     T_table_urdf = np.linalg.inv(table) @ urdf
     assert name not in E_SERIES or np.abs(T_table_urdf - np.eye(4)).max() < 1e-5
     for q in np.random.default_rng(8).uniform(-np.pi, np.pi, (50, 6)):
-        assert np.abs(urdf_link_poses(model, q)[6] - link_poses(model, q)[6] @ T_table_urdf).max() < 1e-5
+        assert np.abs(model_urdf(model).body_poses(q)[6] - link_poses(model, q)[6] @ T_table_urdf).max() < 1e-5
 
 
 def test_no_arm_without_shapes_is_given_any():
     """An arm that has no URDF here is refused, with those that have one."""
     with pytest.raises(InputError, match="no link meshes for robot 'ur16e'.*ur10, ur10e, ur3, ur3e, ur5, ur5e"):
-        urdf_path(replace(ur_model("ur10e"), name="ur16e"))
+        model_urdf(replace(ur_model("ur10e"), name="ur16e"))

@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.insertion import every_branch, needle_lines
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse, jacobian, nearest_within_limits
-from puncture_twin.planning.arm.links import JOINT_NAMES
 from puncture_twin.planning.arm.speed_limits import SpeedLimits
-from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
+from puncture_twin.planning.arm.ur import JOINT_NAMES, UR_MODELS, ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
@@ -72,7 +71,7 @@ def plan_to(waypoints, *, speed_scale=0.5, tip_mm_s=10.0, model=UR3):
         case_name="liver-s7",
         inputs=(Input("case", "case.toml", "0" * 64), Input("mesh liver", "liver.stl", "a" * 64)),
         seed=3,
-        model=model.name,
+        model=model,
         T_base_ct=T_base_ct,
         expected_target_error_mm=math.nan,
         theta=0.1,

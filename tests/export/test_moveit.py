@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.anatomy.anatomy import Role
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.links import JOINT_NAMES, T_BASE_URDFBASE
+from puncture_twin.planning.arm.model_urdf import T_BASE_URDFBASE
 from puncture_twin.planning.arm.tool import Tool
-from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.arm.ur import JOINT_NAMES, ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.settings import Gantry, Obstacle
 from puncture_twin.planning.export.moveit.goal_messages import check_goals, goal_messages

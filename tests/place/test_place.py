@@ -269,7 +269,7 @@ def test_turning_the_base_about_its_own_axis_changes_no_share(ball):
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     wanted = WantedDirections(u, np.full(30, 110.0), np.full(30, 1 / 30))
     skin = ball(80.0, subdivisions=2)
-    check = PlacementCheck("ur3", TOOL, skin, skin, (), (), 5.0, np.zeros(3), wanted, np.zeros(6))
+    check = PlacementCheck(UR3, TOOL, skin, skin, (), (), 5.0, np.zeros(3), wanted, np.zeros(6))
     T = Site(Region("floor", "", (0, 0, 1), ANYWHERE, ANYWHERE), (300.0, 0.0, -250.0)).T_bed_base()
     shares = set()
     for turn in (0.0, 2.5):
@@ -299,7 +299,7 @@ def test_asking_the_best_branch_first_changes_no_estimate():
     at = trimesh.transformations.translation_matrix([0.0, 0.0, -120.0])
     table = Boxes.of([Box("table", at, (800.0, 800.0, 20.0))])
     room = Surroundings(skin, table, nothing, 5.0)
-    quick = Estimator("ur3", TOOL, room, np.eye(4), wanted, itself=False)
+    quick = Estimator(UR3, TOOL, room, np.eye(4), wanted, itself=False)
     region, seen = Region("ceiling", "", (0, 0, -1), ANYWHERE, ANYWHERE), set()
     for position in rng.uniform([-400, -400, 0], [400, 400, 600], (8, 3)):
         site = Site(region, tuple(position))

@@ -10,16 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.links import T_BASE_URDFBASE
+from puncture_twin.planning.arm.links import LINK_NAMES
+from puncture_twin.planning.arm.model_urdf import model_urdf
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.arm.urdf.arm_urdf import FLANGE, ArmUrdf
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.world.arm_file import write_arm_urdf
 from puncture_twin.twin.world.engine import pybullet
 from puncture_twin.twin.world.units import pose_to_m, pose_to_mm
-
-FLANGE = "tool0"
-"""The URDF's link whose frame is the controller's flange."""
 
 POSITION_GAIN = 0.1
 """Fraction of a joint's position error that its motor takes back per step, Bullet's default: an error falls to 1/e
@@ -132,7 +131,8 @@ def load_arm(client: int, model: UrModel, tool: Tool, T_world_base: Floats | Non
     Raises:
         InputError: There is no body of that model.
     """
-    T_world_urdf = T_BASE_URDFBASE if T_world_base is None else T_world_base @ T_BASE_URDFBASE
+    urdf = model_urdf(model)
+    T_world_urdf = urdf.T_base_root if T_world_base is None else T_world_base @ urdf.T_base_root
     position, quaternion = pose_to_m(T_world_urdf)
     with tempfile.TemporaryDirectory() as folder:
         body = pybullet.loadURDF(
@@ -143,13 +143,21 @@ def load_arm(client: int, model: UrModel, tool: Tool, T_world_base: Floats | Non
             flags=pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_IMPLICIT_CYLINDER,
             physicsClientId=client,
         )
-    joints, links = [], {"base": -1}
+    joints, links, names = [], {"base": -1}, _names(urdf)
     for index in range(pybullet.getNumJoints(body, physicsClientId=client)):
         info = pybullet.getJointInfo(body, index, physicsClientId=client)
-        links[info[12].decode().removesuffix("_link")] = index
+        links[names.get(link := info[12].decode(), f"{link} of the URDF")] = index
+        if link == urdf.chain.flange:
+            links[FLANGE] = index
         if info[2] == pybullet.JOINT_REVOLUTE:
             joints.append(index)
         pybullet.changeDynamics(
             body, index, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, physicsClientId=client
         )
     return Arm(client, body, tuple(joints), MappingProxyType(links), tuple(model.max_torques.tolist()))
+
+
+def _names(urdf: ArmUrdf) -> dict[str, str]:
+    """What the URDF's moving links, and those that are added to them, are called here."""
+    first = [body[0].link.name for body in urdf.chain.bodies]
+    return {"holder": "holder", "needle": "needle", **dict(zip(first[1:], LINK_NAMES[1:], strict=True))}

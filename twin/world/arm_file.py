@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.links import collision_links, resolve_package, urdf_link_poses, urdf_path
+from puncture_twin.planning.arm.links import collision_links
+from puncture_twin.planning.arm.model_urdf import address_file, model_urdf
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.arm.urdf.arm_urdf import ArmUrdf
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.world.surface_file import write_obj
 from puncture_twin.twin.world.units import to_m
 
@@ -22,6 +26,15 @@ NEEDLE_DENSITY_KG_M3 = 7900.0
 """Stainless steel, taken as solid."""
 
 
+KEPT = ("visual", "collision", "inertial")
+"""Of a link; other programs' additions would be taken for friction and the like."""
+
+NO_WEIGHT = ET.fromstring(
+    '<inertial><mass value="0"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial>'
+)
+"""Of a link that states nothing: PyBullet would take 1 kg, and 1 kg m^2 about each axis."""
+
+
 def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
     """Write the arm with holder and needle as a URDF that PyBullet can load, and its collision pieces beside it.
 
@@ -30,54 +43,75 @@ def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
     Args:
         model: The arm.
         tool: What the flange carries.
-        folder: Where to write; the links' meshes stay where they are and are named by absolute paths.
+        folder: Where to write.
 
     Returns:
         The URDF's path.
 
     Raises:
-        InputError: There is no URDF of that model.
+        InputError: There is no URDF of that model, or it does not say what a moving link weighs.
     """
-    robot = ET.parse(urdf_path(model)).getroot()
-    for mesh in robot.iter("mesh"):
-        mesh.set("filename", str(resolve_package(mesh.get("filename", ""))))
-    _replace_collisions(robot, model, folder)
-    _weigh_frames(robot)
+    urdf = model_urdf(model)
+    robot, flange = ET.fromstring(urdf.text), urdf.chain.flange
+    _check_weights(urdf)
+    _simplify(robot)
+    _replace_shapes(robot, model, folder)
     if tool.holder_length_mm > 0:
-        _add_cylinder(robot, "holder", 0.0, tool.holder_length_mm, tool.holder_diameter_mm, HOLDER_DENSITY_KG_M3)
-    _add_cylinder(robot, "needle", tool.holder_length_mm, tool.shaft_mm, tool.needle_diameter_mm, NEEDLE_DENSITY_KG_M3)
+        _add_cylinder(
+            robot, flange, "holder", 0.0, tool.holder_length_mm, tool.holder_diameter_mm, HOLDER_DENSITY_KG_M3
+        )
+    span = tool.holder_length_mm, tool.shaft_mm
+    _add_cylinder(robot, flange, "needle", *span, tool.needle_diameter_mm, NEEDLE_DENSITY_KG_M3)
     path = folder / "arm.urdf"
     ET.ElementTree(robot).write(path, encoding="utf-8", xml_declaration=True)
     return path
 
 
-def _weigh_frames(robot: ET.Element) -> None:
-    """Say of links without inertia, which are mere frames, that they weigh nothing: PyBullet would give them 1 kg."""
+def _check_weights(urdf: ArmUrdf) -> None:
+    for members in urdf.chain.bodies[1:]:
+        if not any(member.link.weighs for member in members):
+            what = "it states no mass and inertia above 0, without which nothing can be simulated"
+            here = f"{urdf.where}: link '{members[0].link.name}'"
+            raise InputError(what, where=here, allowed="an <inertial> of every moving link")
+
+
+def _simplify(robot: ET.Element) -> None:
+    """Leave links, joints and shapes; what states no weight has none."""
+    for element in list(robot):
+        if element.tag not in ("link", "joint"):
+            robot.remove(element)
     for link in robot.findall("link"):
+        for element in list(link):
+            if element.tag not in KEPT:
+                link.remove(element)
         if link.find("inertial") is None:
-            nothing = '<mass value="0"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>'
-            link.append(ET.fromstring(f"<inertial>{nothing}</inertial>"))
+            link.append(deepcopy(NO_WEIGHT))
 
 
-def _replace_collisions(robot: ET.Element, model: UrModel, folder: Path) -> None:
-    """Give every link the planner's convex pieces, moved from our link frames to the URDF's: a constant motion."""
-    T_urdflink_link = np.linalg.inv(urdf_link_poses(model, np.zeros(6))) @ link_poses(model, np.zeros(6))
+def _replace_shapes(robot: ET.Element, model: UrModel, folder: Path) -> None:
+    """Give every body the planner's convex pieces, moved from our link frames to the URDF's: a constant motion."""
+    urdf = model_urdf(model)
+    T_urdflink_link = np.linalg.inv(urdf.body_poses(np.zeros(6))) @ link_poses(model, np.zeros(6))
     elements = {element.get("name"): element for element in robot.findall("link")}
-    for link, T in zip(collision_links(model), T_urdflink_link, strict=True):
-        element = elements[f"{link.name}_link"]
-        for collision in element.findall("collision"):
-            element.remove(collision)
+    kinds = ("collision",) if model.shipped else ("collision", "visual")  # what else may be drawn need not be readable
+    for element in elements.values():
+        for shape in [shape for kind in kinds for shape in element.findall(kind)]:
+            element.remove(shape)
+    for mesh in robot.iter("mesh"):
+        mesh.set("filename", address_file(urdf, mesh.get("filename", "")))
+    for link, members, T in zip(collision_links(model), urdf.chain.bodies, T_urdflink_link, strict=True):
         for number, piece in enumerate(link.pieces):
             path = folder / f"{link.name}_{number}.obj"
             write_obj(piece.transformed(T), path)
-            geometry = ET.SubElement(ET.SubElement(element, "collision"), "geometry")
-            ET.SubElement(geometry, "mesh", filename=str(path))
+            for kind in kinds:
+                geometry = ET.SubElement(ET.SubElement(elements[members[0].link.name], kind), "geometry")
+                ET.SubElement(geometry, "mesh", filename=str(path))
 
 
 def _add_cylinder(
-    robot: ET.Element, name: str, start_mm: float, length_mm: float, diameter_mm: float, density: float
+    robot: ET.Element, flange: str, name: str, start_mm: float, length_mm: float, diameter_mm: float, density: float
 ) -> None:
-    """A cylinder on tool0's z axis, its link frame at its flange end."""
+    """A cylinder on the flange's z axis, its link frame at its flange end."""
     length, radius = float(to_m(length_mm)), float(to_m(diameter_mm / 2))
     mass = density * math.pi * radius**2 * length
     across, along = mass * (3 * radius**2 + length**2) / 12, mass * radius**2 / 2
@@ -92,7 +126,7 @@ def _add_cylinder(
     )
     robot.append(
         ET.fromstring(
-            f'<joint name="{name}_joint" type="fixed"><parent link="tool0"/><child link="{name}"/>'
+            f'<joint name="{name}_joint" type="fixed"><parent link="{flange}"/><child link="{name}"/>'
             f'<origin xyz="0 0 {to_m(start_mm)}" rpy="0 0 0"/></joint>'
         )
     )

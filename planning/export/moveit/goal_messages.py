@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.arm.links import JOINT_NAMES
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.export.motion import SampledMotion, check_sampled
@@ -28,12 +27,12 @@ def goal_messages(plan: Plan) -> dict[str, Any]:
 
 
 def _goal(plan: Plan, trajectory: Trajectory) -> dict[str, Any]:
-    speeds = velocities(plan.model, trajectory)
+    speeds, names = velocities(plan.model, trajectory), plan.model.joint_names
     points = [_point(*row) for row in zip(trajectory.times_s, trajectory.q, speeds, strict=True)]
     return {
-        "trajectory": {"header": {"frame_id": ""}, "joint_names": list(JOINT_NAMES), "points": points},
-        "path_tolerance": [{"name": name, "position": PATH_TOLERANCE_RAD} for name in JOINT_NAMES],
-        "goal_tolerance": [{"name": name, "position": GOAL_TOLERANCE_RAD} for name in JOINT_NAMES],
+        "trajectory": {"header": {"frame_id": ""}, "joint_names": list(names), "points": points},
+        "path_tolerance": [{"name": name, "position": PATH_TOLERANCE_RAD} for name in names],
+        "goal_tolerance": [{"name": name, "position": GOAL_TOLERANCE_RAD} for name in names],
         "goal_time_tolerance": {"sec": GOAL_TIME_S, "nanosec": 0},
     }
 
@@ -56,8 +55,8 @@ def check_goals(goals: Any, plan: Plan, *, where: Path) -> None:
     parts = {}
     for phase in SampledMotion._fields:
         trajectory = goals[phase]["trajectory"]
-        if trajectory["joint_names"] != list(JOINT_NAMES):
-            raise InputError(f"{phase} is of other joints", where=where, allowed=", ".join(JOINT_NAMES))
+        if trajectory["joint_names"] != list(plan.model.joint_names):
+            raise InputError(f"{phase} is of other joints", where=where, allowed=", ".join(plan.model.joint_names))
         starts = [point["time_from_start"] for point in trajectory["points"]]
         times = np.array([one["sec"] + one["nanosec"] / NANOSECONDS for one in starts])
         parts[phase] = Trajectory(times, np.array([point["positions"] for point in trajectory["points"]]))

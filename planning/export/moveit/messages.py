@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.arm.links import T_BASE_URDFBASE
 from puncture_twin.planning.arm.tool import Box
+from puncture_twin.planning.arm.urdf.arm_urdf import ArmUrdf
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 M_PER_MM = 1e-3
-
-BASE_FRAME, FLANGE_FRAME = "base_link", "tool0"
-"""ROS's base is the controller's turned by 180 deg about z; ``tool0`` is the controller's flange."""
 
 BOX, CYLINDER = 1, 3
 """Of ``shape_msgs/SolidPrimitive``."""
@@ -23,7 +20,27 @@ BOX, CYLINDER = 1, 3
 GRAIN_M = 1e-6
 """To what coordinates are rounded."""
 
-T_ROSBASE_BASE = np.linalg.inv(T_BASE_URDFBASE)
+
+class RosFrames(NamedTuple):
+    """The links of an arm's URDF in which messages speak."""
+
+    root: str
+    """The root, of a UR ``base_link``: the controller's base turned by 180 deg about z."""
+    flange: str
+    """The controller's flange, of a UR ``tool0``."""
+    touching: tuple[str, ...]
+    """What holder and needle are bolted to."""
+    T_root_base: Floats
+    """Shape (4, 4), mm: the controller's base in the root's frame."""
+
+    @classmethod
+    def of(cls, urdf: ArmUrdf) -> RosFrames:
+        """Those of an arm."""
+        last = [member.link.name for member in urdf.chain.bodies[-1]]
+        touching = dict.fromkeys((last[0], "flange", urdf.chain.flange, *last[1:]))
+        return cls(
+            urdf.root, urdf.chain.flange, tuple(touching), np.asarray(np.linalg.inv(urdf.T_base_root), np.float64)
+        )
 
 
 def pose_message(T: Floats) -> dict[str, Any]:
@@ -32,10 +49,10 @@ def pose_message(T: Floats) -> dict[str, Any]:
     return {"position": _named("xyz", T[:3, 3] * M_PER_MM), "orientation": _named("xyzw", quaternion)}
 
 
-def box_message(box: Box) -> tuple[dict[str, Any], dict[str, Any]]:
-    """``shape_msgs/SolidPrimitive`` of a box in the controller's base frame, and its pose in ROS's."""
+def box_message(box: Box, frames: RosFrames) -> tuple[dict[str, Any], dict[str, Any]]:
+    """``shape_msgs/SolidPrimitive`` of a box in the controller's base frame, and its pose in the root's."""
     sides = [float(side) * M_PER_MM for side in box.size_mm]
-    return {"type": BOX, "dimensions": sides}, pose_message(T_ROSBASE_BASE @ box.T_base_box)
+    return {"type": BOX, "dimensions": sides}, pose_message(frames.T_root_base @ box.T_base_box)
 
 
 def cylinder_message(start_mm: float, end_mm: float, diameter_mm: float) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.arm.links import JOINT_NAMES
+from puncture_twin.planning.arm.model_urdf import model_urdf
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.workcell import case_boxes, case_tool, patient_surface
 from puncture_twin.planning.export.moveit.messages import (
-    BASE_FRAME,
-    FLANGE_FRAME,
-    T_ROSBASE_BASE,
+    RosFrames,
     box_message,
     cylinder_message,
     mesh_message,
@@ -21,9 +19,6 @@ from puncture_twin.planning.export.moveit.messages import (
 from puncture_twin.planning.plan.plan import Plan
 
 PATIENT, NEEDLE, HOLDER = "patient", "needle", "needle_holder"
-
-TOUCH_LINKS = ("wrist_3_link", "flange", FLANGE_FRAME)
-"""What holder and needle are bolted to."""
 
 
 def scene_message(case: Case, anatomy: Anatomy, plan: Plan) -> dict[str, Any]:
@@ -34,9 +29,10 @@ def scene_message(case: Case, anatomy: Anatomy, plan: Plan) -> dict[str, Any]:
         anatomy: Its structures and skin.
         plan: The plan; its registration places the patient.
     """
-    solids = [_solid(box) for box in case_boxes(case, plan.T_base_ct)]
-    start = {"name": list(JOINT_NAMES), "position": [float(angle) for angle in plan.approach.q[0]]}
-    carried = _attached(case_tool(case))
+    frames = RosFrames.of(model_urdf(plan.model))
+    solids = [_solid(box, frames) for box in case_boxes(case, plan.T_base_ct)]
+    start = {"name": list(plan.model.joint_names), "position": [float(angle) for angle in plan.approach.q[0]]}
+    carried = _attached(case_tool(case), frames)
     return {
         "name": "puncture",
         "is_diff": True,
@@ -45,22 +41,22 @@ def scene_message(case: Case, anatomy: Anatomy, plan: Plan) -> dict[str, Any]:
             "joint_state": start,
             "attached_collision_objects": carried,
         },
-        "world": {"collision_objects": [_patient(anatomy, plan), *solids]},
+        "world": {"collision_objects": [_patient(anatomy, plan, frames), *solids]},
     }
 
 
-def _patient(anatomy: Anatomy, plan: Plan) -> dict[str, Any]:
+def _patient(anatomy: Anatomy, plan: Plan, frames: RosFrames) -> dict[str, Any]:
     """The skin with all that the CT shows outside of it, in its own frame; the pose says where it lies."""
-    pose = pose_message(T_ROSBASE_BASE @ plan.T_base_ct)
-    return _object(PATIENT, BASE_FRAME) | {"meshes": [mesh_message(patient_surface(anatomy))], "mesh_poses": [pose]}
+    pose = pose_message(frames.T_root_base @ plan.T_base_ct)
+    return _object(PATIENT, frames.root) | {"meshes": [mesh_message(patient_surface(anatomy))], "mesh_poses": [pose]}
 
 
-def _solid(box: Box) -> dict[str, Any]:
-    primitive, pose = box_message(box)
-    return _object(box.name, BASE_FRAME) | {"primitives": [primitive], "primitive_poses": [pose]}
+def _solid(box: Box, frames: RosFrames) -> dict[str, Any]:
+    primitive, pose = box_message(box, frames)
+    return _object(box.name, frames.root) | {"primitives": [primitive], "primitive_poses": [pose]}
 
 
-def _attached(tool: Tool) -> list[dict[str, Any]]:
+def _attached(tool: Tool, frames: RosFrames) -> list[dict[str, Any]]:
     ends = tool.needle_length_mm - tool.shaft_mm, tool.needle_length_mm
     parts = [(NEEDLE, *ends, tool.needle_diameter_mm)]
     if ends[0] > 0:
@@ -68,8 +64,8 @@ def _attached(tool: Tool) -> list[dict[str, Any]]:
     made = []
     for name, start, end, diameter in parts:
         primitive, pose = cylinder_message(start, end, diameter)
-        body = _object(name, FLANGE_FRAME) | {"primitives": [primitive], "primitive_poses": [pose]}
-        made.append({"link_name": FLANGE_FRAME, "object": body, "touch_links": list(TOUCH_LINKS)})
+        body = _object(name, frames.flange) | {"primitives": [primitive], "primitive_poses": [pose]}
+        made.append({"link_name": frames.flange, "object": body, "touch_links": list(frames.touching)})
     return made
 
 

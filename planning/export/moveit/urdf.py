@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from xml.etree import ElementTree
 
-from puncture_twin.planning.arm.links import resolve_package, urdf_path
+from puncture_twin.planning.arm.model_urdf import address_file, model_urdf
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.export.moveit.messages import FLANGE_FRAME, M_PER_MM
+from puncture_twin.planning.export.moveit.messages import M_PER_MM
 
 TIP_FRAME = "needle_tip"
 
@@ -18,33 +19,37 @@ def urdf_with_needle(model: UrModel, tool: Tool) -> str:
     Raises:
         InputError: Nobody has the shapes of such a model.
     """
-    robot = ElementTree.parse(urdf_path(model)).getroot()
+    urdf = model_urdf(model)
+    robot, flange = ElementTree.fromstring(urdf.text), urdf.chain.flange
     for mesh in robot.iter("mesh"):
-        mesh.set("filename", resolve_package(mesh.get("filename", "")).as_uri())
+        file = address_file(urdf, mesh.get("filename", ""))
+        mesh.set("filename", Path(file).as_uri() if Path(file).is_absolute() else file)
     start = tool.needle_length_mm - tool.shaft_mm
     if start > 0:
-        _add_cylinder(robot, "needle_holder", 0.0, start, tool.holder_diameter_mm)
-    _add_cylinder(robot, "needle", start, tool.shaft_mm, tool.needle_diameter_mm)
+        _add_cylinder(robot, flange, "needle_holder", 0.0, start, tool.holder_diameter_mm)
+    _add_cylinder(robot, flange, "needle", start, tool.shaft_mm, tool.needle_diameter_mm)
     ElementTree.SubElement(robot, "link", name=TIP_FRAME)
-    _fix(robot, TIP_FRAME, tool.needle_length_mm)
+    _fix(robot, flange, TIP_FRAME, tool.needle_length_mm)
     ElementTree.indent(robot, " ")
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(robot, encoding="unicode") + "\n"
 
 
-def _add_cylinder(robot: ElementTree.Element, name: str, start_mm: float, length_mm: float, diameter_mm: float) -> None:
+def _add_cylinder(
+    robot: ElementTree.Element, flange: str, name: str, start_mm: float, length_mm: float, diameter_mm: float
+) -> None:
     link = ElementTree.SubElement(robot, "link", name=name)
     for kind in ("visual", "collision"):
         part = ElementTree.SubElement(link, kind)
         ElementTree.SubElement(part, "origin", rpy="0 0 0", xyz=f"0 0 {_metres(length_mm / 2)}")
         shape = {"radius": _metres(diameter_mm / 2), "length": _metres(length_mm)}
         ElementTree.SubElement(ElementTree.SubElement(part, "geometry"), "cylinder", shape)
-    _fix(robot, name, start_mm)
+    _fix(robot, flange, name, start_mm)
 
 
-def _fix(robot: ElementTree.Element, name: str, at_mm: float) -> None:
+def _fix(robot: ElementTree.Element, flange: str, name: str, at_mm: float) -> None:
     """Bolt a link to the flange."""
-    joint = ElementTree.SubElement(robot, "joint", name=f"{FLANGE_FRAME}-{name}", type="fixed")
-    ElementTree.SubElement(joint, "parent", link=FLANGE_FRAME)
+    joint = ElementTree.SubElement(robot, "joint", name=f"{flange}-{name}", type="fixed")
+    ElementTree.SubElement(joint, "parent", link=flange)
     ElementTree.SubElement(joint, "child", link=name)
     ElementTree.SubElement(joint, "origin", rpy="0 0 0", xyz=f"0 0 {_metres(at_mm)}")
 

@@ -65,7 +65,15 @@ def read_mesh(path: Path, *, unit: Unit, space: Space, space_is_default: bool = 
     return parse_mesh(data, path, unit=unit, space=space, space_is_default=space_is_default)
 
 
-def parse_mesh(data: bytes, path: Path, *, unit: Unit, space: Space, space_is_default: bool = False) -> TriangleMesh:
+def parse_mesh(
+    data: bytes,
+    path: Path,
+    *,
+    unit: Unit,
+    space: Space,
+    space_is_default: bool = False,
+    stretch: NDArray[np.float64] | None = None,
+) -> TriangleMesh:
     """The same of a file that has been read; it is not opened again.
 
     Args:
@@ -74,6 +82,7 @@ def parse_mesh(data: bytes, path: Path, *, unit: Unit, space: Space, space_is_de
         unit: The unit of its coordinates.
         space: Their space.
         space_is_default: As in `read_mesh`.
+        stretch: Shape (3,): factors of the file's axes on top of its unit, as a URDF states them.
 
     Raises:
         InputError: As `read_mesh`, but for reading.
@@ -84,7 +93,7 @@ def parse_mesh(data: bytes, path: Path, *, unit: Unit, space: Space, space_is_de
         raw = reader(data, name)
         stated = raw.space or _stated_space(data)
         actual = space if stated is None else _actual_space(stated, space, default=space_is_default, where=name)
-        vertices = to_lps(raw.vertices, actual) * unit.mm
+        vertices = to_lps(raw.vertices, actual) * (unit.mm if stretch is None else unit.mm * stretch)
     return guard_mesh(vertices, raw.faces, where=name)
 
 

@@ -97,7 +97,7 @@ def case(*obstacles: Obstacle) -> Case:
         structure=(),
         structures=(),
         registration=None,
-        robot=RobotSettings("ur3", None, T_BASE_CT),
+        robot=RobotSettings(UR3, None, T_BASE_CT),
         obstacles=obstacles,
         rehearsal=RehearsalSection(),
         files=InputFiles(Path()),

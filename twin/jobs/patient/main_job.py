@@ -185,6 +185,7 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     Raises:
         InputError: A plan that does not belong to the case or does not hold any more.
     """
+    from puncture_twin.planning.plan.plan_check import with_case_arm
     from puncture_twin.planning.plan.recheck import check_plan
     from puncture_twin.twin.jobs.patient.rehearsed import rehearsed
     from puncture_twin.twin.report.scene.scene_picture import draw_scene
@@ -192,6 +193,7 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     source, plan = _read_plan(plan_path, context.watcher.note)
     with context.stages.time("plan"):
         candidates = check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
+    plan = with_case_arm(plan, context.case)
     with _writing(out, "rehearse", context, ("rehearsal.json", FILM, ROOMS), source) as draft:
         run = rehearsed(Run(context, candidates, (), plan, read=(source,)), draft.folder, rooms)
         if not draft.source_has("scene.png"):

@@ -9,6 +9,7 @@ from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.export.exporter import Exported
 from puncture_twin.planning.export.moveit import MOVEIT, moveit_files, moveit_names
+from puncture_twin.planning.plan.plan_check import with_case_arm
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
 from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.context import CaseContext
@@ -45,6 +46,7 @@ def export_to_moveit(context: CaseContext, plan_path: Path | None, out: Path, ch
         note(f"warning: {found.note}")
     source, plan = found.input("plan"), parse_plan(found.data, plan_path)
     check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
+    plan = with_case_arm(plan, context.case)
     names, inputs = moveit_names(plan_path.stem), (source, *plan.inputs)
     texts = moveit_files(plan, context.case, context.anatomy, source=plan_path)
     made_from = {source.path: source.sha256}

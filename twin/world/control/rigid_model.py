@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from puncture_twin.planning.arm.links import T_BASE_URDFBASE
+from puncture_twin.planning.arm.model_urdf import model_urdf
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
@@ -62,8 +62,8 @@ def rigid_model(model: UrModel, tool: Tool, down_base: Floats) -> Iterator[Rigid
     Raises:
         InputError: There is no body of that arm.
     """
-    R_base_urdf = T_BASE_URDFBASE[:3, :3]
-    with physics_client(down=R_base_urdf.T @ down_base) as client:
+    T_base_root = model_urdf(model).T_base_root
+    with physics_client(down=T_base_root[:3, :3].T @ down_base) as client:
         # T_world_urdf = T_world_base T_base_urdf = identity
-        arm = load_arm(client, model, tool, np.linalg.inv(T_BASE_URDFBASE))
+        arm = load_arm(client, model, tool, np.asarray(np.linalg.inv(T_base_root), np.float64))
         yield RigidModel(model, tool.needle_length_mm / 1000.0, arm)

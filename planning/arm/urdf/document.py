@@ -1,0 +1,311 @@
+"""A URDF as plain values: links with their shapes, and joints; in mm and rad. What cannot be read whole is refused."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import TypeVar
+from xml.etree import ElementTree
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.text_names import check_name
+from puncture_twin.planning.geometry.rigid import pose
+
+Element = ElementTree.Element
+
+MM_PER_M = 1000.0
+"""URDFs speak metres."""
+
+MOST_BYTES = 10_000_000
+"""Of a URDF: the largest of a whole humanoid has a tenth of it."""
+
+MOST_LINKS = 1000
+"""Of a URDF: an arm has ten."""
+
+MOST_SIZE_MM = 5000.0
+"""Of a box or a cylinder in a link: no arm that can be planned for here has a longer one."""
+
+SHAPES = {"mesh": ("filename",), "box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",)}
+"""Kinds of shape that URDF knows, and what each must state."""
+
+JOINTS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+"""Kinds of joint that URDF knows."""
+
+PLAIN = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_./-]*")
+"""Names of links and joints: they are written into programs of robots."""
+
+TAKEN = ("holder", "needle", "needle_holder", "needle_tip", "tool")
+"""Names of what the flange carries."""
+
+LIMITS = ("lower", "upper", "velocity", "effort")
+
+ALLOWED = "a URDF: one <robot> with links and joints, as ROS reads it"
+
+Named = TypeVar("Named", bound="UrdfLink | UrdfJoint")
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfShape:
+    """One collision shape of a link.
+
+    Attributes:
+        kind: One of ``SHAPES``.
+        T_link_shape: Shape (4, 4), mm.
+        address: Of a mesh, as the URDF states it; else "".
+        size: Factors of a mesh's axes (3,); a box's edges (3,), a cylinder's radius and length (2,), a sphere's radius
+            (1,), mm.
+    """
+
+    kind: str
+    T_link_shape: Floats
+    address: str
+    size: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfLink:
+    """One link.
+
+    Attributes:
+        name: As the URDF has it.
+        collisions: What it is made of for contacts.
+        drawn: Whether it has a visual shape.
+        weighs: Whether it states a mass and a tensor of inertia that physics can use.
+    """
+
+    name: str
+    collisions: tuple[UrdfShape, ...]
+    drawn: bool
+    weighs: bool
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfJoint:
+    """One joint.
+
+    Attributes:
+        name: As the URDF has it.
+        kind: One of ``JOINTS``.
+        parent: Name of the link before it.
+        child: Name of the link that it moves.
+        T_parent_child: Shape (4, 4), mm, at the angle zero.
+        axis: Shape (3,), unit, in the child's frame.
+        limits: Those of ``LIMITS`` that are stated: rad, rad/s, N m.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    T_parent_child: Floats
+    axis: Floats
+    limits: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfDocument:
+    """A whole URDF.
+
+    Attributes:
+        name: The robot's.
+        links: By name, in the file's order.
+        joints: In the file's order.
+        where: The file, for errors.
+    """
+
+    name: str
+    links: Mapping[str, UrdfLink]
+    joints: tuple[UrdfJoint, ...]
+    where: Path
+
+    @property
+    def addresses(self) -> tuple[str, ...]:
+        """Every mesh file that a collision shape names, once, as it is named."""
+        shapes = [shape for link in self.links.values() for shape in link.collisions]
+        return tuple(dict.fromkeys(shape.address for shape in shapes if shape.kind == "mesh"))
+
+
+def parse_urdf(data: bytes, where: Path) -> UrdfDocument:
+    """The links and joints of a URDF.
+
+    Args:
+        data: The whole file.
+        where: Its name, for errors.
+
+    Raises:
+        InputError: It is no well-formed XML, no URDF, or says something that is not understood.
+    """
+    root = _root(data, where)
+    name = check_name(root.get("name", ""), "<robot>", where=where)
+    links = _by_name([_link(one, where) for one in root.findall("link")], "link", where)
+    joints = _by_name([_joint(one, where) for one in root.findall("joint")], "joint", where)
+    if len(links) > MOST_LINKS:
+        raise InputError(f"{len(links)} links", where=where, allowed=f"at most {MOST_LINKS}")
+    for joint in joints.values():
+        for end in (joint.parent, joint.child):
+            if end not in links:
+                raise InputError(
+                    f"joint '{joint.name}': there is no link '{end}'", where=where, allowed=", ".join(links)
+                )
+    return UrdfDocument(name, links, tuple(joints.values()), where)
+
+
+def _root(data: bytes, where: Path) -> Element:
+    try:
+        text = data.decode("utf-8-sig")
+        if "<!" in text.replace("<!--", ""):
+            raise InputError("a document type or CDATA section", where=where, allowed="a URDF without either")
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise InputError(f"XML is not well formed ({error})", where=where, allowed=ALLOWED) from error
+    if any("xacro" in one.tag for one in root.iter()):
+        what = "it holds xacro macros, which stand for what is not there yet"
+        raise InputError(what, where=where, allowed="the URDF that they make: xacro arm.urdf.xacro > arm.urdf")
+    if root.tag != "robot":
+        raise InputError(f"<{root.tag}> where <robot> was expected", where=where, allowed=ALLOWED)
+    return root
+
+
+def _by_name(parts: Sequence[Named], what: str, where: Path) -> Mapping[str, Named]:
+    for name, count in Counter(part.name for part in parts).items():
+        if count > 1:
+            raise InputError(f"{what} '{name}' stands {count} times", where=where, allowed="each name once")
+    return MappingProxyType({part.name: part for part in parts})
+
+
+def _link(element: Element, where: Path) -> UrdfLink:
+    name = _plain(element, "a link", where)
+    if name in TAKEN:
+        raise InputError(f"a link called '{name}'", where=where, allowed=f"any name but {', '.join(TAKEN)}, the tool's")
+    here = f"{where}: link '{name}'"
+    shapes = tuple(_shape(one, here) for one in element.findall("collision"))
+    return UrdfLink(name, shapes, element.find("visual") is not None, _weighs(element, here))
+
+
+def _plain(element: Element, what: str, where: Path) -> str:
+    name = check_name(element.get("name", ""), what, where=where)
+    if not PLAIN.fullmatch(name):
+        raise InputError(f"{what} is called '{name}'", where=where, allowed="letters, digits and _ . / -")
+    return name
+
+
+def _shape(element: Element, here: str) -> UrdfShape:
+    geometry = _only(element, "geometry", here)
+    kinds = [one.tag for one in geometry]
+    if len(kinds) != 1 or kinds[0] not in SHAPES:
+        found = ", ".join(kinds) or "nothing"
+        raise InputError(f"a collision of {found}", where=here, allowed=f"one of {', '.join(SHAPES)}")
+    kind, shape = kinds[0], geometry[0]
+    for key in SHAPES[kind]:
+        if not shape.get(key, "").strip():
+            raise InputError(f"<{kind}> without {key}", where=here, allowed=", ".join(SHAPES[kind]))
+    T = _origin(element, here)
+    if kind == "mesh":
+        return UrdfShape(kind, T, shape.get("filename", ""), _scale(shape, here))
+    counts = {"size": 3}
+    size = MM_PER_M * np.concatenate([_numbers(shape, key, counts.get(key, 1), here) for key in SHAPES[kind]])
+    if not ((size > 0.0) & (size <= MOST_SIZE_MM)).all():
+        raise InputError(f"<{kind}> of {_listed(size)} mm", where=here, allowed=f"above 0, at most {MOST_SIZE_MM:g} mm")
+    return UrdfShape(kind, T, "", size)
+
+
+def _scale(mesh: Element, here: str) -> Floats:
+    """The factors (3,) by which a mesh is stretched."""
+    scale = _numbers(mesh, "scale", 3, here) if "scale" in mesh.attrib else np.ones(3)
+    if not (scale > 0.0).all():
+        what = f'scale="{mesh.get("scale")}" mirrors or flattens the mesh'
+        raise InputError(what, where=here, allowed="three factors above 0")
+    return scale
+
+
+def _joint(element: Element, where: Path) -> UrdfJoint:
+    name = _plain(element, "a joint", where)
+    here, kind = f"{where}: joint '{name}'", element.get("type", "")
+    if kind not in JOINTS:
+        raise InputError(f"type '{kind}'", where=here, allowed=", ".join(JOINTS))
+    if element.find("mimic") is not None:
+        raise InputError("it mimics another joint", where=here, allowed="joints that move by themselves")
+    parent, child = (_only(element, end, here).get("link", "") for end in ("parent", "child"))
+    axis = _axis(element, here)
+    limit = element.find("limit")
+    stated = (
+        {} if limit is None else {key: float(_numbers(limit, key, 1, here)[0]) for key in LIMITS if key in limit.attrib}
+    )
+    return UrdfJoint(name, kind, parent, child, _origin(element, here), axis, MappingProxyType(stated))
+
+
+def _axis(element: Element, here: str) -> Floats:
+    """The unit axis (3,) of a joint: x where none is stated, as URDF has it."""
+    stated = element.find("axis")
+    axis = np.array([1.0, 0.0, 0.0]) if stated is None else _numbers(stated, "xyz", 3, here)
+    length = float(np.linalg.norm(axis))
+    if length == 0.0:
+        raise InputError("its axis is zero", where=here, allowed="a direction")
+    return np.asarray(axis / length)
+
+
+def _origin(element: Element, here: str) -> Floats:
+    """The ``origin`` of a joint or a shape as (4, 4), mm: rpy about the fixed axes x, y, z, in this order."""
+    origins = element.findall("origin")
+    if not origins:
+        return np.eye(4)
+    if len(origins) > 1 or not set(origins[0].attrib) <= {"xyz", "rpy"}:
+        raise InputError("an <origin> with more than xyz and rpy, or two of them", where=here, allowed="one, of both")
+    xyz, rpy = (
+        _numbers(origins[0], key, 3, here) if key in origins[0].attrib else np.zeros(3) for key in ("xyz", "rpy")
+    )
+    return pose(Rotation.from_euler("xyz", rpy).as_matrix(), MM_PER_M * xyz)
+
+
+def _weighs(element: Element, here: str) -> bool:
+    inertial = element.find("inertial")
+    if inertial is None:
+        return False
+    mass, tensor = inertial.find("mass"), inertial.find("inertia")
+    if mass is None or tensor is None:
+        return False
+    diagonal = [_numbers(tensor, key, 1, here)[0] for key in ("ixx", "iyy", "izz") if key in tensor.attrib]
+    return len(diagonal) == 3 and min(*diagonal, _numbers(mass, "value", 1, here)[0]) > 0.0
+
+
+def _only(element: Element, tag: str, here: str) -> Element:
+    found = element.findall(tag)
+    if len(found) != 1:
+        raise InputError(f"{len(found)} <{tag}>", where=here, allowed="one")
+    return found[0]
+
+
+def _numbers(element: Element, key: str, count: int, here: str) -> Floats:
+    """So many finite numbers of an attribute, shape (count,)."""
+    text = element.get(key, "")
+    values = _parsed(text.split(), _number)
+    if values is None or len(values) != count or not all(map(math.isfinite, values)):
+        allowed = "a finite number" if count == 1 else f"{count} finite numbers"
+        raise InputError(f'<{element.tag} {key}="{text}">', where=here, allowed=allowed)
+    return np.array(values)
+
+
+def _parsed(words: Sequence[str], parse: Callable[[str], float]) -> list[float] | None:
+    try:
+        return [parse(word) for word in words]
+    except ValueError:
+        return None
+
+
+def _number(word: str) -> float:
+    if "_" in word:  # Python takes 1_000 for a number; nobody else does
+        raise ValueError(word)
+    return float(word)
+
+
+def _listed(values: Floats) -> str:
+    return ", ".join(f"{value:g}" for value in values)

@@ -1,0 +1,165 @@
+"""The lengths of an arm built as a UR, from its URDF's chain; another arm is refused, with the joint that differs.
+
+At the angle zero a UR's axes are, in the controller's base frame (Denavit-Hartenberg, see `planning.arm.ur`): axis 1
+along z through the origin; axes 2, 3 and 4 along -y at the heights d1, at x = 0, a2 and a2 + a3; axis 5 along -z at
+x = a2 + a3, y = -d4; axis 6 along -y at the height d1 - d5; the flange d6 farther, its z along axis 6, its x along x.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.arm.urdf.chain import ArmChain
+from puncture_twin.planning.arm.urdf.document import UrdfDocument
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.rigid import apply, log_rotation
+
+SQUARE_RAD = 1e-4
+"""How far an axis may be from where a UR has it: 1.5708 for a right angle is off by 4e-6, 1.57 by 8e-4."""
+
+OFF_MM = 0.05
+"""The same for an axis' place and the flange's: what a UR repeats. Rounded angles leave 0.005 mm at a metre."""
+
+DIGITS_MM = 6
+"""To which lengths are rounded: a URDF's right angles are rounded, so that its chain gives 89.15899999999999."""
+
+DIGITS_TURN = 9
+"""To which the base's rotation is rounded, for the same reason."""
+
+BASE = "base"
+"""The link that ROS has for the controller's base frame."""
+
+DIRECTIONS = np.array([[0, 0, 1], [0, -1, 0], [0, -1, 0], [0, -1, 0], [0, 0, -1], [0, -1, 0]], dtype=np.float64)
+"""Of a UR's six axes at the angle zero, base frame."""
+
+R_BASE_FLANGE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Of a UR's flange at the angle zero."""
+
+AS_UR = "six axes as a UR's, zero and sense of rotation included (docs/how-to/own-arm.md)"
+
+
+class UrLengths(NamedTuple):
+    """What a chain gives where it is a UR's."""
+
+    lengths_mm: tuple[float, ...]
+    """d1, a2, a3, d4, d5, d6."""
+    T_base_root: Floats
+    """Shape (4, 4), mm: the URDF's root in the controller's base frame."""
+
+
+class _Axes(NamedTuple):
+    """The six axes and the flange at the angle zero."""
+
+    points: Floats
+    """Shape (6, 3), mm."""
+    directions: Floats
+    """Shape (6, 3), unit."""
+    T_flange: Floats
+    """Shape (4, 4), mm."""
+
+    def moved(self, T: Floats) -> _Axes:
+        """The same in another frame."""
+        return _Axes(apply(T, self.points), self.directions @ T[:3, :3].T, T @ self.T_flange)
+
+
+def ur_lengths(chain: ArmChain, document: UrdfDocument, T_base_root: Floats | None = None) -> UrLengths:
+    """The Denavit-Hartenberg lengths of a chain, and where its root is in the controller's base frame.
+
+    Args:
+        chain: The arm.
+        document: Its URDF, for names.
+        T_base_root: Where its root is, if another source says it: shape (4, 4), mm.
+
+    Raises:
+        InputError: It is not built as a UR, or does not say which frame its controller's base is.
+    """
+    axes = _axes(chain)
+    T_base_root = _base(chain, axes, document) if T_base_root is None else T_base_root
+    axes = axes.moved(T_base_root)
+    _check_directions(chain, axes, document)
+    p, flange = axes.points, axes.T_flange
+    d1, d4, fifth = p[1, 2], -p[4, 1], p[5, 2]
+    a2, a3, d5, d6 = p[2, 0], p[3, 0] - p[2, 0], d1 - fifth, -flange[1, 3] - d4
+    _check_places(chain, axes, document)
+    lengths = tuple(round(float(length), DIGITS_MM) for length in (d1, a2, a3, d4, d5, d6))
+    for name, length, sign in zip(("d1", "a2", "a3", "d4", "d5", "d6"), lengths, (1, -1, -1, 1, 1, 1), strict=True):
+        if not sign * length > OFF_MM:
+            what = f"its length {name} is {length:g} mm (flange '{chain.flange}')"
+            raise InputError(what, where=document.where, allowed=f"{'above' if sign > 0 else 'below'} 0, as of a UR")
+    return UrLengths(lengths, T_base_root)
+
+
+def _axes(chain: ArmChain) -> _Axes:
+    """In the root's frame."""
+    poses = chain.body_poses(np.eye(4), np.zeros(len(chain.joints)))
+    directions = np.stack([T[:3, :3] @ joint.axis for T, joint in zip(poses[1:], chain.joints, strict=True)])
+    return _Axes(poses[1:, :3, 3], directions, poses[-1] @ chain.T_body_flange)
+
+
+def _base(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> Floats:
+    """T_base_root: the frame whose z is axis 1 and whose -y is axis 2 at the angle zero, if the URDF says so.
+
+    Raises:
+        InputError: Axis 2 is not square to axis 1, or the link 'base' (or the root) is another frame.
+    """
+    first, second = axes.directions[:2]
+    if abs(first @ second) > SQUARE_RAD:
+        raise _other(chain, 1, "is not at a right angle to the axis before it", document)
+    stated = {member.link.name: member.T_body_link for member in chain.bodies[0]}
+    root = chain.bodies[0][0].link.name
+    name = BASE if BASE in stated else root
+    y = -second
+    R = np.round(np.stack([np.cross(y, first), y, first]), DIGITS_TURN) + 0.0
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, np.round(-R @ stated[name][:3, 3], DIGITS_MM) + 0.0
+    difference = T @ stated[name]
+    angle = float(np.linalg.norm(log_rotation(difference[:3, :3])))
+    if angle > SQUARE_RAD:
+        what = f"link '{name}' is turned by {np.degrees(angle):.4g} degrees against the controller's base of a UR"
+        allowed = (
+            "a link 'base', fixed to the root, whose z is axis 1 and whose -y is axis 2 at the angle zero "
+            '(ur_description: rpy="0 0 3.141592653589793")'
+        )
+        raise InputError(what, where=document.where, allowed=allowed)
+    return T
+
+
+def _check_directions(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> None:
+    """Refuse an axis that points otherwise than a UR's at the angle zero."""
+    for joint, (direction, wanted) in enumerate(zip(axes.directions, DIRECTIONS, strict=True)):
+        if np.linalg.norm(direction - wanted) > SQUARE_RAD:
+            x, y, z = np.round(direction, 4) + 0.0
+            as_ur = ", ".join(f"{value:g}" for value in wanted)
+            what = f"points along ({x:g}, {y:g}, {z:g}) of the base at the angle zero, a UR's along ({as_ur})"
+            raise _other(chain, joint, what, document)
+
+
+def _check_places(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> None:
+    """Refuse an axis that passes elsewhere than a UR's of these lengths; along itself it may begin anywhere."""
+    p, T = axes.points, axes.T_flange
+    wanted = {0: (0, 0, None), 1: (0, None, p[1, 2]), 2: (p[2, 0], None, p[1, 2]), 3: (p[3, 0], None, p[1, 2])}
+    wanted |= {4: (p[3, 0], p[4, 1], None), 5: (p[3, 0], None, p[5, 2])}
+    for joint, place in wanted.items():
+        off = [0.0 if want is None else float(at - want) for at, want in zip(p[joint], place, strict=True)]
+        if np.linalg.norm(off) > OFF_MM:
+            what = f"passes {np.linalg.norm(off):.4g} mm beside where a UR's does, by ({_mm(off)}) mm in the base"
+            raise _other(chain, joint, what, document)
+    off = [float(T[0, 3] - p[3, 0]), 0.0, float(T[2, 3] - p[5, 2])]
+    turned = float(np.linalg.norm(log_rotation(R_BASE_FLANGE.T @ T[:3, :3])))
+    if np.linalg.norm(off) > OFF_MM or turned > SQUARE_RAD:
+        what = (
+            f"the flange '{chain.flange}' is {np.linalg.norm(off):.4g} mm beside axis 6 and turned by "
+            f"{np.degrees(turned):.4g} degrees against a UR's"
+        )
+        raise InputError(what, where=document.where, allowed=f"the link that a UR has as tool0; {AS_UR}")
+
+
+def _mm(off: list[float]) -> str:
+    return ", ".join(f"{value:.4g}" for value in off)
+
+
+def _other(chain: ArmChain, joint: int, what: str, document: UrdfDocument) -> InputError:
+    return InputError(f"axis {joint + 1} ('{chain.joints[joint].name}') {what}", where=document.where, allowed=AS_UR)

@@ -1,0 +1,54 @@
+"""The arm that a case names: one of the table, or one of the user's own, from a URDF with its meshes beside it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path, PurePosixPath
+
+from puncture_twin.planning.arm.own_arm import own_arm
+from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.urdf.document import MOST_BYTES
+from puncture_twin.planning.arm.urdf.limits import JointLimits, narrowed
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.provenance import InputFiles
+from puncture_twin.planning.case.case_file import RobotSection
+from puncture_twin.planning.case.sections.limits_section import stated_limits
+from puncture_twin.planning.formats.meshes import mesh_files as meshes
+
+URDF_ROLE, MESH_ROLE = "urdf", "urdf mesh"
+"""Of the files that decide an arm."""
+
+
+def arm_of(section: RobotSection, files: InputFiles, path: Path) -> UrModel:
+    """The arm's model; each file that decides it becomes an input of the case.
+
+    Args:
+        section: As the case states it.
+        files: The case's files.
+        path: The case file, for errors.
+
+    Raises:
+        InputError: An unknown name, a URDF or a mesh that cannot be used, or limits that are wider than the arm's own.
+    """
+    stated = stated_limits(section.limits)
+    if section.urdf is None:
+        model = ur_model(section.model)
+    else:
+        data = files.read(URDF_ROLE, section.urdf, max_bytes=MOST_BYTES, key="robot.urdf", where=path)
+        read = partial(_mesh, urdf=section.urdf, files=files, path=path)
+        model = own_arm(data, path.parent / section.urdf, flange=section.flange, read=read, stated=stated)
+    if section.limits is None:
+        return model
+    known = JointLimits(model.joint_limits, model.max_speeds, model.max_torques)
+    limits = narrowed(known, stated, f"{path}: robot.limits")
+    return replace(model, joint_limits=limits.angles, max_speeds=limits.speeds)
+
+
+def _mesh(address: str, *, urdf: str, files: InputFiles, path: Path) -> bytes:
+    """The bytes of a mesh that a URDF names."""
+    if "://" in address or PurePosixPath(address).is_absolute():
+        what = f"robot.urdf: mesh '{address}' is no path beside the URDF"
+        raise InputError(what, where=path, allowed="paths relative to the URDF's folder, such as meshes/base.stl")
+    name = str(PurePosixPath(urdf).parent / address)
+    return files.read(MESH_ROLE, name, max_bytes=meshes.MAX_FILE_BYTES, key=f"robot.urdf: mesh '{address}'", where=path)
