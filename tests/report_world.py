@@ -46,6 +46,7 @@ def make_case(*, space="LPS", frame=None, name="ball"):
         rehearsal=SimpleNamespace(seed=7),
         breathing=None,
         bending=None,
+        tool=None,
     )
 
 

@@ -84,7 +84,12 @@ def collision_links(model: UrModel) -> tuple[Link, ...]:
         InputError: If no meshes ship for this model, or one cannot be used.
     """
     urdf = model_urdf(model)
-    made_from = {"what": "collision links", "lengths": urdf.lengths_mm, "urdf": urdf.digest, "shipped": model.shipped}
+    made_from = {
+        "what": "collision links",
+        "lengths": model.lengths.tolist(),
+        "urdf": urdf.digest,
+        "shipped": model.shipped,
+    }
     kept = user_cache().arrays(made_from, lambda: _packed(_convex_links(model)), by=__name__, check=unpacked_meshes)
     pieces, ends = unpacked_meshes(kept), np.cumsum(kept["pieces"])
     parts = zip(LINK_NAMES, [0, *ends], ends, strict=False)

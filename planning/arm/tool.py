@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 
+from puncture_twin.planning.arm.tool_body import ToolBody
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply
@@ -28,6 +29,7 @@ class Tool:
         shaft_mm: Usable length: from the holder's end to the tip.
         needle_diameter_mm: Diameter of the needle.
         holder_diameter_mm: Diameter of the holder.
+        body: What the flange carries beside them, or None.
 
     Raises:
         InputError: If a length is not finite and positive, or the shaft is longer than the needle.
@@ -37,9 +39,11 @@ class Tool:
     shaft_mm: float
     needle_diameter_mm: float
     holder_diameter_mm: float
+    body: ToolBody | None = None
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
+        for name in ("needle_length_mm", "shaft_mm", "needle_diameter_mm", "holder_diameter_mm"):
+            value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
                 raise InputError(f"{name} = {value}", where="tool", allowed="finite and above 0")
         if self.shaft_mm > self.needle_length_mm:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from puncture_twin.planning.arm.speed_limits import SpeedLimits
+from puncture_twin.planning.arm.tool_body import ToolBody
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
@@ -44,6 +45,7 @@ from puncture_twin.planning.case.registration_section import (
 from puncture_twin.planning.case.sections.arm import arm_of
 from puncture_twin.planning.case.sections.bend import bending_of
 from puncture_twin.planning.case.sections.breath import breathing_of
+from puncture_twin.planning.case.sections.tool_section import tool_of
 from puncture_twin.planning.case.settings import (
     CtSettings,
     Gantry,
@@ -88,6 +90,7 @@ class Case:
         bending: How the needle bends, and in what, or None where the case does not say.
         own_target: Whether the target lies in no structure: its own is then the ball of the hit radius about it, which
             has its name.
+        tool: What the flange carries beside needle and holder, or None.
     """
 
     path: Path
@@ -120,6 +123,7 @@ class Case:
     breathing: Breathing | None = None
     bending: Bending | None = None
     own_target: bool = False
+    tool: ToolBody | None = None
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""
@@ -170,7 +174,7 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
     _read_files(content, path, files, case_volumes)
     space = Space(content.space)
     target = _target(content, path, space, files)
-    settings, robot = content.search, _robot(content, space, path, files)
+    settings, robot, tool = content.search, _robot(content, space, path, files), tool_of(content.tool, files, path)
     return Case(
         path=path,
         name=content.name,
@@ -187,6 +191,7 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
         structures=content.structures,
         registration=_markers(content.registration),
         robot=robot,
+        tool=tool,
         obstacles=tuple(_obstacle(one, space) for one in content.obstacle),
         rehearsal=content.rehearsal,
         files=files,
@@ -289,7 +294,7 @@ def _of_transform(content: CaseFile) -> tuple[str, ...]:
 def _of_robot(content: CaseFile, robot: RobotSettings) -> tuple[str, ...]:
     """That a robot is named, and nothing said of where it is located: then no verdict is about it."""
     located = content.registration is not None or content.robot.mount is not None
-    nowhere = not located and "robot" in content.model_fields_set
+    nowhere = not located and bool({"robot", "tool"} & content.model_fields_set)
     return (ROBOT_NOWHERE.format(robot=robot.model.name),) if nowhere else ()
 
 

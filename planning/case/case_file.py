@@ -16,6 +16,7 @@ from puncture_twin.planning.case.registration_section import RegistrationSection
 from puncture_twin.planning.case.sections.breathing_section import BreathingSection
 from puncture_twin.planning.case.sections.limits_section import LimitsSection
 from puncture_twin.planning.case.sections.tissue_section import TissueSection
+from puncture_twin.planning.case.sections.tool_section import ToolSection
 from puncture_twin.planning.case.toml_types import (
     Anatomical,
     Coordinate,
@@ -382,6 +383,7 @@ class CaseFile(Section):
     ct: CtSection = CtSection()
     registration: RegistrationSection | None = None
     robot: RobotSection = RobotSection()
+    tool: ToolSection | None = None
     obstacle: Annotated[tuple[ObstacleSection, ...], Field(max_length=MAX_STRUCTURES)] = ()
     gantry: GantrySection | None = None
     place: PlaceSection = PlaceSection()

@@ -21,6 +21,9 @@ def _facts(case: Any) -> Facts:
     yield "target", f"{case.target_name} in {case.target_structure}: ({x:.1f}, {y:.1f}, {z:.1f}) mm in {axes}"
     needle = case.needle
     yield "needle", f"⌀ {needle.diameter_mm:g} mm, shaft {needle.shaft_mm:g} mm, tip to flange {needle.length_mm:g} mm"
+    if case.tool is not None:
+        size = " × ".join(f"{edge:.0f}" for edge in np.ptp(case.tool.mesh.bounds, axis=0))
+        yield "tool", f"{case.tool.file.name}, {size} mm along the flange's axes"
     stated = [one.name for one in case.structure] + [f"those of {one.source}" for one in case.structures]
     yield "structures", ", ".join(stated) or "none"
     (low, high), (first, last) = np.degrees(case.search.theta), np.degrees(case.search.beta)

@@ -21,8 +21,11 @@ from puncture_twin.planning.collision.shapes import convex, padded, surface
 from puncture_twin.planning.geometry.mesh_list import packed_meshes, unpacked_meshes
 from puncture_twin.planning.geometry.rigid import pose
 
-BODY_NAMES = (*LINK_NAMES, "holder", "needle")
-"""The bodies of the arm, from the base on."""
+BODY_NAMES = (*LINK_NAMES, "tool", "holder", "needle")
+"""The bodies of the arm, from the base on; not every arm has a tool."""
+
+FLANGE_FRAME = 6
+"""The frame of wrist 3, whose origin and axes are the flange's."""
 
 NEVER_TESTED: Mapping[tuple[str, str], str] = MappingProxyType(
     {
@@ -32,6 +35,9 @@ NEVER_TESTED: Mapping[tuple[str, str], str] = MappingProxyType(
         ("forearm", "wrist_1"): "joined by a joint",
         ("wrist_1", "wrist_2"): "joined by a joint",
         ("wrist_2", "wrist_3"): "joined by a joint",
+        ("wrist_3", "tool"): "bolted together",
+        ("tool", "holder"): "bolted together",
+        ("tool", "needle"): "bolted together",
         ("wrist_3", "holder"): "bolted together",
         ("wrist_3", "needle"): "bolted together",
         ("holder", "needle"): "bolted together",
@@ -93,9 +99,10 @@ def arm_bodies(model: UrModel, tool: Tool, padding_mm: float) -> tuple[Body, ...
         padding_mm: How much fuller ``full`` is than ``bare``.
 
     Raises:
-        InputError: If the model's meshes do not ship.
+        InputError: If the model's meshes do not ship, or the tool is flat.
     """
-    links = collision_links(model)
+    own = () if tool.body is None else (Link("tool", FLANGE_FRAME, tool.body.pieces),)
+    links = (*collision_links(model), *own)
     full = padded_links(links, padding_mm) if padding_mm else links
     return (
         *(_link_body(bare, more) for bare, more in zip(links, full, strict=True)),
@@ -134,7 +141,7 @@ def _round_body(name: str, diameter_mm: float, span_mm: tuple[float, float], pad
     T_flange_body = pose(np.eye(3), [0.0, 0.0, (span_mm[0] + span_mm[1]) / 2.0])
     bare = _cylinder(diameter_mm / 2.0, length)
     full = _cylinder(diameter_mm / 2.0 + padding_mm, length + 2.0 * padding_mm) if padding_mm else bare
-    return Body(name, 6, T_flange_body, bare, full, float(np.hypot(diameter_mm, length)) / 2.0)
+    return Body(name, FLANGE_FRAME, T_flange_body, bare, full, float(np.hypot(diameter_mm, length)) / 2.0)
 
 
 def _cylinder(radius_mm: float, length_mm: float) -> Shape:

@@ -9,7 +9,7 @@ surface counts (``patient_closed``).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from itertools import combinations, product
 from typing import NamedTuple
 
@@ -24,6 +24,7 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies import BODY_NAMES, NEVER_TESTED, Body, arm_bodies
+from puncture_twin.planning.collision.hanging import check_hanging
 from puncture_twin.planning.collision.neighbours import check_neighbours
 from puncture_twin.planning.collision.shapes import FclSkin, touch
 from puncture_twin.planning.collision.state_checker import (
@@ -95,7 +96,8 @@ class CellChecker:
 
     Raises:
         InputError: If the padding is negative, two boxes share a name, the patient's mesh is unusable, the base
-            stands in the patient, or the shapes of an own arm leave a gap at a joint.
+            stands in the patient, the shapes of an own arm leave a gap at a joint,
+            or an own tool does not hang on the flange.
     """
 
     def __init__(
@@ -115,8 +117,10 @@ class CellChecker:
         self._bodies = arm_bodies(model, tool, padding_mm)
         if model.urdf is not None:
             check_neighbours(model, self._bodies[: len(LINK_NAMES)])
+        if tool.body is not None:
+            check_hanging(tool.body, self._bodies)
         self._swept = SweptBodies.of(model, tool)
-        self._boxes = _boxes(boxes)
+        self._boxes = _boxes(boxes, {PATIENT, *(body.name for body in self._bodies)})
         self._bounds = {box.name: box.bounds for box in boxes}
         self._patient = None if patient is None else FclSkin(patient, PATIENT)
         self._skin = None if skin is None else FclSkin(skin, PATIENT)
@@ -293,9 +297,9 @@ def _nearest(
     return best
 
 
-def _boxes(boxes: Sequence[Box]) -> dict[str, fcl.CollisionObject]:
+def _boxes(boxes: Sequence[Box], taken: Set[str]) -> dict[str, fcl.CollisionObject]:
     names = [box.name for box in boxes]
-    if len(set(names)) < len(names) or set(names) & {PATIENT, *BODY_NAMES}:
+    if len(set(names)) < len(names) or set(names) & taken:
         raise InputError(f"box names {names}", where="cell", allowed="each once, and none a body's or the patient's")
     return {
         box.name: fcl.CollisionObject(

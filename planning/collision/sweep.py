@@ -24,7 +24,7 @@ class SweptBodies:
     Attributes:
         model: The arm.
         tool: What its flange carries.
-        corners: Shape (6, 8, 3), mm: a box about each moving link in its frame, the last one with holder and needle.
+        corners: Shape (6, 8, 3), mm: a box about each moving link in its frame, the last with all on the flange.
     """
 
     model: UrModel
@@ -38,6 +38,9 @@ class SweptBodies:
         radius = max(tool.holder_diameter_mm, tool.needle_diameter_mm) / 2.0
         reach = np.array([[-radius, -radius, tool.holder_span_mm[0]], [radius, radius, tool.needle_length_mm]])
         boxes[-1] = np.stack([np.minimum(boxes[-1][0], reach[0]), np.maximum(boxes[-1][1], reach[1])])
+        if tool.body is not None:
+            low, high = tool.body.mesh.bounds
+            boxes[-1] = np.stack([np.minimum(boxes[-1][0], low), np.maximum(boxes[-1][1], high)])
         grown = [box + [[-padding_mm], [padding_mm]] for box in boxes]
         return cls(model, tool, np.stack([np.array(list(product(*box.T))) for box in grown]))
 

@@ -30,9 +30,9 @@ TREE_COPIES = 8
 
 
 def case_tool(case: Case) -> Tool:
-    """The needle and its holder."""
+    """The needle, its holder, and what else the flange carries."""
     needle = case.needle
-    return Tool(needle.length_mm, needle.shaft_mm, needle.diameter_mm, needle.holder_diameter_mm)
+    return Tool(needle.length_mm, needle.shaft_mm, needle.diameter_mm, needle.holder_diameter_mm, case.tool)
 
 
 def case_boxes(case: Case, T_base_ct: Floats) -> tuple[Box, ...]:

@@ -30,7 +30,7 @@ FLANGE = 6
 
 @dataclass(frozen=True, eq=False)
 class ArmSpheres:
-    """Spheres that enclose the links and the needle's holder, in bodies; not the needle.
+    """Spheres that enclose the links, the needle's holder and the tool, in bodies; not the needle.
 
     Attributes:
         centres: Shape (n, 3), mm, each in its body's frame.
@@ -54,6 +54,8 @@ class ArmSpheres:
         bodies = [[piece.vertices for piece in link.pieces] for link in collision_links(model)]
         start, end = tool.holder_span_mm
         bodies.append([prism(tool.holder_diameter_mm / 2, end - start) + [0.0, 0.0, (start + end) / 2]])
+        if tool.body is not None:
+            bodies.append([piece.vertices for piece in tool.body.pieces])
         trees = [sphere_tree(pieces, BALL_MM) for pieces in bodies]
         rows = [np.insert(tree.leaves, 0, 0) for tree in trees]  # row 0 is the root
         return cls(

@@ -57,8 +57,8 @@ ROLLS = 8
 CHUNK = 64
 """Requests between two reports of progress."""
 
-ROLL_BODY = "wrist_3"
-"""The only body that turns with the roll and is not round about the needle: other contacts are the same at any roll."""
+ROLL_BODIES = frozenset({"wrist_3", "tool"})
+"""The bodies that turn with the roll and are not round about the needle: other contacts are the same at any roll."""
 
 
 class _Insertion(NamedTuple):
@@ -248,7 +248,7 @@ def _try(checker: StateChecker, request: ReachRequest, insertion: _Insertion, de
     contact = checker.contact(standoff[0], needle_may_touch_patient=False)
     if contact is not None:
         detail = f"{contact.body} touches {contact.other} at standoff"
-        block = _Blocked(0.0, detail, ROLL_BODY not in contact, at_standoff=True, contact=contact)
+        block = _Blocked(0.0, detail, ROLL_BODIES.isdisjoint(contact), at_standoff=True, contact=contact)
         return _Tried(standoff, depths[:1], block)
     q, depths = _refined(checker, request, insertion, depths)
     stop = first_stop(model, q, depths)
@@ -261,7 +261,7 @@ def _try(checker: StateChecker, request: ReachRequest, insertion: _Insertion, de
         return _Tried(q, depths, None)
     depth, contact = float(depths[first.at]), first.contact
     detail = f"{contact.body} touches {contact.other} {depth:.1f} mm after the standoff"
-    return _Tried(q, depths, _Blocked(depth, detail, ROLL_BODY not in contact, contact=contact))
+    return _Tried(q, depths, _Blocked(depth, detail, ROLL_BODIES.isdisjoint(contact), contact=contact))
 
 
 def _refined(

@@ -8,7 +8,6 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
@@ -214,9 +213,7 @@ def approach_checkers(context: CaseContext, needle_padding_mm: float) -> Approac
     """The workcell with the case's needle, and with one whose tip is taken off and that is so much fuller."""
     assert context.reach is not None
     tool = case_tool(context.case)
-    short = Tool(
-        tool.needle_length_mm - TIP_MM, tool.shaft_mm - TIP_MM, tool.needle_diameter_mm, tool.holder_diameter_mm
-    )
+    short = replace(tool, needle_length_mm=tool.needle_length_mm - TIP_MM, shaft_mm=tool.shaft_mm - TIP_MM)
     case, anatomy, T_base_ct = context.case, context.anatomy, context.reach.T_base_ct
     surface, alone = patient_surface(anatomy), anatomy.skin.mesh
     blunted = FastChecker(

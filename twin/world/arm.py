@@ -160,4 +160,7 @@ def load_arm(client: int, model: UrModel, tool: Tool, T_world_base: Floats | Non
 def _names(urdf: ArmUrdf) -> dict[str, str]:
     """What the URDF's moving links, and those that are added to them, are called here."""
     first = [body[0].link.name for body in urdf.chain.bodies]
-    return {"holder": "holder", "needle": "needle", **dict(zip(first[1:], LINK_NAMES[1:], strict=True))}
+    return {
+        **{name: name for name in ("tool", "holder", "needle")},
+        **dict(zip(first[1:], LINK_NAMES[1:], strict=True)),
+    }

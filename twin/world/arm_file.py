@@ -8,11 +8,13 @@ from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
+import trimesh
 
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.links import collision_links
+from puncture_twin.planning.arm.links import collision_links, joined
 from puncture_twin.planning.arm.model_urdf import address_file, model_urdf
 from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.tool_body import ToolBody
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.arm.urdf.arm_urdf import ArmUrdf
 from puncture_twin.planning.base.errors import InputError
@@ -62,6 +64,8 @@ def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
         )
     span = tool.holder_length_mm, tool.shaft_mm
     _add_cylinder(robot, flange, "needle", *span, tool.needle_diameter_mm, NEEDLE_DENSITY_KG_M3)
+    if tool.body is not None:
+        _add_tool(robot, flange, tool.body, folder)
     path = folder / "arm.urdf"
     ET.ElementTree(robot).write(path, encoding="utf-8", xml_declaration=True)
     return path
@@ -106,6 +110,33 @@ def _replace_shapes(robot: ET.Element, model: UrModel, folder: Path) -> None:
             for kind in kinds:
                 geometry = ET.SubElement(ET.SubElement(elements[members[0].link.name], kind), "geometry")
                 ET.SubElement(geometry, "mesh", filename=str(path))
+
+
+def _add_tool(robot: ET.Element, flange: str, body: ToolBody, folder: Path) -> None:
+    """The tool's convex pieces, all of the holder's material."""
+    whole = joined(body.pieces)
+    solid = trimesh.Trimesh(to_m(whole.vertices), whole.faces, process=False)
+    solid.density = HOLDER_DENSITY_KG_M3
+    weight, tensor = solid.mass_properties, solid.moment_inertia
+    shapes = []
+    for number, piece in enumerate(body.pieces):
+        path = folder / f"tool_{number}.obj"
+        write_obj(piece, path)
+        shapes += [
+            f'<{kind}><geometry><mesh filename="{path}"/></geometry></{kind}>' for kind in ("visual", "collision")
+        ]
+    xyz = " ".join(str(float(value)) for value in weight.center_mass)
+    names = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2)}
+    inertia = " ".join(f'{name}="{tensor[at]}"' for name, at in names.items())
+    robot.append(
+        ET.fromstring(
+            f'<link name="tool"><inertial><origin xyz="{xyz}" rpy="0 0 0"/><mass value="{weight.mass}"/>'
+            f"<inertia {inertia}/></inertial>{''.join(shapes)}</link>"
+        )
+    )
+    robot.append(
+        ET.fromstring(f'<joint name="tool_joint" type="fixed"><parent link="{flange}"/><child link="tool"/></joint>')
+    )
 
 
 def _add_cylinder(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.arm.model_urdf import model_urdf
 from puncture_twin.planning.arm.tool import Box, Tool
@@ -65,6 +67,12 @@ def _attached(tool: Tool, frames: RosFrames) -> list[dict[str, Any]]:
     for name, start, end, diameter in parts:
         primitive, pose = cylinder_message(start, end, diameter)
         body = _object(name, frames.flange) | {"primitives": [primitive], "primitive_poses": [pose]}
+        made.append({"link_name": frames.flange, "object": body, "touch_links": list(frames.touching)})
+    if tool.body is not None:
+        body = _object("tool", frames.flange) | {
+            "meshes": [mesh_message(tool.body.mesh)],
+            "mesh_poses": [pose_message(np.eye(4))],
+        }
         made.append({"link_name": frames.flange, "object": body, "touch_links": list(frames.touching)})
     return made
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree import ElementTree
 
+from scipy.spatial.transform import Rotation
+
 from puncture_twin.planning.arm.model_urdf import address_file, model_urdf
 from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.tool_body import ToolBody
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.export.moveit.messages import M_PER_MM
 
@@ -28,6 +31,8 @@ def urdf_with_needle(model: UrModel, tool: Tool) -> str:
     if start > 0:
         _add_cylinder(robot, flange, "needle_holder", 0.0, start, tool.holder_diameter_mm)
     _add_cylinder(robot, flange, "needle", start, tool.shaft_mm, tool.needle_diameter_mm)
+    if tool.body is not None:
+        _add_mesh(robot, flange, tool.body)
     ElementTree.SubElement(robot, "link", name=TIP_FRAME)
     _fix(robot, flange, TIP_FRAME, tool.needle_length_mm)
     ElementTree.indent(robot, " ")
@@ -44,6 +49,19 @@ def _add_cylinder(
         shape = {"radius": _metres(diameter_mm / 2), "length": _metres(length_mm)}
         ElementTree.SubElement(ElementTree.SubElement(part, "geometry"), "cylinder", shape)
     _fix(robot, flange, name, start_mm)
+
+
+def _add_mesh(robot: ElementTree.Element, flange: str, body: ToolBody) -> None:
+    """The tool's own file, scaled to metres."""
+    link = ElementTree.SubElement(robot, "link", name="tool")
+    T, scale = body.T_flange_file, f"{body.unit_mm * M_PER_MM:.9g}"
+    rpy = " ".join(f"{angle:.12g}" for angle in Rotation.from_matrix(T[:3, :3]).as_euler("xyz"))
+    for kind in ("visual", "collision"):
+        part = ElementTree.SubElement(link, kind)
+        ElementTree.SubElement(part, "origin", rpy=rpy, xyz=" ".join(_metres(value) for value in T[:3, 3]))
+        mesh = {"filename": body.file.resolve().as_uri(), "scale": " ".join([scale] * 3)}
+        ElementTree.SubElement(ElementTree.SubElement(part, "geometry"), "mesh", mesh)
+    _fix(robot, flange, "tool", 0.0)
 
 
 def _fix(robot: ElementTree.Element, flange: str, name: str, at_mm: float) -> None:

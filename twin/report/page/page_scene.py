@@ -113,7 +113,7 @@ def _bodies(
         bodies += needle_bodies(case.needle, case.target_ct, direction).all
     if plan is None or direction is None:
         return bodies, []
-    arm = ArmPicture(plan.model, plan.T_base_ct)
+    arm = ArmPicture(plan.model, plan.T_base_ct, case.tool)
     bodies += arm.bodies(plan.insertion.q[-1])
     tip = case.target_ct + plan.standoff_mm * direction
     waiting = [*arm.bodies(plan.insertion.q[0]), *needle_bodies(case.needle, tip, direction).all]

@@ -20,6 +20,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.reasons import Rgb
+from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.numbers import demanding
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.compositing import (
@@ -188,10 +189,11 @@ def _planned_path(plan: Any) -> SceneBody:
 
 
 def _tool_layer(case: Any) -> Layer:
-    """Needle and holder in the flange frame: the needle points along +z."""
+    """All that the flange carries, in its frame: the needle points along +z."""
     tip = np.array([0.0, 0.0, case.needle.length_mm])
     bodies = needle_bodies(case.needle, tip, np.array([0.0, 0.0, -1.0])).all
-    return Layer([Surface(b.mesh, b.colour) for b in bodies])
+    own = [] if case.tool is None else [Surface(case.tool.mesh, palette.HOLDER)]
+    return Layer([*(Surface(b.mesh, b.colour) for b in bodies), *own])
 
 
 def _wide_camera(case: Any, still: list[SceneBody], arm: ArmPicture, rehearsal: Any, plan: Any) -> ViewCamera:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.links import visual_links
+from puncture_twin.planning.arm.links import Link, visual_links
+from puncture_twin.planning.arm.tool_body import ToolBody
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import SAFE, Rgb
@@ -157,17 +158,23 @@ def needle_text(needle: Any) -> str:
     return f"needle (drawn ⌀ {2 * LEAST_NEEDLE_MM:g} mm, is ⌀ {needle.diameter_mm:g} mm)"
 
 
+FLANGE = 6
+"""The frame with which a tool moves."""
+
+
 class ArmPicture:
     """The arm's links ready to be drawn at any configuration.
 
     Args:
         model: The arm.
         T_base_ct: Shape (4, 4), where the patient is believed (or known) to be.
+        tool: What its flange carries beside needle and holder, or None.
     """
 
-    def __init__(self, model: UrModel, T_base_ct: Floats) -> None:
+    def __init__(self, model: UrModel, T_base_ct: Floats, tool: ToolBody | None = None) -> None:
         self._model = model
-        self._links = visual_links(self._model)
+        own = () if tool is None else (Link("tool", FLANGE, (tool.mesh,)),)
+        self._links = (*visual_links(self._model), *own)
         self._T_ct_base = np.linalg.inv(T_base_ct)
         self.layers = tuple(Layer([Surface(link.mesh, palette.ARM)]) for link in self._links)
 
@@ -180,7 +187,9 @@ class ArmPicture:
         """The links in the CT frame at one configuration."""
         poses = self.poses_ct(q)
         links = (
-            SceneBody(link.name, "arm", link.mesh.transformed(T), palette.ARM)
+            SceneBody(
+                link.name, "arm", link.mesh.transformed(T), palette.HOLDER if link.name == "tool" else palette.ARM
+            )
             for link, T in zip(self._links, poses, strict=True)
         )
         return (*links, self.plate)

@@ -71,7 +71,7 @@ def draw_scene(
     direction = chosen_direction(pick, plan)
     if direction is not None:
         bodies.extend(needle_bodies(case.needle, case.target_ct, direction).all)
-    arm = [] if plan is None else list(ArmPicture(plan.model, plan.T_base_ct).bodies(plan.insertion.q[-1]))
+    arm = [] if plan is None else list(ArmPicture(plan.model, plan.T_base_ct, case.tool).bodies(plan.insertion.q[-1]))
     image = Image.new("RGB", (WIDTH, HEIGHT), annotate.WHITE)
     draw = ImageDraw.Draw(image)
     path_ct = _path(case, pick, plan)
