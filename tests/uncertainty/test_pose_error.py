@@ -1,12 +1,15 @@
 """The needle's covariance: against rooms drawn with exact kinematics, against published formulas, and by its laws."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import chdtri
 from uncertainty_world import NO_ARM, SLICES, declared, world
 
-from puncture_twin.planning.geometry.rigid import exp_rotation, pose
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.registration.conditioning import leverage
+from puncture_twin.planning.registration.registration import MarkerPairs, register
 from puncture_twin.planning.uncertainty.pose_error import error_budget
 from puncture_twin.twin.rehearsal.rooms import draw_rooms
 
@@ -95,6 +98,25 @@ def test_a_base_that_is_moved_changes_nothing_for_the_patient():
     one, other = (world("carton/case_m.toml", "weighted", errors, moved=moved) for moved in (None, T))
     covs = [w.error.tip_covariance_ct(w.puncture.q_insertion[None])[0] for w in (one, other)]
     np.testing.assert_allclose(covs[0], covs[1], rtol=1e-9)
+
+
+@pytest.mark.parametrize("method", ["rigid", "weighted", "joint"])
+@pytest.mark.parametrize("axes", [(1, 2, 0), (2, 0, 1)])
+def test_ct_axes_in_another_order_change_nothing_for_the_robot(method, axes):
+    """Markers, target and declared reading in axes that are named otherwise: the same pose and the same doubt."""
+    w = world("carton/case_m.toml", "weighted", declared(**(SLICES | NOMINAL)))
+    P, rng = np.eye(3)[list(axes)], np.random.default_rng(5)
+    noise, points, target = w.puncture.noise, w.puncture.points_ct, w.puncture.target_ct
+    there = apply(w.puncture.T_base_ct, points) + rng.normal(0, 0.5, points.shape)
+    names, told = tuple("ABC"), []
+    for turn in (np.eye(3), P):
+        turned = replace(noise, cov_ct=turn @ noise.cov_ct @ turn.T)
+        markers = MarkerPairs(names, points @ turn.T, there)
+        fitted = register(markers, method=method, target_ct=turn @ target, noise=turned, accept_residuals=True)
+        at = apply(fitted.T_base_ct, turn @ target)
+        told.append((at, fitted.uncertainty.cov_at(at)))
+    np.testing.assert_allclose(told[0][0], told[1][0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(told[0][1], told[1][1], rtol=1e-7, atol=1e-12)
 
 
 def test_the_budget_adds_up():
