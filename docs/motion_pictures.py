@@ -93,11 +93,11 @@ def draw_bevel(axes):
     """The needle in tissues of three stiffnesses, and a turned one."""
     shaft, count = Shaft(200.0, *GAUGES[18]), 120
     for k, colour in ((0.01, GREEN), (0.1, BLUE), (0.4, ORANGE)):
-        path = bevel_path(shaft, np.full(count, k), np.full(count, np.radians(1.0)))
+        path = bevel_path(shaft, np.full(count, k), np.full(count, np.radians(1.0)), 1.0)
         axes.plot(path.depth_mm, path.cut_mm, color=colour, label=f"path cut, k = {k:g} N/mm²")
         axes.plot(path.depth_mm, path.needle_mm, "--", color=colour, linewidth=1)
     rotated = np.radians(np.where(np.arange(count) < 30, 1.0, -1.0))
-    path = bevel_path(shaft, np.full(count, 0.1), rotated)
+    path = bevel_path(shaft, np.full(count, 0.1), rotated, 1.0)
     axes.plot(path.depth_mm, path.cut_mm, color=RED, label="turned by 180° at 30 mm, k = 0.1")
     axes.plot([], [], "--", color="grey", linewidth=1, label="the shaft, once all is in")
     axes.set(xlabel="depth in tissue, mm", ylabel="off the straight line, mm", title="18G tube, bevel 1°")

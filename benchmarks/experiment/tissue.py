@@ -8,10 +8,10 @@ import numpy as np
 
 from benchmarks.experiment.row import Row
 from puncture_twin.planning.needle.beam import Beam
-from puncture_twin.planning.needle.bevel_path import bevel_path
-from puncture_twin.planning.needle.deflection import deflection_bound
+from puncture_twin.planning.needle.bevel_path import bevel_path, step_for
+from puncture_twin.planning.needle.deflection import ALLOWANCE, MOST_SLENDER, deflection_bound
 from puncture_twin.planning.needle.insertion_force import insertion_force
-from puncture_twin.planning.needle.shaft import Shaft
+from puncture_twin.planning.needle.shaft import GAUGES, Shaft
 from puncture_twin.planning.needle.tissue import Layer, Tissue
 
 SHAFT = Shaft(200.0, 1.27)
@@ -27,7 +27,7 @@ LAYERS = (
 
 def rows() -> list[Row]:
     """All figures of the part."""
-    return [*_beam(), *_shafts(), *_bevel(), *_force()]
+    return [*_beam(), *_shafts(), *_bevel(), *_orders(), *_force()]
 
 
 def _beam() -> list[Row]:
@@ -65,7 +65,15 @@ def _bevel() -> list[Row]:
         found.append(Row(f"18G at 100 mm, k {k:g} N/mm2: mm off per degree", f"{ends[1] / 3:.2f}", "", True))
         change = 100 * float(np.abs(np.diff(ends)).max()) / ends[-1]
         found.append(Row.at_most("... halving the step changes it by, %", change, 1.5))
-    long = bevel_path(Shaft(500.0, 1.27), np.full(400, 0.1), np.full(400, np.radians(1.0))).cut_mm
+    thin, depth = Shaft(150.0, *GAUGES[25]), 5.0
+    count = int(np.ceil(depth / step_for(thin, 10.0)))
+    ends = [
+        bevel_path(thin, np.full(n, 10.0), np.full(n, np.radians(1.0)), depth / n).cut_mm[-1]
+        for n in (count, 2 * count)
+    ]
+    what = f"25G, 5 mm deep in 10 N/mm2, {count} steps: halving them changes it by, %"
+    found.append(Row.at_most(what, 100 * abs(ends[1] / ends[0] - 1), 1.5))
+    long = bevel_path(Shaft(500.0, 1.27), np.full(400, 0.1), np.full(400, np.radians(1.0)), 1.0).cut_mm
     circle = 2 * (0.1 / (4 * SHAFT.bending_stiffness)) ** 0.25 * np.radians(1.0)
     curvature = float(np.diff(long[-60:], 2).mean()) / circle
     found.append(Row.between("curvature far from the holder over 2 l alpha", curvature, 0.99, 1.01))
@@ -80,6 +88,31 @@ def _bevel() -> list[Row]:
     bound = deflection_bound(SHAFT, np.radians(0.5), tissues, 150.0)
     found.append(Row("bound of 0.5 deg at 100 mm in the stiffest, mm", f"{float(bound.at(100.0)):.2f}", "", True))
     return found
+
+
+def beyond(slenderness: float, depth: float = 12.0) -> float:
+    """By which fraction a thin stiff layer before a gap takes the tip beyond the stiffest tissue alone, at most.
+
+    Args:
+        slenderness: lambda L.
+        depth: Of the path, over 1 / lambda.
+    """
+    rate, count = slenderness / SHAFT.length_mm, int(16 * min(depth, slenderness))
+    stiffest, alpha = 4 * SHAFT.bending_stiffness * rate**4, np.full(count, 0.01)
+    alone = bevel_path(SHAFT, np.full(count, stiffest), alpha, 1 / 16 / rate).largest_mm[1:]
+    worst = 0.0
+    for thick in (5, 7, 10, 12, 14, 19):  # sixteenths of 1 / lambda
+        k = np.where(np.arange(count) < thick, stiffest, 0.0)
+        worst = max(worst, float((bevel_path(SHAFT, k, alpha, 1 / 16 / rate).largest_mm[1:] / alone).max()) - 1)
+    return worst
+
+
+def _orders() -> list[Row]:
+    """Up to the most slender shaft that a case may declare."""
+    what = "a thin stiff layer before a gap, beyond the stiffest alone, lambda L"
+    found = [Row(f"{what} {one:g}, %", f"{100 * beyond(one):.1f}", "", True) for one in (20.0, 40.0, 80.0)]
+    most = MOST_SLENDER
+    return [*found, Row.at_most(f"{what} {most:g}, %", 100 * beyond(most), 100 * ALLOWANCE - 3, ".1f")]
 
 
 def _force() -> list[Row]:

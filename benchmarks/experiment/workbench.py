@@ -171,6 +171,6 @@ def pressed_by(force_n):
 def tissue(entry_base, into_base, degrees=1.0):
     """Skin that ruptures at 4 N, a capsule at 25 mm, cutting and friction; a bevel that cuts to the flange's x."""
     count = 50
-    path = bevel_path(SHAFT, np.full(count, 0.1), np.full(count, np.radians(degrees)))
+    path = bevel_path(SHAFT, np.full(count, 0.1), np.full(count, np.radians(degrees)), 1.0)
     passed = Insertion(path, insertion_force(LAYERS), np.inf, np.inf)
     return TrueTissue(passed, StraightPath(entry_base, into_base), 0.0, SHAFT.length_mm)

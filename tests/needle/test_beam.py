@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from benchmarks.experiment.tissue import beyond
 from puncture_twin.planning.needle.beam import Beam
-from puncture_twin.planning.needle.bevel_path import bevel_path
-from puncture_twin.planning.needle.deflection import deflection_bound
+from puncture_twin.planning.needle.bevel_path import bevel_path, step_for
+from puncture_twin.planning.needle.deflection import ALLOWANCE, MOST_SLENDER, deflection_bound, stiffest_resolved
 from puncture_twin.planning.needle.shaft import GAUGES, Shaft
 from puncture_twin.planning.needle.tissue import Tissue
 
@@ -97,6 +98,49 @@ def test_the_path_converges():
     assert changes[2] < changes[1] < changes[0]
 
 
+def needle_and_tissue(rng):
+    """A shaft and a stiffness of what a case may declare, log-uniform, in no more than 300 steps."""
+    while True:
+        length, outer, modulus, k = np.exp(rng.uniform(np.log([10, 0.1, 20, 1e-4]), np.log([400, 4, 250, 100])))
+        shaft = Shaft(float(length), float(outer), float(outer * rng.choice([0.0, 0.7])), float(modulus))
+        count = int(np.ceil(length * rng.uniform(0.05, 1.0) / step_for(shaft, k)))
+        if count <= 300 and k <= stiffest_resolved(shaft):
+            return shaft, float(k), count
+
+
+def test_halving_the_step_changes_little_whatever_is_declared(rng):
+    """From any shaft to any tissue that it is not too thin for, also in layers: see `OF_BENDING`."""
+    for one in range(24):
+        shaft, stiffest, count = needle_and_tissue(rng)
+        k = layers(rng, stiffest, count) if one % 2 else np.full(count, stiffest)
+        alpha, step = np.full(count, np.radians(1.0)), step_for(shaft, stiffest)
+        found = bevel_path(shaft, k, alpha, step)
+        finer = bevel_path(shaft, np.repeat(k, 2), np.repeat(alpha, 2), step / 2)
+        changed = np.abs(finer.cut_mm[2::2] - found.cut_mm[1:]) / finer.cut_mm[2::2]
+        assert changed[16:].max(initial=0.0) < 0.015 and changed.max() < 0.03
+        assert found.largest_mm[-1] == pytest.approx(finer.largest_mm[-1], rel=0.015)
+
+
+def test_the_step_shortens_for_thin_needles_in_stiff_tissue_alone():
+    """An 18G in tissue keeps 1 mm; a 25G in what is as stiff as rubber does not, nor a short one."""
+    assert step_for(TUBE_18, 0.3) == step_for(TUBE_18, 0.0) == 1.0
+    thin = Shaft(150.0, *GAUGES[25])
+    assert step_for(thin, 10.0) == pytest.approx((4 * thin.bending_stiffness / 10.0) ** 0.25 / 16)
+    assert step_for(thin, 10.0) < 0.3
+    assert step_for(Shaft(10.0, 4.0), 1e-3) == pytest.approx(10 / 64)
+
+
+def test_a_very_slender_shaft_needs_the_first_steps_most():
+    """150 times as long as it bends over: 1.5 % would not hold in the first steps, and does from the sixteenth on."""
+    shaft = Shaft(750.0, 0.3)
+    k, alpha = np.full(64, stiffest_resolved(shaft)), np.full(64, np.radians(1.0))
+    step = step_for(shaft, k[0])
+    coarse = bevel_path(shaft, k, alpha, step).cut_mm[1:]
+    finer = bevel_path(shaft, np.repeat(k, 2), np.repeat(alpha, 2), step / 2).cut_mm[2::2]
+    changed = np.abs(finer - coarse) / finer
+    assert changed.max() > 0.015 and changed.max() < 0.03 and changed[16:].max() < 0.015
+
+
 @pytest.mark.parametrize("k", [0.05, 0.1, 0.4])
 def test_a_bevel_steers_a_long_needle_along_a_circle(k):
     """Far from the holder the path's curvature is 2 l alpha: l = (k / 4 EI)^(1/4), a tip that is held, without moment.
@@ -132,6 +176,37 @@ def test_a_needle_that_is_turned_comes_back():
     np.testing.assert_allclose(path(-3.0, turned_at=30).cut_mm, -turned.cut_mm, atol=1e-12)
 
 
+def layers(rng, stiffest, count):
+    """k of each step: the stiffest in one of five layers, a gap in another."""
+    cuts = np.sort(rng.integers(0, count, 4))
+    return stiffest * np.array([1.0, 0.0, 0.1, 0.5, 0.01])[rng.permutation(5)][np.searchsorted(cuts, np.arange(count))]
+
+
+def test_a_needle_of_other_size_in_the_same_layers_goes_the_same_way(rng):
+    """With lengths over 1 / rate and deflections over alpha / rate, neither EI nor k is left in the equations."""
+    one, other = Shaft(120.0, 1.2), Shaft(300.0, 0.8, 0.4, 120.0)
+    size = other.length_mm / one.length_mm
+    k = layers(rng, 0.3, 60)
+    scaled = k * other.bending_stiffness / one.bending_stiffness / size**4
+    found = bevel_path(one, k, np.full(60, 0.01), 1.0)
+    larger = bevel_path(other, scaled, np.full(60, 0.03), size)
+    np.testing.assert_allclose(larger.cut_mm, 3 * size * found.cut_mm, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(larger.largest_mm, 3 * size * found.largest_mm, rtol=1e-6, atol=1e-9)
+
+
+def test_in_given_layers_a_bevel_that_never_turns_goes_furthest(rng):
+    """The path is linear in alpha, and what a bevel does at one depth alone never takes the tip to the other side."""
+    shaft = Shaft(100.0, 1.0)
+    for one in range(8):
+        rate, count = np.exp(rng.uniform(np.log(0.01), np.log(0.4))), int(rng.integers(8, 33))
+        stiffest, step = 4 * shaft.bending_stiffness * rate**4, min(0.125 / rate, 100.0 / count)
+        k = layers(rng, stiffest, count) if one % 2 else np.full(count, stiffest)
+        alone = np.array([bevel_path(shaft, k, alpha, step).cut_mm for alpha in np.eye(count)])
+        assert alone.min() >= 0.0
+        alpha = rng.uniform(-1, 1, count)
+        np.testing.assert_allclose(alpha @ alone, bevel_path(shaft, k, alpha, step).cut_mm, atol=1e-6)
+
+
 def test_no_order_of_layers_goes_beyond_the_bound(rng):
     """Random layers no stiffer than the stiffest, a bevel that turns at random, depths up to the longest."""
     tissues = [Tissue(k) for k in (0.01, 0.05, 0.3)]
@@ -141,12 +216,17 @@ def test_no_order_of_layers_goes_beyond_the_bound(rng):
         cuts = np.sort(rng.integers(0, count, 4))
         k = np.array([0.01, 0.05, 0.3, 0.0, 0.01])[rng.permutation(5)][np.searchsorted(cuts, np.arange(count))]
         alpha = np.radians(1.0) * (np.ones(count) if rng.random() < 0.5 else rng.choice([-1.0, 1.0], count))
-        found = bevel_path(TUBE_18, k, alpha)
+        found = bevel_path(TUBE_18, k, alpha, step_for(TUBE_18, 0.3))
         assert found.largest_mm[-1] <= bound.at(count) - bound.sag_mm
-    worst = np.repeat([48.9, 0.0], [2, 15])  # the order that went nearly furthest beyond the stiffest tissue alone
-    thin, alpha = Shaft(266.0, *GAUGES[24]), np.full(17, np.radians(1.0))
+    thin, per_mm = Shaft(266.0, *GAUGES[24]), 8  # the order that went nearly furthest beyond the stiffest tissue alone
+    worst, alpha = np.repeat([48.9, 0.0], [2 * per_mm, 15 * per_mm]), np.full(17 * per_mm, np.radians(1.0))
+    assert 1 / per_mm <= step_for(thin, 48.9)
     limit = deflection_bound(thin, np.radians(1.0), [Tissue(48.9)], 17.0)
-    alone = bevel_path(thin, np.full(17, 48.9), alpha).largest_mm[-1]
-    assert 1.17 * alone < bevel_path(thin, worst, alpha).largest_mm[-1] <= limit.at(17.0) - limit.sag_mm
+    alone = bevel_path(thin, np.full(len(alpha), 48.9), alpha, 1 / per_mm).largest_mm[-1]
+    furthest = bevel_path(thin, worst, alpha, 1 / per_mm).largest_mm[-1]
+    assert 1.14 * alone < furthest <= limit.at(17.0) - limit.sag_mm
+    most = beyond(MOST_SLENDER, 10.0)
+    assert 0.18 < most < ALLOWANCE - 0.03  # the step's
+    assert 0.0 < beyond(20.0, 3.0) < 0.02
     assert bound.at(100.0) > bound.at(50.0) > bound.at(0.0) == bound.sag_mm
     assert bound.at(101.0) == np.inf and np.isnan(bound.at(np.nan))

@@ -9,7 +9,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.needle.bending import Bending
-from puncture_twin.planning.needle.bevel_path import STEP_MM, BevelPath, bevel_path
+from puncture_twin.planning.needle.bevel_path import BevelPath, bevel_path, step_for
 from puncture_twin.planning.needle.insertion_force import InsertionForce, insertion_force
 from puncture_twin.planning.search.bending.path_layers import path_layers
 
@@ -54,7 +54,8 @@ def insertion_along(
         path_length: From there to the skin, mm.
     """
     layers = path_layers(bending, anatomy, end_ct, outward_ct, path_length)
-    count = max(1, round(path_length / STEP_MM))
+    stiffest = max(layer.tissue.stiffness_n_mm2 for layer in layers)
+    count = max(1, int(np.ceil(path_length / step_for(bending.shaft, stiffest))))
     middles = (np.arange(count) + 0.5) * path_length / count
     ends = np.array([layer.end_mm for layer in layers])
     at = np.minimum(np.searchsorted(ends, middles), len(layers) - 1)

@@ -13,7 +13,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.labels.naming import REST
 from puncture_twin.planning.needle.bending import Bending
-from puncture_twin.planning.needle.deflection import SHORTEST_BEND_MM, stiffest_resolved
+from puncture_twin.planning.needle.deflection import shortest_bend, stiffest_resolved
 from puncture_twin.planning.needle.tissue import Layer
 from puncture_twin.planning.search.along_path import inside_at
 
@@ -33,7 +33,8 @@ def check_tissues(case: Case, anatomy: Anatomy) -> None:
     tissues.check([one.name for one in anatomy.structures], "tissue", case.path)
     for pattern, tissue in tissues.of_pattern.items():
         if tissue.stiffness_n_mm2 > most:
-            what = f"tissue.{pattern}: {tissue.stiffness_n_mm2:g} N/mm2 bends this shaft within {SHORTEST_BEND_MM:g} mm"
+            bend = shortest_bend(case.bending.shaft)
+            what = f"tissue.{pattern}: {tissue.stiffness_n_mm2:g} N/mm2 bends this shaft within {bend:.2g} mm"
             allowed = f"at most {most:.3g} N/mm2 for it: beyond, no bound of its bending is known"
             raise InputError(what, where=case.path, allowed=allowed)
 

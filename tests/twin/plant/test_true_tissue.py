@@ -20,7 +20,9 @@ X, Y = np.array([0.8, 0.0, 0.6]), np.array([0.0, 1.0, 0.0])
 
 def insertion():
     """Of a bevel that never turns."""
-    return Insertion(bevel_path(SHAFT, np.full(60, 0.1), np.full(60, 0.02)), insertion_force(LAYERS), np.inf, np.inf)
+    return Insertion(
+        bevel_path(SHAFT, np.full(60, 0.1), np.full(60, 0.02), 1.0), insertion_force(LAYERS), np.inf, np.inf
+    )
 
 
 def tip(depth):
