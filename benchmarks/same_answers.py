@@ -4,8 +4,9 @@
 
 BEFORE and AFTER are checkouts of this project. Both run the same commands on the same copies of the embedded cases
 and, with --data (TotalSegmentator's example: ct.nii.gz and both label maps), of the real CT: search with a certificate,
-plan, export, rehearse, register, place, servo and self-calibration. Every file that is written and all that is printed
-must be equal, pictures and films included; only wall times may differ. Each side keeps a cache of its own.
+plan, export, rehearse, register, place, servo, self-calibration, and the experiment (scan, touch, pivot, sweep). Every
+file that is written and all that is printed must be equal, pictures and films included; only wall times may differ.
+Each side keeps a cache of its own.
 """
 
 import argparse
@@ -49,6 +50,12 @@ def commands(cases: Path) -> Iterator[Command]:
             words = ("export", f"{case}-plan/plan.json", "--format", form, "--case", path)
             yield Command(f"{case}-{form}", (*words, "--out", f"{case}-{form}"))
         yield Command(f"{case}-rehearse", ("rehearse", path, "--out", f"{case}-rehearse"), slow=True)
+    carton, angles = str(cases / "carton" / "case_m.toml"), ("--theta", "18", "--beta", "232")
+    yield Command("carton-scan", ("scan", carton, "--spacing", "5", "--pixel", "2", "--out", "carton-scan"))
+    yield Command("carton-touch", ("touch", carton, *angles, "--out", "carton-touch"), slow=True)
+    yield Command("carton-pivot", ("pivot", carton, "--poses", "4", "--out", "carton-pivot"), slow=True)
+    sweep = ("rehearse", carton, *angles, "--sweep", "--to", "24,226", "--out", "carton-sweep")
+    yield Command("carton-sweep", sweep, slow=True)
     check = ("check", str(cases / "abdomen"), "--theta", "30", "--beta", "100", "--json")
     yield Command("abdomen-check", check)
     yield Command("place", ("place", str(cases / "abdomen"), "--out", "place"), slow=True)
@@ -66,7 +73,7 @@ def main() -> int:
     parser.add_argument("after", type=Path)
     parser.add_argument("--data", type=Path)
     parser.add_argument("--out", type=Path, help="Where both sides' outputs stay; a temporary folder if left out.")
-    parser.add_argument("--quick", action="store_true", help="Without rehearse, place, servo and selfcal.")
+    parser.add_argument("--quick", action="store_true", help="Without those that take long.")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         out = (arguments.out or Path(name)).resolve()

@@ -47,6 +47,10 @@ WRITTEN = {
     "servo": ("camera_1.png", "camera_2.png", "convergence.png", "servo.html"),
     "selfcal": ("calibration.json", "recording.csv", "bmode.png", "room.png", "report.html"),
     "batch merge": ("candidates/id=1/a.parquet", "candidates/id=2/a.parquet", "cases.parquet", "cohort.html"),
+    "scan": ("dicom/IM0001.dcm", "ct.nii.gz", "labels.nii.gz", "markers_ct.csv", "scan.json", "scan.png"),
+    "touch": ("touch.csv", "touch.json"),
+    "pivot": ("pivot.csv", "pivot.json"),
+    "sweep": ("sweep.json", "sweep.png"),
     "reproduce": ("camera_1.png", "camera_2.png", "convergence.png", "servo.html"),
 }
 """What each command writes; sizes do not matter, so a few hundred bytes stand for each."""
@@ -167,6 +171,22 @@ def test_export_killed_at_random(plans, tmp_path):
     """The same."""
     runs = [["export", plan, "--format", "csv"] for plan in plans]
     kills("export", "export plan.csv", runs, [sha256(plan) for plan in plans], tmp_path / "out")
+
+
+@needs_time
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("scan", ["scan", "--spacing", "5", "--pixel", "2"]),
+        ("touch", ["touch", "--theta", "18", "--beta", "232"]),
+        ("pivot", ["pivot", "--poses", "4"]),
+        ("sweep", ["rehearse", "--theta", "18", "--beta", "232", "--sweep", "--to", "19,231"]),
+    ],
+)
+def test_the_experiment_killed_at_random(command, words, world, tmp_path):
+    """Each of its commands on both cases in turn, into one folder."""
+    runs = [[words[0], case, *words[1:]] for case in world[1]]
+    kills(command, command, runs, [sha256(case) for case in world[1]], tmp_path / "out")
 
 
 @needs_time

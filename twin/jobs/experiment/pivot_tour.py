@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,6 @@ import numpy as np
 from puncture_twin.planning.arm.error_jacobian import PARAMETERS
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.formats.points.point_files import NamedPoints, write_points
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
@@ -22,6 +20,7 @@ from puncture_twin.planning.touch.pivot_planner import LEAST_POSES, MOST_POSES, 
 from puncture_twin.planning.touch.touch_plan import TouchTour
 from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, approach_checkers
 from puncture_twin.twin.jobs.experiment.pivot_job import PivotRun, calibrated, pivot_text
+from puncture_twin.twin.jobs.experiment.result_file import write_result
 from puncture_twin.twin.plant.touch_truth import TouchTruth, draw_pivot_truth
 from puncture_twin.twin.rehearsal.touching import Touched, execute_touches
 
@@ -119,8 +118,7 @@ def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats |
         run = PivotTourRun(found, seed, tour.touches[0].point_base, true_tip, touched, files)
         points = np.array([one.point_base for one in touched.readings])
         write_points(draft.folder / PIVOT, NamedPoints(names, points, None, joints=joints))
-        with atomic(draft.folder / SUMMARY) as temporary:
-            temporary.write_text(json.dumps(run.summary(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        write_result(run.summary(), draft.folder / SUMMARY, out)
     return run
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
@@ -20,6 +18,7 @@ from puncture_twin.planning.search.selection.choice import Choice, choose, chose
 from puncture_twin.planning.search.selection.windows import find_windows
 from puncture_twin.planning.sweep.sweep_plan import SweepPlan
 from puncture_twin.planning.sweep.sweep_planner import plan_sweep
+from puncture_twin.twin.jobs.experiment.result_file import write_result
 from puncture_twin.twin.rehearsal.sweeping import Swept, execute_sweep
 
 SWEEP = "sweep.json"
@@ -95,8 +94,7 @@ def sweep_case(context: CaseContext, out: Path, choice: Choice, to: Angles | Non
             swept = execute_sweep(plan, case, context.anatomy, context.placement.T_base_ct)
         files = draft.final((draft.folder / SWEEP,))
         run = SweepRun(case.name, case.inputs, case.rehearsal.control, plan, swept, files)
-        with atomic(draft.folder / SWEEP) as temporary:
-            temporary.write_text(json.dumps(run.summary(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        write_result(run.summary(), draft.folder / SWEEP, out)
     return run
 
 

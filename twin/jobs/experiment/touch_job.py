@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,7 +11,6 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.case.errors import ErrorModel
@@ -30,6 +28,7 @@ from puncture_twin.planning.touch.touch_planner import (
     plan_touches,
     registered,
 )
+from puncture_twin.twin.jobs.experiment.result_file import write_result
 from puncture_twin.twin.plant.touch_truth import AtTarget, TouchTruth, draw_at_target, draw_touch_truth, nominal_tip
 from puncture_twin.twin.plant.true_needle import true_needle
 from puncture_twin.twin.rehearsal.distribution import misregistered
@@ -142,8 +141,7 @@ def touch_case(context: CaseContext, out: Path, choice: Choice, seed: int) -> To
         run = TouchRun(context.case.name, context.case.inputs, seed, planned.plan, touched, use, files)
         if touched.readings:
             write_points(draft.folder / TOUCH, _points(touched))
-        with atomic(draft.folder / SUMMARY) as temporary:
-            temporary.write_text(json.dumps(run.summary(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        write_result(run.summary(), draft.folder / SUMMARY, out)
     return run
 
 
