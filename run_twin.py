@@ -138,7 +138,7 @@ def search(
     ] = None,
     certify_touch: Annotated[
         float | None,
-        typer.Option(metavar="P", help="With --certify: no structure is touched more often, to first order."),
+        typer.Option(metavar="P", help="With --certify: no structure is touched more often."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtri, stdtrit
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
 from puncture_twin.planning.base.arrays import Floats
@@ -19,7 +18,7 @@ from puncture_twin.planning.uncertainty.any_pose import any_pose
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 MOST_TOUCH = 0.5
-"""Above it the bound of the deviation bounds nothing: a wider spread would make a likely touch less likely."""
+"""More than every other needle is no limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +41,7 @@ class Question:
         structures: Names of the k structures that demand a margin.
         margins: Shape (k,), their margins; with ``touch`` at least so wide that the chance is kept.
         lengths: Shape (k,), how far the needle's axis is checked against each.
-        touch: The chance to touch each structure, to first order, that no safe cell exceeds; None asks for none.
+        touch: The chance to touch each structure that no safe cell exceeds; None asks for none.
     """
 
     case_name: str
@@ -111,7 +110,7 @@ def question_of(
 
 
 def _margins(case: Case, demanding: list[Structure], touch: float | None, error: PoseError | None) -> Floats:
-    """The structures' margins, (k,), mm; z sigma where that is more, sigma the most that any configuration leaves."""
+    """The structures' margins, (k,), mm; where that is more, what keeps the chance in any configuration."""
     margins = np.array([s.margin_mm for s in demanding], dtype=np.float64)
     if touch is None:
         return margins
@@ -121,6 +120,6 @@ def _margins(case: Case, demanding: list[Structure], touch: float | None, error:
         message = "a chance to touch cannot be certified: only markers and [errors] give the needle's error"
         raise InputError(message, where=case.path, allowed="[registration] with markers, and [errors]; or no chance")
     farthest = np.array([np.linalg.norm(s.mesh.vertices - case.target_ct, axis=1).max() for s in demanding])
-    sigma = any_pose(error).of_distance(np.minimum(farthest, axis_lengths(case, demanding)))
-    z = -ndtri(touch) if error.freedom is None else -stdtrit(error.freedom, touch)
-    return np.asarray(np.maximum(margins, z * sigma))
+    lengths = axis_lengths(case, demanding)
+    kept = any_pose(error).margin(touch, error.freedom, farthest, lengths, case.needle.radius_mm)
+    return np.asarray(np.maximum(margins, kept))

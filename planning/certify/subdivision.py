@@ -69,7 +69,7 @@ def certify(
         size: Cells of a smaller angular diameter stay undecided, rad.
         theta: The cap's puncture angles, rad; the case's own for None.
         beta: The cap's azimuths, rad; the case's own for None.
-        touch: A chance to touch each structure, to first order, that no safe cell may exceed in any configuration of
+        touch: A chance to touch each structure that no safe cell may exceed in any configuration of
             the arm; None asks for none.
         error: Of the case's needle; needed for a chance.
 

@@ -7,6 +7,15 @@ values), so that for every q
     sqrt(lmax Sigma_dd) <= deviation_mm,   sqrt(lmax Sigma_phiphi) <= deviation_rad.
 
 A distance whose gradient is g = (n; s u x n), |n| = |u| = 1, then deviates by deviation_mm + s deviation_rad at most.
+
+A point of the axis at depth s is displaced by no more than |d| + s |phi|, phi across the axis, and a surface by e. With
+(d, phi, e) whitened to w of 6 dimensions, Cauchy and Schwarz give for all s at once
+
+    |d| + s |phi| + |e| <= |w| hypot(deviation_mm + s deviation_rad, surface_mm),
+
+and |w|^2 is chi-squared (6 times Fisher's F where the residuals gave the noise's size). So a distance that is larger
+than the needle's radius by z times this, z^2 the quantile of 1 - P, is used up with a chance of P at most, whatever the
+surface's shape.
 """
 
 from __future__ import annotations
@@ -14,6 +23,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import chdtri, fdtri
 
 from puncture_twin.planning.arm.error_jacobian import PARAMETERS
 from puncture_twin.planning.base.arrays import Floats
@@ -31,6 +41,31 @@ class AnyPose(NamedTuple):
     def of_distance(self, depth_mm: Floats) -> Floats:
         """Bound of the standard deviation of distances whose nearest axis points lie no deeper than this, (k,), mm."""
         return np.hypot(self.deviation_mm + depth_mm * self.deviation_rad, self.surface_mm)
+
+    def margin(
+        self, chance: float, freedom: int | None, farthest_mm: Floats, lengths_mm: Floats, radius_mm: float
+    ) -> Floats:
+        """Clearance at which no needle touches a structure more often than ``chance``, whatever its shape, (k,), mm.
+
+        Beyond ``farthest`` the axis leaves the structure by as much as it goes on, which is more than it is displaced
+        by as soon as it has left it by ``beyond``: deeper points never decide.
+
+        Args:
+            chance: P.
+            freedom: Of the residuals that gave the noise's size; None where it is declared.
+            farthest_mm: Shape (k,), the structures' greatest distances from the target.
+            lengths_mm: Shape (k,), how long the axis is.
+            radius_mm: The needle's.
+        """
+        count = 5 + (self.surface_mm > 0)
+        square = chdtri(count, chance) if freedom is None else count * fdtri(count, freedom, 1.0 - chance)
+        z = np.sqrt(square)
+        kept, deepest = 1.0 - z * self.deviation_rad, np.asarray(lengths_mm, dtype=np.float64)
+        if kept > 0.0:
+            straight = self.deviation_mm + self.surface_mm + farthest_mm * self.deviation_rad
+            beyond = (radius_mm + z * straight) / kept
+            deepest = np.minimum(farthest_mm + beyond, deepest)
+        return np.asarray(z * self.of_distance(deepest))
 
 
 def any_pose(error: PoseError) -> AnyPose:
