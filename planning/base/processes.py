@@ -1,11 +1,14 @@
-"""Work on processes of this machine, each of which starts anew: libraries with threads do not survive a fork."""
+"""Work on processes of this machine, each of which starts anew: libraries with threads do not survive a fork.
+
+And on threads, where compiled code does it.
+"""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from functools import partial
 from typing import TypeVar
@@ -45,6 +48,29 @@ def process_pool(jobs: int, pieces: int) -> Iterator[ProcessPoolExecutor]:
     pool = ProcessPoolExecutor(worker_count(jobs, pieces), mp_context=context)
     try:
         yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def on_threads(work: Callable[[int], None], pieces: int, threads: int) -> Iterator[int]:
+    """Do pieces of work that let go of the interpreter, side by side; yields how many are done.
+
+    Args:
+        work: Called with the number of a piece.
+        pieces: How many there are.
+        threads: What the caller wants; see `worker_count`.
+    """
+    threads = worker_count(threads, pieces)
+    if threads == 1:
+        for piece in range(pieces):
+            work(piece)
+            yield piece + 1
+        return
+    pool = ThreadPoolExecutor(threads)
+    try:
+        for done, one in enumerate(as_completed([pool.submit(work, piece) for piece in range(pieces)])):
+            one.result()
+            yield done + 1
     finally:
         pool.shutdown(cancel_futures=True)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.processes import on_threads
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.direction_tiles import Tiles, bundle
 from puncture_twin.planning.clearance.engine import AxisDistances
@@ -30,6 +31,12 @@ COORDINATE_SLACK = 1e-6
 
 FCL_BEYOND_MM = 1.0
 """Farther from a capsule FCL sees nothing: its tolerance is 1e-6 mm, and the bounds' rounding 1e-5 mm."""
+
+MOST_THREADS = 16
+"""The largest structure takes a sixth of a search; more threads would wait for it."""
+
+WORTH_THREADS = 20_000
+"""Answers, a few milliseconds of work: below, starting threads takes as long."""
 
 LONGEST_MM = 1e9
 """A needle that could reach the nodes that only fill a level up would be measured from them."""
@@ -55,16 +62,23 @@ class FastEngine:
         meshes: The k surfaces, in the CT frame, mm.
         progress: Called with (structures done x directions, directions x structures).
         memory: Where packed surfaces are kept.
+        threads: At most so many structures are searched side by side, and one a core; each is searched by itself, so
+            the answer is the same to the bit.
 
     Attributes:
         counts: Shape (7,), what all searches so far went through, see `tile_search.COUNTED`.
     """
 
     def __init__(
-        self, meshes: Sequence[TriangleMesh], progress: Count | None = None, memory: Memory = NO_MEMORY
+        self,
+        meshes: Sequence[TriangleMesh],
+        progress: Count | None = None,
+        memory: Memory = NO_MEMORY,
+        threads: int = MOST_THREADS,
     ) -> None:
         self._blocks = tuple(_packed(mesh, memory) for mesh in meshes)
-        self._seen: tuple[Floats, list[_Placed]] | None = None
+        self._seen: tuple[Floats, tuple[_Placed, ...]] | None = None
+        self._threads = threads
         self._progress = progress
         self.counts = np.zeros(len(COUNTED), np.int64)
 
@@ -80,12 +94,18 @@ class FastEngine:
         if not (sound and np.all((lengths >= 0.0) & (lengths <= LONGEST_MM))):
             raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
         distance, depth, nearest = np.empty(shape), np.empty(shape), np.empty(shape, np.int32)
+        counts = np.zeros((len(self._blocks), len(COUNTED)), np.int64)
         tiles, seen = bundle(outward), self._seen_from(target)
-        for row, blocks in enumerate(self._blocks):
+
+        def search(row: int) -> None:
             answer = AxisDistances(distance[row], depth[row], nearest[row])
-            _one_structure(blocks, next(seen), tiles, target, lengths[row], answer, self.counts)
+            _one_structure(self._blocks[row], seen[row], tiles, target, lengths[row], answer, counts[row])
+
+        many = np.prod(shape) >= WORTH_THREADS
+        for done in on_threads(search, len(self._blocks), self._threads if many else 1):
             if shown and self._progress is not None:
-                self._progress((row + 1) * len(outward), len(self._blocks) * len(outward))
+                self._progress(done * len(outward), len(self._blocks) * len(outward))
+        self.counts += counts.sum(axis=0)
         return AxisDistances(distance.T, depth.T, nearest.T)
 
     def normals(self, target_ct: Floats, outward_ct: Floats, axes: AxisDistances) -> Floats:
@@ -93,15 +113,11 @@ class FastEngine:
         triangles = [blocks.triangles for blocks in self._blocks]
         return normals_of(triangles, target_ct, outward_ct, axes)
 
-    def _seen_from(self, target: Floats) -> Iterator[_Placed]:
-        """The surfaces as seen from a target, one by one; those of the last target are kept."""
+    def _seen_from(self, target: Floats) -> tuple[_Placed, ...]:
+        """The surfaces as seen from a target; those of the last target are kept."""
         if self._seen is None or not np.array_equal(self._seen[0], target):
-            self._seen = (target.copy(), [])
-        kept = self._seen[1]
-        for row, blocks in enumerate(self._blocks):
-            if row == len(kept):
-                kept.append(_placed(blocks, target))
-            yield kept[row]
+            self._seen = (target.copy(), tuple(_placed(blocks, target) for blocks in self._blocks))
+        return self._seen[1]
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
         """FCL collision of a capsule with one structure; see `ClearanceEngine`.

@@ -10,7 +10,7 @@ from places import DATA
 
 from puncture_twin import meshes
 from puncture_twin.planning.clearance.engine import AxisDistances
-from puncture_twin.planning.clearance.fast_engine import FastEngine
+from puncture_twin.planning.clearance.fast_engine import WORTH_THREADS, FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.clearance.measure import NEAR_THRESHOLD_MM, ROUNDING_MM, too_near
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -140,6 +140,18 @@ def test_fcl_says_of_the_near_triangles_what_it_says_of_the_whole_surface(abdome
             assert said[-1] == whole.collides(*asked)
     assert 0.3 < np.mean(said) < 0.7
     assert len(said) > 500
+
+
+@pytest.mark.parametrize("threads", [2, 5])
+def test_any_number_of_threads_gives_the_same_bytes(abdomen, threads):
+    """Distances, depths, nearest triangles and counts; every structure is searched by itself."""
+    target, directions = np.array([-85.0, -15.0, 30.0]), units(np.random.default_rng(3), 5000)
+    one, many = FastEngine(abdomen, threads=1), FastEngine(abdomen, threads=threads)
+    first, second = one.measure(target, directions, LENGTH), many.measure(target, directions, LENGTH)
+    for name in ("distance", "depth", "nearest"):
+        assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
+    assert one.counts.tolist() == many.counts.tolist()
+    assert len(abdomen) * len(directions) >= WORTH_THREADS
 
 
 def test_fcl_trees_are_built_when_first_asked(ball, monkeypatch):

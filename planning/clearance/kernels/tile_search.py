@@ -18,7 +18,7 @@ COUNTED = ("bundles", "nodes", "blocks found", "axes", "filters", "block tests",
 """What `search_tiles` counts: the times it went through each of its stages, a node and a filter being 16 discs."""
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def search_tiles(  # type: ignore[no-untyped-def]  # numba infers
     surface, all_nodes, slack, origin, length, at_target, nearest, tiles, scratch, found, lanes
 ):
