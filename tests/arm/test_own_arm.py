@@ -1,5 +1,6 @@
 """An arm of the user's own, from a URDF with meshes beside it: right, or refused with what and where."""
 
+import pickle
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -97,6 +98,14 @@ def test_a_urs_own_urdf_is_the_arm_of_the_table(tmp_path, name):
     assert np.abs(model.joint_limits - known.joint_limits).max() < 1e-11
     pairs = zip(collision_links(model), collision_links(known), strict=True)
     assert all(a.mesh.digest == b.mesh.digest and len(a.pieces) == len(b.pieces) for a, b in pairs)
+
+
+def test_an_arm_is_sent_to_another_process(plain):
+    """Placements are rated in several: what arrives is the same arm, with its shapes."""
+    model = arm(plain)
+    arrived = pickle.loads(pickle.dumps(model))
+    assert arrived == model and arrived.urdf.digest == model.urdf.digest
+    assert collision_links(arrived)[3].mesh.digest == collision_links(model)[3].mesh.digest
 
 
 def edited(plain, tmp_path, *changes):

@@ -1,5 +1,6 @@
 """A tool of the user's own on the flange: its mesh is a body of the arm wherever the arm is asked."""
 
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -169,6 +170,12 @@ def test_a_tool_that_does_not_hang_on_the_flange_is_refused(solid, says):
     """One that floats could lie in the patient with nothing touching the skin."""
     with pytest.raises(InputError, match=says):
         CellChecker(UR3, replace(NEEDLE, body=body(solid)))
+
+
+def test_a_tool_is_sent_to_another_process():
+    """Placements are rated in several: what arrives is the same tool."""
+    tool = replace(NEEDLE, body=body(camera()))
+    assert pickle.loads(pickle.dumps(tool)) == tool and hash(tool) != hash(NEEDLE)
 
 
 def tool_case(folder, *lines, solid=None):

@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import TypeVar
 from xml.etree import ElementTree
 
@@ -179,7 +178,7 @@ def _by_name(parts: Sequence[Named], what: str, where: Path) -> Mapping[str, Nam
     for name, count in Counter(part.name for part in parts).items():
         if count > 1:
             raise InputError(f"{what} '{name}' stands {count} times", where=where, allowed="each name once")
-    return MappingProxyType({part.name: part for part in parts})
+    return {part.name: part for part in parts}  # no proxy: an arm is sent to other processes
 
 
 def _link(element: Element, where: Path) -> UrdfLink:
@@ -240,7 +239,7 @@ def _joint(element: Element, where: Path) -> UrdfJoint:
     stated = (
         {} if limit is None else {key: float(_numbers(limit, key, 1, here)[0]) for key in LIMITS if key in limit.attrib}
     )
-    return UrdfJoint(name, kind, parent, child, _origin(element, here), axis, MappingProxyType(stated))
+    return UrdfJoint(name, kind, parent, child, _origin(element, here), axis, stated)
 
 
 def _axis(element: Element, here: str) -> Floats:
