@@ -173,9 +173,17 @@ def expected_of_touches(context: CaseContext, q_insertion: Floats, read: NamedPo
         q_insertion: Shape (6,), rad, the tip on the target.
         read: Names and joints of the touches.
     """
-    task = _task(context, q_insertion)
+    task, read = _task(context, q_insertion), _in_order(context, read)
     assert read.joints is not None
     return task.of([task.markers.names.index(name) for name in read.names]).expected_mm(read.joints)
+
+
+def _in_order(context: CaseContext, read: NamedPoints) -> NamedPoints:
+    """Touches in the order of the case's markers, in which its own registration takes them: a triad depends on it."""
+    assert context.placement is not None and context.placement.registration is not None and read.joints is not None
+    names = context.placement.registration.markers.names
+    rows = sorted(range(len(read.names)), key=lambda row: names.index(read.names[row]))
+    return NamedPoints(tuple(read.names[row] for row in rows), read.points[rows], read.space, None, read.joints[rows])
 
 
 def registered(context: CaseContext, read: NamedPoints) -> Registration:
@@ -187,7 +195,7 @@ def registered(context: CaseContext, read: NamedPoints) -> Registration:
     """
     placement, case = context.placement, context.case
     assert placement is not None and placement.registration is not None and case.errors is not None
-    found = placement.registration.markers
+    found, read = placement.registration.markers, _in_order(context, read)
     rows = [found.names.index(name) for name in read.names]
     pairs = MarkerPairs(read.names, found.points_ct[rows], read.points, read.joints)
     noise = marker_noise(case, case.errors, pairs, where="touched markers")

@@ -28,7 +28,7 @@ from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.selection.choice import Choice
 from puncture_twin.planning.touch.puncture import plan_puncture
 from puncture_twin.planning.touch.straight_approach import line_to
-from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, approach_checkers, plan_touches
+from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, approach_checkers, plan_touches, registered
 from puncture_twin.run_twin import app
 from puncture_twin.twin.jobs.experiment import touch_job
 from puncture_twin.twin.jobs.experiment.touch_job import touch_case, touch_text
@@ -209,6 +209,18 @@ def test_one_marker_that_fails_leaves_the_others(context, done):
     assert list(found.failed) == [missed.name]
     for one, touch in zip(found.readings, (plan.touches[0], plan.touches[2]), strict=True):
         assert np.linalg.norm(one.point_base - touch.point_base) < 0.03
+
+
+def test_the_order_of_the_tour_decides_nothing(context, done):
+    """The case's method is a triad, which depends on the order of its markers: that of the case, however touched."""
+    read = read_points(done[1] / "touch.csv")
+    turned = [2, 0, 1]
+    names = tuple(read.names[row] for row in turned)
+    other = NamedPoints(names, read.points[turned], None, joints=read.joints[turned])
+    one, again = registered(context, read), registered(context, other)
+    assert one.markers.names == context.placement.registration.markers.names
+    np.testing.assert_array_equal(one.T_base_ct, again.T_base_ct)
+    assert done[0].use.expected_mm == pytest.approx(done[0].plan.expected_mm, rel=1e-2)
 
 
 def test_a_run_errs_as_its_drawn_twin(context, done):
