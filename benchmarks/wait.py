@@ -1,7 +1,7 @@
 """How long a person waits, and for what: ``python -m benchmarks.wait``; beside an older state: ``--against CHECKOUT``.
 
-Every command runs in a new process, in three states: with nothing compiled and an empty cache folder (first use), with
-an empty cache folder (cold), and with everything there (warm, the median of ``--times``). What is printed is processor
+Every command runs in a new process, in two states: with an empty cache folder (cold), and with everything there (warm,
+the median of ``--times``); with ``--first-use`` also with nothing compiled. What is printed is processor
 time, which other work on the machine changes less than the clock; `benchmarks.wait_probe` divides it. Two checkouts
 take turns. The real CT (61 structures, 1 degree, with the arm) is left out where it is not on this machine.
 """
@@ -59,11 +59,12 @@ def real_case(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Side:
-    """One checkout, with folders of its own for what it keeps and compiles."""
+    """One checkout, with a folder of its own for what it keeps, and for what it compiles if ``alone``."""
 
     name: str
     checkout: Path
     folder: Path
+    alone: bool
 
     def run(self, command: Command) -> Seconds:
         """Seconds of one run in a new process, by what was waited for."""
@@ -86,8 +87,8 @@ class Side:
     def _environment(self) -> dict[str, str]:
         unset = ("PYTHONPATH", "PYTHONDONTWRITEBYTECODE")
         environment = {key: value for key, value in os.environ.items() if key not in unset}
-        kept, kernels = str(self.folder / "kept"), str(self.folder / "kernels")
-        return environment | {"PUNCTURE_TWIN_CACHE": kept, "NUMBA_CACHE_DIR": kernels}
+        kernels = {"NUMBA_CACHE_DIR": str(self.folder / "kernels")} if self.alone else {}
+        return {**environment, "PUNCTURE_TWIN_CACHE": str(self.folder / "kept"), **kernels}
 
 
 def measured(command: Command, sides: list[Side], times: int, *, first_use: bool) -> dict[str, Seconds]:
@@ -134,9 +135,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         shutil.copytree(REPOSITORY / "meshes" / "abdomen", folder / "abdomen")
-        sides = [Side("this", REPOSITORY, folder / "this")]
+        sides = [Side("this", REPOSITORY, folder / "this", chosen.first_use)]
         if chosen.against is not None:
-            sides.insert(0, Side("before", chosen.against.resolve(), folder / "before"))
+            sides.insert(0, Side("before", chosen.against.resolve(), folder / "before", chosen.first_use))
         for side in sides:
             side.folder.mkdir()
         only = None if chosen.only is None else set(chosen.only.split(","))
