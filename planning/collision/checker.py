@@ -18,14 +18,14 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.links import LINK_NAMES, collision_links
+from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies import BODY_NAMES, NEVER_TESTED, Body, arm_bodies
 from puncture_twin.planning.collision.hanging import check_hanging
-from puncture_twin.planning.collision.neighbours import check_neighbours
+from puncture_twin.planning.collision.neighbours import joined_pieces
 from puncture_twin.planning.collision.shapes import FclSkin, touch
 from puncture_twin.planning.collision.state_checker import (
     DISTANCE_PAIRS,
@@ -96,7 +96,7 @@ class CellChecker:
 
     Raises:
         InputError: If the padding is negative, two boxes share a name, the patient's mesh is unusable, the base
-            stands in the patient, the shapes of an own arm leave a gap at a joint,
+            stands in the patient, a shape of an own arm hangs on nothing,
             or an own tool does not hang on the flange.
     """
 
@@ -115,8 +115,7 @@ class CellChecker:
         self.model = model
         self.tool = tool
         self._bodies = arm_bodies(model, tool, padding_mm)
-        if model.urdf is not None:
-            check_neighbours(model, self._bodies[: len(LINK_NAMES)])
+        self._joined = {} if model.urdf is None else joined_pieces(model)
         if tool.body is not None:
             check_hanging(tool.body, self._bodies)
         self._swept = SweptBodies.of(model, tool)
@@ -231,12 +230,15 @@ class CellChecker:
                     yield Check(Contact(body.name, name), box, solid, None, body, (None, hull))
 
     def _self_checks(self) -> Iterator[Check]:
-        """Every pair of bodies that might touch, piece by piece."""
+        """Every pair of bodies that might touch, piece by piece; of an own arm's neighbours what is not joined."""
         for first, second in combinations(self._bodies, 2):
-            if (first.name, second.name) in NEVER_TESTED:
+            joined = self._joined.get((first.name, second.name))
+            if joined is None and (first.name, second.name) in NEVER_TESTED:
                 continue
             shapes = product(*(zip(body.bare.solids, body.bare.hulls, strict=True) for body in (first, second)))
-            for (a, hull_a), (b, hull_b) in shapes:
+            for number, ((a, hull_a), (b, hull_b)) in enumerate(shapes):
+                if joined is not None and joined.flat[number]:
+                    continue
                 yield Check(Contact(second.name, first.name), a, b, first, second, (hull_a, hull_b))
 
     def _place(self, q: Floats) -> None:

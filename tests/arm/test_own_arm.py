@@ -81,9 +81,7 @@ def test_shapes_lie_where_the_text_has_them(tmp_path, seed):
 def touches(path, q, link, mesh, block):
     """Whether a link's raw mesh, as a convex body, meets a block."""
     T = slow_chain(path, q, link)
-    corners = 1000.0 * mesh.vertices
-    counted = np.insert(mesh.faces, 0, 3, axis=1).ravel().astype(np.int32)
-    body = fcl.CollisionObject(fcl.Convex(corners, len(mesh.faces), counted), fcl.Transform(T[:3, :3], T[:3, 3]))
+    body = fcl.CollisionObject(solid(mesh), fcl.Transform(T[:3, :3], T[:3, 3]))
     return bool(fcl.collide(body, block, fcl.CollisionRequest(), fcl.CollisionResult()))
 
 
@@ -272,3 +270,45 @@ def test_plain_shapes_are_contained(plain, tmp_path, tag, size):
     mesh = arm(path).urdf.shapes[6][0].mesh
     assert (mesh.bounds[1] >= np.array(size) - 1e-9).all() and (mesh.bounds[1] <= 1.003 * np.array(size)).all()
     assert trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight
+
+
+CAMERA = (
+    '<link name="camera"><collision><origin xyz="{0} 0 {1}"/><geometry><box size="{2} 0.02 0.02"/></geometry>'
+    '</collision><collision><origin xyz="{3} 0 {4}"/><geometry><box size="0.02 0.06 0.2"/></geometry></collision>'
+    "</link>"
+    '<joint name="screws" type="fixed"><parent link="hand"/><child link="camera"/></joint></robot>'
+)
+"""A bracket from wrist 3 to the side, and a block at its end that reaches back beside wrist 2."""
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_is_fixed_to_a_link_meets_its_neighbours(plain, tmp_path, seed):
+    """A camera on wrist 3 against wrist 2, an upper arm against the folded forearm: FCL's answer for the raw shapes."""
+    path = edited(plain, tmp_path, ("</robot>", CAMERA.format(0.03, -0.03, 0.1, 0.07, -0.11)))
+    checker, rng = CellChecker(arm(path), TOOL), np.random.default_rng(seed)
+    raw = {link: trimesh.load_mesh(path.parent / f"{link}.stl") for link in LINKS}
+    block = trimesh.creation.box((0.02, 0.06, 0.2))
+    block.apply_translation([0.07, 0.0, -0.11])
+    met = 0
+    for q in rng.uniform(-3, 3, (150, 6)):
+        T = slow_chain(path, q, "pitch")
+        wrist_2 = fcl.CollisionObject(solid(raw["pitch"]), fcl.Transform(T[:3, :3], T[:3, 3]))
+        meets = touches(path, q, "hand", block, wrist_2)
+        assert not meets or checker.contact(q, needle_may_touch_patient=False) is not None
+        met += meets
+    assert 10 < met < 140
+    for bend in np.radians([160.0, 170.0, -165.0]):
+        assert checker.contact(np.array([0, -1.5, bend, 0, 1.5, 0]), needle_may_touch_patient=False) is not None
+
+
+def solid(mesh):
+    """A convex mesh in metres for FCL, in mm."""
+    counted = np.insert(mesh.faces, 0, 3, axis=1).ravel().astype(np.int32)
+    return fcl.Convex(1000.0 * np.asarray(mesh.vertices), len(mesh.faces), counted)
+
+
+def test_a_shape_that_hangs_on_nothing_is_refused(plain, tmp_path):
+    """A camera whose bracket was left out could lie in the patient while nothing touches the skin."""
+    path = edited(plain, tmp_path, ("</robot>", CAMERA.format(0.3, 0.0, 0.02, 0.3, -0.1)))
+    with pytest.raises(InputError, match=r"shape of wrist_3, 20 x \d+ x \d+ mm, hangs on nothing"):
+        CellChecker(arm(path), TOOL)
