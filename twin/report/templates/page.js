@@ -77,8 +77,8 @@
 
   function chanceWords(chance) { // what is not sure never reads as 0 or 1
     if (chance < 5e-5) return "<0.0001"; // what the page was given is rounded: 0 may be 1e-10
-    if (chance < 1 && chance > 1 - 5e-5) return ">0.9999";
-    return chance.toFixed(chance === 0 || chance === 1 || chance >= 0.0095 && chance <= 0.99 ? 2 : 4);
+    if (chance > 1 - 5e-5) return ">0.9999";
+    return chance.toFixed(chance >= 0.0095 && chance <= 0.99 ? 2 : 4);
   }
 
   function explain(row) {
