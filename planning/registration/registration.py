@@ -249,7 +249,7 @@ def register(
         points = markers.points_ct, markers.points_base
         uncertainty = fit_uncertainty(method, fit, T_base_ct, *points, noise, found=noise_found)
         fle_mm = None if noise_found else _greatest_fle_mm(noise, T_base_ct)
-    test = ResidualTest(len(markers), _rigid_fre(markers), fle_mm)
+    test = ResidualTest(len(markers), rigid_fre(markers), fle_mm)
     noise_test = test if uncertainty is None else uncertainty.test
     if not (noise_test.explained or accept_residuals):
         odd = _odd_marker(markers, fle_mm)
@@ -283,8 +283,8 @@ def _check_noise(markers: MarkerPairs, method: Method, noise: ReadingNoise, *, f
     if not values[0] > SINGULAR * values[-1]:
         message = "the declared errors leave readings of the markers without any"
         raise InputError(message, where=where, allowed="ct_in_plane_mm, ct_slice_mm or touch_mm above 0")
-    if found and _rigid_fre(markers) < LEAST_FOUND_MM:
-        message = f"marker_noise = 'found', but the residuals ({_rigid_fre(markers):.2g} mm) hold none"
+    if found and rigid_fre(markers) < LEAST_FOUND_MM:
+        message = f"marker_noise = 'found', but the residuals ({rigid_fre(markers):.2g} mm) hold none"
         raise InputError(message, where=where, allowed="markers measured on both sides, or marker_noise = 'declared'")
 
 
@@ -350,7 +350,7 @@ def fit_affine(points_ct: Floats, points_base: Floats) -> Floats:
     return T
 
 
-def _rigid_fre(markers: MarkerPairs) -> float:
+def rigid_fre(markers: MarkerPairs) -> float:
     """FRE of the least-squares fit, whatever the method: the chi-squared test is about that."""
     fitted = apply(fit_rigid(markers.points_ct, markers.points_base), markers.points_ct)
     return _rms(fitted - markers.points_base)

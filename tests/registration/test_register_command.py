@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 from places import ROOT
+from scipy.stats import chi2, f
 
 from puncture_twin.planning.arm.kinematics import flange_pose, inverse
 from puncture_twin.planning.arm.ur import ur_model
@@ -32,6 +33,20 @@ def test_two_lists_register_without_a_case(capfd):
     ]
     ras = printed(capfd, *LISTS, "--target=90,10,60", "--space", "RAS")
     assert not np.allclose(ras["T_base_ct"], found["T_base_ct"])  # the CT's list is in the stated space too
+
+
+@pytest.mark.parametrize("fle", [None, 0.5])
+def test_two_lists_say_how_sure_they_are_and_what_would_help(fle, capfd):
+    """The isotropic formulas' own error (Fitzpatrick 1998); the ellipsoid holds 95 %; dropping costs, adding helps."""
+    found = printed(capfd, *LISTS, TARGET, *([] if fle is None else ["--fle", str(fle)]))
+    expected, markers = found["expected_tre_target_mm"], len(found["residual_mm"])
+    assert found["fle_mm"] == pytest.approx(fle or found["fre_mm"] * np.sqrt(markers / (markers - 2)))
+    assert expected == pytest.approx(found["fle_mm"] * found["leverage"], rel=1e-6)
+    axes = np.array(found["half_axes_95_mm"])
+    factor = np.linalg.norm(axes) / expected
+    assert factor == pytest.approx(np.sqrt(chi2.ppf(0.95, 3) if fle else 3 * f.ppf(0.95, 3, 3 * markers - 6)))
+    assert min(one["rms_mm"] for one in found["without"].values()) > expected > found["one_more"]["rms_mm"]
+    assert "[errors]" not in found["fle_source"] and "declared" not in found["declaration"]["text"]
 
 
 @pytest.mark.parametrize("target", [None, "--target=1,2", "--target=1,2,nan", "--target=a,b,c"])

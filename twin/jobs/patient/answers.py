@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import load_anatomy, load_skin
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
@@ -27,7 +29,15 @@ from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.registration.advice import OneMore, odd_branches, one_more, without_each
 from puncture_twin.planning.registration.checks.marker_check import checked_placement
 from puncture_twin.planning.registration.checks.squareness import Squareness, check_squareness
-from puncture_twin.planning.registration.registration import Registration, match, register
+from puncture_twin.planning.registration.reading_noise import ReadingNoise
+from puncture_twin.planning.registration.registration import (
+    LEAST_FOUND_MM,
+    MarkerPairs,
+    Registration,
+    match,
+    register,
+    rigid_fre,
+)
 from puncture_twin.planning.registration.touching import touchable_points
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
@@ -115,7 +125,10 @@ def lists_report(
     read = [parse_points(content[0], markers_ct, default_space=space), parse_points(content[1], markers_base)]
     target_ct = to_lps(np.array([numbers]), space)[0]
     pairs = match(*read, use=None, where=f"{markers_ct}, {markers_base}")
-    registration = register(pairs, method="rigid", target_ct=target_ct, fle_mm=fle_mm, where=str(markers_base))
+    stated = {"method": "rigid", "target_ct": target_ct, "where": str(markers_base)}
+    noise = _noise_of_lists(pairs, fle_mm)
+    given = {"fle_mm": fle_mm} if noise is None else {"noise": noise, "noise_found": fle_mm is None}
+    registration = register(pairs, **stated, **given)
     report = registration_summary(registration)
     report["case"] = f"{markers_ct} and {markers_base}"
     report["target_mm"], report["space"] = numbers, str(space)
@@ -127,9 +140,57 @@ def lists_report(
     report["expected_tre_target_interval_mm"] = list(registration.expected_tre_interval_mm(target_ct))
     report["expected_tre_along_shaft_mm"] = []
     report["squareness"] = _squareness(check_squareness(registration, target_ct))
+    report |= _advice_of_lists(registration, target_ct, space)
     report["warnings"] = []
     report["notes"] = ["two lists alone: neither skin nor couch was asked whether axes or names have slipped"]
     return report
+
+
+def _noise_of_lists(pairs: MarkerPairs, fle_mm: float | None) -> ReadingNoise | None:
+    """Equal in all axes, of both lists together, stated or to be found; None where they agree to rounding."""
+    if fle_mm is None and rigid_fre(pairs) < LEAST_FOUND_MM:
+        return None
+    count = len(pairs)
+    found_mm = rigid_fre(pairs) * np.sqrt(count / (count - 2))  # Fitzpatrick 1998: FRE^2 = (1 - 2 / N) FLE^2
+    each = np.eye(3) * (found_mm if fle_mm is None else fle_mm) ** 2 / 6.0
+    return ReadingNoise(
+        cov_ct=each,
+        cov_base=np.broadcast_to(each, (count, 3, 3)),
+        arm_jacobian=np.zeros((3 * count, 1)),
+        eta_variances=np.zeros(1),
+        touches_known=True,
+    )
+
+
+def _advice_of_lists(registration: Registration, target_ct: Floats, space: Space) -> dict[str, Any]:
+    """As `_advice`, by the readings alone: which marker to drop, and to which side one more would help most."""
+    uncertainty = registration.uncertainty
+    if uncertainty is None:
+        return {}
+    cov = uncertainty.cov_at(apply(registration.T_base_ct, target_ct))[:3, :3]
+    far = np.linalg.norm(registration.markers.points_ct - target_ct, axis=1).max()
+    sides = np.array([side for side in product((-1.0, 0.0, 1.0), repeat=3) if any(side)])
+    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+    more = one_more(registration, target_ct, target_ct + far * sides)
+    test = uncertainty.test
+    stated = test.text().replace("the declared errors", "--fle")
+    found = f"the noise is the residuals' own: {registration.fle_mm:.3f} mm, with {test.freedom} degrees of freedom"
+    return {
+        "budget": None,
+        "fle_source": "estimated from FRE of the rigid fit" if test.scaled else "stated by --fle",
+        "declaration": {**registration_summary(registration)["declaration"], "text": found if test.scaled else stated},
+        "half_axes_95_mm": (uncertainty.test.region_factor * np.sqrt(np.linalg.eigvalsh(cov)[::-1])).tolist(),
+        "share": {"the markers in both lists": 1.0},
+        "without": _without(registration, target_ct),
+        "one_more": None if more is None else _one_more(space, more),
+    }
+
+
+def _without(registration: Registration, target_ct: Floats) -> dict[str, Any]:
+    return {
+        one.name: {"rms_mm": one.rms_mm, "probability": one.probability}
+        for one in without_each(registration, target_ct)
+    }
 
 
 def _squareness(found: Squareness | None) -> dict[str, Any] | None:
@@ -169,18 +230,15 @@ def _advice(case: Case, registration: Registration) -> dict[str, Any]:
         **({} if registration.aim is None else {"correction": correction_facts(case, registration)}),
         "half_axes_95_mm": (uncertainty.test.region_factor * np.sqrt(np.linalg.eigvalsh(cov)[::-1])).tolist(),
         "share": {"markers_ct": float(read / (read + touched)), "touch": float(touched / (read + touched))},
-        "without": {
-            one.name: {"rms_mm": one.rms_mm, "probability": one.probability}
-            for one in without_each(registration, case.target_ct)
-        },
-        "one_more": None if more is None else _one_more(case, more),
+        "without": _without(registration, case.target_ct),
+        "one_more": None if more is None else _one_more(case.space, more),
     }
 
 
-def _one_more(case: Case, more: OneMore) -> dict[str, Any]:
-    """Where: LPS, and as the case speaks."""
-    typed = to_lps(more.point_ct[None], case.space)[0]  # its own inverse
-    place = {"point_ct_mm": more.point_ct.tolist(), "point_mm": typed.tolist(), "space": str(case.space)}
+def _one_more(space: Space, more: OneMore) -> dict[str, Any]:
+    """Where: LPS, and in the space that the user reads."""
+    typed = to_lps(more.point_ct[None], space)[0]  # its own inverse
+    place = {"point_ct_mm": more.point_ct.tolist(), "point_mm": typed.tolist(), "space": str(space)}
     return {**place, "rms_mm": more.rms_mm}
 
 
