@@ -48,7 +48,8 @@ def planned(carton, found):
 def test_a_plan_whose_own_configuration_breaks_a_limit_is_refused(carton, planned, limit):
     """The search may have had another configuration: its verdict says nothing of the plan's."""
     _check_limits(planned.plan, carton, "plan.json")
-    strict = replace(carton, case=replace(carton.case, search=replace(carton.case.search, **limit)))
+    case = replace(carton.case, search=replace(carton.case.search, **limit))
+    strict = replace(carton, case=case, chance=replace(carton.chance, case=case))
     with pytest.raises(InputError, match="does not keep search.min_hit and max_touch"):
         _check_limits(planned.plan, strict, "plan.json")
 
