@@ -283,4 +283,6 @@ def _cut_warnings(view: FieldOfView) -> tuple[str, ...]:
     cut = [name for name, (axis, end) in SIDES.items() if view.cut[axis, end]]
     if not cut:
         return ()
-    return (f"the body is cut at its {', '.join(cut)} side: no skin is known there",)
+    return (
+        f"the body is cut at its {', '.join(cut)} side: no skin is known there, and no body that the arm could meet",
+    )

@@ -33,7 +33,11 @@ MIN_BODY_ML = 100.0
 """Less than a tenth of a newborn's head: something else was found."""
 PADDED = (
     "where nothing was scanned the image is filled up with one value, and that cuts the body; no skin is known there, "
-    "and what is filled up is unknown_region (outside_body)"
+    "no body that the arm could meet, and what is filled up is unknown_region (outside_body)"
+)
+CIRCLE = (
+    "the scanner's field of view (a circle in the image) cuts the body; no skin is known there, "
+    "and no body that the arm could meet"
 )
 
 
@@ -93,7 +97,7 @@ def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where
     if (ends & padded).any():
         warnings.append(PADDED)
     if (ends & ~padded).any():
-        warnings.append("the scanner's field of view (a circle in the image) cuts the body; no skin is known there")
+        warnings.append(CIRCLE)
     flat = flat_sides(hu - BODY_HU, body, spacing_mm)
     drawn = drawn_sides(hu - BODY_HU, trunk, spacing_mm)
     warnings.extend(_table_warnings(flat, drawn, body.shape[2] * float(spacing_mm[2])))
