@@ -8,6 +8,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.processes import worker_count
@@ -48,6 +49,7 @@ class RunCounts:
         planned: Cases of the part.
         same: Of them the same as others, to the byte: they are run once.
         before: Others that had their rows.
+        refused_before: Of these, cases whose inputs were refused.
         ended: Exit code of a row to how many rows.
         reasons: Of rows whose exit code is above 1.
         stale: Cases whose files are not those of the plan; they have no row.
@@ -56,14 +58,20 @@ class RunCounts:
     planned: int
     same: int
     before: int
+    refused_before: int = 0
     ended: Counter[int] = field(default_factory=Counter)
     reasons: Counter[str] = field(default_factory=Counter)
     stale: int = 0
 
     @property
     def failed(self) -> int:
-        """Cases without a verdict so far."""
+        """Cases that this run has left without a verdict so far."""
         return self.stale + sum(count for code, count in self.ended.items() if code > 1)
+
+    @property
+    def whole(self) -> bool:
+        """Whether every case of the part has a verdict, whichever run gave it."""
+        return not (self.failed or self.refused_before)
 
     def add(self, end: CaseEnd) -> None:
         """Count one more."""
@@ -94,8 +102,10 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
     with running(out, request.part) as work:
         rows = request.part.of(plan.cases)
         cases = distinct(rows)
-        tasks = [CaseTask(one, out, work, request.write_page) for one in cases if not _is_done(one, out, work)]
-        counts = RunCounts(len(rows), len(rows) - len(cases), len(cases) - len(tasks))
+        kept = [_kept_row(one, out, work) for one in cases]
+        tasks = [CaseTask(one, out, work, request.write_page) for one, row in zip(cases, kept, strict=True) if not row]
+        refused = sum(row["exit_code"] > 1 for row in kept if row)
+        counts = RunCounts(len(rows), len(rows) - len(cases), len(cases) - len(tasks), refused)
         watcher.count("cases", 0, len(tasks))
         with closing(_ends(tasks, request, elsewhere)) as ends:
             for done, end in enumerate(ends, start=1):
@@ -118,9 +128,10 @@ def _ends(tasks: Sequence[CaseTask], request: Request, elsewhere: RunTasks | Non
     return run_tasks(tasks, worker_count(request.jobs, len(tasks)), request.limits)
 
 
-def _is_done(planned: PlannedCase, out: Path, work: Path) -> bool:
-    """Whether a case has its row; what is there otherwise, a failure of the program or half a result, goes."""
-    if is_final(read_row(out, planned.id)):
-        return True
+def _kept_row(planned: PlannedCase, out: Path, work: Path) -> dict[str, Any] | None:
+    """The row of a case; what is there otherwise, a failure of the program or half a result, goes."""
+    row = read_row(out, planned.id)
+    if is_final(row):
+        return row
     discard(out, planned.id, work)
-    return False
+    return None

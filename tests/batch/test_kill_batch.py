@@ -98,7 +98,7 @@ def test_nothing_is_lost_by_kills(cohort):
         for name in done if len(done) == len(ids) else done[: len(done) // 2]:
             shutil.rmtree(out / name)  # there is work to be killed at again
     print(killed)  # noqa: T201  # make kill-batch shows it
-    assert main(["batch", "run", "--out", str(out), "--jobs", "2"]) == 0
+    assert main(["batch", "run", "--out", str(out), "--jobs", "2"]) == 1  # one is refused
     assert main(["batch", "merge", "--out", str(out)]) == 0
     assert not list(out.glob(f"{WORK_PREFIX}*"))
     assert files(out) == files(cohort / "alone" / "out")

@@ -60,7 +60,7 @@ def _run(
     with progress_display() as progress:
         counts = run_part(out_dir, where, progress)
     print_answer(run_summary(out_dir, counts), run_text(out_dir, counts), as_json)
-    if counts.failed:
+    if not counts.whole:
         raise typer.Exit(PROGRAM_FAILED if counts.ended[PROGRAM_FAILED] else ANSWER_IS_NO)
 
 

@@ -80,6 +80,7 @@ def run_summary(out: Path, counts: RunCounts) -> dict[str, Any]:
         "cases": counts.planned,
         "same": counts.same,
         "before": counts.before,
+        "refused_before": counts.refused_before,
         "done": counts.ended[0] + counts.ended[1],
         "failed": counts.failed,
         "reasons": [{"reason": reason, "count": count} for reason, count in counts.reasons.most_common()],

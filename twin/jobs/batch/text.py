@@ -41,8 +41,11 @@ def plan_text(run: PlanRun, jobs: int) -> str:
 def run_text(out: Path, counts: RunCounts) -> str:
     """What a run did, and what comes next."""
     done = counts.ended[0] + counts.ended[1]
+    refused = f" ({counts.refused_before} refused)" if counts.refused_before else ""
     same = f"{counts.same} the same as others, " if counts.same else ""
-    lines = [f"{_cases(counts.planned)}: {same}{counts.before} had their row, {done} done, {counts.failed} failed"]
+    lines = [
+        f"{_cases(counts.planned)}: {same}{counts.before} had their row{refused}, {done} done, {counts.failed} failed"
+    ]
     lines += _reasons(counts.reasons)
     if counts.stale:
         lines.append(f"{counts.stale:6d}  not run: the inputs have changed since the plan; batch plan again")
