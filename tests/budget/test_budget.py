@@ -127,6 +127,8 @@ def test_register_prints_the_budget_and_draws_it(tmp_path):
     budget = json.loads(done.stdout)["budget"]
     assert (tmp_path / "budget.png").read_bytes().startswith(b"\x89PNG")
     assert sum(one["alone_mm"] ** 2 for one in budget["sources"]) == pytest.approx(budget["expected_mm"] ** 2)
+    across, along = budget["expected_lateral_mm"], budget["expected_depth_mm"]
+    assert across**2 + along**2 == pytest.approx(budget["expected_mm"] ** 2) and 0 < along < across
     assert budget["best"]["expected_mm"] == min(one["expected_mm"] for one in budget["changes"])
     text = CliRunner().invoke(app, ["register", str(ABDOMEN)]).stdout
     assert "mm is won by" in text

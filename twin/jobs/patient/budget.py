@@ -56,6 +56,7 @@ def budget_facts(
     return {
         **needle_angles(case, registration, q),
         "expected_mm": chain.expected_mm(),
+        **_across_and_along(chain),
         "sources": [
             {"text": SOURCES[one.source].text, "alone_mm": one.alone_mm, "without_mm": one.without_mm}
             for one in source_costs(chain)
@@ -64,6 +65,15 @@ def budget_facts(
         "best": _change(case, best),
         "not_modelled": _not_modelled(chain),
     }
+
+
+def _across_and_along(chain: Chain) -> dict[str, float]:
+    """The error's parts across and along the needle, rms: their squares add up to that of the whole."""
+    along_base = flange_pose(chain.model, chain.q_insertion)[:3, 2]
+    square = chain.tip_mean_square()
+    depth = float(along_base @ square @ along_base)
+    lateral = max(float(np.trace(square)) - depth, 0.0)
+    return {"expected_lateral_mm": float(np.sqrt(lateral)), "expected_depth_mm": float(np.sqrt(depth))}
 
 
 def _not_modelled(chain: Chain) -> str:
@@ -110,9 +120,10 @@ def budget_lines(facts: dict[str, Any] | None) -> list[str]:
     if facts is None:
         return []
     now = facts["expected_mm"]
+    parts = f"{facts['expected_lateral_mm']:.2f} across it and {facts['expected_depth_mm']:.2f} along it"
     lines = [
         f"  the needle's whole error, inserted at theta {facts['theta_deg']:.0f}, beta {facts['beta_deg']:.0f}: "
-        f"{now:.2f} mm (rms); not modelled: {facts['not_modelled']}",
+        f"{now:.2f} mm (rms), {parts}; not modelled: {facts['not_modelled']}",
         f"    {'source':34s} {'alone':>7s} {'all but it':>11s}",
     ]
     lines += [
