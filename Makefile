@@ -72,6 +72,7 @@ pictures: demo
 	$(BIN)/python run_twin.py place meshes/abdomen --out out/place
 	$(BIN)/python run_twin.py selfcal --seeds 1 --out out/selfcal
 	$(BIN)/python run_twin.py servo meshes/head --out out/servo
+	mkdir -p out/budget
 	$(BIN)/python run_twin.py register meshes/abdomen --picture out/budget/budget.png
 	$(BIN)/python docs/concept_pictures.py $(OUT)/plan.json
 	$(BIN)/python docs/reliability_picture.py
