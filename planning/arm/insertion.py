@@ -182,6 +182,8 @@ class Survey(NamedTuple):
 
     stop_at: NDArray[np.int64]
     """Shape (n, 8): index of the sample at which the path ends, -1 where it reaches the target."""
+    starts: Floats
+    """Shape (n, 8, 6), rad: each path's first configuration at roll 0; NaN where there is none."""
     margins: Floats
     """Shape (n, 8, r): see :func:`reach_margin`; NaN where the path ends early or leaves the joint limits."""
     turns: Floats
@@ -207,12 +209,13 @@ def survey(
     count = len(lines)
     found = Survey(
         np.empty((count, N_BRANCHES), np.int64),
+        np.empty((count, N_BRANCHES, 6)),
         np.empty((count, N_BRANCHES, len(rolls))),
         np.empty((count, N_BRANCHES, len(rolls), 6)),
     )
     bounds = (MIN_SINGULARITY, MAX_JOINT_STEP_RAD_PER_MM, FULL_MARGIN_RAD)
     for i in range(count):
-        filled = (found.stop_at[i], found.margins[i], found.turns[i])
+        filled = (found.stop_at[i], found.starts[i], found.margins[i], found.turns[i])
         path = (*lines[i], distances_mm[i], depths_mm[i])
-        kernels.survey(model.lengths, model.joint_limits, *path, rolls, *bounds, *filled)
+        kernels.survey(model.lengths, model.joint_limits, *path, rolls, bounds, *filled)
     return found

@@ -273,9 +273,16 @@ def path_margin(lengths, limits, full, path):
 
 
 @nb.njit(cache=True)
-def survey(
-    lengths, limits, R, target, outward, distances, depths, rolls, at_least, fastest, full, stops, margins, turns
-):
+def _fast_joint(before, after, mm, fastest):
+    """Whether a joint turns more than ``fastest``, rad/mm, between two configurations (6,) that lie so far apart."""
+    fast = False
+    for joint in range(6):
+        fast |= abs(after[joint] - before[joint]) / mm > fastest
+    return fast
+
+
+@nb.njit(cache=True)
+def survey(lengths, limits, R, target, outward, distances, depths, rolls, bounds, stops, starts, margins, turns):
     """Every branch and roll of one direction, by kinematics alone.
 
     Args:
@@ -287,38 +294,69 @@ def survey(
         distances: Shape (m,), mm: target to flange.
         depths: Shape (m,), mm, rising.
         rolls: Shape (r,), rad.
-        at_least: Least of the singular terms.
-        fastest: rad/mm.
-        full: Distance from a limit that counts as 1, rad.
+        bounds: Least of the singular terms; most that a joint may turn, rad/mm; distance from a limit that counts as 1,
+            rad.
         stops: Shape (8,), filled: see :func:`first_stop_at`.
+        starts: Shape (8, 6), filled: the configuration at the first distance, roll 0, rad.
         margins: Shape (8, r), filled: see :func:`path_margin`; NaN where the path stops or leaves the limits.
         turns: Shape (8, r, 6), filled: what to add to the path at roll 0, rad: roll and whole turns.
     """
-    path = np.empty((8, len(distances), 6))
-    every_branch(lengths, R, target, outward, distances, path)
+    at_least, fastest, full = bounds
+    p, here, least = np.empty(3), np.empty((8, 6)), np.ones(8)
+    before, lowest, highest, middle = np.empty((8, 6)), np.empty((8, 6)), np.empty((8, 6)), np.empty((8, 6))
+    stops[:] = -1
+    for k in range(len(distances)):
+        for i in range(3):
+            p[i] = target[i] + distances[k] * outward[i]
+        _branches(lengths, R, p, here, -1)
+        if k == 0:
+            starts[:], before[:], lowest[:], highest[:] = here, here, here, here
+        for branch in range(8):
+            if stops[branch] >= 0:
+                continue
+            q = here[branch]
+            for joint in range(6):
+                q[joint] = q[joint] if k == 0 else before[branch, joint] + _wrapped(q[joint] - before[branch, joint])
+            if k > 0 and _fast_joint(before[branch], q, depths[k] - depths[k - 1], fastest):
+                stops[branch] = k - 1
+                continue
+            term = _least_term(lengths, q)
+            if not term > at_least:
+                stops[branch] = k
+                continue
+            least[branch] = min(least[branch], term)
+            for joint in range(6):
+                before[branch, joint] = q[joint]
+                lowest[branch, joint] = min(lowest[branch, joint], q[joint])
+                highest[branch, joint] = max(highest[branch, joint], q[joint])
+                if k == len(distances) // 2:
+                    middle[branch, joint] = q[joint]
     margins[:] = math.nan
     turns[:] = 0.0
     for branch in range(8):
-        stops[branch] = first_stop_at(lengths, path[branch], depths, at_least, fastest)
-        if stops[branch] >= 0:
-            continue
-        least = 1.0
-        lowest, highest = path[branch, 0].copy(), path[branch, 0].copy()
-        for k in range(len(distances)):
-            least = min(least, _least_term(lengths, path[branch, k]))
-            for joint in range(6):
-                lowest[joint] = min(lowest[joint], path[branch, k, joint])
-                highest[joint] = max(highest[joint], path[branch, k, joint])
-        for i in range(len(rolls)):
-            margin = least
-            for joint in range(6):
-                roll = rolls[i] if joint == 5 else 0.0
-                low, high = limits[joint]
-                middle = path[branch, len(distances) // 2, joint] + roll
-                fewest, most = math.ceil((low - middle) / TURN), math.floor((high - middle) / TURN)
-                turn = TURN * min(max(round(((low + high) / 2.0 - middle) / TURN), fewest), most)
-                turns[branch, i, joint] = roll + turn
-                below, above = lowest[joint] + (roll + turn) - low, high - (highest[joint] + (roll + turn))
-                margin = min(margin, below / full, above / full)
-            if margin >= 0.0:
-                margins[branch, i] = margin
+        if stops[branch] < 0:
+            reached = least[branch], lowest[branch], highest[branch], middle[branch]
+            _rolled(limits, rolls, full, reached, margins[branch], turns[branch])
+
+
+@nb.njit(cache=True)
+def _rolled(limits, rolls, full, reached, margins, turns):
+    """Fill ``margins`` (r,) and ``turns`` (r, 6) of one branch.
+
+    ``reached`` holds the least singular term of its path at roll 0, each joint's lowest and highest angle and those at
+    its middle (6,), rad.
+    """
+    least, lowest, highest, middle = reached
+    for i in range(len(rolls)):
+        margin = least
+        for joint in range(6):
+            roll = rolls[i] if joint == 5 else 0.0
+            low, high = limits[joint]
+            at = middle[joint] + roll
+            fewest, most = math.ceil((low - at) / TURN), math.floor((high - at) / TURN)
+            turn = TURN * min(max(round(((low + high) / 2.0 - at) / TURN), fewest), most)
+            turns[i, joint] = roll + turn
+            below, above = lowest[joint] + (roll + turn) - low, high - (highest[joint] + (roll + turn))
+            margin = min(margin, below / full, above / full)
+        if margin >= 0.0:
+            margins[i] = margin

@@ -7,8 +7,9 @@ from .checker import (
     Nearest as Nearest,
 )
 from .fast_checker import FastChecker as FastChecker
+from .patient import FclPatient as FclPatient, FclSkin as FclSkin
 from .segments import halving_order as halving_order
-from .shapes import FclSkin as FclSkin, touch as touch
+from .shapes import surface as surface, touch as touch
 from .state_checker import PATIENT as PATIENT
 from .surroundings import with_surroundings as with_surroundings
 from .workcell import (

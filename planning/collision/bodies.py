@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from types import MappingProxyType
 from typing import NamedTuple
@@ -77,6 +78,12 @@ class Body:
     full: Shape
     radius_mm: float
 
+    @cached_property
+    def box(self) -> Floats:
+        """Shape (2, 3), mm: lowest and highest corner of a box about ``full``, in the frame of the shapes."""
+        corners = np.concatenate(self.full.hulls)
+        return np.array([corners.min(axis=0), corners.max(axis=0)])
+
     def pose(self, poses: Floats) -> fcl.Transform:
         """Where ``link_poses`` (7, 4, 4) has the body's shapes."""
         T = poses[self.frame] @ self.T_frame_body
@@ -127,7 +134,8 @@ def padded_links(links: Sequence[Link], padding_mm: float) -> tuple[Link, ...]:
 def _link_body(link: Link, grown: Link) -> Body:
     bare = _link_shape(link)
     full = bare if grown is link else _link_shape(grown)
-    return Body(link.name, link.frame, np.eye(4), bare, full, float(np.linalg.norm(link.mesh.vertices, axis=1).max()))
+    radius_mm = float(np.linalg.norm(link.mesh.vertices, axis=1).max())
+    return Body(link.name, link.frame, np.eye(4), bare, full, radius_mm)
 
 
 def _link_shape(link: Link) -> Shape:
@@ -141,7 +149,8 @@ def _round_body(name: str, diameter_mm: float, span_mm: tuple[float, float], pad
     T_flange_body = pose(np.eye(3), [0.0, 0.0, (span_mm[0] + span_mm[1]) / 2.0])
     bare = _cylinder(diameter_mm / 2.0, length)
     full = _cylinder(diameter_mm / 2.0 + padding_mm, length + 2.0 * padding_mm) if padding_mm else bare
-    return Body(name, FLANGE_FRAME, T_flange_body, bare, full, float(np.hypot(diameter_mm, length)) / 2.0)
+    radius_mm = float(np.hypot(diameter_mm, length)) / 2.0
+    return Body(name, FLANGE_FRAME, T_flange_body, bare, full, radius_mm)
 
 
 def _cylinder(radius_mm: float, length_mm: float) -> Shape:

@@ -10,6 +10,7 @@ surface counts (``patient_closed``).
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence, Set
+from functools import cached_property
 from itertools import combinations, product
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.links import collision_links
+from puncture_twin.planning.arm.links import collision_links, joined
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
@@ -26,7 +27,8 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies import BODY_NAMES, NEVER_TESTED, Body, arm_bodies
 from puncture_twin.planning.collision.hanging import check_hanging
 from puncture_twin.planning.collision.neighbours import joined_pieces
-from puncture_twin.planning.collision.shapes import FclSkin, touch
+from puncture_twin.planning.collision.patient import FclPatient
+from puncture_twin.planning.collision.shapes import surface, touch
 from puncture_twin.planning.collision.state_checker import (
     DISTANCE_PAIRS,
     NEEDLE_IN_PATIENT,
@@ -63,8 +65,8 @@ class Check(NamedTuple):
 
     contact: Contact
     """What it means if they do."""
-    first: fcl.CollisionObject | FclSkin
-    """The skin, a box, or a piece of a body."""
+    first: fcl.CollisionObject | FclPatient
+    """The patient, a box, or a piece of a body."""
     second: fcl.CollisionObject
     first_body: Body | None
     """The body that ``first`` moves with; None for skin and boxes."""
@@ -72,10 +74,16 @@ class Check(NamedTuple):
     hulls: tuple[Floats | None, Floats] | None
     """Corners that enclose either, in the frames of their shapes; None for a box, and for the pair with the skin."""
 
-    def touches(self) -> bool:
-        """Whether the two shapes touch where they are."""
-        first = self.first.object if isinstance(self.first, FclSkin) else self.first
-        return touch(first, self.second)
+    def met(self) -> Contact | None:
+        """The contact, if the two shapes touch where they are: ``outside_body`` where that is all of the patient."""
+        if not isinstance(self.first, FclPatient):
+            return self.contact if touch(self.first, self.second) else None
+        if self.first.skin.touches(self.second, self.second_body.box):
+            return self.contact
+        outside = self.first.outside
+        if outside is not None and outside.touches(self.second, self.second_body.box):
+            return self.contact._replace(other=OUTSIDE_BODY)
+        return None
 
 
 class CellChecker:
@@ -88,8 +96,8 @@ class CellChecker:
         tool: What the flange carries.
         boxes: Solids of the workcell, base frame. The base link is not tested against them: it is bolted to one.
         patient: The skin, base frame, mm; None for an empty workcell.
-        skin: The skin alone, where ``patient`` holds more: the base may touch the rest (a table), not the skin, and
-            contacts with the rest are named ``outside_body``.
+        outside: What is not to be touched besides (a table), likewise: the base may touch it, and contacts with it are
+            named ``outside_body``.
         padding_mm: How much fuller the arm is for contacts with patient and boxes (not for distances, nor with itself):
             room for what robot and registration get wrong. With 1 mm or more, free states between which no body moves
             more than 2 mm prove that the path between them meets neither patient nor box.
@@ -107,7 +115,7 @@ class CellChecker:
         boxes: Sequence[Box] = (),
         patient: TriangleMesh | None = None,
         *,
-        skin: TriangleMesh | None = None,
+        outside: TriangleMesh | None = None,
         padding_mm: float = 0.0,
     ) -> None:
         if not (np.isfinite(padding_mm) and padding_mm >= 0.0):
@@ -118,15 +126,14 @@ class CellChecker:
         self._joined = {} if model.urdf is None else joined_pieces(model)
         if tool.body is not None:
             check_hanging(tool.body, self._bodies)
-        self._swept = SweptBodies.of(model, tool)
+        self.swept = SweptBodies.of(model, tool)
         self._boxes = _boxes(boxes, {PATIENT, *(body.name for body in self._bodies)})
         self._bounds = {box.name: box.bounds for box in boxes}
-        self._patient = None if patient is None else FclSkin(patient, PATIENT)
-        self._skin = None if skin is None else FclSkin(skin, PATIENT)
-        self._surface = patient
-        if patient is not None:
-            self._bounds[PATIENT] = patient.bounds
-            self._refuse_base_in(patient, skin)
+        self._surface = patient if patient is None or outside is None else joined([patient, outside])
+        self._patient = None if patient is None else FclPatient.of(patient, outside)
+        if patient is not None and self._surface is not None:
+            self._bounds[PATIENT] = self._surface.bounds
+            self._refuse_base_in(patient, outside)
         self._checks = tuple(self._workcell_checks()) + tuple(self._self_checks())
 
     @property
@@ -147,9 +154,17 @@ class CellChecker:
         self._place(q)
         for check in self._checks:
             allowed = needle_may_touch_patient and check.contact == NEEDLE_IN_PATIENT
-            if not allowed and check.touches():
-                return self._named(check)
+            if not allowed and (contact := check.met()) is not None:
+                return contact
         return None
+
+    def contacts(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact | None]:
+        """:meth:`contact` of many states by themselves, shape (n, 6), rad.
+
+        Raises:
+            InputError: If a state is not finite.
+        """
+        return [self.contact(state, needle_may_touch_patient=needle_may_touch_patient) for state in q]
 
     def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
         """The first state of a path with a contact, and the contact; None when all are clear.
@@ -184,7 +199,7 @@ class CellChecker:
             raise InputError("no such distance", where=where, allowed=allowed)
         self._place(q)
         bodies = [b for b in self._bodies if (b.name in names if body is None else b.name == body)]
-        skin = {} if self._patient is None else {PATIENT: self._patient.object}
+        skin = {} if self._surface is None else {PATIENT: self._whole}
         return _nearest(bodies, self._boxes if pair == "boxes" else skin, self._bounds)
 
     def distances(self, q: Floats) -> Distances:
@@ -207,18 +222,18 @@ class CellChecker:
         Returns:
             Shape (m - 1,), mm; see :meth:`SweptBodies.bounds_mm`.
         """
-        return np.asarray(self._swept.bounds_mm(q_path).max(axis=1))
+        return np.asarray(self.swept.bounds_mm(q_path).max(axis=1))
 
     def body_sweeps_mm(self, q_path: Floats) -> dict[str, Floats]:
         """Bound on each moving body's motion along each segment, by name; the tool counts with wrist 3 as one."""
-        bounds = self._swept.bounds_mm(q_path)
+        bounds = self.swept.bounds_mm(q_path)
         return {body.name: bounds[:, body.frame - 1] for body in self._bodies[1:]}
 
-    def _named(self, check: Check) -> Contact:
-        """The contact of a check whose shapes are placed and touch: ``outside_body`` where the skin is not touched."""
-        if check.contact.other != PATIENT or self._skin is None or touch(self._skin.object, check.second):
-            return check.contact
-        return check.contact._replace(other=OUTSIDE_BODY)
+    @cached_property
+    def _whole(self) -> fcl.CollisionObject:
+        """The patient in one tree, for distances."""
+        assert self._surface is not None
+        return fcl.CollisionObject(surface(self._surface))
 
     def _workcell_checks(self) -> Iterator[Check]:
         """Every moving body against the patient, then the boxes."""
@@ -247,14 +262,13 @@ class CellChecker:
         for body in self._bodies[1:]:
             body.place(poses)
 
-    def _refuse_base_in(self, patient: TriangleMesh, skin: TriangleMesh | None) -> None:
-        base, bounds = self._bodies[0].bare.surface, collision_links(self.model)[0].mesh.bounds
-        surface = self._patient if self._skin is None else self._skin
-        assert surface is not None  # there is a patient
-        centre = bounds.mean(axis=0)
-        if surface.touches_still(base, bounds) or _encloses(patient if skin is None else skin, centre):
+    def _refuse_base_in(self, patient: TriangleMesh, outside: TriangleMesh | None) -> None:
+        base = self._bodies[0]
+        centre = collision_links(self.model)[0].mesh.bounds.mean(axis=0)
+        assert self._patient is not None  # it is asked about one
+        if self._patient.skin.touches(base.bare.surface, base.box) or _encloses(patient, centre):
             raise InputError("the robot's base stands in the patient", where="cell", allowed="a base outside the skin")
-        if skin is not None and _encloses(patient, centre):
+        if outside is not None and _encloses(joined([patient, outside]), centre):
             what = "the robot's base stands in what the CT shows outside of the body (its table?)"
             raise InputError(what, where="cell", allowed="a base outside of it")
 

@@ -19,7 +19,7 @@ from puncture_twin.planning.collision.checker import (
     require_finite,
 )
 from puncture_twin.planning.collision.never_touching import without_neighbours
-from puncture_twin.planning.collision.proofs import Motion, Proofs, fcl_touches
+from puncture_twin.planning.collision.proofs import Motion, Proofs, fcl_contact
 from puncture_twin.planning.collision.segments import SegmentChecker
 from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.collision.sweep import SweptBodies
@@ -37,7 +37,7 @@ class FastChecker(CellChecker):
         tool: Needle and holder, likewise.
         boxes: Obstacles, likewise.
         patient: The body's surface, likewise.
-        skin: Names contacts, likewise.
+        outside: A table, likewise.
         padding_mm: Of contacts with patient and boxes, likewise.
         cache: Where the enclosures of the arm's bodies are kept.
 
@@ -52,13 +52,13 @@ class FastChecker(CellChecker):
         boxes: Sequence[Box] = (),
         patient: TriangleMesh | None = None,
         *,
-        skin: TriangleMesh | None = None,
+        outside: TriangleMesh | None = None,
         padding_mm: float = 0.0,
         cache: Cache = NO_CACHE,
     ) -> None:
-        super().__init__(model, tool, boxes, patient, skin=skin, padding_mm=padding_mm)
+        super().__init__(model, tool, boxes, patient, outside=outside, padding_mm=padding_mm)
         self._swept_full = SweptBodies.of(model, tool, padding_mm)
-        self._proofs = Proofs(model, self._checks, boxes, patient, cache)
+        self._proofs = Proofs(model, self._checks, boxes, self._surface, cache)
         self._tested = without_neighbours(model, self._checks, self._proofs, cache)
         self._still = (np.zeros((1, 7)), np.zeros((1, 6)))
         needle = np.array([check.contact == NEEDLE_IN_PATIENT for check in self._tested])
@@ -70,6 +70,21 @@ class FastChecker(CellChecker):
         first = self.first_contact(np.asarray(q)[None], needle_may_touch_patient=needle_may_touch_patient)
         return None if first is None else first.contact
 
+    def contacts(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact | None]:
+        """See :meth:`CellChecker.contacts`."""
+        states = np.asarray(q, dtype=np.float64).reshape(-1, 6)
+        require_finite(states)
+        frames, mask = link_poses(self.model, states), self._masks[needle_may_touch_patient]
+        found: list[Contact | None] = [None] * len(states)
+        begins = np.zeros(len(states), dtype=np.int64)
+        while (open_at := self._proofs.unproven_at_each(frames, begins, mask)).max(initial=-1) >= 0:
+            begins = np.where(open_at < 0, len(self._tested), open_at + 1)
+            for row in np.flatnonzero(open_at >= 0).tolist():
+                found[row] = fcl_contact(self._tested[open_at[row]], frames[row])
+                if found[row] is not None:
+                    begins[row] = len(self._tested)
+        return found
+
     def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
         """See :meth:`CellChecker.first_contact`."""
         path = np.asarray(q_path, dtype=np.float64)
@@ -80,8 +95,9 @@ class FastChecker(CellChecker):
         open_at = self._proofs.first_unproven(motion, 0, mask)
         while open_at >= 0:
             index, check = divmod(open_at, len(self._tested))
-            if fcl_touches(self._tested[check], motion.frames[index]):
-                return FirstContact(index, self._named(self._tested[check]))
+            contact = fcl_contact(self._tested[check], motion.frames[index])
+            if contact is not None:
+                return FirstContact(index, contact)
             open_at = self._proofs.first_unproven(motion, open_at + 1, mask)
         return None
 
@@ -130,7 +146,4 @@ class FastChecker(CellChecker):
         """States (m, 6) with what the bounds need of them."""
         if len(path) <= 1:
             return Motion(link_poses(self.model, path), *self._still)
-        moved, rotated = np.zeros((len(path), 7)), np.zeros((len(path), 6))
-        np.cumsum(self._swept_full.bounds_mm(path), axis=0, out=moved[1:, 1:])
-        np.cumsum(np.abs(np.diff(path, axis=0)), axis=0, out=rotated[1:])
-        return Motion(link_poses(self.model, path), moved, rotated)
+        return Motion(*self._swept_full.moving(path))

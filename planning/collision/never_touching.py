@@ -11,7 +11,7 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.collision.checker import Check
-from puncture_twin.planning.collision.proofs import Proofs, fcl_touches, made_from
+from puncture_twin.planning.collision.proofs import Proofs, fcl_contact, made_from
 
 Touches = Callable[[int, Floats], bool]
 
@@ -37,11 +37,13 @@ def without_neighbours(model: UrModel, checks: Sequence[Check], proofs: Proofs, 
     between = proofs.joint_spans[:, 0] > 0
     pairs = [check.hulls or () for check, pair in zip(checks, between, strict=True) if pair]
     pieces = [hull for pair in pairs for hull in pair if hull is not None]
+
+    def touches(check: int, frames: Floats) -> bool:
+        return fcl_contact(checks[check], frames) is not None
+
     stored = cache.arrays(
         made_from("never touching", [model.lengths, proofs.joint_spans[between], *pieces]),
-        lambda: {
-            "never": never_touching(model, proofs, lambda check, frames: fcl_touches(checks[check], frames))[between]
-        },
+        lambda: {"never": never_touching(model, proofs, touches)[between]},
         by=__name__,
     )
     never = between.copy()

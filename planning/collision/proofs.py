@@ -24,12 +24,12 @@ from puncture_twin.planning.collision.bounding_spheres import (
     neighbours,
     sphere_tree,
 )
-from puncture_twin.planning.collision.checker import Check
+from puncture_twin.planning.collision.checker import Check, Contact
 from puncture_twin.planning.collision.kernels import proofs as proof_kernels
 from puncture_twin.planning.collision.kernels.hulls import Hulls
 from puncture_twin.planning.collision.kernels.proofs import Movers, ProofScene, SkinTree, scratch
 from puncture_twin.planning.collision.kernels.surfaces import CELL_MM
-from puncture_twin.planning.collision.shapes import FclSkin
+from puncture_twin.planning.collision.patient import FclPatient
 from puncture_twin.planning.collision.triangle_tree import TriangleTree
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
@@ -134,6 +134,18 @@ class Proofs:
         arguments = (self.scene, self._levers, tuple(motion), self._work, self._proven, *at, tested, clear_mm)
         return int(proof_kernels.first_unproven(*arguments))
 
+    def unproven_at_each(self, frames: Floats, begins: Ints, tested: Bools) -> Ints:
+        """Of each state by itself the first check that is not proven, at or after one; -1 for none.
+
+        Args:
+            frames: Shape (m, 7, 4, 4), mm.
+            begins: Shape (m,): where to begin; ``len(self)`` to pass a state over.
+            tested: Shape (k,): which checks.
+        """
+        found = np.empty(len(frames), dtype=np.int64)
+        proof_kernels.unproven_at_each(self.scene, frames, self._work, tested, begins, found)
+        return found
+
     def clear_about(self, frames: Floats, turns: Floats, tested: Bools) -> Around:
         """Prove checks clear all about some states.
 
@@ -147,13 +159,13 @@ class Proofs:
         return Around(gaps <= 0.0, unproven)
 
 
-def fcl_touches(check: Check, frames: Floats) -> bool:
-    """Whether the shapes of a check touch where ``link_poses`` (7, 4, 4) has them."""
+def fcl_contact(check: Check, frames: Floats) -> Contact | None:
+    """The contact, if the shapes of a check touch where ``link_poses`` (7, 4, 4) has them."""
     check.second.setTransform(check.second_body.pose(frames))
     if check.first_body is not None:
-        assert not isinstance(check.first, FclSkin)  # it belongs to no body
+        assert not isinstance(check.first, FclPatient)  # it belongs to no body
         check.first.setTransform(check.first_body.pose(frames))
-    return check.touches()
+    return check.met()
 
 
 def _levers(model: UrModel, check: Check) -> Floats:

@@ -14,7 +14,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.checker import Check, Contact, require_finite
 from puncture_twin.planning.collision.kernels import segments as segment_kernels
 from puncture_twin.planning.collision.kernels.segments import CONTACT, NOT_FINITE, QUERY, Answer
-from puncture_twin.planning.collision.proofs import Proofs, fcl_touches
+from puncture_twin.planning.collision.proofs import Proofs, fcl_contact
 
 LOOK_FIRST_RAD = 0.125
 """States of a segment so far apart are looked at before it is proven: what it touches is found soonest so."""
@@ -71,7 +71,7 @@ class SegmentChecker:
                 continue
             questions = self._answer.fractions[:count].tolist(), self._answer.checks[:count].tolist()
             for fraction, at in zip(*questions, strict=True):
-                if fcl_touches(self._checks[at], link_poses(self._model, start + fraction * (end - start))):
+                if fcl_contact(self._checks[at], link_poses(self._model, start + fraction * (end - start))) is not None:
                     return self._contact(at)
             if status != QUERY:
                 return None

@@ -2,55 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from itertools import product
 
 import fcl
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-
-class FclSkin:
-    """The skin, whose tree FCL builds when it is first asked about: that takes longer than most questions.
-
-    Args:
-        patient: The surface, mm.
-        name: Of it, for who is told of its fault.
-
-    Raises:
-        InputError: FCL calls a NaN vertex free and dies of an index out of range: so that is looked for first.
-    """
-
-    def __init__(self, patient: TriangleMesh, name: str) -> None:
-        count = len(patient.vertices)
-        usable = len(patient.faces) > 0 and bool(np.isfinite(patient.vertices).all())
-        if not usable or patient.faces.min() < 0 or patient.faces.max() >= count:
-            what = "mesh is empty, not finite or has an index out of range"
-            raise InputError(what, where=name, allowed="a checked mesh")
-        self._mesh = patient
-
-    @cached_property
-    def object(self) -> fcl.CollisionObject:
-        """The whole surface for FCL."""
-        return fcl.CollisionObject(surface(self._mesh))
-
-    def touches_still(self, solid: fcl.CollisionObject, bounds: Floats) -> bool:
-        """Whether a body that does not move touches the surface.
-
-        Only triangles whose box meets the body's box can touch it, so FCL is asked about these alone.
-
-        Args:
-            solid: The body.
-            bounds: Shape (2, 3), mm: a box about it, in the surface's frame.
-        """
-        triangles = self._mesh.triangles
-        near = np.all((triangles.max(axis=1) >= bounds[0]) & (triangles.min(axis=1) <= bounds[1]), axis=1)
-        if not near.any():
-            return False
-        return touch(fcl.CollisionObject(surface(TriangleMesh(self._mesh.vertices, self._mesh.faces[near]))), solid)
 
 
 def touch(a: fcl.CollisionObject, b: fcl.CollisionObject) -> bool:

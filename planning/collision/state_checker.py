@@ -10,6 +10,7 @@ from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.bodies import BODY_NAMES
+from puncture_twin.planning.collision.sweep import SweptBodies
 
 PATIENT = "patient"
 
@@ -69,8 +70,15 @@ class StateChecker(Protocol):
     def tool(self) -> Tool:
         """What the flange carries."""
 
+    @property
+    def swept(self) -> SweptBodies:
+        """The arm's moving bodies, to bound how far they move."""
+
     def contact(self, q: Floats, *, needle_may_touch_patient: bool) -> Contact | None:
         """The first contact found at ``q``, shape (6,), rad; None when the arm is clear."""
+
+    def contacts(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact | None]:
+        """Of each of many states (n, 6), rad, by itself what ``contact`` says."""
 
     def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
         """The first state of ``q_path`` (m, 6), rad, with a contact, and the contact; None when all are clear."""

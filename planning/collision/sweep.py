@@ -9,6 +9,7 @@ from itertools import product
 
 import numpy as np
 
+from puncture_twin.planning.arm.kernels import link_frames
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.tool import Tool
@@ -60,8 +61,23 @@ class SweptBodies:
         """
         path = np.array(q_path, dtype=np.float64, order="C")
         bounds = np.empty((len(path) - 1, 6))
-        _motion_bounds(link_poses(self.model, path), path, self.corners, self.longest_lever_mm, bounds)
+        motion_bounds(link_poses(self.model, path), path, self.corners, self.longest_lever_mm, bounds)
         return bounds
+
+    def moving(self, q_path: Floats) -> tuple[Floats, Floats, Floats]:
+        """A path's frames, and how far bodies and joints may have moved since its first state.
+
+        Args:
+            q_path: Shape (m, 6), rad.
+
+        Returns:
+            T_base_link, shape (m, 7, 4, 4), mm; sums of :meth:`bounds_mm`, shape (m, 7), mm, the base's first; sums
+            of each joint's turns, shape (m, 6), rad.
+        """
+        path = np.array(q_path, dtype=np.float64, order="C")
+        frames, moved, rotated = np.empty((len(path), 7, 4, 4)), np.empty((len(path), 7)), np.empty((len(path), 6))
+        _moving(self.model.lengths, path, self.corners, self.longest_lever_mm, frames, moved, rotated)
+        return frames, moved, rotated
 
     @cached_property
     def longest_lever_mm(self) -> float:
@@ -72,7 +88,20 @@ class SweptBodies:
 
 
 @nb.njit(cache=True)
-def _motion_bounds(frames, q, corners, lever, bounds):  # type: ignore[no-untyped-def]  # numba infers
+def _moving(lengths, q, corners, lever, frames, moved, rotated):  # type: ignore[no-untyped-def]  # numba infers
+    """Fill ``frames`` (m, 7, 4, 4), ``moved`` (m, 7) and ``rotated`` (m, 6) from ``q`` (m, 6)."""
+    link_frames(lengths, q, frames)
+    bounds = np.empty((len(q) - 1, 6))
+    motion_bounds(frames, q, corners, lever, bounds)
+    moved[0], rotated[0], moved[:, 0] = 0.0, 0.0, 0.0
+    for k in range(len(q) - 1):
+        for link in range(6):
+            moved[k + 1, link + 1] = moved[k, link + 1] + bounds[k, link]
+            rotated[k + 1, link] = rotated[k, link] + abs(q[k + 1, link] - q[k, link])
+
+
+@nb.njit(cache=True)
+def motion_bounds(frames, q, corners, lever, bounds):  # type: ignore[no-untyped-def]  # numba infers
     """Fill ``bounds`` (m - 1, 6) from ``frames`` (m, 7, 4, 4), ``q`` (m, 6) and box ``corners`` (6, 8, 3).
 
     A NaN anywhere gives a NaN.

@@ -91,10 +91,16 @@ def check_gantry(case: Case, skin: TriangleMesh) -> None:
         raise InputError(what, where=f"{case.path}: gantry", allowed="a bore about the body: see center_mm, tilt_deg")
 
 
+def outside_surface(anatomy: Anatomy) -> TriangleMesh | None:
+    """What the CT shows outside of the skin that the arm must not touch, CT frame; None where there is nothing."""
+    outside = [one.mesh for one in anatomy.surroundings if one.role is Role.UNKNOWN]
+    return joined(outside) if outside else None
+
+
 def patient_surface(anatomy: Anatomy) -> TriangleMesh:
     """What the arm must not touch as the patient, CT frame: the skin, and what the CT shows outside of it."""
-    outside = [one.mesh for one in anatomy.surroundings if one.role is Role.UNKNOWN]
-    return joined([anatomy.skin.mesh, *outside]) if outside else anatomy.skin.mesh
+    outside = outside_surface(anatomy)
+    return anatomy.skin.mesh if outside is None else joined([anatomy.skin.mesh, outside])
 
 
 def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory = NO_MEMORY) -> FastChecker:
@@ -106,20 +112,23 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
         InputError: The robot's base stands in the patient, or the gantry's wall does.
     """
     check_gantry(case, anatomy.skin.mesh)
-    surface, alone = patient_surface(anatomy), anatomy.skin.mesh
+    skin, outside = anatomy.skin.mesh, outside_surface(anatomy)
     boxes = case_boxes(case, T_base_ct)
     model, tool = case.robot.model, case_tool(case)
 
     def make() -> FastChecker:
-        patient, skin = surface.transformed(T_base_ct), None if surface is alone else alone.transformed(T_base_ct)
-        return FastChecker(model, tool, boxes, patient, skin=skin, padding_mm=ARM_PADDING_MM, cache=user_cache())
+        surfaces = (None if mesh is None else mesh.transformed(T_base_ct) for mesh in (skin, outside))
+        return FastChecker(
+            model, tool, boxes, next(surfaces), outside=next(surfaces), padding_mm=ARM_PADDING_MM, cache=user_cache()
+        )
 
     if memory is NO_MEMORY:
         return make()
     stated = tuple((box.name, box.T_base_box.tobytes(), box.size_mm) for box in boxes)
-    surfaces = (surface.digest, alone.digest, np.ascontiguousarray(T_base_ct, np.float64).tobytes())
-    key = (__name__, model, tool, stated, surfaces, ARM_PADDING_MM)
-    return memory.get(key, make, lambda _: CHECKER_BYTES + TREE_COPIES * (surface.nbytes + alone.nbytes))
+    meshes = [mesh for mesh in (skin, outside) if mesh is not None]
+    place = np.ascontiguousarray(T_base_ct, np.float64).tobytes()
+    key = (__name__, model, tool, stated, tuple(mesh.digest for mesh in meshes), place, ARM_PADDING_MM)
+    return memory.get(key, make, lambda _: CHECKER_BYTES + TREE_COPIES * sum(mesh.nbytes for mesh in meshes))
 
 
 def home_configuration(case: Case) -> Floats:

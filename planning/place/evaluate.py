@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from puncture_twin.planning.arm.links import joined
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
@@ -50,7 +52,7 @@ class PlacementCheck:
         model: The arm.
         tool: What its flange carries.
         skin: CT frame.
-        patient: CT frame, the skin and what the CT shows outside of it.
+        outside: CT frame, what the CT shows outside of it, or None.
         fixed: Boxes that stand with the patient; their ``T_base_box`` is in the CT frame.
         carried: Boxes that stand with the arm, base frame.
         padding_mm: Of the arm.
@@ -62,13 +64,18 @@ class PlacementCheck:
     model: UrModel
     tool: Tool
     skin: TriangleMesh
-    patient: TriangleMesh
+    outside: TriangleMesh | None
     fixed: tuple[Box, ...]
     carried: tuple[Box, ...]
     padding_mm: float
     target_ct: Floats
     wanted: WantedDirections
     home: Floats
+
+    @cached_property
+    def patient(self) -> TriangleMesh:
+        """CT frame: the skin, and what the CT shows outside of it."""
+        return self.skin if self.outside is None else joined([self.skin, self.outside])
 
     def verdict(self, T_base_ct: Floats) -> Verdict:
         """Check every direction.
@@ -98,11 +105,10 @@ class PlacementCheck:
 
     def _checker(self, T_base_ct: Floats) -> FastChecker:
         boxes = [Box(box.name, T_base_ct @ box.T_base_box, box.size_mm) for box in self.fixed]
-        patient, skin = (mesh.transformed(T_base_ct) for mesh in (self.patient, self.skin))
+        outside = None if self.outside is None else self.outside.transformed(T_base_ct)
         model, everything = self.model, (*boxes, *self.carried)
-        return FastChecker(
-            model, self.tool, everything, patient, skin=skin, padding_mm=self.padding_mm, cache=user_cache()
-        )
+        skin, cache = self.skin.transformed(T_base_ct), user_cache()
+        return FastChecker(model, self.tool, everything, skin, outside=outside, padding_mm=self.padding_mm, cache=cache)
 
 
 def _contact_text(contact: Contact | None) -> str:

@@ -22,7 +22,7 @@ from puncture_twin.planning.collision.workcell import (
     case_tool,
     check_gantry,
     home_configuration,
-    patient_surface,
+    outside_surface,
 )
 from puncture_twin.planning.place.arm_spheres import Surroundings
 from puncture_twin.planning.place.bed import bed_frame
@@ -205,7 +205,7 @@ def _placement_check(case: Case, anatomy: Anatomy, found: Candidates) -> Placeme
         model=case.robot.model,
         tool=case_tool(case),
         skin=anatomy.skin.mesh,
-        patient=patient_surface(anatomy),
+        outside=outside_surface(anatomy),
         fixed=tuple(box for box in boxes if box.name not in carried),
         carried=tuple(box for box in boxes if box.name in carried),
         padding_mm=ARM_PADDING_MM,

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.insertion import (
     NeedleLine,
     away_from_singularities,
-    branch_path,
     every_branch,
     first_stop,
     flange_at,
@@ -31,6 +30,7 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.checker import Contact, StateChecker
 from puncture_twin.planning.reach.answer import ReachAnswer, ReachRequest
+from puncture_twin.planning.reach.sampling import sampled
 
 __all__ = [
     "MAX_SWEEP_MM",
@@ -54,7 +54,7 @@ MARGIN_DIGITS = 9
 ROLLS = 8
 """Rolls about the needle that are tried, evenly over the turn."""
 
-CHUNK = 64
+CHUNK = 256
 """Requests between two reports of progress."""
 
 ROLL_BODIES = frozenset({"wrist_3", "tool"})
@@ -69,10 +69,8 @@ class _Insertion(NamedTuple):
     roll: float
     turn: Floats
     """Shape (6,), rad: what to add to the branch's path at roll 0, the roll and whole turns."""
-
-    def along(self, model: UrModel, request: ReachRequest, depths_mm: Floats) -> Floats:
-        """The motion at some depths, shape (m, 6), rad."""
-        return branch_path(model, self.line, _distances(request, depths_mm), self.branch, self.turn)
+    standoff: Floats
+    """Shape (6,), rad: where the motion begins."""
 
 
 class _Blocked(NamedTuple):
@@ -107,8 +105,9 @@ def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswe
         InputError: See :func:`assess_reach_all`.
     """
     surveyed = next(_surveyed(checker, [request], ROLLS))
-    tries = ((insertion, _try(checker, request, insertion, surveyed.depths)) for insertion in surveyed.insertions())
-    return [_success(checker.model, insertion, tried) for insertion, tried in tries if tried.block is None]
+    insertions = list(surveyed.insertions())
+    tried = _tried_all(checker, [(surveyed, insertion) for insertion in insertions])
+    return [_success(checker.model, *one) for one in zip(insertions, tried, strict=True) if one[1].block is None]
 
 
 def assess_reach_all(
@@ -121,7 +120,7 @@ def assess_reach_all(
     """Find, for each direction, a roll and a branch that reach the standoff pose and insert straight, untouched.
 
     All (roll, branch) pairs are ordered by margin; the first that is clear is the answer, so it is the best of them.
-    Kinematics comes first, for all requests; then contacts, one by one.
+    Kinematics comes first, for a chunk of requests; then contacts, of each request's next motion at once.
 
     Args:
         checker: Checks contacts, in the base frame.
@@ -148,12 +147,21 @@ class _Surveyed(NamedTuple):
     depths: Floats
     rolls: Floats
     stop_at: NDArray[np.int64]
+    starts: Floats
     margins: Floats
     turns: Floats
 
     def insertions(self, without: Container[int] = ()) -> Iterator[_Insertion]:
-        """The motions that kinematics allows, see :func:`_insertions`."""
-        return _insertions(self.line, self.margins, self.turns, self.rolls, without)
+        """The motions that kinematics allows, the best margin first; of equals the first branch, then the first roll.
+
+        Branches that ``without`` has come to hold are passed over.
+        """
+        branches, rolled = np.nonzero(~np.isnan(self.margins))
+        order = np.argsort(-np.round(self.margins[branches, rolled], MARGIN_DIGITS), kind="stable")
+        for branch, roll in zip(branches[order].tolist(), rolled[order].tolist(), strict=True):
+            if branch not in without:
+                turn = self.turns[branch, roll]
+                yield _Insertion(self.line, branch, float(self.rolls[roll]), turn, self.starts[branch] + turn)
 
 
 def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> Iterator[_Surveyed]:
@@ -170,18 +178,55 @@ def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: 
     distances = [_distances(request, depth) for request, depth in zip(requests, depths, strict=True)]
     lines = needle_lines(targets, outwards)
     found = survey(checker.model, lines, distances, depths, rolls)
-    for request, line, depth, stop_at, margins, turns in zip(requests, lines, depths, *found, strict=True):
-        yield _Surveyed(request, line, depth, rolls, stop_at, margins, turns)
+    for request, line, depth, *of_request in zip(requests, lines, depths, *found, strict=True):
+        yield _Surveyed(request, line, depth, rolls, *of_request)
 
 
 def _answers(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[ReachAnswer]:
-    answers = []
-    for found in _surveyed(checker, requests, n_rolls):
-        if not np.isnan(found.margins).all():
-            answers.append(_first_clear(checker, found))
-        else:
-            answers.append(_why_none(checker.model, found.request, found.line, found.depths, found.stop_at))
-    return answers
+    """Of each request; round by round the next motion of all that have no answer yet."""
+    searches = [_Search(found) for found in _surveyed(checker, requests, n_rolls)]
+    waiting = searches
+    while waiting := [search for search in waiting if search.next is not None]:
+        nexts = [(search.surveyed, search.next) for search in waiting if search.next is not None]
+        for search, tried in zip(waiting, _tried_all(checker, nexts), strict=True):
+            search.take(tried)
+    return [search.answer(checker.model) for search in searches]
+
+
+class _Search:
+    """The search for the first clear motion of one request: what is tried next, and what came of those before."""
+
+    def __init__(self, surveyed: _Surveyed) -> None:
+        self.surveyed = surveyed
+        self._hopeless: set[int] = set()
+        self._blocks: list[_Blocked] = []
+        self._found: _Tried | None = None
+        self._insertions = surveyed.insertions(without=self._hopeless)
+        self._best: _Insertion | None = None
+        self.next = next(self._insertions, None)
+
+    def take(self, tried: _Tried) -> None:
+        """What came of the next motion: it is the answer, or there is another next one."""
+        if tried.block is None:
+            self._found, self._best, self.next = tried, self.next, None
+            return
+        assert self.next is not None  # it was tried
+        self._blocks.append(tried.block)
+        if tried.block.at_any_roll:
+            self._hopeless.add(self.next.branch)
+        self.next = next(self._insertions, None)
+
+    def answer(self, model: UrModel) -> ReachAnswer:
+        """Of a search that is over: the first motion that touches nothing; else a refusal with what came farthest."""
+        if self._found is not None and self._best is not None:
+            return _success(model, self._best, self._found)
+        if not self._blocks:
+            found = self.surveyed
+            return _why_none(model, found.request, found.line, found.depths, found.stop_at)
+        deepest = max(self._blocks, key=lambda block: block.depth_mm)  # the first of equals: the best margin
+        if deepest.at_standoff:
+            return _refusal(Reason.ARM_COLLISION, None, deepest.detail, deepest.contact)
+        return _refusal(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail, deepest.contact)
 
 
 def _why_none(
@@ -210,47 +255,31 @@ def _distances(request: ReachRequest, depths_mm: Floats) -> Floats:
     return request.needle_length_mm + request.standoff_mm - depths_mm
 
 
-def _insertions(
-    line: NeedleLine, margins: Floats, turns: Floats, rolls: Floats, without: Container[int] = ()
-) -> Iterator[_Insertion]:
-    """The motions that kinematics allows, the best margin first; of equals the first branch, then the first roll.
-
-    Branches that ``without`` has come to hold are passed over.
-    """
-    branches, rolled = np.nonzero(~np.isnan(margins))
-    order = np.argsort(-np.round(margins[branches, rolled], MARGIN_DIGITS), kind="stable")
-    for branch, roll in zip(branches[order].tolist(), rolled[order].tolist(), strict=True):
-        if branch not in without:
-            yield _Insertion(line, branch, float(rolls[roll]), turns[branch, roll])
+def _tried_all(checker: StateChecker, motions: Sequence[tuple[_Surveyed, _Insertion]]) -> list[_Tried]:
+    """Check motions for contacts: the standoffs of all at once, then those motions whose standoff is clear."""
+    standoffs = np.array([insertion.standoff for _, insertion in motions]).reshape(-1, 6)
+    contacts = checker.contacts(standoffs, needle_may_touch_patient=False)
+    return [
+        _tried(checker, surveyed.request, insertion, surveyed.depths)
+        if contact is None
+        else _held(surveyed, insertion, contact)
+        for (surveyed, insertion), contact in zip(motions, contacts, strict=True)
+    ]
 
 
-def _first_clear(checker: StateChecker, surveyed: _Surveyed) -> ReachAnswer:
-    """The first of a request's motions that touches nothing; else a refusal with the one that came farthest."""
-    blocks: list[_Blocked] = []
-    hopeless: set[int] = set()
-    for insertion in surveyed.insertions(without=hopeless):
-        tried = _try(checker, surveyed.request, insertion, surveyed.depths)
-        if tried.block is None:
-            return _success(checker.model, insertion, tried)
-        blocks.append(tried.block)
-        if tried.block.at_any_roll:
-            hopeless.add(insertion.branch)
-    deepest = max(blocks, key=lambda block: block.depth_mm)  # the first of equals: the best margin
-    if deepest.at_standoff:
-        return _refusal(Reason.ARM_COLLISION, None, deepest.detail, deepest.contact)
-    return _refusal(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail, deepest.contact)
+def _held(surveyed: _Surveyed, insertion: _Insertion, contact: Contact) -> _Tried:
+    """A motion whose standoff touches something."""
+    detail = f"{contact.body} touches {contact.other} at standoff"
+    block = _Blocked(0.0, detail, ROLL_BODIES.isdisjoint(contact), at_standoff=True, contact=contact)
+    return _Tried(insertion.standoff[None], surveyed.depths[:1], block)
 
 
-def _try(checker: StateChecker, request: ReachRequest, insertion: _Insertion, depths: Floats) -> _Tried:
-    """Check one motion for contacts, standoff first."""
+def _tried(checker: StateChecker, request: ReachRequest, insertion: _Insertion, depths: Floats) -> _Tried:
+    """Check one motion for contacts, whose standoff is clear."""
     model = checker.model
-    standoff = insertion.along(model, request, depths[:1])
-    contact = checker.contact(standoff[0], needle_may_touch_patient=False)
-    if contact is not None:
-        detail = f"{contact.body} touches {contact.other} at standoff"
-        block = _Blocked(0.0, detail, ROLL_BODIES.isdisjoint(contact), at_standoff=True, contact=contact)
-        return _Tried(standoff, depths[:1], block)
-    q, depths = _refined(checker, request, insertion, depths)
+    lengths = request.needle_length_mm, request.standoff_mm
+    line, branch, turn = insertion.line, insertion.branch, insertion.turn
+    q, depths = sampled(checker.swept, line, branch, turn, lengths, len(depths), MAX_SWEEP_MM)
     stop = first_stop(model, q, depths)
     if stop is not None:
         return _Tried(q, depths, _Blocked(stop.depth_mm, stop.detail))
@@ -262,19 +291,6 @@ def _try(checker: StateChecker, request: ReachRequest, insertion: _Insertion, de
     depth, contact = float(depths[first.at]), first.contact
     detail = f"{contact.body} touches {contact.other} {depth:.1f} mm after the standoff"
     return _Tried(q, depths, _Blocked(depth, detail, ROLL_BODIES.isdisjoint(contact), contact=contact))
-
-
-def _refined(
-    checker: StateChecker, request: ReachRequest, insertion: _Insertion, depths: Floats
-) -> tuple[Floats, Floats]:
-    """The motion sampled so that no body moves more than ``MAX_SWEEP_MM`` from sample to sample, and its depths."""
-    q = insertion.along(checker.model, request, depths)
-    while (worst := checker.sweep_mm(q).max()) > MAX_SWEEP_MM:
-        depths = np.linspace(0.0, request.standoff_mm, math.ceil((len(depths) - 1) * worst / MAX_SWEEP_MM) + 1)
-        q = insertion.along(checker.model, request, depths)
-        if np.isnan(q).any():
-            break  # the caller finds where
-    return q, depths
 
 
 def _success(model: UrModel, insertion: _Insertion, tried: _Tried) -> ReachAnswer:

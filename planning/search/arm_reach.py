@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from itertools import repeat
 
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.checker import CellChecker
@@ -26,7 +27,7 @@ class ArmReach:
 def with_reach(case: Case, found: Candidates, reach: ArmReach, progress: Count | None = None) -> Candidates:
     """Check the arm for every candidate that the organs allow; progress counts the checked ones."""
     rows = np.flatnonzero(found.safe)
-    requests = [reach_request(case, found, int(row), reach.T_base_ct) for row in rows]
+    requests = reach_requests(case, found, rows, reach.T_base_ct)
     answers = assess_reach_all(reach.checker, requests, progress)
     verdict = {field.name: getattr(found.verdict, field.name).copy() for field in fields(found.verdict)}
     reachable, margin, q_insertion = (getattr(found.arm, field.name).copy() for field in fields(found.arm))
@@ -47,12 +48,15 @@ def with_reach(case: Case, found: Candidates, reach: ArmReach, progress: Count |
 
 def reach_request(case: Case, candidates: Candidates, row: int, T_base_ct: Floats) -> ReachRequest:
     """What the arm has to reach for one candidate."""
-    return ReachRequest(
-        target_base=T_base_ct[:3, :3] @ case.target_ct + T_base_ct[:3, 3],
-        outward_base=T_base_ct[:3, :3] @ candidates.outward_ct[row],
-        needle_length_mm=case.needle.length_mm,
-        standoff_mm=float(standoffs(case.needle, candidates.path.length[row], candidates.path.skin_angle[row])),
-    )
+    return reach_requests(case, candidates, np.array([row]), T_base_ct)[0]
+
+
+def reach_requests(case: Case, candidates: Candidates, rows: Ints, T_base_ct: Floats) -> list[ReachRequest]:
+    """What the arm has to reach for some candidates."""
+    R, target = T_base_ct[:3, :3], T_base_ct[:3, :3] @ case.target_ct + T_base_ct[:3, 3]
+    lengths = standoffs(case.needle, candidates.path.length[rows], candidates.path.skin_angle[rows]).tolist()
+    outward = [R @ candidates.outward_ct[row] for row in rows]
+    return [ReachRequest(target, *of_row) for of_row in zip(outward, repeat(case.needle.length_mm), lengths)]
 
 
 def reach_depth(case: Case, found: Candidates, row: int, inserted_mm: float) -> float:

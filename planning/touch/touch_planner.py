@@ -17,7 +17,7 @@ from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.workcell import (
     case_boxes,
     case_tool,
-    patient_surface,
+    outside_surface,
 )
 from puncture_twin.planning.formats.points.point_files import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
@@ -223,13 +223,13 @@ def approach_checkers(context: CaseContext, needle_padding_mm: float) -> Approac
     tool = case_tool(context.case)
     short = replace(tool, needle_length_mm=tool.needle_length_mm - TIP_MM, shaft_mm=tool.shaft_mm - TIP_MM)
     case, anatomy, T_base_ct = context.case, context.anatomy, context.reach.T_base_ct
-    surface, alone = patient_surface(anatomy), anatomy.skin.mesh
+    outside = outside_surface(anatomy)
     blunted = FastChecker(
         case.robot.model,
         short,
         case_boxes(case, T_base_ct),
-        surface.transformed(T_base_ct),
-        skin=None if surface is alone else alone.transformed(T_base_ct),
+        anatomy.skin.mesh.transformed(T_base_ct),
+        outside=None if outside is None else outside.transformed(T_base_ct),
         padding_mm=needle_padding_mm,
         cache=user_cache(),
     )

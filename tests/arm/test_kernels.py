@@ -76,8 +76,9 @@ def test_the_survey_is_what_its_parts_say() -> None:
     model, many = ur_model("ur3"), lines(60, seed=4)
     found = survey(model, many, [DISTANCES] * 60, [DEPTHS] * 60, ROLLS)
     allowed = 0
-    for line, stop_at, margins, turns in zip(many, *found, strict=True):
+    for line, stop_at, starts, margins, turns in zip(many, *found, strict=True):
         ways = every_branch(model, line, DISTANCES)
+        assert np.array_equal(starts, ways[:, 0], equal_nan=True)
         for branch in range(8):
             stop = first_stop(model, ways[branch], DEPTHS)
             assert (stop is None) == (stop_at[branch] < 0)

@@ -165,8 +165,12 @@ def test_what_is_outside_of_the_body_is_named_so(engine: type[CellChecker]) -> N
     at = T[:3, 3] + 60.0 * T[:3, 2]
     there, elsewhere = cuboid(at - 15.0, at + 15.0), cuboid(at - 15.0 + 3000.0, at + 15.0 + 3000.0)
     both = joined([there, elsewhere])
-    for skin, other in ((there, "patient"), (elsewhere, "outside_body"), (None, "patient")):
-        checker = engine(UR3, TOOL, patient=both, skin=skin)
+    for skin, outside, other in (
+        (there, elsewhere, "patient"),
+        (elsewhere, there, "outside_body"),
+        (both, None, "patient"),
+    ):
+        checker = engine(UR3, TOOL, patient=skin, outside=outside)
         assert checker.contact(BENT, needle_may_touch_patient=True) == Contact("holder", other)
 
 

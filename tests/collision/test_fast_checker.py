@@ -28,7 +28,7 @@ from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING, hull_gap
 from puncture_twin.planning.collision.kernels.surfaces import STACK, to_surface
-from puncture_twin.planning.collision.proofs import fcl_touches
+from puncture_twin.planning.collision.proofs import fcl_contact
 from puncture_twin.planning.collision.shapes import convex
 from puncture_twin.planning.collision.triangle_tree import TriangleTree
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool
@@ -379,7 +379,7 @@ def test_what_a_judge_remembers_changes_no_verdict() -> None:
         if contact is not None:
             states = ends[0] + np.linspace(0.0, 1.0, 400)[:, None] * (ends[1] - ends[0])
             names = [check for check in slow._checks if check.contact == contact]
-            met = (fcl_touches(check, poses) for poses in link_poses(UR3, states) for check in names)
+            met = (fcl_contact(check, poses) is not None for poses in link_poses(UR3, states) for check in names)
             assert any(met)
 
 

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import trimesh
 
 from benchmarks.chen2019_reach import SHARES, WINDOWS, PublishedShare, cap, runs
-from puncture_twin.planning.arm.insertion import MIN_SINGULARITY, every_branch, flange_poses, needle_lines, reach_margin
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse, singularity
+from puncture_twin.planning.arm.insertion import (
+    MIN_SINGULARITY,
+    branch_path,
+    every_branch,
+    flange_poses,
+    needle_lines,
+    reach_margin,
+)
+from puncture_twin.planning.arm.kinematics import flange_pose, inverse, link_poses, singularity
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.collision.sweep import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.reach.reach import MAX_SWEEP_MM, ReachRequest, assess_reach_all
+from puncture_twin.planning.reach.sampling import sampled
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=200.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
@@ -290,3 +301,36 @@ def test_requests_that_make_no_sense_are_refused() -> None:
         request(u, 0.0)
     with pytest.raises(InputError, match="n_rolls"):
         assess_reach_all(checker, [request(u)], n_rolls=0)[0]
+
+
+def test_the_samples_are_those_of_the_plain_loop() -> None:
+    """Depths as ``np.linspace`` has them, states as ``branch_path``, as many as the largest motion asks for."""
+    swept, rng = SweptBodies.of(UR3, TOOL), np.random.default_rng(5)
+    ended = 0
+    for _ in range(200):
+        u = rng.normal(size=3)
+        line = needle_lines(TARGET[None], u[None] / np.linalg.norm(u))[0]
+        branch, turn, standoff = int(rng.integers(8)), rng.normal(size=6), float(rng.uniform(20.0, 200.0))
+        lengths = TOOL.needle_length_mm, standoff
+        count = math.ceil(standoff / MAX_SWEEP_MM) + 1
+        found = sampled(swept, line, branch, turn, lengths, count, MAX_SWEEP_MM)
+        while True:
+            depths = np.linspace(0.0, standoff, count)
+            q = branch_path(UR3, line, sum(lengths) - depths, branch, turn)
+            if not (worst := swept.bounds_mm(q).max()) > MAX_SWEEP_MM:
+                break
+            count = math.ceil((count - 1) * worst / MAX_SWEEP_MM) + 1
+        ended += bool(np.isnan(q).any())
+        assert np.array_equal(found.depths_mm, depths) and np.array_equal(found.q, q, equal_nan=True)
+    assert 20 < ended < 180
+
+
+def test_how_far_a_path_may_have_moved_is_the_sum_of_its_bounds() -> None:
+    """Frames as ``link_poses``; motions and turns as running sums."""
+    swept = SweptBodies.of(UR3, TOOL, 5.0)
+    path = np.random.default_rng(6).uniform(-3.0, 3.0, (30, 6))
+    frames, moved, rotated = swept.moving(path)
+    assert np.array_equal(frames, link_poses(UR3, path))
+    assert not moved[0].any() and not moved[:, 0].any() and not rotated[0].any()
+    assert np.array_equal(moved[1:, 1:], np.cumsum(swept.bounds_mm(path), axis=0))
+    assert np.array_equal(rotated[1:], np.cumsum(np.abs(np.diff(path, axis=0)), axis=0))

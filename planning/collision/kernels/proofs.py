@@ -142,6 +142,21 @@ def near_gap(scene, work, at, frames, enough, far, needed):
     return hull_gap(scene.hulls, scene.checks[at, 1], second, work.M, work.axes[at], work.corners[at], needed, work.S)
 
 
+@nb.njit(cache=True, inline="always")
+def _gap(scene, work, at, frames, enough, far, needed):
+    """Lower bound as of :func:`near_gap`, sooner where the spheres about two hulls are ``enough`` apart.
+
+    The spheres stand where :func:`place_spheres` has put them.
+    """
+    kind, first, second = scene.checks[at, 0], scene.checks[at, 1], scene.checks[at, 2]
+    if kind != SKIN:
+        boxes, spheres = (scene.T_box_base, scene.halves), (work.spheres, scene.hulls.radii)
+        gap = sphere_gap(kind == BOX, first, second, spheres[0], spheres[1], boxes[0], boxes[1])
+        if gap > enough:
+            return gap
+    return near_gap(scene, work, at, frames, enough, far, needed)
+
+
 @nb.njit(cache=True)
 def first_unproven(scene, levers, motion, work, proven, state, check, tested, clear_mm):
     """The first state and check, in order, that the bounds do not prove to be more than ``clear_mm`` apart.
@@ -165,13 +180,12 @@ def first_unproven(scene, levers, motion, work, proven, state, check, tested, cl
     Returns:
         state * k + check; -1 where all is clear.
     """
-    checks, radii, T_box_base, halves = scene.checks, scene.hulls.radii, scene.T_box_base, scene.halves
     frames, paths, rotated = motion
-    count, stood = len(checks), -1
+    count, stood = len(scene.checks), -1
     enough, far = (clear_mm + ENOUGH_MM, clear_mm + FAR_MM) if len(frames) > 1 else (clear_mm, clear_mm + MIN_GAP_MM)
     for row in range(state, len(frames)):
         for at in range(check if row == state else 0, count):
-            kind, first, second, frame_a, frame_b = checks[at]
+            kind, frame_a, frame_b = scene.checks[at, 0], scene.checks[at, 3], scene.checks[at, 4]
             path = paths[row, frame_b]
             if kind == PAIR:
                 path = 0.0
@@ -182,16 +196,37 @@ def first_unproven(scene, levers, motion, work, proven, state, check, tested, cl
             if stood < row:
                 stood = row
                 place_spheres(scene.hulls, frames[row], work.spheres)
-            gap = -math.inf
-            if kind != SKIN:
-                gap = sphere_gap(kind == BOX, first, second, work.spheres, radii, T_box_base, halves)
-            if gap <= enough:
-                gap = near_gap(scene, work, at, frames[row], enough, far, clear_mm)
+            gap = _gap(scene, work, at, frames[row], enough, far, clear_mm)
             if gap <= clear_mm:
                 proven[at] = -math.inf
                 return row * count + at
             proven[at] = path + gap - clear_mm
     return -1
+
+
+@nb.njit(cache=True)
+def unproven_at_each(scene, frames, work, tested, begins, found):
+    """At each of some states that have nothing to do with one another, the first check that the bounds do not prove.
+
+    Args:
+        scene: See :class:`ProofScene`.
+        frames: Shape (m, 7, 4, 4), mm: the states.
+        work: See :class:`ProofScratch`.
+        tested: Shape (k,): which checks.
+        begins: Shape (m,): the first check at each state; k to pass it over.
+        found: Shape (m,), filled; -1 where all from there on is clear.
+    """
+    for row in range(len(frames)):
+        found[row] = -1
+        if begins[row] < len(scene.checks):
+            place_spheres(scene.hulls, frames[row], work.spheres)
+        for at in range(begins[row], len(scene.checks)):
+            if (
+                tested[at]
+                and not _gap(scene, work, at, frames[row], MIN_GAP_MM, 2.0 * MIN_GAP_MM, MIN_GAP_MM) > MIN_GAP_MM
+            ):
+                found[row] = at
+                break
 
 
 @nb.njit(cache=True)

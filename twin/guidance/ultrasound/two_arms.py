@@ -21,7 +21,7 @@ from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.bodies import Body, Shape, arm_bodies
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.shapes import FclSkin, touch
+from puncture_twin.planning.collision.shapes import surface, touch
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import PhantomSection, SelfcalCase
@@ -98,7 +98,7 @@ class TwoArms:
             self.needle_model, tools[1], [moved], phantom.transformed(T_base2_base1), padding_mm=clearance
         )
         self._between = BetweenArms(case, case.T_end1_image, case.T_base1_base2, clearance)
-        self._phantom = FclSkin(phantom, "phantom").object
+        self._phantom = fcl.CollisionObject(surface(phantom))
         self._table = fcl.CollisionObject(
             fcl.Box(*table.size_mm), fcl.Transform(table.T_base_box[:3, :3], table.T_base_box[:3, 3])
         )

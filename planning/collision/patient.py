@@ -1,0 +1,117 @@
+"""The patient as FCL is asked about it: the skin and what else the CT shows, in parts that are made when needed."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import NamedTuple
+
+import fcl
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
+from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.collision.shapes import surface, touch
+from puncture_twin.planning.collision.state_checker import PATIENT
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+PART_TRIANGLES = 8192
+"""About so many triangles share a tree: FCL takes some 4 us to build for each, and 20 us to ask a tree."""
+
+ROUNDING_MM = 1e-6
+"""By how much a body's box is grown: far above the rounding of its pose."""
+
+
+class FclSkin:
+    """A surface in parts, each with a tree of its own, which FCL builds when a body first comes near the part.
+
+    To build a tree takes longer than most questions, and the arm comes near to few parts of a patient. FCL judges a
+    triangle by itself, whichever tree it stands in, so the surface touches what one of its parts touches.
+
+    Args:
+        mesh: The surface, mm.
+        name: Of it, for who is told of its fault.
+
+    Raises:
+        InputError: FCL calls a NaN vertex free and dies of an index out of range: so that is looked for first.
+    """
+
+    def __init__(self, mesh: TriangleMesh, name: str) -> None:
+        count = len(mesh.vertices)
+        usable = len(mesh.faces) > 0 and bool(np.isfinite(mesh.vertices).all())
+        if not usable or mesh.faces.min() < 0 or mesh.faces.max() >= count:
+            what = "mesh is empty, not finite or has an index out of range"
+            raise InputError(what, where=name, allowed="a checked mesh")
+        self._mesh = mesh
+
+    def touches(self, solid: fcl.CollisionObject, box: Floats) -> bool:
+        """Whether a body touches the surface where it stands.
+
+        Args:
+            solid: The body.
+            box: Shape (2, 3), mm: lowest and highest corner of a box about it, in its own frame.
+        """
+        low, high = _bounds_at(solid, box)
+        near = np.all((self._bounds[:, 1] >= low) & (self._bounds[:, 0] <= high), axis=1)
+        return any(touch(self._tree(part), solid) for part in np.flatnonzero(near).tolist())
+
+    @cached_property
+    def _parts(self) -> list[Ints]:
+        """The triangles of each part: rows of the mesh's faces."""
+        return halved(self._mesh.triangles.mean(axis=1), PART_TRIANGLES)
+
+    @cached_property
+    def _bounds(self) -> Floats:
+        """Shape (parts, 2, 3), mm: a box about each part."""
+        corners = [self._mesh.triangles[part].reshape(-1, 3) for part in self._parts]
+        return np.array([(points.min(axis=0), points.max(axis=0)) for points in corners])
+
+    @cached_property
+    def _trees(self) -> dict[int, fcl.CollisionObject]:
+        return {}
+
+    def _tree(self, part: int) -> fcl.CollisionObject:
+        if part not in self._trees:
+            faces = self._mesh.faces[self._parts[part]]
+            used, corners = np.unique(faces, return_inverse=True)
+            piece = TriangleMesh(self._mesh.vertices[used], corners.reshape(faces.shape).astype(np.int32))
+            self._trees[part] = fcl.CollisionObject(surface(piece))
+        return self._trees[part]
+
+
+class FclPatient(NamedTuple):
+    """The skin, and what besides it is not to be touched."""
+
+    skin: FclSkin
+    outside: FclSkin | None
+
+    @classmethod
+    def of(cls, skin: TriangleMesh, outside: TriangleMesh | None) -> FclPatient:
+        """Of two surfaces.
+
+        Raises:
+            InputError: See :class:`FclSkin`.
+        """
+        return cls(FclSkin(skin, PATIENT), None if outside is None else FclSkin(outside, OUTSIDE_BODY))
+
+
+def halved(points: Floats, most: int) -> list[Ints]:
+    """Points (n, 3) in compact lots of at most so many, halved along their longest side: rows of each."""
+    waiting, lots = [np.arange(len(points))], list[Ints]()
+    while waiting:
+        rows = waiting.pop()
+        if len(rows) <= most:
+            lots.append(rows)
+            continue
+        axis = np.ptp(points[rows], axis=0).argmax()
+        order = rows[np.argpartition(points[rows, axis], len(rows) // 2)]
+        waiting += [order[: len(rows) // 2], order[len(rows) // 2 :]]
+    return lots
+
+
+def _bounds_at(solid: fcl.CollisionObject, box: Floats) -> tuple[Floats, Floats]:
+    """Lowest and highest corner (3,) of a box about a body's own box where the body stands."""
+    R = solid.getRotation()
+    centre = R @ (0.5 * (box[0] + box[1])) + solid.getTranslation()
+    reach = np.abs(R) @ (0.5 * (box[1] - box[0])) + ROUNDING_MM
+    return centre - reach, centre + reach

@@ -1,0 +1,84 @@
+"""A surface in parts touches what the whole touches; what is never near is never built."""
+
+from __future__ import annotations
+
+import fcl
+import numpy as np
+import pytest
+import trimesh
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.collision.patient import PART_TRIANGLES, FclSkin, halved
+from puncture_twin.planning.collision.shapes import surface, touch
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import exp_rotation
+
+
+def ball(subdivisions: int) -> TriangleMesh:
+    """A sphere: at six subdivisions 81,920 triangles, in sixteen parts."""
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions, radius=100.0)
+    return TriangleMesh(np.asarray(sphere.vertices), np.asarray(sphere.faces))
+
+
+def bodies() -> list[tuple[fcl.CollisionObject, np.ndarray]]:
+    """A cylinder, a box and a surface, each with a box about it."""
+    box = trimesh.creation.box((30.0, 20.0, 60.0))
+    mesh = TriangleMesh(np.asarray(box.vertices), np.asarray(box.faces))
+    about = np.array([[-15.0, -10.0, -30.0], [15.0, 10.0, 30.0]])
+    return [
+        (fcl.CollisionObject(fcl.Cylinder(5.0, 80.0)), np.array([[-5.0, -5.0, -40.0], [5.0, 5.0, 40.0]])),
+        (fcl.CollisionObject(fcl.Box(30.0, 20.0, 60.0)), about),
+        (fcl.CollisionObject(surface(mesh)), about),
+    ]
+
+
+def test_the_parts_touch_what_the_whole_touches(rng) -> None:
+    """Nine hundred poses of three kinds of body, against one tree of the whole surface."""
+    mesh = ball(6)
+    parts, whole = FclSkin(mesh, "ball"), fcl.CollisionObject(surface(mesh))
+    told = []
+    for solid, box in bodies():
+        for _ in range(300):
+            at = rng.normal(size=3)
+            turn, along = exp_rotation(rng.normal(size=3)), at / np.linalg.norm(at) * rng.uniform(50.0, 150.0)
+            solid.setTransform(fcl.Transform(turn, along))
+            told.append((parts.touches(solid, box), touch(whole, solid)))
+    mine, oracle = np.array(told).T
+    assert (mine == oracle).all()
+    assert 100 < oracle.sum() < 800
+
+
+def test_a_body_just_at_the_edge_of_a_part_is_asked_about() -> None:
+    """One flat face exactly on the surface: the box of the body and that of the part share a plane and no more."""
+    wall = TriangleMesh(
+        np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [0.0, 50.0, 0.0]]), np.array([[0, 1, 2]], np.int32)
+    )
+    solid, half = fcl.CollisionObject(fcl.Box(10.0, 10.0, 10.0)), np.full(3, 5.0)
+    for gap, expected in ((0.0, True), (-1e-9, True), (1e-3, False)):
+        solid.setTransform(fcl.Transform(np.eye(3), np.array([10.0, 10.0, 5.0 + gap])))
+        assert FclSkin(wall, "wall").touches(solid, np.array([-half, half])) is expected
+
+
+def test_only_parts_that_a_body_comes_near_are_built() -> None:
+    """Far away none; at the surface one or a few."""
+    parts = FclSkin(ball(6), "ball")
+    solid, box = bodies()[0]
+    solid.setTransform(fcl.Transform(np.eye(3), np.array([0.0, 0.0, 400.0])))
+    assert not parts.touches(solid, box) and not parts._trees
+    solid.setTransform(fcl.Transform(np.eye(3), np.array([0.0, 0.0, 100.0])))
+    assert parts.touches(solid, box) and 0 < len(parts._trees) < len(parts._parts)
+
+
+@pytest.mark.parametrize("count", [1, PART_TRIANGLES, PART_TRIANGLES + 1, 10_000])
+def test_every_triangle_stands_in_one_part(rng, count) -> None:
+    """None is lost, none stands in two, none of the parts is too large."""
+    lots = halved(rng.normal(size=(count, 3)), PART_TRIANGLES)
+    assert np.array_equal(np.sort(np.concatenate(lots)), np.arange(count))
+    assert max(map(len, lots)) <= PART_TRIANGLES
+
+
+def test_a_surface_that_fcl_would_misread_is_refused() -> None:
+    """FCL calls a NaN vertex free."""
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, np.nan, 0.0]])
+    with pytest.raises(InputError, match="not finite"):
+        FclSkin(TriangleMesh(corners, np.array([[0, 1, 2]], np.int32)), "wall")
