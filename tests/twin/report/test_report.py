@@ -31,8 +31,9 @@ from puncture_twin.twin.report.page.page_scene import TRIANGLES, lightened
 from puncture_twin.twin.report.page.page_slices import slices_data
 from puncture_twin.twin.report.palette import SAFE_HIGH, SAFE_LOW
 from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
-from puncture_twin.twin.report.raster.compositing import RasterShot, compose, empty_translucent
-from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, put_moving, translucents_of
+from puncture_twin.twin.report.raster.compositing import RasterShot, Shells, compose
+from puncture_twin.twin.report.raster.moving import MovingPicture
+from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, shells_of
 from puncture_twin.twin.report.scene import film, lighter_mesh, scene_picture
 from puncture_twin.twin.report.scene.film import draw_film
 from puncture_twin.twin.report.scene.film_text import model_note
@@ -269,25 +270,24 @@ def test_depth_and_outline_of_a_ball(ball):
 def test_a_veil_has_both_shells(ball):
     """A see-through ball is hit twice, in front and behind, at the analytic depths."""
     centre, camera, near, far = sphere_view()
-    shells = translucents_of(Layer([Surface(ball(60.0, centre, 5), (200, 40, 40), 0.3)]), camera)
-    assert len(shells) == 2
-    inner = np.isfinite(shells[1].depth) & (far - near > 40)
+    shells = shells_of(Layer([Surface(ball(60.0, centre, 5), (200, 40, 40), 0.3)]), camera)
+    assert len(shells.depth) == 2
+    inner = np.isfinite(shells.depth[1]) & (far - near > 40)
     assert inner.sum() > 1000
-    assert np.abs(shells[0].depth - near)[inner].max() < 0.3
-    assert np.abs(shells[1].depth - far)[inner].max() < 0.3
+    assert np.abs(shells.depth[0] - near)[inner].max() < 0.3
+    assert np.abs(shells.depth[1] - far)[inner].max() < 0.3
 
 
 def test_a_veil_behind_something_opaque_is_not_drawn():
     """Blending respects depth, and is Porter and Duff's over."""
     opaque = RasterShot(np.full((2, 2, 3), 100, np.float32), np.full((2, 2), 50, np.float32))
     for depth, wanted in ((40, 0.25 * 200 + 0.75 * 100), (60, 100)):
-        translucent = replace(
-            empty_translucent((2, 2)),
-            colour=np.full((2, 2, 3), 200, np.float32),
-            alpha=np.full((2, 2), 0.25, np.float32),
-            depth=np.full((2, 2), depth, np.float32),
+        shell = Shells(
+            colour=np.full((1, 2, 2, 3), 200, np.float32),
+            alpha=np.full((1, 2, 2), 0.25, np.float32),
+            depth=np.full((1, 2, 2), depth, np.float32),
         )
-        assert (compose(opaque, [translucent]) == round(wanted)).all()
+        assert (compose(opaque, shell) == round(wanted)).all()
 
 
 def test_a_moved_body_looks_like_a_body_that_stands_there(ball, rng):
@@ -297,9 +297,10 @@ def test_a_moved_body_looks_like_a_body_that_stands_there(ball, rng):
     T[:3, :3] = Rotation.random(rng=rng).as_matrix()
     T[:3, 3] = [20.0, 10.0, -5.0]
     camera = ViewCamera(np.array([0, -300.0, 0]), np.zeros(3), np.array([0, 0, 1.0]), 0.5, 120, 90)
-    still = opaque_shot(Layer([Surface(mesh.transformed(T), (90, 120, 200))]), camera)
-    shot = RasterShot(np.full((90, 120, 3), 7, np.float32), np.full((90, 120), np.inf, np.float32))
-    box = put_moving(shot, Layer([Surface(mesh, (90, 120, 200))]), T, camera)
+    moving = MovingPicture(Layer([]), Layer([]), [Layer([Surface(mesh, (90, 120, 200))])], camera)
+    moving.at([T])
+    still = opaque_shot(Layer([Surface(mesh.transformed(T), (90, 120, 200))]), camera.finer(2))
+    shot, box = moving.shot, moving.changed
     struck = np.isfinite(still.depth)
     # Rays through a shared edge may fall to either triangle: a few pixels differ by rounding.
     assert (struck == np.isfinite(shot.depth)).mean() > 0.999
@@ -314,12 +315,11 @@ def test_a_moved_body_looks_like_a_body_that_stands_there(ball, rng):
 def test_a_body_behind_another_stays_hidden(ball):
     """What moves behind what stands is not drawn."""
     camera = ViewCamera(np.array([0, -300.0, 0]), np.zeros(3), np.array([0, 0, 1.0]), 0.5, 60, 60)
-    shot = opaque_shot(Layer([Surface(ball(40.0), (250, 0, 0))]), camera)
-    before = shot.colour.copy()
-    T = np.eye(4)
+    wall, T = Layer([Surface(ball(40.0), (250, 0, 0))]), np.eye(4)
     T[1, 3] = 150.0
-    put_moving(shot, Layer([Surface(ball(20.0), (0, 0, 250))]), T, camera)
-    assert np.array_equal(shot.colour, before)
+    moving = MovingPicture(wall, Layer([]), [Layer([Surface(ball(20.0), (0, 0, 250))])], camera)
+    moving.at([T])
+    assert np.array_equal(moving.shot.colour, opaque_shot(wall, camera.finer(2)).colour)
 
 
 def test_camera_round_trip(rng):

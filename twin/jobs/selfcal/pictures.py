@@ -28,7 +28,7 @@ from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.annotate import width_of, write
 from puncture_twin.twin.report.raster.camera import camera_around
 from puncture_twin.twin.report.raster.compositing import compose
-from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, translucents_of
+from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, shells_of
 from puncture_twin.twin.report.scene.shapes import bar, box
 
 PX_PER_MM = 8
@@ -186,7 +186,7 @@ def workcell_picture(case: SelfcalCase, q_probe: Floats, q_needle: Floats, path:
     toward, up = np.array([0.25, 1.0, -0.45]), np.array([0.0, 0.0, 1.0])
     camera = camera_around(points, toward, up, fov=0.5, width=WORKCELL_SIZE[0], height=WORKCELL_SIZE[1])
     fine = camera.finer(2)
-    pixels = compose(opaque_shot(Layer(opaque), fine), translucents_of(Layer(veiled), fine))
+    pixels = compose(opaque_shot(Layer(opaque), fine), shells_of(Layer(veiled), fine))
     picture = Image.fromarray(np.ascontiguousarray(pixels))
     if picture.size != WORKCELL_SIZE:
         picture = picture.resize(WORKCELL_SIZE, Image.Resampling.LANCZOS)

@@ -4,15 +4,16 @@ from .compositing import (
     SAMPLES as SAMPLES,
     PixelBox as PixelBox,
     RasterShot as RasterShot,
-    TranslucentLayer as TranslucentLayer,
+    Shells as Shells,
     compose as compose,
+    recompose as recompose,
 )
+from .moving import MovingPicture as MovingPicture
 from .render import (
     BACKGROUND as BACKGROUND,
     Layer as Layer,
     Surface as Surface,
     opaque_shot as opaque_shot,
     picture as picture,
-    put_moving as put_moving,
-    translucents_of as translucents_of,
+    shells_of as shells_of,
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -29,23 +28,34 @@ class RasterShot:
     colour: Floats32
     depth: Floats32
 
+    def part(self, where: tuple[slice, slice]) -> RasterShot:
+        """Rows and columns of it."""
+        return RasterShot(self.colour[where], self.depth[where])
+
 
 @dataclass(frozen=True, eq=False)
-class TranslucentLayer:
-    """One see-through layer: colour, opacity and depth per sample."""
+class Shells:
+    """See-through surfaces, the nearest of every sample first.
+
+    Attributes:
+        colour: Shape (k, h, w, 3), 0..255.
+        alpha: Shape (k, h, w), opacity, 0..1.
+        depth: Shape (k, h, w), mm along the ray, infinite where there is none.
+    """
 
     colour: Floats32
     alpha: Floats32
     depth: Floats32
 
-
-def empty_translucent(size: tuple[int, int]) -> TranslucentLayer:
-    """A translucent layer with nothing in it, of a height and width in samples."""
-    return TranslucentLayer(
-        np.zeros((*size, 3), dtype=np.float32),
-        np.zeros(size, dtype=np.float32),
-        np.full(size, np.inf, dtype=np.float32),
-    )
+    @staticmethod
+    def empty(count: int, height: int, width: int) -> Shells:
+        """Shells with nothing in them; the size is in samples."""
+        size = (count, height, width)
+        return Shells(
+            np.zeros((*size, 3), dtype=np.float32),
+            np.zeros(size, dtype=np.float32),
+            np.full(size, np.inf, dtype=np.float32),
+        )
 
 
 class PixelBox(NamedTuple):
@@ -66,56 +76,70 @@ class PixelBox(NamedTuple):
         """To index an image."""
         return slice(self.y0, self.y1), slice(self.x0, self.x1)
 
-    def around(self, other: PixelBox) -> PixelBox:
-        """The least box that holds both."""
-        if self.empty or other.empty:
-            return other if self.empty else self
-        return PixelBox(min(self.x0, other.x0), min(self.y0, other.y0), max(self.x1, other.x1), max(self.y1, other.y1))
-
 
 NOWHERE = PixelBox(0, 0, 0, 0)
 
 
-def compose(
-    shot: RasterShot, translucents: Sequence[TranslucentLayer], box: PixelBox | None = None
-) -> NDArray[np.uint8]:
-    """Blend the translucent layers over the opaque shot and average the samples to pixels, shape (h, w, 3).
+def compose(shot: RasterShot, shells: Shells) -> NDArray[np.uint8]:
+    """Blend see-through shells over the opaque shot and average the samples to pixels, shape (h, w, 3).
 
     The "over" operator of Porter and Duff, Compositing Digital Images (SIGGRAPH 1984), from back to front.
 
     Args:
         shot: The opaque part, in the sample grid.
-        translucents: The shells of ``translucents_of``, nearest first; drawn where they lie before the opaque part.
-        box: The part to make, in samples, whole pixels; all of it when None.
+        shells: Drawn where they lie before the opaque part.
     """
     height, width = shot.depth.shape
-    part = (box or PixelBox(0, 0, width, height)).slices
-    colour = shot.colour[part].copy()
-    for translucent in reversed(translucents):
-        _blend(colour, shot.depth[part], translucent.colour[part], translucent.alpha[part], translucent.depth[part])
-    return np.asarray(_pixels(colour, SAMPLES))
-
-
-@nb.njit(cache=True, nogil=True)
-def _blend(colour, depth, translucent_colour, translucent_alpha, translucent_depth):  # type: ignore[no-untyped-def]  # numba infers
-    """One translucent layer over what lies behind it, sample by sample, in place."""
-    for i in range(depth.shape[0]):
-        for j in range(depth.shape[1]):
-            if translucent_depth[i, j] < depth[i, j]:
-                for k in range(3):
-                    colour[i, j, k] += translucent_alpha[i, j] * (translucent_colour[i, j, k] - colour[i, j, k])
-
-
-@nb.njit(cache=True, nogil=True)
-def _pixels(colour, samples):  # type: ignore[no-untyped-def]  # numba infers
-    """Means of squares of samples, rounded."""
-    pixels = np.empty((colour.shape[0] // samples, colour.shape[1] // samples, 3), dtype=np.uint8)
-    for i in range(pixels.shape[0]):
-        for j in range(pixels.shape[1]):
-            for k in range(3):
-                total = 0.0
-                for a in range(samples):
-                    for b in range(samples):
-                        total += colour[i * samples + a, j * samples + b, k]
-                pixels[i, j, k] = np.uint8(min(max(np.round(total / samples**2), 0.0), 255.0))
+    pixels = np.empty((height // SAMPLES, width // SAMPLES, 3), dtype=np.uint8)
+    nothing = np.full((height, width), np.nan, dtype=np.float32)
+    recompose(pixels, shot, shells, nothing, PixelBox(0, 0, width, height))
     return pixels
+
+
+def recompose(pixels: NDArray[np.uint8], shot: RasterShot, shells: Shells, before: Floats32, box: PixelBox) -> None:
+    """Make those pixels of a picture anew, in place, that show something else than they did.
+
+    Args:
+        pixels: Shape (h, w, 3), what `compose` made of the same shells and another shot.
+        shot: What is opaque now.
+        shells: The shells.
+        before: Shape of ``shot.depth``, its depths then; a sample of the same depth shows the same.
+        box: The part in which something may have changed, in samples.
+    """
+    columns = box.x0 // SAMPLES, -(-box.x1 // SAMPLES)
+    rows = box.y0 // SAMPLES, -(-box.y1 // SAMPLES)
+    _blend(pixels, shot.colour, shot.depth, shells.colour, shells.alpha, shells.depth, before, (*columns, *rows))
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _blend(pixels, colour, depth, shell_colour, shell_alpha, shell_depth, before, box):  # type: ignore[no-untyped-def]  # numba infers
+    """Shells over what lies behind them, sample by sample, and the rounded means of squares of samples."""
+    left, right, top, bottom = box
+    for i in range(top, bottom):
+        for j in range(left, right):
+            same = True
+            for a in range(SAMPLES):
+                for b in range(SAMPLES):
+                    r, c = i * SAMPLES + a, j * SAMPLES + b
+                    same = same and depth[r, c] == before[r, c]
+            if same:
+                continue
+            red, green, blue = 0.0, 0.0, 0.0
+            for a in range(SAMPLES):
+                for b in range(SAMPLES):
+                    r, c = i * SAMPLES + a, j * SAMPLES + b
+                    x, y, z = colour[r, c, 0], colour[r, c, 1], colour[r, c, 2]
+                    for k in range(len(shell_depth) - 1, -1, -1):
+                        if shell_depth[k, r, c] < depth[r, c]:
+                            alpha = shell_alpha[k, r, c]
+                            x += alpha * (shell_colour[k, r, c, 0] - x)
+                            y += alpha * (shell_colour[k, r, c, 1] - y)
+                            z += alpha * (shell_colour[k, r, c, 2] - z)
+                    red, green, blue = red + x, green + y, blue + z
+            pixels[i, j, 0], pixels[i, j, 1], pixels[i, j, 2] = _byte(red), _byte(green), _byte(blue)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _byte(total):  # type: ignore[no-untyped-def]  # numba infers
+    """The mean of a pixel's samples as a byte."""
+    return np.uint8(min(max(np.round(total / SAMPLES**2), 0.0), 255.0))

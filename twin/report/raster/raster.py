@@ -182,7 +182,7 @@ def draw(points, faces, bodies, spans, grid, corner, before, inverse, triangle):
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def depth_before(depth, grid, corner):
-    """1/z of depths along the rays, shape (h, w): 0 where the depth is infinite.
+    """1/z of depths along the rays, shape (h, w), float32: 0 where the depth is infinite.
 
     Args:
         depth: Shape (h, w), mm.
@@ -190,7 +190,7 @@ def depth_before(depth, grid, corner):
         corner: Row and column of the picture at which ``depth`` begins.
     """
     scale, height, width = grid
-    inverse = np.empty(depth.shape)
+    inverse = np.empty(depth.shape, dtype=np.float32)
     for i in range(depth.shape[0]):
         y = (height / 2 - (corner[0] + i) - 0.5) / scale
         for j in range(depth.shape[1]):

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,10 @@ from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.compositing import (
-    NOWHERE,
     SAMPLES,
-    PixelBox,
     RasterShot,
-    TranslucentLayer,
+    Shells,
     compose,
-    empty_translucent,
 )
 from puncture_twin.twin.report.raster.line_of_sight import blocked
 from puncture_twin.twin.report.raster.raster import depth_before, draw, outlines, sorted_by_band
@@ -35,6 +32,8 @@ from puncture_twin.twin.report.raster.shading import corner_normals, flat_normal
 
 Floats32 = NDArray[np.float32]
 T = TypeVar("T")
+
+_SHELL_PARTS = ("colour", "alpha", "depth")
 
 MAX_SHELLS = 4
 """Layers of a translucent surface that are drawn: skin in, skin out, twice."""
@@ -76,6 +75,7 @@ class Layer:
     """
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
+        self.surfaces = tuple(surfaces)
         meshes = [s.mesh for s in surfaces]
         shifts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
         self.vertices = _joined([m.vertices for m in meshes], np.float64)
@@ -97,31 +97,62 @@ class Layer:
         )
 
 
-class _View:
+class Drawn(NamedTuple):
+    """1/z and triangle of the nearest surfaces of every sample, each (k, h, w); 0 and -1 for none."""
+
+    inverse: Floats32
+    triangle: Ints32
+
+    def part(self, where: tuple[slice, slice]) -> Drawn:
+        """Rows and columns of it."""
+        return Drawn(self.inverse[:, *where], self.triangle[:, *where])
+
+    @staticmethod
+    def empty(most: int, shape: tuple[int, ...]) -> Drawn:
+        """Nothing is drawn yet; at most so many surfaces a sample."""
+        return Drawn(np.zeros((most, *shape), dtype=np.float32), np.full((most, *shape), -1, dtype=np.int32))
+
+
+class Posed(NamedTuple):
+    """Corners and their normals in a camera's frame, each (n, 3)."""
+
+    points: Floats
+    normals: Floats32
+
+
+def posed(layer: Layer, camera: ViewCamera, T_ct_layer: Floats | None = None) -> Posed:
+    """A layer before a camera: at a pose, shape (4, 4), mm, or in the CT frame itself."""
+    turn, eye = camera.axes, np.asarray(camera.eye, dtype=float)
+    if T_ct_layer is not None:
+        turn, eye = camera.axes @ T_ct_layer[:3, :3], (eye - T_ct_layer[:3, 3]) @ T_ct_layer[:3, :3]
+    return Posed(rotated(layer.vertices, turn, eye), rotated(layer.normals, turn, np.zeros(3)))
+
+
+class View:
     """A layer as a camera has it before it: corners in the camera's frame, and where each triangle lies.
 
     Args:
         layer: The layer.
         camera: Its pixels are the samples.
-        T_ct_layer: The layer's pose, shape (4, 4), mm; the CT frame itself when None.
+        seen: The layer's corners and their normals.
     """
 
-    def __init__(self, layer: Layer, camera: ViewCamera, T_ct_layer: Floats | None = None) -> None:
-        turn, eye = camera.axes, np.asarray(camera.eye, dtype=float)
-        if T_ct_layer is not None:
-            turn, eye = camera.axes @ T_ct_layer[:3, :3], (eye - T_ct_layer[:3, 3]) @ T_ct_layer[:3, :3]
-        self.points = rotated(layer.vertices, turn, eye)
+    def __init__(self, layer: Layer, camera: ViewCamera, seen: Posed) -> None:
         self._grid = camera.scale, camera.height, camera.width
-        self._layer = layer
-        self._mesh = self.points, layer.faces, layer.bodies
-        normals = rotated(layer.normals, turn, np.zeros(3))
-        self._look = normals, flat_normals(self.points, layer.faces), layer.colours
-        self.spans = outlines(self.points, layer.faces, self._grid)
-        self._starts, self._in_bands = sorted_by_band(self.spans, _band_rows(camera), len(_bands(camera)))
+        self._layer, self._camera = layer, camera
+        self._mesh = seen.points, layer.faces, layer.bodies
+        self._look = seen.normals, flat_normals(seen.points, layer.faces), layer.colours
+        self.spans = outlines(seen.points, layer.faces, self._grid)
+
+    @cached_property
+    def _by_band(self) -> tuple[NDArray[np.int64], Ints32]:
+        starts, spans = sorted_by_band(self.spans, _band_rows(self._camera), len(_bands(self._camera)))
+        return starts, spans
 
     def of_band(self, band: int) -> Ints32:
         """The rows of ``spans`` that a band of the picture needs."""
-        return np.asarray(self._in_bands[self._starts[band] : self._starts[band + 1]])
+        starts, spans = self._by_band
+        return spans[starts[band] : starts[band + 1]]
 
     def put_opaque(self, shot: RasterShot, corner: tuple[int, int], spans: Ints32) -> None:
         """Draw what is opaque into a picture, where it is nearer than what is there; in place.
@@ -131,38 +162,47 @@ class _View:
             corner: Row and column of the whole picture at which it begins, multiples of ``SAMPLES``.
             spans: The triangles that it needs.
         """
-        inverse, triangle = self._drawn(1, shot.depth, corner, spans)
-        place = tuple(LIGHT), self._grid, corner, inverse[0], triangle[0]
+        drawn = Drawn.empty(1, shot.depth.shape)
+        self.draw(depth_before(shot.depth, self._grid, corner), drawn, corner, spans)
+        self.shade(drawn, shot, corner)
+
+    def draw(self, hidden: Floats32, drawn: Drawn, corner: tuple[int, int], spans: Ints32) -> None:
+        """Find what every sample of a part of the picture shows.
+
+        Args:
+            hidden: Shape (h, w), of `depth_before`: what is there already.
+            drawn: With nothing in it; written to.
+            corner: Row and column of the whole picture at which it begins.
+            spans: The triangles that it needs.
+        """
+        draw(*self._mesh, spans, self._grid, corner, hidden, *drawn)
+
+    def shade(self, drawn: Drawn, shot: RasterShot, corner: tuple[int, int]) -> None:
+        """Colour and depth of the samples for which a triangle was found, in place; ``corner`` is even."""
+        place = tuple(LIGHT), self._grid, corner, drawn.inverse[0], drawn.triangle[0]
         shade_nearest(*self._mesh, *self._look, *place, shot.colour, shot.depth)
 
-    def shells(self, before: Floats32, corner: tuple[int, int], spans: Ints32) -> tuple[TranslucentLayer, ...]:
-        """What is see-through, as far as nothing opaque hides it, nearest first.
+    def shells(self, before: Floats32, corner: tuple[int, int], spans: Ints32) -> Shells:
+        """What is see-through, as far as nothing opaque hides it.
 
         Args:
             before: Depth of what is opaque in a part of the picture, shape (h, w), mm along the ray.
             corner: Row and column of the whole picture at which it begins, multiples of ``SAMPLES``.
             spans: The triangles that it needs.
         """
-        inverse, triangle = self._drawn(MAX_SHELLS, before, corner, spans)
-        translucents = tuple(empty_translucent(before.shape) for _ in range(MAX_SHELLS))
+        drawn = Drawn.empty(MAX_SHELLS, before.shape)
+        self.draw(depth_before(before, self._grid, corner), drawn, corner, spans)
+        shells = Shells.empty(MAX_SHELLS, *before.shape)
         look: Any = (*self._look, self._layer.alphas, self._layer.rims, tuple(LIGHT), self._grid, corner)
-        for translucent, *drawn in zip(translucents, inverse, triangle, strict=True):
-            samples: Any = (*drawn, translucent.colour, translucent.alpha, translucent.depth)
+        for shell in zip(*drawn, shells.colour, shells.alpha, shells.depth, strict=True):
+            samples: Any = shell
             shade_shells(*self._mesh, *look, *samples)
-        return translucents
-
-    def _drawn(self, most: int, before: Floats32, corner: tuple[int, int], spans: Ints32) -> tuple[Floats32, Ints32]:
-        """1/z and triangle of the nearest surfaces, shape (most, h, w), before what is opaque already."""
-        size = (most, *before.shape)
-        inverse, triangle = np.zeros(size, dtype=np.float32), np.full(size, -1, dtype=np.int32)
-        hidden = depth_before(before, self._grid, corner)
-        draw(*self._mesh, spans, self._grid, corner, hidden, inverse, triangle)
-        return inverse, triangle
+        return shells
 
 
 def opaque_shot(layer: Layer, camera: ViewCamera) -> RasterShot:
     """Everything opaque of one layer in the CT frame, at the camera's own resolution."""
-    view, shot = _View(layer, camera), _background(camera.height, camera.width)
+    view, shot = View(layer, camera, posed(layer, camera)), _background(camera.height, camera.width)
 
     def draw_band(band: int, rows: slice) -> None:
         view.put_opaque(RasterShot(shot.colour[rows], shot.depth[rows]), (rows.start, 0), view.of_band(band))
@@ -171,22 +211,19 @@ def opaque_shot(layer: Layer, camera: ViewCamera) -> RasterShot:
     return shot
 
 
-def translucents_of(layer: Layer, camera: ViewCamera) -> tuple[TranslucentLayer, ...]:
+def shells_of(layer: Layer, camera: ViewCamera) -> Shells:
     """The shells of a see-through layer: the nearest hit of every sample first, then the one behind it, and so on.
 
     Args:
         layer: The surfaces, CT frame.
         camera: Its pixels are the samples.
     """
-    view, depth = _View(layer, camera), np.full((camera.height, camera.width), np.inf, dtype=np.float32)
+    view = View(layer, camera, posed(layer, camera))
+    depth = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
     parts = _in_bands(camera, lambda band, rows: view.shells(depth[rows], (rows.start, 0), view.of_band(band)))
-    translucents = (
-        TranslucentLayer(
-            *(np.concatenate([getattr(part[k], name) for part in parts]) for name in ("colour", "alpha", "depth"))
-        )
-        for k in range(MAX_SHELLS)
-    )
-    return tuple(translucent for translucent in translucents if np.isfinite(translucent.depth).any())
+    most = max(int(np.isfinite(part.depth).any(axis=(1, 2)).sum()) for part in parts)
+    joined = (np.concatenate([getattr(part, name)[:most] for part in parts], axis=1) for name in _SHELL_PARTS)
+    return Shells(*joined)
 
 
 def picture(opaque: Layer, translucents: Layer, camera: ViewCamera) -> NDArray[np.uint8]:
@@ -198,7 +235,7 @@ def picture(opaque: Layer, translucents: Layer, camera: ViewCamera) -> NDArray[n
         camera: Its pixels are the picture's; each is the mean of ``SAMPLES`` by ``SAMPLES``.
     """
     fine = camera.finer(SAMPLES)
-    solid, glass = _View(opaque, fine), _View(translucents, fine)
+    solid, glass = (View(layer, fine, posed(layer, fine)) for layer in (opaque, translucents))
 
     def draw_band(band: int, rows: slice) -> NDArray[np.uint8]:
         shot = _background(rows.stop - rows.start, fine.width)
@@ -206,28 +243,6 @@ def picture(opaque: Layer, translucents: Layer, camera: ViewCamera) -> NDArray[n
         return compose(shot, glass.shells(shot.depth, (rows.start, 0), glass.of_band(band)))
 
     return np.concatenate(_in_bands(fine, draw_band))
-
-
-def put_moving(shot: RasterShot, layer: Layer, T_ct_layer: Floats, camera: ViewCamera) -> PixelBox:
-    """Draw one more rigid body into a shot, in place, where it is nearer than what is there.
-
-    Args:
-        shot: What is there already, at the camera's resolution; its arrays are written to.
-        layer: The body, in its own frame.
-        T_ct_layer: Its pose, shape (4, 4), mm.
-        camera: The camera.
-
-    Returns:
-        Where something may have changed.
-    """
-    view = _View(layer, camera, T_ct_layer)
-    if len(view.spans) == 0:
-        return NOWHERE
-    first, last, begin, end = view.spans[:, 1:].T
-    top, left = (int(low.min()) // SAMPLES * SAMPLES for low in (first, begin))
-    box = PixelBox(left, top, int(end.max()) + 1, int(last.max()) + 1)
-    view.put_opaque(RasterShot(shot.colour[box.slices], shot.depth[box.slices]), (top, left), view.spans)
-    return box
 
 
 def _background(height: int, width: int) -> RasterShot:

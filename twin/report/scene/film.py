@@ -6,10 +6,15 @@ where the arm is, and blends only what changed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
-from typing import Any
+from queue import Queue
+from typing import Any, NamedTuple
 
 import imageio_ffmpeg
 import numpy as np
@@ -23,19 +28,18 @@ from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.numbers import demanding
 from puncture_twin.twin.report.raster.camera import ViewCamera
-from puncture_twin.twin.report.raster.compositing import (
-    NOWHERE,
-    SAMPLES,
-    PixelBox,
-    RasterShot,
-    TranslucentLayer,
-    compose,
-)
-from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, put_moving, translucents_of
-from puncture_twin.twin.report.scene.film_text import FrameText, draw_frame_text, model_note
+from puncture_twin.twin.report.raster.moving import MovingPicture
+from puncture_twin.twin.report.raster.render import Layer, Surface
+from puncture_twin.twin.report.scene.film_text import FrameText, draw_frame_text, draw_still_text, model_note
 from puncture_twin.twin.report.scene.scene_parts import ArmPicture, SceneBody, needle_bodies, patient, room
 from puncture_twin.twin.report.scene.shapes import bar
 from puncture_twin.twin.report.scene.views import close_up, overview
+
+MOST_THREADS = 4
+"""Of those that draw: each takes 40 MB, and the encoder and the words do not keep up with more."""
+
+Frame = NDArray[np.uint8]
+"""Shape (HEIGHT, WIDTH, 3)."""
 
 WIDTH, HEIGHT = 832, 608
 """Pixels; multiples of 16, as H.264 likes them."""
@@ -109,15 +113,24 @@ def draw_film(
         The file that was written.
     """
     times = film_times(float(rehearsal.times_s[-1]))
-    frames = list(_frames(rehearsal, plan, case, anatomy, times, progress))
-    frames += [frames[-1]] * times.still_frames
+
+    def frames() -> Iterator[Frame]:
+        return _with_still(_frames(rehearsal, plan, case, anatomy, times, progress), times.still_frames)
+
     path = Path(path)
     try:
-        _write_mp4(frames, path)
+        _write_mp4(frames(), path)
     except (OSError, RuntimeError):  # no encoder on this machine, or one without H.264
         path = path.with_suffix(".gif")
-        _write_gif(frames, path)
+        _write_gif(frames(), path)
     return path
+
+
+def _with_still(frames: Iterable[Frame], count: int) -> Iterator[Frame]:
+    """The frames, then the last so many times more."""
+    for frame in frames:
+        yield frame
+    yield from repeat(frame, count)
 
 
 def _frames(
@@ -127,58 +140,86 @@ def _frames(
     anatomy: Any,
     times: FilmTimes,
     progress: Count | None,
-) -> Iterator[NDArray[np.uint8]]:
+) -> Iterator[Frame]:
     T_base_ct = rehearsal.T_base_ct_true
     arm = ArmPicture(plan.model, T_base_ct)
+    base = arm.bodies(rehearsal.q[0])[0]
     still = [*patient(anatomy, case), *room(case, T_base_ct), arm.plate, _planned_path(plan)]
-    wide = _Stage(still, _wide_camera(case, still, arm, rehearsal, plan))
-    near = _Stage([b for b in still if b.group != "room"], _near_camera(case, still, plan))
+    cameras = _wide_camera(case, still, arm, rehearsal, plan), _near_camera(case, still, plan)
     tool = _tool_layer(case)
+    views = _Views(
+        _moving_picture([*still, base], cameras[0], [*arm.layers[1:], tool]),
+        _moving_picture([b for b in still if b.group != "room"], cameras[1], [tool]),
+    )
     text = FrameText(rehearsal, plan, times.speed, demanding(anatomy), model_note(case))
-    for number, moment in enumerate(times.moments):
-        row = int(np.searchsorted(rehearsal.times_s, moment, side="right")) - 1
+    ground = Image.new("RGB", (WIDTH, HEIGHT), (255, 255, 255))
+    draw_still_text(ground, text, cameras, case)
+    rows = np.searchsorted(rehearsal.times_s, times.moments, side="right") - 1
+
+    def poses(row: int) -> list[Floats]:
         T_ct_flange = np.linalg.inv(T_base_ct) @ rehearsal.T_base_flange_true[row]
-        links = list(zip(arm.layers, arm.poses_ct(rehearsal.q[row]), strict=True))
-        frame = Image.new("RGB", (WIDTH, HEIGHT), (255, 255, 255))
-        frame.paste(Image.fromarray(wide.picture([*links, (tool, T_ct_flange)])), (0, 0))
-        frame.paste(Image.fromarray(near.picture([(tool, T_ct_flange)])), (VIEW_WIDTH, 0))
-        draw_frame_text(frame, text, row, moment, (wide.camera, near.camera), case)
+        return [*arm.poses_ct(rehearsal.q[row])[1:], T_ct_flange]
+
+    for number, pictures in enumerate(_drawn_ahead(views, [poses(row) for row in rows])):
+        frame = ground.copy()
+        frame.paste(Image.fromarray(pictures.wide), (0, 0))
+        frame.paste(Image.fromarray(pictures.near), (VIEW_WIDTH, 0))
+        draw_frame_text(frame, text, int(rows[number]), times.moments[number], cameras, case)
         if progress is not None:
             progress(number + 1, len(times.moments))
         yield np.asarray(frame)
 
 
-class _Stage:
-    """One view: what stands still is drawn once, what moves is drawn over a copy.
+class _Pictures(NamedTuple):
+    """The two views of a frame, each (h, w, 3)."""
 
-    Args:
-        bodies: What stands still, CT frame.
-        camera: The view, in pixels.
-    """
+    wide: Frame
+    near: Frame
 
-    def __init__(self, bodies: list[SceneBody], camera: ViewCamera) -> None:
-        self.camera = camera
-        self._fine = camera.finer(SAMPLES)
-        self._still: RasterShot = opaque_shot(Layer([b.surface for b in bodies if b.alpha >= 1]), self._fine)
-        translucents = [b.surface for b in bodies if b.alpha < 1]
-        self._translucents: tuple[TranslucentLayer, ...] = (
-            translucents_of(Layer(translucents), self._fine) if translucents else ()
-        )
-        self._picture = compose(self._still, self._translucents)
 
-    def picture(self, moving: list[tuple[Layer, Floats]]) -> NDArray[np.uint8]:
-        """The view with bodies at their poses T_ct_body, shape (h, w, 3)."""
-        shot = RasterShot(self._still.colour.copy(), self._still.depth.copy())
-        changed = NOWHERE
-        for layer, T_ct_layer in moving:
-            changed = changed.around(put_moving(shot, layer, T_ct_layer, self._fine))
-        picture = self._picture.copy()
-        if not changed.empty:
-            x0, y0 = changed.x0 // SAMPLES, changed.y0 // SAMPLES
-            x1, y1 = -(-changed.x1 // SAMPLES), -(-changed.y1 // SAMPLES)
-            box = PixelBox(x0 * SAMPLES, y0 * SAMPLES, x1 * SAMPLES, y1 * SAMPLES)
-            picture[y0:y1, x0:x1] = compose(shot, self._translucents, box)
-        return picture
+class _Views(NamedTuple):
+    """The overview, with the links after the base and the tool, and the close-up with the tool alone."""
+
+    wide: MovingPicture
+    near: MovingPicture
+
+    def at(self, poses: Sequence[Floats]) -> _Pictures:
+        """Both, with the links and at last the tool at their poses T_ct_body."""
+        return _Pictures(self.wide.at(poses), self.near.at(poses[-1:]))
+
+    def another(self) -> _Views:
+        """For another thread."""
+        return _Views(self.wide.another(), self.near.another())
+
+
+def _drawn_ahead(views: _Views, poses: Sequence[Sequence[Floats]]) -> Iterator[_Pictures]:
+    """The pictures of all poses, in order; a few are drawn, by as many threads as there are cores, before one asks."""
+    threads = min(len(os.sched_getaffinity(0)), MOST_THREADS)
+    free: Queue[_Views] = Queue()
+    for own in (views, *(views.another() for _ in range(threads - 1))):
+        free.put(own)
+
+    def drawn(pose: Sequence[Floats]) -> _Pictures:
+        own = free.get()
+        try:
+            return own.at(pose)
+        finally:
+            free.put(own)
+
+    with ThreadPoolExecutor(threads) as pool:
+        waiting: deque[Future[_Pictures]] = deque()
+        for pose in poses:
+            waiting.append(pool.submit(drawn, pose))
+            if len(waiting) > threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+def _moving_picture(bodies: list[SceneBody], camera: ViewCamera, layers: Sequence[Layer]) -> MovingPicture:
+    """One view of bodies that stand still (CT frame) and of layers that move."""
+    opaque, translucent = ([b.surface for b in bodies if (b.alpha >= 1) == solid] for solid in (True, False))
+    return MovingPicture(Layer(opaque), Layer(translucent), layers, camera)
 
 
 def _planned_path(plan: Any) -> SceneBody:
@@ -213,7 +254,7 @@ def _near_camera(case: Any, still: list[SceneBody], plan: Any) -> ViewCamera:
     return close_up(case, path_ct, INSET_RADIUS_MM, blockers, (INSET, INSET))
 
 
-def _write_mp4(frames: list[NDArray[np.uint8]], path: Path) -> None:
+def _write_mp4(frames: Iterable[Frame], path: Path) -> None:
     with atomic(path) as temporary:
         writer = imageio_ffmpeg.write_frames(
             str(temporary),
@@ -225,17 +266,19 @@ def _write_mp4(frames: list[NDArray[np.uint8]], path: Path) -> None:
             ffmpeg_log_level="quiet",
         )
         writer.send(None)
+        sent = 0
         try:
-            for frame in frames:
+            for frame in frames:  # drawn while the encoder works on those before
                 writer.send(np.ascontiguousarray(frame))
+                sent += 1
         finally:
             writer.close()
         written, _ = imageio_ffmpeg.count_frames_and_secs(str(temporary))  # an encoder on a full disk says nothing
-        if written != len(frames):
-            raise RuntimeError(f"the encoder wrote {written} of {len(frames)} frames")
+        if written != sent:
+            raise RuntimeError(f"the encoder wrote {written} of {sent} frames")
 
 
-def _write_gif(frames: list[NDArray[np.uint8]], path: Path) -> None:
+def _write_gif(frames: Iterable[Frame], path: Path) -> None:
     images = [Image.fromarray(frame).quantize(128) for frame in frames]
     with atomic(path) as temporary:
         images[0].save(

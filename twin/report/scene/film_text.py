@@ -23,6 +23,15 @@ CONTACT_SHOWN_S = 3.0
 
 LABEL, VALUE = 13, 17
 
+CELLS = (
+    (12, "time"),
+    (95, "phase"),
+    (320, "true tip to target"),
+    (470, "contacts"),
+    (560, "needle to nearest structure"),
+)
+"""Column and name of each number below the overview."""
+
 
 @dataclass(frozen=True)
 class FrameText:
@@ -53,26 +62,18 @@ class FrameText:
         return [c for c in self.rehearsal.contacts if c.time_s <= moment]
 
 
-def draw_frame_text(
-    frame: Image.Image, source: FrameText, row: int, moment: float, cameras: tuple[ViewCamera, ViewCamera], case: Any
-) -> None:
-    """Write a frame's words.
+def draw_still_text(frame: Image.Image, source: FrameText, cameras: tuple[ViewCamera, ViewCamera], case: Any) -> None:
+    """Write the words beside the views that every frame has.
 
     Args:
-        frame: The picture, already with its views: the overview upper left, the close-up beside it.
-        source: Where the numbers come from.
-        row: The rehearsal's record shown.
-        moment: Its time, s.
+        frame: What the views are put on: the overview upper left, the close-up beside it.
+        source: Where the words come from.
         cameras: Of the overview and of the close-up.
         case: For names and the space.
     """
     draw = ImageDraw.Draw(frame)
     wide, near = cameras
     left, below = wide.width, near.height
-    draw.rectangle([left, 0, frame.width, below], outline=(150, 156, 164), width=1)
-    draw.line([(left, below), (left, wide.height), (0, wide.height)], fill=(190, 194, 200), width=1)
-    annotate.write(draw, (left + 8, 7), "close-up", size=13, bold=True, halo=2)
-    annotate.scale_bar(draw, near, case.target_ct, left + 12, below - 12, 90, note="")
     speed = "real time" if source.speed == 1 else f"playback × {source.speed:g}"
     annotate.write(draw, (left + 10, below + 12), str(case.name)[:26], size=17, bold=True)
     standing = source.rehearsal.standing
@@ -81,6 +82,30 @@ def draw_frame_text(
         annotate.write(draw, (left + 10, below + 37 + 19 * line), text, size=13)
     annotate.body_axes(draw, wide, case.space, (left + near.width / 2, wide.height - 96), 42, size=14)
     annotate.write(draw, (left + 24, wide.height - 204), "directions in the large view", size=11, colour=annotate.FAINT)
+    for x, label in CELLS:
+        annotate.write(draw, (x, wide.height + 6), label, size=LABEL, colour=annotate.FAINT)
+
+
+def draw_frame_text(
+    frame: Image.Image, source: FrameText, row: int, moment: float, cameras: tuple[ViewCamera, ViewCamera], case: Any
+) -> None:
+    """Write what changes from frame to frame, and what stands in the views.
+
+    Args:
+        frame: The picture, with `draw_still_text` and its views.
+        source: Where the numbers come from.
+        row: The rehearsal's record shown.
+        moment: Its time, s.
+        cameras: Of the overview and of the close-up.
+        case: For the target.
+    """
+    draw = ImageDraw.Draw(frame)
+    wide, near = cameras
+    left, below = wide.width, near.height
+    draw.rectangle([left, 0, frame.width, below], outline=(150, 156, 164), width=1)
+    draw.line([(left, below), (left, wide.height), (0, wide.height)], fill=(190, 194, 200), width=1)
+    annotate.write(draw, (left + 8, 7), "close-up", size=13, bold=True, halo=2)
+    annotate.scale_bar(draw, near, case.target_ct, left + 12, below - 12, 90, note="")
     _strip(draw, source, row, moment, wide.height)
     _alarm(draw, source, moment)
 
@@ -101,16 +126,14 @@ def _strip(draw: ImageDraw.ImageDraw, source: FrameText, row: int, moment: float
     nearest = source.clearance(moment)
     contacts = len(source.contacts(moment))
     near = "– (not yet)" if nearest is None else f"{number(nearest[1], 1, 'mm')}  {_short(nearest[0])}"
-    colour = annotate.RED if contacts else annotate.INK
-    cells = [
-        (12, "time", f"{moment:.1f} s", annotate.INK),
-        (95, "phase", PHASES.get(phase, phase), annotate.INK),
-        (320, "true tip to target", number(source.distance(row), 1, "mm"), annotate.INK),
-        (470, "contacts", str(contacts), colour),
-        (560, "needle to nearest structure", near, annotate.INK),
-    ]
-    for x, label, value, ink in cells:
-        annotate.write(draw, (x, top + 6), label, size=LABEL, colour=annotate.FAINT)
+    values = (
+        (f"{moment:.1f} s", annotate.INK),
+        (PHASES.get(phase, phase), annotate.INK),
+        (number(source.distance(row), 1, "mm"), annotate.INK),
+        (str(contacts), annotate.RED if contacts else annotate.INK),
+        (near, annotate.INK),
+    )
+    for (x, _), (value, ink) in zip(CELLS, values, strict=True):
         annotate.write(draw, (x, top + 22), value, size=VALUE, bold=True, colour=ink)
     r = source.rehearsal
     if row == len(r.times_s) - 1:
