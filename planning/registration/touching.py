@@ -60,13 +60,14 @@ def untouchable(case: Case, points_ct: Floats, normals_ct: Floats) -> tuple[tupl
     Returns:
         Row and name of the obstacle that is before it.
     """
-    found = []
-    for row, (point, normal) in enumerate(zip(points_ct, normals_ct, strict=True)):
-        directions = _cone(normal)
-        blocked = [_intersects(box, point, directions, case.needle.length_mm) for box in _boxes_ct(case)]
-        if blocked and np.any(blocked, axis=0).all():
-            found.append((row, _boxes_ct(case)[int(np.argmax(np.sum(blocked, axis=1)))].name))
-    return tuple(found)
+    boxes = _boxes_ct(case)
+    if not boxes or not len(points_ct):
+        return ()
+    directions = _cones(normals_ct)
+    blocked = np.stack([_intersects(box, points_ct[:, None], directions, case.needle.length_mm) for box in boxes])
+    before_most = blocked.sum(axis=2).argmax(axis=0)
+    rows = np.flatnonzero(np.all(np.any(blocked, axis=0), axis=1))
+    return tuple((int(row), boxes[before_most[row]].name) for row in rows)
 
 
 def touchable_points(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> Floats:
@@ -96,20 +97,27 @@ def _boxes_ct(case: Case) -> tuple[Obstacle, ...]:
     return tuple(box for box in case.obstacles if box.frame == "ct")
 
 
-def _cone(axis: Floats) -> Floats:
-    """Unit vectors within `CONE` of an axis, evenly spread (Fibonacci), the axis first, shape (k, 3)."""
+def _cones(axes: Floats) -> Floats:
+    """Unit vectors within `CONE` of each axis (n, 3), evenly spread (Fibonacci), the axis first, shape (n, k, 3)."""
     number = np.arange(CONE_DIRECTIONS)
     z = 1 - (1 - np.cos(CONE)) * number / (CONE_DIRECTIONS - 1)
     angle = number * np.pi * (3 - np.sqrt(5))
     local = np.column_stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z])
-    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    across = across / np.linalg.norm(across)
-    return np.asarray(local @ np.stack([across, np.cross(axis, across), axis]))
+    across = np.cross(axes, np.eye(3)[np.argmin(np.abs(axes), axis=1)])
+    across = across / np.linalg.norm(across, axis=1, keepdims=True)
+    return np.asarray(local @ np.stack([across, np.cross(axes, across), axes], axis=1))
 
 
-def _intersects(box: Obstacle, point: Floats, directions: Floats, length_mm: float) -> NDArray[np.bool_]:
-    """Which segments from a point meet a box with axes parallel to the frame's (slabs), shape (k,)."""
+def _intersects(box: Obstacle, points: Floats, directions: Floats, length_mm: float) -> NDArray[np.bool_]:
+    """Which segments from points meet a box with axes parallel to the frame's (slabs).
+
+    Args:
+        box: The box.
+        points: Shape (..., 3), mm.
+        directions: Shape (..., 3), unit.
+        length_mm: Of every segment.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):  # along a slab: from -inf to inf, or nowhere
-        one, other = ((box.center_mm + side * box.size_mm / 2 - point) / directions for side in (-1.0, 1.0))
-    into, out = np.fmin(one, other).max(axis=1), np.fmax(one, other).min(axis=1)
+        one, other = ((box.center_mm + side * box.size_mm / 2 - points) / directions for side in (-1.0, 1.0))
+    into, out = np.fmin(one, other).max(axis=-1), np.fmax(one, other).min(axis=-1)
     return np.asarray((into <= out) & (out >= 0) & (into <= length_mm))

@@ -70,6 +70,25 @@ def test_a_ball_is_cut_in_a_circle():
 
 
 @given(UNITS, st.integers(0, 9))
+def test_a_cut_is_that_of_another_library(direction, seed):
+    """The segments, ends in either order, that trimesh finds of a soup of triangles that share corners."""
+    rng = np.random.default_rng(seed)
+    mesh = TriangleMesh(rng.normal(size=(30, 3)) * 20, rng.integers(0, 30, (60, 3)).astype(np.int32))
+    along = np.array(direction) / np.linalg.norm(direction)
+    plane = needle_planes(rng.normal(size=3), along, 50.0)[seed % 4]
+    surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    theirs = trimesh.intersections.mesh_plane(surface, plane.normal, plane.at_ct).reshape(-1, 2, 3)
+
+    def in_order(segments):
+        ends = [sorted(map(tuple, one)) for one in segments.round(9).tolist()]
+        return np.array(sorted(ends)).reshape(-1, 2, 2)
+
+    found, wanted = in_order(outline(mesh, plane)), in_order(plane.place(theirs))
+    assert len(found) == len(wanted) > 0
+    assert np.allclose(found, wanted, atol=1e-6)
+
+
+@given(UNITS, st.integers(0, 9))
 def test_the_region_is_cut_on_its_surface(direction, seed):
     """Every point of the line lies in the plane and on the ellipsoid x' inv(R) x = 1."""
     spread = np.random.default_rng(seed).normal(size=(3, 3))

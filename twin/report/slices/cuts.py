@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import trimesh
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -13,11 +12,18 @@ from puncture_twin.twin.report.slices.planes import Plane
 def outline(mesh: TriangleMesh, plane: Plane) -> Floats:
     """The cut of a surface, shape (n, 2, 2): segments in the plane, mm to the right and up of the target."""
     height = (mesh.vertices - plane.at_ct) @ plane.normal
-    if height.min() > 0 or height.max() < 0:
+    above = height > 0  # a corner in the plane counts as below it: every triangle is cut in no edge or in two
+    if above.all() or not above.any():
         return np.zeros((0, 2, 2))
-    surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    segments = trimesh.intersections.mesh_plane(surface, plane.normal, plane.at_ct, cached_dots=height)
-    return plane.place(np.asarray(segments).reshape(-1, 2, 3))
+    sides = above[mesh.faces]
+    cut = np.flatnonzero((sides[:, 0] != sides[:, 1]) | (sides[:, 0] != sides[:, 2]))
+    sides, faces = sides[cut], mesh.faces[cut]
+    alone = np.where(sides[:, 0] == sides[:, 1], 2, np.where(sides[:, 0] == sides[:, 2], 1, 0))
+    row = np.arange(len(faces))
+    tip, others = faces[row, alone], np.stack([faces[row, (alone + 1) % 3], faces[row, (alone + 2) % 3]], axis=1)
+    along = (height[tip] / (height[tip] - height[others].T)).T[:, :, None]
+    ends = mesh.vertices[tip][:, None] * (1 - along) + mesh.vertices[others] * along
+    return plane.place(ends)
 
 
 def ellipse(region_ct: Floats, plane: Plane, points: int = 121) -> Floats:

@@ -6,11 +6,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import patheffects
-from matplotlib.axes import Axes
+from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
+from matplotlib.lines import Line2D
+from matplotlib.patches import Ellipse, Patch, PathPatch, Polygon
+from matplotlib.path import Path
+from matplotlib.text import Text
+from matplotlib.transforms import Affine2D, Transform
 from PIL import Image
 
 from puncture_twin.planning.base.arrays import Floats
@@ -34,7 +37,7 @@ IN_PLANE = 1e-3
 STEEP = 0.05
 """A cut is drawn at most twenty times as long as it is wide."""
 
-DASHED: Any = {"colors": NEEDLE_COLOUR, "linewidths": 1.0, "linestyles": "--"}
+DASHED: Any = {"edgecolor": NEEDLE_COLOUR, "lw": 1.0, "ls": "--"}
 """The needle with the greatest margin."""
 
 BEADS = 0.025
@@ -64,19 +67,49 @@ def draw_panel(subject: Subject, plane: Plane) -> Panel:
     """Draw one plane of a direction."""
     scan = subject.anatomy.scan
     hu = None if scan is None else scan.hu_at(plane.points_ct(PIXELS)).reshape(PIXELS, PIXELS)
-    figure = Figure(figsize=(PIXELS / DPI, PIXELS / DPI), dpi=DPI, facecolor="none")
-    canvas = FigureCanvasAgg(figure)
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), facecolor="none", frameon=False)
-    axes.set_axis_off()
-    (x, y), half = plane.centre, plane.half_mm
-    axes.set_xlim(x - half, x + half)
-    axes.set_ylim(y - half, y + half)
-    _outlines(axes, subject, plane)
-    _needle(axes, subject, plane)
-    _target(axes, subject, plane)
-    _directions(axes, subject, plane)
-    _scale(axes, plane)
-    return Panel(plane, hu, drawn(canvas))
+    sheet = _Sheet(plane)
+    _outlines(sheet, subject, plane)
+    _needle(sheet, subject, plane)
+    _target(sheet, subject, plane)
+    _directions(sheet, subject, plane)
+    _scale(sheet, plane)
+    return Panel(plane, hu, drawn(sheet.canvas))
+
+
+class _Sheet:
+    """What one draws on in a plane's mm: a figure without axes, which take longer to make than all that is drawn.
+
+    Args:
+        plane: The plane.
+    """
+
+    def __init__(self, plane: Plane) -> None:
+        self._figure = Figure(figsize=(PIXELS / DPI, PIXELS / DPI), dpi=DPI, facecolor="none")
+        self.canvas = FigureCanvasAgg(self._figure)
+        corner = plane.centre - plane.half_mm
+        self._to_pixels = Affine2D().translate(*-corner).scale(PIXELS / (2 * plane.half_mm))
+
+    def line(self, points: Floats, **look: Any) -> None:
+        """A line through points (n, 2), mm."""
+        self._add(Line2D(*np.asarray(points, dtype=float).T, **look))
+
+    def segments(self, segments: Floats, **look: Any) -> None:
+        """Lines from point to point, each alone, shape (n, 2, 2), mm."""
+        codes = np.tile(np.array([Path.MOVETO, Path.LINETO], dtype=Path.code_type), len(segments))
+        path = Path(np.asarray(segments, dtype=float).reshape(-1, 2), codes)
+        self._add(PathPatch(path, fill=False, **look))
+
+    def patch(self, patch: Patch) -> None:
+        """A patch in mm."""
+        self._add(patch)
+
+    def words(self, x: float, y: float, text: str, *, relative: bool = False, **look: Any) -> None:
+        """Text at a point, mm, or as a fraction of the picture."""
+        self._add(Text(x, y, text, **look), self._figure.transFigure if relative else self._to_pixels)
+
+    def _add(self, artist: Artist, transform: Transform | None = None) -> None:
+        artist.set_transform(self._to_pixels if transform is None else transform)
+        self._figure.add_artist(artist)
 
 
 def drawn(canvas: FigureCanvasAgg) -> Image.Image:
@@ -85,18 +118,16 @@ def drawn(canvas: FigureCanvasAgg) -> Image.Image:
     return Image.frombytes("RGBA", size, bytes(pixels))
 
 
-def _outlines(axes: Axes, subject: Subject, plane: Plane) -> None:
+def _outlines(sheet: _Sheet, subject: Subject, plane: Plane) -> None:
     """Every structure that the plane cuts: the near ones and the target's strongly, unknown ones as beads."""
     strong = {one.name for one in subject.near} | {subject.case.target_structure}
     for one in subject.anatomy.checked:
         segments, colour = outline(one.mesh, plane), css(subject.colours[one.name])
         if str(one.role) == "unknown":
-            axes.plot(*_beads(segments, plane).T, ls="none", marker=".", ms=4, mec=colour, mfc=colour)
-        else:
-            width = 1.9 if one.name in strong else 0.8
-            axes.add_collection(LineCollection(list(segments), colors=colour, linewidths=width), autolim=False)
-    skin = LineCollection(list(outline(subject.anatomy.skin.mesh, plane)), colors=css(SKIN), linewidths=1.2)
-    axes.add_collection(skin, autolim=False)
+            sheet.line(_beads(segments, plane), ls="none", marker=".", ms=4, mec=colour, mfc=colour)
+        elif len(segments):
+            sheet.segments(segments, edgecolor=colour, lw=1.9 if one.name in strong else 0.8)
+    sheet.segments(outline(subject.anatomy.skin.mesh, plane), edgecolor=css(SKIN), lw=1.2)
 
 
 def _beads(segments: Floats, plane: Plane) -> Floats:
@@ -114,62 +145,64 @@ def _beads(segments: Floats, plane: Plane) -> Floats:
     return np.asarray(points[np.unique(column * MOST_BEADS + row, return_index=True)[1]])
 
 
-def _needle(axes: Axes, subject: Subject, plane: Plane) -> None:
+def _needle(sheet: _Sheet, subject: Subject, plane: Plane) -> None:
     """The needle as thick as it is where the plane holds it, else its cut and, dotted, its shadow."""
     outward = subject.outward_ct
     along = float(outward @ plane.normal)
     if abs(along) > 1 - IN_PLANE:
-        return _cut(axes, subject, 1.0, 0.0)
+        return _cut(sheet, subject, 1.0, 0.0)
     end = plane.place(plane.at_ct + subject.case.needle.shaft_mm * outward)
     if abs(along) > IN_PLANE:
-        axes.plot([0, end[0]], [0, end[1]], color=NEEDLE_COLOUR, lw=1.1, ls=":", path_effects=HALO)
-        return _cut(axes, subject, abs(along), float(np.degrees(np.arctan2(end[1], end[0]))))
+        sheet.line(np.stack([np.zeros(2), end]), color=NEEDLE_COLOUR, lw=1.1, ls=":", path_effects=HALO)
+        return _cut(sheet, subject, abs(along), float(np.degrees(np.arctan2(end[1], end[0]))))
     aside = np.array([-end[1], end[0]]) / np.linalg.norm(end)
     body = subject.needle_radius_mm * aside
-    axes.fill(*np.array([-body, end - body, end + body, body]).T, facecolor=NEEDLE_COLOUR, lw=0, zorder=3)
+    corners = np.array([-body, end - body, end + body, body])
+    sheet.patch(Polygon(corners, facecolor=NEEDLE_COLOUR, lw=0, zorder=3))
     if subject.margin_mm > 0:
         wide = (subject.needle_radius_mm + subject.margin_mm) * aside
-        axes.add_collection(LineCollection([(wide, end + wide), (-wide, end - wide)], **DASHED), autolim=False)
+        sheet.segments(np.array([(wide, end + wide), (-wide, end - wide)]), **DASHED)
     if subject.bent_mm is not None:
         along_end = end / np.linalg.norm(end)
         sides = [subject.bent_mm @ np.stack([along_end, sign * aside]) for sign in (1, -1)]
-        axes.add_collection(LineCollection(sides, colors=BENT_COLOUR, linewidths=1.3, zorder=4), autolim=False)
+        for side in sides:
+            sheet.line(side, color=BENT_COLOUR, lw=1.3, zorder=4, solid_capstyle="butt")
     return None
 
 
-def _cut(axes: Axes, subject: Subject, cosine: float, turn_deg: float) -> None:
+def _cut(sheet: _Sheet, subject: Subject, cosine: float, turn_deg: float) -> None:
     """The needle's cut at the target, an ellipse, and dashed the same with the greatest margin."""
     radius = subject.needle_radius_mm
     style: Any = {"angle": turn_deg, "lw": 1.0}
     long = 1 / max(cosine, STEEP)
-    axes.add_patch(Ellipse((0, 0), 2 * radius * long, 2 * radius, color=NEEDLE_COLOUR, zorder=3, **style))
+    sheet.patch(Ellipse((0, 0), 2 * radius * long, 2 * radius, color=NEEDLE_COLOUR, zorder=3, **style))
     if subject.bent_mm is not None:
         off = 2 * float(subject.bent_mm[-1, 1])
-        axes.add_patch(Ellipse((0, 0), off * long, off, fill=False, edgecolor=BENT_COLOUR, **style))
+        sheet.patch(Ellipse((0, 0), off * long, off, fill=False, edgecolor=BENT_COLOUR, **style))
     if subject.margin_mm > 0:
         wide = 2 * (radius + subject.margin_mm)
         look: Any = {"fill": False, "linestyle": "--", "edgecolor": NEEDLE_COLOUR}
-        axes.add_patch(Ellipse((0, 0), wide * long, wide, **style, **look))
+        sheet.patch(Ellipse((0, 0), wide * long, wide, **style, **look))
 
 
-def _target(axes: Axes, subject: Subject, plane: Plane) -> None:
+def _target(sheet: _Sheet, subject: Subject, plane: Plane) -> None:
     """A cross at the target, and the region of the tip where errors are declared."""
     near, far = 0.03 * plane.half_mm, 0.09 * plane.half_mm
     arms = [((near, 0), (far, 0)), ((-near, 0), (-far, 0)), ((0, near), (0, far)), ((0, -near), (0, -far))]
-    axes.add_collection(LineCollection(arms, colors=css(TARGET_POINT), linewidths=1.8, zorder=4), autolim=False)
+    sheet.segments(np.array(arms), edgecolor=css(TARGET_POINT), lw=1.8, zorder=4)
     if subject.region_ct is not None:
-        axes.plot(*ellipse(subject.region_ct, plane).T, color=REGION_COLOUR, lw=1.3, path_effects=HALO)
+        sheet.line(ellipse(subject.region_ct, plane), color=REGION_COLOUR, lw=1.3, path_effects=HALO)
 
 
-def _directions(axes: Axes, subject: Subject, plane: Plane) -> None:
+def _directions(sheet: _Sheet, subject: Subject, plane: Plane) -> None:
     """What lies beyond each edge of the picture."""
     edges = ((0.985, 0.5, plane.right), (0.015, 0.5, -plane.right), (0.5, 0.985, plane.up), (0.5, 0.015, -plane.up))
     for x, y, direction in edges:
-        axes.text(
+        sheet.words(
             x,
             y,
             letters(subject.case.space, direction),
-            transform=axes.transAxes,
+            relative=True,
             ha="right" if x > 0.9 else "left" if x < 0.1 else "center",
             va="top" if y > 0.9 else "bottom" if y < 0.1 else "center",
             color="white",
@@ -179,11 +212,12 @@ def _directions(axes: Axes, subject: Subject, plane: Plane) -> None:
         )
 
 
-def _scale(axes: Axes, plane: Plane) -> None:
+def _scale(sheet: _Sheet, plane: Plane) -> None:
     """A bar of a round length in the lower left corner."""
     side = 2 * plane.half_mm
     length = max((mm for mm in SCALE_BARS_MM if mm <= SCALE_FRACTION * side), default=SCALE_BARS_MM[0])
     left, low = plane.centre - plane.half_mm * np.array([0.94, 0.93])
-    axes.plot([left, left + length], [low, low], color="white", lw=3, solid_capstyle="butt", path_effects=HALO)
+    bar = np.array([(left, low), (left + length, low)])
+    sheet.line(bar, color="white", lw=3, solid_capstyle="butt", path_effects=HALO)
     words = f"{length} mm"
-    axes.text(left, low + 0.022 * side, words, color="white", fontsize=9, va="bottom", path_effects=HALO)
+    sheet.words(left, low + 0.022 * side, words, color="white", fontsize=9, va="bottom", path_effects=HALO)
