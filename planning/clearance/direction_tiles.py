@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.clearance.kernels.kd_order import kd_order
+from puncture_twin.planning.geometry.kd_order import kd_order
 
 TILE = 12
 """Directions of a bundle at most."""

@@ -13,10 +13,11 @@ from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.shapes import surface, touch
 from puncture_twin.planning.collision.state_checker import PATIENT
+from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 PART_TRIANGLES = 8192
-"""About so many triangles share a tree: FCL takes some 4 us to build for each, and 20 us to ask a tree."""
+"""So many triangles share a tree: FCL takes some 4 us to build for each, and 20 us to ask a tree."""
 
 ROUNDING_MM = 1e-6
 """By how much a body's box is grown: far above the rounding of its pose."""
@@ -58,7 +59,8 @@ class FclSkin:
     @cached_property
     def _parts(self) -> list[Ints]:
         """The triangles of each part: rows of the mesh's faces."""
-        return halved(self._mesh.triangles.mean(axis=1), PART_TRIANGLES)
+        order = kd_order(self._mesh.triangles.mean(axis=1), PART_TRIANGLES)
+        return np.split(order, range(PART_TRIANGLES, len(order), PART_TRIANGLES))
 
     @cached_property
     def _bounds(self) -> Floats:
@@ -93,20 +95,6 @@ class FclPatient(NamedTuple):
             InputError: See :class:`FclSkin`.
         """
         return cls(FclSkin(skin, PATIENT), None if outside is None else FclSkin(outside, OUTSIDE_BODY))
-
-
-def halved(points: Floats, most: int) -> list[Ints]:
-    """Points (n, 3) in compact lots of at most so many, halved along their longest side: rows of each."""
-    waiting, lots = [np.arange(len(points))], list[Ints]()
-    while waiting:
-        rows = waiting.pop()
-        if len(rows) <= most:
-            lots.append(rows)
-            continue
-        axis = np.ptp(points[rows], axis=0).argmax()
-        order = rows[np.argpartition(points[rows, axis], len(rows) // 2)]
-        waiting += [order[: len(rows) // 2], order[len(rows) // 2 :]]
-    return lots
 
 
 def _bounds_at(solid: fcl.CollisionObject, box: Floats) -> tuple[Floats, Floats]:

@@ -15,6 +15,10 @@ from puncture_twin.planning.geometry.rigid import apply
 Faces = NDArray[np.int32]
 
 
+MOST_IN_ONE = 2_000_000
+"""So many places give triples that fit in 63 bits."""
+
+
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
     """Vertices and triangles of one surface. Whoever holds one may trust that the guard has passed it.
@@ -53,7 +57,8 @@ class TriangleMesh:
     def distinct(self) -> NDArray[np.bool_]:
         """Which triangles have three corners in different places and are not given before, shape (m,)."""
         a, b, c = self._welded.T
-        return (a != b) & (b != c) & (c != a) & _first_of_equals(np.sort(np.stack([a, b, c]), axis=0))
+        least, most = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+        return (a != b) & (b != c) & (c != a) & _first_of_equals(least, a + b + c - least - most, most)
 
     @cached_property
     def wound_alike(self) -> bool:
@@ -95,12 +100,13 @@ class TriangleMesh:
         return TriangleMesh(apply(T_b_a, self.vertices), self.faces)
 
 
-def _first_of_equals(columns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which columns (3, m) are the first of those that are equal, shape (m,)."""
-    order = np.lexsort(columns)
-    ordered = columns[:, order]
-    fresh = np.ones(columns.shape[1], bool)
-    fresh[1:] = np.any(ordered[:, 1:] != ordered[:, :-1], axis=0)
-    first = np.empty(len(fresh), bool)
-    first[order] = fresh
-    return first
+def _first_of_equals(a: NDArray[np.int64], b: NDArray[np.int64], c: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which triples of numbers, each (m,) and at least 0, are the first of those that are equal, shape (m,)."""
+    count = int(max(a.max(initial=0), b.max(initial=0), c.max(initial=0))) + 1
+    pairs = a * count + b
+    if count > MOST_IN_ONE:
+        pairs = np.unique(pairs, return_inverse=True)[1].astype(np.int64)  # fewer than 2^31: a mesh has no more faces
+    _, first = np.unique(pairs * count + c, return_index=True)
+    fresh = np.zeros(len(a), bool)
+    fresh[first] = True
+    return fresh

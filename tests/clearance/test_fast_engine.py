@@ -7,7 +7,7 @@ from oracles import segment_mesh_distance
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.clearance.kernels.kd_order import kd_order
+from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 LENGTH = 150.0

@@ -49,13 +49,17 @@ def kernels_stamp() -> ProjectStamp:
     return ProjectStamp(f"{stamp_of(files)} {library_versions(COMPILERS)}")
 
 
+@cache
+def _ours(py_file: str) -> bool:
+    return any(Path(py_file).resolve().is_relative_to((PACKAGE / part).resolve()) for part in PARTS)
+
+
 class _OfTheProject:
     """Of two bases, the one that comes first: takes the project's files only, and stamps them with all kernels."""
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> Any:
-        ours = any(Path(py_file).resolve().is_relative_to((PACKAGE / part).resolve()) for part in PARTS)
-        return super().from_function(py_func, py_file) if ours else None
+        return super().from_function(py_func, py_file) if _ours(py_file) else None
 
     def get_source_stamp(self) -> ProjectStamp:
         return kernels_stamp()

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.clearance.kernels.kd_order import kd_order
 from puncture_twin.planning.clearance.kernels.lanes import LANES
+from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 PARALLEL = 1e-6

@@ -150,8 +150,8 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
 
 def _signed_volume(mesh: TriangleMesh) -> float:
     """Volume by the divergence theorem, mm^3; negative when the triangles face inward."""
-    corners = mesh.triangles - mesh.vertices[0]
-    return float(np.linalg.det(corners).sum() / 6.0)
+    a, b, c = np.moveaxis(mesh.triangles - mesh.vertices[0], 1, 0)
+    return float(np.einsum("ij,ij", a, np.cross(b, c)) / 6.0)
 
 
 def _reader(path: Path) -> Callable[[bytes, str], RawMesh]:
