@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, beside the package
 
 from benchmarks.approach import Scene, scenes
-from puncture_twin.planning.arm.kinematics import wrapped_solutions
+from puncture_twin.planning.arm.inverse_kinematics import wrapped_solutions
 from puncture_twin.planning.collision.bodies import NEVER_TESTED
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker

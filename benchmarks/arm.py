@@ -20,7 +20,8 @@ from time import process_time
 import numpy as np
 import ur_analytic_ik
 
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse, wrap_to_pi
+from puncture_twin.planning.arm.inverse_kinematics import inverse, wrap_to_pi
+from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker

@@ -20,7 +20,8 @@ from scipy.special import chdtri
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.insertion import flange_poses
-from puncture_twin.planning.arm.kinematics import inverse, singularity
+from puncture_twin.planning.arm.inverse_kinematics import inverse
+from puncture_twin.planning.arm.kinematics import singularity
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.case.errors import ErrorModel, error_model

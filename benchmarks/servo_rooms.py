@@ -24,7 +24,7 @@ from scipy.special import chdtrc, chdtri
 
 from benchmarks.servo_variants import pixel_detector, varied
 from puncture_twin.meshes import folder
-from puncture_twin.planning.arm.kinematics import inverse
+from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import process_pool

@@ -28,7 +28,8 @@ from scipy.special import chdtri, fdtri
 from benchmarks.scenes import DATA
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.insertion import flange_poses
-from puncture_twin.planning.arm.kinematics import inverse, singularity
+from puncture_twin.planning.arm.inverse_kinematics import inverse
+from puncture_twin.planning.arm.kinematics import singularity
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.geometry.rigid import apply

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import trimesh
 
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse
+from puncture_twin.planning.arm.inverse_kinematics import inverse
+from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.case.entry import entry_frame, grid, view_frame

@@ -6,7 +6,8 @@ import numpy as np
 from places import ROOT
 
 from puncture_twin.planning.arm.insertion import flange_poses
-from puncture_twin.planning.arm.kinematics import inverse, singularity
+from puncture_twin.planning.arm.inverse_kinematics import inverse
+from puncture_twin.planning.arm.kinematics import singularity
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.errors_section import ErrorsSection

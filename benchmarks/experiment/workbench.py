@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.arm.insertion import flange_poses
-from puncture_twin.planning.arm.kinematics import inverse, nearest_within_limits
+from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.geometry.rigid import frame_about, pose

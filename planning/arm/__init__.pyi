@@ -3,8 +3,8 @@ from .insertion import (
     MIN_SINGULARITY as MIN_SINGULARITY,
     NeedleLine as NeedleLine,
     away_from_singularities as away_from_singularities,
-    branch_path as branch_path,
     every_branch as every_branch,
+    fill_branch_path as fill_branch_path,
     first_stop as first_stop,
     flange_at as flange_at,
     flange_poses as flange_poses,
@@ -13,17 +13,19 @@ from .insertion import (
     survey as survey,
     why_unreachable as why_unreachable,
 )
-from .kernels import link_frames as link_frames
-from .kinematics import (
+from .inverse_kinematics import (
     N_BRANCHES as N_BRANCHES,
-    flange_pose as flange_pose,
     inverse as inverse,
-    jacobian as jacobian,
-    link_poses as link_poses,
     nearest_within_limits as nearest_within_limits,
-    singularity as singularity,
     wrap_to_pi as wrap_to_pi,
     wrapped_solutions as wrapped_solutions,
+)
+from .kinematics import (
+    flange_pose as flange_pose,
+    jacobian as jacobian,
+    link_frames as link_frames,
+    link_poses as link_poses,
+    singularity as singularity,
 )
 from .links import (
     LINK_NAMES as LINK_NAMES,

@@ -9,8 +9,7 @@ from itertools import product
 
 import numpy as np
 
-from puncture_twin.planning.arm.kernels import link_frames
-from puncture_twin.planning.arm.kinematics import link_poses
+from puncture_twin.planning.arm.kinematics import link_frames, link_poses
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel

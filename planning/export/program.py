@@ -16,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse, wrap_to_pi
+from puncture_twin.planning.arm.inverse_kinematics import inverse, wrap_to_pi
+from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError

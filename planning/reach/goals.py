@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from puncture_twin.planning.arm.insertion import reach_margin
-from puncture_twin.planning.arm.kinematics import wrapped_solutions
+from puncture_twin.planning.arm.inverse_kinematics import wrapped_solutions
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.checker import StateChecker
 from puncture_twin.planning.reach.reach import ReachAnswer, ReachRequest, every_reach

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.insertion import NeedleLine
-from puncture_twin.planning.arm.kernels import branch_path, link_frames
+from puncture_twin.planning.arm.insertion import NeedleLine, fill_branch_path
+from puncture_twin.planning.arm.kinematics import link_frames
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.collision.sweep import SweptBodies, motion_bounds
@@ -60,7 +60,7 @@ def _sampled(  # type: ignore[no-untyped-def]  # numba infers
             depths[k] = k * step if k < samples - 1 else standoff
             distances[k] = needle + standoff - depths[k]
         q, frames, bounds = np.empty((samples, 6)), np.empty((samples, 7, 4, 4)), np.empty((samples - 1, 6))
-        branch_path(lengths, R, target, outward, distances, branch, turn, q)
+        fill_branch_path(lengths, R, target, outward, distances, branch, turn, q)
         link_frames(lengths, q, frames)
         motion_bounds(frames, q, bodies[0], bodies[1], bounds)
         worst = bounds.max()

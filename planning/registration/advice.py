@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from puncture_twin.planning.arm.kinematics import branch_of
+from puncture_twin.planning.arm.inverse_kinematics import branch_of
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import apply

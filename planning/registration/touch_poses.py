@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from puncture_twin.planning.arm.kinematics import inverse, singularity
+from puncture_twin.planning.arm.inverse_kinematics import inverse
+from puncture_twin.planning.arm.kinematics import singularity
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits
+from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
+from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.speed_limits import slowed
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats

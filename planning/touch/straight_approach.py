@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from puncture_twin.planning.arm.insertion import MAX_JOINT_STEP_RAD_PER_MM
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits
+from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
+from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.checker import CellChecker

@@ -7,8 +7,8 @@ import pytest
 
 from puncture_twin.planning.arm.insertion import (
     FULL_MARGIN_RAD,
-    branch_path,
     every_branch,
+    fill_branch_path,
     first_stop,
     flange_at,
     flange_poses,
@@ -16,7 +16,8 @@ from puncture_twin.planning.arm.insertion import (
     reach_margin,
     survey,
 )
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits, singularity, wrap_to_pi
+from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits, wrap_to_pi
+from puncture_twin.planning.arm.kinematics import flange_pose, singularity
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
 from puncture_twin.planning.collision.sweep import SweptBodies
@@ -61,7 +62,8 @@ def test_one_branch_alone_and_all_eight_agree() -> None:
     for line in lines(10, seed=2):
         every = every_branch(model, line, DISTANCES)
         for branch in range(8):
-            alone = branch_path(model, line, DISTANCES, branch, turn)
+            alone = np.empty((len(DISTANCES), 6))
+            fill_branch_path(model.lengths, *line, DISTANCES, branch, turn, alone)
             assert np.allclose(alone, every[branch] + turn, rtol=0.0, atol=1e-12, equal_nan=True)
 
 

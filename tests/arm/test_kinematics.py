@@ -9,17 +9,14 @@ import pytest
 import ur_analytic_ik
 from hypothesis import example, given, settings, strategies as st
 
-from puncture_twin.planning.arm.kinematics import (
-    flange_pose,
+from puncture_twin.planning.arm.inverse_kinematics import (
     inverse,
-    jacobian,
-    link_poses,
     missing_reach_mm,
     nearest_within_limits,
-    singularity,
     wrap_to_pi,
     wrapped_solutions,
 )
+from puncture_twin.planning.arm.kinematics import flange_pose, jacobian, link_poses, singularity
 from puncture_twin.planning.arm.links import LINK_NAMES, collision_links, visual_links
 from puncture_twin.planning.arm.model_urdf import model_urdf
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model

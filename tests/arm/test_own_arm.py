@@ -12,7 +12,8 @@ import pytest
 import trimesh
 from own_arms import LENGTHS, LINKS, beside, origin, placed, shipped_as_own, slow_chain, write_own_arm
 
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse, link_poses
+from puncture_twin.planning.arm.inverse_kinematics import inverse
+from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.own_arm import own_arm
 from puncture_twin.planning.arm.tool import Box, Tool

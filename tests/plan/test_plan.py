@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits
+from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
+from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.speed_limits import SpeedLimits
 from puncture_twin.planning.arm.tip_speed import tip_speeds
 from puncture_twin.planning.arm.ur import ur_model

@@ -11,13 +11,14 @@ import trimesh
 from benchmarks.chen2019_reach import SHARES, WINDOWS, PublishedShare, cap, runs
 from puncture_twin.planning.arm.insertion import (
     MIN_SINGULARITY,
-    branch_path,
     every_branch,
+    fill_branch_path,
     flange_poses,
     needle_lines,
     reach_margin,
 )
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse, link_poses, singularity
+from puncture_twin.planning.arm.inverse_kinematics import inverse
+from puncture_twin.planning.arm.kinematics import flange_pose, link_poses, singularity
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
@@ -304,7 +305,7 @@ def test_requests_that_make_no_sense_are_refused() -> None:
 
 
 def test_the_samples_are_those_of_the_plain_loop() -> None:
-    """Depths as ``np.linspace`` has them, states as ``branch_path``, as many as the largest motion asks for."""
+    """Depths as ``np.linspace`` has them, states as ``fill_branch_path``, as many as the largest motion asks for."""
     swept, rng = SweptBodies.of(UR3, TOOL), np.random.default_rng(5)
     ended = 0
     for _ in range(200):
@@ -316,7 +317,8 @@ def test_the_samples_are_those_of_the_plain_loop() -> None:
         found = sampled(swept, line, branch, turn, lengths, count, MAX_SWEEP_MM)
         while True:
             depths = np.linspace(0.0, standoff, count)
-            q = branch_path(UR3, line, sum(lengths) - depths, branch, turn)
+            q = np.empty((len(depths), 6))
+            fill_branch_path(UR3.lengths, *line, sum(lengths) - depths, branch, turn, q)
             if not (worst := swept.bounds_mm(q).max()) > MAX_SWEEP_MM:
                 break
             count = math.ceil((count - 1) * worst / MAX_SWEEP_MM) + 1

@@ -8,7 +8,8 @@ import pytest
 from places import ROOT
 from scipy.stats import chi2, f
 
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse
+from puncture_twin.planning.arm.inverse_kinematics import inverse
+from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import BAD_INPUT, OK

@@ -9,7 +9,8 @@ import pytest
 import trimesh
 
 from puncture_twin.planning.arm.insertion import flange_poses
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse, nearest_within_limits, singularity
+from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
+from puncture_twin.planning.arm.kinematics import flange_pose, singularity
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.collision.checker import CellChecker

@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse, wrap_to_pi
+from puncture_twin.planning.arm.inverse_kinematics import inverse, wrap_to_pi
+from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.case.errors import ErrorModel

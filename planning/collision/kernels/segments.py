@@ -1,7 +1,7 @@
 """Compiled check of one straight joint segment: what surely touches, what is surely clear, and what is left to ask.
 
 It calls the kernels of :mod:`puncture_twin.planning.collision.kernels.proofs`, of those that they call and of
-:mod:`puncture_twin.planning.arm.kernels`.
+:mod:`puncture_twin.planning.arm.kinematics`.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.kernels import link_frames
+from puncture_twin.planning.arm.kinematics import link_frames
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING
@@ -165,7 +165,7 @@ def check_segment(scene, movers, lengths, start, end, fractions, begin, fine_mm,
     Args:
         scene: See :class:`Scene`.
         movers: See :class:`Movers`.
-        lengths: Of the arm, see :mod:`puncture_twin.planning.arm.kernels`.
+        lengths: Of the arm, see :mod:`puncture_twin.planning.arm.kinematics`.
         start: Shape (6,), rad.
         end: Shape (6,), rad.
         fractions: Shape (m,): of the segment, where states are that are looked at first.

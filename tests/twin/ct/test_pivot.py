@@ -8,7 +8,8 @@ from places import ROOT
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.erring_arm import ErringArm
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse
+from puncture_twin.planning.arm.inverse_kinematics import inverse
+from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import load_case

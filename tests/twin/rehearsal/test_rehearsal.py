@@ -13,7 +13,8 @@ from uncertainty_world import declared
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
 from puncture_twin.planning.anatomy.skin import skin_from_mesh
-from puncture_twin.planning.arm.kinematics import flange_pose, inverse, jacobian, nearest_within_limits
+from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
+from puncture_twin.planning.arm.kinematics import flange_pose, jacobian
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case import Case

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.kinematics import inverse, nearest_within_limits, singularity
+from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
+from puncture_twin.planning.arm.kinematics import singularity
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm import kernels
+from puncture_twin.planning.arm.kinematics import jacobians, link_frames
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import skew
@@ -33,8 +33,8 @@ def tips(model: UrModel, tip_m: float, q: Floats) -> Tip:
         q: Shape (n, 6), rad.
     """
     frames, J = np.empty((len(q), 7, 4, 4)), np.empty((len(q), 6, 6))
-    kernels.link_frames(model.lengths, np.ascontiguousarray(q), frames)
-    kernels.jacobians(frames, J)
+    link_frames(model.lengths, np.ascontiguousarray(q), frames)
+    jacobians(frames, J)
     flange = frames[:, 6]
     arm_m = tip_m * flange[:, :3, 2]
     # v_tip = v_flange + w x r
