@@ -47,8 +47,8 @@ def named_files(content: CaseFile, path: Path) -> Iterator[NamedFile]:
         yield NamedFile("ct", content.ct.file, "ct.file", volumes.MAX_FILE_BYTES)
     for side in ("markers_ct", "markers_base", "transform"):
         file = getattr(content.registration, side, None)
-        most = itk_transform.MAX_FILE_BYTES if side == "transform" else points.MAX_FILE_BYTES
         if file is not None:
+            most = itk_transform.most_bytes(file) if side == "transform" else points.MAX_FILE_BYTES
             yield NamedFile(side, file, f"registration.{side}", most)
     if content.rehearsal.truth_base is not None:
         yield NamedFile("truth_base", content.rehearsal.truth_base, "rehearsal.truth_base", points.MAX_FILE_BYTES)

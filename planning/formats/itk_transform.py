@@ -1,13 +1,11 @@
-"""Linear transforms of ITK, as text (.tfm, .txt): what 3D Slicer, SimpleITK and ANTs write.
+"""Linear transforms of ITK, as text (.tfm, .txt) or HDF5 (.h5): what 3D Slicer, SimpleITK and ANTs write.
 
-A file states what ``TransformPoint`` does: y = M (x - c) + c + t, with x and y in LPS mm; the parameters are M by rows
-and then t, the fixed parameters the centre c. Which frame x is in, no file says.
-Source: ITK, MatrixOffsetTransformBase; Slicer's developer guide, "Transforms": a node's file goes from its parent.
+Which frame a transform's points are in, no file says.
+Source: ITK, TxtTransformIO; Slicer's developer guide, "Transforms": a node's file goes from its parent.
 """
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -15,20 +13,22 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.guard import guard_transform
+from puncture_twin.planning.formats.itk_hdf5 import hdf5_transforms
+from puncture_twin.planning.formats.itk_linear import ALLOWED, StatedTransform, linear_motion
 from puncture_twin.planning.formats.raw_mesh import decode_text, refuse
-from puncture_twin.planning.geometry.rigid import pose
 
-MAX_FILE_BYTES = 100_000
-"""A linear transform has 15 numbers; a larger file holds another one."""
-ENDINGS = (".tfm", ".txt")
+TEXT_ENDINGS, HDF5_ENDINGS = (".tfm", ".txt"), (".h5", ".hdf5")
+MAX_TEXT_BYTES = 100_000
+"""A linear transform has 15 numbers; a larger text holds another one."""
+MAX_HDF5_BYTES = 500_000_000
+"""A field of displacements is refused by its name, which has to be read."""
 _HEADER = "#Insight Transform File V1.0"
-_LINEAR = re.compile(r"(AffineTransform|MatrixOffsetTransformBase)_(double|float)_3_3")
-_ALLOWED = (
-    "an ITK transform file (.tfm) with one AffineTransform of three dimensions, as Slicer saves a linear transform"
-)
-_SAVE_AS_TFM = (
-    "the same transform as text: in Slicer, Save with the file format .tfm; in SimpleITK, WriteTransform(T, 'x.tfm')"
-)
+_KEYS = ("Parameters", "FixedParameters")
+
+
+def most_bytes(name: str) -> int:
+    """How large a transform file may be, by its ending."""
+    return MAX_HDF5_BYTES if name.lower().endswith(HDF5_ENDINGS) else MAX_TEXT_BYTES
 
 
 def parse_transform(data: bytes, path: Path) -> Floats:
@@ -41,47 +41,46 @@ def parse_transform(data: bytes, path: Path) -> Floats:
     Raises:
         InputError: Another format or kind of transform, several of them, or one that is not rigid.
     """
-    if not path.name.lower().endswith(ENDINGS):
-        binary = path.suffix.lower() in (".h5", ".hdf5", ".mat")
-        allowed = _SAVE_AS_TFM if binary else _ALLOWED
-        raise InputError(f"transform file of the kind {path.suffix!r}", where=path, allowed=allowed)
     name = str(path)
-    lines = [line.strip() for line in decode_text(data, name).splitlines() if line.strip()]
+    if name.lower().endswith(HDF5_ENDINGS):
+        stated = hdf5_transforms(data, name)
+    elif name.lower().endswith(TEXT_ENDINGS):
+        stated = _text_transforms(data, name)
+    else:
+        raise InputError(f"transform file of the kind {path.suffix!r}", where=path, allowed=ALLOWED)
+    return guard_transform(linear_motion(stated, name), where=path)
+
+
+def _text_transforms(data: bytes, where: str) -> list[StatedTransform]:
+    """The transforms of a text, in its order."""
+    lines = [line.strip() for line in decode_text(data, where).splitlines() if line.strip()]
     if not lines or lines[0] != _HEADER:
-        refuse("no ITK transform file", name, _ALLOWED)
-    stated = _stated(lines[1:], name)
-    kind = stated.get("Transform", "")
-    if _LINEAR.fullmatch(kind) is None:
-        refuse(f"transform of type {kind[:60]!r}", name, _ALLOWED)
-    numbers, centre = _numbers(stated, "Parameters", 12, name), _numbers(stated, "FixedParameters", 3, name)
-    M = numbers[:9].reshape(3, 3)
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
-        T = pose(M, numbers[9:] + centre - M @ centre)
-    return guard_transform(T, where=path)
+        refuse("no ITK transform file", where, ALLOWED)
+    return [StatedTransform(kind, *(_numbers(one, key, where) for key in _KEYS)) for kind, one in _blocks(lines, where)]
 
 
-def _stated(lines: list[str], where: str) -> dict[str, str]:
-    """The values of the one transform by their keys."""
-    stated: dict[str, str] = {}
+def _blocks(lines: list[str], where: str) -> list[tuple[str, dict[str, str]]]:
+    """The kind of each transform, and its values by their keys."""
+    blocks: list[tuple[str, dict[str, str]]] = []
     for line in lines:
+        key, mark, value = (part.strip() for part in line.partition(":"))
         if line.startswith("#"):
             continue
-        key, mark, value = line.partition(":")
-        if not mark or key in stated:
-            what = "several transforms: harden them into one" if key == "Transform" else f"line {line[:60]!r}"
-            refuse(what, where, _ALLOWED)
-        stated[key] = value.strip()
-    return stated
+        if key == "Transform":
+            blocks.append((value, {}))
+        elif not blocks or key not in _KEYS or not mark or key in blocks[-1][1]:
+            refuse(f"line {line[:60]!r}", where, ALLOWED)
+        else:
+            blocks[-1][1][key] = value
+    return blocks
 
 
-def _numbers(stated: dict[str, str], key: str, count: int, where: str) -> Floats:
+def _numbers(stated: dict[str, str], key: str, where: str) -> Floats:
     words = stated.get(key, "").split()
-    if len(words) != count or any("_" in word for word in words):
-        refuse(f"{len(words)} {key}", where, f"{count} numbers")
     try:
-        return np.array([float(word) for word in words])
+        return np.array([float(word.replace("_", "no number")) for word in words])
     except ValueError as error:
-        raise InputError(f"{key} are no numbers ({error})", where=where, allowed=_ALLOWED) from error
+        raise InputError(f"{key} are no numbers ({str(error)[:80]})", where=where, allowed=ALLOWED) from error
 
 
 def transform_text(T: Floats) -> str:

@@ -8,6 +8,7 @@ import struct
 import zlib
 
 import dicom_world as world
+import h5py
 import numpy as np
 import SimpleITK
 import trimesh
@@ -64,6 +65,7 @@ def make_corpus(folder):
     make_volumes(folder)
     make_dicom(folder)
     make_points(folder)
+    make_transforms(folder)
     sound_case(folder, CASE + RIB)
     text = CASE + RIB + LABELS + REGISTRATION + TABLE
     (folder / "full.toml").write_text(text)
@@ -80,6 +82,16 @@ def make_corpus(folder):
     joints = [f"{number / 10},{','.join(map(repr, row))}" for number, row in enumerate(plan.insertion.q.tolist())]
     (folder / "set.json").write_text(output_set_manifest())
     (folder / "joints.csv").write_text("\n".join(["time_s," + ",".join(f"q{j}_rad" for j in range(1, 7)), *joints]))
+
+
+def make_transforms(folder):
+    """A composite of a rigid part about a centre and an affine one, as HDF5 and as text."""
+    euler = SimpleITK.Euler3DTransform([10.0, -20.0, 30.0], 0.1, 0.2, 0.3, [300.0, 0.0, -90.0])
+    for name in ("transform.h5", "transform.tfm"):
+        both = SimpleITK.CompositeTransform([euler, SimpleITK.AffineTransform(3)])
+        SimpleITK.WriteTransform(both, str(folder / name))
+    with h5py.File(folder / "transform.h5") as new, h5py.File(folder / "earliest.h5", "w", libver="earliest") as old:
+        new.copy("TransformGroup", old)  # without the checksums that refuse most changes
 
 
 def output_set_manifest():

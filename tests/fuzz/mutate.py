@@ -301,6 +301,7 @@ KINDS = {
     "glb": [*PLAIN, *[change_glb] * 5],
     "stl": [*PLAIN, change_head, change_floats, change_floats, change_floats],
     "headed": [*PLAIN, change_floats, change_floats, *[change_text_head] * 4],
+    "hdf5": [*PLAIN, flip, flip, change_floats, change_word],
     "nifti": [*PLAIN, change_floats, *[change_head] * 5],
     "dicom": [*PLAIN, *[change_element] * 8],
     "gzip": [*PLAIN, *[inside_gzip(how) for how in (flip, truncate, insert, change_floats, *[change_head] * 5)]],

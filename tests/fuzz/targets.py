@@ -16,6 +16,7 @@ from puncture_twin.planning.formats.dicom.ct_series import parse_series
 from puncture_twin.planning.formats.dicom.recognise import recognise
 from puncture_twin.planning.formats.dicom.segmentation import parse_segmentation
 from puncture_twin.planning.formats.dicom.structure_set import parse_structure_set
+from puncture_twin.planning.formats.itk_transform import parse_transform
 from puncture_twin.planning.formats.labels.labelmaps import labelmap_of
 from puncture_twin.planning.formats.labels.naming import names_for
 from puncture_twin.planning.formats.meshes.mesh_files import mesh_warnings, read_mesh
@@ -73,6 +74,12 @@ def whole_points(points):
     """As many finite points as names, each name once and not empty."""
     assert points.points.shape == (len(points.names), 3) and np.isfinite(points.points).all()
     assert len(set(points.names)) == len(points.names) > 0 and all(points.names)
+
+
+def whole_transform(T):
+    """A rigid motion."""
+    assert np.isfinite(T).all() and np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max() < 1e-4
+    assert np.linalg.det(T[:3, :3]) > 0
 
 
 def whole_names(names):
@@ -197,6 +204,11 @@ def read_times(path):
     return read_csv(path.read_bytes().decode("utf-8", "replace"), where=path)
 
 
+def read_transform(path):
+    """The motion of ITK's transforms."""
+    return parse_transform(path.read_bytes(), path)
+
+
 MESHES = {
     "a.stl": "stl",
     "ascii.stl": "text",
@@ -217,6 +229,7 @@ LABELS = {
     "labels.seg.nrrd": "headed",
     "labels.nhdr": "text",
 }
+TRANSFORMS = {"transform.h5": "hdf5", "earliest.h5": "hdf5", "transform.tfm": "text"}
 CASES = ("full.toml", "stated.toml", "case.toml", "mount.toml")
 TARGETS = [
     Target("mesh", MESHES, read_own_mesh, whole_mesh),
@@ -230,6 +243,7 @@ TARGETS = [
         read_own_points,
         whole_points,
     ),
+    Target("transform", TRANSFORMS, read_transform, whole_transform),
     Target("naming", {"names.csv": "table"}, read_names, whole_names),
     Target("case", dict.fromkeys(CASES, "text"), read_case, whole_case, heavy=True),
     Target("servo case", {"servo.toml": "text"}, load_servo_case, whole_anything, heavy=True),

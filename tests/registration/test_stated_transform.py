@@ -100,8 +100,9 @@ TWICE = GOOD + "\n".join(GOOD.splitlines()[1:]) + "\n"
         ("a.tfm", GOOD.replace("\nParameters: ", "\nParameters: 1 "), "13 Parameters"),
         ("a.tfm", GOOD.replace("\nParameters: ", "\nParameters: a"), "no numbers"),
         ("a.tfm", GOOD.replace("FixedParameters: 0", "FixedParameters: nan"), "not finite|NaN|nan"),
-        ("a.tfm", GOOD.splitlines()[0], "transform of type ''"),
-        ("a.h5", "\x89HDF", r"kind '\.h5'; allowed: the same transform as text: in Slicer, Save .* \.tfm"),
+        ("a.tfm", GOOD.splitlines()[0], "no linear transform"),
+        ("a.tfm", GOOD.replace("Transform: Aff", "Transform:\nAff"), "line 'AffineTransform_double_3_3'"),
+        ("a.tfm", GOOD.replace("#Transform 0", "Parameters: 1"), "line 'Parameters: 1'"),
         ("a.mat", GOOD, r"kind '\.mat'"),
     ],
 )

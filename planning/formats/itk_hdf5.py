@@ -1,0 +1,115 @@
+"""Transforms of ITK in HDF5 (.h5): the default of 3D Slicer for all transforms, and of ANTs for composites.
+
+A file has a group ``TransformGroup`` with groups ``0``, ``1``, ... of ``TransformType`` (one text),
+``TransformParameters`` and ``TransformFixedParameters``; files of ITK 4 spell both ``Tranform``. A composite is group 0
+without parameters, its parts the groups after it. What is read are the bytes that were hashed: nothing that points
+elsewhere is followed.
+Source: ITK, HDF5TransformIO. Needs the extra ``hdf5`` (h5py), which is imported only here.
+"""
+
+from __future__ import annotations
+
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.itk_linear import ALLOWED, MAX_PARTS, StatedTransform
+from puncture_twin.planning.formats.raw_mesh import refuse
+
+MAX_STORED_BYTES = 4096
+"""Of one list of numbers: twelve doubles are 96; compressed ones cannot grow to more than a thousand times of this."""
+MAX_NUMBERS = 64
+"""Of one list: more than any linear transform has."""
+_GROUP, _TYPE = "TransformGroup", "TransformType"
+_PARAMETERS = ("TransformParameters", "TranformParameters")
+_FIXED = ("TransformFixedParameters", "TranformFixedParameters")
+_DAMAGED = (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError, MemoryError, OverflowError)
+"""What h5py raises for bytes that are no whole HDF5."""
+_WITHOUT_H5PY = (
+    "pip install 'puncture-twin[hdf5]', or the same transform as text: in Slicer, Save with the file format .tfm; in "
+    "SimpleITK, WriteTransform(T, 'x.tfm')"
+)
+
+
+def hdf5_transforms(data: bytes, where: str) -> list[StatedTransform]:
+    """The transforms of a file in its order, linear or not; lists too long for a linear one come empty.
+
+    Args:
+        data: The whole file.
+        where: Its name, for errors.
+
+    Raises:
+        InputError: Without h5py; or no whole HDF5 file of ITK's transforms.
+    """
+    try:
+        import h5py
+    except ImportError:
+        refuse("to read HDF5 needs h5py, which is not installed", where, _WITHOUT_H5PY)
+    try:
+        with h5py.File(BytesIO(data), "r") as file:
+            return [_transform(group, where) for group in _groups(h5py, file, where)]
+    except _DAMAGED as error:
+        raise InputError(f"no whole HDF5 file ({str(error)[:120]})", where=where, allowed=ALLOWED) from error
+
+
+def _groups(h5py: Any, file: Any, where: str) -> list[Any]:
+    """The groups of the transforms by their numbers."""
+    if _GROUP not in file:
+        refuse(f"HDF5 without {_GROUP}", where, ALLOWED)
+    parent = _own(h5py, file, _GROUP, h5py.Group, where)
+    if not 0 < len(parent) <= MAX_PARTS + 1:
+        refuse(f"{len(parent)} transforms", where, f"1, or at most {MAX_PARTS} parts of a CompositeTransform")
+    names = [str(number) for number in range(len(parent))]
+    if set(parent) != set(names):
+        refuse(f"{_GROUP} with {', '.join(sorted(parent))[:60]}", where, f"transforms numbered {', '.join(names)}")
+    return [_Members(h5py, _own(h5py, parent, name, h5py.Group, where), where) for name in names]
+
+
+def _own(h5py: Any, parent: Any, name: str, kind: type, where: str) -> Any:
+    """A member that is in the file itself; links could name any file of the host."""
+    if not isinstance(parent.get(name, getlink=True), h5py.HardLink) or not isinstance(parent[name], kind):
+        refuse(f"{parent.name}/{name} is a link or of another sort", where, ALLOWED)
+    return parent[name]
+
+
+class _Members:
+    """What one transform's group holds."""
+
+    def __init__(self, h5py: Any, group: Any, where: str) -> None:
+        self._h5py, self._group, self._where = h5py, group, where
+
+    def text(self, name: str) -> str:
+        """The one text of a dataset."""
+        if name not in self._group:
+            refuse(f"{self._group.name} without {name}", self._where, ALLOWED)
+        data = self._dataset(name)
+        if data.size != 1 or self._h5py.check_string_dtype(data.dtype) is None:
+            refuse(f"{data.name} is no text", self._where, ALLOWED)
+        return str(np.ravel(data.asstr()[()])[0])
+
+    def numbers(self, names: tuple[str, ...]) -> Floats:
+        """The numbers of a dataset by either of its names; none where there is none or it is too large."""
+        there = [name for name in names if name in self._group]
+        if len(there) > 1:
+            refuse(f"{self._group.name} with {' and '.join(there)}", self._where, ALLOWED)
+        data = self._dataset(there[0]) if there else None
+        if data is None or data.size > MAX_NUMBERS:
+            return np.empty(0)
+        if data.dtype not in (np.float64, np.float32) or data.ndim != 1:
+            refuse(f"{data.name} of {data.dtype} with shape {data.shape}", self._where, "a list of floats or doubles")
+        return np.asarray(data[()], dtype=np.float64)
+
+    def _dataset(self, name: str) -> Any:
+        data = _own(self._h5py, self._group, name, self._h5py.Dataset, self._where)
+        if data.is_virtual or data.external:
+            refuse(f"{data.name} lies in another file", self._where, ALLOWED)
+        if data.size <= MAX_NUMBERS and data.id.get_storage_size() > MAX_STORED_BYTES:
+            refuse(f"{data.name} takes {data.id.get_storage_size()} bytes", self._where, ALLOWED)
+        return data
+
+
+def _transform(members: _Members, where: str) -> StatedTransform:
+    return StatedTransform(members.text(_TYPE), members.numbers(_PARAMETERS), members.numbers(_FIXED))

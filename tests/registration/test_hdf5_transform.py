@@ -1,0 +1,267 @@
+"""CT to robot from ITK's HDF5 transforms (.h5), and from all linear kinds as text: TransformPoint is the oracle."""
+
+import re
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+import SimpleITK
+from registration.test_stated_transform import FLIP, POINTS, T_BASE_CT, slicer_file, stating
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.formats.itk_transform import parse_transform
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.run_twin import main
+
+TOLERANCE_MM = 1e-9
+SINGLE_MM = 2e-4
+"""What a rotation in single precision moves a point at 500 mm by, several times over."""
+KINDS = ("affine", "euler", "euler_zyx", "versor", "composite")
+
+
+def random_transform(kind, rng):
+    """A rigid transform of SimpleITK with a centre of rotation somewhere."""
+    centre, shift = rng.uniform(-200, 200, (2, 3)).tolist()
+    if kind == "composite":
+        return SimpleITK.CompositeTransform([random_transform(one, rng) for one in KINDS[:4]])
+    euler = SimpleITK.Euler3DTransform(centre, *rng.uniform(-3, 3, 3).tolist(), shift)
+    euler.SetComputeZYX(kind == "euler_zyx")
+    if kind.startswith("euler"):
+        return euler
+    made = SimpleITK.AffineTransform(3) if kind == "affine" else SimpleITK.VersorRigid3DTransform()
+    made.SetCenter(centre)
+    made.SetMatrix(euler.GetMatrix())
+    made.SetTranslation(shift)
+    return made
+
+
+def read(file):
+    """What the program reads."""
+    return parse_transform(file.read_bytes(), file)
+
+
+def by_itk(transform):
+    """Where SimpleITK puts the points."""
+    return np.array([transform.TransformPoint(point) for point in POINTS.tolist()])
+
+
+@pytest.mark.parametrize("ending", [".h5", ".hdf5", ".tfm"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_linear_kind_does_to_points_what_itk_does(tmp_path, kind, ending):
+    """Written by SimpleITK, read back by it and by us: centre of rotation, order of angles, order of parts."""
+    rng = np.random.default_rng([14, *kind.encode()])
+    for number in range(10):
+        file = tmp_path / f"{number}{ending}"
+        SimpleITK.WriteTransform(random_transform(kind, rng), str(file))
+        expected = by_itk(SimpleITK.ReadTransform(str(file)))
+        assert apply(read(file), POINTS) == pytest.approx(expected, abs=TOLERANCE_MM)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, np.pi - 1e-7, np.pi])
+def test_a_versor_at_its_ends(tmp_path, angle):
+    """No rotation, and half a turn, where the vector part has length 1 and ITK shortens it."""
+    versor = SimpleITK.VersorRigid3DTransform()
+    versor.SetRotation([0.6, 0.0, 0.8], float(angle))
+    SimpleITK.WriteTransform(versor, str(tmp_path / "a.h5"))
+    expected = by_itk(SimpleITK.ReadTransform(str(tmp_path / "a.h5")))
+    assert apply(read(tmp_path / "a.h5"), POINTS) == pytest.approx(expected, abs=1e-7)
+
+
+def rewritten(folder, kind, change, name="b.h5"):
+    """A file of SimpleITK's after a change of its HDF5."""
+    SimpleITK.WriteTransform(random_transform(kind, np.random.default_rng(7)), str(folder / name))
+    with h5py.File(folder / name, "r+") as file:
+        change(file["TransformGroup"], file)
+    return folder / name
+
+
+def in_single_precision(parent, _):
+    """As ITK writes what was computed with float."""
+    for group in parent.values():
+        kind = group["TransformType"].asstr()[0].replace("double", "float")
+        replace(group, "TransformType", kind)
+        if "TransformParameters" in group:
+            replace(group, "TransformParameters", group["TransformParameters"][()].astype("<f4"))
+
+
+def as_itk_4(parent, _):
+    """The names that older files spell wrongly; Euler without its flag."""
+    for group in parent.values():
+        group["TranformParameters"] = group["TransformParameters"][()]
+        group["TranformFixedParameters"] = group["TransformFixedParameters"][()][:3]
+        del group["TransformParameters"], group["TransformFixedParameters"]
+
+
+def replace(group, name, value):
+    """Another dataset under a name; a text as ITK writes one."""
+    group.pop(name, None)
+    if isinstance(value, str):
+        group.create_dataset(name, data=[value], dtype=h5py.string_dtype("ascii"))
+    else:
+        group[name] = value
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [(kind, in_single_precision) for kind in KINDS] + [("euler", as_itk_4), ("versor", as_itk_4)],
+)
+def test_single_precision_and_older_files(tmp_path, kind, change):
+    """ITK reads both; so do we, and put points where it puts them."""
+    file = rewritten(tmp_path, kind, change)
+    expected = by_itk(SimpleITK.ReadTransform(str(file)))
+    assert apply(read(file), POINTS) == pytest.approx(expected, abs=SINGLE_MM)
+
+
+def test_a_compressed_file_is_read(tmp_path):
+    """ITK can deflate its lists."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        group = file.create_group("TransformGroup/0")
+        replace(group, "TransformType", "AffineTransform_double_3_3")
+        group.create_dataset("TransformParameters", data=[1.0, 0, 0, 0, 1, 0, 0, 0, 1, 1, 2, 3], compression="gzip")
+        group.create_dataset("TransformFixedParameters", data=[0.0, 0, 0], compression="gzip")
+    assert read(tmp_path / "a.h5")[:3, 3].tolist() == [1, 2, 3]
+
+
+def test_a_case_takes_what_slicer_saves_by_default(tmp_path):
+    """The way from its parent, in LPS, in HDF5: the base where Slicer shows it."""
+    affine = slicer_file(tmp_path, T_BASE_CT @ FLIP)
+    SimpleITK.WriteTransform(affine, str(tmp_path / "ct_to_robot.h5"))
+    case = load_case(stating(tmp_path, "base_to_ct", "RAS", "ct_to_robot.h5"))
+    assert load_placement(case).T_base_ct == pytest.approx(T_BASE_CT, abs=TOLERANCE_MM)
+    assert ("transform", "ct_to_robot.h5") in [(one.role, one.path) for one in case.inputs]
+
+
+def displacement_field(folder, name):
+    """A field of displacements beside an affine part, as ANTs writes it."""
+    vectors = SimpleITK.Image([9, 8, 7], SimpleITK.sitkVectorFloat64, 3)
+    field = SimpleITK.DisplacementFieldTransform(vectors)
+    SimpleITK.WriteTransform(SimpleITK.CompositeTransform([SimpleITK.AffineTransform(3), field]), str(folder / name))
+
+
+def scaled(parent, _):
+    """One axis 1 mm longer in 1 m."""
+    numbers = parent["0/TransformParameters"][()]
+    numbers[:9] = (numbers[:9].reshape(3, 3) @ np.diag([1.001, 1.0, 1.0])).ravel()
+    parent["0/TransformParameters"][...] = numbers
+
+
+def sheared(parent, _):
+    """x grows with y."""
+    numbers = parent["0/TransformParameters"][()]
+    numbers[:9] = (numbers[:9].reshape(3, 3) @ [[1, 0.01, 0], [0, 1, 0], [0, 0, 1]]).ravel()
+    parent["0/TransformParameters"][...] = numbers
+
+
+def set_to(name, value):
+    """A change of one dataset of the first transform."""
+    return lambda parent, _: replace(parent["0"], name, value)
+
+
+def renumbered(parent, _):
+    """A part is gone."""
+    del parent["2"]
+
+
+def no_composite(parent, _):
+    """Two transforms that nothing chains."""
+    del parent["0"]
+    for number in range(4):
+        parent.move(str(number + 1), str(number))
+
+
+def linked_outside(parent, _):
+    """What decides lies in another file of the host."""
+    del parent["0/TransformParameters"]
+    parent["0/TransformParameters"] = h5py.ExternalLink("/etc/other.h5", "/a")
+
+
+def stored_outside(parent, _):
+    """The same, by a dataset whose bytes are elsewhere."""
+    del parent["0/TransformParameters"]
+    parent["0"].create_dataset("TransformParameters", (12,), "f8", external=[("/etc/hostname", 0, 96)])
+
+
+BAD = [
+    ("affine", scaled, "not a rotation"),
+    ("affine", sheared, "not a rotation"),
+    ("affine", lambda parent, _: parent["0"].pop("TransformType"), "/TransformGroup/0 without TransformType"),
+    ("affine", lambda parent, file: file.pop("TransformGroup"), "HDF5 without TransformGroup"),
+    ("affine", lambda parent, _: parent.pop("0"), "0 transforms"),
+    (
+        "affine",
+        set_to("TransformType", "BSplineTransform_double_3_3"),
+        "type 'BSplineTransform_double_3_3'",
+    ),
+    ("affine", set_to("TransformType", "AffineTransform_double_2_2"), "transform of type 'AffineTransform_double_2_2'"),
+    ("affine", set_to("TransformType", [1.0]), "TransformType is no text"),
+    ("affine", set_to("TransformParameters", np.arange(12)), "TransformParameters of int64"),
+    ("affine", set_to("TransformParameters", np.ones((3, 4))), r"TransformParameters of float64 with shape \(3, 4\)"),
+    ("affine", set_to("TransformParameters", np.ones(13)), "13 Parameters; allowed: 12 numbers"),
+    ("affine", set_to("TransformParameters", np.full(12, np.nan)), "not finite"),
+    ("affine", set_to("TransformFixedParameters", np.ones(2)), "2 FixedParameters; allowed: 3 numbers"),
+    ("affine", set_to("TranformParameters", np.ones(12)), "with TransformParameters and TranformParameters"),
+    ("affine", linked_outside, "TransformParameters is a link"),
+    ("affine", stored_outside, "TransformParameters lies in another file"),
+    ("versor", set_to("TransformParameters", np.array([1.0, 0.1, 0, 0, 0, 0])), "a versor of length 1.00498756"),
+    ("euler", set_to("TransformParameters", np.array([np.inf, 0, 0, 0, 0, 0])), "not finite"),
+    ("composite", renumbered, "TransformGroup with 0, 1, 3, 4"),
+    ("composite", no_composite, "several transforms"),
+    ("composite", set_to("TransformType", "SyNTransform_double_3_3"), "transform of type 'SyNTransform_double_3_3'"),
+]
+
+
+@pytest.mark.parametrize(("kind", "change", "says"), BAD)
+def test_what_is_not_one_rigid_transform_is_refused(tmp_path, kind, change, says):
+    """Stretched, sheared, of another kind, incomplete, pointing elsewhere: named, in one line."""
+    with pytest.raises(InputError, match=says) as caught:
+        read(rewritten(tmp_path, kind, change))
+    assert "\n" not in str(caught.value) and str(tmp_path / "b.h5") in str(caught.value)
+
+
+def test_every_truncation_is_refused(tmp_path):
+    """A file that is cut anywhere is no whole HDF5 file."""
+    file = tmp_path / "a.h5"
+    SimpleITK.WriteTransform(random_transform("composite", np.random.default_rng(3)), str(file))
+    whole = file.read_bytes()
+    for length in range(0, len(whole), 97):
+        with pytest.raises(InputError, match="no whole HDF5 file"):
+            parse_transform(whole[:length], file)
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "says"),
+    [
+        ("field.h5", displacement_field, "transform of type 'DisplacementFieldTransform_double_3_3'"),
+        ("cut.h5", lambda folder, name: (folder / name).write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(99)), "no whole HDF5"),
+        ("text.h5", lambda folder, name: (folder / name).write_text("#Insight Transform File V1.0"), "no whole HDF5"),
+    ],
+)
+def test_at_the_terminal_it_is_one_line(tmp_path, capsys, name, make, says):
+    """Exit code 2, and nothing is written."""
+    make(tmp_path, name)
+    stating(tmp_path, file=name)
+    assert main(["search", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    told = capsys.readouterr()
+    assert told.out == "" and len(told.err.splitlines()) == 1 and re.search(says, told.err)
+    assert not (tmp_path / "out").exists()
+
+
+WITHOUT = """
+import sys
+sys.modules["h5py"] = None  # as if it were not installed
+from pathlib import Path
+from puncture_twin.planning.formats.itk_transform import parse_transform
+parse_transform(b"x", Path("a.h5"))
+"""
+
+
+def test_without_h5py_it_says_how_to_get_it():
+    """The extra, or the same transform as text; and nothing else of the program needs it."""
+    done = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True)
+    last = done.stderr.splitlines()[-1]
+    assert last.endswith("WriteTransform(T, 'x.tfm')")
+    assert "a.h5: to read HDF5 needs h5py, which is not installed; allowed: pip install 'puncture-twin[hdf5]'" in last
