@@ -21,7 +21,7 @@ from scipy.special import chdtri
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.kinematics import singularity
+from puncture_twin.planning.arm.kinematics import farthest_from_singular
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.case.errors import ErrorModel, error_model
@@ -87,7 +87,7 @@ def stand_of(path: Path, theta_deg: float, beta_deg: float) -> Stand:
     theta, beta = np.radians([theta_deg, beta_deg])
     outward = case.T_ct_entry[:3, :3] @ [np.sin(theta) * np.cos(beta), np.sin(theta) * np.sin(beta), np.cos(theta)]
     reached = _reached(model, tip, apply(T, case.target_ct), T[:3, :3] @ outward, ROLLS)
-    q = reached[np.argmax(singularity(model, reached).least())]
+    q = farthest_from_singular(model, reached, T[:3, :3] @ outward)
     return Stand(model, tip, case, MarkerPairs(found.names, found.points_ct, apply(T, found.points_ct)), T, outward, q)
 
 
@@ -99,7 +99,7 @@ def touches(of: Stand) -> dict[str, np.ndarray]:
         for kept, rolls in ((far, np.zeros(1)), (rolled, np.array([row * APART]))):
             q = _reached(of.model, of.tip_mm, point, up, rolls)
             q = q if len(q) else _reached(of.model, of.tip_mm, point, along, ROLLS)
-            kept.append(q[np.argmax(singularity(of.model, q).least())])
+            kept.append(farthest_from_singular(of.model, q, up))
         q = _reached(of.model, of.tip_mm, point, along, ROLLS)
         turns = (q - of.q + np.pi) % (2 * np.pi) - np.pi
         alike.append(of.q + turns[np.abs(turns).max(axis=1).argmin()])

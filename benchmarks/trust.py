@@ -29,7 +29,7 @@ from benchmarks.scenes import DATA
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.kinematics import singularity
+from puncture_twin.planning.arm.kinematics import farthest_from_singular
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.geometry.rigid import apply
@@ -170,7 +170,7 @@ def _reached(context: CaseContext, T_base_ct: np.ndarray, count: int) -> tuple[n
         q = inverse(model, poses).reshape(-1, 6)
         if np.isfinite(q).all(axis=1).any() and len(kept) < count:
             outward.append(along)
-            kept.append(q[np.nanargmax(singularity(model, q).least())])
+            kept.append(farthest_from_singular(model, q, T_base_ct[:3, :3] @ along))
     return np.array(outward), np.array(kept)
 
 

@@ -7,7 +7,7 @@ from places import ROOT
 
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.kinematics import singularity
+from puncture_twin.planning.arm.kinematics import farthest_from_singular
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.errors_section import ErrorsSection
@@ -100,7 +100,7 @@ def _insertion(model, target, outward, tip):
     """The configuration farthest from singular over all rolls and branches."""
     rolls = np.radians(np.arange(0, 360, 30))
     q = inverse(model, flange_poses(target, outward, tip, rolls)).reshape(-1, 6)
-    return q[np.nanargmax(singularity(model, q).least())]
+    return farthest_from_singular(model, q, outward)
 
 
 def _nearest(model, point, outward, tip, q_near):

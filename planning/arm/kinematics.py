@@ -16,6 +16,15 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
 
+TIE_DIGITS = 9
+"""Distances from singular that agree to so many digits are equal: mirrored branches and rolls are, but for rounding."""
+
+ELBOW = 2
+"""The row of `link_poses` whose origin is the elbow: where the upper arm ends."""
+
+ELBOW_DIGITS = 6
+"""The same of its place, mm: it does not move with the roll."""
+
 
 def _rows(q: Floats) -> Floats:
     """Configurations (..., 6) as one new (n, 6): a copy, since read-only arrays would be compiled for once more."""
@@ -140,6 +149,26 @@ def singularity(model: UrModel, q: Floats) -> Singularity:
     terms = np.empty((3, len(rows)))
     _singularities(model.lengths, rows, terms)
     return Singularity(*terms.reshape(3, *np.shape(q)[:-1]))
+
+
+def farthest_from_singular(model: UrModel, q: Floats, elbow_towards: Floats) -> Floats:
+    """Of configurations the one farthest from singular; of equals the one whose elbow lies farthest along a direction.
+
+    A branch and its mirror image, and all rolls about the flange's axis, are equally far but for rounding: a choice
+    among them by the last bit differs between machines.
+
+    Args:
+        model: The arm.
+        q: Shape (n, 6), rad; rows may be NaN, not all of them.
+        elbow_towards: Shape (3,), base frame: where there is room for the elbow.
+
+    Returns:
+        Shape (6,), rad.
+    """
+    least = np.round(singularity(model, q).least(), TIE_DIGITS)
+    equal = q[least == np.nanmax(least)]
+    elbow = link_poses(model, equal)[:, ELBOW, :3, 3] @ elbow_towards
+    return np.asarray(equal[int(np.argmax(np.round(elbow, ELBOW_DIGITS)))])
 
 
 @nb.njit(cache=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.kinematics import singularity
+from puncture_twin.planning.arm.kinematics import farthest_from_singular, singularity
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
@@ -24,6 +24,8 @@ LEAST_SINGULARITY = 0.05
 def touching_configuration(model: UrModel, tip_mm: float, point_base: Floats, needle_base: Floats) -> Floats:
     """Joint angles that hold the tip on a point, shape (6,), rad: the least tilt, then the farthest from singular.
 
+    Of equals the one with its elbow on the side from which the needle comes: mirrored branches are equal.
+
     Args:
         model: The arm.
         tip_mm: Flange to tip, along the flange's z.
@@ -37,9 +39,8 @@ def touching_configuration(model: UrModel, tip_mm: float, point_base: Floats, ne
         poses = touching_poses(tip_mm, point_base, needle_base, float(tilt))
         q = np.concatenate([inverse(model, T)[0] for T in poses])
         q = q[model.within_limits(q)]
-        slack = singularity(model, q).least()
-        if len(q) and slack.max() >= LEAST_SINGULARITY:
-            return np.asarray(q[int(np.argmax(slack))])
+        if len(q) and singularity(model, q).least().max() >= LEAST_SINGULARITY:
+            return farthest_from_singular(model, q, -needle_base)
     place = ", ".join(f"{value:.1f}" for value in point_base)
     raise NoAnswerError(f"a {model.name} cannot touch ({place}) mm with a needle of {tip_mm:g} mm")
 

@@ -8,7 +8,7 @@ import pytest
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.kinematics import singularity
+from puncture_twin.planning.arm.kinematics import farthest_from_singular
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.place.expected_error import expected_tip_error_mm, pose_error_from
@@ -30,7 +30,7 @@ def insertion(case, T_base_ct):
     target, rolls = apply(T_base_ct, case.target_ct), np.radians(np.arange(0, 360, 30))
     model = case.robot.model
     q = inverse(model, flange_poses(target, outward, case.needle.length_mm, rolls)).reshape(-1, 6)
-    return q[[np.nanargmax(singularity(model, q).least())]]
+    return farthest_from_singular(model, q, outward)[None]
 
 
 def test_where_the_arm_stands_already_it_is_the_cases_own_error(abdomen):

@@ -10,7 +10,7 @@ import trimesh
 
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
-from puncture_twin.planning.arm.kinematics import flange_pose, singularity
+from puncture_twin.planning.arm.kinematics import farthest_from_singular, flange_pose
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.collision.checker import CellChecker
@@ -42,7 +42,7 @@ def touching(outward, point=None):
     point = CENTRE + RADIUS * outward if point is None else point
     q = nearest_within_limits(UR3, inverse(UR3, flange_poses(point, outward, TIP)[0])[0], HOME)
     q = q[~np.isnan(q).any(axis=1)]
-    return q[np.argmax(singularity(UR3, q).least())]
+    return farthest_from_singular(UR3, q, outward)
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])

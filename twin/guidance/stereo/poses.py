@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
-from puncture_twin.planning.arm.kinematics import singularity
+from puncture_twin.planning.arm.kinematics import TIE_DIGITS, singularity
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
@@ -60,7 +60,7 @@ def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, 
     every = inverse(rod.model, flange_poses(rod, points_base))
     workcell = np.nan_to_num(singularity(rod.model, every).least(), nan=0.0).min(axis=0)
     why = f"a {rod.model.name} cannot hold the ball on all {len(points_base)} points on one branch"
-    order = sorted(range(len(workcell)), key=lambda branch: (branch != first, -workcell[branch]))
+    order = sorted(range(len(workcell)), key=lambda branch: (branch != first, -round(workcell[branch], TIE_DIGITS)))
     for branch in (branch for branch in order if workcell[branch] >= LEAST_SINGULARITY):
         q = nearest_within_limits(rod.model, every[:, branch], REFERENCE_RAD)
         if np.isnan(q).any():
