@@ -1,6 +1,7 @@
 """CT to robot from ITK's HDF5 transforms (.h5), and from all linear kinds as text: TransformPoint is the oracle."""
 
 import re
+import struct
 import subprocess
 import sys
 
@@ -12,6 +13,7 @@ from registration.test_stated_transform import FLIP, POINTS, T_BASE_CT, slicer_f
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.formats.itk_hdf5 import HEAP_HEAD_BYTES
 from puncture_twin.planning.formats.itk_transform import parse_transform
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.placement import load_placement
@@ -254,6 +256,7 @@ WITHOUT = """
 import sys
 sys.modules["h5py"] = None  # as if it were not installed
 from pathlib import Path
+from puncture_twin.planning.formats.itk_hdf5 import HEAP_HEAD_BYTES
 from puncture_twin.planning.formats.itk_transform import parse_transform
 parse_transform(b"x", Path("a.h5"))
 """
@@ -265,3 +268,27 @@ def test_without_h5py_it_says_how_to_get_it():
     last = done.stderr.splitlines()[-1]
     assert last.endswith("WriteTransform(T, 'x.tfm')")
     assert "a.h5: to read HDF5 needs h5py, which is not installed; allowed: pip install 'puncture-twin[hdf5]'" in last
+
+
+def test_a_heap_on_which_hdf5_never_ends_is_refused(tmp_path):
+    """An object of no size in the heap of texts: HDF5's own library would look for the next one for ever."""
+    file = rewritten(tmp_path, "affine", lambda parent, _: None)
+    data = bytearray(file.read_bytes())
+    object_of_type = data.index(b"AffineTransform_double_3_3\0") - HEAP_HEAD_BYTES
+    data[object_of_type : object_of_type + HEAP_HEAD_BYTES] = struct.pack("<HH4xQ", 7, 0, 0)
+    with pytest.raises(InputError, match=r"no whole HDF5 file \(a text is not in its heap\)"):
+        parse_transform(bytes(data), file)
+
+
+@pytest.mark.parametrize(
+    ("at", "layout", "value"), [(0, "<I", 2**31), (4, "<Q", 2**63), (4, "<Q", 5), (12, "<I", 99), (12, "<I", 0)]
+)
+def test_a_text_elsewhere_is_refused(tmp_path, at, layout, value):
+    """Too long, beyond the end, in no heap, of no number."""
+    file = rewritten(tmp_path, "affine", lambda parent, _: None)
+    data = bytearray(file.read_bytes())
+    with h5py.File(file) as whole:
+        place = whole["TransformGroup/0/TransformType"].id.get_offset()
+    struct.pack_into(layout, data, place + at, value)
+    with pytest.raises(InputError, match="no whole HDF5 file"):
+        parse_transform(bytes(data), file)
