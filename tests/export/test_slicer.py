@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import SimpleITK
 from case_world import CASE, changed, registration_section, write_case
+from export.slicer_facts import MARKUP, POINT, SCHEMA, check_attributes, check_properties
 
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.case.case import load_case
@@ -53,19 +54,13 @@ def exported(context, tmp_path_factory):
 
 
 def check_markups(document):
-    """What the published schema, version 1.0.3, requires of the fields that we write."""
-    assert document["@schema"].endswith("markups-schema-v1.0.3.json#")
+    """By the published schema, version 1.0.3."""
+    assert set(document) == {"@schema", "markups"} and document["@schema"] == SCHEMA
     (markup,) = document["markups"]
-    assert markup["type"] in ("Fiducial", "Line", "Angle", "Curve", "ClosedCurve", "Plane", "ROI")
-    assert markup["coordinateSystem"] in ("LPS", "RAS") and markup["coordinateUnits"] in ("mm", "um")
-    assert all(type(markup[key]) is bool for key in ("locked", "fixedNumberOfControlPoints"))
-    assert all(type(markup[key]) is str for key in ("name", "labelFormat"))
+    check_properties(markup, MARKUP)
     for point in markup["controlPoints"]:
-        assert all(type(point[key]) is str for key in ("id", "label"))
-        assert [len(point[key]) for key in ("position", "orientation")] == [3, 9]
-        assert all(type(number) is float for key in ("position", "orientation") for number in point[key])
-        assert all(type(point[key]) is bool for key in ("selected", "locked", "visibility"))
-        assert point["positionStatus"] in ("undefined", "preview", "defined")
+        check_properties(point, POINT)
+    assert len({point["id"] for point in markup["controlPoints"]}) == len(markup["controlPoints"])
     return markup
 
 
@@ -77,6 +72,8 @@ def test_the_files_are_one_set_and_the_scene_names_what_is_there(exported):
     assert set(entries) == {"export slicer"} and all((out / name).is_file() for name in ALL)
     nodes = list(ElementTree.parse(out / "scene.mrml").getroot())
     ids = [node.attrib["id"] for node in nodes]
+    for node in nodes:
+        check_attributes(node)
     assert len(set(ids)) == len(ids)
     assert {node.attrib["fileName"] for node in nodes if "fileName" in node.attrib} == ALL - {"scene.mrml"}
     for node in nodes:
@@ -84,6 +81,24 @@ def test_the_files_are_one_set_and_the_scene_names_what_is_there(exported):
         for part in node.get("references", "").split(";")[:-1]:
             role, number = part.split(":")
             assert number in ids and role in ("storage", "display")
+
+
+@pytest.mark.parametrize(
+    ("tag", "change"),
+    [
+        ("Modell", {}),
+        ("ModelDisplay", {"visibilty": "true"}),
+        ("ModelDisplay", {"visibility": "1"}),
+        ("ModelDisplay", {"scalarRangeFlag": "Data"}),
+        ("ModelDisplay", {"scalarVisibility": "true", "activeScalarName": "window"}),
+        ("MarkupsDisplay", {"color": "1 0.5"}),
+    ],
+)
+def test_the_check_of_a_scene_sees_what_slicer_would_not_read(tag, change):
+    """Another class, attribute or value; scalars that would not be shown."""
+    node = ElementTree.Element(tag, {"id": f"vtkMRML{tag}Node1", "name": "a", **change})
+    with pytest.raises((AssertionError, KeyError)):
+        check_attributes(node)
 
 
 def test_the_line_goes_from_the_entry_to_the_target(exported, context):

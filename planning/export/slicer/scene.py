@@ -1,4 +1,8 @@
-"""A Slicer scene (.mrml): a node for each file, with how it is shown and where it is stored."""
+"""A Slicer scene (.mrml): a node for each file, with how it is shown and where it is stored.
+
+A transform node's file is read as the way from its parent; scalars are shown only where the display names a color node.
+Source: Slicer, Libs/MRML/Core: vtkMRMLDisplayNode, vtkMRMLStorageNode, vtkMRMLTransformStorageNode.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +26,7 @@ _SHOWN = {
         "opacity": "0.6",
         "scalarVisibility": "true",
         "activeScalarName": "window",
+        "colorNodeID": "vtkMRMLColorTableNodeFileViridis.txt",
         "scalarRangeFlag": "UseData",
         "backfaceCulling": "false",
     },
