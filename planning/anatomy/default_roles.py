@@ -396,6 +396,16 @@ def default_role(name: str, region: str) -> DefaultRole | None:
     return max(hurt, key=lambda one: one[0], default=(0.0, closest))[1]
 
 
+def never_crossed(name: str) -> DefaultRole | None:
+    """The line of a structure that is no usual target and that no path crosses, such as a large vessel; None of others.
+
+    Args:
+        name: A structure's, in any spelling; in any region.
+    """
+    lines = (default_role(name, region) for region in ("other", *BY_REGION))
+    return next((line for line in lines if line is not None and line.group in NEVER_CROSSED), None)
+
+
 def plain_name(name: str) -> str:
     """A name in lower case with underscores.
 

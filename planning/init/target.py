@@ -8,7 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from puncture_twin.planning.anatomy.default_roles import BODY, LESION, NEVER_CROSSED, default_role
+from puncture_twin.planning.anatomy.default_roles import (
+    BODY,
+    LESION,
+    NEVER_CROSSED,
+    DefaultRole,
+    default_role,
+    never_crossed,
+)
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
@@ -70,7 +77,7 @@ def typed_target(
 
     Raises:
         InputError: It would lie in a structure, or a likelier one, if it was meant in the other space, and nobody said
-            which.
+            which; or it lies in a vessel or another structure that no path may cross, which a slip of numbers does.
     """
     names = _holders(point_ct, segmentations)
     other = "" if names and space_stated else _other_reading(point_ct, segmentations, space, names)
@@ -84,8 +91,22 @@ def typed_target(
             allowed="--space LPS or --space RAS, whichever is meant",
         )
     chosen = chosen_target(names)
+    _refuse_in_danger(point_ct, chosen, space, _other_reading(point_ct, segmentations, space, names))
     holding = Holding(chosen, frozenset(names) - {chosen})
     return Target(point_ct, holding, (f"the target lies in '{chosen}', which is the target's structure",))
+
+
+def _refuse_in_danger(point_ct: Floats, chosen: str, space: Space, other: str) -> None:
+    """A point in the aorta is a slip of numbers: as the target's structure nothing would keep the needle out of it."""
+    line = never_crossed(chosen)
+    if line is not None:
+        what = f"target ({shown(point_ct, space)}) lies in '{chosen}'{other}: {_danger(line)}"
+        allowed = f"a point outside of it, or --target-label '{chosen}' where it is itself the target"
+        raise InputError(what, where="--target", allowed=allowed)
+
+
+def _danger(line: DefaultRole) -> str:
+    return f"of '{line.group}' ({line.reason}), which nothing keeps the needle out of where it holds the target"
 
 
 def label_target(name: str, segmentations: Sequence[Segmentation], space: Space) -> Target:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
+from puncture_twin.planning.anatomy.default_roles import never_crossed
 from puncture_twin.planning.anatomy.inside_skin import LEAST_TOLERANCE_MM, kept_inside_skin
 from puncture_twin.planning.anatomy.label_grids import label_grids
 from puncture_twin.planning.anatomy.own_target import OWN_TARGET
@@ -58,11 +59,23 @@ def check_consistency(
     outside = _outside_warnings(case, anatomy, headers, cache)
     _refuse_open_around_target(case, anatomy)
     return (
+        *_target_warnings(case),
         *outside,
         *_marker_warnings(case, anatomy, placement, cache),
         *_needle_warnings(case, anatomy.skin),
         *resolution_warnings(case, anatomy, headers),
         *_region_warnings(case, anatomy),
+    )
+
+
+def _target_warnings(case: Case) -> tuple[str, ...]:
+    """That the target is a vessel or the like: its structure is not avoided, so paths that end in it are safe."""
+    line = never_crossed(case.target_structure)
+    if line is None or case.own_target:
+        return ()
+    return (
+        f"the target lies in '{case.target_structure}', of '{line.group}' ({line.reason}): every safe path ends in it; "
+        "is the target's place right?",
     )
 
 

@@ -260,6 +260,31 @@ def test_a_vessel_that_holds_the_target_too_is_not_crossed(tmp_path, capfd):
     assert code == 2 and "lies inside 'pulmonary_artery', which is to be avoided" in said[-1]
 
 
+def test_a_typed_target_in_a_vessel_is_a_slip(tmp_path, capfd):
+    """The aorta became the target's structure, and every path into it was safe, with exit code 0 and a note."""
+    write_ct(tmp_path / "scan.nii.gz")
+    write_masks(tmp_path / "seg")
+    for words in (("--target", "36,36,0", "--space", "LPS"), ("--target", "-36,-36,0", "--space", "RAS")):
+        code, out, said = init(capfd, tmp_path, *words)
+        assert code == 2 and out == "" and not (tmp_path / "case.toml").exists()
+        (line,) = said
+        assert "lies in 'aorta'" in line and "of 'aorta and venae cavae' (large vessel: bleeding)" in line
+        assert line.endswith("allowed: a point outside of it, or --target-label 'aorta' where it is itself the target")
+
+
+def test_a_vessel_that_is_meant_is_taken_and_every_result_says_so(tmp_path, capfd):
+    """By its name, or in a case that a person wrote: a warning first of all, in the case's list as a search has it."""
+    write_ct(tmp_path / "scan.nii.gz")
+    write_masks(tmp_path / "seg")
+    code, _, said = init(capfd, tmp_path, "--target-label", "aorta", "--space", "LPS")
+    text = "the target lies in 'aorta', of 'aorta and venae cavae' (large vessel: bleeding): every safe path ends in it"
+    assert code == 0 and any(text in line for line in said)
+    warnings = prepare(tmp_path, arm=False).anatomy.warnings
+    assert any(line.startswith(text) for line in warnings)
+    assert init(capfd, tmp_path, "--target", TARGET, "--force")[0] == 0
+    assert not any("every safe path ends in it" in line for line in prepare(tmp_path, arm=False).anatomy.warnings)
+
+
 def test_a_lesion_of_the_other_space_is_asked_about(tmp_path, capfd):
     """Typed in RAS without saying so, the target lay in a lung on the other side, which became its structure."""
     write_ct(tmp_path / "scan.nii.gz")
