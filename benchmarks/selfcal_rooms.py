@@ -24,7 +24,8 @@ from scipy.stats import chi2
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.acquisition import acquire, choose
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, find_candidates

@@ -23,7 +23,7 @@ from types import CodeType, FrameType
 import numpy as np
 
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import FILE_NAME, write_recording
+from puncture_twin.twin.guidance.ultrasound.recording_file import FILE_NAME, write_recording
 from puncture_twin.twin.guidance.ultrasound.simulate import simulate_recording
 from puncture_twin.twin.jobs.selfcal.selfcal import selfcal_recording
 

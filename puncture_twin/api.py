@@ -259,7 +259,7 @@ def read_recording(path: Path | str) -> Recording:
     Raises:
         InputError: It cannot be read, or a row is no pair of rigid motions with a point.
     """
-    from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import read_recording
+    from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording
 
     return read_recording(Path(path))
 
@@ -274,7 +274,7 @@ def calibrate(recording: Recording, *, needle_length_mm: float | None = None) ->
     Raises:
         InputError: Too few poses, poses that cannot show every unknown, or more than half of them disagree.
     """
-    from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 
     return calibrate(recording, needle_length_mm=needle_length_mm)
 

@@ -26,7 +26,7 @@ from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import read_recording
+from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import load_selfcal_case
 from puncture_twin.twin.jobs.robot.mirror import RecordedJoints
 

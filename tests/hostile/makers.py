@@ -10,7 +10,8 @@ from puncture_twin.planning.certify.cells import Cells
 from puncture_twin.planning.certify.certificate import Certificate, write_certificate
 from puncture_twin.planning.certify.question import Question
 from puncture_twin.planning.plan.plan_document import write_plan
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording, write_recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.twin.guidance.ultrasound.recording_file import write_recording
 from puncture_twin.twin.guidance.ultrasound.simulate import simulate_recording
 
 SKIN, ORGAN, RIB = (

@@ -7,16 +7,14 @@ from selfcal_world import as_estimate
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import log_rotation
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import closed_form
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import direction_from_plane, mean_direction
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import N_PARAMETERS, SCALE, T_X, W_X, W_Y, active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem, covariances
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import refine
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
-    UNWEIGHTED,
-    Problem,
-    covariances,
     direction_residuals,
     directions_image,
     linearised_direction,
@@ -116,7 +114,7 @@ def test_the_refinement_finds_scipys_minimum(rng, weighted):
     recording, _ = simulate_recording(rng, 25)
     start = closed_form(recording)
     noise = SPEC_NOISE if weighted else UNWEIGHTED
-    fit = refine(Problem(recording, noise, ALL), start, np.ones((25, 3)))
+    fit = refine(Problem(recording, noise, ALL), start, np.ones(25), np.ones(25))
     W = np.linalg.cholesky(np.linalg.inv(covariances(fit.estimate, recording, noise))).transpose(0, 2, 1)
 
     def white(step):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.pose_choice import expected_tre_mm
+from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording
 from puncture_twin.twin.jobs.papers.axp_ybq import (
     COMPARED_WITH,

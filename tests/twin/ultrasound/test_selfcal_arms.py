@@ -12,28 +12,27 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import arm_errors, corrected, without_play
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import PLAY_SIGN, calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import PLAY_SIGN, calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import active_columns
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import (
-    Noise,
-    Recording,
-    read_recording,
-    write_recording,
-)
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import weighed
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import (
     Problem,
     Spread,
-    direction_residuals,
-    directions_image,
     flange_slopes,
     linear_model,
+)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
+    direction_residuals,
+    directions_image,
     tip_residuals,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import plain_fit, weighed
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import plain_fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.spread import found_spreads
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import Whitening
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import drawing
 from puncture_twin.twin.guidance.ultrasound.puncture import aim
+from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording, write_recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording
 

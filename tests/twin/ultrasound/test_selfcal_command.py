@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2, f
 
 from puncture_twin.run_twin import main
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import read_recording, write_recording
+from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording, write_recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import load_selfcal_case
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
 from puncture_twin.twin.guidance.ultrasound.simulate import PoseRanges, simulate_recording

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording, read_recording, write_recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording, write_recording
 from puncture_twin.twin.guidance.ultrasound.simulate import simulate_recording
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording
 

@@ -6,7 +6,7 @@ from scipy.stats import binom
 from selfcal_world import as_estimate
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import SHAFT_BIAS, calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import SHAFT_BIAS, calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import tip_residuals
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording

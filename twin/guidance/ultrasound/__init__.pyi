@@ -5,11 +5,19 @@ from .acquisition import (
     choice_noise as choice_noise,
 )
 from .candidate_poses import CandidatePoses as CandidatePoses, drawing as drawing, find_candidates as find_candidates
+from .pose_choice import choose_poses as choose_poses, expected_tre_mm as expected_tre_mm
 from .puncture import (
     Puncture as Puncture,
     puncture_picture as puncture_picture,
     punctures as punctures,
     unseen_errors_mm as unseen_errors_mm,
+)
+from .recording_file import (
+    FILE_NAME as FILE_NAME,
+    MAX_BYTES as MAX_BYTES,
+    parse_recording as parse_recording,
+    recording_file as recording_file,
+    write_recording as write_recording,
 )
 from .selfcal_case import SelfcalCase as SelfcalCase, load_selfcal_case as load_selfcal_case
 from .selfcal_truth import draw_workcell as draw_workcell
@@ -18,6 +26,7 @@ from .simulate import (
     SimulatedTruth as SimulatedTruth,
     simulate_recording as simulate_recording,
 )
+from .slips import checked_calibration as checked_calibration
 from .summaries import (
     calibration_summary as calibration_summary,
     choice_summary as choice_summary,

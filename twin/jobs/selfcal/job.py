@@ -9,7 +9,7 @@ from puncture_twin.planning.base.errors import PlanningError
 from puncture_twin.planning.base.output.draft import Draft
 from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.progress import Watcher
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import FILE_NAME
+from puncture_twin.twin.guidance.ultrasound.recording_file import FILE_NAME
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
 from puncture_twin.twin.jobs.selfcal.page import write_page
 from puncture_twin.twin.jobs.selfcal.pictures import detection_sheet, workcell_picture

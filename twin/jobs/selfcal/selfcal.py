@@ -17,22 +17,22 @@ from puncture_twin.planning.base.progress import Stages, Watcher
 from puncture_twin.planning.base.provenance import Input, content_input, inputs_document
 from puncture_twin.planning.base.whole_lines import unfinished_warnings
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, acquire, choice_noise
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.pose_choice import expected_tre_mm
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, drawing, find_candidates
+from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
+from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, punctures, unseen_errors_mm
+from puncture_twin.twin.guidance.ultrasound.recording_file import (
     FILE_NAME,
     MAX_BYTES,
-    Noise,
-    Recording,
     parse_recording,
     recording_file,
     write_recording,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.slips import checked_calibration
-from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, drawing, find_candidates
-from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, punctures, unseen_errors_mm
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
+from puncture_twin.twin.guidance.ultrasound.slips import checked_calibration
 from puncture_twin.twin.guidance.ultrasound.summaries import calibration_summary
 from puncture_twin.twin.guidance.ultrasound.trial import Choice, SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
@@ -45,10 +45,6 @@ TARGETS = 6
 
 UNSEEN = 60
 """Candidates per seed at which prediction and truth are compared."""
-
-LARGEST_RATIO = 1.1
-"""Chi-squared over its freedom from which on a declaration is doubted: arms declared half as large as they are give
-1.1 to 1.2. Too large does no harm: the region is wider than it need be."""
 
 NO_JOINTS = "{file}: no joints (columns A_q1_deg to B_q6_deg): the arms' errors that the case declares are not counted"
 
@@ -124,7 +120,7 @@ def selfcal_twin(case: SelfcalCase, seeds: int, watcher: Watcher) -> SelfcalRun:
         candidates,
         choice,
         stages,
-        warnings=declaration_warnings(first.calibration),
+        warnings=first.calibration.declaration_doubts(),
     )
 
 
@@ -143,22 +139,10 @@ def selfcal_recording(path: Path, case: SelfcalCase | None) -> SelfcalRun:
     with stages.time("calibrate"):
         calibration = checked_calibration(recording, partial(calibrate_case, recording, case), file)
     inputs = (content_input("recording", file.name, content), *(() if case is None else case.inputs))
-    warnings = (*unfinished_warnings(content, file.name), *declaration_warnings(calibration))
+    warnings = (*unfinished_warnings(content, file.name), *calibration.declaration_doubts())
     if case is not None and calibration.arms is None:
         warnings += (NO_JOINTS.format(file=file.name),)
     return SelfcalRun(file.stem, calibration, recording, inputs, case=case, stages=stages, warnings=warnings)
-
-
-def declaration_warnings(found: Calibration) -> tuple[str, ...]:
-    """Where the residuals are larger than a stated noise and the declared arms let expect."""
-    ratio = found.chi_squared_ratio
-    if not isinstance(found.noise, Noise) or ratio <= LARGEST_RATIO:
-        return ()
-    chance = 100.0 * found.chi_squared_chance()
-    return (
-        f"chi-squared of the residuals is {ratio:.2f} times their freedom ({found.freedom}): noise or arms are "
-        f"probably declared too small, and the stated errors with them; a right one gives this in {chance:.2g} %",
-    )
 
 
 def calibrate_case(recording: Recording, case: SelfcalCase | None) -> Calibration:

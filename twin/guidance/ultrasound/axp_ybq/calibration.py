@@ -5,41 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.stats import chi2, f
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import log_rotation, pose
+from puncture_twin.planning.geometry.rigid import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, corrected
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, PARAMETERS, T_Q, Estimate, tangent_basis
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import PARAMETERS, T_Q, Estimate, tangent_basis
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, Spread, linear_model
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
-    Problem,
-    Spread,
-    linear_model,
-    linearised_tip,
-    tip_residuals,
-)
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.solve import Solution, solve
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip, tip_residuals
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.spread import SmallSample
 
-SHAFT_BIAS = (
-    "a constant error of the detected tip along the shaft moves the tip in the needle's flange frame and leaves every "
-    "residual as it is; the known needle length would hold it"
-)
-SCALE_TAKEN = "the image's mm per pixel was taken as given: 1 % off makes the error at the tip half as large again"
-ARMS_TAKEN = (
-    "errors of the arms that repeat from pose to pose (lengths, joint zeros): none were declared with the joints, so "
-    "the stated errors count noise alone and are too small"
-)
-PLAY_SIGN = (
-    "on which side of their play the joints stood: the recording does not say which way they turned, so play counts as "
-    "noise, and the region is too narrow beside a noise that was found"
-)
-DIRECTION_SIGN = (
-    "no directions were measured: the needle's axis comes from the image plane alone, pointing from flange to tip"
-)
+LARGEST_RATIO = 1.1
+"""Chi-squared over its freedom from which on a declaration is doubted: arms declared half as large as they are give
+1.1 to 1.2. Too large does no harm: the region is wider than it need be."""
 
 NO_NOISE = Noise(0.0, 0.0, 0.0, 0.0)
 """What is queried is where the tip is, not where it would be seen."""
@@ -108,6 +87,17 @@ class Calibration:
     def chi_squared_chance(self) -> float:
         """How often a right declaration has residuals as large as these."""
         return float(chi2.sf(self.chi_squared_ratio * self.freedom, self.freedom))
+
+    def declaration_doubts(self) -> tuple[str, ...]:
+        """A sentence where the residuals are larger than a stated noise and the declared arms let expect."""
+        ratio = self.chi_squared_ratio
+        if not isinstance(self.noise, Noise) or ratio <= LARGEST_RATIO:
+            return ()
+        chance = 100.0 * self.chi_squared_chance()
+        return (
+            f"chi-squared of the residuals is {ratio:.2f} times their freedom ({self.freedom}): noise or arms are "
+            f"probably declared too small, and the stated errors with them; a right one gives this in {chance:.2g} %",
+        )
 
     @property
     def covariance_counts(self) -> Floats:
@@ -226,117 +216,3 @@ class Calibration:
             return float(chi2.ppf(level, p))
         per_pose = 5 if "V_1_rad" in self.parameters else 3
         return float(p * f.ppf(level, p, max(self.freedom / per_pose, 1.0)))
-
-
-def calibrate(
-    recording: Recording,
-    *,
-    noise: Noise | None = None,
-    known_tip: Floats | None = None,
-    needle_length_mm: float | None = None,
-    scale: bool = False,
-    robust: bool = True,
-    direction: bool = True,
-    start: Estimate | None = None,
-    arms: DeclaredArms | None = None,
-) -> Calibration:
-    """Solve A X P = Y B Q: closed form, then weighted least squares over the poses that agree.
-
-    Args:
-        recording: At least 16 poses (20 are better); 7 with ``known_tip``; unknowns / 3 + 1 with ``start``.
-        noise: Of both arms and the image; None finds the residuals' spread inside and across the image by itself.
-        known_tip: t_Q, shape (3,), mm, frame end2, where it is known.
-        needle_length_mm: Distance along the shaft from the flange's origin to the tip: holds a constant error of the
-            detected tip along the shaft, which nothing else can.
-        scale: Find mm per unit of P along both axes of the image.
-        robust: Set aside poses that disagree with the others.
-        direction: Let measured directions take part, where the recording has them.
-        start: Begin here instead of at the closed form.
-        arms: How far both arms may lastingly be from their nominal models; the recording then needs joints. None takes
-            all errors of the flanges for noise.
-
-    Raises:
-        InputError: Too few poses, or more than half of them disagree; joints that are missing or of another arm.
-        Degenerate: The poses cannot show every unknown. It names the motion and proposes further poses.
-    """
-    if needle_length_mm is not None and not 0 < needle_length_mm < np.inf:
-        raise InputError(f"needle length {needle_length_mm}", where="needle_length_mm", allowed="a positive number, mm")
-    solution = solve(
-        recording,
-        noise=noise,
-        known_tip=known_tip,
-        scale=scale,
-        robust=robust,
-        direction=direction,
-        start=start,
-        arms=arms,
-    )
-    bias = None
-    if needle_length_mm is not None and known_tip is None:
-        bias = float(solution.estimate.V @ solution.estimate.t_Q) - needle_length_mm
-        solution = _with_length(solution, bias)
-    cannot = [SHAFT_BIAS] * (needle_length_mm is None and known_tip is None) + [SCALE_TAKEN] * (not scale)
-    cannot += [DIRECTION_SIGN] * (recording.v is None) + [ARMS_TAKEN] * (arms is None)
-    if arms is not None and recording.turn_probe is None and any(arm.play_rad > 0.0 for arm in arms):
-        cannot.append(PLAY_SIGN)
-    return _assembled(recording, solution, bias, tuple(cannot), arms)
-
-
-def _assembled(
-    recording: Recording, solution: Solution, bias: float | None, cannot: tuple[str, ...], arms: DeclaredArms | None
-) -> Calibration:
-    estimate, kept, p = solution.estimate, solution.tip_kept, len(solution.active)
-    return Calibration(
-        _pose(estimate.R_X, estimate.t_X),
-        _pose(estimate.R_Y, estimate.t_Y),
-        _frozen(estimate.t_Q),
-        _frozen(estimate.V),
-        _frozen(estimate.scale),
-        _frozen(solution.residuals),
-        float(np.sqrt(np.mean(np.sum(solution.residuals[kept] ** 2, axis=1)))),
-        _frozen(1.0 * kept),
-        tuple(name for name, used in zip(recording.names, kept, strict=True) if not used),
-        solution.iterations,
-        solution.observability.ratio,
-        _frozen(solution.covariance[:p, :p]),
-        tuple(PARAMETERS[column] for column in solution.active),
-        solution.freedom,
-        solution.noise,
-        solution.noise_ratio,
-        bias,
-        _frozen(solution.orientations),
-        cannot,
-        arms,
-        _frozen(solution.arm_errors),
-        _frozen(solution.covariance),
-        solution.small_sample,
-    )
-
-
-def _with_length(solution: Solution, bias: float) -> Solution:
-    """The solution after t_Q <- t_Q - (V.t_Q - length) V."""
-    V, t_Q = solution.estimate.V, solution.estimate.t_Q
-    full = np.eye(len(PARAMETERS))
-    full[T_Q, T_Q] -= np.outer(V, V)
-    full[T_Q, DIRECTION] = -(bias * np.eye(3) + np.outer(V, t_Q)) @ tangent_basis(V)
-    change = full[np.ix_(solution.active, solution.active)]
-    whole = np.eye(len(solution.covariance))
-    whole[: len(change), : len(change)] = change
-    region = solution.small_sample
-    if region is not None:
-        region = region._replace(covariance=change @ region.covariance @ change.T)
-    return solution._replace(
-        estimate=solution.estimate._replace(t_Q=t_Q - bias * V),
-        covariance=np.asarray(whole @ solution.covariance @ whole.T),
-        small_sample=region,
-    )
-
-
-def _pose(R: Floats, t: Floats) -> Floats:
-    return _frozen(pose(R, t))
-
-
-def _frozen(array: ArrayLike) -> Floats:
-    copy = np.array(array, dtype=np.float64)
-    copy.setflags(write=False)
-    return copy

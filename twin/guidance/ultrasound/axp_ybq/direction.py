@@ -64,11 +64,7 @@ def mean_direction(estimate: Estimate, recording: Recording) -> Floats:
         estimate: R_X and R_Y.
         recording: With directions.
     """
-    seen = directions_end2(estimate, recording)
-    return _unit(seen.sum(axis=0))
-
-
-def _unit(total: Floats) -> Floats:
+    total = directions_end2(estimate, recording).sum(axis=0)
     return np.asarray(total / np.linalg.norm(total))
 
 
@@ -85,7 +81,8 @@ def agreed_direction(estimate: Estimate, recording: Recording, kept: NDArray[np.
     angles = np.arccos(np.clip(seen @ middle / np.linalg.norm(middle), -1.0, 1.0))
     limit = max(FAR * float(np.median(angles[kept])) / HALF_NORMAL, LEAST_ANGLE)
     agrees = angles <= limit
-    V = _unit((agrees & kept) @ seen)
+    total = (agrees & kept) @ seen
+    V = np.asarray(total / np.linalg.norm(total))
     found = direction_residuals(estimate._replace(V=V), recording, directions_image(recording, estimate))
     inside, across = np.sqrt(np.mean(found[agrees & kept] ** 2, axis=0))
     return SeenDirection(V, agrees, max(float(inside), LEAST_SPREAD), max(float(across), LEAST_SPREAD))

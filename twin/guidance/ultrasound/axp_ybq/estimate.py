@@ -64,6 +64,12 @@ class Estimate(NamedTuple):
             V / np.linalg.norm(V),
         )
 
+    def moved_by(self, active: NDArray[np.int_], step: Floats) -> Estimate:
+        """After a step (p,) of the free parameters, in `parameter_units`."""
+        full = np.zeros(N_PARAMETERS)
+        full[active] = parameter_units(active, self.scale) * step
+        return self.moved(full)
+
 
 def active_columns(*, tip: bool, scale: bool, direction: bool) -> NDArray[np.int_]:
     """Which of the 19 parameters are estimated."""

@@ -1,4 +1,4 @@
-"""What both arms and the image said, pose by pose: the input of the self-calibration, in memory and as CSV.
+"""What both arms and the image said, pose by pose: the input of the self-calibration.
 
 Frames: ``base1`` and ``end1`` of the arm that holds the probe, ``image`` (mm, the slice is z = 0), ``base2`` and
 ``end2`` of the arm that holds the needle.
@@ -6,11 +6,7 @@ Frames: ``base1`` and ``end1`` of the arm that holds the probe, ``image`` (mm, t
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import dataclass
-from itertools import product
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,18 +14,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.files import atomic, is_folder
-from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE
-from puncture_twin.planning.formats.points.raw_points import parse_coordinate
-from puncture_twin.planning.formats.raw_mesh import decode_text
-from puncture_twin.planning.geometry.rigid import pose
-
-FILE_NAME = "recording.csv"
-"""What a folder is searched for."""
-
-MAX_BYTES = 50_000_000
-"""More than 50,000 poses: no calibration needs so many, and a larger file is likely something else."""
 
 OPTIONAL = ("v", "shaft_mm", "q_probe", "q_needle", "turn_probe", "turn_needle")
 """What a recording may hold beside both flanges and the tip: arrays with one row per pose."""
@@ -161,114 +146,9 @@ class Recording:
         return Recording(A, B, P, pixels=self.pixels, **parts)
 
 
-def recording_file(path: Path) -> Path:
-    """The CSV itself, also of a folder that holds ``recording.csv``."""
-    return path / FILE_NAME if is_folder(path) else path
-
-
-def read_recording(path: Path) -> Recording:
-    """Read a recording from its CSV, or from ``recording.csv`` in a folder.
-
-    Columns: ``name``; ``A_r11 .. A_r33, A_x_mm, A_y_mm, A_z_mm``; the same for B; ``P_u_mm, P_v_mm`` (or ``_px``); and,
-    where directions were measured, ``v_x, v_y`` or ``v_x, v_y, v_z``, and behind them, where it was measured too, how
-    much of the shaft shows, ``shaft_mm``; and, where the joints were recorded,
-    ``A_q1_deg .. A_q6_deg, B_q1_deg .. B_q6_deg``; and, behind these, which way each joint last turned (1, -1; 0 where
-    nobody knows), ``A_turn1 .. B_turn6``. Lines that start with # are passed over.
-
-    Raises:
-        InputError: Another header, a field that is no finite number, or a matrix that is no rigid motion.
-    """
-    file = recording_file(path)
-    return parse_recording(read_input(file, max_bytes=MAX_BYTES, where=str(file)), file)
-
-
-def parse_recording(content: bytes, file: Path) -> Recording:
-    """The same of a file that has been read; it is not opened again.
-
-    Raises:
-        InputError: As `read_recording`, but for reading.
-    """
-    text = decode_text(content, str(file))
-    try:
-        rows = [row for row in csv.reader(io.StringIO(text), strict=True) if row and not row[0].startswith("#")]
-    except csv.Error as error:
-        raise InputError(f"is no CSV ({error})", where=file, allowed="one line per pose, fields of numbers") from error
-    header = tuple(cell.strip() for cell in rows[0]) if rows else ()
-    choices = product((False, True), ((0, 0), (2, 0), (3, 0), (2, 1), (3, 1)), (0, 12, 24))
-    kinds = {_columns(*choice): choice for choice in choices}
-    if header not in kinds:
-        raise InputError(
-            f"columns {', '.join(header)[:200]}",
-            where=f"{file}, header",
-            allowed=", ".join(_columns(False, (3, 1), 24)),
-        )
-    pixels, (width, shaft), behind = kinds[header]
-    values = np.array([_numbers(row, header, f"{file}, row {i}") for i, row in enumerate(rows[1:], start=2)])
-    if values.size == 0:
-        raise InputError("no pose", where=file, allowed="one row per pose")
-    names = tuple(row[0].strip() for row in rows[1:])
-    try:
-        first = 26 + width + shaft
-        v, shaft_mm = values[:, 26 : 26 + width] if width else None, values[:, first - 1] if shaft else None
-        q_probe, q_needle = np.radians(np.split(values[:, first : first + 12], 2, axis=1)) if behind else (None, None)
-        turn_probe, turn_needle = np.split(values[:, first + 12 :], 2, axis=1) if behind == 24 else (None, None)
-        A, B = _matrices(values[:, :12]), _matrices(values[:, 12:24])
-        joints = (q_probe, q_needle, turn_probe, turn_needle)
-        return Recording(A, B, values[:, 24:26], v, names, pixels, *joints, shaft_mm)
-    except InputError as error:
-        raise InputError(error.what, where=f"{file}: {error.where}", allowed=error.allowed) from error
-
-
-def write_recording(recording: Recording, path: Path) -> None:
-    """Write a recording as CSV, every number in full, whole or not at all.
-
-    Raises:
-        InputError: The file cannot be written.
-    """
-    seen = [part for part in (recording.v, recording.shaft_mm) if part is not None]
-    width = 0 if recording.v is None else recording.v.shape[1]
-    joints = [np.degrees(q) for q in (recording.q_probe, recording.q_needle) if q is not None]
-    turns = [turn for turn in (recording.turn_probe, recording.turn_needle) if turn is not None]
-    parts = [_row_major(recording.A), _row_major(recording.B), recording.P]
-    values = np.column_stack([*parts, *seen, *joints, *turns])
-    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(
-            _columns(recording.pixels, (width, int(recording.shaft_mm is not None)), 6 * len(joints + turns))
-        )
-        writer.writerows([name, *map(repr, row)] for name, row in zip(recording.names, values.tolist(), strict=True))
-
-
-def _columns(pixels: bool, direction: tuple[int, int], behind: int) -> tuple[str, ...]:
-    """The header: columns of the direction and of its shaft's length, and of the joints and turns behind them."""
-    unit = "px" if pixels else "mm"
-    poses = [
-        [f"{arm}_r{i}{j}" for i in "123" for j in "123"] + [f"{arm}_{axis}_mm" for axis in "xyz"] for arm in ("A", "B")
-    ]
-    joints = [f"{arm}_q{i}_deg" for arm in "AB" for i in "123456"]
-    turns = [f"{arm}_turn{i}" for arm in "AB" for i in "123456"]
-    width, shaft = direction
-    seen = (f"P_u_{unit}", f"P_v_{unit}", *("v_x", "v_y", "v_z")[:width], *("shaft_mm",)[:shaft])
-    return ("name", *poses[0], *poses[1], *seen, *(joints + turns)[:behind])
-
-
 def _both(first: Floats | None, second: Floats | None) -> Floats | None:
     """One after the other, where both are there."""
     return None if first is None or second is None else np.concatenate([first, second])
-
-
-def _numbers(row: list[str], header: tuple[str, ...], where: str) -> list[float]:
-    if len(row) != len(header):
-        raise InputError(f"{len(row)} fields", where=where, allowed=f"{len(header)} fields, as in the header")
-    return [parse_coordinate(cell, f"{where}, {name}") for name, cell in zip(header[1:], row[1:], strict=True)]
-
-
-def _matrices(values: Floats) -> Floats:
-    return pose(values[:, :9].reshape(-1, 3, 3), values[:, 9:])
-
-
-def _row_major(T: Floats) -> Floats:
-    return np.column_stack([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]])
 
 
 def _finite(values: Floats, what: str, names: tuple[str, ...], *, widths: tuple[int, ...]) -> Floats:

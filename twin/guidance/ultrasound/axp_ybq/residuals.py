@@ -1,4 +1,4 @@
-"""What every pose says of the unknowns of A X P = Y B Q: residuals, their Jacobians and their expected covariance.
+"""What every pose says of the unknowns of A X P = Y B Q: residuals and their Jacobians.
 
 Tip:       F = R_Y (R_B t_Q + t_B) + t_Y - R_A (R_X S p + t_X) - t_A (mm, base1), S = diag(scale).
            With R <- R exp([w]x) its derivatives by w_X, t_X, w_Y, t_Y, t_Q, scale are
@@ -14,11 +14,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import skew
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import ArmErrors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
     DIRECTION,
     N_PARAMETERS,
@@ -31,42 +29,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
     Estimate,
     tangent_basis,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-
-Weights = Floats | Bools
-
-
-class Spread(NamedTuple):
-    """The same spread for every pose; with equal parts inside and across the image this is unweighted least squares."""
-
-    inside_mm: float
-    """Of the tip's residual along each axis of the image."""
-    across_mm: float
-    """Of the tip's residual across the image, where the image itself measures nothing."""
-    direction_rad: float
-    """Of the direction's residual inside the image."""
-
-
-UNWEIGHTED = Spread(1.0, 1.0, 1.0)
-"""Every residual counts the same."""
-
-
-class Problem(NamedTuple):
-    """What is to be estimated, from what."""
-
-    recording: Recording
-    noise: Noise | Spread
-    active: NDArray[np.int_]
-    """Which of the 19 parameters are free."""
-    lean_rad: float = 0.0
-    """How far needles lean out of the slice and still show: all that a direction seen in the image says across it."""
-    arms: ArmErrors | None = None
-    """Errors of both arms, where they are declared."""
-
-    @property
-    def with_direction(self) -> bool:
-        """Whether the measured directions take part."""
-        return bool(self.active[-1] >= DIRECTION.start)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
 
 class Linearised(NamedTuple):
@@ -78,88 +41,9 @@ class Linearised(NamedTuple):
     """Shape (n, k, 19), by the parameters of ``estimate.PARAMETERS``."""
 
 
-class LinearModel(NamedTuple):
-    """A problem at an estimate: residuals, derivatives, and what is expected of the residuals."""
-
-    residuals: Floats
-    """Shape (n, k), k = 3, or 5 with directions."""
-    jacobian: Floats
-    """Shape (n, k, p), by the free parameters."""
-    sigma: Floats
-    """Expected covariance of each pose's own noise, shape (n, k, k)."""
-    shared: Floats | None
-    """Derivative by the arms' lasting errors, each in its standard deviation, shape (n, k, m); None undeclared."""
-
-
-def linear_model(problem: Problem, estimate: Estimate) -> LinearModel:
-    """Everything that a fit or a test of it needs to know of a problem at one estimate."""
-    r, J = linearise(problem, estimate)
-    return LinearModel(r, J, _pose_covariances(problem, estimate), _shared_slopes(problem, estimate))
-
-
-def linearise(problem: Problem, estimate: Estimate) -> Linearised:
-    """All residuals (n, 3 or 5) and their Jacobian by the free parameters (n, 3 or 5, p)."""
-    tip = linearised_tip(estimate, problem.recording)
-    if not problem.with_direction:
-        return Linearised(tip.residuals, tip.jacobian[:, :, problem.active])
-    v_image = directions_image(problem.recording, estimate)
-    turn = linearised_direction(estimate, problem.recording, v_image)
-    jacobian = np.concatenate([tip.jacobian, turn.jacobian], axis=1)[:, :, problem.active]
-    return Linearised(np.concatenate([tip.residuals, turn.residuals], axis=1), jacobian)
-
-
-def _pose_covariances(problem: Problem, estimate: Estimate) -> Floats:
-    """The expected covariance of each pose's residuals, shape (n, k, k)."""
-    v_image = directions_image(problem.recording, estimate) if problem.with_direction else None
-    sigma = covariances(estimate, problem.recording, problem.noise, v_image, problem.lean_rad)
-    if problem.arms is not None:
-        slopes = flange_slopes(estimate, problem.recording, v_image)
-        for by_flange, cov in zip(slopes, (problem.arms.probe_arrival, problem.arms.needle_arrival), strict=True):
-            sigma = sigma + by_flange @ cov @ by_flange.transpose(0, 2, 1)
-    return sigma
-
-
-def _shared_slopes(problem: Problem, estimate: Estimate) -> Floats | None:
-    """The residuals' derivative by the arms' lasting errors, each in its standard deviation, shape (n, k, m)."""
-    if problem.arms is None:
-        return None
-    v_image = directions_image(problem.recording, estimate) if problem.with_direction else None
-    by_probe, by_needle = flange_slopes(estimate, problem.recording, v_image)
-    return np.concatenate([by_probe @ problem.arms.probe, by_needle @ problem.arms.needle], axis=2)
-
-
-def residual_weights(problem: Problem, tip_weights: Weights, direction_weights: Weights) -> Floats:
-    """One weight per residual, shape (n, k), from one per pose for tip and direction (a flag counts as 1 or 0)."""
-    columns = [tip_weights] * 3 + [direction_weights] * (2 if problem.with_direction else 0)
-    return np.column_stack(columns).astype(np.float64)
-
-
-def residuals(problem: Problem, estimate: Estimate) -> Floats:
-    """All residuals alone, shape (n, 3 or 5)."""
-    tip = tip_residuals(estimate, problem.recording)
-    if not problem.with_direction:
-        return tip
-    v_image = directions_image(problem.recording, estimate)
-    return np.concatenate([tip, direction_residuals(estimate, problem.recording, v_image)], axis=1)
-
-
-def tip_points(estimate: Estimate, recording: Recording) -> tuple[Floats, Floats]:
-    """The tip in end1, as the image says, and in base2, as the needle's arm says; both (n, 3), mm."""
-    in_end1 = (recording.P * estimate.scale) @ estimate.R_X[:, :2].T + estimate.t_X
-    in_base2 = recording.B[:, :3, :3] @ estimate.t_Q + recording.B[:, :3, 3]
-    return in_end1, in_base2
-
-
-def tip_residuals(estimate: Estimate, recording: Recording) -> Floats:
-    """F = Y B Q - A X P, shape (n, 3), mm, base1."""
-    in_end1, in_base2 = tip_points(estimate, recording)
-    by_probe = (recording.A[:, :3, :3] @ in_end1[:, :, None])[:, :, 0] + recording.A[:, :3, 3]
-    return np.asarray(in_base2 @ estimate.R_Y.T + estimate.t_Y - by_probe)
-
-
 def linearised_tip(estimate: Estimate, recording: Recording) -> Linearised:
     """The tip's residuals with their Jacobian."""
-    n = len(recording)
+    n, r = len(recording), tip_residuals(estimate, recording)
     R_A, R_AX = recording.A[:, :3, :3], recording.A[:, :3, :3] @ estimate.R_X
     p = np.column_stack([recording.P * estimate.scale, np.zeros(n)])
     _, in_base2 = tip_points(estimate, recording)
@@ -170,7 +54,45 @@ def linearised_tip(estimate: Estimate, recording: Recording) -> Linearised:
     J[:, :, T_Y] = np.eye(3)
     J[:, :, T_Q] = estimate.R_Y @ recording.B[:, :3, :3]
     J[:, :, SCALE] = -R_AX[:, :, :2] * recording.P[:, None, :]
-    return Linearised(tip_residuals(estimate, recording), J)
+    return Linearised(r, J)
+
+
+def tip_residuals(estimate: Estimate, recording: Recording) -> Floats:
+    """F = Y B Q - A X P, shape (n, 3), mm, base1."""
+    in_end1, in_base2 = tip_points(estimate, recording)
+    by_probe = (recording.A[:, :3, :3] @ in_end1[:, :, None])[:, :, 0] + recording.A[:, :3, 3]
+    return np.asarray(in_base2 @ estimate.R_Y.T + estimate.t_Y - by_probe)
+
+
+def tip_points(estimate: Estimate, recording: Recording) -> tuple[Floats, Floats]:
+    """The tip in end1, as the image says, and in base2, as the needle's arm says; both (n, 3), mm."""
+    in_end1 = (recording.P * estimate.scale) @ estimate.R_X[:, :2].T + estimate.t_X
+    in_base2 = recording.B[:, :3, :3] @ estimate.t_Q + recording.B[:, :3, 3]
+    return in_end1, in_base2
+
+
+def linearised_direction(estimate: Estimate, recording: Recording, v_image: Floats) -> Linearised:
+    """The direction's residuals (n, 2), rad for small ones, with their Jacobian.
+
+    Args:
+        estimate: Where to linearise.
+        recording: The poses.
+        v_image: The measured directions, unit, shape (n, 3).
+    """
+    M = needle_in_image(estimate, recording)
+    m = M @ estimate.V
+    rows = across(v_image)
+    R_AXY = (recording.A[:, :3, :3] @ estimate.R_X).transpose(0, 2, 1) @ estimate.R_Y
+    J = np.zeros((len(recording), 2, N_PARAMETERS))
+    J[:, :, W_X] = rows @ skew(m)
+    J[:, :, W_Y] = -rows @ R_AXY @ skew(recording.B[:, :3, :3] @ estimate.V)
+    J[:, :, DIRECTION] = rows @ M @ tangent_basis(estimate.V)
+    return Linearised((rows @ m[:, :, None])[:, :, 0], J)
+
+
+def direction_residuals(estimate: Estimate, recording: Recording, v_image: Floats) -> Floats:
+    """The direction's residuals alone, shape (n, 2)."""
+    return np.asarray(across(v_image) @ needle_in_image(estimate, recording) @ estimate.V)
 
 
 def needle_in_image(estimate: Estimate, recording: Recording) -> Floats:
@@ -207,103 +129,3 @@ def across(v: Floats) -> Floats:
     rows[:, 0, 0], rows[:, 0, 1] = -b / flat, a / flat
     rows[:, 1, 0], rows[:, 1, 1], rows[:, 1, 2] = -a * c / flat, -b * c / flat, flat
     return rows
-
-
-def direction_residuals(estimate: Estimate, recording: Recording, v_image: Floats) -> Floats:
-    """The direction's residuals alone, shape (n, 2)."""
-    return np.asarray(across(v_image) @ needle_in_image(estimate, recording) @ estimate.V)
-
-
-def linearised_direction(estimate: Estimate, recording: Recording, v_image: Floats) -> Linearised:
-    """The direction's residuals (n, 2), rad for small ones, with their Jacobian.
-
-    Args:
-        estimate: Where to linearise.
-        recording: The poses.
-        v_image: The measured directions, unit, shape (n, 3).
-    """
-    M = needle_in_image(estimate, recording)
-    m = M @ estimate.V
-    rows = across(v_image)
-    R_AXY = (recording.A[:, :3, :3] @ estimate.R_X).transpose(0, 2, 1) @ estimate.R_Y
-    J = np.zeros((len(recording), 2, N_PARAMETERS))
-    J[:, :, W_X] = rows @ skew(m)
-    J[:, :, W_Y] = -rows @ R_AXY @ skew(recording.B[:, :3, :3] @ estimate.V)
-    J[:, :, DIRECTION] = rows @ M @ tangent_basis(estimate.V)
-    return Linearised((rows @ m[:, :, None])[:, :, 0], J)
-
-
-def covariances(
-    estimate: Estimate,
-    recording: Recording,
-    noise: Noise | Spread,
-    v_image: Floats | None = None,
-    lean_rad: float = 0.0,
-) -> Floats:
-    """Covariance of each pose's residuals, shape (n, 3, 3) of the tip, or (n, 5, 5) with the direction's two behind it.
-
-    Args:
-        estimate: Where the residuals are linearised.
-        recording: The poses.
-        noise: Propagated to first order through both arms and the image, or taken as it is.
-        v_image: The measured directions, unit, shape (n, 3), where they are used.
-        lean_rad: How far the needle leans out of the measured direction's plane across the image.
-    """
-    n, size = len(recording), 3 if v_image is None else 5
-    sigma = np.zeros((n, size, size))
-    if isinstance(noise, Spread):
-        in_image = recording.A[:, :3, :3] @ estimate.R_X * [noise.inside_mm, noise.inside_mm, noise.across_mm]
-        sigma[:, :3, :3] = in_image @ in_image.transpose(0, 2, 1)
-    else:
-        sigma += _propagated(estimate, recording, noise, v_image)
-    if v_image is not None:
-        sigma[:, 3, 3] += (noise.direction_rad * recording.direction_spread) ** 2
-        sigma[:, 4, 4] += lean_rad**2
-    return sigma
-
-
-def flange_slopes(estimate: Estimate, recording: Recording, v_image: Floats | None) -> tuple[Floats, Floats]:
-    """The residuals' derivatives by a small motion of the probe's and of the needle's flange, each (n, k, 6).
-
-    A motion is a shift and a turn about the flange's origin, along the axes of the arm's own base:
-    dF = -(dt_A - [R_A p1]x dw_A) + R_Y (dt_B - [R_B t_Q]x dw_B), p1 = R_X S p + t_X, and of the direction
-    dm = (R_A R_X)^T [R_Y R_B V]x dw_A - (R_A R_X)^T R_Y [R_B V]x dw_B.
-
-    Args:
-        estimate: Where to linearise.
-        recording: The poses.
-        v_image: The measured directions, unit, shape (n, 3), where they are used.
-    """
-    n, size = len(recording), 3 if v_image is None else 5
-    R_A, R_B = recording.A[:, :3, :3], recording.B[:, :3, :3]
-    in_end1, _ = tip_points(estimate, recording)
-    probe, needle = np.zeros((2, n, size, 6))
-    probe[:, :3, :3], needle[:, :3, :3] = -np.eye(3), estimate.R_Y
-    probe[:, :3, 3:] = skew((R_A @ in_end1[:, :, None])[:, :, 0])
-    needle[:, :3, 3:] = -estimate.R_Y @ skew(R_B @ estimate.t_Q)
-    if v_image is not None:
-        rows = across(v_image) @ (R_A @ estimate.R_X).transpose(0, 2, 1)
-        along = R_B @ estimate.V
-        probe[:, 3:, 3:] = rows @ skew(along @ estimate.R_Y.T)
-        needle[:, 3:, 3:] = -rows @ estimate.R_Y @ skew(along)
-    return probe, needle
-
-
-def _propagated(estimate: Estimate, recording: Recording, noise: Noise, v_image: Floats | None) -> Floats:
-    """Both flanges' and the tip's noise in the residuals; every source is independent and isotropic."""
-    R_A, R_B = recording.A[:, :3, :3], recording.B[:, :3, :3]
-    in_end1, _ = tip_points(estimate, recording)
-    turn_A, turn_B = R_A @ skew(in_end1), -estimate.R_Y @ R_B @ skew(estimate.t_Q)
-    if v_image is not None:
-        M, rows = needle_in_image(estimate, recording), across(v_image)
-        end1 = (M @ estimate.V) @ estimate.R_X.T
-        turn_A = np.concatenate([turn_A, rows @ estimate.R_X.T @ skew(end1)], axis=1)
-        turn_B = np.concatenate([turn_B, -rows @ M @ skew(estimate.V)], axis=1)
-    sigma = noise.robot_rad**2 * (turn_A @ turn_A.transpose(0, 2, 1) + turn_B @ turn_B.transpose(0, 2, 1))
-    in_image = (R_A @ estimate.R_X)[:, :, :2]
-    sigma[:, :3, :3] += noise.image_mm**2 * in_image @ in_image.transpose(0, 2, 1)
-    sigma[:, :3, :3] += 2 * noise.robot_mm**2 * np.eye(3)
-    if noise.off_plane_mm:
-        normal = (R_A @ estimate.R_X)[:, :, 2]
-        sigma[:, :3, :3] += noise.off_plane_mm**2 * normal[:, :, None] * normal[:, None, :]
-    return np.asarray(sigma)

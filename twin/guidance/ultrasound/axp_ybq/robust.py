@@ -16,22 +16,22 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import HALF_NORMAL
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Fitted, fitted, refine
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import RobustFit, weighed
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import (
     LinearModel,
     Problem,
     Spread,
-    directions_image,
     linear_model,
     linearise,
-    needle_in_image,
-    residual_weights,
 )
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import refine
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import directions_image, needle_in_image
 
 FALSE_ALARMS = 0.01
 """Chance that a recording without outliers loses a pose."""
 
 HUBER_STEPS, TUKEY_STEPS = 6, 12
+
 HUBER, TUKEY = (float(np.sqrt(2 * gammaincinv(3 / 2, level))) for level in (0.8, 0.9999))
 """Where the weights begin to fall, and where they reach zero, in standard deviations."""
 
@@ -54,17 +54,6 @@ LEAST_KEPT = 0.5
 """If more than half of the poses disagree, nobody can say which half is right."""
 
 
-class RobustFit(NamedTuple):
-    """A fit, and which poses made it."""
-
-    estimate: Estimate
-    tip_kept: Bools
-    """Shape (n,): the tip of this pose was used."""
-    direction_kept: Bools
-    """Shape (n,): its direction was used."""
-    iterations: int
-
-
 class _Block(NamedTuple):
     """One kind of residual."""
 
@@ -76,15 +65,10 @@ class _Block(NamedTuple):
     """Variance over the expected one below which it is not believed: told noise is there; less than rounding is not."""
 
 
-def weighed(problem: Problem, fit: RobustFit) -> Fitted:
-    """A problem at a fit, with the poses that made it."""
-    return fitted(problem, fit.estimate, residual_weights(problem, fit.tip_kept, fit.direction_kept))
-
-
 def plain_fit(problem: Problem, start: Estimate) -> RobustFit:
     """Least squares over all poses."""
     ones = np.ones(len(problem.recording))
-    fit = refine(problem, start, residual_weights(problem, ones, ones))
+    fit = refine(problem, start, ones, ones)
     return RobustFit(fit.estimate, ones > 0, ones > 0, fit.iterations)
 
 
@@ -116,7 +100,7 @@ def settled(problem: Problem, fit: RobustFit, *, recheck: bool = True) -> Robust
     kept = (fit.tip_kept, fit.direction_kept)
     for _ in range(LOOKS):
         _check_enough(problem, kept[0])
-        again = refine(problem, fit.estimate, residual_weights(problem, kept[0], kept[1]))
+        again = refine(problem, fit.estimate, *kept)
         fit = RobustFit(again.estimate, *kept, fit.iterations + again.iterations)
         kept = _agreeing(problem, fit) if recheck else kept
         if all(np.array_equal(new, old) for new, old in zip(kept, fit[1:3], strict=True)):
@@ -203,7 +187,7 @@ def _reweighted(problem: Problem, fit: RobustFit) -> RobustFit:
             size = np.sqrt(squared / _scale(squared, block))
             falls = np.minimum(1.0, HUBER / np.maximum(size, 1e-12))
             weights[k] = falls if step < HUBER_STEPS else np.maximum(1 - (size / TUKEY) ** 2, 0.0) ** 2
-        estimate = refine(problem, estimate, residual_weights(problem, *weights), max_steps=1).estimate
+        estimate = refine(problem, estimate, *weights, max_steps=1).estimate
     steps = fit.iterations + HUBER_STEPS + TUKEY_STEPS
     return RobustFit(estimate, weights[0] > STILL_USED, weights[1] > STILL_USED, steps)
 

@@ -18,9 +18,14 @@ import numpy as np
 from scipy.stats import f
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Fitted
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import UNWEIGHTED, Problem, Spread
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import LEAST_MM, RobustFit, weighed
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import SeenDirection
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import Fitted, RobustFit, weighed
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem, Spread
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import LEAST_MM, settled
+
+SPREAD_ROUNDS = 2
+"""How often the residuals' spread is found and the fit repeated with it; it settles to a few percent in two."""
 
 LEAST_FREEDOM = 15
 """Residuals minus unknowns below which inside and across are not told apart: their ratio would be chance."""
@@ -39,6 +44,26 @@ LEAST_PART_FREEDOM = 3.0
 
 LEAST_PART_RAD = 1e-6
 """No direction is measured better, and none leans less."""
+
+
+def refitted(problem: Problem, fit: RobustFit, seen: SeenDirection, *, recheck: bool) -> tuple[Problem, RobustFit]:
+    """Fit again with the directions, and with the spread that the residuals themselves show where no noise is given.
+
+    Args:
+        problem: With the directions where they take part.
+        fit: Of the tips alone.
+        seen: The needle's direction at that fit.
+        recheck: Whether poses may change sides.
+    """
+    declared = not isinstance(problem.noise, Spread)
+    if not declared:
+        tips = problem._replace(active=problem.active[problem.active < DIRECTION.start])
+        problem = problem._replace(noise=found_spreads(tips, fit).spread._replace(direction_rad=seen.spread_rad))
+    for _ in range(SPREAD_ROUNDS):
+        fit = settled(problem, fit, recheck=recheck)
+        found = found_spreads(problem, fit)
+        problem = problem._replace(noise=problem.noise if declared else found.spread, lean_rad=found.lean_rad)
+    return problem, fit
 
 
 class ResidualSpreads(NamedTuple):

@@ -15,9 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import LEAST_RATIO, scaled_jacobian, tips_centre
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import (
+    LEAST_RATIO,
+    Observability,
+    WeakMotion,
+    observe,
+    scaled_jacobian,
+    tips_centre,
+)
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import needle_in_image
 
@@ -63,6 +71,34 @@ class SuggestedPoses(NamedTuple):
     ratio_after: float
     """Singular value ratio with these poses added, by the present estimate."""
     text: str
+
+
+class Degenerate(InputError):  # noqa: N818 - the field's word for such poses
+    """The poses cannot show every unknown.
+
+    Attributes:
+        motions: What can move without any residual showing it, in words and with its cause.
+        suggestion: Poses that would mend it.
+    """
+
+    def __init__(self, observability: Observability, suggestion: SuggestedPoses) -> None:
+        self.motions: tuple[WeakMotion, ...] = observability.weak
+        self.ratio = observability.ratio
+        self.suggestion = suggestion
+        what = "; ".join(motion.text for motion in self.motions) + f" (singular value ratio {self.ratio:.1e})"
+        super().__init__(what, where="recording", allowed=suggestion.text)
+
+
+def require_observable(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> Observability:
+    """How well the poses show the unknowns; the arguments are those of `observe`.
+
+    Raises:
+        Degenerate: They do not; with poses that would mend it.
+    """
+    found = observe(estimate, recording, active)
+    if found.weak:
+        raise Degenerate(found, propose(estimate, recording, active))
+    return found
 
 
 def propose(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> SuggestedPoses:

@@ -16,7 +16,8 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import inverse
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
 Reading = Callable[[Recording], Recording]

@@ -1,0 +1,263 @@
+"""From a recording to a calibration: checks, start, fit, noise; a refusal where the poses cannot show the unknowns."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, without_play
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import LEAST_POSES, LEAST_POSES_KNOWN_TIP, closed_form
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import needle_direction
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
+    DIRECTION,
+    PARAMETERS,
+    T_Q,
+    Estimate,
+    active_columns,
+    tangent_basis,
+)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import RobustFit, weighed
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem, Spread
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import needle_in_image
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import plain_fit, robust_fit
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.spread import SmallSample, refitted, small_sample
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.suggested_poses import require_observable
+
+SHAFT_BIAS = (
+    "a constant error of the detected tip along the shaft moves the tip in the needle's flange frame and leaves every "
+    "residual as it is; the known needle length would hold it"
+)
+
+SCALE_TAKEN = "the image's mm per pixel was taken as given: 1 % off makes the error at the tip half as large again"
+
+ARMS_TAKEN = (
+    "errors of the arms that repeat from pose to pose (lengths, joint zeros): none were declared with the joints, so "
+    "the stated errors count noise alone and are too small"
+)
+
+PLAY_SIGN = (
+    "on which side of their play the joints stood: the recording does not say which way they turned, so play counts as "
+    "noise, and the region is too narrow beside a noise that was found"
+)
+
+DIRECTION_SIGN = (
+    "no directions were measured: the needle's axis comes from the image plane alone, pointing from flange to tip"
+)
+
+ADVISED_POSES = 20
+"""From 20 poses on the closed form is well conditioned (median 5e2; 6e3 at 16)."""
+
+
+def calibrate(
+    recording: Recording,
+    *,
+    noise: Noise | None = None,
+    known_tip: Floats | None = None,
+    needle_length_mm: float | None = None,
+    scale: bool = False,
+    robust: bool = True,
+    direction: bool = True,
+    start: Estimate | None = None,
+    arms: DeclaredArms | None = None,
+) -> Calibration:
+    """Solve A X P = Y B Q: closed form, then weighted least squares over the poses that agree.
+
+    Args:
+        recording: At least 16 poses (20 are better); 7 with ``known_tip``; unknowns / 3 + 1 with ``start``.
+        noise: Of both arms and the image; None finds the residuals' spread inside and across the image by itself.
+        known_tip: t_Q, shape (3,), mm, frame end2, where it is known.
+        needle_length_mm: Distance along the shaft from the flange's origin to the tip: holds a constant error of the
+            detected tip along the shaft, which nothing else can.
+        scale: Find mm per unit of P along both axes of the image.
+        robust: Set aside poses that disagree with the others.
+        direction: Let measured directions take part, where the recording has them.
+        start: Begin here instead of at the closed form.
+        arms: How far both arms may lastingly be from their nominal models; the recording then needs joints. None takes
+            all errors of the flanges for noise.
+
+    Raises:
+        InputError: Too few poses, or more than half of them disagree; joints that are missing or of another arm.
+        Degenerate: The poses cannot show every unknown. It names the motion and proposes further poses.
+    """
+    if needle_length_mm is not None and not 0 < needle_length_mm < np.inf:
+        raise InputError(f"needle length {needle_length_mm}", where="needle_length_mm", allowed="a positive number, mm")
+    solution = _solve(
+        recording,
+        noise=noise,
+        known_tip=known_tip,
+        scale=scale,
+        robust=robust,
+        direction=direction,
+        start=start,
+        arms=arms,
+    )
+    bias = None
+    if needle_length_mm is not None and known_tip is None:
+        bias = float(solution.estimate.V @ solution.estimate.t_Q) - needle_length_mm
+        solution = _with_length(solution, bias)
+    cannot = [SHAFT_BIAS] * (needle_length_mm is None and known_tip is None) + [SCALE_TAKEN] * (not scale)
+    cannot += [DIRECTION_SIGN] * (recording.v is None) + [ARMS_TAKEN] * (arms is None)
+    if arms is not None and recording.turn_probe is None and any(arm.play_rad > 0.0 for arm in arms):
+        cannot.append(PLAY_SIGN)
+    return _assembled(recording, solution, bias, tuple(cannot), arms)
+
+
+def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: Estimate | None) -> None:
+    if recording.pixels and not scale:
+        raise InputError("the tip is in pixels", where="recording", allowed="mm, or mm per pixel to be found (scale)")
+    if known_tip is not None and (np.shape(known_tip) != (3,) or not np.isfinite(known_tip).all()):
+        raise InputError(f"known tip {known_tip}", where="known_tip", allowed="three finite numbers, mm, frame end2")
+    least = LEAST_POSES if known_tip is None else LEAST_POSES_KNOWN_TIP
+    if start is not None:
+        least = len(active_columns(tip=known_tip is None, scale=scale, direction=False)) // 3 + 1
+    if len(recording) < least:
+        allowed = f"{least} or more" + (f", better {ADVISED_POSES}" if least == LEAST_POSES else "")
+        raise InputError(f"{len(recording)} poses", where="recording", allowed=allowed)
+
+
+class _Solution(NamedTuple):
+    """A fit with all that is known about it."""
+
+    estimate: Estimate
+    active: NDArray[np.int_]
+    tip_kept: NDArray[np.bool_]
+    iterations: int
+    noise: Noise | Spread
+    covariance: Floats
+    """Of the free parameters, then of the arms' lasting errors where they are declared, shape (p + m, p + m)."""
+    arm_errors: Floats
+    """Posterior mean of the arms' lasting errors, in standard deviations, shape (m,): 46, with
+    play in both arms 58, and 0 where none are declared."""
+    small_sample: SmallSample | None
+    residuals: Floats
+    noise_ratio: float
+    freedom: int
+    observability: Observability
+    orientations: Floats
+
+
+def _solve(
+    recording: Recording,
+    *,
+    noise: Noise | None,
+    known_tip: Floats | None,
+    scale: bool,
+    robust: bool,
+    direction: bool,
+    start: Estimate | None,
+    arms: DeclaredArms | None = None,
+) -> _Solution:
+    """The unknowns of a recording; the arguments are those of `calibrate`.
+
+    Raises:
+        InputError: Too few poses, pixels without scale, or most poses disagree.
+        Degenerate: The poses cannot show every unknown.
+    """
+    _check(recording, known_tip, scale, start)
+    errors = None if arms is None else arm_errors(arms, recording)
+    if errors is not None:
+        recording = without_play(recording, errors)
+    estimate = start or closed_form(recording, known_tip=known_tip, scale=scale)
+    if start is not None and known_tip is not None:
+        estimate = estimate._replace(t_Q=np.asarray(known_tip, dtype=np.float64))
+    active = active_columns(tip=known_tip is None, scale=scale, direction=False)
+    problem = Problem(recording, noise or UNWEIGHTED, active, arms=errors)
+    fit = (robust_fit if robust else plain_fit)(problem, estimate)
+    seen = needle_direction(fit.estimate, recording, fit.tip_kept)
+    fit = fit._replace(estimate=fit.estimate._replace(V=seen.V), direction_kept=seen.agrees)
+    observability = require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
+    if direction and recording.v is not None:
+        active = np.append(active, [DIRECTION.start, DIRECTION.start + 1])
+        problem = problem._replace(active=active, lean_rad=seen.lean_rad)
+    if noise is None or problem.with_direction:
+        before = fit.tip_kept
+        problem, fit = refitted(problem, fit, seen, recheck=robust)
+        if not np.array_equal(before, fit.tip_kept):
+            observability = require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
+    return _solution(problem, fit, observability)
+
+
+def _solution(problem: Problem, fit: RobustFit, observability: Observability) -> _Solution:
+    at_fit = weighed(problem, fit)
+    count = 3 * int(fit.tip_kept.sum()) + 2 * int(fit.direction_kept.sum()) * problem.with_direction
+    freedom = count - len(problem.active)
+    region = small_sample(problem, fit) if problem.arms is not None else None
+    return _Solution(
+        fit.estimate,
+        problem.active,
+        fit.tip_kept,
+        fit.iterations,
+        problem.noise,
+        at_fit.covariance,
+        at_fit.shared,
+        region,
+        at_fit.residuals[:, :3],
+        float(np.sqrt(at_fit.chi_squared / max(freedom, 1))),
+        freedom,
+        observability,
+        needle_in_image(fit.estimate, problem.recording),
+    )
+
+
+def _with_length(solution: _Solution, bias: float) -> _Solution:
+    """The solution after t_Q <- t_Q - (V.t_Q - length) V."""
+    V, t_Q = solution.estimate.V, solution.estimate.t_Q
+    full = np.eye(len(PARAMETERS))
+    full[T_Q, T_Q] -= np.outer(V, V)
+    full[T_Q, DIRECTION] = -(bias * np.eye(3) + np.outer(V, t_Q)) @ tangent_basis(V)
+    change = full[np.ix_(solution.active, solution.active)]
+    whole = np.eye(len(solution.covariance))
+    whole[: len(change), : len(change)] = change
+    region = solution.small_sample
+    if region is not None:
+        region = region._replace(covariance=change @ region.covariance @ change.T)
+    return solution._replace(
+        estimate=solution.estimate._replace(t_Q=t_Q - bias * V),
+        covariance=np.asarray(whole @ solution.covariance @ whole.T),
+        small_sample=region,
+    )
+
+
+def _assembled(
+    recording: Recording, solution: _Solution, bias: float | None, cannot: tuple[str, ...], arms: DeclaredArms | None
+) -> Calibration:
+    estimate, kept, p = solution.estimate, solution.tip_kept, len(solution.active)
+    return Calibration(
+        _frozen(pose(estimate.R_X, estimate.t_X)),
+        _frozen(pose(estimate.R_Y, estimate.t_Y)),
+        _frozen(estimate.t_Q),
+        _frozen(estimate.V),
+        _frozen(estimate.scale),
+        _frozen(solution.residuals),
+        float(np.sqrt(np.mean(np.sum(solution.residuals[kept] ** 2, axis=1)))),
+        _frozen(1.0 * kept),
+        tuple(name for name, used in zip(recording.names, kept, strict=True) if not used),
+        solution.iterations,
+        solution.observability.ratio,
+        _frozen(solution.covariance[:p, :p]),
+        tuple(PARAMETERS[column] for column in solution.active),
+        solution.freedom,
+        solution.noise,
+        solution.noise_ratio,
+        bias,
+        _frozen(solution.orientations),
+        cannot,
+        arms,
+        _frozen(solution.arm_errors),
+        _frozen(solution.covariance),
+        solution.small_sample,
+    )
+
+
+def _frozen(array: ArrayLike) -> Floats:
+    copy = np.array(array, dtype=np.float64)
+    copy.setflags(write=False)
+    return copy
