@@ -30,9 +30,11 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed
+from puncture_twin.planning.registration.fits import Method, fit_rigid
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.reading_noise import reading_noise
-from puncture_twin.planning.registration.registration import MarkerPairs, Method, fit_rigid, register
+from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.twin.rehearsal.rooms import Puncture, draw_rooms
 

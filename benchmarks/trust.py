@@ -37,10 +37,12 @@ from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
+from puncture_twin.planning.registration.fits import Method, fit_rigid
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.noise_test import NoiseTest
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.reading_noise import reading_noise
-from puncture_twin.planning.registration.registration import MarkerPairs, Method, fit_rigid, register
+from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.registration.touch_poses import touching_configuration
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.organs import organ_candidates

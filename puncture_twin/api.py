@@ -121,9 +121,9 @@ def register(
     Raises:
         InputError: Names that do not match, collinear or mirrored markers, residuals that the noise does not explain.
     """
-    from puncture_twin.planning.registration import registration
+    from puncture_twin.planning.registration import marker_pairs, registration
 
-    pairs = registration.match(_named(markers_ct, "register"), _named(markers_base, "register"), use=None)
+    pairs = marker_pairs.match(_named(markers_ct, "register"), _named(markers_base, "register"), use=None)
     target = _named({"target": target_ct}, "register: target_ct").points[0]
     return registration.register(pairs, method=method, target_ct=target, fle_mm=fle_mm)
 

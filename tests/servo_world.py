@@ -7,7 +7,7 @@ import numpy as np
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.registration import fit_rigid
+from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.twin.guidance.stereo.joint.erring_rod import N_ROD
 from puncture_twin.twin.guidance.stereo.joint.joint_model import Guess, Observed, Unknowns
 from puncture_twin.twin.guidance.stereo.poses import configurations, rod_orientation

@@ -17,7 +17,7 @@ from puncture_twin.planning.budget.breath import GATES
 from puncture_twin.planning.budget.chain import Chain
 from puncture_twin.planning.case.errors import ARM_KINDS, UNIFORM, ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.registration import MIN_MARKERS
+from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.uncertainty.pose_error import error_budget
 from puncture_twin.planning.uncertainty.touch_choice import choose_touches
 

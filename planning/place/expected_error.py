@@ -9,9 +9,11 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.placement import Placement, default_method, touches
+from puncture_twin.planning.registration.marker_noise import touches
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs
+from puncture_twin.planning.registration.placement import Placement, default_method
 from puncture_twin.planning.registration.reading_noise import reading_noise
-from puncture_twin.planning.registration.registration import MarkerPairs, Registration, register
+from puncture_twin.planning.registration.registration import Registration, register
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 

@@ -11,8 +11,9 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fit_map import carried, design
+from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.registration.noise_test import noise_test
-from puncture_twin.planning.registration.registration import MIN_MARKERS, Registration
+from puncture_twin.planning.registration.registration import Registration
 
 APART_MM = 20.0
 """One more marker is no nearer than this to those that are there."""

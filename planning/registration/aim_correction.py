@@ -23,8 +23,9 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.registration.aim import Aim
-from puncture_twin.planning.registration.fit_map import carried, design, fit_joint
+from puncture_twin.planning.registration.fit_map import carried, design
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
+from puncture_twin.planning.registration.fits import fit_joint
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.registration.registration import Registration
 

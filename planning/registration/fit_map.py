@@ -1,8 +1,8 @@
-"""Weighted registration, and the linear map from reading errors to the pose that each method makes of them.
+"""The linear map from reading errors to the pose that each method makes of them.
 
-Weighted fit: Moghari, Abolmaesumi, IEEE TMI 26(12), 2007; Danilchenko, Fitzpatrick, IEEE TMI 30(3), 2011. With A_i =
-[I, -[p_i - c]x] stacked and weights W, a reading error z moves the fitted pose by L z, L = (A' W A)^-1 A' W: a shift of
-the centroid c, then a rotation about it, base axes.
+With A_i = [I, -[p_i - c]x] stacked and weights W, a reading error z moves the fitted pose by L z, L = (A' W A)^-1 A' W:
+a shift of the centroid c, then a rotation about it, base axes. The weighted fit is Gauss-Newton along this map:
+Moghari, Abolmaesumi, IEEE TMI 26(12), 2007; Danilchenko, Fitzpatrick, IEEE TMI 30(3), 2011.
 """
 
 from __future__ import annotations
@@ -12,11 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import apply, exp_rotation, log_rotation, pose, skew
-from puncture_twin.planning.registration.reading_noise import ReadingNoise
-
-STEPS = 6
-"""Gauss-Newton steps of the weighted fit: from the least-squares fit its error falls below 1e-12 mm in four."""
+from puncture_twin.planning.geometry.rigid import apply, log_rotation, skew
 
 NUDGE_MM = 1e-4
 """Of central differences of a method that has no formula of its own; their error is 1e-9 of the map."""
@@ -24,7 +20,7 @@ NUDGE_MM = 1e-4
 
 def design(points_base: Floats, center_base: Floats) -> Floats:
     """A, shape (3 N, 6), of points (N, 3) about a centre (3,): how a shift and a rotation (rad) move them."""
-    return _blocks(points_base, center_base).reshape(-1, 6)
+    return design_blocks(points_base, center_base).reshape(-1, 6)
 
 
 def least_squares_map(A: Floats, weights: Floats | None = None) -> Floats:
@@ -33,59 +29,10 @@ def least_squares_map(A: Floats, weights: Floats | None = None) -> Floats:
     return np.asarray(np.linalg.solve(weighted @ A, weighted))
 
 
-def fit_weighted(points_ct: Floats, points_base: Floats, noise: ReadingNoise, T_start: Floats) -> Floats:
-    """T_base_ct, shape (..., 4, 4), that minimises z' Omega^-1 z over rigid motions, z the stacked residuals.
-
-    Args:
-        points_ct: Shape (..., N, 3), mm: one set of markers, or many of one noise.
-        points_base: Shape (..., N, 3), mm.
-        noise: Gives Omega, for the rotation found so far.
-        T_start: Shape (..., 4, 4), such as the least-squares fit.
-    """
-    R, t, center = T_start[..., :3, :3], T_start[..., :3, 3], points_base.mean(axis=-2)
-    for _ in range(STEPS):
-        fitted = points_ct @ _transposed(R) + t[..., None, :]
-        weights = np.linalg.inv(noise.blocks(R))
-        A = _blocks(fitted, center)
-        weighted = np.swapaxes(A, -1, -2) @ weights
-        normal, right = (weighted @ A).sum(axis=-3), weighted @ (points_base - fitted)[..., None]
-        step = np.linalg.solve(normal, right.sum(axis=-3))[..., 0]
-        turn = exp_rotation(step[..., 3:])
-        t = (turn @ (t - center)[..., None])[..., 0] + center + step[..., :3]
-        R = turn @ R
-    U, _, Vt = np.linalg.svd(R)  # products of rotations drift from one by rounding
-    return pose(U @ Vt, t)
-
-
-def fit_joint(points_ct: Floats, points_base: Floats, noise: ReadingNoise, T_start: Floats) -> Floats:
-    """T_base_ct, shape (..., 4, 4), that minimises z' C^-1 z: the arm's errors, common to all markers, count too.
-
-    The arguments are those of `fit_weighted`. C is taken at T_start, from which the fit turns by little.
-    """
-    R, t, center = T_start[..., :3, :3], T_start[..., :3, 3], points_base.mean(axis=-2)
-    weights = np.linalg.inv(noise.whole(R))
-    for _ in range(STEPS):
-        fitted = points_ct @ _transposed(R) + t[..., None, :]
-        blocks = _blocks(fitted, center)
-        A = blocks.reshape(*blocks.shape[:-3], -1, 6)
-        weighted = np.swapaxes(A, -1, -2) @ weights
-        residuals = (points_base - fitted).reshape(*A.shape[:-1], 1)
-        step = np.linalg.solve(weighted @ A, weighted @ residuals)[..., 0]
-        turn = exp_rotation(step[..., 3:])
-        t = (turn @ (t - center)[..., None])[..., 0] + center + step[..., :3]
-        R = turn @ R
-    U, _, Vt = np.linalg.svd(R)  # as in `fit_weighted`
-    return pose(U @ Vt, t)
-
-
-def _blocks(points: Floats, center: Floats) -> Floats:
+def design_blocks(points: Floats, center: Floats) -> Floats:
     """A_i = [I, -[p_i - c]x], shape (..., N, 3, 6)."""
     eye = np.broadcast_to(np.eye(3), (*points.shape, 3))
     return np.concatenate([eye, -skew(points - center[..., None, :])], axis=-1)
-
-
-def _transposed(R: Floats) -> Floats:
-    return np.swapaxes(R, -1, -2)
 
 
 def differenced_map(fit: Callable[[Floats, Floats], Floats], points_ct: Floats, points_base: Floats) -> Floats:

@@ -9,9 +9,8 @@ from typing import Literal
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
@@ -19,26 +18,13 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed
+from puncture_twin.planning.registration.marker_noise import marker_noise
+from puncture_twin.planning.registration.marker_pairs import match
 from puncture_twin.planning.registration.reached_insertion import reached_insertion
-from puncture_twin.planning.registration.reading_noise import ReadingNoise, reading_noise
-from puncture_twin.planning.registration.registration import (
-    MarkerPairs,
-    Registration,
-    check_pairs,
-    fit_rigid,
-    match,
-    register,
-)
-from puncture_twin.planning.registration.touch_poses import touching_configuration
-
-MAX_JOINTS_OFF_MM = 5.0
-"""A controller with its own calibration puts the tip up to some mm from where the data sheet's arm does."""
+from puncture_twin.planning.registration.registration import Registration, register
 
 MAX_AIM_OFF_MM = 20.0
 """A plan's joints are at the target as it was corrected then: no nominal arm errs by so much."""
-
-GUESSED_HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
-"""An arm bent at the elbow, its needle down."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,50 +117,6 @@ def _aimed_insertion(case: Case, T_base_ct: Floats, where: str | Path) -> Floats
 def default_method(errors: ErrorModel | None) -> Literal["rigid", "weighted"]:
     """Weighted where markers are declared to be read better along some axes than along others."""
     return "weighted" if errors is not None and errors.anisotropic else "rigid"
-
-
-def marker_noise(case: Case, errors: ErrorModel, markers: MarkerPairs, *, where: str | Path) -> ReadingNoise:
-    """The declared noise of a case's markers, with the arm as it stood at the touches, or as it is guessed to have.
-
-    Raises:
-        InputError: Too few markers to fit, or joints that do not put the tip where the file says that it touched.
-    """
-    model, tip = case.robot.model, case.needle.length_mm
-    check_pairs(markers, where)
-    if markers.joints is not None:
-        _check_joints(model, tip, markers, where)
-    return reading_noise(errors, model, tip, touches(case, markers), known=markers.joints is not None)
-
-
-def touches(case: Case, markers: MarkerPairs) -> Floats:
-    """How the arm stood when it touched each marker, shape (N, 6), rad: as the file says, or as it may have stood."""
-    if markers.joints is not None:
-        return markers.joints
-    model, tip = case.robot.model, case.needle.length_mm
-    needle = -(fit_rigid(markers.points_ct, markers.points_base)[:3, :3] @ case.T_ct_entry[:3, 2])
-    return np.array([_guessed(model, tip, point, needle) for point in markers.points_base])
-
-
-def _guessed(model: UrModel, tip_mm: float, point_base: Floats, needle_base: Floats) -> Floats:
-    """How the arm may have stood; its home where it cannot touch the point in any direction tried."""
-    try:
-        return touching_configuration(model, tip_mm, point_base, needle_base)
-    except NoAnswerError:
-        return GUESSED_HOME
-
-
-def _check_joints(model: UrModel, tip_mm: float, markers: MarkerPairs, where: str | Path) -> None:
-    assert markers.joints is not None
-    flanges = flange_pose(model, markers.joints)
-    tips = flanges[:, :3, 3] + tip_mm * flanges[:, :3, 2]
-    away = np.linalg.norm(tips - markers.points_base, axis=1)
-    worst = int(np.argmax(away))
-    if away[worst] > MAX_JOINTS_OFF_MM:
-        raise InputError(
-            f"the joints of marker {markers.names[worst]} put the tip {away[worst]:.1f} mm away from where it touched",
-            where=where,
-            allowed=f"within {MAX_JOINTS_OFF_MM:g} mm: joints in degrees, of this robot, with this needle",
-        )
 
 
 def _points(case: Case, name: str, space: Space) -> NamedPoints:

@@ -66,6 +66,13 @@ class ReadingNoise:
         """C, shape (..., 3 N, 3 N): both."""
         return self.independent(R_base_ct) + self.shared()
 
+    def greatest_fle_mm(self, R_base_ct: Floats) -> float:
+        """The noise of the isotropic test that other pairings of the names are compared with: the worst axis in all.
+
+        Residuals that pass the weighted test have |r|^2 <= lambda_max chi-squared: the given names pass this one too.
+        """
+        return float(np.sqrt(3 * np.linalg.eigvalsh(self.whole(R_base_ct))[-1]))
+
 
 def reading_noise(errors: ErrorModel, model: UrModel, tip_mm: float, q_touch: Floats, *, known: bool) -> ReadingNoise:
     """The noise of markers that were touched in given configurations.
@@ -77,9 +84,8 @@ def reading_noise(errors: ErrorModel, model: UrModel, tip_mm: float, q_touch: Fl
         q_touch: Shape (N, 6), rad.
         known: Whether these are the real ones.
     """
+    eta_variances = parameter_variances(errors.arm)
     J = error_jacobian(model, q_touch, tip_mm)[:, :3]
     Jq = J[..., PARAMETERS["joint"]]
     cov_base = errors.touch_mm**2 * np.eye(3) + errors.arm.repeatability**2 * Jq @ np.swapaxes(Jq, -1, -2)
-    return ReadingNoise(
-        errors.marker_cov_ct, cov_base, J.reshape(-1, N_PARAMETERS), parameter_variances(errors.arm), known
-    )
+    return ReadingNoise(errors.marker_cov_ct, cov_base, J.reshape(-1, N_PARAMETERS), eta_variances, known)

@@ -23,9 +23,11 @@ from puncture_twin.planning.formats.points.point_files import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed
-from puncture_twin.planning.registration.placement import marker_noise
+from puncture_twin.planning.registration.fits import Method
+from puncture_twin.planning.registration.marker_noise import marker_noise
+from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs
 from puncture_twin.planning.registration.reading_noise import reading_noise
-from puncture_twin.planning.registration.registration import MIN_MARKERS, MarkerPairs, Method, Registration, register
+from puncture_twin.planning.registration.registration import Registration, register
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.straight_approach import TIP_MM, ApproachCheckers, why_not
 from puncture_twin.planning.touch.touch_plan import TouchPlan

@@ -18,8 +18,10 @@ from puncture_twin.planning.geometry.rigid import apply, exp_rotation, log_rotat
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed, aimed_fit
 from puncture_twin.planning.registration.fit_map import differenced_map
+from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.planning.registration.registration import MarkerPairs, fit_rigid, register
+from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.uncertainty.pose_error import pose_error
 from puncture_twin.twin.rehearsal.rooms import draw_rooms
 

@@ -5,7 +5,9 @@ import pytest
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply, exp_twist
-from puncture_twin.planning.registration.registration import MarkerPairs, fit_rigid, register
+from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs
+from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.registration.residual_test import FALSE_ALARM, odd_marker
 
 T_BASE_CT = exp_twist(np.array([300.0, -50.0, 100.0, 0.3, -0.2, 1.0]))

@@ -12,14 +12,9 @@ from puncture_twin.planning.formats.points.point_files import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.conditioning import leverage
-from puncture_twin.planning.registration.registration import (
-    MarkerPairs,
-    fit_affine,
-    fit_rigid,
-    fit_triad,
-    match,
-    register,
-)
+from puncture_twin.planning.registration.fits import fit_affine, fit_rigid, fit_triad
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
+from puncture_twin.planning.registration.registration import register
 
 TARGET = np.array([10.0, 20.0, 30.0])
 NAMES = ("a", "b", "c", "d")

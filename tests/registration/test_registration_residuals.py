@@ -8,7 +8,9 @@ from scipy.stats import chi2
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.checks.marker_ambiguity import rigid_rss
-from puncture_twin.planning.registration.registration import MarkerPairs, fit_rigid, register
+from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs
+from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.registration.residual_test import DOUBT, MIN_FLE_MM, ResidualTest
 from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_2
 

@@ -5,7 +5,9 @@ import pytest
 
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.registration.checks.squareness import PLANES, check_squareness
-from puncture_twin.planning.registration.registration import MarkerPairs, fit_rigid, register
+from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs
+from puncture_twin.planning.registration.registration import register
 from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_4
 
 TARGET = np.array(TABLE_1["M"], float)

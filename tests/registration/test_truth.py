@@ -19,8 +19,9 @@ from puncture_twin.planning.case.registration_section import MarkerSection
 from puncture_twin.planning.case.settings import Needle, RobotSettings, SearchSettings
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
 from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.planning.registration.registration import fit_rigid, fit_triad, leverage
+from puncture_twin.planning.registration.registration import leverage
 from puncture_twin.twin.plant.truth import MarkerNoise, draw_truth, registration_error
 
 MESHES = ROOT / "meshes"

@@ -9,7 +9,8 @@ from uncertainty_world import NO_ARM, SLICES, declared, world
 
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.registration.conditioning import leverage
-from puncture_twin.planning.registration.registration import MarkerPairs, register
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs
+from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.uncertainty.pose_error import error_budget
 from puncture_twin.twin.rehearsal.rooms import draw_rooms
 

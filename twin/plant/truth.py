@@ -15,7 +15,8 @@ from puncture_twin.planning.case.registration_section import MarkerSection
 from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.registration import MIN_MARKERS, MarkerPairs, fit_rigid, fit_triad, match
+from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
+from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, match
 
 COLLINEAR = 0.01
 """s2/s1 of the true points below which they leave a rotation free."""

@@ -15,8 +15,8 @@ from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
+from puncture_twin.planning.registration.marker_noise import touches
 from puncture_twin.planning.registration.noise_test import NoiseTest
-from puncture_twin.planning.registration.placement import touches
 from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.search.bending.insertion import insertion_along
 from puncture_twin.planning.search.context import CaseContext

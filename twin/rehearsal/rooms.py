@@ -20,9 +20,9 @@ from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.aim_correction import aimed_fit
-from puncture_twin.planning.registration.fit_map import design, fit_joint, fit_weighted, least_squares_map
+from puncture_twin.planning.registration.fit_map import design, least_squares_map
+from puncture_twin.planning.registration.fits import fit_joint, fit_rigid, fit_triad, fit_weighted
 from puncture_twin.planning.registration.reading_noise import ReadingNoise, parameter_variances
-from puncture_twin.planning.registration.registration import fit_rigid, fit_triad
 from puncture_twin.planning.uncertainty.pose_error import Bend
 from puncture_twin.twin.plant.true_needle import TrueNeedle, driven_onto, true_needle
 

@@ -19,8 +19,9 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.checks.skin_fit import SkinFit, kept_skin_fit
-from puncture_twin.planning.registration.registration import Registration, fit_rigid
-from puncture_twin.planning.registration.touching import place_excluded, untouchable
+from puncture_twin.planning.registration.checks.touching import place_excluded, untouchable
+from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.registration import Registration
 
 Signs = tuple[float, float, float]
 

@@ -16,7 +16,8 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.registration import MarkerPairs, fit_rigid
+from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 
 MAX_NUMBERS = 20_000_000
 """Of one table of beginnings (160 MB): sets that are more alike than that are tested for swaps of two names only."""

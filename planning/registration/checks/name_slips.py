@@ -13,8 +13,8 @@ from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.registration.checks.marker_ambiguity import Renaming, renamings
+from puncture_twin.planning.registration.checks.touching import place_excluded
 from puncture_twin.planning.registration.registration import Registration
-from puncture_twin.planning.registration.touching import place_excluded
 
 ALLOWED_NAMES = (
     "markers without a symmetry, fle_mm as small as it is known, or registration.accept_symmetry = true once the "

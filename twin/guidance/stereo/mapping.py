@@ -17,7 +17,8 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
 from puncture_twin.planning.geometry.rigid import apply, rotated_about
 from puncture_twin.planning.registration.conditioning import Conditioning
-from puncture_twin.planning.registration.registration import MarkerPairs, register
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs
+from puncture_twin.planning.registration.registration import register
 
 MAX_ITERATIONS = 20
 CONVERGED = 1e-12

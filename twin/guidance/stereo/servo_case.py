@@ -20,7 +20,7 @@ from puncture_twin.planning.formats.points import point_files as points
 from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit
-from puncture_twin.planning.registration.registration import MIN_MARKERS
+from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors, declared_errors
 from puncture_twin.twin.guidance.stereo.errors_section import ServoErrorsSection, ServoRehearsalSection
 

@@ -16,7 +16,8 @@ from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.formats.points.point_files import NamedPoints, write_points
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.registration import MIN_MARKERS, Registration
+from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
+from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.selection.choice import Choice, choose, chosen_angles
 from puncture_twin.planning.touch.puncture import registered_joints

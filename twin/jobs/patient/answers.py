@@ -29,16 +29,11 @@ from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.registration.advice import OneMore, odd_branches, one_more, without_each
 from puncture_twin.planning.registration.checks.marker_check import checked_placement
 from puncture_twin.planning.registration.checks.squareness import Squareness, check_squareness
+from puncture_twin.planning.registration.checks.touching import touchable_points
+from puncture_twin.planning.registration.fits import rigid_fre
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
-from puncture_twin.planning.registration.registration import (
-    LEAST_FOUND_MM,
-    MarkerPairs,
-    Registration,
-    match,
-    register,
-    rigid_fre,
-)
-from puncture_twin.planning.registration.touching import touchable_points
+from puncture_twin.planning.registration.registration import LEAST_FOUND_MM, Registration, register
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation

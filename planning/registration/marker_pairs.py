@@ -1,0 +1,110 @@
+"""The same markers in the CT and at the robot, paired by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.points.point_files import NamedPoints
+
+MIN_MARKERS = 3
+"""Two points leave a rotation free."""
+
+COLLINEAR = 0.01
+"""Second over first singular value of the centred markers below which they count as one line."""
+
+UNIT_SLIP = 5.0
+"""Ratio of the two marker sets' spreads from which on a unit (mm, cm, m) is wrong, not a measurement."""
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerPairs:
+    """The same markers in both frames, matched by name; shapes (n, 3), mm.
+
+    Joints: how the arm stood at each touch, shape (n, 6), rad, where the file has them.
+    """
+
+    names: tuple[str, ...]
+    points_ct: Floats
+    points_base: Floats
+    joints: Floats | None = None
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def match(
+    markers_ct: NamedPoints,
+    markers_base: NamedPoints,
+    *,
+    use: tuple[str, ...] | None,
+    where: str | Path = "registration",
+) -> MarkerPairs:
+    """Pair markers by name.
+
+    Args:
+        markers_ct: Markers in the CT frame.
+        markers_base: Markers in the base frame.
+        use: The names to use, in this order; None demands the same names on both sides.
+        where: What errors name.
+
+    Raises:
+        InputError: A name that one side lacks, or fewer than three markers.
+    """
+    names = markers_ct.names if use is None else use
+    for side, points, other in (
+        ("CT", markers_ct, markers_base),
+        ("base", markers_base, markers_ct),
+    ):
+        wanted = set(names) if use is not None else set(other.names)
+        missing = sorted(wanted - set(points.names))
+        if missing:
+            raise InputError(
+                f"{', '.join(missing)} missing on the {side} side",
+                where=where,
+                allowed="the same names on both sides, or registration.use = [names]",
+            )
+    if len(set(names)) < len(names):
+        raise InputError(f"names repeat: {', '.join(names)}", where=where, allowed="unique names")
+    rows_ct = [markers_ct.names.index(name) for name in names]
+    rows_base = [markers_base.names.index(name) for name in names]
+    joints = None if markers_base.joints is None else markers_base.joints[rows_base]
+    return MarkerPairs(tuple(names), markers_ct.points[rows_ct], markers_base.points[rows_base], joints)
+
+
+def check_pairs(markers: MarkerPairs, where: str | Path) -> None:
+    """Whether markers can be fitted at all.
+
+    Raises:
+        InputError: Fewer than three, not finite, on a line, or of two sizes.
+    """
+    if len(markers) < MIN_MARKERS:
+        raise InputError(f"{len(markers)} markers", where=where, allowed="3 or more, by the same names")
+    both = np.concatenate([markers.points_ct, markers.points_base])
+    if not np.isfinite(both).all():
+        bad = [n for n, a, b in zip(markers.names, markers.points_ct, markers.points_base, strict=True)
+               if not np.isfinite([a, b]).all()]  # fmt: skip
+        raise InputError(f"marker {', '.join(bad)} is not finite", where=where, allowed="finite mm")
+    spreads = [_singular_values(points) for points in (markers.points_ct, markers.points_base)]
+    for side, values in zip(("CT", "base"), spreads, strict=True):
+        if values[0] == 0 or values[1] / values[0] < COLLINEAR:
+            raise InputError(
+                f"markers {', '.join(markers.names)} are collinear on the {side} side",
+                where=where,
+                allowed="three markers that span a triangle",
+            )
+    ratio = float(np.linalg.norm(spreads[1]) / np.linalg.norm(spreads[0]))
+    if not 1 / UNIT_SLIP < ratio < UNIT_SLIP:
+        raise InputError(
+            f"base markers spread {ratio:.3g} times as wide as the CT's: a likely mm/cm/m slip",
+            where=where,
+            allowed="both sides in mm",
+        )
+
+
+def _singular_values(points: Floats) -> Floats:
+    return np.asarray(np.linalg.svd(points - points.mean(axis=0), compute_uv=False))
