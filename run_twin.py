@@ -628,18 +628,30 @@ def scan(
     rehearsal: Annotated[
         Path | None, typer.Option("--rehearsal", metavar="rehearsal.json", help="Its needle in a control CT.")
     ] = None,
+    arms: Annotated[
+        str,
+        typer.Option(
+            "--arms", metavar="none|beside|pressed|across", help="Beside the trunk, pressed against it, or across it."
+        ),
+    ] = "none",
+    bed: Annotated[
+        str,
+        typer.Option("--bed", metavar="none|flat|curved|pad", help="Mattress on a flat table, curved table, or gel."),
+    ] = "none",
+    lines: Annotated[int, typer.Option("--lines", min=0, max=12, help="Tubes and cables over the skin.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Scan a case with a virtual CT; write DICOM, NIfTI, labels, and what is read off it beside the truth."""
     from math import radians
 
     from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.experiment.scan_beside import parse_beside
     from puncture_twin.twin.jobs.experiment.scan_job import ScanRequest, parse_marker, scan_case
     from puncture_twin.twin.jobs.experiment.scan_text import scan_text
     from puncture_twin.twin.plant.scanner.image import ScanSettings
 
     settings = ScanSettings(spacing, pixel, noise, seed=seed, fov_mm=fov, length_mm=length, turn=radians(turn))
-    request = ScanRequest(settings, parse_marker(marker), rehearsal)
+    request = ScanRequest(settings, parse_marker(marker), rehearsal, parse_beside(arms, bed, lines))
     with progress_display() as progress:
         run = scan_case(prepare(case, arm=False, watcher=progress), _out(out_dir, case, "scan"), request)
     print_answer(run.summary(), scan_text(run), as_json)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.formats.meshes.ply_writer import ply_bytes
 from puncture_twin.twin.phantoms import abdomen, carton, guidance, head
 
 __all__ = ["ply_bytes", "points_csv", "write_phantoms"]
@@ -46,18 +46,6 @@ def write_phantoms(folder: Path, report: Callable[[str], None] = lambda _: None)
         for path in [str(entry["path"]) for entry in entries] + ["manifest.json"]:
             (folder / path).parent.mkdir(exist_ok=True)
             (staging / path).replace(folder / path)
-
-
-def ply_bytes(mesh: TriangleMesh) -> bytes:
-    """A mesh as a little-endian binary PLY: float32 vertices, int32 faces."""
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(mesh.vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
-    faces["count"], faces["index"] = 3, mesh.faces
-    return header.encode("ascii") + mesh.vertices.astype("<f4").tobytes() + faces.tobytes()
 
 
 def points_csv(points: dict[str, Floats], decimals: int, joints_deg: dict[str, Floats] | None = None) -> bytes:

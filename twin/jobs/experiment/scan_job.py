@@ -26,7 +26,9 @@ from puncture_twin.twin.guidance.ct.markers import READING_MM, Markers, find_mar
 from puncture_twin.twin.guidance.ct.metal import METAL_HU
 from puncture_twin.twin.guidance.ct.needle import FoundNeedle, find_needle, needle_error
 from puncture_twin.twin.jobs.experiment.result_file import write_result
+from puncture_twin.twin.jobs.experiment.scan_beside import beside_summary, write_beside
 from puncture_twin.twin.jobs.experiment.scan_picture import Shown, draw_scan
+from puncture_twin.twin.plant.beside.beside import Beside
 from puncture_twin.twin.plant.scanner.case_scene import CaseScene, MarkerKind, TrueRod, case_scene, label_layers
 from puncture_twin.twin.plant.scanner.dicom_writer import write_series
 from puncture_twin.twin.plant.scanner.field_of_view import scan_grid
@@ -44,11 +46,19 @@ SUB_VOXEL_SD = 0.15
 
 
 class ScanRequest(NamedTuple):
-    """What the user asks for: how to scan, what stands at the markers' places, and a rehearsal with its needle."""
+    """What the user asks for.
+
+    Attributes:
+        settings: How to scan.
+        marker: What stands at the markers' places.
+        rehearsal: Its needle is shown in a control CT.
+        beside: What lies beside the patient.
+    """
 
     settings: ScanSettings
     marker: MarkerKind = "disc"
     rehearsal: Path | None = None
+    beside: Beside | None = None
 
 
 def parse_marker(text: str) -> MarkerKind:
@@ -108,6 +118,7 @@ class ScanRun:
             "markers": list(self._markers()),
             "lesion": {"true_mm": true.tolist(), "found_mm": found.tolist(), "error_mm": (found - true).tolist()},
             "needle": None if self.control is None else control_summary(self.control),
+            "beside": beside_summary(self.scene.beside),
             "thin_voxels": dict(self.image.thin),
             "inputs": inputs_document(self.inputs),
             "files": [str(path) for path in self.files],
@@ -178,15 +189,23 @@ def scan_case(context: CaseContext, out: Path, request: ScanRequest) -> ScanRun:
 def _scanned(context: CaseContext, request: ScanRequest) -> ScanRun:
     case, settings = context.case, request.settings
     rng = np.random.default_rng(settings.seed)
+    _refuse_two_beds(context, request)
     needle, read = _rehearsed(request.rehearsal)
     rod = None if needle is None else needle[0]
-    scene = case_scene(case, context.anatomy, settings, rng, marker=request.marker, needle=rod)
+    scene = case_scene(case, context.anatomy, settings, rng, marker=request.marker, needle=rod, beside=request.beside)
     image = scan_solids(scene.solids, scan_grid(scene, settings, rng), settings, rng)
     volume = Volume(image.hu, image.grid.T_ct_index, case.path)
     markers = None if scene.listed is None else find_markers(volume, scene.listed)
     lesion = _lesion(context, scene, image, volume)
     control = None if needle is None else _control(scene, volume, case.needle.diameter_mm, *needle)
     return ScanRun(context, request, scene, image, markers, lesion, control, (*read, *case.inputs))
+
+
+def _refuse_two_beds(context: CaseContext, request: ScanRequest) -> None:
+    own = [one.name for one in context.case.obstacles if one.frame == "ct"]
+    if own and request.beside is not None and request.beside.bed != "none":
+        what = f"the case has what stands in the scanner: {', '.join(own)}"
+        raise InputError(what, where="--bed", allowed="none, or a case without obstacles in the frame ct")
 
 
 def _lesion(context: CaseContext, scene: CaseScene, image: CtImage, volume: Volume) -> tuple[Floats, Floats]:
@@ -241,6 +260,7 @@ def _write(run: ScanRun, folder: Path) -> Iterator[Path]:
     if run.markers is not None:
         write_points(folder / FOUND, run.markers.fine)
         yield folder / FOUND
+    yield from write_beside(run.scene.beside, folder)
     found = None if run.markers is None else run.markers.fine
     needle = None if run.control is None else run.control.found
     yield draw_scan(image, Shown(run.scene.target, found, needle, case.needle.shaft_mm), folder / PICTURE)

@@ -24,6 +24,7 @@ def scan_text(run: ScanRun) -> str:
             *_marker_lines(facts),
             f"  {'lesion':<15}{_vector(facts['lesion']['error_mm'])}   read against true",
             *_needle_lines(facts["needle"]),
+            *_beside_lines(facts["beside"]),
             *_thin_lines(facts["thin_voxels"]),
             f"next: run-twin init {folder} --ct {SERIES} --target={target}",
         ]
@@ -63,6 +64,15 @@ def _needle_lines(needle: dict[str, Any] | None) -> list[str]:
         "so that the "
         f"tip was read {needle['tip_reading_error_mm']:.2f} mm and {needle['angle_reading_error_deg']:.2f}° off",
     ]
+
+
+def _beside_lines(parts: list[dict[str, Any]]) -> list[str]:
+    shown = ", ".join(one["name"] for one in parts if one["place"] != "within" and not one["name"].endswith(INSIDE))
+    return [f"  beside         {shown}: surfaces in beside/"] if shown else []
+
+
+INSIDE = ("_core", "_foam")
+"""Ends of the names of what fills a line or a bed."""
 
 
 def _thin_lines(thin: dict[str, int]) -> list[str]:

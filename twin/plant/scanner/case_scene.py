@@ -19,6 +19,8 @@ from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.registration.checks.skin_fit import skin_fit
+from puncture_twin.twin.plant.beside.beside import Beside, lay_beside
+from puncture_twin.twin.plant.beside.tubes import Part
 from puncture_twin.twin.plant.scanner.hounsfield import (
     FOAM_HU,
     METAL_HU,
@@ -55,7 +57,8 @@ class CaseScene:
         T_scan_ct: Shape (4, 4): the case's frame to the scanner's; a rotation, never a mirror.
         skin: The body's surface.
         cut: Shape (3, 2): at which ends the body goes on beyond its surface.
-        tables: Shape (2, 3): the box about what stands in the CT's frame, such as a table; infinite without any.
+        tables: Shape (2, 3): the box about what the patient lies on; infinite without any.
+        beside: What was laid beside the patient.
         markers: True positions, or None.
         listed: The case's own readings of them.
         target: Shape (3,).
@@ -66,6 +69,7 @@ class CaseScene:
     skin: TriangleMesh
     cut: Bools
     tables: Floats
+    beside: tuple[Part, ...]
     markers: NamedPoints | None
     listed: NamedPoints | None
     target: Floats
@@ -79,6 +83,7 @@ def case_scene(
     *,
     marker: MarkerKind = "disc",
     needle: TrueRod | None = None,
+    beside: Beside | None = None,
 ) -> CaseScene:
     """Lay a case into the scanner.
 
@@ -89,6 +94,7 @@ def case_scene(
         rng: Draws where in its cell each marker truly is.
         marker: What stands at each marker's place.
         needle: Drawn of metal, its usable length.
+        beside: Arms, bed and lines to lay beside the patient.
 
     Raises:
         InputError: A structure's surface is open.
@@ -96,22 +102,28 @@ def case_scene(
     T = scan_frame(case, settings.turn)
     listed = None if marker == "none" else _listed_markers(case)
     true = None if listed is None else _drawn_in_cells(case, listed, settings, rng)
-    solids = [*_tables(case), *_body(case, anatomy)]
+    skin = anatomy.skin.mesh.transformed(T)
+    target = apply(T, case.target_ct)
+    laid = () if beside is None else lay_beside(skin, float(target[2]), beside, rng)
+    solids = _body(case, anatomy)
     if true is not None:
         solids += _markers(true, skin_fit(true.points, anatomy.skin).normals_ct, marker)
     if needle is not None:
         start = needle.tip_ct - case.needle.shaft_mm * needle.forward_ct
         solids.append(Solid("needle", rod(start, needle.tip_ct, case.needle.diameter_mm), METAL_HU))
+    tables, (body, *rest) = _moved_solids(_tables(case), T), _moved_solids(solids, T)
+    beneath, upon, within = (_laid(laid, place) for place in ("beneath", "upon", "within"))
     view = anatomy.skin.field_of_view
     return CaseScene(
-        solids=tuple(one._replace(mesh=one.mesh.transformed(T)) for one in solids),
+        solids=(*tables, *beneath, *upon, body, *within, *rest),
         T_scan_ct=T,
-        skin=anatomy.skin.mesh.transformed(T),
+        skin=skin,
         cut=np.zeros((3, 2), np.bool_) if view is None else view.cut,
-        tables=_bounds([one.mesh.transformed(T) for one in _tables(case)]),
+        tables=_bounds([one.mesh for one in (*tables, *beneath)]),
+        beside=laid,
         markers=_moved(true, T),
         listed=_moved(listed, T),
-        target=apply(T, case.target_ct),
+        target=target,
     )
 
 
@@ -187,6 +199,15 @@ def _tables(case: Case) -> list[Solid]:
             if one.size_mm.min() > 2 * SHELL_MM:
                 solids.append(Solid(one.name, box(one.center_mm, one.size_mm - 2 * SHELL_MM), FOAM_HU))
     return solids
+
+
+def _laid(parts: Sequence[Part], place: str) -> list[Solid]:
+    """What lies in one place; no segmentation names it."""
+    return [Solid(one.name, one.mesh, one.hu) for one in parts if one.place == place]
+
+
+def _moved_solids(solids: Sequence[Solid], T_scan_ct: Floats) -> list[Solid]:
+    return [one._replace(mesh=one.mesh.transformed(T_scan_ct)) for one in solids]
 
 
 def _listed_markers(case: Case) -> NamedPoints | None:

@@ -11,7 +11,7 @@ from puncture_twin.twin.plant.scanner.case_scene import CaseScene
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 
 AIR_MM = 15.0
-"""Air around the body: a needle's entry is not at the image's edge."""
+"""Air around the body, and about arms and lines: a needle's entry is not at the image's edge."""
 TABLE_MM = 100.0
 """Beside and behind the body, so much of a table is shown: where the image cuts it, what is beyond is not known."""
 MOST_VOXELS = 200_000_000
@@ -51,6 +51,10 @@ def _shown(scene: CaseScene, settings: ScanSettings) -> tuple[Floats, Floats]:
     low, high = scene.skin.bounds
     low = low - np.where(scene.cut[:, 0], 0.0, AIR_MM)
     high = high + np.where(scene.cut[:, 1], 0.0, AIR_MM)
+    for one in scene.beside:
+        if one.place == "upon":
+            low[:2] = np.minimum(low[:2], one.mesh.bounds[0, :2] - AIR_MM)
+            high[:2] = np.maximum(high[:2], one.mesh.bounds[1, :2] + AIR_MM)
     for axis in (0, 1):
         low[axis] = min(low[axis], max(scene.tables[0, axis] - AIR_MM, low[axis] - TABLE_MM))
         high[axis] = max(high[axis], min(scene.tables[1, axis] + AIR_MM, high[axis] + TABLE_MM))

@@ -1,0 +1,110 @@
+"""What a safe needle truly passes: its axis against the true surfaces, triangle by triangle, without the product."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+STEP_MM = 0.5
+PER_MM2 = 1.5
+"""Samples of a surface: on average less than a millimetre apart."""
+
+
+class Passed(NamedTuple):
+    """What the axis of one needle passes.
+
+    Attributes:
+        part: Its name.
+        row: Of the needle.
+        deepest_mm: How deep within the part, and beyond the trunk's skin, the axis runs.
+        long_mm: How far.
+    """
+
+    part: str
+    row: int
+    deepest_mm: float
+    long_mm: float
+
+
+def crossings(mesh, origin, directions):
+    """Where rays from one point cross a surface, shape (rows, triangles), NaN elsewhere; + where they leave it."""
+    a, b, c = np.moveaxis(np.asarray(mesh.vertices)[np.asarray(mesh.faces)], 1, 0)
+    normal, off = np.cross(b - a, c - a), a - origin
+    leaves = directions @ normal.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = np.sum(off * normal, axis=1) / leaves
+        hit = origin + at[..., None] * directions[:, None]
+        inside = np.ones(at.shape, bool)
+        for p, q in ((a, b), (b, c), (c, a)):
+            inside &= np.einsum("rti,ti->rt", np.cross(q - p, hit - p), normal) >= 0
+    return np.where(inside & (at > 0), at, np.nan), np.sign(leaves)
+
+
+def inside(mesh, origin, directions, depths):
+    """Whether points along rays lie in a closed surface, shape (rows, depths): by the crossings beyond each."""
+    found = np.zeros((len(directions), len(depths)), int)
+    for rows in np.array_split(np.arange(len(directions)), max(1, len(directions) // 20)):
+        at, way = crossings(mesh, origin, directions[rows])
+        for one, (where, sign) in enumerate(zip(at, way, strict=True)):
+            known = np.isfinite(where)
+            order = np.argsort(where[known])
+            beyond = np.concatenate([np.cumsum(sign[known][order][::-1])[::-1], [0.0]])
+            found[rows[one]] = beyond[np.searchsorted(where[known][order], depths, side="right")]
+    return found != 0
+
+
+class Distances:
+    """Distances from a surface, by samples of it: never too short, too long by a fraction of a millimetre."""
+
+    def __init__(self, mesh):
+        one = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        count = int(np.clip(PER_MM2 * one.area, 1000, 400_000))
+        self.tree = cKDTree(np.concatenate([trimesh.sample.sample_surface(one, count, seed=0)[0], mesh.vertices]))
+
+    def __call__(self, points):
+        """Of points (..., 3)."""
+        return self.tree.query(points)[0]
+
+
+def passed(parts, skin, origin, directions, lengths):
+    """What needles pass outside of the trunk.
+
+    Args:
+        parts: Name to closed surface.
+        skin: The trunk's.
+        origin: The target.
+        directions: Outward, shape (n, 3).
+        lengths: Of the axes, from the target on, shape (n,).
+    """
+    found = []
+    if not len(directions):
+        return found
+    depths = np.arange(0.0, lengths.max(), STEP_MM)
+    outside = ~inside(skin, origin, directions, depths) & (depths <= lengths[:, None])
+    for name, mesh in parts.items():
+        within = inside(mesh, origin, directions, depths) & outside
+        rows = np.flatnonzero(within.any(axis=1))
+        if not len(rows):
+            continue
+        to_part, to_skin = Distances(mesh), Distances(skin)
+        for row in rows:
+            points = origin + depths[within[row], None] * directions[row]
+            deepest = np.minimum(to_part(points), to_skin(points)).max()
+            found.append(Passed(name, int(row), float(deepest), float(STEP_MM * within[row].sum())))
+    return found
+
+
+def lacks(mesh, origin, directions, lengths, wanted_mm):
+    """By how much needles from the target to the skin lack clearance, mm, shape (n,); 0 where they do not."""
+    to = Distances(mesh)
+    found = np.zeros(len(directions))
+    for row, (direction, length) in enumerate(zip(directions, lengths, strict=True)):
+        depths = np.arange(0.0, length, STEP_MM)
+        near = to(origin + depths[:, None] * direction).min()
+        if inside(mesh, origin, direction[None], depths).any():
+            near = 0.0
+        found[row] = max(0.0, wanted_mm - near)
+    return found

@@ -1,0 +1,2 @@
+from .beside import Beside as Beside, lay_beside as lay_beside
+from .tubes import Part as Part
