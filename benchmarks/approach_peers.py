@@ -35,9 +35,9 @@ from puncture_twin.planning.arm.inverse_kinematics import wrapped_solutions
 from puncture_twin.planning.collision.bodies import NEVER_TESTED
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.motion import approach
 from puncture_twin.planning.motion.path_check import dense_states, first_contact, path_length
 from puncture_twin.planning.motion.rrt_connect import RANGE_RAD, Connected
+from puncture_twin.planning.motion.shortest import MAX_SAMPLES, Task, shortest_path
 
 Array = np.ndarray
 RUNNER = Path(__file__).with_name("peer_planners.py")
@@ -47,7 +47,7 @@ CARRIED = {"holder": "wrist_3", "needle": "wrist_3"}
 STATES = 300
 """Asked about, so that it is the same room that they plan in."""
 
-ITERATIONS = approach.MAX_SAMPLES
+ITERATIONS = MAX_SAMPLES
 """Of pybullet-planning, beside its limit of time."""
 
 
@@ -104,7 +104,7 @@ def turned(checker: FastChecker, goals: Array) -> Array:
 
 def ours(checker: FastChecker, home: Array, goals: Array, seed: int) -> Array | None:
     """The search alone, as :func:`plan_approach` begins; None without a way."""
-    found = approach._shortest(checker, checker.segment_checker(), home, goals, seed, approach.MAX_SAMPLES)
+    found = shortest_path(Task(checker.model.joint_limits, checker.segment_checker(), home, goals), seed=seed)
     return None if isinstance(found, Connected) else found.waypoints
 
 

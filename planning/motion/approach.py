@@ -10,7 +10,6 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +22,7 @@ from puncture_twin.planning.collision.checker import Contact, StateChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.segments import halving_order
 from puncture_twin.planning.motion.follow import follow, rounded
+from puncture_twin.planning.motion.joint_space import SegmentContact
 from puncture_twin.planning.motion.path_check import (
     MAX_SWEEP_MM,
     dense_states,
@@ -30,7 +30,8 @@ from puncture_twin.planning.motion.path_check import (
     least_clearance,
     path_length,
 )
-from puncture_twin.planning.motion.rrt_connect import Connected, SegmentContact, connect
+from puncture_twin.planning.motion.rrt_connect import Connected
+from puncture_twin.planning.motion.shortest import MAX_SAMPLES, RUNS, Task, shortest_path
 from puncture_twin.planning.motion.trajectory import Trajectory
 
 __all__ = [
@@ -52,19 +53,6 @@ RESOLUTION_RAD = 0.05
 FINER = 10
 """The check of the finished trajectory is this many times finer, and no body moves more than ``MAX_SWEEP_MM`` between
 its states."""
-
-MAX_SAMPLES = 6000
-"""Of the planner, in each run: in a free room tens of them do, beside a gantry it may take thousands; all of them take
-it one to two seconds."""
-
-PATIENCE, LEAST_SAMPLES = 4, 500
-"""A run for a shorter path gets so many times the samples that the first one took, or at least so many."""
-
-RUNS = 3
-"""Of the planner, while it might find a path that is much shorter; see ``SHORT_ENOUGH``."""
-
-SHORT_ENOUGH = 1.3
-"""No run seeks a path shorter than one that is this many times as long as the straight line to the nearest goal."""
 
 ATTEMPTS = 6
 """Ways that the finer check may refuse; for FCL alone each next one is planned at half the resolution."""
@@ -107,17 +95,6 @@ class Approach:
             array.setflags(write=False)
 
 
-class _Path(NamedTuple):
-    """Straight segments from home to a goal."""
-
-    waypoints: Floats
-    goal_index: int
-
-    @property
-    def length(self) -> float:
-        return path_length(self.waypoints)
-
-
 def plan_approach(
     checker: StateChecker,
     q_home: Floats,
@@ -148,7 +125,8 @@ def plan_approach(
     refused = ""
     for attempt in range(ATTEMPTS):
         contact_of = _segment_check(checker, RESOLUTION_RAD / 2**attempt)
-        path = _shortest(checker, contact_of, home, goals[open_goals], seed + RUNS * attempt, max_samples)
+        task = Task(checker.model.joint_limits, contact_of, home, goals[open_goals])
+        path = shortest_path(task, seed=seed + RUNS * attempt, max_samples=max_samples)
         if isinstance(path, Connected):
             raise NoAnswerError(_why_none(path, len(goals), len(open_goals), seed) + refused)
         cuts = _cuts(contact_of, path.waypoints)
@@ -181,35 +159,6 @@ def _segment_check(checker: StateChecker, resolution_rad: float) -> SegmentConta
         return first_contact(checker, states)
 
     return sampled
-
-
-def _shortest(
-    checker: StateChecker, contact_of: SegmentContact, home: Floats, goals: Floats, seed: int, max_samples: int
-) -> _Path | Connected:
-    """The shortest path found to any goal, or the run that found none.
-
-    No path is shorter than the straight line to its goal, so once there is one, only goals nearer than it is long are
-    sought.
-    """
-    away = np.linalg.norm(goals - home, axis=1)
-    nearest_first = np.argsort(away, kind="stable")
-    straight = (goal for goal in nearest_first.tolist() if contact_of(home, goals[goal]) is None)
-    goal = next(straight, None)
-    best = None if goal is None else _Path(np.stack([home, goals[goal]]), goal)
-    for run in range(RUNS):
-        sought = nearest_first if best is None else nearest_first[away[nearest_first] * SHORT_ENOUGH < best.length]
-        if len(sought) == 0:
-            break
-        found = connect(
-            checker.model.joint_limits, contact_of, home, goals[sought], seed=seed + run, max_samples=max_samples
-        )
-        if found.waypoints is None:
-            return found if best is None else best
-        max_samples = min(max_samples, max(LEAST_SAMPLES, PATIENCE * found.samples))
-        path = _Path(found.waypoints, int(sought[found.goal_index]))
-        best = path if best is None or path.length < best.length else best
-    assert best is not None  # the first run has returned without one
-    return best
 
 
 def _cuts(contact_of: SegmentContact, waypoints: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""RRT-Connect and its shortcuts, by OMPL, over straight joint segments that somebody else checks.
+"""RRT-Connect, by OMPL, over straight joint segments that somebody else checks.
 
 Source: Kuffner and LaValle 2000, "RRT-Connect: an efficient approach to single-query path planning".
 
@@ -9,30 +9,24 @@ OMPL keeps one random generator for the whole process and reseeds it here; two p
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
-from ompl import base as ob, geometric as og, util as ou
+from ompl import base as ob, geometric as og
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.checker import Contact
+from puncture_twin.planning.motion.joint_space import Angles, JointSpace, SegmentContact, angles_of, seeded
+from puncture_twin.planning.motion.shortcuts import shortened
 
-SegmentContact = Callable[[Floats, Floats], Contact | None]
-"""What the straight joint segment between two states (6,) meets; None when it is free, its end included. Of a segment
-that begins at a state known to be free the check gets that state first."""
-
-RANGE_RAD = 0.5
-"""Longest branch of the planner's trees."""
+RANGE_RAD = 1.0
+"""Longest branch of the planner's trees, with the wrist's joints counted for half."""
 
 END_TOLERANCE_RAD = 1e-9
 """How far the planner's ends may be from home and goal: rounding."""
-
-SEEDS = 2**31 - 1
-"""OMPL takes positive seeds; 0 would mean its own choice."""
 
 HOME_TREE, GOAL_TREE = 0, 1
 """The planner's two trees."""
@@ -59,80 +53,97 @@ class Connected(NamedTuple):
     """What its segments touched, and how often."""
 
 
-def connect(
-    joint_limits: Floats, contact_of: SegmentContact, home: Floats, goals: Floats, *, seed: int, max_samples: int
-) -> Connected:
+class Limits(NamedTuple):
+    """Where a run looks, and when it stops."""
+
+    bounds: Floats
+    """Shape (6, 2), rad: where samples are drawn; home and goals lie in it."""
+    max_samples: int
+    """After so many the planner gives up."""
+    shorter_than: float = math.inf
+    """States through which no path to a goal is shorter than this, rad, are passed over unchecked."""
+
+
+def connect(contact_of: SegmentContact, home: Floats, goals: Floats, limits: Limits, *, seed: int) -> Connected:
     """Plan from home to any of several goals, and shorten what was found.
 
     Args:
-        joint_limits: Shape (6, 2), rad.
         contact_of: Checks a segment.
         home: Shape (6,), rad, free.
         goals: Shape (g, 6), rad, free.
+        limits: Where, and how long.
         seed: Of OMPL's generator.
-        max_samples: After so many the planner gives up.
 
     Raises:
         NoAnswerError: If the planner's path does not join home and a goal.
     """
-    with _quiet_ompl():
-        ou.RNG.setSeed(1 + seed % SEEDS)
-        information = ob.SpaceInformation(_space(joint_limits))
-        validator = _Validator(information, contact_of, home, goals)
-        information.setStateValidityChecker(_everything)  # a segment is checked with its end
-        information.setMotionValidator(validator)
-        information.setup()
-        problem = ob.ProblemDefinition(information)
-        problem.addStartState(_state(information, home))
-        goal_states = ob.GoalStates(information)
+    with seeded(seed):
+        space = JointSpace(limits.bounds)
+        validator = _Validator(space.information, contact_of, home, goals, limits)
+        space.set_up(validator)
+        problem = ob.ProblemDefinition(space.information)
+        problem.addStartState(space.state(home))
+        goal_states = ob.GoalStates(space.information)
         for goal in goals:
-            goal_states.addState(_state(information, goal))
+            goal_states.addState(space.state(goal))
         problem.setGoal(goal_states)
-        planner = og.RRTConnect(information)
-        planner.setRange(RANGE_RAD)
+        planner = _planner(space.information)
         planner.setProblemDefinition(problem)
         planner.setup()
-        planner.solve(ob.PlannerTerminationCondition(lambda: validator.next_sample(max_samples)))
+        planner.solve(ob.PlannerTerminationCondition(validator.next_sample))
         of_home, of_goals = validator.grown
         none = Connected(None, -1, of_home, of_goals, validator.samples, validator.blocked)
         if not problem.hasExactSolution():
             return none
-        path = problem.getSolutionPath()
-        _shorten(information, path)
-        found = np.array([_angles(state) for state in path.getStates()])
-    waypoints, goal_index = _with_exact_ends(found, home, goals)
-    return none._replace(waypoints=waypoints, goal_index=goal_index)
+        found = np.array([angles_of(state) for state in problem.getSolutionPath().getStates()])
+        waypoints, goal_index = _with_exact_ends(found, home, goals)
+        waypoints = shortened(limits.bounds, contact_of, waypoints)
+    return none._replace(waypoints=_with_exact_ends(waypoints, home, goals)[0], goal_index=goal_index)
+
+
+def _planner(information: ob.SpaceInformation) -> ob.Planner:
+    planner = og.RRTConnect(information)
+    planner.setRange(RANGE_RAD)
+    return planner
 
 
 class _Validator(ob.MotionValidator):  # type: ignore[misc]  # compiled, without types
-    """Hands segments to a check, and counts the contacts and how the trees grow.
+    """Hands segments to a check, and counts samples, contacts and how the trees grow.
 
     A free segment from a state of a tree makes its other end a state of that tree. OMPL asks about a branch of the tree
     from the goals the other way round, toward that tree.
     """
 
     def __init__(
-        self, information: ob.SpaceInformation, contact_of: SegmentContact, home: Floats, goals: Floats
+        self,
+        information: ob.SpaceInformation,
+        contact_of: SegmentContact,
+        home: Floats,
+        goals: Floats,
+        limits: Limits,
     ) -> None:
-        super().__init__(information)
-        self._contact_of = contact_of
-        self._tree_of = {tuple(goal): GOAL_TREE for goal in goals.tolist()} | {tuple(home.tolist()): HOME_TREE}
+        super().__init__(information)  # and not kept: it keeps the validator, and no one would free the two
+        self._contact_of, self._limits = contact_of, limits
+        self._home, self._goals = tuple(home.tolist()), [tuple(goal) for goal in goals.tolist()]
+        self._tree_of = dict.fromkeys(self._goals, GOAL_TREE) | {self._home: HOME_TREE}
         self._grew_at = [0, 0]
         self.samples = 0
         self.grown = [1, len(goals)]
         self.blocked: Counter[Contact] = Counter()
 
-    def next_sample(self, most: int) -> bool:
+    def next_sample(self) -> bool:
         """Counts the planner's samples; whether to stop instead, after so many or where a tree has stalled."""
-        if self.samples >= most or self.samples - min(self._grew_at) >= STALLED:
+        if self.samples >= self._limits.max_samples or self.samples - min(self._grew_at) >= STALLED:
             return True
         self.samples += 1
         return False
 
     def checkMotion(self, start: ob.State, end: ob.State) -> bool:  # noqa: N802  # OMPL's name
-        known, new = _angles(start), _angles(end)
+        known, new = angles_of(start), angles_of(end)
         if known not in self._tree_of:
             known, new = (new, known) if new in self._tree_of else (known, new)
+        if self._is_detour(new):
+            return False
         contact = self._contact_of(np.array(known), np.array(new))
         if contact is not None:
             self.blocked[contact] += 1
@@ -144,38 +155,10 @@ class _Validator(ob.MotionValidator):  # type: ignore[misc]  # compiled, without
             self.grown[tree] += 1
         return True
 
-
-def _everything(state: ob.State) -> bool:
-    return True
-
-
-def _angles(state: ob.State) -> tuple[float, ...]:
-    return state[0], state[1], state[2], state[3], state[4], state[5]  # beyond them OMPL reads garbage
-
-
-def _space(joint_limits: Floats) -> ob.RealVectorStateSpace:
-    bounds = ob.RealVectorBounds(6)
-    for joint, (low, high) in enumerate(joint_limits):
-        bounds.setLow(joint, float(low))
-        bounds.setHigh(joint, float(high))
-    space = ob.RealVectorStateSpace(6)
-    space.setBounds(bounds)
-    return space
-
-
-def _state(information: ob.SpaceInformation, q: Floats) -> ob.State:
-    state = information.allocState()
-    for joint in range(6):
-        state[joint] = float(q[joint])
-    return state
-
-
-def _shorten(information: ob.SpaceInformation, path: og.PathGeometric) -> None:
-    """Shortcuts by numbers of steps, never by time."""
-    simplifier = og.PathSimplifier(information)
-    simplifier.reduceVertices(path)
-    simplifier.partialShortcutPath(path)
-    simplifier.reduceVertices(path)
+    def _is_detour(self, q: Angles) -> bool:
+        """Whether no path by way of a state is short enough (Gammell, Srinivasa and Barfoot 2014)."""
+        left = self._limits.shorter_than - math.dist(self._home, q)
+        return left < math.inf and all(math.dist(q, goal) >= left for goal in self._goals)
 
 
 def _with_exact_ends(waypoints: Floats, home: Floats, goals: Floats) -> tuple[Floats, int]:
@@ -186,14 +169,3 @@ def _with_exact_ends(waypoints: Floats, home: Floats, goals: Floats) -> tuple[Fl
     if len(waypoints) < 2 or max(from_home, off[goal_index]) > END_TOLERANCE_RAD:
         raise NoAnswerError(f"the planner's path does not join home and goal: {from_home:.3g}, {off.min():.3g} rad off")
     return np.concatenate([home[None], waypoints[1:-1], goals[goal_index][None]]), goal_index
-
-
-@contextmanager
-def _quiet_ompl() -> Iterator[None]:
-    """OMPL's own messages off, then as before. Reseeding makes it complain; a test holds that it works all the same."""
-    level = ou.getLogLevel()
-    ou.setLogLevel(ou.LOG_NONE)
-    try:
-        yield
-    finally:
-        ou.setLogLevel(level)

@@ -26,7 +26,7 @@ from puncture_twin.planning.motion.path_check import (
     least_clearance,
     path_length,
 )
-from puncture_twin.planning.motion.rrt_connect import STALLED, connect
+from puncture_twin.planning.motion.rrt_connect import STALLED, Limits, connect
 from puncture_twin.planning.motion.timing import LENGTH_SLACK, Rates, reachable_speed, speed_change_length, time_law
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
 
@@ -227,7 +227,7 @@ def test_a_tree_that_never_grows_ends_the_search_early(shut_in: str) -> None:
         known.add(tuple(end))
         return None
 
-    found = connect(UR3.joint_limits, contact_of, LEFT, RIGHT[None], seed=1, max_samples=10 * STALLED)
+    found = connect(contact_of, LEFT, RIGHT[None], Limits(UR3.joint_limits, 10 * STALLED), seed=1)
     assert found.waypoints is None and found.samples == STALLED
     shut, open_ = (found.home_states, found.goal_states)[:: 1 if shut_in == "home" else -1]
     assert shut == 1 and open_ > 100 and shut + open_ == len(known)
