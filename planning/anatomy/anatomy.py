@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.anatomy.beyond_labels import BEYOND_LABELS, beyond_labels
+from puncture_twin.planning.anatomy.beyond_labels import beyond_labels
 from puncture_twin.planning.anatomy.body.support import support_warnings
 from puncture_twin.planning.anatomy.own_target import own_target
 from puncture_twin.planning.anatomy.scan import Scan
@@ -19,13 +18,11 @@ from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.sources import StructureSources
 from puncture_twin.planning.anatomy.structure import Role as Role, Structure as Structure
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.case_file import StructureSection
 from puncture_twin.planning.case.case_schema import count_difference
-from puncture_twin.planning.formats.meshes.mesh_files import mesh_warnings
+from puncture_twin.planning.formats.meshes.mesh_files import kept_mesh_warnings
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
@@ -110,13 +107,12 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     structures = [loader.one(section) for section in case.structure if section.role != "skin"]
     for section in case.structures:
         structures.extend(loader.many(section))
-    skin_section = _skin_section(case)
-    skin = loader.skin(skin_section)
+    skin = loader.skin(case.skin_section)
     _check_count(case, structures)
     _check_demands(case, structures)
     structures.extend(own_target(case))
     outside: tuple[Structure, ...] = ()
-    scan = loader.scan(skin_section, skin)
+    scan = loader.scan(case.skin_section, skin)
     if scan is None:
         loader.warnings.append(OUTSIDE_NOT_KNOWN)
     else:
@@ -128,21 +124,14 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
         if case.ct.trust_labels:
             loader.warnings.append(LABELS_TRUSTED)
         structures.extend(_unnamed(case, scan, structures))
-    structures.extend(_beyond(case, skin, structures, loader.warnings))
+    beyond = beyond_labels(case, skin, structures)
+    structures.extend(beyond.structures)
     _check_names(case, [*structures, *outside])
-    warnings = [*loader.warnings, *loader.unnamed_warnings(), *skin.warnings]
-    for structure in structures:
-        warnings.extend(_mesh_warnings(structure, cache.memory))
     _check_target(case, structures, skin)
+    warnings = [*loader.warnings, *beyond.warnings, *loader.unnamed_warnings(), *skin.warnings]
+    for structure in structures:
+        warnings.extend(kept_mesh_warnings(structure.mesh, structure.name, cache.memory))
     return Anatomy(tuple(structures), skin, tuple(warnings), outside, scan, tuple(loader.ignored))
-
-
-def _mesh_warnings(structure: Structure, memory: Memory) -> tuple[str, ...]:
-    mesh, name = structure.mesh, structure.name
-    if memory is NO_MEMORY:
-        return mesh_warnings(mesh, name)
-    key = (mesh_warnings.__name__, mesh.digest, name)
-    return memory.get(key, partial(mesh_warnings, mesh, name), lambda lines: sum(map(len, lines)))
 
 
 def _outside(case: Case, scan: Scan, warnings: list[str]) -> tuple[Structure, ...]:
@@ -169,25 +158,13 @@ def _unnamed(case: Case, scan: Scan, structures: Sequence[Structure]) -> Iterato
             yield Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, source, voxel_mm=voxel_mm)
 
 
-def _beyond(case: Case, skin: Skin, structures: Sequence[Structure], warnings: list[str]) -> Iterator[Structure]:
-    """The body beyond label maps that end in it, within the needle's reach: no organ there has a label."""
-    found = beyond_labels(case, skin, structures)
-    warnings.extend(found.warnings)
-    if found.mesh is not None:
-        yield Structure(BEYOND_LABELS, Role.UNKNOWN, found.margin_mm, found.mesh, BEYOND_LABELS)
-
-
 def load_skin(case: Case, cache: Cache = NO_CACHE) -> Skin:
     """The skin of a case alone.
 
     Raises:
         InputError: A file that cannot be trusted.
     """
-    return StructureSources(case, lambda _: None, cache).skin(_skin_section(case))
-
-
-def _skin_section(case: Case) -> StructureSection:
-    return next(section for section in case.structure if section.role == "skin")
+    return StructureSources(case, lambda _: None, cache).skin(case.skin_section)
 
 
 def _check_count(case: Case, structures: list[Structure]) -> None:
@@ -225,18 +202,15 @@ def surface_distance(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
     return float(np.sqrt(squared_distance(point, mesh.triangles).min()))
 
 
-def _in_box(mesh: TriangleMesh, point: NDArray[np.float64]) -> bool:
-    low, high = mesh.bounds
-    return bool(np.all((low <= point) & (point <= high)))
-
-
 def _check_target(case: Case, structures: list[Structure], skin: Skin) -> None:
     """A target must lie inside the skin and its own structure, and inside nothing that is to be avoided."""
+    low, high = (np.array([structure.mesh.bounds[end] for structure in structures]) for end in (0, 1))
+    in_box = np.all((low <= case.target_ct) & (case.target_ct <= high), axis=1)
     point = ", ".join(f"{x:.1f}" for x in case.target_ct)
     if side_of(skin.mesh, case.target_ct) is Side.OUTSIDE:
         raise InputError(f"target ({point}) lies outside the skin", where=case.path, allowed="a point in the body")
-    for structure in structures:
-        if structure.name != case.target_structure and not _in_box(structure.mesh, case.target_ct):
+    for structure, near in zip(structures, in_box, strict=True):
+        if structure.name != case.target_structure and not near:
             continue
         side = side_of(structure.mesh, case.target_ct)
         if structure.role is Role.AVOID and side is Side.INSIDE:

@@ -17,7 +17,7 @@ import scipy
 from puncture_twin.planning.anatomy.body.outside_body import joined
 from puncture_twin.planning.anatomy.label_grids import LabelGrid, label_grids
 from puncture_twin.planning.anatomy.skin import Skin
-from puncture_twin.planning.anatomy.structure import Structure
+from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
@@ -53,6 +53,13 @@ class Beyond(NamedTuple):
     mesh: TriangleMesh | None
     margin_mm: float
     warnings: tuple[str, ...]
+
+    @property
+    def structures(self) -> tuple[Structure, ...]:
+        """The one of role ``unknown`` that it is, or none."""
+        if self.mesh is None:
+            return ()
+        return (Structure(BEYOND_LABELS, Role.UNKNOWN, self.margin_mm, self.mesh, BEYOND_LABELS),)
 
 
 @dataclass(frozen=True, eq=False)

@@ -133,6 +133,11 @@ class Skin:
         cut_faces.setflags(write=False)
         object.__setattr__(self, "cut_faces", cut_faces)
 
+    @property
+    def nbytes(self) -> int:
+        """What mesh and flags hold."""
+        return self.mesh.nbytes + self.cut_faces.nbytes
+
 
 def skin_from_ct(volume: Volume, *, max_deviation_mm: float | None = None) -> Skin:
     """The body's surface at ``BODY_HU``, between voxels, where air touches the body.

@@ -137,7 +137,9 @@ class StructureSources:
                 allowed=f"cut = {json.dumps(ends)} where no skin is, or cut = [] if all of it is skin",
             )
         cut = section.cut or ()
-        return kept.get((skin_from_mesh.__name__, mesh.digest, cut), partial(skin_from_mesh, mesh, cut), _skin_bytes)
+        return kept.get(
+            (skin_from_mesh.__name__, mesh.digest, cut), partial(skin_from_mesh, mesh, cut), lambda skin: skin.nbytes
+        )
 
     def scan(self, skin_section: StructureSection, skin: Skin) -> Scan | None:
         """The CT of the case: of its skin, or the one that ``[ct]`` names; None where there is none."""
@@ -211,10 +213,6 @@ class StructureSources:
 def _no_bytes(ends: tuple[str, ...]) -> int:
     """Of a few names."""
     return 100 * len(ends)
-
-
-def _skin_bytes(skin: Skin) -> int:
-    return skin.mesh.nbytes + skin.cut_faces.nbytes
 
 
 def _ruled(rule: LabelRule, mesh: TriangleMesh, source: str, voxel_mm: float) -> Structure:

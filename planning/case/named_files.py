@@ -6,7 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
+from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case_file import CaseFile, StructuresSection
+from puncture_twin.planning.case.case_volumes import VOLUME_ROLES, CaseVolumes
 from puncture_twin.planning.formats import itk_transform
 from puncture_twin.planning.formats.labels import naming
 from puncture_twin.planning.formats.labels.mask_folder import mask_files, structure_name
@@ -25,6 +27,30 @@ class NamedFile(NamedTuple):
     name: str
     key: str
     max_bytes: int
+
+
+def read_named_files(
+    content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes, ct: str | None
+) -> None:
+    """Read and hash whatever the case names, each file once.
+
+    Args:
+        content: The case file.
+        path: Where it is.
+        files: Takes what is read.
+        case_volumes: Takes the volumes.
+        ct: Name of the case's CT, on whose grid masks that have none are drawn.
+
+    Raises:
+        InputError: A file that is missing, too large or not what its key says.
+    """
+    for one in named_files(content, path):
+        if one.role in VOLUME_ROLES or one.role.startswith(MASK_ROLE):
+            case_volumes.read(one.role, one.name, key=one.key)
+        else:
+            files.read(one.role, one.name, max_bytes=one.max_bytes, key=one.key, where=path)
+    for many in content.structures:
+        case_volumes.read_masks(many, ct)
 
 
 def named_files(content: CaseFile, path: Path) -> Iterator[NamedFile]:

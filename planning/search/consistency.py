@@ -86,7 +86,7 @@ def _outside_warnings(case: Case, anatomy: Anatomy, headers: Headers, cache: Cac
     _refuse_wholly_outside(case, anatomy.skin, placed)
     if not anatomy.skin.mesh.closed:
         return ("the skin mesh is open: how much of each structure lies inside the body is not known",)
-    skin_volume = next(section.ct or section.labelmap for section in case.structure if section.role == "skin")
+    skin_volume = case.skin_section.ct or case.skin_section.labelmap
     tolerances = np.array([_surface_tolerance_mm(structure, skin_volume, headers) for structure in placed])
     meshes = [structure.mesh for structure in placed]
     parts = kept_inside_skin(meshes, anatomy.skin, case.target_ct, tolerances, cache)

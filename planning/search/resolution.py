@@ -46,7 +46,7 @@ def _map_warnings(case: Case, anatomy: Anatomy) -> Iterator[str]:
 
 def _skin_warnings(case: Case, headers: Headers) -> Iterator[str]:
     """A CT whose slices lie farther apart than what needle and arm keep from the skin that is found in it."""
-    name = next(section.ct for section in case.structure if section.role == "skin")
+    name = case.skin_section.ct
     if name is not None and (spacing := float(headers[name].spacing_mm.max())) > ARM_PADDING_MM:
         yield (
             f"{name}: slices {spacing:.3g} mm apart, and needle and arm keep {ARM_PADDING_MM:g} mm from the skin "

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.formats.guard import guard_mesh, twice_areas
@@ -146,6 +148,14 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
     elif _signed_volume(mesh) < 0.0:
         warnings.append(f"{name}: inverted normals: they point inward; inside is found without them")
     return tuple(warnings)
+
+
+def kept_mesh_warnings(mesh: TriangleMesh, name: str, memory: Memory) -> tuple[str, ...]:
+    """As `mesh_warnings`; what this process keeps of the same mesh is not found again."""
+    if memory is NO_MEMORY:
+        return mesh_warnings(mesh, name)
+    key = (mesh_warnings.__name__, mesh.digest, name)
+    return memory.get(key, partial(mesh_warnings, mesh, name), lambda lines: sum(map(len, lines)))
 
 
 def _signed_volume(mesh: TriangleMesh) -> float:

@@ -30,7 +30,7 @@ def moving_weights(case: Case, breathing: Breathing, anatomy: Anatomy) -> Moving
     Raises:
         InputError: A structure without a weight, a pattern that matches none, or another weight for the target's own.
     """
-    skin = next(section.name for section in case.structure if section.role == "skin")
+    skin = case.skin_section.name
     stated = breathing.weights.of_pattern
     fixed = {one.name: _by_itself(case, one) for one in anatomy.checked}
     needed = [skin, *(name for name, weight in fixed.items() if weight is None)]

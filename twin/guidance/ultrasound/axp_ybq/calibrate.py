@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, without_play
@@ -231,33 +231,27 @@ def _assembled(
 ) -> Calibration:
     estimate, kept, p = solution.estimate, solution.tip_kept, len(solution.active)
     return Calibration(
-        _frozen(pose(estimate.R_X, estimate.t_X)),
-        _frozen(pose(estimate.R_Y, estimate.t_Y)),
-        _frozen(estimate.t_Q),
-        _frozen(estimate.V),
-        _frozen(estimate.scale),
-        _frozen(solution.residuals),
+        read_only(pose(estimate.R_X, estimate.t_X)),
+        read_only(pose(estimate.R_Y, estimate.t_Y)),
+        read_only(estimate.t_Q),
+        read_only(estimate.V),
+        read_only(estimate.scale),
+        read_only(solution.residuals),
         float(np.sqrt(np.mean(np.sum(solution.residuals[kept] ** 2, axis=1)))),
-        _frozen(1.0 * kept),
+        read_only(1.0 * kept),
         tuple(name for name, used in zip(recording.names, kept, strict=True) if not used),
         solution.iterations,
         solution.observability.ratio,
-        _frozen(solution.covariance[:p, :p]),
+        read_only(solution.covariance[:p, :p]),
         tuple(PARAMETERS[column] for column in solution.active),
         solution.freedom,
         solution.noise,
         solution.noise_ratio,
         bias,
-        _frozen(solution.orientations),
+        read_only(solution.orientations),
         cannot,
         arms,
-        _frozen(solution.arm_errors),
-        _frozen(solution.covariance),
+        read_only(solution.arm_errors),
+        read_only(solution.covariance),
         solution.small_sample,
     )
-
-
-def _frozen(array: ArrayLike) -> Floats:
-    copy = np.array(array, dtype=np.float64)
-    copy.setflags(write=False)
-    return copy
