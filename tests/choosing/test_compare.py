@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -116,7 +117,12 @@ def test_two_plans_by_what_they_state_and_with_their_case_by_what_holds(tmp_path
     assert told["a"]["check"] is None
     assert [told[side]["plan"]["theta_deg"] for side in "ab"] == [np.degrees(plan.theta) for plan in plans]
     assert main(["compare", *paths]) == OK
-    assert "name their case with --case" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "name their case with --case" in shown and "same files" not in shown
+    changed = [replace(one, sha256="0" * 64) if one.role == "markers_ct" else one for one in plans[1].inputs]
+    write_plan(replace(plans[1], inputs=tuple(changed)), tmp_path / "other.json")
+    assert main(["compare", paths[0], str(tmp_path / "other.json")]) == OK
+    assert "not made from the same files (markers_ct): is it one case?" in capsys.readouterr().out
     assert main(["compare", *paths, "--case", str(case), "--json"]) == OK
     told = json.loads(capsys.readouterr().out)
     for side, plan in zip("ab", plans, strict=True):

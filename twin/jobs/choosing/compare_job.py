@@ -26,6 +26,9 @@ from puncture_twin.twin.jobs.patient.case_or_plan import is_plan
 SAME_DIRECTION = 1e-9
 """Radians within which a direction is one of the grid: rounding of typed degrees."""
 
+MOST_ROLES = 4
+"""Of inputs that differ, so many are named."""
+
 BEST_OF_ALL = Choice(rank=1)
 
 
@@ -98,10 +101,21 @@ def compare_plans(paths: tuple[Path, Path], context: CaseContext | None) -> Comp
     if context is None:
         a, b = (_stated_side(path, plan) for path, plan in zip(paths, plans, strict=True))
         names = sorted({plan.case_name for plan in plans})
-        return Comparison(" and ".join(names), (*inputs, *plans[0].inputs, *plans[1].inputs), a, b)
+        read_by_both = (*inputs, *plans[0].inputs, *plans[1].inputs)
+        return Comparison(" and ".join(names), read_by_both, a, b, _differing(*plans))
     found = context.search()
     a, b = (_planned_side(context, found, path, plan) for path, plan in zip(paths, plans, strict=True))
     return Comparison(context.case.name, (*inputs, *context.case.inputs), a, b, tuple(context.anatomy.warnings))
+
+
+def _differing(a: Plan, b: Plan) -> tuple[str, ...]:
+    """That two plans were made from different files: of another patient, or before and after a change."""
+    ours, theirs = ({one.role: one.sha256 for one in plan.inputs} for plan in (a, b))
+    roles = sorted(role for role in ours.keys() | theirs.keys() if ours.get(role) != theirs.get(role))
+    if not roles:
+        return ()
+    more = f" and {len(roles) - MOST_ROLES} more" if len(roles) > MOST_ROLES else ""
+    return (f"the plans were not made from the same files ({', '.join(roles[:MOST_ROLES])}{more}): is it one case?",)
 
 
 def _read(path: Path) -> tuple[Input, Plan]:
