@@ -30,7 +30,6 @@ from puncture_twin.planning.reach.reach import assess_reach_all
 from puncture_twin.planning.search.arm_reach import reach_request
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.organs import organ_candidates
-from puncture_twin.planning.search.search import case_directions
 
 ROOT = Path(__file__).parents[1]
 CHUNK = 200
@@ -110,7 +109,7 @@ def reach(name: str, case_file: Path, step_deg: float, n_states: int) -> None:
     context = prepare(case_file)
     case, anatomy, placed = context.case, context.anatomy, context.reach
     assert placed is not None
-    found = organ_candidates(case, anatomy, context.engine, case_directions(case))
+    found = organ_candidates(case, anatomy, context.engine, case.directions())
     requests = [reach_request(case, found, int(row), placed.T_base_ct) for row in np.flatnonzero(found.safe)]
     skin = anatomy.skin.mesh.transformed(placed.T_base_ct)
     room = (case.robot.model, case_tool(case), case_boxes(case, placed.T_base_ct), skin)

@@ -32,7 +32,6 @@ from puncture_twin.planning.place.search import search_placements
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.organs import organ_candidates
-from puncture_twin.planning.search.search import case_directions
 
 AXIS_WORDS = {AGAINST_Z: "base -z", TOWARD_AXIS: "to base axis"}
 LESION_M_CT = np.array([50.0, 130.0, 63.0])
@@ -97,7 +96,7 @@ def best_positions() -> None:
 def search(path: Path, jobs: int) -> None:
     """The whole search on a case: seconds, and what was estimated beside what was judged."""
     context = prepare(path, arm=False)
-    found = organ_candidates(context.case, context.anatomy, context.engine, case_directions(context.case))
+    found = organ_candidates(context.case, context.anatomy, context.engine, context.case.directions())
     begin, cpu = perf_counter(), _cpu()
     done = search_placements(context.case, context.anatomy, found, context.placement, jobs=jobs)
     spent = f"{perf_counter() - begin:.1f} s, CPU {_cpu() - cpu:.1f} s"

@@ -46,10 +46,9 @@ from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.registration.touch_poses import touching_configuration
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.organs import organ_candidates
-from puncture_twin.planning.search.search import case_directions
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, demanding
-from puncture_twin.planning.uncertainty.chances import HitModel, hit_model
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
+from puncture_twin.planning.uncertainty.hit_model import HitModel, hit_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
 
@@ -160,7 +159,7 @@ def scene(name: str, path: Path, directions: int) -> Scene:
 
 def _reached(context: CaseContext, T_base_ct: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     case, rng = context.case, np.random.default_rng(SEED)
-    judged = organ_candidates(case, context.anatomy, context.engine, case_directions(case))
+    judged = organ_candidates(case, context.anatomy, context.engine, case.directions())
     rows = np.flatnonzero(judged.safe)
     nearest = rows[np.argsort(judged.clearance.least[rows])]
     order = [row for pair in zip(nearest, rng.permutation(rows), strict=True) for row in pair]

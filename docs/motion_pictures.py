@@ -16,7 +16,6 @@ from puncture_twin.planning.needle.shaft import GAUGES, Shaft
 from puncture_twin.planning.needle.tissue import Layer, Tissue
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.organs import organ_candidates
-from puncture_twin.planning.search.search import case_directions
 
 PICTURES = Path(__file__).parent / "pictures"
 BLUE, ORANGE, GREEN, RED, GREY = "#1f4e8c", "#b9770e", "#1e8449", "#c0392b", "#d9d9d9"
@@ -68,7 +67,7 @@ def draw_curve(axes):
 def draw_directions(axes):
     """What the breath leaves of the abdomen's directions: safe for the organs, without the arm."""
     context = prepare(folder() / "abdomen", arm=False)
-    directions = case_directions(context.case)
+    directions = context.case.directions()
 
     def searched(breath):
         return organ_candidates(replace(context.case, breathing=breath), context.anatomy, context.engine, directions)

@@ -16,7 +16,6 @@ from puncture_twin.planning.formats.labels.by_name import ByName
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.organs import organ_candidates
-from puncture_twin.planning.search.search import case_directions
 
 WEIGHTS = {
     "*": 0.0, "skin": 0.3, "liver": 1.0, "gallbladder": 1.0, "portal_vein": 0.9, "hepatic_veins": 1.0, "kidney_*": 0.7,
@@ -34,7 +33,7 @@ def breath(gate: float | None = None, amplitude_mm: float = 12.0, phases: int = 
 def rows() -> list[Row]:
     """All figures of the part."""
     context = prepare(folder() / "abdomen", arm=False)
-    directions = case_directions(context.case)
+    directions = context.case.directions()
 
     def searched(declared: Breathing | None) -> Candidates:
         case = replace(context.case, breathing=declared)

@@ -50,6 +50,7 @@ def skin_paths(
         length: Needle length, tip to flange: how far unknown regions matter to an inserted needle, mm.
         farthest: How far skin matters, mm: to where the flange can be while the tip waits; ``length`` if left out.
     """
+    view = view_depth(skin, target_ct, outward_ct)
     found, odd = settled_crossings(skin.mesh, target_ct, outward_ct)
     has = found.count > 0
     first = found.first[has]
@@ -60,7 +61,6 @@ def skin_paths(
     reentry[again] = found.depth[found.first[again] + 1]
     reentry[reentry > (length if farthest is None else farthest)] = np.nan
     cut = has & skin.cut_faces[face]
-    view = view_depth(skin, target_ct, outward_ct)
     unknown = np.where(view < length, view, np.nan)
     unknown[cut] = depth[cut]
     if skin.mesh.closed:

@@ -20,7 +20,7 @@ from puncture_twin.planning.case.case_file import (
     StructuresSection,
 )
 from puncture_twin.planning.case.case_volumes import CaseVolumes
-from puncture_twin.planning.case.entry import entry_frame, view_frame
+from puncture_twin.planning.case.entry import Directions, direction, entry_frame, grid, view_frame
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.case.html import case_html
 from puncture_twin.planning.case.named_files import MASK_ROLE, read_named_files
@@ -114,6 +114,14 @@ class Case:
         """This case with another target, shape (3,), mm: in the same structure, with the entry frame about it."""
         target = read_only(target_ct)
         return replace(self, target_ct=target, T_ct_entry=view_frame(self.T_ct_entry[:3, :3], target))
+
+    def directions(self) -> Directions:
+        """The grid of the case."""
+        return grid(self.search.theta, self.search.beta, self.search.step, self.T_ct_entry[:3, :3])
+
+    def direction(self, theta: float, beta: float) -> Directions:
+        """A single direction (rad) of the case's entry frame."""
+        return direction(theta, beta, self.T_ct_entry[:3, :3])
 
     @property
     def folder(self) -> Path:

@@ -78,6 +78,13 @@ class ReachAnswer:
     insertion_depth_mm: Floats
     margin: float
 
+    @classmethod
+    def refused(
+        cls, reason: Reason, depth_mm: float | None, detail: str, contact: Contact | None = None
+    ) -> ReachAnswer:
+        """Of a direction that the arm does not reach, or not to the target."""
+        return cls(False, reason, depth_mm, detail, contact, math.nan, -1, np.empty((0, 6)), np.empty(0), 0.0)
+
     def __post_init__(self) -> None:
         self.insertion_q.setflags(write=False)
         self.insertion_depth_mm.setflags(write=False)

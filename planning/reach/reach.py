@@ -225,8 +225,8 @@ class _Search:
             return _why_none(model, found.request, found.line, found.depths, found.stop_at)
         deepest = max(self._blocks, key=lambda block: block.depth_mm)  # the first of equals: the best margin
         if deepest.at_standoff:
-            return _refusal(Reason.ARM_COLLISION, None, deepest.detail, deepest.contact)
-        return _refusal(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail, deepest.contact)
+            return ReachAnswer.refused(Reason.ARM_COLLISION, None, deepest.detail, deepest.contact)
+        return ReachAnswer.refused(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail, deepest.contact)
 
 
 def _why_none(
@@ -234,16 +234,16 @@ def _why_none(
 ) -> ReachAnswer:
     """The refusal of a direction along which kinematics allows no motion."""
     if (stop_at < 0).any():
-        return _refusal(Reason.UNREACHABLE, None, "every roll and branch leaves the joint limits")
+        return ReachAnswer.refused(Reason.UNREACHABLE, None, "every roll and branch leaves the joint limits")
     distances = _distances(request, depths)
     paths = every_branch(model, line, distances)
     reached = away_from_singularities(model, paths[:, 0])
     if not reached.any():
         why = why_unreachable(model, flange_at(line, distances[0]))
-        return _refusal(Reason.UNREACHABLE, None, why)
+        return ReachAnswer.refused(Reason.UNREACHABLE, None, why)
     stops = [first_stop(model, path, depths) for path in paths[reached]]
     deepest = max((stop for stop in stops if stop), key=lambda stop: stop.depth_mm)
-    return _refusal(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail)
+    return ReachAnswer.refused(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail)
 
 
 def _depths(request: ReachRequest) -> Floats:
@@ -298,7 +298,3 @@ def _success(model: UrModel, insertion: _Insertion, tried: _Tried) -> ReachAnswe
     return ReachAnswer(
         True, Reason.NONE, None, "", None, insertion.roll, insertion.branch, tried.q, tried.depths, margin
     )
-
-
-def _refusal(reason: Reason, depth_mm: float | None, detail: str, contact: Contact | None = None) -> ReachAnswer:
-    return ReachAnswer(False, reason, depth_mm, detail, contact, math.nan, -1, np.empty((0, 6)), np.empty(0), 0.0)

@@ -10,5 +10,4 @@ from .explain import (
 )
 from .organs import organ_candidates as organ_candidates
 from .ranking import ranked as ranked
-from .search import case_directions as case_directions
 from .table import write_table as write_table

@@ -53,20 +53,21 @@ def with_chances(
     if case.errors is None:
         return found
     check_limits(case, anatomy, model)
+    limits = None if model is None else model.limits
     names = tuple(anatomy.checked[column].name for column in demanding(anatomy.checked))
     chances = Chances.unknown(names, len(found))
     rows = np.flatnonzero(found.safe & np.isfinite(found.arm.q_insertion).all(axis=1))
-    if model is None or not len(rows):
+    if model is None or limits is None or not len(rows):
         return replace(found, chances=chances)
     for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
         known = None if axes is None else axes.at(part)
         chances = chances.put(part, model.chances(found.outward_ct[part], found.arm.q_insertion[part], known))
-    return _limited(case, _refined_near_limits(replace(found, chances=chances), model))
+    return _limited(case, _refined_near_limits(replace(found, chances=chances), model, limits))
 
 
-def _refined_near_limits(found: Candidates, model: ChanceModel) -> Candidates:
+def _refined_near_limits(found: Candidates, model: ChanceModel, limits: Floats) -> Candidates:
     """Refine the chances to touch that first order puts near a limit, or that may be there if the needle leans."""
-    chances, limits = found.chances, model.limits
+    chances = found.chances
     assert chances is not None
     if not np.isfinite(limits).any():
         return found

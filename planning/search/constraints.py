@@ -66,7 +66,7 @@ def first_broken(
         for column, value in columns:
             column[rows] = value[rows] if isinstance(value, np.ndarray) else value
 
-    length = paths.path_length
+    length, worst = paths.path_length, worst_violation(clearances, structures)
     give(Reason.UNKNOWN_REGION, ~np.isnan(paths.unknown_depth), SKIN, paths.unknown_depth)
     give(Reason.NO_SKIN_ENTRY, np.isnan(length), SKIN, np.nan)
     give(Reason.REENTERS_SKIN, ~np.isnan(paths.reentry_depth), SKIN, paths.reentry_depth)
@@ -74,7 +74,6 @@ def first_broken(
     give(Reason.SKIN_ANGLE, paths.skin_angle > max_skin_angle, SKIN, length, np.degrees(paths.skin_angle))
     waiting = paths.view_depth < waiting_flange(needle, length, paths.skin_angle)
     give(Reason.UNKNOWN_REGION, waiting, SKIN, paths.view_depth)
-    worst = worst_violation(clearances, structures)
     names = np.array([s.name for s in structures] or [""], dtype=object)[worst]
     unknown = np.array([s.role is Role.UNKNOWN for s in structures] or [False])[worst]
     rows = np.arange(count)

@@ -38,7 +38,7 @@ from puncture_twin.planning.search.consistency import check_consistency
 from puncture_twin.planning.search.doubt import Doubt, doubt_of
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases.breath_warnings import breath_warnings
-from puncture_twin.planning.search.search import case_directions, one_direction, search
+from puncture_twin.planning.search.search import search
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
 
@@ -88,7 +88,7 @@ class CaseContext:
                 self.case,
                 self.anatomy,
                 self.engine,
-                case_directions(self.case),
+                self.case.directions(),
                 reach=self.reach,
                 chance=self.chance,
                 progress=partial(self.watcher.count, "arm"),
@@ -97,15 +97,16 @@ class CaseContext:
 
     def check(self, theta: float, beta: float) -> Candidates:
         """Check a single direction (rad)."""
-        directions = one_direction(self.case, theta, beta)
+        directions = self.case.direction(theta, beta)
         found = search(self.case, self.anatomy, self.engine, directions, reach=self.reach, chance=self.chance)
         return replace(found, arm_note=self.arm)
 
     def explain(self, theta: float, beta: float) -> Explanation:
         """Check a single direction (rad), and say what it was checked against and how sure it is."""
         found = self.check(theta, beta)
+        doubt = self._doubt(found)
         facts = self.entry_facts(found.path.entry_ct[0], found.outward_ct[0])
-        return Explanation(self.case, self.anatomy, found, facts, self._doubt(found))
+        return Explanation(self.case, self.anatomy, found, facts, doubt)
 
     def entry_facts(self, entry_ct: Floats, outward_ct: Floats) -> EntryFacts:
         """A path for whoever stands at the patient: its skin entry (3,), mm, and its direction outward (3,), unit."""
@@ -150,7 +151,7 @@ class CaseContext:
             CrossCheckError: A distance differs by more than rounding.
         """
         with self.stages.time("cross-check"):
-            case, outward = self.case, case_directions(self.case).outward_ct
+            case, outward = self.case, self.case.directions().outward_ct
             meshes = tuple(structure.mesh for structure in self.anatomy.checked)
             length, rng = axis_lengths(case, self.anatomy.checked), np.random.default_rng(case.rehearsal.seed)
             found = self.engine.measure(case.target_ct, outward, length)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.entry import Directions, direction, grid
+from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.candidates import Candidates
@@ -15,17 +15,6 @@ from puncture_twin.planning.search.phases.arm_phases import with_breathing_reach
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.search.selection.safe_cone import with_grid_cone
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
-
-
-def case_directions(case: Case) -> Directions:
-    """The grid of the case."""
-    settings = case.search
-    return grid(settings.theta, settings.beta, settings.step, case.T_ct_entry[:3, :3])
-
-
-def one_direction(case: Case, theta: float, beta: float) -> Directions:
-    """A single direction (rad) of the case's entry frame."""
-    return direction(theta, beta, case.T_ct_entry[:3, :3])
 
 
 def search(

@@ -16,7 +16,8 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
 from puncture_twin.planning.reach.standoff import axis_lengths
-from puncture_twin.planning.uncertainty.chances import Chances, HitModel, hit_model
+from puncture_twin.planning.uncertainty.chances import Chances
+from puncture_twin.planning.uncertainty.hit_model import HitModel, hit_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.planning.uncertainty.refined_touch import Needles, Surroundings, refined
 from puncture_twin.planning.uncertainty.touch import Proximity, proximity, touch_chance, touching_any

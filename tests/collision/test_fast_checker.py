@@ -38,7 +38,6 @@ from puncture_twin.planning.reach.reach import ReachAnswer, assess_reach_all
 from puncture_twin.planning.search.arm_reach import reach_request
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.organs import organ_candidates
-from puncture_twin.planning.search.search import case_directions
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
@@ -300,7 +299,7 @@ def test_reach_answers_over_the_abdomen_are_those_of_fcl(abdomen: CaseContext) -
     """Every organ-safe direction: the same verdict, reason, depth, contact, branch, roll and motion."""
     case, anatomy, reach = abdomen.case, abdomen.anatomy, abdomen.reach
     assert reach is not None
-    found = organ_candidates(case, anatomy, abdomen.engine, case_directions(case))
+    found = organ_candidates(case, anatomy, abdomen.engine, case.directions())
     requests = [reach_request(case, found, int(row), reach.T_base_ct) for row in np.flatnonzero(found.safe)]
     room = (case_tool(case), case_boxes(case, reach.T_base_ct), anatomy.skin.mesh.transformed(reach.T_base_ct))
     slow, fast = (kind(UR3, *room, padding_mm=ARM_PADDING_MM) for kind in (CellChecker, FastChecker))

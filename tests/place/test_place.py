@@ -44,7 +44,6 @@ from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.organs import organ_candidates
-from puncture_twin.planning.search.search import case_directions
 from puncture_twin.twin.jobs.patient.place_text import needle_line
 
 UR3 = ur_model("ur3")
@@ -358,7 +357,7 @@ def _same_as_the_search(here, best):
     pasted = here / "pasted.toml"
     pasted.write_text(text[:start] + text[end:] + "\n" + mount + "\n")
     context = prepare(pasted)
-    found = organ_candidates(context.case, context.anatomy, context.engine, case_directions(context.case))
+    found = organ_candidates(context.case, context.anatomy, context.engine, context.case.directions())
     reached = with_reach(context.case, found, ArmReach(context.reach.checker, context.reach.T_base_ct))
     assert int((reached.arm.reachable == 1).sum()) == best["held"] and int(found.safe.sum()) == best["asked"]
 
@@ -376,6 +375,6 @@ def test_no_placement_holds_anything(case_folder, tmp_path, capsys):
 def test_a_search_that_finds_nothing_safe_says_so(case_folder):
     """No direction is safe for the organs: nothing to hold."""
     context = prepare(case_folder(("margin_mm = 2.0", "margin_mm = 400.0"), more=FEW), arm=False)
-    found = organ_candidates(context.case, context.anatomy, context.engine, case_directions(context.case))
+    found = organ_candidates(context.case, context.anatomy, context.engine, context.case.directions())
     with pytest.raises(Exception, match="no direction is safe"):
         search_placements(context.case, context.anatomy, found, None)

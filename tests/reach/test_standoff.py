@@ -30,7 +30,6 @@ from puncture_twin.planning.reach.standoff import (
 )
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.organs import organ_candidates
-from puncture_twin.planning.search.search import case_directions
 
 DEG = np.pi / 180.0
 
@@ -104,7 +103,7 @@ def test_no_direction_of_the_abdomen_is_lost_to_its_own_needle():
     """Every organ-safe direction can start, the most oblique ones too; with the least gap alone one in ten cannot."""
     context = prepare(folder() / "abdomen", arm=False)
     case = context.case
-    found = organ_candidates(case, context.anatomy, context.engine, case_directions(case))
+    found = organ_candidates(case, context.anatomy, context.engine, case.directions())
     wanted = wanted_directions(case, found)
     tool, skin = case_tool(case), context.anatomy.skin.mesh
     assert needle_can_start(tool, skin, case.target_ct, wanted, ARM_PADDING_MM).all()

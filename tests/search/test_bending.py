@@ -16,7 +16,6 @@ from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.search.bending.path_layers import path_layers
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.organs import organ_candidates
-from puncture_twin.planning.search.search import case_directions
 from puncture_twin.planning.search.table import to_table
 
 NEEDLE = "length_mm = 210.0\nshaft_mm = 150.0\ndiameter_mm = 1.27\n"
@@ -55,7 +54,7 @@ def patient(tmp_path_factory):
 def searched(patient, **changes):
     """The organs' verdicts of a case with something else."""
     case = replace(patient.case, **changes)
-    return organ_candidates(case, patient.anatomy, patient.engine, case_directions(case))
+    return organ_candidates(case, patient.anatomy, patient.engine, case.directions())
 
 
 def test_what_lacks_the_clearance_to_bend_is_rejected_and_nothing_else(patient):
@@ -107,7 +106,7 @@ def test_a_body_that_breathes_is_checked_with_a_needle_that_bends(patient):
         case = replace(patient.case, target_ct=patient.case.target_ct + breath.moved_ct(s))
         anatomy = replace(patient.anatomy, structures=structures, skin=skin)
         engine = FclEngine([one.mesh for one in structures])
-        safe.append(organ_candidates(case, anatomy, engine, case_directions(case)).safe)
+        safe.append(organ_candidates(case, anatomy, engine, case.directions()).safe)
     at_phases = np.all(safe, axis=0)
     assert not np.any(found.safe & ~at_phases)
     assert np.sum(at_phases & ~found.safe) < 0.01 * len(found)  # what passes between two of them

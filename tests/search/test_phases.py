@@ -22,7 +22,6 @@ from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.organs import organ_candidates
 from puncture_twin.planning.search.phases.arm_phases import with_breathing_reach
-from puncture_twin.planning.search.search import case_directions
 from puncture_twin.planning.search.table import to_table
 from puncture_twin.twin.jobs.patient.main_job import search_case
 
@@ -54,7 +53,7 @@ def searched(patient, breath=None, case=None, anatomy=None):
     """The organs' verdicts, with FCL."""
     case, anatomy = replace(case or patient.case, breathing=breath), anatomy or patient.anatomy
     engine = FclEngine([one.mesh for one in anatomy.checked])
-    return organ_candidates(case, anatomy, engine, case_directions(case))
+    return organ_candidates(case, anatomy, engine, case.directions())
 
 
 def moved_body(patient, breath, s):
@@ -187,7 +186,7 @@ def test_the_arm_is_checked_where_the_breath_puts_target_and_skin():
     settings = replace(context.case.search, step=np.radians(15.0))
     case = replace(context.case, breathing=breath, search=settings)
     base = context.placement.T_base_ct
-    organs = organ_candidates(case, context.anatomy, context.engine, case_directions(case))
+    organs = organ_candidates(case, context.anatomy, context.engine, case.directions())
     static = with_reach(case, organs, context.reach)
     found = with_breathing_reach(case, context.anatomy, static, context.reach)
     there = replace(case, target_ct=case.target_ct + breath.moved_ct(1.0), breathing=None)
@@ -218,7 +217,7 @@ def test_the_arm_is_checked_against_an_obstacle_where_its_stated_weight_puts_it(
     bare = replace(context.case, breathing=breath, search=search)
     case = replace(bare, obstacles=(*bare.obstacles, box))
     anatomy = with_surroundings(replace(context.anatomy, surroundings=()), case, base)
-    organs = organ_candidates(replace(bare, breathing=None), context.anatomy, context.engine, case_directions(bare))
+    organs = organ_candidates(replace(bare, breathing=None), context.anatomy, context.engine, bare.directions())
     static = with_reach(case, organs, ArmReach(case_checker(case, anatomy, base), base))
     found = with_breathing_reach(case, anatomy, static, ArmReach(case_checker(case, anatomy, base), base))
     skin = anatomy.skin

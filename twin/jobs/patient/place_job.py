@@ -19,7 +19,6 @@ from puncture_twin.planning.search.candidates import ARM_CHECKED
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.organs import organ_candidates
 from puncture_twin.planning.search.ranking import ranked
-from puncture_twin.planning.search.search import case_directions
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.placement_picture import draw_placements
 
@@ -72,7 +71,7 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool) -> Place
     """Search, and write everything into a folder."""
     case, stages = context.case, context.stages
     with stages.time("organs"):
-        candidates = organ_candidates(case, context.anatomy, context.engine, case_directions(case))
+        candidates = organ_candidates(case, context.anatomy, context.engine, case.directions())
     with stages.time("placements"):
         found = search_placements(
             case,
