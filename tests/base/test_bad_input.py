@@ -19,9 +19,9 @@ from case_world import (
     write_labels,
     write_markers,
 )
+from refusals import refused
 
 from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.exit_codes import BAD_INPUT
 
 CASE = case_text(
     SKIN,
@@ -69,17 +69,6 @@ def folder(tmp_path):
     write_labels(here / "labels.nrrd", labels, compressed=False)
     write_markers(here)
     return here
-
-
-def refused(arguments, capfd):
-    """Run a command that must be refused; returns its one line."""
-    assert main([str(argument) for argument in arguments]) == BAD_INPUT
-    captured = capfd.readouterr()
-    assert captured.out == ""
-    lines = [line for line in captured.err.splitlines() if line.strip()]
-    assert len(lines) == 1, captured.err
-    assert "allowed: " in lines[0]
-    return lines[0]
 
 
 def test_the_good_case_is_not_refused(folder, tmp_path, capfd):

@@ -16,6 +16,7 @@ from case_world import (
     write_balls,
     write_markers,
 )
+from refusals import refused
 
 from puncture_twin.meshes import folder as meshes_folder
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
@@ -81,16 +82,6 @@ def case(tmp_path):
         return here
 
     return make
-
-
-def refused(arguments, capfd):
-    """Run a command that must be refused; returns its one line."""
-    assert main([str(argument) for argument in arguments]) == BAD_INPUT
-    captured = capfd.readouterr()
-    assert captured.out == ""
-    lines = [line for line in captured.err.splitlines() if line.strip()]
-    assert len(lines) == 1, captured.err
-    return lines[0]
 
 
 def registered(here, capfd):

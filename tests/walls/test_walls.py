@@ -19,7 +19,6 @@ MOST_MODULES = 16
 
 PLANT_IN_GUIDANCE = {
     "puncture_twin.twin.guidance.stereo.stereo_room",
-    "puncture_twin.twin.guidance.ultrasound.selfcal_case",
     "puncture_twin.twin.guidance.ultrasound.selfcal_truth",
 }
 """Modules of guidance that know the ground truth: stereo and ultrasound still draw their own room. It only shrinks."""

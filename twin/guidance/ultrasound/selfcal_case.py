@@ -19,7 +19,6 @@ from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArm, DeclaredArms
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleEcho
-from puncture_twin.twin.plant.true_arm import ArmErrors
 
 CASE_NAME = "selfcal.toml"
 """What a folder is searched for."""
@@ -48,11 +47,6 @@ class ErrorsSection(Section):
     joint_deg: Deviation = 0.005
     backlash_deg: Deviation = 0.0
     repeatability_deg: Deviation = 0.003
-
-    def arm_errors(self) -> ArmErrors:
-        """In mm and rad."""
-        angles = np.radians([self.twist_deg, self.joint_deg, self.backlash_deg, self.repeatability_deg])
-        return ArmErrors(self.link_mm, *(float(angle) for angle in angles))
 
     def declared(self, model: UrModel) -> DeclaredArm:
         """What a calibration is told of the arm."""
