@@ -2,8 +2,9 @@
 
 The bound is the path of a bevel that never turns, all the way in the stiffest tissue of the case: the stiffer the
 tissue, the more a bevel steers. A stiff layer before soft ones can take it further: the allowance for that was found by
-search, not proven. Which needle it is does not matter for that search: with lengths over 1/lambda, only the shaft's own
-and the layers' are left. In given layers the path is linear in alpha, and a bevel that never turns goes furthest.
+search, not proven (what is proven of every order is several times as wide: docs/concepts/needle-and-tissue.md). Which
+needle it is does not matter for that search: with lengths over 1/lambda, only the shaft's own and the layers' are left.
+In given layers the path is linear in alpha, and a bevel that never turns goes furthest.
 """
 
 from __future__ import annotations

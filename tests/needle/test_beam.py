@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.experiment.tissue import beyond
+from benchmarks.experiment.tissue import beyond, in_every_order, proven
 from puncture_twin.planning.needle.beam import Beam
 from puncture_twin.planning.needle.bevel_path import bevel_path, step_for
 from puncture_twin.planning.needle.deflection import ALLOWANCE, MOST_SLENDER, deflection_bound, stiffest_resolved
@@ -230,3 +230,51 @@ def test_no_order_of_layers_goes_beyond_the_bound(rng):
     assert 0.0 < beyond(20.0, 3.0) < 0.02
     assert bound.at(100.0) > bound.at(50.0) > bound.at(0.0) == bound.sag_mm
     assert bound.at(101.0) == np.inf and np.isnan(bound.at(np.nan))
+
+
+def energy_and_moment(shaft, k, path, step):
+    """Of shaft and foundation once all of a path is cut, N mm, and the bending moment at the clamp, N mm.
+
+    By Gauss's rule from the shape alone, not from the matrices that gave it.
+    """
+    elements, done = round(shaft.length_mm / step), len(k)
+    foundation, rest = np.zeros(elements), np.zeros(elements + 1)
+    foundation[elements - done :], rest[elements - done :] = k, path
+    shape = Beam(shaft.bending_stiffness, step, elements).bent(foundation, rest, tip_mm=float(path[-1]))
+    ends = np.stack([shape.deflection[:-1], shape.slope[:-1], shape.deflection[1:], shape.slope[1:]], axis=1)
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    t, h = (nodes + 1) / 2, step
+    values = np.stack([1 - 3 * t**2 + 2 * t**3, h * (t - 2 * t**2 + t**3), 3 * t**2 - 2 * t**3, h * (t**3 - t**2)])
+    curved = np.stack([12 * t - 6, h * (6 * t - 4), 6 - 12 * t, h * (6 * t - 2)]) / h**2
+    off = ends @ values - rest[:-1, None] * (1 - t) - rest[1:, None] * t
+    bent = shaft.bending_stiffness * (ends @ curved) ** 2
+    stored = 0.5 * (h / 2 * weights * (bent + foundation[:, None] * off**2)).sum()
+    start = np.array([-6.0, -4.0 * h, 6.0, -2.0 * h]) / h**2
+    return float(stored), shaft.bending_stiffness * float(ends[0] @ start), shape.tip_force
+
+
+def test_bevel_and_clamp_do_the_work_that_bends_a_needle(rng):
+    """dW/ds = alpha F + M^2 / 2 EI in layers, the bevel turning: what the bound by energy rests on."""
+    for step, near in ((1.0, 0.02), (0.5, 0.01)):
+        count = round(90 / step)
+        k = np.repeat([0.3, 0.0, 0.05], count // 3)
+        alpha = np.radians(2.0) * np.where(np.arange(count) * step < 60.0, 1.0, -1.0)
+        cut = bevel_path(TUBE_18, k, alpha, step).cut_mm
+        each = [energy_and_moment(TUBE_18, k[:done], cut[: done + 1], step) for done in range(1, count + 1)]
+        stored, moment, force = np.array(each).T
+        work = step * np.cumsum(alpha * force + moment**2 / (2 * TUBE_18.bending_stiffness))
+        assert stored[-1] > 0.05
+        np.testing.assert_allclose(stored, work, atol=near * stored.max())
+
+
+@pytest.mark.parametrize(("gauge", "stiffest"), [(18, 0.3), (22, 0.1)])
+def test_every_order_of_layers_is_within_what_is_kept_and_within_what_is_proven(gauge, stiffest):
+    """All 81 orders of three tissues in four layers, in 80 mm; the bound by energy holds, and is too wide to keep."""
+    shaft, tissues = Shaft(150.0, *GAUGES[gauge]), (0.0, stiffest / 10, stiffest)
+    most = in_every_order(shaft, tissues, 4, 80.0)
+    assert 1.0 <= most < 1.0 + ALLOWANCE - 0.03
+    count = int(np.ceil(80.0 / step_for(shaft, stiffest)))
+    alone = bevel_path(shaft, np.full(count, stiffest), np.full(count, 0.01), 80.0 / count).largest_mm
+    width = proven(shaft, 0.01, stiffest, 80.0)[1:] / alone[1:]
+    assert width.min() > most
+    assert 3.0 < width[-1] < 30.0
