@@ -55,6 +55,12 @@ RESIDUALS = tuple(
 )
 """Without those that draw thousands of registrations."""
 
+REGISTRATION = (
+    "tests/registration/test_registration_limits.py",
+    "tests/registration/test_registration.py",
+    *RESIDUALS,
+)
+
 PLAIN = MappingProxyType(
     {
         "puncture_twin.planning.case.entry": ("tests/case/test_entry.py",),
@@ -65,11 +71,9 @@ PLAIN = MappingProxyType(
         "puncture_twin.planning.reach.standoff": tuple(f"tests/reach/test_standoff.py::{name}" for name in STANDOFF),
         "puncture_twin.planning.geometry.containment": ("tests/geometry/test_containment.py",),
         "puncture_twin.planning.search.constraints": ("tests/search/test_verdict_order.py",),
-        "puncture_twin.planning.registration.registration": (
-            "tests/registration/test_registration_limits.py",
-            "tests/registration/test_registration.py",
-            *RESIDUALS,
-        ),
+        "puncture_twin.planning.registration.marker_pairs": REGISTRATION,
+        "puncture_twin.planning.registration.fits": REGISTRATION,
+        "puncture_twin.planning.registration.registration": REGISTRATION,
     }
 )
 """All mutants of these, and the tests that must notice them."""

@@ -32,7 +32,7 @@ from puncture_twin.planning.case.sections.bend import bending_of
 from puncture_twin.planning.case.sections.breath import breathing_of
 from puncture_twin.planning.case.sections.robot import robot_of, robot_warnings
 from puncture_twin.planning.case.sections.search import search_of
-from puncture_twin.planning.case.sections.stated_errors import ct_name, errors_of
+from puncture_twin.planning.case.sections.stated_errors import errors_of
 from puncture_twin.planning.case.sections.surroundings import gantry_of, obstacle_of
 from puncture_twin.planning.case.sections.target import target_of
 from puncture_twin.planning.case.sections.tool_section import tool_of
@@ -165,7 +165,7 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
         files.state(OPTIONS_ROLE, options.text.encode())
     change = partial(options.applied, where=path)
     content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md", change=change)
-    read_named_files(content, path, files, case_volumes, ct_name(content))
+    read_named_files(content, path, files, case_volumes)
     space = Space(content.space)
     target = target_of(content, path, space, files)
     robot = robot_of(content, space, path, files)

@@ -398,6 +398,11 @@ class CaseFile(Section):
         """How many structures the file says that it has, the skin among them; None in schema 1."""
         return self.structure_count if self.end is None else self.end.structures
 
+    @property
+    def ct_name(self) -> str | None:
+        """The CT that the skin comes from, or the one that stands beside it."""
+        return next((one.ct for one in self.structure if one.ct is not None), self.ct.file)
+
     @model_validator(mode="before")
     @classmethod
     def _with_count(cls, data: Any) -> Any:

@@ -29,9 +29,7 @@ class NamedFile(NamedTuple):
     max_bytes: int
 
 
-def read_named_files(
-    content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes, ct: str | None
-) -> None:
+def read_named_files(content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes) -> None:
     """Read and hash whatever the case names, each file once.
 
     Args:
@@ -39,7 +37,6 @@ def read_named_files(
         path: Where it is.
         files: Takes what is read.
         case_volumes: Takes the volumes.
-        ct: Name of the case's CT, on whose grid masks that have none are drawn.
 
     Raises:
         InputError: A file that is missing, too large or not what its key says.
@@ -50,7 +47,7 @@ def read_named_files(
         else:
             files.read(one.role, one.name, max_bytes=one.max_bytes, key=one.key, where=path)
     for many in content.structures:
-        case_volumes.read_masks(many, ct)
+        case_volumes.read_masks(many, content.ct_name)
 
 
 def named_files(content: CaseFile, path: Path) -> Iterator[NamedFile]:

@@ -31,14 +31,9 @@ def errors_of(
 
 def _ct_cells(content: CaseFile, case_volumes: CaseVolumes) -> Cells | None:
     """Pixel, slice spacing and slice normal of the case's CT; None without one."""
-    name = ct_name(content)
+    name = content.ct_name
     if name is None:
         return None
     grid = case_volumes.source(name).grid
     spacing = grid.spacing_mm
     return Cells(float(spacing[:2].max()), float(spacing[2]), grid.T_ct_index[:3, 2] / spacing[2])
-
-
-def ct_name(content: CaseFile) -> str | None:
-    """The CT that the skin comes from, or the one that stands beside it."""
-    return next((one.ct for one in content.structure if one.ct is not None), content.ct.file)
