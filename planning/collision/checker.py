@@ -42,6 +42,7 @@ from puncture_twin.planning.collision.state_checker import (
 from puncture_twin.planning.collision.sweep import SweptBodies
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.winding import winding_number
 
 __all__ = [
@@ -127,6 +128,7 @@ class CellChecker:
         if tool.body is not None:
             check_hanging(tool.body, self._bodies)
         self.swept = SweptBodies.of(model, tool)
+        self.boxes = tuple(boxes)
         self._boxes = _boxes(boxes, {PATIENT, *(body.name for body in self._bodies)})
         self._bounds = {box.name: box.bounds for box in boxes}
         self._surface = patient if patient is None or outside is None else joined([patient, outside])
@@ -140,6 +142,11 @@ class CellChecker:
     def patient_closed(self) -> bool:
         """Whether there is a patient, and its surface has an inside."""
         return self._surface is not None and self._surface.closed
+
+    def points_of(self, body: str) -> Floats:
+        """Corners (n, 3) of a body's convex pieces as they are, without padding, in the frame that it moves with."""
+        pieces = [(one.T_frame_body, hull) for one in self._bodies if one.name == body for hull in one.bare.hulls]
+        return np.concatenate([apply(T, corners) for T, corners in pieces])
 
     def contact(self, q: Floats, *, needle_may_touch_patient: bool) -> Contact | None:
         """The first contact found, or None when the arm is clear.

@@ -18,9 +18,10 @@ from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits,
 from puncture_twin.planning.arm.tip_speed import TipLimit
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.collision.checker import Contact, StateChecker
+from puncture_twin.planning.collision.checker import CellChecker, Contact, StateChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.segments import halving_order
+from puncture_twin.planning.motion.cut import UPPER_ARM, Cut
 from puncture_twin.planning.motion.follow import follow, rounded
 from puncture_twin.planning.motion.joint_space import SegmentContact
 from puncture_twin.planning.motion.path_check import (
@@ -122,13 +123,13 @@ def plan_approach(
     home = _within_limits(checker, q_home, "home")[0]
     goals = _within_limits(checker, q_goals, "goal")
     open_goals = _free_goals(checker, home, goals)
-    refused = ""
+    refused, cut = "", _cut(checker, home, goals[open_goals])
     for attempt in range(ATTEMPTS):
         contact_of = _segment_check(checker, RESOLUTION_RAD / 2**attempt)
-        task = Task(checker.model.joint_limits, contact_of, home, goals[open_goals])
+        task = Task(checker.model.joint_limits, contact_of, home, goals[open_goals], cut)
         path = shortest_path(task, seed=seed + RUNS * attempt, max_samples=max_samples)
         if isinstance(path, Connected):
-            raise NoAnswerError(_why_none(path, len(goals), len(open_goals), seed) + refused)
+            raise NoAnswerError(_why_none(path, cut, len(goals), len(open_goals), seed) + refused)
         cuts = _cuts(contact_of, path.waypoints)
         for rounding in (cuts, np.zeros_like(cuts)) if cuts.any() else (cuts,):
             trajectory = _timed(checker, path.waypoints, rounding, speeds)
@@ -139,7 +140,14 @@ def plan_approach(
                 return Approach(path.waypoints, rounding, trajectory, goal, checked, seed, attempt + 1)
         assert contact is not None
         refused = f"; before that, on a closer look {contact.body} touched {contact.other} on the way"
-    raise NoAnswerError(f"approach not found: {ATTEMPTS} paths were refused (seed {seed}){refused}")
+    raise NoAnswerError(f"approach unknown: {ATTEMPTS} paths were refused (seed {seed}){refused}")
+
+
+def _cut(checker: StateChecker, home: Floats, goals: Floats) -> Cut | None:
+    """What tells which goals are cut off from home; None for a checker whose boxes are not known."""
+    if not isinstance(checker, CellChecker):
+        return None
+    return Cut(checker.model, checker.boxes, checker.points_of(UPPER_ARM), home, goals)
 
 
 def _timed(checker: StateChecker, waypoints: Floats, cuts: Floats, speeds: SpeedLimits) -> Trajectory:
@@ -200,14 +208,18 @@ def _free_goals(checker: StateChecker, home: Floats, goals: Floats) -> NDArray[n
     return np.array([row for row, contact in enumerate(contacts) if contact is None], dtype=np.int64)
 
 
-def _why_none(found: Connected, n_goals: int, n_free: int, seed: int) -> str:
-    """Why a run found no path, in words: which tree stayed small, and what was in the way."""
+def _why_none(found: Connected, cut: Cut | None, n_goals: int, n_free: int, seed: int) -> str:
+    """Why there is no path, where that is proven; else how far the search came, and what was in the way."""
+    busy = "" if n_free == n_goals else f"; {n_goals - n_free} of {n_goals} goals are in collision themselves"
+    n_off = 0 if cut is None else int(cut.off.sum())
+    if cut is not None and n_off == n_free:
+        return f"approach impossible, proven: {cut.text}{busy}"
     where = "the goals lie" if found.goal_states <= found.home_states else "home lies"
     trees = f"{found.home_states} states joined home, {found.goal_states} the goals"
     total = sum(found.blocked.values())
     most = [f"{c.body} touches {c.other} ({n} of {total})" for c, n in Counter(found.blocked).most_common(2)]
-    busy = "" if n_free == n_goals else f"; {n_goals - n_free} of {n_goals} goals are in collision themselves"
+    proven = f"; {n_off} of {n_free} goals are proven to be cut off" if n_off else ""
     return (
-        f"approach not found: {where} in a part of the space that {found.samples} samples could not reach "
-        f"(seed {seed}): {trees}; most often in the way: {', '.join(most) or 'nothing'}{busy}"
+        f"approach unknown after {found.samples} samples (seed {seed}): {where} in a part of the space that they did "
+        f"not reach: {trees}; most often in the way: {', '.join(most) or 'nothing'}{proven}{busy}"
     )

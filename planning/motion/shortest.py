@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.motion.cut import Cut
 from puncture_twin.planning.motion.joint_space import SegmentContact
 from puncture_twin.planning.motion.path_check import path_length
 from puncture_twin.planning.motion.rrt_connect import Connected, Limits, connect
@@ -53,6 +54,8 @@ class Task(NamedTuple):
     """Shape (6,), rad, free."""
     goals: Floats
     """Shape (g, 6), rad, free."""
+    cut: Cut | None = None
+    """Tells which of the goals are cut off from home."""
 
 
 def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> Path | Connected:
@@ -73,6 +76,7 @@ def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> P
         sought = nearest_first if best is None else nearest_first[away[nearest_first] * SHORT_ENOUGH < best.length]
         if len(sought) == 0:
             break
+        sought = np.sort(sought)  # without a path yet, all of them: as the cut has them
         found = _run(task._replace(goals=task.goals[sought]), best, seed + run, max_samples)
         if found.waypoints is None:
             return found if best is None else best
@@ -101,9 +105,14 @@ def _run(task: Task, best: Path | None, seed: int, max_samples: int) -> Connecte
     first = connect(task.contact_of, task.home, task.goals, near, seed=seed)
     if first.waypoints is not None:
         return first
+    left = np.arange(len(task.goals)) if task.cut is None else np.flatnonzero(~task.cut.off)
+    if len(left) == 0:
+        return first
     anywhere = Limits(task.joint_limits, max_samples - near.max_samples)
-    second = connect(task.contact_of, task.home, task.goals, anywhere, seed=seed)
-    return second._replace(samples=first.samples + second.samples, blocked=first.blocked + second.blocked)
+    second = connect(task.contact_of, task.home, task.goals[left], anywhere, seed=seed)
+    goal_index = -1 if second.waypoints is None else int(left[second.goal_index])
+    both = first.samples + second.samples, first.blocked + second.blocked
+    return second._replace(goal_index=goal_index, samples=both[0], blocked=both[1])
 
 
 def _box(task: Task, margin_rad: Floats | float) -> Floats:
