@@ -10,12 +10,13 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+from skimage.measure import marching_cubes
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.phantoms import torso
 from puncture_twin.twin.phantoms.ct_image import AIR_HU, Grid, ScannedPart
 from puncture_twin.twin.phantoms.implicit import Field, capsule, ellipsoid, offset, within
-from puncture_twin.twin.phantoms.mesher import SamplingBox, mesh_field
 from puncture_twin.twin.plant.scanner.solids import Solid
 
 LESION_LPS_MM = (-55.0, 20.0, 0.0)
@@ -29,6 +30,9 @@ BELLY_MM, WAVE_MM = 8.0, 90.0
 which no patient is, and a table that touches a patient is known by being one."""
 LINE_GAP_MM = 14.0
 """How far the line runs in front of the trunk, mm."""
+
+LOOK_MM, SURFACE_MM, FINE_MM, THIN_MM = 8.0, 5.0, 2.0, 160.0
+"""Spacings at which surfaces are looked for and sampled, and of parts whose box is no thicker than the last."""
 
 Arms = Literal["down", "up", "none"]
 
@@ -131,14 +135,30 @@ def grid(spacing_mm: float = 4.0, slice_mm: float = 4.0) -> Grid:
     return Grid((-300.0 + spacing_mm / 2, -190.0, -80.0), spacing, (shape[0], shape[1], shape[2]))
 
 
-def solids(parts: Sequence[ScannedPart], spacing_mm: float = 6.0) -> list[Solid]:
+def solids(parts: Sequence[ScannedPart]) -> list[Solid]:
     """The same parts as surfaces, for the scanner; what is beyond the longest field of view is cut off.
 
     Args:
         parts: The scene; all of them lie within 320 mm beside the middle of the bed.
-        spacing_mm: At which the surfaces are sampled; thinner parts need less.
     """
-    low, high = (-318.0, -250.0, -120.0), (318.0, 250.0, 120.0)
-    ends = slab(low, high)
-    box = SamplingBox((-330.0, -262.0, -132.0), (330.0, 262.0, 132.0), spacing_mm)
-    return [Solid(part.name, mesh_field(within(part.field, [ends], 0.5), box), part.hu) for part in parts]
+    ends = slab((-318.0, -250.0, -120.0), (318.0, 250.0, 120.0))
+    return [Solid(part.name, _surface(within(part.field, [ends], 0.5)), part.hu) for part in parts]
+
+
+def _surface(field: Field) -> TriangleMesh:
+    """The zero set by marching cubes in the box about it, finer where that box is thin."""
+    low, high = np.array([-330.0, -262.0, -132.0]), np.array([330.0, 262.0, 132.0])
+    nodes, _ = _sampled(low, high, LOOK_MM)
+    near = nodes[field(nodes.reshape(-1, 3)).reshape(nodes.shape[:3]) < LOOK_MM]
+    low, high = near.min(axis=0) - LOOK_MM, near.max(axis=0) + LOOK_MM
+    spacing = FINE_MM if np.sort(high - low)[0] < THIN_MM else SURFACE_MM
+    nodes, first = _sampled(low, high, spacing)
+    values = field(nodes.reshape(-1, 3)).reshape(nodes.shape[:3])
+    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(spacing,) * 3)
+    return TriangleMesh(vertices + first, faces)
+
+
+def _sampled(low: Floats, high: Floats, spacing: float) -> tuple[Floats, Floats]:
+    """Nodes of a grid, shape (nx, ny, nz, 3), and the first of them."""
+    axes = [np.arange(a, b + spacing, spacing) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), low
