@@ -16,6 +16,7 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import MountSection
 from puncture_twin.planning.case.mount import mount_pose
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import (
     ARM_PADDING_MM,
     case_boxes,
@@ -129,7 +130,8 @@ def search_placements(
         progress: Called with (stage, done, total).
 
     Raises:
-        InputError: Bounds that contradict the case, or a gantry that stands in the patient.
+        InputError: Bounds that contradict the case, a gantry that stands in the patient, or an own arm or tool with
+            a shape that hangs on nothing.
         NoAnswerError: No direction is safe for the organs, or in none the needle could start.
     """
     if not found.safe.any():
@@ -137,6 +139,7 @@ def search_placements(
     check_gantry(case, anatomy.skin.mesh)
     T_ct_bed = bed_frame(case)
     check = _placement_check(case, anatomy, found)
+    CellChecker(check.model, check.tool)  # refuses shapes that hang on nothing before minutes are spent
     surroundings = Surroundings(
         SkinField.of(check.patient), Boxes.of(check.fixed), Boxes.of(check.carried), ARM_PADDING_MM
     )

@@ -1,0 +1,185 @@
+"""Commands on a case with an arm and a tool of one's own, from the outside: what each gives, and what each refuses."""
+
+import csv
+import json
+import re
+
+import numpy as np
+import pytest
+import trimesh
+from case_world import NEEDLE, SEARCH, SKIN, case_text, registration_section, structure, write_case
+from own_arms import write_own_arm
+
+from puncture_twin.planning.geometry.rigid import apply, pose
+from puncture_twin.run_twin import main
+
+T_BASE_CT = pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.0, -450.0, 0.0]))
+"""The bed beside the arm, which stands at the patient's right."""
+MARKERS_CT = np.round(
+    [
+        91.0 * direction / np.linalg.norm(direction)
+        for direction in np.array([(0, -1, 0), (0.5, -0.8, 0.3), (-0.5, -0.8, 0.2), (0.1, -0.8, -0.6)])
+    ],
+    3,
+)
+"""On the front of the usual patient, who is a ball of 90 mm."""
+ARM = """[robot]
+urdf = "arm/toy.urdf"
+[robot.limits]
+lowest_deg = [-180, -180, -150, -340, -340, -340]
+highest_deg = [180, 0, 150, 340, 340, 340]
+max_speed_deg_s = [90, 90, 120, 150, 150, 150]
+[tool]
+mesh = "holder.stl"
+unit = "mm"
+position_mm = [0, 0, 0]
+[errors]
+touch_mm = 0.1
+[rehearsal]
+truth_base = "truth.csv"
+seed = 3
+"""
+
+
+def own_case(folder):
+    """A case with its own arm, a holder with something at its side, and markers that it touched."""
+    folder.mkdir()
+    parts = (SKIN, structure("organ", "target"), structure("rib", "avoid", margin_mm=3.0), registration_section())
+    write_case(folder, text=case_text(*parts, needle=NEEDLE, search=SEARCH) + ARM)
+    write_own_arm(folder / "arm")
+    side = trimesh.creation.box((70.0, 20.0, 30.0)).apply_translation([30.0, 0.0, 16.0])
+    trimesh.util.concatenate([trimesh.creation.cylinder(18.0, 50.0).apply_translation([0, 0, 26.0]), side]).export(
+        folder / "holder.stl"
+    )
+    for name, points in (
+        ("markers_ct", MARKERS_CT),
+        *dict.fromkeys(("touch", "truth"), apply(T_BASE_CT, MARKERS_CT)).items(),
+    ):
+        rows = [f"{one},{x!r},{y!r},{z!r}" for one, (x, y, z) in zip("ABCD", points.tolist(), strict=True)]
+        (folder / f"{name}.csv").write_text("\n".join(["name,x_mm,y_mm,z_mm", *rows, ""]))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """That case, for all who only read it."""
+    return own_case(tmp_path_factory.mktemp("own") / "case")
+
+
+def answer(capfd, *words):
+    """What a command prints as JSON; it must end well."""
+    code = main([*map(str, words), "--json"])
+    told = capfd.readouterr()
+    assert code == 0, told.err
+    return json.loads(told.out)
+
+
+def test_register_counts_the_errors_of_that_arm(folder, capfd):
+    """Markers without error have no residuals; the arm's own errors are sources of the expected one."""
+    told = answer(capfd, "register", folder)
+    assert max(told["residual_mm"].values() if isinstance(told["residual_mm"], dict) else told["residual_mm"]) < 0.01
+    assert 0.1 < told["expected_tre_target_mm"] < 5.0
+
+
+def test_the_markers_are_touched(folder, tmp_path, capfd):
+    """All four, within the errors that are declared; the list is one that a case takes."""
+    answer(capfd, "touch", folder, "--out", tmp_path)
+    with (tmp_path / "touch.csv").open(encoding="utf-8") as file:
+        rows = {row["name"]: [float(row[f"{axis}_mm"]) for axis in "xyz"] for row in csv.DictReader(file)}
+    assert sorted(rows) == list("ABCD")
+    off = [
+        np.linalg.norm(np.subtract(rows[name], place))
+        for name, place in zip("ABCD", apply(T_BASE_CT, MARKERS_CT), strict=True)
+    ]
+    assert max(off) < 3.0  # tip and drift of this truth, each half a millimetre on average
+
+
+def test_the_needle_turns_about_the_target(folder, tmp_path, capfd):
+    """A sweep keeps its virtual tip in place."""
+    told = answer(capfd, "rehearse", folder, "--sweep", "--out", tmp_path)
+    assert (tmp_path / "sweep.json").is_file() and not told["contacts"] and told["off_point_max_mm"] < 0.1
+    assert told["reached_deg"] == pytest.approx(told["wanted_deg"])
+
+
+def test_a_scan_shows_the_patient(folder, tmp_path, capfd):
+    """The command and its files; the arm stands outside of the bore."""
+    answer(capfd, "scan", folder, "--out", tmp_path, "--spacing", "4", "--pixel", "2")
+    assert (tmp_path / "markers_ct.csv").is_file() and (tmp_path / "dicom").is_dir()
+
+
+def test_slicer_gets_the_robots_place(folder, tmp_path, capfd):
+    """From base to CT, by the markers."""
+    answer(capfd, "export", folder, "--format", "slicer", "--out", tmp_path)
+    numbers = re.search(r"\nParameters: (.+)", (tmp_path / "ct_to_robot.tfm").read_text()).group(1).split()
+    expected = np.linalg.inv(T_BASE_CT)
+    assert [float(one) for one in numbers] == pytest.approx([*expected[:3, :3].ravel(), *expected[:3, 3]], abs=0.01)
+
+
+def in_text(file, old, new):
+    """A change of a text."""
+
+    def change(folder):
+        text = (folder / file).read_text()
+        assert old in text
+        (folder / file).write_text(text.replace(old, new, 1))
+
+    return change
+
+
+def with_bytes(file, data):
+    """Another file."""
+    return lambda folder: (folder / file).write_bytes(data)
+
+
+def in_metres(folder):
+    """Of a list that speaks mm."""
+    rows = apply(T_BASE_CT, MARKERS_CT) / 1000.0
+    text = "\n".join(f"{name},{x},{y},{z}" for name, (x, y, z) in zip("ABCD", rows.tolist(), strict=True))
+    (folder / "touch.csv").write_text(f"name,x_mm,y_mm,z_mm\n{text}\n")
+
+
+JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n"
+BAD = [
+    (in_text("arm/toy.urdf", '<axis xyz="', '<axis xyz="0 0 0" was="'), ["register"], "joint 'j1': its axis is zero"),
+    (in_text("arm/toy.urdf", 'velocity="3"', 'velocity="0"'), ["place"], r'joint .j1.: <limit velocity="0">; allowed'),
+    (in_text("arm/toy.urdf", 'effort="100"', 'effort="nan"'), ["rehearse"], r"effort=.nan.>; allowed: a finite number"),
+    (in_text("arm/toy.urdf", 'name="j4"', 'name="j 4"'), ["touch"], "a joint is called 'j 4'"),
+    (with_bytes("arm/ulna.stl", b"solid x\nendsolid x\n"), ["scan"], "link 'ulna': mesh 'ulna.stl': STL of 19 bytes"),
+    (with_bytes("arm/toy.urdf", b""), ["plan"], "toy.urdf: file of 0 bytes"),
+    (
+        in_text("case.toml", 'holder.stl"\nunit = "mm"', 'holder.stl"\nunit = "m"'),
+        ["plan"],
+        "bounding box diagonal of 10",
+    ),
+    (with_bytes("holder.stl", b"\0" * 80 + b"\x8c\0\0\0" + b"\0" * 216), ["touch"], "states 140 triangles"),
+    (
+        in_text("case.toml", "position_mm = [0, 0, 0]", "position_mm = [0, 300, 0]"),
+        ["place"],
+        "does not hang on wrist, holder",
+    ),
+    (in_text("case.toml", "position_mm = [0, 0, 0]", "position_mm = [0, 0, nan]"), ["plan"], r"tool\.position_mm\.2"),
+    (with_bytes("j.csv", (JOINTS + "1,2,3,4,5,6\n" * 4).encode()), ["pivot", "j.csv"], "pivot|j.csv"),
+    (with_bytes("j.csv", (JOINTS + "0,-90,90,0,90,0\n10,-90,90,0,90,0,7\n").encode()), ["pivot", "j.csv"], "j.csv"),
+    (with_bytes("j.csv", (JOINTS + "400,-9,9,0,9,0\n0,-9,9,0,9,0\n").encode()), ["pivot", "j.csv"], "j.csv"),
+    (in_text("touch.csv", "\nB,", "\nA,"), ["register"], "the name 'A' is used 2 times|touch.csv"),
+    (in_metres, ["plan"], "touch|markers"),
+    (with_bytes("touch.csv", b"\xff\xfe"), ["touch"], "touch.csv: .*text"),
+    (with_bytes("r.json", b'{"schema": 1}'), ["scan", "--rehearsal", "r.json"], "r.json"),
+    (with_bytes("r.json", b"\0"), ["scan", "--rehearsal", "r.json"], "r.json"),
+    (in_text("case.toml", "[rehearsal]", "[rehearsal]\nhu = 3"), ["scan", "--marker", "cube"], "cube|hu"),
+]
+
+
+@pytest.mark.parametrize(("change", "command", "says"), BAD)
+def test_bad_input_is_one_line_and_nothing_is_written(tmp_path, capfd, change, command, says):
+    """Of arm, tool, pivot, touches and scan: exit code 2."""
+    case = own_case(tmp_path / "case")
+    change(case)
+    out, words = tmp_path / "out", [str(case / one) if (case / one).is_file() else one for one in command[1:]]
+    writes = command[0] not in ("register", "pivot")  # what was read is judged on the terminal
+    code = main([command[0], str(case), *words, *(("--out", str(out)) if writes else ())])
+    told = capfd.readouterr()
+    lines = [line for line in told.err.splitlines() if not re.match(r"stage|[a-z ]+: \d+/\d+", line)]  # no progress
+    assert code == 2, told
+    assert len(lines) == 1 and re.search(says, lines[0]), lines
+    assert not out.exists() or not [one for one in out.rglob("*") if one.is_file()]
