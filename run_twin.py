@@ -22,6 +22,7 @@ from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.twin.jobs.batch.commands import batch_app
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, exit_code_of
 from puncture_twin.twin.jobs.extras import require_extra
+from puncture_twin.twin.jobs.first_use import compiling_beside
 from puncture_twin.twin.jobs.options import (
     ArmOption,
     CaseArgument,
@@ -79,7 +80,7 @@ def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> 
     from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.patient import main_job, text
 
-    with progress_display() as progress:
+    with progress_display() as progress, compiling_beside():
         run = main_job.demo_case(prepare(meshes_folder() / "abdomen", watcher=progress), out_dir)
     print_answer(run.summary(), text.rehearsal_text(run), as_json)
 
@@ -150,7 +151,7 @@ def search(
     for option, value in (("--certify-touch", certify_touch), ("--certify-size", certify_size)):
         if value is not None and not certified:
             raise InputError("of a certificate that nobody asked for", where=option, allowed="beside --certify")
-    with progress_display() as progress:
+    with progress_display() as progress, compiling_beside():
         context = prepare(case, arm=arm, engine=engine, watcher=progress)
         checked = context.cross_check(check_again) if check_again else None
         run = main_job.search_case(
@@ -215,7 +216,7 @@ def check(
         if not listed.safe:
             raise typer.Exit(ANSWER_IS_NO)
         return
-    with progress_display() as progress:
+    with progress_display() as progress, compiling_beside():
         context = prepare(case, arm=arm, watcher=progress)
         explained = check_candidate(context, choice)
         if picture is not None:
@@ -270,7 +271,7 @@ def plan(
     from puncture_twin.twin.jobs.patient import main_job, text
 
     folder = _out(out_dir, case, "plan")
-    with progress_display() as progress:
+    with progress_display() as progress, compiling_beside():
         run = main_job.plan_case(prepare(case, watcher=progress), folder, choice)
     print_answer(run.summary(), text.plan_text(run), as_json)
 
@@ -310,7 +311,7 @@ def rehearse(
     planned_case = case_of(source, case, choice)
     if planned_case is None:
         raise InputError("a plan needs its case", where=source, allowed="rehearse plan.json --case CASE")
-    with progress_display() as progress:
+    with progress_display() as progress, compiling_beside():
         context = prepare(planned_case, watcher=progress)
         if is_plan(source):
             run = main_job.rehearse_plan(context, source, folder, rooms)

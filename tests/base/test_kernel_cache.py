@@ -45,7 +45,11 @@ def _run(project, own=True):
         "" if own else "numba.core.config.CACHE_LOCATOR_CLASSES = ''",
     ]
     lines += ["from puncture_twin.planning.caller import add", "print(add(1), sum(add.stats.cache_hits.values()))"]
-    code = "\n".join(lines)
+    return _python(project, "\n".join(lines))
+
+
+def _python(project, code):
+    """What a process of its own prints."""
     environment = os.environ | {"PYTHONPATH": str(project), "NUMBA_CACHE_DIR": str(project / "cache")}
     return subprocess.run(
         [sys.executable, "-c", code], env=environment, cwd=project, capture_output=True, text=True, check=True
@@ -172,3 +176,18 @@ def test_kernels_of_others_are_left_to_numba(tmp_path):
         [sys.executable, "-c", code], env=environment, cwd=other, capture_output=True, text=True, check=True
     )
     assert run.stdout.split() == ["numba.core.caching", "IndexDataCacheFile"]
+
+
+def test_it_is_known_whether_a_kernel_is_compiled(project):
+    """Of today's sources: not before its first call; afterwards in other processes too, until an edit."""
+    asked = "from puncture_twin.planning.base.cache.kernel_cache import is_compiled\n"
+    asked += "from puncture_twin.planning.caller import add\nprint(is_compiled(add))\n"
+
+    def compiled(then=""):
+        return _python(project, asked + then).stdout.split()
+
+    assert compiled() == ["False"]
+    assert compiled("add(1); print(is_compiled(add))") == ["False", "True"]
+    assert compiled() == ["True"]
+    (project / "puncture_twin" / "planning" / "size.py").write_text("SIZE = 2\n")
+    assert compiled() == ["False"]

@@ -20,7 +20,7 @@ from typing import Any
 from numba.core import config as numba_config
 from numba.core.caching import InTreeCacheLocator, UserProvidedCacheLocator, UserWideCacheLocator
 
-from puncture_twin.planning.base.cache.kernel_files import ProjectStamp, use_checked_files
+from puncture_twin.planning.base.cache.kernel_files import CheckedFiles, ProjectStamp, use_checked_files
 from puncture_twin.planning.base.cache.source_stamp import PACKAGE, PARTS, library_versions, stamp_of
 
 config: Any = numba_config
@@ -83,3 +83,9 @@ def use_kernel_cache() -> None:
     theirs = config.CACHE_LOCATOR_CLASSES.split(",") if config.CACHE_LOCATOR_CLASSES else list(NUMBAS)
     use_checked_files()
     config.CACHE_LOCATOR_CLASSES = ",".join([*ours, *(place for place in theirs if place not in ours)])
+
+
+def is_compiled(kernel: Any) -> bool:
+    """Whether a kernel of this project was compiled for anything, now or earlier, or is never compiled and kept."""
+    files = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+    return not isinstance(files, CheckedFiles) or bool(kernel.signatures) or files.any_kept()

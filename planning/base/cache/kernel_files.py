@@ -59,6 +59,10 @@ class CheckedFiles(NumbasFiles):
         stated, data = pickle.loads(content)
         return data if stated == key else None
 
+    def any_kept(self) -> bool:
+        """Whether the function has been compiled for anything under today's sources."""
+        return bool(self._load_index(report=False))
+
     def save(self, key: Any, data: Any) -> None:
         """Save under a key; a folder that cannot be written to costs time, not the result."""
         overloads = self._load_index(report=False)

@@ -1,0 +1,71 @@
+"""The first command on a new machine: half of its kernels are compiled by a second process beside it.
+
+A kernel is compiled when it is first called, on one thread, and that is most of what a first command takes. A command
+needs the organs' kernels first and those of arm, planner and pictures last: these a second process compiles meanwhile,
+by using each once on a small workcell, and the command then loads them from their files. Two that compile the same at
+once lose time, not more: files are written whole, and what does not fit is compiled anew.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from puncture_twin.planning.base.processes import worker_count
+
+
+@contextmanager
+def compiling_beside() -> Iterator[None]:
+    """While the block runs, compile in a second process, where nothing is compiled yet and a core is free for it."""
+    from puncture_twin.planning.base.cache.kernel_cache import is_compiled
+    from puncture_twin.planning.collision.kernels.proofs import first_unproven
+
+    if is_compiled(first_unproven) or worker_count(2, 2) == 1:
+        yield
+        return
+    other = _begin()
+    try:
+        yield
+    finally:
+        other.terminate()
+        other.wait()
+
+
+def _begin() -> subprocess.Popen[bytes]:
+    """A process that Ctrl-C at the terminal does not reach: whoever began it ends it."""
+    words = [sys.executable, "-c", f"from {__name__} import {use_once.__name__}; {use_once.__name__}()"]
+    places = {"PYTHONPATH": os.pathsep.join(place for place in sys.path if place)}
+    nowhere = subprocess.DEVNULL
+    return subprocess.Popen(
+        words, env={**os.environ, **places}, stdin=nowhere, stdout=nowhere, stderr=nowhere, start_new_session=True
+    )
+
+
+def use_once() -> None:
+    """Use what a first command needs last: the arm, its planner, the pictures."""
+    from puncture_twin.planning.motion.approach import plan_approach
+    from puncture_twin.planning.reach.small_workcell import ask_arm, small_workcell
+
+    checker = small_workcell()
+    reached = [answer for answer in ask_arm(checker) if answer.reachable]
+    _draw_once()
+    plan_approach(checker, np.radians([0.0, -90.0, 0.0, -90.0, 0.0, 0.0]), reached[0].insertion_q[0], seed=0)
+
+
+def _draw_once() -> None:
+    """A body in another that is see-through, and one that moves."""
+    from puncture_twin.planning.reach.small_workcell import TARGET, octahedron
+    from puncture_twin.twin.report.raster.camera import ViewCamera
+    from puncture_twin.twin.report.raster.moving import MovingPicture
+    from puncture_twin.twin.report.raster.render import Layer, Surface
+
+    body, shell = (octahedron(TARGET, radius_mm) for radius_mm in (40.0, 80.0))
+    opaque, glass = Layer([Surface(body, (200, 130, 100))]), Layer([Surface(shell, (230, 200, 180), alpha=0.3)])
+    camera = ViewCamera(TARGET + [300.0, 0.0, 0.0], TARGET, np.array([0.0, 0.0, 1.0]), fov=0.6, width=64, height=48)
+    MovingPicture(opaque, glass, [Layer([Surface(body, (50, 100, 200))])], camera).at([np.eye(4)])
+    opaque.sees(camera.eye, TARGET[None])
