@@ -5,7 +5,13 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from puncture_twin.planning.anatomy.default_roles import BODY, LESION, NEVER_CROSSED, UNKNOWN_NAME, default_role
+from puncture_twin.planning.anatomy.default_roles import (
+    BODY,
+    LESION,
+    UNKNOWN_NAME,
+    default_role,
+    never_crossed,
+)
 from puncture_twin.planning.anatomy.regions import USUAL, absent_organs
 from puncture_twin.planning.init.segmentation import Assigned
 
@@ -40,7 +46,7 @@ def _assigned(label: int, name: str, region: str, holding: Holding) -> Assigned:
     line = default_role(name, region) or UNKNOWN_NAME
     if name == holding.target:
         return Assigned(label, name, "target", 0.0, line)
-    if name in holding.others and line != BODY and line.group not in NEVER_CROSSED:
+    if name in holding.others and line != BODY and never_crossed(name) is None:
         return Assigned(label, name, "traverse", 0.0, line)
     return Assigned(label, name, line.kind, line.margin_mm, line)
 

@@ -260,6 +260,20 @@ def test_a_vessel_that_holds_the_target_too_is_not_crossed(tmp_path, capfd):
     assert code == 2 and "lies inside 'pulmonary_artery', which is to be avoided" in said[-1]
 
 
+@pytest.mark.parametrize("name", ["brainstem", "pons"])
+@pytest.mark.parametrize("region", ["other", "head", "brain"])
+def test_a_brainstem_that_holds_the_target_too_is_crossed_in_no_region(tmp_path, capfd, region, name):
+    """Outside of the region `brain` it is brain or unknown, and became `traverse`: every path through it was safe."""
+    write_ct(tmp_path / "scan.nii.gz")
+    write_masks(tmp_path)
+    (tmp_path / "right lung.nii.gz").unlink()
+    for one, radius in (("tumor", 6.0), (name, 9.0)):
+        mask = image_of(inside((-40, 0, 10), radius).astype(np.uint8), SPACING)
+        sitk.WriteImage(mask, str(tmp_path / f"{one}.nii.gz"))
+    code, _, said = init(capfd, tmp_path, "--target", TARGET, "--region", region)
+    assert code == 2 and f"lies inside '{name}', which is to be avoided" in said[-1]
+
+
 def test_a_typed_target_in_a_vessel_is_a_slip(tmp_path, capfd):
     """The aorta became the target's structure, and every path into it was safe, with exit code 0 and a note."""
     write_ct(tmp_path / "scan.nii.gz")
