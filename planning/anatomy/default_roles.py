@@ -116,7 +116,7 @@ GENERAL: tuple[DefaultRole, ...] = (
     ),
     _line(
         "spinal cord",
-        "*spinal_cord* *spinal_canal* *medulla_spinalis* *cauda_equina*",
+        "*spinal_cord* *spinal_canal* *medulla_spinalis* *cauda_equina* *thecal_sac* *dural_sac*",
         "avoid",
         5.0,
         "palsy",
@@ -174,14 +174,16 @@ GENERAL: tuple[DefaultRole, ...] = (
     ),
     _line(
         "other vessels",
-        "*arter* *vein* hepatic_ve* *vena* *venous* *vessel* *vascul* *sinus_sagitt*",
+        "*arter* *vein* hepatic_ve* *vena* *venous* *vessel* *vascul* *sinus_sagitt* "
+        "*circle_of_willis* aneurysm aneurysma *_aneurysm",
         "avoid",
         3.0,
         "bleeding; smaller ones are rarely segmented whole",
     ),
     _line(
         "heart",
-        "*heart* *cardi* *papillary_muscle* *atri* *ventricle_left* *ventricle_right* *coronar*",
+        "*heart* *cardi* *papillary_muscle* *atri* *ventricle_left* *ventricle_right* "
+        "*left_ventricle *right_ventricle *coronar*",
         "avoid",
         5.0,
         "it moves; tamponade",
@@ -336,7 +338,7 @@ BY_REGION: Mapping[str, tuple[DefaultRole, ...]] = MappingProxyType(
             ),
             _line(
                 "brainstem",
-                "*brainstem* *brain_stem* *truncus_enceph* *pons*",
+                "*brainstem* *brain_stem* *truncus_enceph* *pons* *midbrain* *mesenceph* *medulla_oblong*",
                 "avoid",
                 5.0,
                 "vital centres",

@@ -3,7 +3,14 @@
 import pytest
 from places import ROOT
 
-from puncture_twin.planning.anatomy.default_roles import BODY, BY_REGION, GENERAL, UNKNOWN_NAME, default_role
+from puncture_twin.planning.anatomy.default_roles import (
+    BODY,
+    BY_REGION,
+    GENERAL,
+    UNKNOWN_NAME,
+    default_role,
+    never_crossed,
+)
 from puncture_twin.planning.base.toml_file import parse_toml
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.formats.labels.naming import RuleKind, select
@@ -50,12 +57,12 @@ def test_the_cases_written_by_hand_are_met():
             ["liver_lesion", "Liver Tumor 1", "kidney tumour", "lung_nodules", "colon_cancer_primaries", "Lesion"],
             "lesion",
         ),
-        (["liver_vessels", "Hepatic veins", "femoral artery"], "other vessels"),
+        (["liver_vessels", "Hepatic veins", "femoral artery", "Circle of Willis", "basilar_aneurysm"], "other vessels"),
         (["portal_vein", "Portal Vein and Splenic Vein"], "portal vein"),
         (["gall-bladder", "Gallbladder"], "gallbladder and bile ducts"),
         (["urinary_bladder"], "urinary bladder and ureters"),
-        (["SpinalCord", "spinal cord"], "spinal cord"),
-        (["heart_atrium_left", "pericardium"], "heart"),
+        (["SpinalCord", "spinal cord", "Thecal sac", "dural sac"], "spinal cord"),
+        (["heart_atrium_left", "pericardium", "Left Ventricle", "heart_ventricle_left"], "heart"),
         (["Body", "skin", "body_trunc"], BODY.group),
         (["subcutaneous_fat", "torso_fat"], "fat, breast"),
         (["skeletal_muscle"], "muscles"),
@@ -96,6 +103,19 @@ def test_a_region_has_its_own_lines():
     assert default_role("brain", "neck").kind == "avoid"
     assert default_role("Left lateral ventricle", "brain").group == "ventricles of the brain"
     assert default_role("brainstem", "brain").margin_mm == 5.0
+
+
+@pytest.mark.parametrize("name", ["Midbrain", "Pons", "Medulla oblongata", "mesencephalon"])
+def test_parts_of_the_brainstem_are_brainstem(name):
+    """The midbrain was brain by its ending, which paths to a target in the brain cross freely."""
+    assert default_role(name, "brain").group == "brainstem"
+    assert never_crossed(name).group == "brainstem"
+
+
+def test_a_lesion_named_after_a_vessel_stays_a_lesion():
+    """An aneurysmal bone cyst is biopsied: it is no aneurysm."""
+    assert never_crossed("aneurysmal bone cyst") is None
+    assert never_crossed("Left lateral ventricle") is None
 
 
 def test_the_page_shows_the_table():
