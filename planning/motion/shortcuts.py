@@ -9,7 +9,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.motion.joint_space import JointSpace, SegmentContact, angles_of
 
 ROUNDS = 2
-"""Of shortcuts: a second one takes 13 % off what one leaves beside a gantry."""
+"""Of shortcuts: a second one takes about a tenth off what one leaves beside a gantry."""
 
 
 UNSCALED = 1.0
