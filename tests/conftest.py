@@ -11,6 +11,9 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 settings.register_profile("shared machine", deadline=None)  # the first call of compiled code takes seconds
 settings.load_profile("shared machine")
 
+LONG_S = 1e6
+"""No test takes so long."""
+
 
 def pytest_configure(config):
     """Measure what tests take, where that is wanted."""
@@ -61,4 +64,12 @@ def own_cache(tmp_path_factory):
     """Tests neither see nor fill the user's cache."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PUNCTURE_TWIN_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def no_progress_lines():
+    """A slow machine's progress, a line every few seconds, would stand among what commands are expected to say."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("puncture_twin.twin.report.progress.LINE_EVERY_S", LONG_S)
         yield

@@ -34,6 +34,7 @@ def test_a_rate_has_the_unit_in_which_it_says_something(per_second, text):
 def test_there_is_no_rate_without_time_behind_it(monkeypatch):
     """The first report starts the clock; what was done before it counts for nothing; failures are told."""
     stream, now = io.StringIO(), itertools.count(0, 10)
+    monkeypatch.setattr("puncture_twin.twin.report.progress.LINE_EVERY_S", 5.0)
     monkeypatch.setattr("puncture_twin.twin.report.progress.time.monotonic", lambda: float(next(now)))
     with LineDisplay(stream) as display:
         display.count("cases", 4, 10)

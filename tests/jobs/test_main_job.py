@@ -333,6 +333,7 @@ def test_progress_in_a_log_is_a_line_now_and_then(monkeypatch):
     """No bars where nobody watches: a line with rate and remaining time, at most every few seconds."""
     stream = io.StringIO()
     clock = iter(range(0, 1000, 3))
+    monkeypatch.setattr("puncture_twin.twin.report.progress.LINE_EVERY_S", 5.0)
     monkeypatch.setattr("puncture_twin.twin.report.progress.time.monotonic", lambda: float(next(clock)))
     display = progress_display(stream)
     assert isinstance(display, LineDisplay)
