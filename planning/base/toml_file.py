@@ -91,8 +91,14 @@ def parse_toml(
         return model.model_validate(data if change is None else change(data))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"]) or "top level"
-        said = first["msg"].removeprefix("Value error, ")
+        place, said = _said(first["loc"], first["msg"].removeprefix("Value error, "), first["type"])
         value = "" if isinstance(first["input"], dict | list | tuple) else f" (given: {first['input']!r:.60})"
         allowed = f"the keys, types and ranges of {keys}"
         raise InputError(f"{place}: {said}{value}", where=path, allowed=allowed) from error
+
+
+def _said(keys: tuple[str | int, ...], message: str, kind: str) -> tuple[str, str]:
+    """Which key, and what is wrong with it; of a list that is too short the list's own."""
+    if kind == "missing" and keys and isinstance(keys[-1], int):
+        return ".".join(map(str, keys[:-1])), f"number {keys[-1] + 1} of the list is missing"
+    return ".".join(map(str, keys)) or "top level", message

@@ -108,7 +108,7 @@ BAD = {
         ("[1.0, 2.0, 3.0]", "[1.0, inf, 3.0]"),
         "target.position_mm.1: Input should be a finite number",
     ),
-    "two coordinates": (("[1.0, 2.0, 3.0]", "[1.0, 2.0]"), "target.position_mm.2: Field required"),
+    "two coordinates": (("[1.0, 2.0, 3.0]", "[1.0, 2.0]"), "target.position_mm: number 3 of the list is missing"),
     "no target": (("position_mm = [1.0, 2.0, 3.0]", ""), "needs either position_mm or points"),
     "shaft longer than the needle": (
         ("shaft_mm = 150.0", "shaft_mm = 250.0"),
@@ -158,7 +158,7 @@ def test_a_broken_case_is_refused_in_one_line(name, write):
         ('[registration]\nmarkers_ct = "skin.stl"\nmarkers_base = "skin.stl"\n[robot.mount]\nposition_mm=[0,0,0]\n'
          'x_axis=[1,0,0]\nz_axis=[0,0,1]', "both say where the base is"),
         ("[robot.mount]\nposition_mm=[0,0,0]\nx_axis=[0,0,2]\nz_axis=[0,0,1]", "x_axis and z_axis are parallel"),
-        ('[robot]\nhome_deg = [0, 0, 0]', "robot.home_deg.3: Field required"),
+        ('[robot]\nhome_deg = [0, 0, 0]', "robot.home_deg: number 4 of the list is missing"),
         ('[[structures]]\nlabelmap = "gone.nii.gz"\nnaming = "totalsegmentator-v2"', "file 'gone.nii.gz' is not there"),
     ],
 )  # fmt: skip

@@ -112,7 +112,7 @@ def test_a_needle_is_read_in_a_control_ct(tmp_path, capsys):
     ("arguments", "said"),
     [
         (("--marker", "cross"), "marker 'cross' is not known"),
-        (("--fov", "30"), "marker A is not in the image"),
+        (("--fov", "30"), "marker A is not seen in the image"),
         (("--fov", "30", "--marker", "none", "--length", "6", "--spacing", "10"), "voxels"),
         (("--spacing", "0.3", "--pixel", "0.2"), "200,000,000 at most"),
         (("--rehearsal", "nowhere.json"), "nowhere.json"),

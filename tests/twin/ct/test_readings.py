@@ -70,7 +70,7 @@ def test_a_marker_that_is_not_there_is_named():
     disc = Solid("marker", rod(np.array([0.0, -30.75, 0.0]), np.array([0.0, -29.25, 0.0]), 8.0), 8000.0)
     volume, _ = scanned([BLOCK, disc], 2.5, size=(30.0, 30.0, 30.0))
     expected = NamedPoints(("A", "B"), np.array([[0.0, -30.0, 0.0], [8.0, -30.0, 0.0]]), None)
-    with pytest.raises(InputError, match=r"marker B is not in the image"):
+    with pytest.raises(InputError, match=r"marker B is not seen in the image"):
         find_markers(volume, expected)
 
 

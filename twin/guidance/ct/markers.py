@@ -65,8 +65,10 @@ def _named(pieces: list[Metal], expected: NamedPoints, volume: Volume) -> list[M
     found = {int(row): int(column) for row, column in zip(rows, columns, strict=True)}
     for row, name in enumerate(expected.names):
         if row not in found or distance[row, found[row]] >= FARTHEST_MM:
-            allowed = f"a piece of metal within {FARTHEST_MM:g} mm of where it is expected"
-            raise InputError(f"marker {name} is not in the image", where=volume.path, allowed=allowed)
+            voxels = " x ".join(f"{size:g}" for size in spacing_mm(volume))
+            allowed = f"metal within {FARTHEST_MM:g} mm of where it is expected, and voxels that are small beside it"
+            what = f"marker {name} is not seen in the image, of {voxels} mm voxels"
+            raise InputError(what, where=volume.path, allowed=allowed)
     return [pieces[found[row]] for row in range(len(expected.names))]
 
 
