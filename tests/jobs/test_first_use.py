@@ -41,7 +41,7 @@ def begun(monkeypatch):
         return processes[-1]
 
     monkeypatch.setattr("puncture_twin.planning.base.cache.kernel_cache.is_compiled", lambda kernel: False)
-    monkeypatch.setattr(first_use, "worker_count", lambda wanted, pieces: 2)
+    monkeypatch.setattr("puncture_twin.planning.base.processes.worker_count", lambda wanted, pieces: 2)
     monkeypatch.setattr(first_use.subprocess, "Popen", begin)
     return processes
 
@@ -57,7 +57,7 @@ def test_the_process_ends_with_the_command(begun):
 
 def test_none_begins_on_one_core(begun, monkeypatch):
     """Two that share a core would both be late."""
-    monkeypatch.setattr(first_use, "worker_count", lambda wanted, pieces: 1)
+    monkeypatch.setattr("puncture_twin.planning.base.processes.worker_count", lambda wanted, pieces: 1)
     with first_use.compiling_beside():
         assert not begun
 

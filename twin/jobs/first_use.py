@@ -14,15 +14,12 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import numpy as np
-
-from puncture_twin.planning.base.processes import worker_count
-
 
 @contextmanager
 def compiling_beside() -> Iterator[None]:
     """While the block runs, compile in a second process, where nothing is compiled yet and a core is free for it."""
     from puncture_twin.planning.base.cache.kernel_cache import is_compiled
+    from puncture_twin.planning.base.processes import worker_count
     from puncture_twin.planning.collision.kernels.proofs import first_unproven
 
     if is_compiled(first_unproven) or worker_count(2, 2) == 1:
@@ -48,6 +45,8 @@ def _begin() -> subprocess.Popen[bytes]:
 
 def use_once() -> None:
     """Use what a first command needs last: the arm, its planner, the pictures."""
+    import numpy as np
+
     from puncture_twin.planning.motion.approach import plan_approach
     from puncture_twin.planning.reach.small_workcell import ask_arm, small_workcell
 
@@ -59,6 +58,8 @@ def use_once() -> None:
 
 def _draw_once() -> None:
     """A body in another that is see-through, and one that moves."""
+    import numpy as np
+
     from puncture_twin.planning.reach.small_workcell import TARGET, octahedron
     from puncture_twin.twin.report.raster.camera import ViewCamera
     from puncture_twin.twin.report.raster.moving import MovingPicture
