@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
-from puncture_twin.planning.arm.kinematics import TIE_DIGITS, singularity
+from puncture_twin.planning.arm.kinematics import ELBOW, ELBOW_DIGITS, TIE_DIGITS, link_poses, singularity
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
@@ -46,7 +46,8 @@ class Posture(NamedTuple):
 def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, *, first: int | None = None) -> Posture:
     """Joint angles that hold the ball on every point, all on one branch, free of contacts.
 
-    Of the branches the one that stays farthest from every singularity is taken.
+    Of the branches the one that stays farthest from every singularity is taken; of equals, which mirrored ones are, the
+    one whose elbow is on the rod's side.
 
     Args:
         rod: The arm, its rod and its orientation.
@@ -60,7 +61,9 @@ def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, 
     every = inverse(rod.model, flange_poses(rod, points_base))
     workcell = np.nan_to_num(singularity(rod.model, every).least(), nan=0.0).min(axis=0)
     why = f"a {rod.model.name} cannot hold the ball on all {len(points_base)} points on one branch"
-    order = sorted(range(len(workcell)), key=lambda branch: (branch != first, -round(workcell[branch], TIE_DIGITS)))
+    elbow = np.nan_to_num(link_poses(rod.model, every[0])[:, ELBOW, :3, 3] @ -rod.R_base_flange[:, 2])
+    ranks = np.column_stack([np.round(workcell, TIE_DIGITS), np.round(elbow, ELBOW_DIGITS)])
+    order = sorted(range(len(ranks)), key=lambda branch: (branch != first, *-ranks[branch]))
     for branch in (branch for branch in order if workcell[branch] >= LEAST_SINGULARITY):
         q = nearest_within_limits(rod.model, every[:, branch], REFERENCE_RAD)
         if np.isnan(q).any():
