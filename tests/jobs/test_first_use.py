@@ -1,33 +1,13 @@
 """The process that compiles beside the first command on a new machine: what it compiles, and that it ends."""
 
-import json
 import os
 import subprocess
-import sys
 
 import numpy as np
 import pytest
-from places import ROOT
 
 from puncture_twin.planning.reach.small_workcell import ask_arm, small_workcell
 from puncture_twin.twin.jobs import first_use
-
-COMPILED = """
-import json, sys
-from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.first_use import use_once
-
-def compiled():
-    ours = [m for name, m in sys.modules.items() if name.startswith(ROOMS)]
-    kernels = {id(k): k for m in ours for k in vars(m).values() if hasattr(k, "signatures")}
-    return {f"{k.py_func.__module__}.{k.py_func.__name__}{s}" for k in kernels.values() for s in k.signatures}
-
-ROOMS = ("puncture_twin.planning.collision.kernels", "puncture_twin.planning.reach", "puncture_twin.planning.motion")
-use_once()
-before = compiled()
-main(WORDS)
-print(json.dumps([sorted(before), sorted(compiled() - before)]))
-"""
 
 
 @pytest.fixture
@@ -77,11 +57,6 @@ def test_the_small_workcell_has_directions_of_both_kinds():
     assert all(np.isfinite(answer.insertion_q).all() for answer in answers)
 
 
-def test_a_plan_compiles_nothing_of_the_arm_that_was_not_compiled_beside_it(tmp_path):
-    """Array types decide: a kernel that a command calls with another layout would be compiled again."""
-    words = ["plan", str(ROOT / "meshes" / "carton" / "case_m.toml"), "--theta", "18", "--beta", "232"]
-    code = COMPILED.replace("WORDS", repr([*words, "--out", str(tmp_path / "out"), "--json"]))
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
-    compiled, anew = json.loads(done.stdout.splitlines()[-1])
-    assert len(compiled) > 5
-    assert anew == []
+def test_everything_that_is_used_once_works():
+    """Nobody reads what the process says: an arm, a planner or a painter that has changed must show here."""
+    first_use.use_once()
