@@ -6,6 +6,7 @@ Source: ITK, TxtTransformIO; Slicer's developer guide, "Transforms": a node's fi
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,10 @@ MAX_HDF5_BYTES = 500_000_000
 """A field of displacements is refused by its name, which has to be read."""
 _HEADER = "#Insight Transform File V1.0"
 _KEYS = ("Parameters", "FixedParameters")
+_LINE_END = re.compile(r"\r\n|\r|\n")
+"""Python's `splitlines` takes a vertical tab and six more characters for one too; ITK does not."""
+_NUMBER = re.compile(r"[!-^`-~]+")
+"""Printed ASCII without the underscore: Python also reads 1_0 and the digits of other scripts."""
 
 
 def most_bytes(name: str) -> int:
@@ -53,7 +58,7 @@ def parse_transform(data: bytes, path: Path) -> Floats:
 
 def _text_transforms(data: bytes, where: str) -> list[StatedTransform]:
     """The transforms of a text, in its order."""
-    lines = [line.strip() for line in decode_text(data, where).splitlines() if line.strip()]
+    lines = [line.strip() for line in _LINE_END.split(decode_text(data, where)) if line.strip()]
     if not lines or lines[0] != _HEADER:
         refuse("no ITK transform file", where, ALLOWED)
     return [StatedTransform(kind, *(_numbers(one, key, where) for key in _KEYS)) for kind, one in _blocks(lines, where)]
@@ -78,7 +83,7 @@ def _blocks(lines: list[str], where: str) -> list[tuple[str, dict[str, str]]]:
 def _numbers(stated: dict[str, str], key: str, where: str) -> Floats:
     words = stated.get(key, "").split()
     try:
-        return np.array([float(word.replace("_", "no number")) for word in words])
+        return np.array([float(word if _NUMBER.fullmatch(word) else f"no number {word}") for word in words])
     except ValueError as error:
         raise InputError(f"{key} are no numbers ({str(error)[:80]})", where=where, allowed=ALLOWED) from error
 

@@ -103,6 +103,9 @@ TWICE = GOOD + "\n".join(GOOD.splitlines()[1:]) + "\n"
         ("a.tfm", GOOD.splitlines()[0], "no linear transform"),
         ("a.tfm", GOOD.replace("Transform: Aff", "Transform:\nAff"), "line 'AffineTransform_double_3_3'"),
         ("a.tfm", GOOD.replace("#Transform 0", "Parameters: 1"), "line 'Parameters: 1'"),
+        ("a.tfm", GOOD.replace("\nFixed", "\vFixed"), "Parameters are no numbers"),
+        ("a.tfm", GOOD.replace("FixedParameters: 0", "FixedParameters: \uff11"), "FixedParameters are no numbers"),
+        ("a.tfm", GOOD.replace("FixedParameters: 0", "FixedParameters: 1_0"), "FixedParameters are no numbers"),
         ("a.mat", GOOD, r"kind '\.mat'"),
     ],
 )
