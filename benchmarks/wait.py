@@ -2,8 +2,9 @@
 
 Every command runs in a new process, in two states: with an empty cache folder (cold), and with everything there (warm,
 the median of ``--times``); with ``--first-use`` also with nothing compiled. What is printed is processor
-time, which other work on the machine changes less than the clock; `benchmarks.wait_probe` divides it. Two checkouts
-take turns. The real CT (61 structures, 1 degree, with the arm) is left out where it is not on this machine.
+time, which other work on the machine changes less than the clock; `benchmarks.wait_probe` divides it. The last row is
+the clock's: what a person waits, where nothing else runs. Two checkouts take turns. The real CT (61 structures,
+1 degree, with the arm) is left out where it is not on this machine.
 """
 
 from __future__ import annotations
@@ -19,12 +20,16 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from time import perf_counter
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DATA = REPOSITORY.parent / "shared" / "data" / "totalseg_abdomen_3mm"
 PROBE = Path(__file__).with_name("wait_probe.py")
 
 Seconds = dict[str, float]
+
+ALL, CLOCK = "all", "by the clock"
+"""The last rows: processor seconds of everything, and seconds of the clock."""
 
 
 @dataclass(frozen=True)
@@ -70,14 +75,15 @@ class Side:
         """Seconds of one run in a new process, by what was waited for."""
         answer = self.folder / "answer.json"
         words = [sys.executable, str(PROBE), str(self.checkout), str(answer), *command.words]
+        start = perf_counter()
         done = subprocess.run(words, env=self._environment(), capture_output=True, text=True, check=False)
+        passed = perf_counter() - start
         if done.returncode:
             raise SystemExit(done.stderr)
         found = json.loads(answer.read_text())
         if found["exit_code"] > 1:
             raise SystemExit(f"{self.name}: {command.name} ended with {found['exit_code']}\n{done.stderr}")
-        seconds: Seconds = found["seconds"]
-        return seconds
+        return {**found["seconds"], CLOCK: passed}
 
     def forget(self, *, compiled: bool) -> None:
         """Empty the cache folder, and that of compiled kernels too."""
@@ -117,10 +123,10 @@ def print_table(command: Command, found: Mapping[str, Seconds]) -> None:
     """One row a stage, one column a checkout and state."""
     print(f"\n{command.name}: `{' '.join(Path(word).name for word in command.words)}`\n")
     print(f"| processor, s | {' | '.join(found)} |\n|{'---|' * (1 + len(found))}")
-    stages = dict.fromkeys(stage for seconds in found.values() for stage in seconds if stage != "all")
-    for stage in (*stages, "all"):
+    stages = dict.fromkeys(stage for seconds in found.values() for stage in seconds if stage not in (ALL, CLOCK))
+    for stage in (*stages, ALL, CLOCK):
         values = [seconds.get(stage, 0.0) for seconds in found.values()]
-        if stage == "all" or max(values) >= 0.005:
+        if stage in (ALL, CLOCK) or max(values) >= 0.005:
             print(f"| {stage} | {' | '.join(f'{value:.2f}' for value in values)} |", flush=True)
 
 
