@@ -48,6 +48,12 @@ def mesh_field(field: Field, box: SamplingBox) -> TriangleMesh:
     Raises:
         ValueError: If the body touches the box or the box holds none.
     """
+    surface = marched(field, box)
+    return TriangleMesh(_relax(field, surface.vertices, surface.faces, box.spacing_mm), surface.faces)
+
+
+def marched(field: Field, box: SamplingBox) -> TriangleMesh:
+    """The zero set of a field by marching cubes alone, triangles outward; arguments and errors as for `mesh_field`."""
     values = _sample(field, box)
     rim = np.ones(values.shape, dtype=bool)
     rim[1:-1, 1:-1, 1:-1] = False
@@ -55,9 +61,7 @@ def mesh_field(field: Field, box: SamplingBox) -> TriangleMesh:
         raise ValueError(f"the body must lie inside the box {box} and not touch it")
     vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(box.spacing_mm,) * 3)
     vertices = vertices.astype(float) + np.asarray(box.low)
-    faces = _outward(vertices, faces.astype(np.int32))
-    vertices = _relax(field, vertices, faces, box.spacing_mm)
-    return TriangleMesh(vertices, faces)
+    return TriangleMesh(vertices, _outward(vertices, faces.astype(np.int32)))
 
 
 def _sample(field: Field, box: SamplingBox) -> Floats:

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from skimage.measure import marching_cubes
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.phantoms import torso
 from puncture_twin.twin.phantoms.ct_image import AIR_HU, Grid, ScannedPart
 from puncture_twin.twin.phantoms.implicit import Field, capsule, ellipsoid, offset, within
+from puncture_twin.twin.phantoms.mesher import SamplingBox, marched
 from puncture_twin.twin.plant.scanner.solids import Solid
 
 LESION_LPS_MM = (-55.0, 20.0, 0.0)
@@ -33,6 +33,8 @@ LINE_GAP_MM = 14.0
 
 LOOK_MM, SURFACE_MM, FINE_MM, THIN_MM = 8.0, 5.0, 2.0, 160.0
 """Spacings at which surfaces are looked for and sampled, and of parts whose box is no thicker than the last."""
+ROOM_MM = (330.0, 262.0, 132.0)
+"""Half the edges of the box in which surfaces are looked for."""
 
 Arms = Literal["down", "up", "none"]
 
@@ -147,18 +149,10 @@ def solids(parts: Sequence[ScannedPart]) -> list[Solid]:
 
 def _surface(field: Field) -> TriangleMesh:
     """The zero set by marching cubes in the box about it, finer where that box is thin."""
-    low, high = np.array([-330.0, -262.0, -132.0]), np.array([330.0, 262.0, 132.0])
-    nodes, _ = _sampled(low, high, LOOK_MM)
+    nodes = np.stack(
+        np.meshgrid(*(np.arange(-half, half + LOOK_MM, LOOK_MM) for half in ROOM_MM), indexing="ij"), axis=-1
+    )
     near = nodes[field(nodes.reshape(-1, 3)).reshape(nodes.shape[:3]) < LOOK_MM]
     low, high = near.min(axis=0) - LOOK_MM, near.max(axis=0) + LOOK_MM
-    spacing = FINE_MM if np.sort(high - low)[0] < THIN_MM else SURFACE_MM
-    nodes, first = _sampled(low, high, spacing)
-    values = field(nodes.reshape(-1, 3)).reshape(nodes.shape[:3])
-    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(spacing,) * 3)
-    return TriangleMesh(vertices + first, faces)
-
-
-def _sampled(low: Floats, high: Floats, spacing: float) -> tuple[Floats, Floats]:
-    """Nodes of a grid, shape (nx, ny, nz, 3), and the first of them."""
-    axes = [np.arange(a, b + spacing, spacing) for a, b in zip(low, high, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), low
+    spacing = FINE_MM if np.min(high - low) < THIN_MM else SURFACE_MM
+    return marched(field, SamplingBox(tuple(low), tuple(high), spacing))
