@@ -16,19 +16,11 @@ from puncture_twin.planning.arm.urdf.limits import JointLimits, narrowed
 from puncture_twin.planning.base.arrays import read_only
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.case.case_file import (
-    CaseFile,
-    RobotSection,
-)
+from puncture_twin.planning.case.case_file import CaseFile, RobotSection
 from puncture_twin.planning.case.mount import mount_pose
-from puncture_twin.planning.case.registration_section import (
-    NO_RESIDUALS,
-    stated_base_ct,
-)
+from puncture_twin.planning.case.registration_section import NO_RESIDUALS, stated_base_ct
 from puncture_twin.planning.case.sections.limits_section import stated_limits
-from puncture_twin.planning.case.settings import (
-    RobotSettings,
-)
+from puncture_twin.planning.case.settings import RobotSettings
 from puncture_twin.planning.formats import itk_transform
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
 from puncture_twin.planning.geometry.spaces import Space

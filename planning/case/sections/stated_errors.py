@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from puncture_twin.planning.case.case_file import (
-    CaseFile,
-)
+from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.case_volumes import CaseVolumes
 from puncture_twin.planning.case.errors import Cells, ErrorModel, error_model
 from puncture_twin.planning.case.errors_section import ErrorsSection

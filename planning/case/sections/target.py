@@ -9,9 +9,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.case.case_file import (
-    CaseFile,
-)
+from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.formats.points.point_files import parse_points
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
