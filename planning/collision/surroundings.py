@@ -12,7 +12,7 @@ from puncture_twin.planning.arm.tool import Box
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.collision.workcell import case_boxes, gantry_in_ct
+from puncture_twin.planning.collision.workcell import case_boxes, check_gantry, gantry_in_ct
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 
@@ -32,8 +32,9 @@ def with_surroundings(anatomy: Anatomy, case: Case, T_base_ct: Floats | None) ->
     """The anatomy with the case's obstacles and gantry beside what the CT shows outside of the body.
 
     Raises:
-        InputError: An obstacle has the name of a structure.
+        InputError: An obstacle has the name of a structure, or the gantry's wall stands in the patient.
     """
+    check_gantry(case, anatomy.skin.mesh)
     solids = surroundings(case, T_base_ct)
     taken = {structure.name for structure in anatomy.checked}
     for solid in solids:

@@ -21,7 +21,6 @@ from puncture_twin.planning.collision.workcell import (
     ARM_PADDING_MM,
     case_boxes,
     case_tool,
-    check_gantry,
     home_configuration,
     outside_surface,
 )
@@ -130,13 +129,11 @@ def search_placements(
         progress: Called with (stage, done, total).
 
     Raises:
-        InputError: Bounds that contradict the case, a gantry that stands in the patient, or an own arm or tool with
-            a shape that hangs on nothing.
+        InputError: Bounds that contradict the case, or an own arm or tool with a shape that hangs on nothing.
         NoAnswerError: No direction is safe for the organs, or in none the needle could start.
     """
     if not found.safe.any():
         raise NoAnswerError("no direction is safe for the organs, so no placement can help", counts=found.counts())
-    check_gantry(case, anatomy.skin.mesh)
     T_ct_bed = bed_frame(case)
     check = _placement_check(case, anatomy, found)
     CellChecker(check.model, check.tool)  # refuses shapes that hang on nothing before minutes are spent
