@@ -9,9 +9,16 @@ HEAD = """# Default roles and margins
 What `init` writes for a structure, by its name. Capitals, spaces and signs do not count: "Left Lung" is `left_lung`.
 Of several lines that match, the one with the longest pattern holds; a lesion is a lesion whatever organ it is of, and a
 line that avoids holds before one that traverses: `thigh_artery` is no muscle, `intracranial_vessels` are no skull. The
-structure that holds the target gets the role `target`, others that hold it too `traverse`, but for vessels, nerves,
-spinal cord, brainstem and heart, which stay avoided. Margins, in mm, are a start
+structure that holds the target gets the role `target`. Margins, in mm, are a start
 that a physician looks at for each patient, not a rule of any society; they are those of the cases in this repository.
+
+**What is crossed is told by every word of its name.** `traverse` becomes a structure that holds the target beside a
+lesion, or a muscle or fat, only if each word of its name is known as that of an organ of solid tissue, a bone, a soft
+tissue, a lesion, a side or a part (`planning/anatomy/crossed_names.py`): `lung_upper_lobe_left`, "liver tumour 2".
+Vessels, nerves, spinal cord, brainstem and heart that hold the target too stay avoided, and `init` refuses. Whatever
+else holds it (`AAA`, `Rückenmark`, "liver veins", a bowel) becomes `unknown`: paths through it are `unknown_region`
+until the case, which says so beside the name, states `traverse`. The name of a muscle or fat with another word in it
+(`V. pectoralis`) is avoided as an unknown name is.
 
 *Written by `python docs/default_roles.py`.*
 """

@@ -121,7 +121,8 @@ def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure]) -> Be
 
 def _largest_margin(case: Case, grid: LabelGrid, structures: Sequence[Structure]) -> float:
     """Of the labels that are there, those that patterns name and that may lie beyond, and of what nobody named; mm."""
-    named = [margin for one in case.structures if one.source == grid.name for margin in one.avoid.values()]
+    sections = [one for one in case.structures if one.source == grid.name]
+    named = [margin for one in sections for margin in (*one.avoid.values(), *one.unknown.values())]
     return max([case.ct.margin_mm, *named, *(one.margin_mm for one in grid.own(structures))])
 
 

@@ -9,6 +9,7 @@ looked at for each patient, not a rule of any society.
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
 from types import MappingProxyType
@@ -62,7 +63,8 @@ BODY = _line(
 
 LESION = _line(
     "lesion",
-    "*lesion* *tumor* *tumour* *nodule* *metastas* *carcinoma* *neoplas* *cancer* *mass mass_*",
+    "*lesion* *lasion* *laesion* *tumor* *tumour* *tumeur* *nodule* *metastas* *carcinoma* *neoplas* *cancer* *mass "
+    "mass_* gtv* ctv* itv* ptv* hcc*",
     "avoid",
     3.0,
     "tumour cells are not carried along the needle; the one that holds the target is the target",
@@ -409,12 +411,13 @@ def never_crossed(name: str) -> DefaultRole | None:
 
 
 def plain_name(name: str) -> str:
-    """A name in lower case with underscores.
+    """A name in lower case with underscores, without accents.
 
-    >>> plain_name("Left Lung"), plain_name("rib-left.7"), plain_name("SpinalCord")
-    ('left_lung', 'rib_left_7', 'spinal_cord')
+    >>> plain_name("Left Lung"), plain_name("rib-left.7"), plain_name("SpinalCord"), plain_name("Artère")
+    ('left_lung', 'rib_left_7', 'spinal_cord', 'artere')
     """
-    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)
+    bare = "".join(one for one in unicodedata.normalize("NFKD", name) if not unicodedata.combining(one))
+    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", bare)
     return re.sub(r"[\W_]+", "_", spaced).strip("_").lower()
 
 

@@ -92,6 +92,7 @@ class StructureSources:
             names,
             present,
             avoid=section.avoid,
+            unknown=section.unknown,
             traverse=section.traverse,
             ignore=section.ignore,
             target=section.target,

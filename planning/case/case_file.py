@@ -204,6 +204,7 @@ class StructuresSection(Section):
     naming: str | None = None
     target: Patterns = ()
     avoid: Annotated[dict[Text, Margin], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
+    unknown: Annotated[dict[Text, Margin], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
     traverse: Patterns = ()
     ignore: Patterns = ()
 

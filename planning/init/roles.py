@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
+from puncture_twin.planning.anatomy.crossed_names import named_as_crossed
 from puncture_twin.planning.anatomy.default_roles import (
     BODY,
     LESION,
     UNKNOWN_NAME,
+    DefaultRole,
     default_role,
     never_crossed,
 )
@@ -47,8 +49,18 @@ def _assigned(label: int, name: str, region: str, holding: Holding) -> Assigned:
     if name == holding.target:
         return Assigned(label, name, "target", 0.0, line)
     if name in holding.others and line != BODY and never_crossed(name) is None:
-        return Assigned(label, name, "traverse", 0.0, line)
+        return _around_target(label, name, line)
+    if line.kind == "traverse" and not named_as_crossed(name):
+        line = UNKNOWN_NAME
     return Assigned(label, name, line.kind, line.margin_mm, line)
+
+
+def _around_target(label: int, name: str, line: DefaultRole) -> Assigned:
+    """Of a structure that holds the target too, and no vessel or the like: crossed only if its name tells it wholly."""
+    if named_as_crossed(name):
+        return Assigned(label, name, "traverse", 0.0, line)
+    line = line if line.kind == "avoid" else UNKNOWN_NAME
+    return Assigned(label, name, "unknown", line.margin_mm, line)
 
 
 def role_notes(rows: Sequence[Assigned], holding: Holding) -> Iterator[str]:
@@ -56,6 +68,12 @@ def role_notes(rows: Sequence[Assigned], holding: Holding) -> Iterator[str]:
     unknown = [row.name for row in rows if row.line == UNKNOWN_NAME and row.kind == "avoid"]
     if unknown:
         yield f"not in the table of default roles, so avoided by {UNKNOWN_NAME.margin_mm:g} mm: {_list(unknown)}"
+    doubted = [row.name for row in rows if row.kind == "unknown"]
+    if doubted:
+        yield (
+            f"they hold the target too, and are not known as organs that a needle crosses, so paths through them are "
+            f"unknown_region until the case says traverse: {_list(doubted)}"
+        )
     crossed = [row.name for row in rows if row.name in holding.others and row.kind == "traverse"]
     if crossed:
         yield f"they hold the target too, so paths cross them (traverse): {_list(crossed)}"
@@ -69,14 +87,18 @@ def _list(names: Sequence[str]) -> str:
 
 
 def chosen_target(names: Collection[str]) -> str:
-    """Of the structures that hold the target the one that it is: a lesion, else the first; never the body's outline.
+    """Of the structures that hold the target the one that it is; never the body's outline.
+
+    A lesion, else what the table knows for certain (an organ that a needle crosses, or a vessel that none does), else
+    the first: beside a pancreas that holds the target too, an ``SMA`` is not taken for the target.
 
     Args:
         names: At least one, the smallest first.
     """
     lines = {name: default_role(name, "other") for name in names}
     lesions = [name for name, line in lines.items() if line == LESION]
-    return next(iter([*lesions, *names]))
+    certain = [name for name in names if named_as_crossed(name) or never_crossed(name) is not None]
+    return next(iter([*lesions, *certain, *names]))
 
 
 def likely_region(names: Collection[str], target: str | None) -> str:

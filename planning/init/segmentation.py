@@ -22,6 +22,9 @@ from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, 
 from puncture_twin.planning.formats.volumes.volume_source import Content, VolumeFile
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
+HOLDS_TARGET = "it holds the target too, and its name is not known as that of an organ that a needle crosses"
+"""Why a structure is unknown."""
+
 
 class Assigned(NamedTuple):
     """What the case says of one structure.
@@ -29,7 +32,7 @@ class Assigned(NamedTuple):
     Attributes:
         label: Its number within the segmentation.
         name: Its name.
-        kind: ``target``, ``avoid``, ``traverse``, ``ignore`` or ``skin``.
+        kind: ``target``, ``avoid``, ``unknown``, ``traverse``, ``ignore`` or ``skin``.
         margin_mm: The clearance that it demands.
         line: Of the table of default roles.
     """
@@ -113,7 +116,11 @@ def quoted(text: str) -> str:
 
 def margin_line(row: Assigned) -> str:
     """The margin of a ``[[structure]]`` with its reason; empty where it demands none."""
-    return f"margin_mm = {row.margin_mm:g}  # {row.line.group}: {row.line.reason}\n" if row.kind == "avoid" else ""
+    if row.kind not in {"avoid", "unknown"}:
+        return ""
+    change = f'# {HOLDS_TARGET}: role = "traverse", without a margin, if a path may cross it\n'
+    reason = f"margin_mm = {row.margin_mm:g}  # {row.line.group}: {row.line.reason}\n"
+    return reason + (change if row.kind == "unknown" else "")
 
 
 def rules_text(rows: Sequence[Assigned]) -> str:
@@ -123,9 +130,10 @@ def rules_text(rows: Sequence[Assigned]) -> str:
         names = [row.name for row in rows if row.kind == kind]
         if names:
             parts.append(f"{kind} = [\n" + "".join(f"    {quoted(name)},\n" for name in names) + "]\n")
-    avoided = [row for row in rows if row.kind == "avoid"]
-    if avoided:
-        parts.append("\n[structures.avoid]  # margins, mm\n" + _grouped(avoided))
+    for kind, head in (("avoid", ""), ("unknown", f"# {HOLDS_TARGET}: into traverse = [...] if a path may cross it\n")):
+        demanding = [row for row in rows if row.kind == kind]
+        if demanding:
+            parts.append(f"\n[structures.{kind}]  # margins, mm\n{head}{_grouped(demanding)}")
     return "".join(parts)
 
 

@@ -32,6 +32,10 @@ CELLS = 64
 """Along the longest edge of a structure's box, to find its deepest point."""
 
 
+NOT_KNOWN = "; the table of default roles does not know the name, and every safe path ends in it: is it no vessel?"
+"""Of a target's structure."""
+
+
 @dataclass(frozen=True, eq=False)
 class Target:
     """A point to reach.
@@ -93,7 +97,8 @@ def typed_target(
     chosen = chosen_target(names)
     _refuse_in_danger(point_ct, chosen, space, _other_reading(point_ct, segmentations, space, names))
     holding = Holding(chosen, frozenset(names) - {chosen})
-    return Target(point_ct, holding, (f"the target lies in '{chosen}', which is the target's structure",))
+    unsure = "" if default_role(chosen, "other") else NOT_KNOWN
+    return Target(point_ct, holding, (f"the target lies in '{chosen}', which is the target's structure{unsure}",))
 
 
 def _refuse_in_danger(point_ct: Floats, chosen: str, space: Space, other: str) -> None:

@@ -10,6 +10,7 @@ import SimpleITK as sitk  # noqa: N813
 from case_world import MARKERS, ball, image_of
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.base.toml_file import parse_toml
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.search.context import prepare
@@ -272,6 +273,58 @@ def test_a_brainstem_that_holds_the_target_too_is_crossed_in_no_region(tmp_path,
         sitk.WriteImage(mask, str(tmp_path / f"{one}.nii.gz"))
     code, _, said = init(capfd, tmp_path, "--target", TARGET, "--region", region)
     assert code == 2 and f"lies inside '{name}', which is to be avoided" in said[-1]
+
+
+def around_the_lesion(folder, name, lesion="lung tumor"):
+    """The usual organs, with a lesion in a structure of this name in place of the lung."""
+    write_ct(folder / "scan.nii.gz")
+    write_masks(folder)
+    (folder / "right lung.nii.gz").unlink()
+    for one, radius in ((lesion, 6.0), (name, 14.0)):
+        mask = image_of(inside((-40, 0, 10), radius).astype(np.uint8), SPACING)
+        sitk.WriteImage(mask, str(folder / f"{one}.nii.gz"))
+
+
+@pytest.mark.parametrize("name", ["AAA", "Rückenmark", "artère pulmonaire", "Lungenvene", "A. hepatica", "Segment_1"])
+def test_no_path_through_what_nobody_knows_is_safe(tmp_path, capfd, name):
+    """It became `traverse`, and paths through an aneurysm were safe, with exit code 0."""
+    around_the_lesion(tmp_path, name)
+    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+    if code == 0:
+        assert roles(tmp_path)[name][0] == "unknown"
+        assert any(f"unknown_region until the case says traverse: {name}" in line for line in said)
+        found = prepare(tmp_path, arm=False).search()
+        assert not found.safe.any()
+        assert Reason.UNKNOWN_REGION.value in set(found.verdict.reason)
+    else:
+        assert code == 2 and f"lies inside '{name}', which is to be avoided" in said[-1]
+
+
+def test_the_case_says_how_to_change_it(tmp_path, capfd):
+    """The line beside the name, followed, opens the paths."""
+    around_the_lesion(tmp_path, "AAA")
+    assert init(capfd, tmp_path, "--target", TARGET)[0] == 0
+    path = tmp_path / "case.toml"
+    before = path.read_text()
+    (line,) = [line for line in before.splitlines() if "it holds the target too" in line]
+    assert 'role = "traverse", without a margin, if a path may cross it' in line
+    at = before.index(line)
+    start = before.rindex('role = "unknown"', 0, at)
+    path.write_text(before[:start] + 'role = "traverse"' + before[at + len(line) :])
+    assert prepare(path, arm=False).search().safe.any()
+
+
+def test_in_a_folder_of_masks_it_is_a_table_of_its_own(tmp_path, capfd):
+    """``[structures.unknown]``, with the same line."""
+    around_the_lesion(tmp_path, "AAA")
+    (tmp_path / "seg").mkdir()
+    for one in ("AAA", "aorta", "lung tumor", "odd thing", "spleen"):
+        (tmp_path / f"{one}.nii.gz").rename(tmp_path / "seg" / f"{one}.nii.gz")
+    assert init(capfd, tmp_path, "--target", TARGET)[0] == 0
+    text = (tmp_path / "case.toml").read_text()
+    table = text[text.index("[structures.unknown]") :]
+    assert "into traverse = [...] if a path may cross it" in table and '"AAA" = 5' in table
+    assert roles(tmp_path)["AAA"] == ("unknown", 5.0)
 
 
 def test_a_typed_target_in_a_vessel_is_a_slip(tmp_path, capfd):

@@ -142,6 +142,16 @@ def test_the_most_specific_pattern_holds(
     assert chosen(avoid=dict(reversed(avoid.items())), **rules)["rib_left_7"] == rib
 
 
+def test_what_nobody_knows_demands_a_margin_and_is_no_free_space() -> None:
+    """A table beside ``avoid``, under the same precedence; a smaller margin than another pattern's is told."""
+    found = chosen(avoid={"*": 9.0}, unknown={"rib_*": 4.0, "rib_left_7": 1.0})
+    assert (found["rib_left_7"], found["rib_left_8"]) == (("unknown", 1.0), ("unknown", 4.0))
+    with pytest.raises(InputError, match="is named by avoid 'rib_\\*' and by unknown 'rib_\\*'"):
+        chosen(avoid={"*": 9.0, "rib_*": 1.0}, unknown={"rib_*": 1.0})
+    told = select(NAMES, [2], avoid={"rib_left_*": 1.0}, unknown={"rib_*": 2.0}, where="case.toml").warnings
+    assert "by unknown 'rib_*' = 2" in told[0]
+
+
 @pytest.mark.parametrize("rules", [{"ignore": ["rib_lef?_*"]}, {"traverse": ["lung_*", "aort?"]}, {"target": ["*"]}])
 def test_two_kinds_that_are_equally_specific_are_an_error(rules: dict[str, list[str]]) -> None:
     """Nothing says which is meant; both are named."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from fnmatch import fnmatchcase
 from pathlib import Path
+from types import MappingProxyType
 from typing import Protocol
 
 from puncture_twin.planning.base.errors import InputError
@@ -35,9 +36,14 @@ class RuleKind(StrEnum):
     """What a case wants of the labels that a pattern names."""
 
     AVOID = "avoid"
+    UNKNOWN = "unknown"
     TRAVERSE = "traverse"
     TARGET = "target"
     IGNORE = "ignore"
+
+
+DEMANDING = frozenset((RuleKind.AVOID, RuleKind.UNKNOWN))
+"""The kinds that demand a margin."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,7 @@ class LabelRule:
         label: Its number in the map.
         name: Its name.
         kind: What the case wants of it.
-        margin_mm: The clearance that an avoided structure demands; 0 for the other kinds.
+        margin_mm: The clearance that an avoided or unknown structure demands; 0 for the other kinds.
         pattern: The pattern that said so.
     """
 
@@ -121,6 +127,7 @@ def select(
     present: Collection[int],
     *,
     avoid: Mapping[str, float],
+    unknown: Mapping[str, float] = MappingProxyType({}),
     traverse: Sequence[str] = (),
     target: Sequence[str] = (),
     ignore: Sequence[str] = (),
@@ -131,12 +138,13 @@ def select(
 
     Patterns are shell patterns (``*``, ``?``, ``[...]``), capitals count. Of several that name one label the most
     specific holds: the label's own name, else the one with most characters that are no wildcards; ``"*"`` is the rest.
-    Of equally specific ``avoid`` patterns the largest margin holds.
+    Of equally specific ``avoid`` patterns the largest margin holds, and of ``unknown`` ones.
 
     Args:
         names: Label to name.
         present: The labels of the map.
         avoid: Pattern to margin in mm.
+        unknown: Likewise, of what nobody knows whether a path may cross it.
         traverse: Patterns of what may be crossed.
         target: Patterns of what holds the lesion.
         ignore: Patterns of what does not count.
@@ -149,6 +157,7 @@ def select(
             negative or not finite.
     """
     patterns = [LabelRule(0, "", RuleKind.AVOID, float(margin), pattern) for pattern, margin in avoid.items()]
+    patterns += [LabelRule(0, "", RuleKind.UNKNOWN, float(margin), pattern) for pattern, margin in unknown.items()]
     for kind, listed in ((RuleKind.TRAVERSE, traverse), (RuleKind.TARGET, target), (RuleKind.IGNORE, ignore)):
         patterns += [LabelRule(0, "", kind, 0.0, pattern) for pattern in listed]
     _check_margins(patterns, where)
@@ -161,7 +170,7 @@ def select(
     missing = [names[label] for label, rule in zip(sorted(present), rules, strict=True) if rule is None]
     if missing:
         what = f"no rule names these labels, which are present: {_listed(missing)}"
-        raise InputError(what, where=where, allowed="a pattern in avoid, traverse, target or ignore for each")
+        raise InputError(what, where=where, allowed="a pattern in avoid, unknown, traverse, target or ignore for each")
     here = [names[label] for label in present]
     unused = [p for p in patterns if not any(fnmatchcase(name, p.pattern) for name in here)]
     absent = [f"{where}: {p.kind} pattern {p.pattern!r} matches no label present" for p in unused]
@@ -214,12 +223,12 @@ def _weaker_warnings(rule: LabelRule, patterns: Sequence[LabelRule], where: str 
     if rule.pattern == rule.name:
         return
     for other in patterns:
-        overruled = other.kind is RuleKind.AVOID and other.pattern != REST and fnmatchcase(rule.name, other.pattern)
-        if overruled and (rule.kind is not RuleKind.AVOID or other.margin_mm > rule.margin_mm):
+        overruled = other.kind in DEMANDING and other.pattern != REST and fnmatchcase(rule.name, other.pattern)
+        if overruled and (rule.kind not in DEMANDING or other.margin_mm > rule.margin_mm):
             applies = f"{rule.kind} {rule.pattern!r}"
             yield (
-                f"{where}: {rule.name!r} is named by {applies} and by avoid {other.pattern!r} = {other.margin_mm:g}; "
-                f"the more specific holds: {applies}, {rule.margin_mm:g} mm"
+                f"{where}: {rule.name!r} is named by {applies} and by {other.kind} {other.pattern!r} = "
+                f"{other.margin_mm:g}; the more specific holds: {applies}, {rule.margin_mm:g} mm"
             )
 
 
