@@ -165,7 +165,7 @@ def _survey_line(lengths, limits, R, target, outward, distances, depths, rolls, 
     for k in range(len(distances)):
         for i in range(3):
             p[i] = target[i] + distances[k] * outward[i]
-        fill_branches(lengths, R, p, here, -1)
+        fill_branches(lengths, R, p, here, np.int64(-1))
         if k == 0:
             starts[:], before[:], lowest[:], highest[:] = here, here, here, here
         for branch in range(8):
@@ -261,7 +261,7 @@ def _every_branch(lengths, R, target, outward, distances, q):  # type: ignore[no
     for k in range(len(distances)):
         for i in range(3):
             p[i] = target[i] + distances[k] * outward[i]
-        fill_branches(lengths, R, p, here, -1)
+        fill_branches(lengths, R, p, here, np.int64(-1))
         for branch in range(8):
             for joint in range(6):
                 angle = here[branch, joint]

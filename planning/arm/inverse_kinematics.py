@@ -52,7 +52,7 @@ def inverse(model: UrModel, T_base_flange: Floats) -> Floats:
 def _inverse_all(lengths, T, q):  # type: ignore[no-untyped-def]  # numba infers
     """Fill ``q`` (n, 8, 6) from flange poses ``T`` (n, 4, 4)."""
     for row in range(len(T)):
-        fill_branches(lengths, T[row, :3, :3], T[row, :3, 3], q[row], -1)
+        fill_branches(lengths, T[row, :3, :3], T[row, :3, 3], q[row], np.int64(-1))
 
 
 @nb.njit(cache=True)

@@ -1,6 +1,11 @@
 """Numba, with this project's places for compiled kernels in force: the one way by which kernels are compiled here.
 
 A kernel that is defined before they are in force would be kept by numba's own rule, which misses edits in other files.
+
+What is compiled twice is waited for twice on a new machine. Numba compiles a kernel once more for read-only arrays:
+whoever calls one from Python hands over a copy. It does so for an integer constant that one kernel hands to another,
+which it types as this very number: there ``np.int64(0)`` stands for 0. And an array assigned to part of another brings
+the text of an error with it, two seconds of kernels for characters: inside kernels such parts are filled by a loop.
 """
 
 import numba as nb

@@ -20,9 +20,9 @@ def normals_of(triangles: Sequence[Floats], target_ct: Floats, outward_ct: Float
         outward_ct: Shape (n, 3), unit.
         axes: Measured from there, their ``nearest`` rows of ``triangles``.
     """
-    target, outward = (np.ascontiguousarray(given, dtype=np.float64) for given in (target_ct, outward_ct))
+    target, outward = (np.array(given, dtype=np.float64, order="C") for given in (target_ct, outward_ct))
     normal = np.empty((len(triangles), len(outward), 3))
     for row, corners in enumerate(triangles):
-        nearest, distance, depth = axes.nearest[:, row], axes.distance[:, row], axes.depth[:, row]
+        nearest, distance, depth = (np.array(of[:, row]) for of in (axes.nearest, axes.distance, axes.depth))
         axis_normals(corners, nearest, distance, depth, target, outward, normal[row])
     return normal.transpose(1, 0, 2)

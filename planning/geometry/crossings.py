@@ -58,7 +58,7 @@ def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: fl
     """
     corners = mesh.triangles - origin
     order, starts = _binned(directions)
-    directions = np.ascontiguousarray(directions)
+    directions = np.array(directions, order="C")
     room, total = 0, USUAL_CROSSINGS * len(directions)
     while total > room:
         room = total

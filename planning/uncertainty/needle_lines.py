@@ -38,7 +38,7 @@ ROOT_HALF = math.sqrt(0.5)
 @nb.njit(cache=True, error_model="numpy")
 def walked(problem, root, surface_mm, basis, offsets, sizes):  # type: ignore[no-untyped-def]  # numba infers
     """The chance along each line, shape (n,); its errors are so many times as large (n,)."""
-    chances, hint = np.empty(len(offsets)), 0
+    chances, hint = np.empty(len(offsets)), np.int64(0)
     triangles, faces, blocks, origin, outward, length, threshold = problem
     scene = (triangles, faces, blocks, origin, outward, length, threshold, surface_mm)
     down = _displacement(root, basis[0])
@@ -191,7 +191,7 @@ def first_touches(problem, root, directions, radii):  # type: ignore[no-untyped-
     triangles, faces, blocks, origin, outward, length, threshold = problem
     scene = (triangles, faces, blocks, origin, outward, length, threshold, 0.0)
     start, z = np.zeros(7), np.zeros(6)
-    nominal, nearest = _gap(scene, start, start, 0.0, 0)
+    nominal, nearest = _gap(scene, start, start, 0.0, np.int64(0))
     for ray in range(len(directions)):
         for k in range(5):
             z[k] = directions[ray, k]

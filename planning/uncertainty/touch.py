@@ -56,7 +56,8 @@ def proximity(
         surface_mm: By which a structure's surface may lie off as a whole, along the normal.
     """
     gradient, deviation = np.empty((*distance.shape, 6)), np.empty(distance.shape)
-    _first_order(depth, normal, outward_ct, cov_ct, float(surface_mm), gradient, deviation)
+    near = (np.ascontiguousarray(depth), np.ascontiguousarray(normal), np.array(outward_ct, order="C"))
+    _first_order(*near, cov_ct, float(surface_mm), gradient, deviation)
     return Proximity(distance, gradient, deviation)
 
 

@@ -1,9 +1,9 @@
 """The first command on a new machine: half of its kernels are compiled by a second process beside it.
 
 A kernel is compiled when it is first called, on one thread, and that is most of what a first command takes. A command
-needs the organs' kernels first and those of arm, planner and pictures last: these a second process compiles meanwhile,
-by using each once on a small workcell, and the command then loads them from their files. Two that compile the same at
-once lose time, not more: files are written whole, and what does not fit is compiled anew.
+needs the organs' kernels first and those of arm, chances, planner and pictures later: these a second process compiles
+meanwhile, by using each once on a small workcell, and the command then loads them from their files. Two that compile
+the same at once lose time, not more: files are written whole, and what does not fit is compiled anew.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def _begin() -> subprocess.Popen[bytes]:
 
 
 def use_once() -> None:
-    """Use what a first command needs last: the arm, its planner, the pictures."""
+    """Use what a first command needs last, in the order in which it will: arm, chances, planner, pictures."""
     import numpy as np
 
     from puncture_twin.planning.motion.approach import plan_approach
@@ -52,8 +52,28 @@ def use_once() -> None:
 
     checker = small_workcell()
     reached = [answer for answer in ask_arm(checker) if answer.reachable]
-    _draw_once()
+    _err_once()
     plan_approach(checker, np.radians([0.0, -90.0, 0.0, -90.0, 0.0, 0.0]), reached[0].insertion_q[0], seed=0)
+    _draw_once()
+
+
+def _err_once() -> None:
+    """A needle that may lie off, into a body and beside it: the chances to hit and to touch."""
+    import numpy as np
+
+    from puncture_twin.planning.base.arrays import read_only
+    from puncture_twin.planning.clearance.kernels.blocks import pack
+    from puncture_twin.planning.clearance.near_faces import near_faces
+    from puncture_twin.planning.reach.small_workcell import TARGET, octahedron
+    from puncture_twin.planning.uncertainty.hit import hit_in_mesh, target_rays
+    from puncture_twin.planning.uncertainty.line_sampling import line_chance, needle_doubt
+
+    target, up, cov = read_only(TARGET), np.array([0.0, 0.0, 1.0]), np.diag([1.0, 1.0, 1.0, 1e-4, 1e-4, 1e-4])
+    hit_in_mesh(target_rays(octahedron(target, 5.0), target), cov[None, :3, :3])
+    doubt, length, threshold = needle_doubt(target, up, cov, 0.5), 100.0, 1.0
+    beside = pack(octahedron(target + [23.0, 0.0, 40.0], 20.0))
+    near = near_faces(beside, target, up, length, doubt.reach(length, threshold))
+    line_chance(near, doubt, length, threshold, np.array([-1.0, 0.0, 0.0, 0.0, -40.0, 0.0]))
 
 
 def _draw_once() -> None:
@@ -61,6 +81,7 @@ def _draw_once() -> None:
     import numpy as np
 
     from puncture_twin.planning.reach.small_workcell import TARGET, octahedron
+    from puncture_twin.twin.report.map_view import MapCells, MapView
     from puncture_twin.twin.report.raster.camera import ViewCamera
     from puncture_twin.twin.report.raster.moving import MovingPicture
     from puncture_twin.twin.report.raster.render import Layer, Surface
@@ -70,3 +91,5 @@ def _draw_once() -> None:
     camera = ViewCamera(TARGET + [300.0, 0.0, 0.0], TARGET, np.array([0.0, 0.0, 1.0]), fov=0.6, width=64, height=48)
     MovingPicture(opaque, glass, [Layer([Surface(body, (50, 100, 200))])], camera).at([np.eye(4)])
     opaque.sees(camera.eye, TARGET[None])
+    cells = MapCells(np.arange(1), np.zeros(1), np.array([0, 1]), np.zeros(1), 0.5, np.full(1, np.pi))
+    cells.picture(MapView(turn=0.0, theta_max=1.0, rim=(), centre=""), size=8)

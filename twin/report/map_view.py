@@ -206,7 +206,7 @@ def _find_picture(rows, betas, starts, heights, half_theta, half_beta, turn, the
 @nb.njit(cache=True)
 def _find_row(rows, betas, starts, heights, half_theta, half_beta, theta, beta):  # type: ignore[no-untyped-def]  # numba infers
     """The cell of a direction: in the nearest ring that of the nearest azimuth; -1 where that is too far."""
-    ring = _first_not_below(heights, 0, len(heights), theta)
+    ring = _first_not_below(heights, np.int64(0), len(heights), theta)
     if ring == len(heights) or (ring > 0 and theta - heights[ring - 1] <= heights[ring] - theta):
         ring -= 1
     if abs(theta - heights[ring]) > half_theta:

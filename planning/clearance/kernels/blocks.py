@@ -196,8 +196,8 @@ def _parent_discs(center, disc, child, count, parent):  # type: ignore[no-untype
             q = _dot(disc[:3, j], n)
             across = disc[3, j] + disc[4, j] * np.sqrt(max(0.0, 1.0 - q * q))
             rho = max(rho, np.sqrt(_dot(d, d)) + across)
-        center[parent + group] = c
-        disc[:3, parent + group] = n
+        for x in range(3):
+            center[parent + group, x], disc[x, parent + group] = c[x], n[x]
         disc[3, parent + group], disc[4, parent + group] = rho, 0.5 * (most - least)
 
 

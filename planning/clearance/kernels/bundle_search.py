@@ -51,15 +51,15 @@ def measure_bundle(surface, needle, count, low, high, lanes, scratch, answer, se
         The row of a triangle that was found nearest to one of the axes.
     """
     groups = (count + LANES - 1) // LANES
-    waiting, m, group = _most_promising(needle, groups, low, high, scratch, answer), 0, 0
+    waiting, m, group = _most_promising(needle, groups, low, high, scratch, answer), np.int64(0), np.int64(0)
     while waiting > 0 or m < high - low:
         seed = _measure_pairs(surface, needle, low, waiting, lanes, scratch, answer, seed)
-        waiting = 0
+        waiting = np.int64(0)
         while m < high - low and waiting <= PAIRS - LANES:
             waiting = _others(needle, groups, m, group, low, waiting, scratch, answer)
             group += 1
             if group == groups:
-                m, group = m + 1, 0
+                m, group = m + 1, np.int64(0)
     return seed
 
 
@@ -137,7 +137,7 @@ def _measure_pairs(surface, needle, low, waiting, lanes, scratch, answer, seed):
     for p in range(waiting):
         _test_block(surface[1], needle, p, lanes, scratch)
     for turn in range(2):
-        count = 0
+        count = np.int64(0)
         for p in range(waiting):
             m, first = scratch.pairs[p, 0], scratch.found[scratch.pairs[p, 1]] * LANES
             reach = (scratch.upper[m] + scratch.errors[p]) * (scratch.upper[m] + scratch.errors[p]) * GROWN

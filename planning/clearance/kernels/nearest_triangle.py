@@ -23,7 +23,7 @@ def nearest_triangle(triangles, nodes, base, target, slack):  # type: ignore[no-
         target: Shape (3,), mm.
         slack: Rounding of a node's coordinate, mm.
     """
-    nearest, distance, waiting = 0, _distance(triangles, 0, target), 1
+    nearest, distance, waiting = 0, _distance(triangles, np.int64(0), target), 1
     stack = np.empty((STACK, 2), np.int64)
     stack[0, 0], stack[0, 1] = base[-1], len(base) - 1
     while waiting > 0:

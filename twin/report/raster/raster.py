@@ -91,7 +91,8 @@ def sorted_by_band(spans, rows, count):
     needed = np.empty((starts[count], 5), dtype=np.int32)
     for s in range(len(spans)):
         for band in range(spans[s, 1] // rows, spans[s, 2] // rows + 1):
-            needed[free[band]] = spans[s]
+            for k in range(spans.shape[1]):
+                needed[free[band], k] = spans[s, k]
             free[band] += 1
     return starts, needed
 

@@ -92,9 +92,8 @@ class Layer:
 
     def sees(self, eye: Floats, points: Floats) -> NDArray[np.bool_]:
         """Whether nothing of this layer lies between an eye and each point (n, 3), in the layer's frame."""
-        return np.asarray(
-            ~blocked(self.vertices, self.faces, np.asarray(eye), np.asarray(points), LINE_OF_SIGHT_SLACK_MM)
-        )
+        eye, points = np.array(eye, dtype=np.float64), np.array(points, dtype=np.float64, order="C")
+        return np.asarray(~blocked(self.vertices, self.faces, eye, points, LINE_OF_SIGHT_SLACK_MM))
 
 
 class Drawn(NamedTuple):

@@ -33,7 +33,7 @@ def tips(model: UrModel, tip_m: float, q: Floats) -> Tip:
         q: Shape (n, 6), rad.
     """
     frames, J = np.empty((len(q), 7, 4, 4)), np.empty((len(q), 6, 6))
-    link_frames(model.lengths, np.ascontiguousarray(q), frames)
+    link_frames(model.lengths, np.array(q, order="C"), frames)
     jacobians(frames, J)
     flange = frames[:, 6]
     arm_m = tip_m * flange[:, :3, 2]
