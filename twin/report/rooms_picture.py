@@ -60,6 +60,7 @@ def draw_rooms_picture(found: Any, path: Path) -> None:
     _cloud(along, error, cov, found.in_region, (0, 2), ("lateral x, mm", "depth, mm (down: too deep)"))
     along.invert_yaxis()
     along.set_title("seen from the side", fontsize=10)
+    figure.legend(*along.get_legend_handles_labels(), fontsize=7.5, loc="outside lower left", ncols=4)
     _histogram(sizes, found)
     _reliability(chances, found)
     figure.suptitle(
@@ -94,8 +95,6 @@ def _cloud(axes: Axes, error: Floats, cov: Floats, within: Any, pair: tuple[int,
     axes.set_ylabel(names[1])
     axes.grid(visible=True, color="0.9")
     axes.set_axisbelow(True)
-    if pair == (0, 1):
-        axes.legend(fontsize=7.5, loc="upper left")
 
 
 def _histogram(axes: Axes, found: Any) -> None:
@@ -136,6 +135,6 @@ def _reliability(axes: Axes, found: Any) -> None:
     axes.set_ylim(-0.02, 1.02)
     axes.set_aspect("equal")
     axes.set_xlabel("predicted chance")
-    axes.set_ylabel("share of rooms in which it happened")
-    axes.set_title("does it come true?", fontsize=10)
+    axes.set_ylabel("fraction of rooms in which it happened")
+    axes.set_title("how often it happened", fontsize=10)
     axes.legend(fontsize=7.5, loc="upper left")
