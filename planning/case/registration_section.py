@@ -15,11 +15,15 @@ RAS_OF_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Its own inverse."""
 NO_RESIDUALS = "stated transform {file}: no residuals, expected error unknown"
 
-_OF_MARKERS = ("method", "use", "fle_mm", "correct", "correct_joints_deg", "accept_residuals", "accept_symmetry")
+_OF_MARKERS = ("method", "correct", "correct_joints_deg", "accept_residuals", "accept_symmetry")
+_OF_COMPARISON = ("use", "fle_mm")
 
 
 class RegistrationSection(Section):
-    """Markers seen in the CT and touched by the robot, or the transform between both in a file of ITK."""
+    """Markers seen in the CT and touched by the robot, or the transform between both in a file of ITK.
+
+    Markers beside a transform do not place the base: the transform is held against them.
+    """
 
     method: Literal["triad", "rigid", "weighted", "affine"] | None = None
     markers_ct: str | None = None
@@ -51,7 +55,10 @@ class RegistrationSection(Section):
             if self.transform_maps or self.base_axes:
                 raise ValueError("transform_maps and base_axes belong to transform")
             return self
-        given = [key for key in ("markers_ct", "markers_base", *_OF_MARKERS) if getattr(self, key)]
+        if len(markers) == 1:
+            raise ValueError(f"{markers[0]}: missing; beside transform both lists of markers, which it is held against")
+        placing = (*_OF_MARKERS, *_OF_COMPARISON) if markers else _OF_MARKERS
+        given = [key for key in placing if getattr(self, key)]
         if given:
             raise ValueError(f"transform stands in place of markers; {', '.join(given)} belongs to markers")
         if self.transform_maps is None:
@@ -83,5 +90,27 @@ def stated_base_ct(section: RegistrationSection, T_file: Floats) -> Floats:
     """
     U, _, Vt = np.linalg.svd(T_file[:3, :3])
     T = pose(U @ Vt, T_file[:3, 3])
-    T = T if section.transform_maps == "ct_to_base" else inverse(T)
-    return np.asarray(RAS_OF_LPS @ T if section.base_axes == "RAS" else T)
+    return _read_as(T, inverted=section.transform_maps == "base_to_ct", turned=section.base_axes == "RAS")
+
+
+def other_readings(section: RegistrationSection, T_base_ct: Floats) -> dict[str, Floats]:
+    """What T_base_ct would be with other values of ``transform_maps`` and ``base_axes``, by these keys as text.
+
+    Args:
+        section: As the case states it.
+        T_base_ct: Shape (4, 4), mm, by its own keys.
+    """
+    T = RAS_OF_LPS @ T_base_ct if section.base_axes == "RAS" else T_base_ct
+    maps = "ct_to_base" if section.transform_maps == "base_to_ct" else "base_to_ct"
+    axes = "LPS" if section.base_axes == "RAS" else "RAS"
+    inverted, turned = f'transform_maps = "{maps}"', f'base_axes = "{axes}"'
+    return {
+        inverted: _read_as(T, inverted=True, turned=section.base_axes == "RAS"),
+        turned: _read_as(T, inverted=False, turned=axes == "RAS"),
+        f"{inverted} and {turned}": _read_as(T, inverted=True, turned=axes == "RAS"),
+    }
+
+
+def _read_as(T: Floats, *, inverted: bool, turned: bool) -> Floats:
+    T = inverse(T) if inverted else T
+    return np.asarray(RAS_OF_LPS @ T if turned else T)

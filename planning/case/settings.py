@@ -10,6 +10,7 @@ from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case_file import AIR_HU, DENSE_HU
+from puncture_twin.planning.case.registration_section import RegistrationSection
 
 
 @dataclass(frozen=True)
@@ -102,12 +103,17 @@ class RobotSettings:
         model: Which arm it is.
         home: Shape (6,), rad, or None for the model's own.
         T_base_ct_mount: Shape (4, 4), mm, where a mount or a transform is stated, or None.
-        transform: The file that states it, or None.
+        stated: The section that states a transform, or None.
         speeds: How fast its plans may move.
     """
 
     model: UrModel
     home: Floats | None
     T_base_ct_mount: Floats | None
-    transform: str | None = None
+    stated: RegistrationSection | None = None
     speeds: SpeedLimits = DEFAULT_SPEEDS
+
+    @property
+    def transform(self) -> str | None:
+        """The file of the stated transform, or None."""
+        return None if self.stated is None else self.stated.transform

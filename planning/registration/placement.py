@@ -13,6 +13,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.case.registration_section import MarkerSection
 from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
@@ -52,6 +53,19 @@ def load_placement(case: Case) -> Placement | None:
         mount = case.robot.T_base_ct_mount
         return None if mount is None else Placement(mount, None, float("nan"))
     settings = case.registration
+    registration = registered(case, settings)
+    if settings.correct:
+        registration = corrected(case, registration, where=f"{case.path}: registration")
+    error = float(registration.expected_tre_mm(case.target_ct[None])[0])
+    return Placement(registration.T_base_ct, registration, error)
+
+
+def registered(case: Case, settings: MarkerSection) -> Registration:
+    """The registration of two lists of markers as a case states it; nothing is corrected.
+
+    Raises:
+        InputError: Marker files that cannot be read, matched or trusted.
+    """
     where = f"{case.path}: registration"
     markers = match(
         _points(case, settings.markers_ct, case.space),
@@ -60,7 +74,7 @@ def load_placement(case: Case) -> Placement | None:
         where=where,
     )
     errors = case.errors
-    registration = register(
+    return register(
         markers,
         method="joint" if settings.correct else settings.method or default_method(errors),
         target_ct=case.target_ct,
@@ -70,10 +84,6 @@ def load_placement(case: Case) -> Placement | None:
         accept_residuals=settings.accept_residuals,
         where=where,
     )
-    if settings.correct:
-        registration = corrected(case, registration, where=where)
-    error = float(registration.expected_tre_mm(case.target_ct[None])[0])
-    return Placement(registration.T_base_ct, registration, error)
 
 
 def corrected(case: Case, registration: Registration, *, where: str | Path) -> Registration:

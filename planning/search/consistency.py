@@ -20,6 +20,7 @@ from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 from puncture_twin.planning.geometry.winding import odd_fraction, winding_number
 from puncture_twin.planning.registration.checks.marker_check import check_markers
+from puncture_twin.planning.registration.checks.stated_transform import check_transform
 from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.constraints import longest_path
 from puncture_twin.planning.search.resolution import resolution_warnings
@@ -53,7 +54,7 @@ def check_consistency(
 
     Raises:
         InputError: A structure of which too much lies outside the body, an open one that may hold the target, or
-            markers whose names or axes have likely slipped.
+            markers whose names or axes have likely slipped, or a stated transform that cannot be.
     """
     headers = volume_headers(case)
     outside = _outside_warnings(case, anatomy, headers, cache)
@@ -177,7 +178,9 @@ def _region_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
 
 
 def _marker_warnings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: Cache) -> tuple[str, ...]:
-    if placement is None or placement.registration is None:
+    if placement is None:
         return ()
+    if placement.registration is None:
+        return check_transform(case, anatomy.skin.mesh, placement.T_base_ct)
     weak = tuple(f"registration: {flag}" for flag in placement.registration.flags)
     return (*weak, *check_markers(case, anatomy.skin, placement.registration, cache).warnings)

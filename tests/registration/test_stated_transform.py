@@ -116,18 +116,25 @@ def test_a_file_that_cannot_be_trusted_is_refused(tmp_path, name, text, says):
         load_case(stating(tmp_path, file=name))
 
 
+BOTH_LISTS = 'markers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"'
+
+
 @pytest.mark.parametrize(
     ("keys", "says"),
     [
         ((None, "LPS"), 'transform needs transform_maps = "base_to_ct"'),
         (("ct_to_base", None), 'transform needs base_axes = "RAS"'),
         (("inward", "LPS"), "transform_maps"),
-        (("ct_to_base", "LPS", "ct_to_robot.tfm", 'markers_ct = "markers_ct.csv"'), "markers_ct belongs to markers"),
+        (("ct_to_base", "LPS", "ct_to_robot.tfm", 'markers_ct = "markers_ct.csv"'), "markers_base: missing"),
+        (("ct_to_base", "LPS", "ct_to_robot.tfm", BOTH_LISTS, 'method = "rigid"'), "method belongs to markers"),
         (("ct_to_base", "LPS", "ct_to_robot.tfm", "fle_mm = 1.0"), "fle_mm belongs to markers"),
     ],
 )
 def test_silence_and_contradiction_are_refused(tmp_path, keys, says):
-    """Which way a transform goes, and what the robot's axes are, the case says; markers do not stand beside it."""
+    """Which way a transform goes, and what the robot's axes are, the case says.
+
+    One list alone, or how markers would be fitted, does not stand beside it.
+    """
     itk_file(tmp_path, T_BASE_CT)
     with pytest.raises(InputError, match=says):
         load_case(stating(tmp_path, *keys))

@@ -53,7 +53,7 @@ def robot_of(content: CaseFile, space: Space, path: Path, files: InputFiles) -> 
     if stated is not None and stated.transform is not None:
         T_file = itk_transform.parse_transform(files.content(stated.transform), path.parent / stated.transform)
         mount = read_only(stated_base_ct(stated, T_file))
-        return RobotSettings(model, home, mount, stated.transform, speeds)
+        return RobotSettings(model, home, mount, stated, speeds)
     return RobotSettings(model, home, mount, speeds=speeds)
 
 
@@ -95,7 +95,7 @@ def robot_warnings(content: CaseFile, robot: RobotSettings) -> tuple[str, ...]:
     """That a stated transform has no residuals, or that nothing is said of where a robot is: no verdict is about it."""
     stated = content.registration
     if stated is not None and stated.transform is not None:
-        return (f"registration: {NO_RESIDUALS.format(file=stated.transform)}",)
+        return () if stated.markers_ct else (f"registration: {NO_RESIDUALS.format(file=stated.transform)}",)
     located = stated is not None or content.robot.mount is not None
     nowhere = not located and bool({"robot", "tool"} & content.model_fields_set)
     return (ROBOT_NOWHERE.format(robot=robot.model.name),) if nowhere else ()

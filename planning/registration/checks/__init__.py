@@ -1,5 +1,7 @@
 """What residuals cannot show of markers: permuted names, slipped axes, markers off the skin, a CT out of square.
 
+And what a stated transform, which has no residuals, is held against.
+
 It doubts a registration and never changes one.
 """
 

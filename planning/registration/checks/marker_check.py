@@ -14,6 +14,7 @@ from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.checks.axis_slips import MarkerList, check_axes, marker_list
 from puncture_twin.planning.registration.checks.name_slips import check_names
 from puncture_twin.planning.registration.checks.skin_fit import MARKER_ON_SKIN_MM
+from puncture_twin.planning.registration.checks.stated_transform import check_transform
 from puncture_twin.planning.registration.placement import Placement, load_placement
 from puncture_twin.planning.registration.registration import Registration
 
@@ -25,7 +26,7 @@ BASE_AXES = (
 
 
 class MarkerFindings(NamedTuple):
-    """What is to be known about a case's markers."""
+    """What is to be known about a case's markers or transform."""
 
     warnings: tuple[str, ...]
     """What these markers leave open, one sentence each."""
@@ -34,7 +35,7 @@ class MarkerFindings(NamedTuple):
 
 
 class CheckedPlacement(NamedTuple):
-    """A placement whose markers have been compared with names, skin and couch."""
+    """A placement whose markers, or stated transform, have been compared with what else is known."""
 
     placement: Placement
     findings: MarkerFindings
@@ -44,12 +45,19 @@ def checked_placement(case: Case, cache: Cache) -> CheckedPlacement | None:
     """Where the patient lies for the robot, with its markers checked; None where the case does not say it.
 
     Raises:
-        InputError: As `load_placement` and `check_markers`, or a skin that cannot be read.
+        InputError: As `load_placement`, `check_markers` and `check_transform`, or a skin that cannot be read.
     """
     placement = load_placement(case)
-    if placement is None or placement.registration is None:
-        return None if placement is None else CheckedPlacement(placement, MarkerFindings((), ()))
+    if placement is None:
+        return None
+    if placement.registration is None:
+        said = () if case.robot.stated is None else _of_transform(case, placement, cache)
+        return CheckedPlacement(placement, MarkerFindings(said, ()))
     return CheckedPlacement(placement, check_markers(case, load_skin(case, cache), placement.registration, cache))
+
+
+def _of_transform(case: Case, placement: Placement, cache: Cache) -> tuple[str, ...]:
+    return check_transform(case, load_skin(case, cache).mesh, placement.T_base_ct)
 
 
 def check_markers(case: Case, skin: Skin, registration: Registration, cache: Cache = NO_CACHE) -> MarkerFindings:

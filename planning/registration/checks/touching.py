@@ -35,18 +35,37 @@ def place_excluded(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
         skin: CT frame.
         T_base_ct: Shape (4, 4), mm.
     """
-    model = case.robot.model
-    T_ct_base = np.linalg.inv(T_base_ct)
-    column = apply(T_ct_base, np.stack([np.zeros(3), model.shoulder_base]))
-    if any(side_of(skin, point) is Side.INSIDE for point in column):
+    column = _column_ct(case, T_base_ct)
+    if stands_in_patient(case, skin, T_base_ct):
         return "the robot's base would stand in the patient"
     for box in _boxes_ct(case):
         if any(np.all(np.abs(point - box.center_mm) <= box.size_mm / 2) for point in column):
             return f"the robot's base would stand in obstacle '{box.name}'"
+    return "the target would be out of the arm's reach" if out_of_reach(case, T_base_ct) else ""
+
+
+def stands_in_patient(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> bool:
+    """Whether base or shoulder lie in the patient; arguments as of `place_excluded`."""
+    return any(side_of(skin, point) is Side.INSIDE for point in _column_ct(case, T_base_ct))
+
+
+def out_of_reach(case: Case, T_base_ct: Floats) -> bool:
+    """Whether the target is farther from the shoulder than links and needle span."""
+    model = case.robot.model
     span = abs(model.a2) + abs(model.a3) + model.d4 + model.d5 + model.d6 + case.needle.length_mm
-    if np.linalg.norm(case.target_ct - column[1]) > span:
-        return "the target would be out of the arm's reach"
-    return ""
+    return bool(np.linalg.norm(case.target_ct - _column_ct(case, T_base_ct)[1]) > span)
+
+
+def shoulder_within(case: Case, T_base_ct: Floats) -> str:
+    """The obstacle of frame ``ct`` that the shoulder lies in; a base that stands on one is in none. Empty for none."""
+    shoulder = _column_ct(case, T_base_ct)[1]
+    boxes = (box for box in _boxes_ct(case) if np.all(np.abs(shoulder - box.center_mm) < box.size_mm / 2))
+    return next((box.name for box in boxes), "")
+
+
+def _column_ct(case: Case, T_base_ct: Floats) -> Floats:
+    """The base's origin and the shoulder, shape (2, 3), CT frame."""
+    return apply(np.linalg.inv(T_base_ct), np.stack([np.zeros(3), case.robot.model.shoulder_base]))
 
 
 def untouchable(case: Case, points_ct: Floats, normals_ct: Floats) -> tuple[tuple[int, str], ...]:

@@ -87,7 +87,8 @@ def registration_report(path: Path) -> dict[str, Any]:
     if checked is None or checked.placement.registration is None:
         file = case.robot.transform
         what = "no [registration] with markers" if file is None else NO_RESIDUALS.format(file=file)
-        raise InputError(what, where=case.path, allowed="markers_ct and markers_base")
+        compared = () if checked is None else checked.findings.warnings
+        raise InputError("; ".join((what, *compared)), where=case.path, allowed="markers_ct and markers_base alone")
     placement, registration = checked.placement, checked.placement.registration
     report = registration_summary(registration)
     pose = case.target_ct + case.needle.shaft_mm * case.T_ct_entry[:3, 2]

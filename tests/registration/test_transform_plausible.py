@@ -1,0 +1,252 @@
+"""A stated transform is held against markers, against the boxes about the robot, and against the vertical."""
+
+import json
+
+import numpy as np
+import pytest
+from case_world import CASE, changed, points_file, registration_section, write_case
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.registration_section import other_readings
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, pose
+from puncture_twin.planning.registration.checks.stated_transform import check_transform
+from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.run_twin import main
+
+UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""R_base_ct of an arm on the floor beside a patient on the back: x to their left, y to the head, z to the front."""
+T_BASE_CT = pose(UPRIGHT, [330.0, 60.0, 150.0])
+"""The base on the patient's right, 150 mm below the target."""
+FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
+MARKERS = np.array([[0.0, 0.0, 80.0], [50.0, 0.0, 75.0], [0.0, 60.0, 70.0], [-40.0, -30.0, 72.0]])
+"""Of the usual patient."""
+KEYS = [("ct_to_base", "LPS"), ("ct_to_base", "RAS"), ("base_to_ct", "LPS"), ("base_to_ct", "RAS")]
+
+
+def file_text(T):
+    """A transform file of what T does to a point."""
+    numbers = " ".join(map(repr, [*T[:3, :3].ravel().tolist(), *T[:3, 3].tolist()]))
+    head = "#Insight Transform File V1.0\n#Transform 0\nTransform: AffineTransform_double_3_3\n"
+    return f"{head}Parameters: {numbers}\nFixedParameters: 0 0 0\n"
+
+
+def saved_as(T_base_ct, maps, axes):
+    """What a file says of a placement under these keys."""
+    T = FLIP @ T_base_ct if axes == "RAS" else T_base_ct
+    return inverse(T) if maps == "base_to_ct" else T
+
+
+def stating(folder, T_base_ct=T_BASE_CT, saved=KEYS[0], keys=KEYS[0], more="", boxes=()):
+    """The usual patient's case with a transform that was saved under some keys and is stated under others."""
+    section = f'[registration]\ntransform = "t.tfm"\ntransform_maps = "{keys[0]}"\nbase_axes = "{keys[1]}"\n{more}\n'
+    text = changed(CASE, (registration_section(), section))
+    for name, center, size in boxes:
+        middle = [float(x) for x in center]
+        text += f'[[obstacle]]\nname = "{name}"\nframe = "base"\ncenter_mm = {middle}\nsize_mm = {list(size)}\n'
+    path = write_case(folder, text=text)
+    (folder / "t.tfm").write_text(file_text(saved_as(T_base_ct, *saved)))
+    return path
+
+
+def touched(folder, T_base_ct, off_mm=0.0, names="ABCD"):
+    """Touches of the markers by an arm at this place, moved by so much; returns the keys that name both lists."""
+    points = apply(T_base_ct, MARKERS) + np.array([off_mm, 0.0, 0.0])
+    (folder / "touched.csv").write_text(points_file(points, names))
+    return 'markers_ct = "markers_ct.csv"\nmarkers_base = "touched.csv"\n'
+
+
+def table(top_mm, thick_mm=40.0):
+    """A table in the robot's frame, on the side where the patient lies; its top at this height."""
+    return ("table", (330.0, 60.0, top_mm - thick_mm / 2), (400.0, 900.0, thick_mm))
+
+
+BELOW_MM = 60.0
+"""The height of the patient's lowest point above the base: the ball of 90 mm about 150 mm."""
+
+
+def warnings_of(path):
+    """Those of the registration, of the case as a search reads it without its arm."""
+    return [line for line in prepare(path, arm=False).anatomy.warnings if line.startswith("registration: ")]
+
+
+@pytest.mark.parametrize("keys", KEYS[2:])
+def test_an_inverse_that_is_stated_the_wrong_way_is_named(tmp_path, keys):
+    """It said only that there are no residuals. The robot's z axis would not point up."""
+    said = warnings_of(stating(tmp_path, keys=keys))
+    (line,) = [one for one in said if "more usual than what is stated" in one]
+    assert "(the patient lies on no obstacle of frame base and the robot's z axis" in line and "another image" in line
+    assert 'would be transform_maps = "ct_to_base"' in line
+
+
+def test_what_nothing_tells_apart_is_said(tmp_path):
+    """Other axes at the robot turn the patient about the base: without a box of its frame, they are as plausible."""
+    said = warnings_of(stating(tmp_path))
+    away = 2 * np.hypot(330.0, 60.0)
+    (line,) = [one for one in said if "nothing tells the stated transform" in one]
+    assert f'base_axes = "RAS" ({away:.0f} mm away)' in line and "transform_maps" not in line and len(said) == 2
+
+
+def test_a_table_tells_the_axes(tmp_path):
+    """As stated the patient lies on the table, and nothing is asked; turned, on nothing."""
+    assert len(warnings_of(stating(tmp_path, boxes=[table(BELOW_MM - 5.0)]))) == 1
+    (_, line) = warnings_of(stating(tmp_path, keys=("ct_to_base", "RAS"), boxes=[table(BELOW_MM - 5.0)]))
+    assert "more usual than what is stated" in line and "base_axes = \"LPS\" (the patient lies on 'table'" in line
+
+
+@pytest.mark.parametrize(
+    ("top_mm", "says"),
+    [
+        (BELOW_MM - 150.0, "the patient would float 150 mm above obstacle 'table'"),
+        (BELOW_MM + 180.0 + 40.0 + 75.0, "the patient would lie 75 mm under obstacle 'table'"),
+        (BELOW_MM - 90.0, ""),
+        (BELOW_MM - 600.0, ""),
+    ],
+)
+def test_a_patient_off_the_table_is_told(tmp_path, top_mm, says):
+    """Floating above it or lying under it, as a transform of another image has it; a floor is no table."""
+    (said,) = [one for one in warnings_of(stating(tmp_path, boxes=[table(top_mm)])) if "no residuals" not in one] or [
+        ""
+    ]
+    assert says in said and ("by the stated transform" in said) == bool(says)
+
+
+@pytest.mark.parametrize(
+    ("box", "refused"),
+    [
+        (table(BELOW_MM - 50.0), False),
+        (table(BELOW_MM + 18.0), False),
+        (table(BELOW_MM + 22.0), True),
+        (table(BELOW_MM + 28.0, 100.0), False),
+        (table(BELOW_MM + 33.0, 100.0), True),
+        (table(BELOW_MM + 70.0), True),
+        (("pedestal", (330.0, 60.0, 150.0), (20.0, 20.0, 20.0)), True),
+        (("room", (330.0, 60.0, 150.0), (500.0, 500.0, 500.0)), True),
+        (("rail", (330.0, 200.0, 150.0), (400.0, 40.0, 40.0)), False),
+    ],
+)
+def test_a_patient_in_a_box_of_the_robots_frame_is_refused(tmp_path, box, refused):
+    """Deeper than 30 mm, or beyond its middle; and a box wholly within the patient. A mattress may give way."""
+    path = stating(tmp_path, boxes=[box])
+    if not refused:
+        assert prepare(path, arm=False)
+        return
+    with pytest.raises(InputError, match=f"more than 30 mm deep in obstacle '{box[0]}' or through it") as told:
+        prepare(path, arm=False)
+    assert "transform_maps (the" not in told.value.what and "base_axes" in told.value.what
+
+
+def test_a_base_in_the_patient_is_refused_with_its_causes(tmp_path):
+    """With what would be plausible instead, and without an arm too."""
+    inside = pose(UPRIGHT, [20.0, 0.0, 30.0])
+    with pytest.raises(InputError, match=r"base would stand in the patient: the usual causes .* another image"):
+        prepare(stating(tmp_path, inside), arm=False)
+
+
+def test_markers_that_agree_are_named_with_their_distance(tmp_path):
+    """In place of what nothing could be held against; whose error it is nobody knows."""
+    (line,) = warnings_of(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 0.2) + "fle_mm = 0.5\n"))
+    assert "no residuals" not in line and "0.2 mm from where the stated transform puts it" in line
+    assert line.endswith("its own expected error is unknown") and "more than" not in line
+
+
+def test_markers_that_are_off_by_more_than_their_errors_are_doubted(tmp_path):
+    """By declared errors 3 mm is much, by larger ones it is nothing."""
+    (line,) = warnings_of(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 3.0) + "fle_mm = 0.5\n"))
+    assert "3.0 mm from where the stated transform puts it" in line and "more than their errors explain" in line
+    (line,) = warnings_of(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 3.0) + "fle_mm = 4.0\n"))
+    assert "more than" not in line
+
+
+@pytest.mark.parametrize("keys", KEYS[1:])
+def test_markers_refuse_another_reading_and_name_the_one_that_fits(tmp_path, keys):
+    """In mm, before anything is searched."""
+    more = touched(tmp_path, T_BASE_CT, 0.1) + "fle_mm = 0.5\n"
+    right = " and ".join(
+        f'{name} = "{value}"'
+        for name, value, stated in zip(("transform_maps", "base_axes"), KEYS[0], keys, strict=True)
+        if value != stated
+    )
+    with pytest.raises(InputError, match=rf"mm from where the stated transform .*; with {right} they agree"):
+        prepare(stating(tmp_path, keys=keys, more=more), arm=False)
+
+
+def test_a_transform_of_another_image_is_refused_by_markers(tmp_path):
+    """Moved by 12 mm: no reading of the keys fits, and none is named."""
+    with pytest.raises(InputError, match=r"12\.0 mm from where the stated transform") as told:
+        prepare(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 12.0) + "fle_mm = 0.5\n"), arm=False)
+    assert "they agree" not in told.value.what
+
+
+@pytest.mark.parametrize(("deviation_mm", "doubted"), [(0.3, True), (4.0, False)])
+def test_the_declared_errors_are_the_measure(tmp_path, deviation_mm, doubted):
+    """4 mm apart, by what ``[errors]`` declares of the readings."""
+    declared = f"[errors]\nct_pixel_mm = {deviation_mm}\nct_spacing_mm = 1.0\ntouch_mm = {deviation_mm}\n"
+    (line,) = warnings_of(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 4.0) + declared))
+    assert "4.0 mm from where" in line and ("more than their errors explain" in line) == doubted
+
+
+def test_large_declared_errors_allow_more(tmp_path):
+    """12 mm apart is no contradiction where a marker errs by 10 mm."""
+    said = warnings_of(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 12.0) + "fle_mm = 10.0\n"))
+    assert "12.0 mm" in said[0]
+
+
+def test_the_warning_is_in_text_json_and_page(tmp_path, capfd):
+    """As others are."""
+    path = stating(tmp_path, keys=("base_to_ct", "LPS"))
+    said = "more usual than what is stated"
+    main(["search", str(path.parent), "--no-arm", "--out", str(tmp_path / "out")])
+    out, err = capfd.readouterr()
+    assert said in out + err
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert said in page
+    main(["search", str(path.parent), "--no-arm", "--json"])
+    assert any(said in line for line in json.loads(capfd.readouterr().out)["warnings"])
+
+
+def test_the_markers_are_inputs(tmp_path):
+    """Both lists are hashed, and place nothing."""
+    case = load_case(stating(tmp_path, more=touched(tmp_path, T_BASE_CT)))
+    assert {"transform", "markers_ct", "markers_base"} <= {one.role for one in case.inputs}
+    placement = load_placement(case)
+    assert placement.registration is None and np.isnan(placement.target_error_mm)
+
+
+@pytest.mark.parametrize("keys", KEYS)
+def test_the_readings_are_what_other_keys_say(tmp_path, keys):
+    """Each of the three is what the same file gives under its keys, whichever way it was saved."""
+    path = stating(tmp_path, saved=keys, keys=keys)
+    case = load_case(path)
+    found = {"": case.robot.T_base_ct_mount, **other_readings(case.robot.stated, case.robot.T_base_ct_mount)}
+    assert found[""] == pytest.approx(T_BASE_CT)
+    assert len(found) == 4
+    for other in KEYS:
+        texts = (f'transform_maps = "{other[0]}"', f'base_axes = "{other[1]}"')
+        name = " and ".join(text for text, a, b in zip(texts, other, keys, strict=True) if a != b)
+        again = load_case(stating(tmp_path, saved=keys, keys=other)).robot.T_base_ct_mount
+        assert found[name] == pytest.approx(again)
+
+
+def test_honest_placements_are_never_refused_and_their_slips_are_told(tmp_path, ball):
+    """Arms that stand beside a patient on a table of the robot's frame, turned and tilted a little."""
+    rng, skin = np.random.default_rng(20261124), ball(90.0)
+    told = 0
+    for _ in range(20):
+        height = rng.uniform(100.0, 250.0)
+        turn = exp_rotation([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
+        lean = exp_rotation(rng.uniform(-0.1, 0.1, 3))
+        angle = rng.uniform(-np.pi, np.pi)
+        at = rng.uniform(250.0, 400.0) * np.array([np.cos(angle), np.sin(angle), 0.0])
+        T = pose(lean @ turn @ UPRIGHT, at + [0.0, 0.0, height])
+        box = ("table", (at[0], at[1], height - 95.0 - 20.0), (300.0, 300.0, 40.0))
+        case = load_case(stating(tmp_path, T, boxes=[box]))
+        assert check_transform(case, skin, case.robot.T_base_ct_mount) == ()
+        for saved in KEYS[1:]:
+            slipped = load_case(stating(tmp_path, T, saved=saved, boxes=[box]))
+            try:
+                told += bool(check_transform(slipped, skin, slipped.robot.T_base_ct_mount))
+            except InputError:
+                told += 1
+    assert told == 60
