@@ -109,9 +109,9 @@ class FastChecker(CellChecker):
         """
         return self.segment_checker()(start, end)
 
-    def segment_checker(self) -> SegmentChecker:
-        """A check of many segments, which remembers what touched last."""
-        return SegmentChecker(self.model, self._tested, self._proofs)
+    def segment_checker(self, clear_mm: float = 0.0) -> SegmentChecker:
+        """A check of many segments, which remembers what touched last; with a clearance where their ends have it."""
+        return SegmentChecker(self.model, self._tested, self._proofs, clear_mm)
 
     def open_checks(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact]:
         """The questions at ``q`` (6,) that are left to FCL."""

@@ -37,10 +37,13 @@ class SegmentChecker:
         model: The arm.
         checks: The questions that may find a contact.
         proofs: The same, packed.
+        clear_mm: What the padded arm is to keep from patient and boxes besides; of each body and obstacle that are
+            nearer to one another at an end of the segment, most of their distance there. What is not proven to be kept
+            counts as a contact.
     """
 
-    def __init__(self, model: UrModel, checks: Sequence[Check], proofs: Proofs) -> None:
-        self._model, self._checks = model, checks
+    def __init__(self, model: UrModel, checks: Sequence[Check], proofs: Proofs, clear_mm: float = 0.0) -> None:
+        self._model, self._checks, self._clear_mm = model, checks, clear_mm
         self._packed = (proofs.scene, proofs.movers, model.lengths)
         self._order = np.arange(len(checks), dtype=np.int64)
         self._answer = _empty_answer(QUESTIONS)
@@ -59,7 +62,7 @@ class SegmentChecker:
         fractions, begin = looks(math.ceil(_length(end - start) / LOOK_FIRST_RAD)), 0
         while True:
             segment_kernels.check_segment(
-                *self._packed, start, end, fractions, begin, FINE_MM, self._order, self._answer
+                *self._packed, start, end, fractions, begin, FINE_MM, self._clear_mm, self._order, self._answer
             )
             status, check, begin, count = self._answer.status.tolist()
             if status == NOT_FINITE:

@@ -32,6 +32,7 @@ from puncture_twin.planning.motion.path_check import (
     path_length,
 )
 from puncture_twin.planning.motion.rrt_connect import Connected
+from puncture_twin.planning.motion.shortcuts import CLEARANCE_MM
 from puncture_twin.planning.motion.shortest import MAX_SAMPLES, RUNS, Task, shortest_path
 from puncture_twin.planning.motion.trajectory import Trajectory
 
@@ -126,7 +127,8 @@ def plan_approach(
     refused, cut = "", _cut(checker, home, goals[open_goals])
     for attempt in range(ATTEMPTS):
         contact_of = _segment_check(checker, RESOLUTION_RAD / 2**attempt)
-        task = Task(checker.model.joint_limits, contact_of, home, goals[open_goals], cut)
+        limits, clear_of = checker.model.joint_limits, _shortcut_check(checker)
+        task = Task(limits, contact_of, home, goals[open_goals], cut, clear_of)
         path = shortest_path(task, seed=seed + RUNS * attempt, max_samples=max_samples)
         if isinstance(path, Connected):
             raise NoAnswerError(_why_none(path, cut, len(goals), len(open_goals), seed) + refused)
@@ -169,6 +171,11 @@ def _segment_check(checker: StateChecker, resolution_rad: float) -> SegmentConta
     return sampled
 
 
+def _shortcut_check(checker: StateChecker) -> SegmentContact | None:
+    """What checks shortcuts: the fast checker's proof of their clearance; FCL alone has none."""
+    return checker.segment_checker(CLEARANCE_MM) if isinstance(checker, FastChecker) else None
+
+
 def _cuts(contact_of: SegmentContact, waypoints: Floats) -> Floats:
     """How far from each waypoint between the ends its rounding may begin, shape (k - 2,), rad; 0 where none is free."""
     steps = np.diff(waypoints, axis=0)
@@ -198,10 +205,9 @@ def _within_limits(checker: StateChecker, q: Floats, name: str) -> Floats:
 
 def _free_goals(checker: StateChecker, home: Floats, goals: Floats) -> NDArray[np.int64]:
     """Which goals are free, home being free."""
-    contact = checker.contact(home, needle_may_touch_patient=False)
+    contact, *contacts = checker.contacts(np.concatenate([home[None], goals]), needle_may_touch_patient=False)
     if contact is not None:
         raise NoAnswerError(f"home is in collision: {contact.body} touches {contact.other}")
-    contacts = [checker.contact(goal, needle_may_touch_patient=False) for goal in goals]
     if all(contacts):
         named = sorted({f"{contact.body} touches {contact.other}" for contact in contacts if contact})
         raise NoAnswerError(f"every goal is in collision: {', '.join(named)}")

@@ -64,7 +64,15 @@ class Limits(NamedTuple):
     """States through which no path to a goal is shorter than this, rad, are passed over unchecked."""
 
 
-def connect(contact_of: SegmentContact, home: Floats, goals: Floats, limits: Limits, *, seed: int) -> Connected:
+def connect(
+    contact_of: SegmentContact,
+    home: Floats,
+    goals: Floats,
+    limits: Limits,
+    *,
+    seed: int,
+    clear_of: SegmentContact | None = None,
+) -> Connected:
     """Plan from home to any of several goals, and shorten what was found.
 
     Args:
@@ -73,6 +81,7 @@ def connect(contact_of: SegmentContact, home: Floats, goals: Floats, limits: Lim
         goals: Shape (g, 6), rad, free.
         limits: Where, and how long.
         seed: Of OMPL's generator.
+        clear_of: Checks a shortcut; ``contact_of`` unless stated.
 
     Raises:
         NoAnswerError: If the planner's path does not join home and a goal.
@@ -97,7 +106,7 @@ def connect(contact_of: SegmentContact, home: Floats, goals: Floats, limits: Lim
             return none
         found = np.array([angles_of(state) for state in problem.getSolutionPath().getStates()])
         waypoints, goal_index = _with_exact_ends(found, home, goals)
-        waypoints = shortened(limits.bounds, contact_of, waypoints)
+        waypoints = shortened(limits.bounds, clear_of or contact_of, waypoints)
     return none._replace(waypoints=_with_exact_ends(waypoints, home, goals)[0], goal_index=goal_index)
 
 

@@ -9,8 +9,14 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.motion.joint_space import JointSpace, SegmentContact, angles_of
 
 ROUNDS = 2
-"""Of shortcuts: a second one takes about a tenth off what one leaves beside a gantry."""
+"""Of shortcuts."""
 
+STEPS = 60
+"""Shortcuts tried in each round. By itself OMPL tries as many as the path has vertices: few where branches are long."""
+
+CLEARANCE_MM = 20.0
+"""What a shortcut keeps from patient and boxes beyond the arm's padding, where both of its ends do. The shortest path
+round an obstacle runs along it, and then an arm that errs by more than the padding touches."""
 
 UNSCALED = 1.0
 """What the wrist's angles are divided by here: nothing."""
@@ -21,7 +27,7 @@ def shortened(joint_limits: Floats, contact_of: SegmentContact, waypoints: Float
 
     Args:
         joint_limits: Shape (6, 2), rad.
-        contact_of: Checks a segment.
+        contact_of: Checks a shortcut.
         waypoints: Shape (k, 6), rad: straight free segments.
 
     Returns:
@@ -35,8 +41,9 @@ def shortened(joint_limits: Floats, contact_of: SegmentContact, waypoints: Float
     simplifier = og.PathSimplifier(space.information)
     simplifier.reduceVertices(path)
     for _ in range(ROUNDS):
-        simplifier.partialShortcutPath(path)
+        simplifier.partialShortcutPath(path, STEPS, STEPS)
         simplifier.reduceVertices(path)
+    simplifier.collapseCloseVertices(path)  # corners close together are taken slowly
     return np.array([angles_of(state, UNSCALED) for state in path.getStates()])
 
 

@@ -56,6 +56,8 @@ class Task(NamedTuple):
     """Shape (g, 6), rad, free."""
     cut: Cut | None = None
     """Tells which of the goals are cut off from home."""
+    clear_of: SegmentContact | None = None
+    """Checks a shortcut; None for the check of a segment."""
 
 
 def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> Path | Connected:
@@ -100,16 +102,16 @@ def _run(task: Task, best: Path | None, seed: int, max_samples: int) -> Connecte
     if best is not None:
         spare = (best.length - np.abs(task.goals - task.home)).max(axis=0) / 2.0
         limits = Limits(_box(task, spare.clip(0.0)), max_samples, best.length)
-        return connect(task.contact_of, task.home, task.goals, limits, seed=seed)
+        return connect(task.contact_of, task.home, task.goals, limits, seed=seed, clear_of=task.clear_of)
     near = Limits(_box(task, NEAR_RAD), max_samples // 2)
-    first = connect(task.contact_of, task.home, task.goals, near, seed=seed)
+    first = connect(task.contact_of, task.home, task.goals, near, seed=seed, clear_of=task.clear_of)
     if first.waypoints is not None:
         return first
     left = np.arange(len(task.goals)) if task.cut is None else np.flatnonzero(~task.cut.off)
     if len(left) == 0:
         return first
     anywhere = Limits(task.joint_limits, max_samples - near.max_samples)
-    second = connect(task.contact_of, task.home, task.goals[left], anywhere, seed=seed)
+    second = connect(task.contact_of, task.home, task.goals[left], anywhere, seed=seed, clear_of=task.clear_of)
     goal_index = -1 if second.waypoints is None else int(left[second.goal_index])
     both = first.samples + second.samples, first.blocked + second.blocked
     return second._replace(goal_index=goal_index, samples=both[0], blocked=both[1])

@@ -360,6 +360,34 @@ def test_segments_have_the_verdict_of_many_states(padding: float) -> None:
     assert 10 < sum(verdicts) < 50
 
 
+def test_a_segment_keeps_the_clearance_of_its_ends() -> None:
+    """What passes keeps 20 mm beyond the padding wherever its ends do, or most of what the nearer end keeps.
+
+    Some of the free segments here do not: they pass something nearer than that.
+    """
+    fast, padding, clear = scene(FastChecker), 5.0, 20.0
+    assert isinstance(fast, FastChecker)
+    free, keeps = fast.segment_checker(), fast.segment_checker(clear)
+
+    def nearest(q: np.ndarray) -> float:
+        return min(pair.mm for pair in fast.distances(q)) - padding
+
+    passed, refused = 0, 0
+    for start, end in segments(np.random.default_rng(21), 150):
+        ends = np.stack([start, start + 4.0 * (end - start)])
+        if free(*ends) is not None:
+            assert keeps(*ends) is not None
+            continue
+        least = min(nearest(q) for q in ends[0] + np.linspace(0.0, 1.0, 60)[:, None] * (ends[1] - ends[0]))
+        wanted = min(clear, *(0.8 * nearest(q) for q in ends))
+        if keeps(*ends) is None:
+            passed += 1
+            assert least >= 0.9 * wanted - 1.5  # a bound is loose by up to a tenth; a prism is fuller than its needle
+        else:
+            refused += 1
+    assert passed > 10 and refused > 0
+
+
 def test_what_a_judge_remembers_changes_no_verdict() -> None:
     """Free or not is the same for a fresh judge and for one that has seen other segments; so is it the other way round.
 

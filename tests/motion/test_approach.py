@@ -234,6 +234,26 @@ def test_a_tree_that_never_grows_ends_the_search_early(shut_in: str) -> None:
     assert set(found.blocked) == {Contact("needle", "wall")}
 
 
+def test_a_shortcut_is_taken_only_where_its_own_check_allows() -> None:
+    """Where no shortcut is allowed the path stays as the planner found it; it goes where segments may."""
+
+    def contact_of(start: np.ndarray, end: np.ndarray) -> Contact | None:
+        """Nothing in the way but for a block in the middle of the first two joints' angles."""
+        states = start + np.linspace(0.0, 1.0, 100)[:, None] * (end - start)
+        return Contact("needle", "wall") if (np.abs(states[:, :2] - block).max(axis=1) < 0.5).any() else None
+
+    def never(start: np.ndarray, end: np.ndarray) -> Contact | None:
+        return Contact("needle", "wall")
+
+    block, limits = ((LEFT + RIGHT) / 2.0)[:2], Limits(UR3.joint_limits, 2000)
+    short = connect(contact_of, LEFT, RIGHT[None], limits, seed=1).waypoints
+    found = connect(contact_of, LEFT, RIGHT[None], limits, seed=1, clear_of=never).waypoints
+    assert short is not None and found is not None
+    assert path_length(short) < 0.8 * path_length(found)
+    for path in (short, found):
+        assert all(contact_of(*ends) is None for ends in pairwise(path))
+
+
 def test_angles_outside_the_limits_are_refused() -> None:
     """Home and goals must be within the joint limits and finite."""
     checker = CellChecker(UR3, TOOL)

@@ -281,7 +281,7 @@ def hull_gap(hulls, first, second, M, axis, at, needed, S):
         x, y, z = axis[0], axis[1], axis[2]
         gap = _plane_gap(hulls.few, hulls.few_starts, first, second, M, x, y, z)
         gap -= hulls.slack[first] + hulls.slack[second]
-        if gap <= needed:
+        if gap <= 0.0 or gap <= needed < lower:  # else all corners prove no more that is of use
             gap = max(gap, _plane_gap(hulls.axes, hulls.starts, first, second, M, x, y, z))
         return max(0.0, gap)
     if lower == TOUCHING and (hulls.rounded[first] or hulls.rounded[second]):

@@ -93,14 +93,20 @@ def scratch(checks, hulls):
 
 
 @nb.njit(cache=True)
+def place_sphere(hulls, frames, hull, spheres):
+    """Fill a row of ``spheres`` (h, 3) with the centre of a hull's sphere, the arm standing at ``frames`` (7, 4, 4)."""
+    frame = hulls.frames[hull]
+    x, y, z = hulls.centres[hull, 0], hulls.centres[hull, 1], hulls.centres[hull, 2]
+    for i in range(3):
+        along = frames[frame, i, 0] * x + frames[frame, i, 1] * y + frames[frame, i, 2] * z
+        spheres[hull, i] = along + frames[frame, i, 3]
+
+
+@nb.njit(cache=True)
 def place_spheres(hulls, frames, spheres):
-    """Fill ``spheres`` (h, 3) with the centres of the hulls' spheres, the arm standing at ``frames`` (7, 4, 4)."""
+    """Fill all rows of ``spheres``, see :func:`place_sphere`."""
     for hull in range(len(spheres)):
-        frame = hulls.frames[hull]
-        x, y, z = hulls.centres[hull, 0], hulls.centres[hull, 1], hulls.centres[hull, 2]
-        for i in range(3):
-            along = frames[frame, i, 0] * x + frames[frame, i, 1] * y + frames[frame, i, 2] * z
-            spheres[hull, i] = along + frames[frame, i, 3]
+        place_sphere(hulls, frames, hull, spheres)
 
 
 @nb.njit(cache=True)
