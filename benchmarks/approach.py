@@ -1,10 +1,11 @@
 """How fast the approach is planned: seeded problems in a free room, beside a body on a table, and beside a CT gantry.
 
-    python benchmarks/approach.py [--problems N] [--quick]
+    python benchmarks/approach.py [--problems N] [--quick] [--fast-only]
 
 Each problem is planned twice with the same code and seed: with the fast checker, and with FCL alone judging segments
-at samples. Every path of the fast one is checked once more by FCL alone, twice as densely as when it was planned. Times
-are CPU seconds of this process; building the checkers and measuring the clearance are timed apart.
+at samples (not with --fast-only: that takes most of the time). Every path of the fast one is checked once more by FCL
+alone, twice as densely as when it was planned. Times are CPU seconds of this process; building the checkers and
+measuring the clearance are timed apart.
 """
 
 import argparse
@@ -38,6 +39,7 @@ from puncture_twin.planning.reach.goals import approach_goals
 from puncture_twin.planning.search.context import CaseContext, prepare
 
 STANDOFF_MM = 100.0
+FAST, SLOW = "fast", "FCL alone"
 
 
 @dataclass
@@ -60,6 +62,8 @@ class Tally:
     solve_s: list[float] = field(default_factory=list)
     total_s: list[float] = field(default_factory=list)
     rad: list[float] = field(default_factory=list)
+    straight_rad: list[float] = field(default_factory=list)
+    most_turned_rad: float = 0.0
     tip_mm: list[float] = field(default_factory=list)
     drive_s: list[float] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
@@ -70,12 +74,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--problems", type=int, default=100)
     parser.add_argument("--quick", action="store_true", help="9 problems")
+    parser.add_argument("--fast-only", action="store_true", help="do not plan with FCL alone")
     arguments = parser.parse_args()
     count = 9 if arguments.quick else arguments.problems
-    every: list[tuple[Tally, Tally]] = []
+    every: list[dict[str, Tally]] = []
     for number, scene in enumerate(scenes(count)):
-        every.append(measure(scene, seed=1000 * number))
-    fast, slow = ([t for pair in every for t in pair[k].total_s] for k in (0, 1))
+        every.append(measure(scene, seed=1000 * number, fast_only=arguments.fast_only))
+    if arguments.fast_only:
+        return
+    fast, slow = ([t for tallies in every for t in tallies[name].total_s] for name in (FAST, SLOW))
     print(f"\nall scenes: total {np.sum(slow) / np.sum(fast):.1f}x, median {np.median(slow) / np.median(fast):.1f}x")
 
 
@@ -160,17 +167,17 @@ def to_a_puncture(
     return (home, np.array([goal.insertion_q[0] for goal in goals])) if goals else None
 
 
-def measure(scene: Scene, seed: int) -> tuple[Tally, Tally]:
-    """All problems of a scene with both checkers."""
-    tallies, invalid, clearances, clearance_s, peaks, stops = (Tally(), Tally()), 0, [], [], [], []
+def measure(scene: Scene, seed: int, fast_only: bool) -> dict[str, Tally]:
+    """All problems of a scene with the fast checker, and with FCL alone where it is wanted."""
+    checkers = {FAST: scene.fast} if fast_only else {FAST: scene.fast, SLOW: scene.slow}
+    tallies = {name: Tally() for name in checkers}
+    invalid, clearances, clearance_s, peaks, stops = 0, [], [], [], []
     home, goals = scene.problems[0]
-    for checker in (scene.fast, scene.slow):
+    for checker in checkers.values():
         planned(checker, home, goals, seed, Tally())  # compiled, and warm
     for number, (home, goals) in enumerate(scene.problems):
-        path, _ = (
-            planned(c, home, goals, seed + 50 * number, t)
-            for c, t in zip((scene.fast, scene.slow), tallies, strict=True)
-        )
+        found = {name: planned(checkers[name], home, goals, seed + 50 * number, tallies[name]) for name in checkers}
+        path = found[FAST]
         if path is None:
             continue
         q = dense_states(scene.fast, path.trajectory.q, RESOLUTION_RAD / FINER / 2.0)
@@ -189,7 +196,8 @@ def measure(scene: Scene, seed: int) -> tuple[Tally, Tally]:
     print(f"  clearance least {room[0]:.1f}, median {room[1]:.1f} mm (in {1e3 * np.median(clearance_s):.0f} ms)")
     print(f"  peaks over limits (speed, acceleration, jerk): {np.max(peaks, axis=0).round(4).tolist()}")
     print(
-        f"  motion {np.median(tallies[0].drive_s):.2f} s (median); with a stop at every corner {np.median(stops):.2f} s"
+        f"  motion {np.median(tallies[FAST].drive_s):.2f} s (median);"
+        f" with a stop at every corner {np.median(stops):.2f} s"
     )
     return tallies
 
@@ -218,29 +226,40 @@ def planned(checker: CellChecker, home: np.ndarray, goals: np.ndarray, seed: int
     poses = flange_pose(checker.model, path.trajectory.q)
     tips = poses[:, :3, 3] + checker.tool.needle_length_mm * poses[:, :3, 2]
     tally.rad.append(path_length(path.waypoints))
+    tally.straight_rad.append(float(np.linalg.norm(goals - home, axis=1).min()))
+    turned = float(np.ptp(path.waypoints, axis=0).max())
+    tally.most_turned_rad = max(tally.most_turned_rad, turned - float(np.abs(goals[path.goal_index] - home).max()))
     tally.tip_mm.append(float(np.linalg.norm(np.diff(tips, axis=0), axis=1).sum()))
     tally.drive_s.append(path.trajectory.duration_s)
     return path
 
 
-def report(scene: Scene, tallies: tuple[Tally, Tally], invalid: int) -> None:
+def report(scene: Scene, tallies: dict[str, Tally], invalid: int) -> None:
     """Print a scene's table."""
     anew, cached, plain = scene.built_s
     print(
         f"\n{scene.name}: {len(scene.problems)} problems, {np.mean([len(g) for _, g in scene.problems]):.0f} goals each"
     )
     print(f"  checkers built in {anew:.2f} s (from the cache {cached:.2f} s), FCL alone {plain:.2f} s")
-    for name, tally in zip(("fast", "FCL alone"), tallies, strict=True):
+    for name, tally in tallies.items():
         solve, total = (np.percentile(1e3 * np.array(times), [50, 95]) for times in (tally.solve_s, tally.total_s))
+        straight = np.isclose(tally.rad, tally.straight_rad)
         print(
-            f"  {name:9}: {len(tally.rad)} of {len(scene.problems)} solved; solve {solve[0]:.1f} / {solve[1]:.1f} ms,"
+            f"  {name:9}: {len(tally.rad)} of {len(scene.problems)} solved, {straight.sum()} straight to the nearest"
+            f" goal; solve {solve[0]:.1f} / {solve[1]:.1f} ms,"
             f" total {total[0]:.1f} / {total[1]:.1f} ms (median / 95 %); path {np.median(tally.rad):.2f} rad,"
             f" tip {np.median(tally.tip_mm):.0f} mm"
         )
+        print(
+            f"    joint travel {np.sum(tally.rad):.1f} rad in all, straight lines to the nearest goals"
+            f" {np.sum(tally.straight_rad):.1f}; a joint turns by {np.degrees(tally.most_turned_rad):.0f} deg more than"
+            " from end to end, at most"
+        )
         for why in tally.refused[:2]:
             print(f"    not: {why}")
-    ratio = np.sum(tallies[1].total_s) / np.sum(tallies[0].total_s)
-    print(f"  total {ratio:.1f}x; invalid paths {invalid}")
+    if SLOW in tallies:
+        print(f"  total {np.sum(tallies[SLOW].total_s) / np.sum(tallies[FAST].total_s):.1f}x")
+    print(f"  invalid paths {invalid}")
 
 
 if __name__ == "__main__":
