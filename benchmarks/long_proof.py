@@ -1,6 +1,6 @@
-"""Ten million verdicts of the product against FCL and against a plain brute force, on hostile scenes.
+"""Sixteen million verdicts of the product against FCL and against a plain brute force, on hostile scenes.
 
-``python benchmarks/long_proof.py --count 10000000 --log FILE`` writes one line per scene, without times, and prints the
+``python benchmarks/long_proof.py --count 16000000 --log FILE`` writes one line per scene, without times, and prints the
 log's SHA-256: the same seed and count give the same digest. A log that is there is continued, and only reported where
 it is long enough. Exit 1 where a "safe" is wrong.
 

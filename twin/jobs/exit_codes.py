@@ -70,7 +70,10 @@ def _unread(error: BaseException) -> int:
 
 def _line_and_code(error: PlanningError | ClickException) -> tuple[str, int]:
     if isinstance(error, ClickException):
-        return f"command line: {one_line(error.format_message(), MOST_WHAT)}; allowed: see --help", BAD_INPUT
+        return (
+            f"command line: {one_line(error.format_message(), MOST_WHAT).rstrip('.')}; allowed: see --help",
+            BAD_INPUT,
+        )
     if isinstance(error, NoAnswerError):
         return one_line(str(error)), ANSWER_IS_NO
     return str(error), BAD_INPUT if isinstance(error, InputError) else PROGRAM_FAILED
