@@ -14,13 +14,12 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import N_PARAMETERS
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem, covariances
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import refine
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.direction_residuals import (
     direction_residuals,
     directions_image,
     linearised_direction,
-    linearised_tip,
-    tip_residuals,
 )
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.tip_residuals import linearised_tip, tip_residuals
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, PoseRanges, simulate_recording, with_noise
 
 ALL = active_columns(tip=True, scale=False, direction=False)

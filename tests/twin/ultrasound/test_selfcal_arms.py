@@ -15,20 +15,15 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import arm_errors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import PLAY_SIGN, calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import active_columns
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import weighed
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import (
-    Problem,
-    Spread,
-    flange_slopes,
-    linear_model,
-)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.found_spreads import found_spreads
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers.robust import plain_fit
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, Spread, flange_slopes, linear_model
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.direction_residuals import (
     direction_residuals,
     directions_image,
-    tip_residuals,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import plain_fit
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.spread import found_spreads
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.tip_residuals import tip_residuals
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import Whitening
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import drawing
 from puncture_twin.twin.guidance.ultrasound.puncture import aim

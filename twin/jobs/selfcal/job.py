@@ -11,9 +11,10 @@ from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.twin.guidance.ultrasound.recording_file import FILE_NAME
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
+from puncture_twin.twin.jobs.selfcal.calibration_file import write_run
 from puncture_twin.twin.jobs.selfcal.page import write_page
 from puncture_twin.twin.jobs.selfcal.pictures import detection_sheet, workcell_picture
-from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun, selfcal_recording, selfcal_twin, write_run
+from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun, selfcal_recording, selfcal_twin
 
 COMMAND = "selfcal"
 ANSWERS = ("calibration.json", "report.html")

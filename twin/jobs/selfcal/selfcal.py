@@ -2,43 +2,30 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.base.progress import Stages, Watcher
-from puncture_twin.planning.base.provenance import Input, content_input, inputs_document
+from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.base.whole_lines import unfinished_warnings
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, acquire, choice_noise
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, drawing, find_candidates
 from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, punctures, unseen_errors_mm
-from puncture_twin.twin.guidance.ultrasound.recording_file import (
-    FILE_NAME,
-    MAX_BYTES,
-    parse_recording,
-    recording_file,
-    write_recording,
-)
+from puncture_twin.twin.guidance.ultrasound.recording_file import MAX_BYTES, parse_recording, recording_file
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
 from puncture_twin.twin.guidance.ultrasound.slips import checked_calibration
-from puncture_twin.twin.guidance.ultrasound.summaries import calibration_summary
 from puncture_twin.twin.guidance.ultrasound.trial import Choice, SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
-
-VERSION = 2
-"""Of ``calibration.json``. 2: ``inputs`` lists each file with its role."""
+from puncture_twin.twin.jobs.selfcal.calibrate_case import calibrate_case
 
 TARGETS = 6
 """Punctures per seed."""
@@ -145,14 +132,6 @@ def selfcal_recording(path: Path, case: SelfcalCase | None) -> SelfcalRun:
     return SelfcalRun(file.stem, calibration, recording, inputs, case=case, stages=stages, warnings=warnings)
 
 
-def calibrate_case(recording: Recording, case: SelfcalCase | None) -> Calibration:
-    """Calibrate with what the case says of noise and needle; pixels are solved for where the recording has them."""
-    noise = None if case is None or case.content.noise is None else case.content.noise.noise()
-    length = case.content.needle.length_mm if case is not None and case.content.hold_needle_length else None
-    arms = None if case is None or recording.q_probe is None else case.declared_arms
-    return calibrate(recording, noise=noise, needle_length_mm=length, scale=recording.pixels, arms=arms)
-
-
 def _trial(
     case: SelfcalCase, workcell: TwoArms, candidates: CandidatePoses, seed: int, stages: Stages, watcher: Watcher
 ) -> SelfcalTrial:
@@ -187,34 +166,3 @@ def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisi
 
     sets = [rng.choice(len(poses), len(rows), replace=False) for _ in range(RANDOM_SETS)]
     return Choice(expected(rows), tuple(expected(some) for some in sets))
-
-
-def write_run(run: SelfcalRun, out: Path) -> SelfcalRun:
-    """Write ``calibration.json`` and, in the twin, the first seed's ``recording.csv``."""
-    written = [_write_json(calibration_file(run), out / "calibration.json")]
-    if run.trials:
-        write_recording(run.recording, out / FILE_NAME)
-        written.append(out / FILE_NAME)
-    return run.with_files(*written)
-
-
-def calibration_file(run: SelfcalRun) -> dict[str, Any]:
-    """What ``calibration.json`` holds."""
-    found = run.calibration
-    return {
-        "version": VERSION,
-        "name": run.name,
-        "seed": run.trials[0].seed if run.trials else None,
-        "inputs": inputs_document(run.inputs),
-        **calibration_summary(found, run.recording),
-        "residuals_mm": dict(zip(run.recording.names, found.residuals.tolist(), strict=True)),
-        "parameters": list(found.parameters),
-        "covariance": found.covariance_counts.tolist(),
-        "region_limit_95": found.region_limit(),
-    }
-
-
-def _write_json(content: dict[str, Any], path: Path) -> Path:
-    with atomic(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return path

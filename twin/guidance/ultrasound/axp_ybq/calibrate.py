@@ -2,33 +2,20 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats, read_only
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, without_play
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import LEAST_POSES, LEAST_POSES_KNOWN_TIP, closed_form
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import needle_direction
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
-    DIRECTION,
-    PARAMETERS,
-    T_Q,
-    Estimate,
-    active_columns,
-    tangent_basis,
-)
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import RobustFit, weighed
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem, Spread
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, Estimate, active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.found_spreads import refitted
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers.robust import plain_fit, robust_fit
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import needle_in_image
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.robust import plain_fit, robust_fit
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.spread import SmallSample, refitted, small_sample
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.solution import Solution, assembled, solution_of, with_length
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.suggested_poses import require_observable
 
 SHAFT_BIAS = (
@@ -102,12 +89,12 @@ def calibrate(
     bias = None
     if needle_length_mm is not None and known_tip is None:
         bias = float(solution.estimate.V @ solution.estimate.t_Q) - needle_length_mm
-        solution = _with_length(solution, bias)
+        solution = with_length(solution, bias)
     cannot = [SHAFT_BIAS] * (needle_length_mm is None and known_tip is None) + [SCALE_TAKEN] * (not scale)
     cannot += [DIRECTION_SIGN] * (recording.v is None) + [ARMS_TAKEN] * (arms is None)
     if arms is not None and recording.turn_probe is None and any(arm.play_rad > 0.0 for arm in arms):
         cannot.append(PLAY_SIGN)
-    return _assembled(recording, solution, bias, tuple(cannot), arms)
+    return assembled(recording, solution, bias, tuple(cannot), arms)
 
 
 def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: Estimate | None) -> None:
@@ -123,27 +110,6 @@ def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: E
         raise InputError(f"{len(recording)} poses", where="recording", allowed=allowed)
 
 
-class _Solution(NamedTuple):
-    """A fit with all that is known about it."""
-
-    estimate: Estimate
-    active: NDArray[np.int_]
-    tip_kept: NDArray[np.bool_]
-    iterations: int
-    noise: Noise | Spread
-    covariance: Floats
-    """Of the free parameters, then of the arms' lasting errors where they are declared, shape (p + m, p + m)."""
-    arm_errors: Floats
-    """Posterior mean of the arms' lasting errors, in standard deviations, shape (m,): 46, with
-    play in both arms 58, and 0 where none are declared."""
-    small_sample: SmallSample | None
-    residuals: Floats
-    noise_ratio: float
-    freedom: int
-    observability: Observability
-    orientations: Floats
-
-
 def _solve(
     recording: Recording,
     *,
@@ -154,7 +120,7 @@ def _solve(
     direction: bool,
     start: Estimate | None,
     arms: DeclaredArms | None = None,
-) -> _Solution:
+) -> Solution:
     """The unknowns of a recording; the arguments are those of `calibrate`.
 
     Raises:
@@ -182,76 +148,4 @@ def _solve(
         problem, fit = refitted(problem, fit, seen, recheck=robust)
         if not np.array_equal(before, fit.tip_kept):
             observability = require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
-    return _solution(problem, fit, observability)
-
-
-def _solution(problem: Problem, fit: RobustFit, observability: Observability) -> _Solution:
-    at_fit = weighed(problem, fit)
-    count = 3 * int(fit.tip_kept.sum()) + 2 * int(fit.direction_kept.sum()) * problem.with_direction
-    freedom = count - len(problem.active)
-    region = small_sample(problem, fit) if problem.arms is not None else None
-    return _Solution(
-        fit.estimate,
-        problem.active,
-        fit.tip_kept,
-        fit.iterations,
-        problem.noise,
-        at_fit.covariance,
-        at_fit.shared,
-        region,
-        at_fit.residuals[:, :3],
-        float(np.sqrt(at_fit.chi_squared / max(freedom, 1))),
-        freedom,
-        observability,
-        needle_in_image(fit.estimate, problem.recording),
-    )
-
-
-def _with_length(solution: _Solution, bias: float) -> _Solution:
-    """The solution after t_Q <- t_Q - (V.t_Q - length) V."""
-    V, t_Q = solution.estimate.V, solution.estimate.t_Q
-    full = np.eye(len(PARAMETERS))
-    full[T_Q, T_Q] -= np.outer(V, V)
-    full[T_Q, DIRECTION] = -(bias * np.eye(3) + np.outer(V, t_Q)) @ tangent_basis(V)
-    change = full[np.ix_(solution.active, solution.active)]
-    whole = np.eye(len(solution.covariance))
-    whole[: len(change), : len(change)] = change
-    region = solution.small_sample
-    if region is not None:
-        region = region._replace(covariance=change @ region.covariance @ change.T)
-    return solution._replace(
-        estimate=solution.estimate._replace(t_Q=t_Q - bias * V),
-        covariance=np.asarray(whole @ solution.covariance @ whole.T),
-        small_sample=region,
-    )
-
-
-def _assembled(
-    recording: Recording, solution: _Solution, bias: float | None, cannot: tuple[str, ...], arms: DeclaredArms | None
-) -> Calibration:
-    estimate, kept, p = solution.estimate, solution.tip_kept, len(solution.active)
-    return Calibration(
-        read_only(pose(estimate.R_X, estimate.t_X)),
-        read_only(pose(estimate.R_Y, estimate.t_Y)),
-        read_only(estimate.t_Q),
-        read_only(estimate.V),
-        read_only(estimate.scale),
-        read_only(solution.residuals),
-        float(np.sqrt(np.mean(np.sum(solution.residuals[kept] ** 2, axis=1)))),
-        read_only(1.0 * kept),
-        tuple(name for name, used in zip(recording.names, kept, strict=True) if not used),
-        solution.iterations,
-        solution.observability.ratio,
-        read_only(solution.covariance[:p, :p]),
-        tuple(PARAMETERS[column] for column in solution.active),
-        solution.freedom,
-        solution.noise,
-        solution.noise_ratio,
-        bias,
-        read_only(solution.orientations),
-        cannot,
-        arms,
-        read_only(solution.arm_errors),
-        read_only(solution.covariance),
-        solution.small_sample,
-    )
+    return solution_of(problem, fit, observability)
