@@ -64,15 +64,21 @@ REGISTRATION = (
 PLAIN = MappingProxyType(
     {
         "puncture_twin.planning.case.entry": ("tests/case/test_entry.py",),
-        "puncture_twin.planning.anatomy.skin_entry": (
-            "tests/anatomy/test_skin_entry.py",
-            "tests/search/test_constraints.py",
-        ),
+        **{
+            f"puncture_twin.planning.anatomy.{name}": (
+                "tests/anatomy/test_skin_entry.py",
+                "tests/search/test_constraints.py",
+            )
+            for name in ("skin_entry", "settled_crossings", "skin_normals")
+        },
         "puncture_twin.planning.reach.standoff": tuple(f"tests/reach/test_standoff.py::{name}" for name in STANDOFF),
         "puncture_twin.planning.geometry.containment": ("tests/geometry/test_containment.py",),
         "puncture_twin.planning.search.constraints": ("tests/search/test_verdict_order.py",),
         "puncture_twin.planning.registration.marker_pairs": REGISTRATION,
-        "puncture_twin.planning.registration.fits": REGISTRATION,
+        **{
+            f"puncture_twin.planning.registration.fits.{name}": REGISTRATION
+            for name in ("least_squares", "triad", "weighted", "affine", "method", "residual_checks")
+        },
         "puncture_twin.planning.registration.registration": REGISTRATION,
     }
 )

@@ -29,7 +29,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.twin.guidance.stereo.detection import Detector
 from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, needle_statistics, trial
 from puncture_twin.twin.guidance.stereo.joint.joint_model import Guess, Observed

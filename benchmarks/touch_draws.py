@@ -26,8 +26,10 @@ from benchmarks.trust import Scene, punctures, scenes
 from puncture_twin.planning.clearance.near_faces import NearFaces
 from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.reach.standoff import axis_lengths
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding
-from puncture_twin.planning.uncertainty.line_sampling import NeedleDoubt, line_chance, needle_doubt
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
+from puncture_twin.planning.uncertainty.limits import demanding
+from puncture_twin.planning.uncertainty.lines.line_sampling import line_chance
+from puncture_twin.planning.uncertainty.lines.needle_doubt import NeedleDoubt, needle_doubt
 from puncture_twin.planning.uncertainty.needle_lines import walked
 from puncture_twin.planning.uncertainty.touch import touch_chance
 

@@ -37,7 +37,8 @@ from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
-from puncture_twin.planning.registration.fits import Method, fit_rigid
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits.method import Method
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.noise_test import NoiseTest
 from puncture_twin.planning.registration.placement import load_placement
@@ -46,9 +47,10 @@ from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.registration.touch_poses import touching_configuration
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.organs import organ_candidates
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel, demanding
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.hit_model import HitModel, hit_model
+from puncture_twin.planning.uncertainty.limits import demanding
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
 

@@ -10,12 +10,12 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import farthest_from_singular
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.errors import error_model
-from puncture_twin.planning.case.errors_section import ErrorsSection
+from puncture_twin.planning.case.tables.errors_section import ErrorsSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed
-from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.reading_noise import reading_noise

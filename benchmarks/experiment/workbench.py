@@ -16,7 +16,7 @@ from puncture_twin.planning.needle.bevel_path import bevel_path
 from puncture_twin.planning.needle.insertion_force import insertion_force
 from puncture_twin.planning.needle.shaft import Shaft
 from puncture_twin.planning.needle.tissue import Layer, Tissue
-from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.search.bending.insertion import Insertion
 from puncture_twin.twin.plant.true_tissue import StraightPath, TrueTissue
 from puncture_twin.twin.world.arm import load_arm

@@ -21,8 +21,8 @@ from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.case_schema import count_difference
-from puncture_twin.planning.formats.meshes.mesh_files import kept_mesh_warnings
+from puncture_twin.planning.case.stated_count import count_difference
+from puncture_twin.planning.formats.meshes.mesh_warnings import kept_mesh_warnings
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.triangle_distance import squared_distance

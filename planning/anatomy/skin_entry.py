@@ -5,15 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.anatomy.settled_crossings import settled_crossings
 from puncture_twin.planning.anatomy.skin import Skin
-from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.geometry.crossings import Crossings, crossings
-from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-NUDGE = 1e-7
-"""Radians by which a ray through an edge or corner is turned when its crossings do not add up."""
+from puncture_twin.planning.anatomy.skin_normals import skin_normals
+from puncture_twin.planning.base.arrays import Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,31 +63,9 @@ def skin_paths(
         unknown[~odd] = 0.0
     depth[cut] = np.nan
     entry = target_ct + depth[:, None] * outward_ct
-    cosine = np.abs(np.einsum("ij,ij->i", _normals(skin.mesh, face, entry), outward_ct))
+    cosine = np.abs(np.einsum("ij,ij->i", skin_normals(skin.mesh, face, entry), outward_ct))
     angle = np.where(np.isnan(depth), np.nan, np.arccos(np.minimum(cosine, 1)))
     return SkinPaths(entry, depth, angle, reentry, unknown, view)
-
-
-def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) -> tuple[Crossings, Bools]:
-    """Crossings, and which rays leave the body an odd number of times, as a ray from inside a closed surface must.
-
-    A ray through an edge or corner may count twice or touch without crossing; it is turned by `NUDGE` and asked again.
-    """
-    found = crossings(mesh, origin, directions)
-    odd = found.count % 2 == 1
-    if mesh.closed and not odd.all():
-        rotated = directions.copy()
-        rotated[~odd] = _rotated(directions[~odd])
-        found = crossings(mesh, origin, rotated)
-        odd = found.count % 2 == 1
-    return found, odd
-
-
-def _rotated(directions: Floats) -> Floats:
-    helper = np.eye(3)[np.argmin(np.abs(directions), axis=1)]
-    aside = np.cross(directions, helper)
-    rotated = directions + NUDGE * aside / np.linalg.norm(aside, axis=1, keepdims=True)
-    return np.asarray(rotated / np.linalg.norm(rotated, axis=1, keepdims=True))
 
 
 def view_depth(skin: Skin, target_ct: Floats, outward_ct: Floats) -> Floats:
@@ -111,27 +85,3 @@ def view_depth(skin: Skin, target_ct: Floats, outward_ct: Floats) -> Floats:
         return np.full(len(outward_ct), np.nan)
     out = skin.field_of_view.exit(target_ct, outward_ct)
     return np.where(out.cut, out.depth_mm, np.nan)
-
-
-def _normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) -> Floats:
-    """Unit normals at points of triangles: the corners' normals (area weighted), blended; shape (n, 3)."""
-    a, b, c = np.moveaxis(mesh.triangles, 1, 0)
-    areas = np.cross(b - a, c - a)
-    at_vertex = np.zeros_like(mesh.vertices)
-    for corner in mesh.faces.T:
-        np.add.at(at_vertex, corner, areas)
-    weights = _corner_weights(mesh.triangles[face], points)
-    return _unit(np.einsum("ij,ijk->ik", weights, _unit(at_vertex)[mesh.faces[face]]))
-
-
-def _corner_weights(triangles: Floats, points: Floats) -> Floats:
-    """How much corners count (n, 3) at points of triangles (n, 3, 3): as the areas opposite, in one measure per row."""
-    a, b, c = np.moveaxis(triangles, 1, 0)
-    normal = np.cross(b - a, c - a)
-    parts = [np.cross(c - b, points - b), np.cross(a - c, points - c), np.cross(b - a, points - a)]
-    return np.stack([np.einsum("ij,ij->i", part, normal) for part in parts], axis=1)
-
-
-def _unit(vectors: Floats) -> Floats:
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)

@@ -15,7 +15,8 @@ from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Names
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.case_file import StructureSection, StructuresSection
+from puncture_twin.planning.case.tables.structure_section import StructureSection
+from puncture_twin.planning.case.tables.structures_section import StructuresSection
 from puncture_twin.planning.formats.labels.mask_folder import check_one_grid
 from puncture_twin.planning.formats.labels.naming import BUILT_IN, LabelRule, RuleKind, names_for, select
 from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
@@ -168,9 +169,9 @@ class StructureSources:
         where = f"{self._case.path}: structure '{section.name}'"
         if section.mesh is None or section.unit is None:
             raise InputError("no mesh with a unit", where=where, allowed="mesh and unit")
+        file, by_default = self._file(section.mesh), section.space is None
         space = parse_space(section.space or self._case.space, where=where)
         unit = parse_unit(section.unit, where=where)
-        file, by_default = self._file(section.mesh), section.space is None
         key = (__name__, self._case.files.sha256(section.mesh), file.suffix.lower(), unit, space, by_default)
         return self._cache.memory.get(
             key, partial(self._parsed, section.mesh, unit, space, by_default), lambda mesh: mesh.nbytes

@@ -16,7 +16,7 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.aim_correction import aimed_uncertainty
 from puncture_twin.planning.registration.fit_uncertainty import fit_uncertainty
-from puncture_twin.planning.registration.fits import fit_triad
+from puncture_twin.planning.registration.fits.triad import fit_triad
 from puncture_twin.planning.registration.marker_noise import touches
 from puncture_twin.planning.registration.placement import default_method
 from puncture_twin.planning.registration.reading_noise import reading_noise

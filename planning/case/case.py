@@ -11,39 +11,29 @@ from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
 from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.breathing.breathing import Breathing
-from puncture_twin.planning.case.case_file import (
-    CaseFile,
-    PlaceSection,
-    RankingSection,
-    RehearsalSection,
-    StructureSection,
-    StructuresSection,
-)
+from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.case_volumes import CaseVolumes
 from puncture_twin.planning.case.entry import Directions, direction, entry_frame, grid, view_frame
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.case.html import case_html
 from puncture_twin.planning.case.named_files import MASK_ROLE, read_named_files
 from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOptions
-from puncture_twin.planning.case.registration_section import (
-    MarkerSection,
-)
 from puncture_twin.planning.case.sections.bend import bending_of
 from puncture_twin.planning.case.sections.breath import breathing_of
-from puncture_twin.planning.case.sections.robot import robot_of, robot_warnings
+from puncture_twin.planning.case.sections.robot import robot_of
+from puncture_twin.planning.case.sections.robot_place import robot_warnings
 from puncture_twin.planning.case.sections.search import search_of
 from puncture_twin.planning.case.sections.stated_errors import errors_of
 from puncture_twin.planning.case.sections.surroundings import gantry_of, obstacle_of
 from puncture_twin.planning.case.sections.target import target_of
 from puncture_twin.planning.case.sections.tool_section import tool_of
-from puncture_twin.planning.case.settings import (
-    CtSettings,
-    Gantry,
-    Needle,
-    Obstacle,
-    RobotSettings,
-    SearchSettings,
-)
+from puncture_twin.planning.case.settings import CtSettings, Gantry, Needle, Obstacle, RobotSettings, SearchSettings
+from puncture_twin.planning.case.tables.place_section import PlaceSection
+from puncture_twin.planning.case.tables.ranking_section import RankingSection
+from puncture_twin.planning.case.tables.registration_section import MarkerSection
+from puncture_twin.planning.case.tables.rehearsal_section import RehearsalSection
+from puncture_twin.planning.case.tables.structure_section import StructureSection
+from puncture_twin.planning.case.tables.structures_section import StructuresSection
 from puncture_twin.planning.case.whole_case import wholeness_warnings
 from puncture_twin.planning.formats.labels.mask_folder import structure_name
 from puncture_twin.planning.geometry.spaces import Space

@@ -8,8 +8,9 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.case_file import EntryAxes, MountSection
 from puncture_twin.planning.case.entry import entry_frame
+from puncture_twin.planning.case.tables.robot_section import MountSection
+from puncture_twin.planning.case.tables.search_section import EntryAxes
 from puncture_twin.planning.case.toml_types import Anatomical
 from puncture_twin.planning.geometry.rigid import frame_of_axes, pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps

@@ -7,8 +7,9 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.case.case_file import CaseFile, StructuresSection
+from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.case_volumes import VOLUME_ROLES, CaseVolumes
+from puncture_twin.planning.case.tables.structures_section import StructuresSection
 from puncture_twin.planning.formats import itk_transform
 from puncture_twin.planning.formats.labels import naming
 from puncture_twin.planning.formats.labels.mask_folder import mask_files, structure_name

@@ -9,8 +9,8 @@ from types import MappingProxyType
 from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.case.case_file import AIR_HU, DENSE_HU
-from puncture_twin.planning.case.registration_section import RegistrationSection
+from puncture_twin.planning.case.tables.ct_section import AIR_HU, DENSE_HU
+from puncture_twin.planning.case.tables.registration_section import RegistrationSection
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.base.whole_lines import unfinished_warnings
 from puncture_twin.planning.case.case_file import CaseFile
-from puncture_twin.planning.case.case_schema import NOT_LAST_NOTE, SCHEMA_ONE_NOTE, TOP_COUNT_NOTE, ends_with_end
+
+SCHEMA_ONE_NOTE = (
+    "schema = 1 does not show whether the case file is whole: schema = 2 states its structures and its region "
+    "(docs/how-to/case-schema-2.md)"
+)
+
+TOP_COUNT_NOTE = (
+    "structures = N stands at the top of the case, so that a cut after its last structure would not be seen; "
+    "state it in [end], the file's last table (docs/how-to/case-schema-2.md)"
+)
+
+NOT_LAST_NOTE = "[end] is not the last table of the case: what stands after it could be cut off unseen"
+
+_HEADER = re.compile(r"^[ \t]*\[{1,2}[ \t]*([^\[\]\n]+?)[ \t]*\]{1,2}[ \t]*(?:#.*)?$", re.MULTILINE)
+"""The header of a table, on a line of its own."""
+
 
 LINE_FILES = (".csv", ".fcsv")
 """Endings of lists that are read line by line: one that was cut within a number is another number, and looks whole."""
@@ -41,3 +57,9 @@ def _notes(content: CaseFile, text: str) -> list[str]:
 
 def _line_files(files: InputFiles) -> list[str]:
     return list(dict.fromkeys(one.path for one in files.inputs if one.path.lower().endswith(LINE_FILES)))
+
+
+def ends_with_end(text: str) -> bool:
+    """Whether the last table of a file is ``[end]``."""
+    headers = _HEADER.findall(text)
+    return bool(headers) and headers[-1] == "end"

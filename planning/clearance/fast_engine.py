@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +18,12 @@ from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import capsule_touches_any
 from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
 from puncture_twin.planning.clearance.kernels.lanes import LANES
-from puncture_twin.planning.clearance.kernels.nearest_triangle import nearest_triangle
 from puncture_twin.planning.clearance.kernels.scratch import Found, scratch_for
 from puncture_twin.planning.clearance.kernels.tile_search import COUNTED, search_tiles
 from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
 from puncture_twin.planning.clearance.normals import normals_of
+from puncture_twin.planning.clearance.placed_surface import PlacedSurface, placed_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-COORDINATE_SLACK = 1e-6
-"""Share of a coordinate by which float32 arithmetic of a few terms may err: 8 times its rounding."""
 
 FCL_BEYOND_MM = 1.0
 """Farther from a capsule FCL sees nothing: its tolerance is 1e-6 mm, and the bounds' rounding 1e-5 mm."""
@@ -40,16 +36,6 @@ WORTH_THREADS = 20_000
 
 LONGEST_MM = 1e9
 """A needle that could reach the nodes that only fill a level up would be measured from them."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Placed:
-    """One surface as seen from one target: the nodes of `bounds.disc_bounds`, and the target's own distance."""
-
-    nodes: NDArray[np.float32]
-    slack: float
-    distance: float
-    nearest: int
 
 
 class FastEngine:
@@ -77,7 +63,7 @@ class FastEngine:
         threads: int = MOST_THREADS,
     ) -> None:
         self._blocks = tuple(_packed(mesh, memory) for mesh in meshes)
-        self._seen: tuple[Floats, tuple[_Placed, ...]] | None = None
+        self._seen: tuple[Floats, tuple[PlacedSurface, ...]] | None = None
         self._threads = threads
         self._progress = progress
         self.counts = np.zeros(len(COUNTED), np.int64)
@@ -95,7 +81,7 @@ class FastEngine:
             raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
         distance, depth, nearest = np.empty(shape), np.empty(shape), np.empty(shape, np.int32)
         counts = np.zeros((len(self._blocks), len(COUNTED)), np.int64)
-        tiles, seen = bundle(outward), self._seen_from(target)
+        seen, tiles = self._seen_from(target), bundle(outward)
 
         def search(row: int) -> None:
             answer = AxisDistances(distance[row], depth[row], nearest[row])
@@ -113,10 +99,10 @@ class FastEngine:
         triangles = [blocks.triangles for blocks in self._blocks]
         return normals_of(triangles, target_ct, outward_ct, axes)
 
-    def _seen_from(self, target: Floats) -> tuple[_Placed, ...]:
+    def _seen_from(self, target: Floats) -> tuple[PlacedSurface, ...]:
         """The surfaces as seen from a target; those of the last target are kept."""
         if self._seen is None or not np.array_equal(self._seen[0], target):
-            self._seen = (target.copy(), tuple(_placed(blocks, target) for blocks in self._blocks))
+            self._seen = (target.copy(), tuple(placed_surface(blocks, target) for blocks in self._blocks))
         return self._seen[1]
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
@@ -154,7 +140,7 @@ def _packed(mesh: TriangleMesh, memory: Memory) -> Blocks:
 
 def _one_structure(
     blocks: Blocks,
-    placed: _Placed,
+    placed: PlacedSurface,
     tiles: Tiles,
     target: Floats,
     length: float,
@@ -174,17 +160,3 @@ def _one_structure(
         bundles, scratch_for(len(placed.nodes)), found, LANES,
     )  # fmt: skip
     distance[tiles.order], depth[tiles.order], nearest[tiles.order] = np.sqrt(found.square), found.depth, found.triangle
-
-
-def _placed(blocks: Blocks, target: Floats) -> _Placed:
-    """A surface as seen from a target."""
-    nodes = np.empty((10, len(blocks.center)), np.float32)
-    nodes[:3] = (blocks.center - target).T
-    nodes[3:8] = blocks.disc
-    nodes[8] = np.hypot(nodes[6], nodes[7]) * np.float32(1 + 1e-6)
-    away = np.sqrt(nodes[0] ** 2 + nodes[1] ** 2 + nodes[2] ** 2)
-    nodes[9] = (away + nodes[8]) * np.float32(1 + 1e-6)
-    slack = COORDINATE_SLACK * float(nodes[9][: len(blocks.local)].max())
-    grouped = np.ascontiguousarray(nodes.reshape(10, -1, LANES).transpose(1, 0, 2))
-    distance, nearest = nearest_triangle(blocks.triangles, grouped, blocks.base, target, slack)
-    return _Placed(grouped, slack, distance, nearest)

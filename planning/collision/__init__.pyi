@@ -1,15 +1,17 @@
-from .bodies import Body as Body, Shape as Shape, arm_bodies as arm_bodies
-from .bounding_spheres import prism as prism, sphere_tree as sphere_tree
+from .bodies.arm_bodies import arm_bodies as arm_bodies
+from .bodies.body import Body as Body, Shape as Shape
+from .bodies.shapes import surface as surface, touch as touch
 from .checker import (
     DISTANCE_PAIRS as DISTANCE_PAIRS,
     CellChecker as CellChecker,
     Distances as Distances,
     Nearest as Nearest,
 )
+from .enclosures.prism import prism as prism
+from .enclosures.sphere_tree import sphere_tree as sphere_tree
 from .fast_checker import FastChecker as FastChecker
 from .patient import FclPatient as FclPatient, FclSkin as FclSkin
 from .segments import halving_order as halving_order
-from .shapes import surface as surface, touch as touch
 from .state_checker import PATIENT as PATIENT
 from .surroundings import with_surroundings as with_surroundings
 from .workcell import (

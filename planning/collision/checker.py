@@ -19,16 +19,18 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.links import collision_links, joined
+from puncture_twin.planning.arm.links import joined
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision.bodies import BODY_NAMES, NEVER_TESTED, Body, arm_bodies
+from puncture_twin.planning.collision.base_place import refuse_base_in
+from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
+from puncture_twin.planning.collision.bodies.body import BODY_NAMES, NEVER_TESTED, Body
+from puncture_twin.planning.collision.bodies.shapes import surface, touch
 from puncture_twin.planning.collision.hanging import check_hanging
 from puncture_twin.planning.collision.neighbours import joined_pieces
 from puncture_twin.planning.collision.patient import FclPatient
-from puncture_twin.planning.collision.shapes import surface, touch
 from puncture_twin.planning.collision.state_checker import (
     DISTANCE_PAIRS,
     NEEDLE_IN_PATIENT,
@@ -40,10 +42,8 @@ from puncture_twin.planning.collision.state_checker import (
     StateChecker,
 )
 from puncture_twin.planning.collision.sweep import SweptBodies
-from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.winding import winding_number
 
 __all__ = [
     "BODY_NAMES",
@@ -133,9 +133,9 @@ class CellChecker:
         self._bounds = {box.name: box.bounds for box in boxes}
         self._surface = patient if patient is None or outside is None else joined([patient, outside])
         self._patient = None if patient is None else FclPatient.of(patient, outside)
-        if patient is not None and self._surface is not None:
+        if patient is not None and self._surface is not None and self._patient is not None:
             self._bounds[PATIENT] = self._surface.bounds
-            self._refuse_base_in(patient, outside)
+            refuse_base_in(model, self._bodies[0], self._patient, patient, outside)
         self._checks = tuple(self._workcell_checks()) + tuple(self._self_checks())
 
     @property
@@ -268,25 +268,6 @@ class CellChecker:
         poses = link_poses(self.model, q)
         for body in self._bodies[1:]:
             body.place(poses)
-
-    def _refuse_base_in(self, patient: TriangleMesh, outside: TriangleMesh | None) -> None:
-        base = self._bodies[0]
-        centre = collision_links(self.model)[0].mesh.bounds.mean(axis=0)
-        assert self._patient is not None  # it is asked about one
-        if self._patient.skin.touches(base.bare.surface, base.box) or _encloses(patient, centre):
-            raise InputError("the robot's base stands in the patient", where="cell", allowed="a base outside the skin")
-        if outside is not None and _encloses(joined([patient, outside]), centre):
-            what = "the robot's base stands in what the CT shows outside of the body (its table?)"
-            raise InputError(what, where="cell", allowed="a base outside of it")
-
-
-def _encloses(mesh: TriangleMesh, point: Floats) -> bool:
-    """Whether a point lies inside a surface; more than half around an open one counts too."""
-    low, high = mesh.bounds
-    if not np.all((point >= low) & (point <= high)) and abs(winding_number(mesh, point)) <= 0.5:
-        return False  # outside, or an open surface that goes less than half around: whether it is open need not be told
-    side = side_of(mesh, point)
-    return side is Side.INSIDE or (side is Side.UNKNOWN and abs(winding_number(mesh, point)) > 0.5)
 
 
 def require_finite(q: Floats) -> None:

@@ -8,8 +8,8 @@ import fcl
 
 from puncture_twin.planning.arm.tool_body import ToolBody
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision.bodies import Body
-from puncture_twin.planning.collision.shapes import convex, padded, touch
+from puncture_twin.planning.collision.bodies.body import Body
+from puncture_twin.planning.collision.bodies.shapes import convex, padded, touch
 
 APART_MM = 1.0
 """What a mesh may leave between its parts, or to the flange: less than a gap through which a surface could pass."""

@@ -16,7 +16,7 @@ from puncture_twin.planning.arm.model_urdf import model_urdf
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision.shapes import convex
+from puncture_twin.planning.collision.bodies.shapes import convex
 
 ANGLES = 72
 """At which a joint is looked at, evenly over the turn: every 5 degrees."""

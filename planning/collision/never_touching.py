@@ -11,7 +11,9 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.collision.checker import Check
-from puncture_twin.planning.collision.proofs import Proofs, fcl_contact, made_from
+from puncture_twin.planning.collision.fcl_contact import fcl_contact
+from puncture_twin.planning.collision.packed.made_from import made_from
+from puncture_twin.planning.collision.proofs import Proofs
 
 Touches = Callable[[int, Floats], bool]
 

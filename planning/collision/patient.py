@@ -11,7 +11,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision.shapes import surface, touch
+from puncture_twin.planning.collision.bodies.shapes import surface, touch
 from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh

@@ -12,9 +12,10 @@ from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.checker import Check, Contact, require_finite
+from puncture_twin.planning.collision.fcl_contact import fcl_contact
 from puncture_twin.planning.collision.kernels import segments as segment_kernels
 from puncture_twin.planning.collision.kernels.segments import CONTACT, NOT_FINITE, QUERY, Answer
-from puncture_twin.planning.collision.proofs import Proofs, fcl_contact
+from puncture_twin.planning.collision.proofs import Proofs
 
 LOOK_FIRST_RAD = 0.125
 """States of a segment so far apart are looked at before it is proven: what it touches is found soonest so."""

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.collision.bodies import BODY_NAMES
+from puncture_twin.planning.collision.bodies.body import BODY_NAMES
 from puncture_twin.planning.collision.sweep import SweptBodies
 
 PATIENT = "patient"

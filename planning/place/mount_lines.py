@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.case.case_file import MountSection
+from puncture_twin.planning.case.tables.robot_section import MountSection
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 POSITION_DIGITS = 1

@@ -14,8 +14,8 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.case_file import MountBounds, MountName
 from puncture_twin.planning.case.settings import Obstacle
+from puncture_twin.planning.case.tables.place_section import MountBounds, MountName
 from puncture_twin.planning.geometry.rigid import frame_xz, pose
 
 Range = tuple[float, float]

@@ -14,8 +14,8 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import map_all
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.case_file import MountSection
 from puncture_twin.planning.case.mount import mount_pose
+from puncture_twin.planning.case.tables.robot_section import MountSection
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import (
     ARM_PADDING_MM,

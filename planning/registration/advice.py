@@ -55,7 +55,8 @@ def without_each(registration: Registration, target_ct: Floats) -> tuple[Without
         return ()
     fitted = apply(registration.T_base_ct, markers.points_ct)
     target, residuals = apply(registration.T_base_ct, target_ct), markers.points_base - fitted
-    omega, whole = uncertainty.noise.independent(uncertainty.R_base_ct), uncertainty.noise.whole(uncertainty.R_base_ct)
+    omega, shared = uncertainty.noise.covariance(uncertainty.R_base_ct)
+    whole = omega + shared
     found = []
     for row, name in enumerate(markers.names):
         kept = np.delete(np.arange(len(markers)), row)
@@ -82,7 +83,7 @@ def one_more(registration: Registration, target_ct: Floats, skin_points_ct: Floa
     if uncertainty is None or not len(points):
         return None
     T, fitted = registration.T_base_ct, apply(registration.T_base_ct, markers.points_ct)
-    center, omega = fitted.mean(axis=0), uncertainty.noise.independent(uncertainty.R_base_ct)
+    center, omega = fitted.mean(axis=0), uncertainty.noise.covariance(uncertainty.R_base_ct).independent
     A = design(fitted, center)
     known = A.T @ np.linalg.inv(omega) @ A
     weight = np.linalg.inv(uncertainty.noise.blocks(uncertainty.R_base_ct).mean(axis=0))

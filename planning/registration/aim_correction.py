@@ -25,7 +25,7 @@ from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.fit_map import carried, design
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
-from puncture_twin.planning.registration.fits import fit_joint
+from puncture_twin.planning.registration.fits.weighted import fit_joint
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.registration.registration import Registration
 
@@ -40,7 +40,7 @@ def _aimed(T_base_ct: Floats, points_ct: Floats, points_base: Floats, noise: Rea
     R = T_base_ct[..., :3, :3]
     t = T_base_ct[..., None, :3, 3]
     residuals = points_base - points_ct @ np.swapaxes(R, -1, -2) - t
-    weights = np.asarray(np.linalg.inv(noise.whole(R)), dtype=np.float64)
+    weights = np.asarray(np.linalg.inv(noise.covariance(R).whole), dtype=np.float64)
     stacked = residuals.reshape(*residuals.shape[:-2], -1, 1)
     step = (aim.response(noise, weights) @ stacked)[..., 0]
     at = (R @ aim.target_ct) + t[..., 0, :]
@@ -73,7 +73,7 @@ def aimed_uncertainty(
     """
     A = design(apply(T_base_ct, points_ct), fit.center_base)
     M = np.eye(len(A)) - A @ fit.fit_map
-    weights = np.asarray(np.linalg.inv(fit.noise.whole(fit.R_base_ct)), dtype=np.float64)
+    weights = np.asarray(np.linalg.inv(fit.noise.covariance(fit.R_base_ct).whole), dtype=np.float64)
     at_center = carried(target_base, fit.center_base)  # the inverse of what carries from there to the target
     fit_map = fit.fit_map + at_center @ aim.response(fit.noise, weights) @ M
     return replace(fit, R_base_ct=T_base_ct[:3, :3], fit_map=np.asarray(fit_map))

@@ -34,7 +34,7 @@ class FitUncertainty:
     @property
     def fle_mm(self) -> float:
         """The rms length of one marker's error, CT and touch together, scaled; the arm's own errors not counted."""
-        omega = self.noise.independent(self.R_base_ct)
+        omega = self.noise.covariance(self.R_base_ct).independent
         return self.test.scale * float(np.sqrt(np.trace(omega) / (len(omega) / 3)))
 
     def map_at(self, point_base: Floats) -> Floats:
@@ -44,7 +44,7 @@ class FitUncertainty:
     def cov_at(self, point_base: Floats) -> Floats:
         """X L Omega L' X', shape (6, 6): shift (mm) at a point (3,) and rotation, from the readings alone, scaled."""
         at = self.map_at(point_base)
-        return np.asarray(self.test.scale**2 * at @ self.noise.independent(self.R_base_ct) @ at.T)
+        return np.asarray(self.test.scale**2 * at @ self.noise.covariance(self.R_base_ct).independent @ at.T)
 
     def parts_at(self, point_base: Floats) -> tuple[Floats, Floats]:
         """`cov_at`'s part of shift, shape (3, 3) each: of the reading in the CT, and of the touch."""
@@ -81,13 +81,13 @@ def fit_uncertainty(
     """
     R, center = T_base_ct[:3, :3], points_base.mean(axis=0)
     fitted = points_ct @ R.T + T_base_ct[:3, 3]
-    A, omega = design(fitted, center), noise.independent(R)
+    A, covariance = design(fitted, center), noise.covariance(R)
     if method in {"weighted", "joint"}:
-        cov = omega if method == "weighted" else omega + noise.shared()
+        cov = covariance.independent if method == "weighted" else covariance.whole
         L = least_squares_map(A, np.asarray(np.linalg.inv(cov), dtype=np.float64))
     elif method == "rigid":
         L = least_squares_map(A)
     else:
         L = differenced_map(fit, points_ct, fitted)
-    test = noise_test((points_base - fitted).ravel(), omega + noise.shared(), A, found=found)
+    test = noise_test((points_base - fitted).ravel(), covariance.whole, A, found=found)
     return FitUncertainty(noise, R, center, L, test)

@@ -13,14 +13,14 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
-from puncture_twin.planning.case.registration_section import MarkerSection
+from puncture_twin.planning.case.tables.registration_section import MarkerSection
 from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed
 from puncture_twin.planning.registration.marker_noise import marker_noise
-from puncture_twin.planning.registration.marker_pairs import match
+from puncture_twin.planning.registration.marker_pairs import check_pairs, match
 from puncture_twin.planning.registration.reached_insertion import reached_insertion
 from puncture_twin.planning.registration.registration import Registration, register
 
@@ -67,16 +67,18 @@ def registered(case: Case, settings: MarkerSection) -> Registration:
         InputError: Marker files that cannot be read, matched or trusted.
     """
     where = f"{case.path}: registration"
+    errors = case.errors
+    method = "joint" if settings.correct else settings.method or default_method(errors)
     markers = match(
         _points(case, settings.markers_ct, case.space),
         _points(case, settings.markers_base, Space.LOCAL),
         use=settings.use,
         where=where,
     )
-    errors = case.errors
+    check_pairs(markers, where)
     return register(
         markers,
-        method="joint" if settings.correct else settings.method or default_method(errors),
+        method=method,
         target_ct=case.target_ct,
         fle_mm=settings.fle_mm if errors is None else None,
         noise=None if errors is None else marker_noise(case, errors, markers, where=where),

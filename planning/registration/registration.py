@@ -13,27 +13,14 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.conditioning import Conditioning, conditioning, leverage
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, fit_uncertainty
-from puncture_twin.planning.registration.fits import (
-    Method,
-    check_residuals,
-    fit_by,
-    fit_rigid,
-    rigid_fre,
-)
+from puncture_twin.planning.registration.fits.method import Method, checked_fit
+from puncture_twin.planning.registration.fits.residual_checks import check_residuals, rigid_fre
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, check_pairs
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
-from puncture_twin.planning.registration.residual_test import Interval, OddMarker, ResidualTest, odd_marker
+from puncture_twin.planning.registration.residual_test import Interval, ResidualTest
+from puncture_twin.planning.registration.weak_points import fit_doubts, odd_marker_of
 
 ALLOWED_RESIDUALS = "names and readings checked, the true errors declared, or registration.accept_residuals = true"
-
-LEAST_FOUND_MM = 0.01
-"""FRE from which on the markers can say how large the errors are: no arm repeats so well, so one side was computed."""
-
-SINGULAR = 1e-12
-"""Least over greatest variance of the readings below which some of them count as free of error."""
-
-WEIGHING = frozenset({"weighted", "joint"})
-"""Methods that cannot do without declared errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,19 +76,9 @@ class Registration:
     @property
     def flags(self) -> tuple[str, ...]:
         """What weakens it, in words: the conditioning, residuals that were accepted, a marker that does not fit."""
-        doubts, odd = self._doubts(), _odd_marker(self.markers, self.residual_test.declared_fle_mm)
+        doubts = fit_doubts(self.residual_test, self.uncertainty)
+        odd = odd_marker_of(self.markers, self.residual_test.declared_fle_mm)
         return (*self.conditioning.flags, *doubts, *(() if odd is None else (odd.text(),)))
-
-    def _doubts(self) -> tuple[str, ...]:
-        if self.uncertainty is None:
-            test = self.residual_test
-            return () if test.explained else (f"{test.text()}; accepted by the case",)
-        declared = self.uncertainty.test
-        if declared.agrees:
-            return ()
-        return (
-            declared.text() + ("; all errors are scaled to them" if declared.explained else "; accepted by the case"),
-        )
 
     @property
     def residual_mm(self) -> Floats:
@@ -166,14 +143,11 @@ def register(
         InputError: Fewer than three markers, collinear, mirrored, a unit slip, a marker far off, ``affine``,
             ``weighted`` or ``joint`` without noise, noise that is none, or residuals that the noise does not explain.
     """
-    _check_method(method, noise, where)
     check_pairs(markers, where)
     fre_mm = rigid_fre(markers)
-    if noise is not None:
-        _check_noise(markers, method, noise, fre_mm if noise_found else None, where=where)
+    fit = checked_fit(markers, method, noise, fre_mm if noise_found else None, where=where)
     if method == "triad" and len(markers) != MIN_MARKERS:
         raise InputError(f"triad takes 3 markers, not {len(markers)}", where=where, allowed="3 names in use")
-    fit = fit_by(method, noise)
     T_base_ct = fit(markers.points_ct, markers.points_base)
     residuals = apply(T_base_ct, markers.points_ct) - markers.points_base
     check_residuals(markers, residuals, where)
@@ -181,43 +155,12 @@ def register(
     if noise is not None:
         points = markers.points_ct, markers.points_base
         uncertainty = fit_uncertainty(method, fit, T_base_ct, *points, noise, found=noise_found)
-        fle_mm = None if noise_found else noise.greatest_fle_mm(T_base_ct[:3, :3])
+        fle_mm = None if noise_found else noise.covariance(T_base_ct[:3, :3]).greatest_fle_mm
     test = ResidualTest(len(markers), fre_mm, fle_mm)
     noise_test = test if uncertainty is None else uncertainty.test
     if not (noise_test.explained or accept_residuals):
-        odd = _odd_marker(markers, fle_mm)
+        odd = odd_marker_of(markers, fle_mm)
         what = noise_test.text() if odd is None else f"{noise_test.text()}; {odd.text()}"
         raise InputError(what, where=where, allowed=ALLOWED_RESIDUALS)
     weak = conditioning(markers.points_ct, target_ct)
     return Registration(method, T_base_ct, markers, residuals, test, weak, uncertainty)
-
-
-def _odd_marker(markers: MarkerPairs, fle_mm: float | None) -> OddMarker | None:
-    return odd_marker(fit_rigid, markers.names, markers.points_ct, markers.points_base, fle_mm)
-
-
-def _check_method(method: Method, noise: ReadingNoise | None, where: str | Path) -> None:
-    if method == "affine":
-        raise InputError(
-            "method 'affine' bends the patient",
-            where=where,
-            allowed="triad, rigid or weighted; affine only reproduces the paper's Table 6",
-        )
-    if method in WEIGHING and noise is None:
-        raise InputError(
-            f"method '{method}' weighs by declared errors", where=where, allowed="[errors], or method rigid"
-        )
-
-
-def _check_noise(
-    markers: MarkerPairs, method: Method, noise: ReadingNoise, found_in_mm: float | None, *, where: str | Path
-) -> None:
-    """Refuse noise that cannot be weighed, and an FRE (mm, where the noise is found in it) that holds none."""
-    R = fit_rigid(markers.points_ct, markers.points_base)[:3, :3]
-    values = np.linalg.eigvalsh(noise.independent(R) if method in WEIGHING else noise.whole(R))
-    if not values[0] > SINGULAR * values[-1]:
-        message = "the declared errors leave readings of the markers without any"
-        raise InputError(message, where=where, allowed="ct_in_plane_mm, ct_slice_mm or touch_mm above 0")
-    if found_in_mm is not None and found_in_mm < LEAST_FOUND_MM:
-        message = f"marker_noise = 'found', but the residuals ({found_in_mm:.2g} mm) hold none"
-        raise InputError(message, where=where, allowed="markers measured on both sides, or marker_noise = 'declared'")

@@ -34,7 +34,7 @@ from puncture_twin.planning.search.bedside.entry_facts import EntryFacts, entry_
 from puncture_twin.planning.search.bedside.entry_place import Landmark
 from puncture_twin.planning.search.bending.path_layers import check_tissues
 from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
-from puncture_twin.planning.search.consistency import check_consistency
+from puncture_twin.planning.search.consistency.consistency import check_consistency
 from puncture_twin.planning.search.doubt import Doubt, doubt_of
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases.breath_warnings import breath_warnings

@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel, touch_limit
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.hit import hit_in_ball, hit_in_mesh
+from puncture_twin.planning.uncertainty.limits import touch_limit
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget, error_budget
 from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES, deviation, not_modelled, reading_parts
 from puncture_twin.planning.uncertainty.touch import Proximity, touch_chance

@@ -18,11 +18,6 @@ from puncture_twin.planning.search.phases.organ_phases import with_breathing
 from puncture_twin.planning.search.tissue import tissue_crossed
 
 
-def organ_distances(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> AxisDistances:
-    """How far the needle's axis is from every structure in every direction."""
-    return engine.measure(case.target_ct, directions.outward_ct, axis_lengths(case, anatomy.checked))
-
-
 def organ_candidates(
     case: Case,
     anatomy: Anatomy,

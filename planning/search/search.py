@@ -9,8 +9,11 @@ from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.chance import with_best_refined, with_chances, with_joint_chances
-from puncture_twin.planning.search.organs import organ_candidates, organ_distances
+from puncture_twin.planning.search.chances.best_refined import with_best_refined
+from puncture_twin.planning.search.chances.candidate_chances import with_chances
+from puncture_twin.planning.search.chances.joint import with_joint_chances
+from puncture_twin.planning.search.organ_distances import organ_distances
+from puncture_twin.planning.search.organs import organ_candidates
 from puncture_twin.planning.search.phases.arm_phases import with_breathing_reach
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.search.selection.safe_cone import with_grid_cone

@@ -14,16 +14,12 @@ from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.workcell import (
-    case_boxes,
-    case_tool,
-    outside_surface,
-)
+from puncture_twin.planning.collision.workcell import case_boxes, case_tool, outside_surface
 from puncture_twin.planning.formats.points.point_files import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed
-from puncture_twin.planning.registration.fits import Method
+from puncture_twin.planning.registration.fits.method import Method
 from puncture_twin.planning.registration.marker_noise import marker_noise
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs
 from puncture_twin.planning.registration.reading_noise import reading_noise

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
+from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
@@ -18,8 +18,9 @@ from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngi
 from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.hit_model import HitModel, hit_model
+from puncture_twin.planning.uncertainty.limits import demanding, touch_limit
+from puncture_twin.planning.uncertainty.lines.refined_touch import Needles, Surroundings, refined
 from puncture_twin.planning.uncertainty.pose_error import PoseError
-from puncture_twin.planning.uncertainty.refined_touch import Needles, Surroundings, refined
 from puncture_twin.planning.uncertainty.touch import Proximity, proximity, touch_chance, touching_any
 
 TAKEN = frozenset({"any", "joint"})
@@ -168,33 +169,3 @@ def chance_model(case: Case, anatomy: Anatomy, engine: ClearanceEngine, error: P
         message = f"the mesh of '{case.target_structure}' is open: what lies in it, and is hit, is not known"
         raise InputError(message, where=case.path, allowed="target.hit_radius_mm, or a closed mesh")
     return ChanceModel(case, anatomy, engine, error, hit_model(case.hit_radius_mm, mesh, case.target_ct))
-
-
-def demanding(structures: tuple[Structure, ...]) -> Ints:
-    """Columns of the structures that must not be touched."""
-    return np.flatnonzero([s.demands_margin for s in structures])
-
-
-def check_limits(case: Case, anatomy: Anatomy, model: ChanceModel | None) -> None:
-    """Refuse limits that no candidate can be tested against: every one would pass untested.
-
-    Raises:
-        InputError: Limits without a pose error, or of a structure that has no chance to be touched.
-    """
-    settings = case.search
-    limited = settings.min_hit is not None or settings.max_touch is not None or bool(settings.max_touch_of)
-    if limited and model is None:
-        message = "search.min_hit and max_touch cannot be checked: only markers and the arm give the needle's error"
-        allowed = "[registration] with markers, and a search with the arm; or no such limit"
-        raise InputError(message, where=case.path, allowed=allowed)
-    names = [anatomy.checked[column].name for column in demanding(anatomy.checked)]
-    unknown = sorted(set(settings.max_touch_of) - set(names))
-    if unknown:
-        message = f"search.max_touch_of '{unknown[0]}' is no structure that must not be touched"
-        raise InputError(message, where=case.path, allowed=", ".join(names))
-
-
-def touch_limit(case: Case, name: str) -> float:
-    """The greatest chance to touch a structure that a case allows."""
-    allowed = case.search.max_touch_of.get(name, case.search.max_touch)
-    return np.inf if allowed is None else allowed

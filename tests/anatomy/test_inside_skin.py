@@ -11,7 +11,7 @@ from puncture_twin.planning.anatomy.inside_skin import SAMPLES, inside_skin, nea
 from puncture_twin.planning.anatomy.skin import skin_from_mesh
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.search.consistency import check_consistency
+from puncture_twin.planning.search.consistency.consistency import check_consistency
 from puncture_twin.planning.search.context import prepare
 from tests.oracles import point_triangle_distance
 

@@ -21,7 +21,9 @@ BY = "puncture_twin.planning.anatomy.surfaces"
 MAKERS = (
     "puncture_twin.planning.anatomy.surfaces",
     "puncture_twin.planning.anatomy.scan",
-    "puncture_twin.planning.collision.proofs",
+    "puncture_twin.planning.collision.packed.hulls",
+    "puncture_twin.planning.collision.packed.skin",
+    "puncture_twin.planning.collision.packed.trees",
     "puncture_twin.planning.collision.never_touching",
     "puncture_twin.twin.report.scene.lighter_mesh",
 )

@@ -18,8 +18,8 @@ from puncture_twin.planning.anatomy.skin import FieldOfView, Skin, skin_from_mes
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.case.case_file import EntryAxes
 from puncture_twin.planning.case.entry import Directions, angles, entry_frame, outward
+from puncture_twin.planning.case.tables.search_section import EntryAxes
 from puncture_twin.planning.certify.bounds import FlangeBounds, view_bounds
 from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, nearest_cell, split
 from puncture_twin.planning.certify.certificate import read_certificate, write_certificate

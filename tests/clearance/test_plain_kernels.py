@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from oracles import ray_crossings, segment_triangle_distance
 
-from puncture_twin.planning.clearance.fast_engine import _placed
 from puncture_twin.planning.clearance.kernels.blocks import pack
 from puncture_twin.planning.clearance.kernels.segment_triangle import axis_triangle
 from puncture_twin.planning.clearance.kernels.side_by_side import (
@@ -18,6 +17,7 @@ from puncture_twin.planning.clearance.kernels.side_by_side import (
     measure_beside,
     measure_other,
 )
+from puncture_twin.planning.clearance.placed_surface import placed_surface
 from puncture_twin.planning.geometry.crossings import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -197,7 +197,7 @@ def test_the_nearest_triangle_of_a_packed_surface(rng, place):
     mesh = TriangleMesh(corners.reshape(-1, 3), np.arange(900).reshape(-1, 3))
     detections = {"amid": [1.0, 2, 3], "aside": [70.0, -20, 9], "far": [900.0, 0, -400], "on a corner": corners[17, 1]}
     target, blocks = np.array(detections[place]), pack(mesh)
-    placed = _placed(blocks, target)
+    placed = placed_surface(blocks, target)
     each = [segment_triangle_distance(target, target, t.reshape(3, 3)) for t in blocks.triangles]
     assert placed.distance == pytest.approx(min(each), abs=TIGHT_MM)
     assert each[placed.nearest] == pytest.approx(min(each), abs=TIGHT_MM)
@@ -211,7 +211,7 @@ def test_of_two_far_specks_the_nearer_one_is_nearest(away_mm):
         groups = [np.array([0, 0, side * away_mm * (1 - 4e-6 * (side == nearer))]) for side in (-1, 1)]
         corners = np.concatenate([speck + place for place in groups for _ in range(32)])
         blocks = pack(TriangleMesh(corners, np.arange(len(corners)).reshape(-1, 3)))
-        placed = _placed(blocks, np.zeros(3))
+        placed = placed_surface(blocks, np.zeros(3))
         assert placed.distance == pytest.approx(away_mm * (1 - 4e-6), abs=TIGHT_MM)
         assert np.sign(blocks.triangles[placed.nearest][2]) == nearer
 
@@ -221,13 +221,13 @@ def test_the_row_of_the_nearest_triangle_is_its_own(rng):
     corners = rng.normal(0, 60, (40, 1, 3)) + rng.normal(0, 1, (40, 3, 3))
     blocks = pack(TriangleMesh(corners.reshape(-1, 3), np.arange(120).reshape(-1, 3)))
     for row in range(4):
-        placed = _placed(blocks, blocks.triangles[row].reshape(3, 3).mean(axis=0) + 0.01)
+        placed = placed_surface(blocks, blocks.triangles[row].reshape(3, 3).mean(axis=0) + 0.01)
         assert placed.nearest == row and placed.distance < 0.02
 
 
 def test_a_surface_of_one_triangle_has_a_nearest_one():
     """The smallest surface: one block, filled up with one triangle."""
-    placed = _placed(pack(TriangleMesh(square_on(7.0), np.array([[0, 1, 2]]))), np.array([0.0, 0, 3]))
+    placed = placed_surface(pack(TriangleMesh(square_on(7.0), np.array([[0, 1, 2]]))), np.array([0.0, 0, 3]))
     assert placed.distance == pytest.approx(4.0, abs=TIGHT_MM)
 
 

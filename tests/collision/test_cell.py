@@ -15,10 +15,10 @@ from puncture_twin.planning.arm.links import LINK_NAMES, collision_links, visual
 from puncture_twin.planning.arm.tool import HOLDER_ROOT_MM
 from puncture_twin.planning.arm.ur import UR_MODELS, UrModel, ur_model
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision.bodies import NEVER_TESTED
+from puncture_twin.planning.collision.bodies.body import NEVER_TESTED
+from puncture_twin.planning.collision.bodies.shapes import convex, surface, touch
 from puncture_twin.planning.collision.checker import Box, CellChecker, Contact, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.shapes import convex, surface, touch
 from puncture_twin.planning.collision.sweep import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.winding import winding_number, winding_numbers

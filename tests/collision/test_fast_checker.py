@@ -16,20 +16,17 @@ from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision.bodies import arm_bodies
-from puncture_twin.planning.collision.bounding_spheres import (
-    coarse_hull,
-    inscribed_prism,
-    neighbours,
-    prism,
-    sphere_tree,
-)
+from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
+from puncture_twin.planning.collision.bodies.shapes import convex
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.collision.enclosures.coarse_hull import coarse_hull
+from puncture_twin.planning.collision.enclosures.hull_edges import neighbours
+from puncture_twin.planning.collision.enclosures.prism import inscribed_prism, prism
+from puncture_twin.planning.collision.enclosures.sphere_tree import sphere_tree
 from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.fcl_contact import fcl_contact
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING, hull_gap
 from puncture_twin.planning.collision.kernels.surfaces import STACK, to_surface
-from puncture_twin.planning.collision.proofs import fcl_contact
-from puncture_twin.planning.collision.shapes import convex
 from puncture_twin.planning.collision.triangle_tree import TriangleTree
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh

@@ -18,7 +18,8 @@ from slicer_files import vtk_model
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.guard import guard_mesh
-from puncture_twin.planning.formats.meshes.mesh_files import mesh_warnings, read_mesh
+from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
+from puncture_twin.planning.formats.meshes.mesh_warnings import mesh_warnings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit
 

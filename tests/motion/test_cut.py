@@ -7,7 +7,7 @@ import pytest
 
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.collision.bodies import arm_bodies
+from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.motion.approach import plan_approach

@@ -18,7 +18,7 @@ from puncture_twin.planning.geometry.rigid import apply, exp_rotation, log_rotat
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed, aimed_fit
 from puncture_twin.planning.registration.fit_map import differenced_map
-from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.registration import register
@@ -47,7 +47,7 @@ def changed_case(tmp_path, *lines, touch=None, errors=True):
 def noisy(w, rng):
     """The markers of a world, read and touched with errors that its declaration allows."""
     noise, there = w.puncture.noise, apply(w.puncture.T_base_ct, w.puncture.points_ct)
-    whole = noise.whole(w.puncture.T_base_ct[:3, :3])
+    whole = noise.covariance(w.puncture.T_base_ct[:3, :3]).whole
     off = rng.multivariate_normal(np.zeros(there.size), whole).reshape(-1, 3)
     return MarkerPairs(tuple(f"M{i}" for i in range(len(there))), w.puncture.points_ct, there + off)
 

@@ -7,7 +7,8 @@ from scipy.special import chdtri
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.registration.fit_map import design, differenced_map, least_squares_map
-from puncture_twin.planning.registration.fits import fit_rigid, fit_weighted
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits.weighted import fit_weighted
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.noise_test import NoiseTest, noise_test
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
@@ -41,7 +42,7 @@ def test_the_statistic_is_chi_squared_and_its_regions_hold(count, rng):
     told, markers = noise(count), MARKERS[:count]
     ct, base = draws(20_000, markers, rng, told)
     T = fit_weighted(ct, base, told, fit_rigid(ct, base))
-    omega = told.independent(T_TRUE[:3, :3])
+    omega = told.covariance(T_TRUE[:3, :3]).independent
     fitted = apply(T_TRUE, markers)
     A = design(fitted, fitted.mean(axis=0))
     L = least_squares_map(A, np.linalg.inv(omega))

@@ -5,7 +5,7 @@ import pytest
 
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.registration.checks.squareness import PLANES, check_squareness
-from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_4

@@ -9,8 +9,8 @@ import trimesh
 from case_world import points_file
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.search import chance
-from puncture_twin.planning.search.chance import _limited
+from puncture_twin.planning.search.chances import best_refined, joint
+from puncture_twin.planning.search.chances.limited import limited
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.touch import proximity, touch_bound, touch_chance
@@ -123,7 +123,7 @@ def test_a_chance_that_is_not_known_keeps_no_limit(tmp_path):
         ({"max_touch_of": MappingProxyType({"rib": 0.5})}, False),
     ):
         case = replace(context.case, search=replace(settings, **keys))
-        assert _limited(case, found).safe.any() == left
+        assert limited(case, found).safe.any() == left
 
 
 @pytest.mark.parametrize("limit", ["min_hit", "max_touch"])
@@ -135,7 +135,7 @@ def test_limits_are_kept_in_a_configuration_or_not_as_the_search_says(tmp_path, 
     hit, touch = found.chances.hit[rows], found.chances.touch[rows, 0]
     value = float(np.median(hit)) if limit == "min_hit" else float(np.sort(touch)[-2:].mean())
     case = replace(context.case, search=replace(context.case.search, **{limit: value}))
-    said = _limited(case, found).safe[rows]
+    said = limited(case, found).safe[rows]
     q = found.arm.q_insertion[rows]
     kept = replace(context.chance, case=case).keeps_limits(found.outward_ct[rows], q)
     assert said.any() and not said.all()
@@ -199,7 +199,8 @@ def test_a_needle_that_leans_is_refined_where_it_is_most_doubtful(tmp_path, monk
     trimesh.util.concatenate([slat, ring]).export(tmp_path / "rib.ply")
     path.write_text(path.read_text().replace("theta_deg = [20, 20]", "theta_deg = [0, 0]"))
     context = prepare(path)
-    monkeypatch.setattr(chance, "BEST", 0)  # as of the many candidates that are not among the best
+    monkeypatch.setattr(best_refined, "BEST", 0)  # as of the many candidates that are not among the best
+    monkeypatch.setattr(joint, "BEST", 0)
     found = context.search()
     assert (found.verdict.reason == "touch_likely").any() and not found.safe.any()
 
@@ -212,7 +213,8 @@ def test_what_may_decide_is_line_sampled(tmp_path, monkeypatch, limited):
     path.write_text(
         path.read_text().replace("theta_deg = [20, 20]", "theta_deg = [10, 50]").replace("[0, 80]", "[0, 40]")
     )
-    monkeypatch.setattr(chance, "BEST", 2)
+    monkeypatch.setattr(best_refined, "BEST", 2)
+    monkeypatch.setattr(joint, "BEST", 2)
     context = prepare(path)
     found = context.search()
     rows = np.flatnonzero(np.isfinite(found.chances.hit))

@@ -11,7 +11,7 @@ from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import exp_rotation
-from puncture_twin.planning.uncertainty.refined_touch import Needles, Surroundings, refined
+from puncture_twin.planning.uncertainty.lines.refined_touch import Needles, Surroundings, refined
 from puncture_twin.planning.uncertainty.touch import proximity, touch_chance
 
 LENGTH, RADIUS = 150.0, 0.6

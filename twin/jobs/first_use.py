@@ -66,7 +66,8 @@ def _err_once() -> None:
     from puncture_twin.planning.clearance.near_faces import near_faces
     from puncture_twin.planning.reach.small_workcell import TARGET, octahedron
     from puncture_twin.planning.uncertainty.hit import hit_in_mesh, target_rays
-    from puncture_twin.planning.uncertainty.line_sampling import line_chance, needle_doubt
+    from puncture_twin.planning.uncertainty.lines.line_sampling import line_chance
+    from puncture_twin.planning.uncertainty.lines.needle_doubt import needle_doubt
 
     target, up, cov = read_only(TARGET), np.array([0.0, 0.0, 1.0]), np.diag([1.0, 1.0, 1.0, 1e-4, 1e-4, 1e-4])
     hit_in_mesh(target_rays(octahedron(target, 5.0), target), cov[None, :3, :3])

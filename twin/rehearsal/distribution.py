@@ -21,8 +21,9 @@ from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.search.bending.insertion import insertion_along
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
-from puncture_twin.planning.uncertainty.chance_model import chance_model, demanding
+from puncture_twin.planning.uncertainty.chance_model import chance_model
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE
+from puncture_twin.planning.uncertainty.limits import demanding
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
 from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, not_modelled
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms

@@ -21,7 +21,9 @@ from puncture_twin.planning.geometry.rigid import apply, exp_rotation
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.aim_correction import aimed_fit
 from puncture_twin.planning.registration.fit_map import design, least_squares_map
-from puncture_twin.planning.registration.fits import fit_joint, fit_rigid, fit_triad, fit_weighted
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits.triad import fit_triad
+from puncture_twin.planning.registration.fits.weighted import fit_joint, fit_weighted
 from puncture_twin.planning.registration.reading_noise import ReadingNoise, parameter_variances
 from puncture_twin.planning.uncertainty.pose_error import Bend
 from puncture_twin.twin.plant.true_needle import TrueNeedle, driven_onto, true_needle
@@ -145,7 +147,7 @@ def _chi_squared(puncture: Puncture, residuals: Floats) -> Floats:
     """Of residuals (n, 3 N) in base axes, by the nominal registration's weights, as `noise_test` computes it."""
     R, points = puncture.T_base_ct[:3, :3], apply(puncture.T_base_ct, puncture.points_ct)
     A = design(points, points.mean(axis=0))
-    weights = np.asarray(np.linalg.inv(puncture.noise.independent(R) + puncture.noise.shared()), dtype=np.float64)
+    weights = np.asarray(np.linalg.inv(puncture.noise.covariance(R).whole), dtype=np.float64)
     left = weights - weights @ A @ least_squares_map(A, weights)
     return np.asarray(np.einsum("na,ab,nb->n", residuals, left, residuals, optimize=True))
 

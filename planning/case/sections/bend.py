@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.case_file import NeedleSection
-from puncture_twin.planning.case.sections.tissue_section import TissueSection
+from puncture_twin.planning.case.tables.needle_section import NeedleSection
+from puncture_twin.planning.case.tables.tissue_section import TissueSection
 from puncture_twin.planning.formats.labels.by_name import ByName
 from puncture_twin.planning.formats.labels.naming import REST
 from puncture_twin.planning.needle.bending import Bending

@@ -16,22 +16,18 @@ from puncture_twin.planning.arm.urdf.limits import JointLimits, narrowed
 from puncture_twin.planning.base.arrays import read_only
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.case.case_file import CaseFile, RobotSection
+from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.mount import mount_pose
-from puncture_twin.planning.case.registration_section import NO_RESIDUALS, stated_base_ct
-from puncture_twin.planning.case.sections.limits_section import stated_limits
 from puncture_twin.planning.case.settings import RobotSettings
+from puncture_twin.planning.case.tables.limits_section import stated_limits
+from puncture_twin.planning.case.tables.registration_section import stated_base_ct
+from puncture_twin.planning.case.tables.robot_section import RobotSection
 from puncture_twin.planning.formats import itk_transform
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
 from puncture_twin.planning.geometry.spaces import Space
 
 URDF_ROLE, MESH_ROLE = "urdf", "urdf mesh"
 """Of the files that decide an arm."""
-
-ROBOT_NOWHERE = (
-    "the case names a robot ({robot}), but not where its base is: the arm is not checked "
-    "([registration] or [robot.mount] says it)"
-)
 
 
 def robot_of(content: CaseFile, space: Space, path: Path, files: InputFiles) -> RobotSettings:
@@ -89,13 +85,3 @@ def _mesh(address: str, *, urdf: str, files: InputFiles, path: Path) -> bytes:
         raise InputError(what, where=path, allowed="paths relative to the URDF's folder, such as meshes/base.stl")
     name = str(PurePosixPath(urdf).parent / address)
     return files.read(MESH_ROLE, name, max_bytes=meshes.MAX_FILE_BYTES, key=f"robot.urdf: mesh '{address}'", where=path)
-
-
-def robot_warnings(content: CaseFile, robot: RobotSettings) -> tuple[str, ...]:
-    """That a stated transform has no residuals, or that nothing is said of where a robot is: no verdict is about it."""
-    stated = content.registration
-    if stated is not None and stated.transform is not None:
-        return () if stated.markers_ct else (f"registration: {NO_RESIDUALS.format(file=stated.transform)}",)
-    located = stated is not None or content.robot.mount is not None
-    nowhere = not located and bool({"robot", "tool"} & content.model_fields_set)
-    return (ROBOT_NOWHERE.format(robot=robot.model.name),) if nowhere else ()

@@ -6,8 +6,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from puncture_twin.planning.case.case_file import SearchSection
 from puncture_twin.planning.case.settings import SearchSettings
+from puncture_twin.planning.case.tables.search_section import SearchSection
 
 
 def search_of(section: SearchSection) -> SearchSettings:

@@ -7,7 +7,7 @@ from pathlib import Path
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.case_volumes import CaseVolumes
 from puncture_twin.planning.case.errors import Cells, ErrorModel, error_model
-from puncture_twin.planning.case.errors_section import ErrorsSection
+from puncture_twin.planning.case.tables.errors_section import ErrorsSection
 from puncture_twin.planning.geometry.spaces import Space
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from puncture_twin.planning.base.arrays import read_only
-from puncture_twin.planning.case.case_file import GantrySection, ObstacleSection
 from puncture_twin.planning.case.mount import axes_frame
 from puncture_twin.planning.case.settings import Gantry, Obstacle
+from puncture_twin.planning.case.tables.surroundings_section import GantrySection, ObstacleSection
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 

@@ -11,17 +11,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
-from puncture_twin.planning.formats.guard import guard_mesh, twice_areas
+from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.formats.meshes.glb import read_glb
 from puncture_twin.planning.formats.meshes.obj import read_obj
 from puncture_twin.planning.formats.meshes.ply import read_ply
@@ -38,9 +36,12 @@ MAX_FILE_BYTES = 2_000_000_000
 _READERS: Mapping[str, Callable[[bytes, str], RawMesh]] = MappingProxyType(
     {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".glb": read_glb, ".vtp": read_vtp, ".vtk": read_vtk}
 )
+
 _STATEMENT = re.compile(rb"3D Slicer output\. SPACE=(LPS|RAS)\b")
+
 _STATEMENT_BYTES = 1000
 """Slicer writes what space a mesh is in into its header or first comment; a VTP has a field for it."""
+
 MESH_SUFFIXES: tuple[str, ...] = tuple(_READERS)
 """The file name endings that ``read_mesh`` takes, in lower case; upper case is the same."""
 
@@ -125,43 +126,6 @@ def mesh_extent(path: Path) -> NDArray[np.float64]:
     if not np.isfinite(raw.vertices).all() or len(raw.vertices) == 0:
         raise InputError("a vertex is not finite, or there is none", where=path, allowed="finite vertices")
     return np.stack([raw.vertices.min(axis=0), raw.vertices.max(axis=0)]).astype(np.float64)
-
-
-def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
-    """What can no longer be known about a structure, or looks unusual, one sentence each.
-
-    Args:
-        mesh: The structure's surface, mm.
-        name: Its name, for the text.
-    """
-    warnings = []
-    flat = int((twice_areas(mesh.vertices, mesh.faces) == 0.0).sum())
-    if flat:
-        warnings.append(f"{name}: {flat} of {len(mesh.faces)} triangles have no area (kept)")
-    if not mesh.closed:
-        warnings.append(
-            f"{name}: open mesh: inside or outside cannot be known, only the distance to its surface; "
-            "if it should be closed, the file may be incomplete"
-        )
-    elif not mesh.wound_alike:
-        warnings.append(f"{name}: triangles are wound against their neighbours: inside is found by rays")
-    elif _signed_volume(mesh) < 0.0:
-        warnings.append(f"{name}: inverted normals: they point inward; inside is found without them")
-    return tuple(warnings)
-
-
-def kept_mesh_warnings(mesh: TriangleMesh, name: str, memory: Memory) -> tuple[str, ...]:
-    """As `mesh_warnings`; what this process keeps of the same mesh is not found again."""
-    if memory is NO_MEMORY:
-        return mesh_warnings(mesh, name)
-    key = (mesh_warnings.__name__, mesh.digest, name)
-    return memory.get(key, partial(mesh_warnings, mesh, name), lambda lines: sum(map(len, lines)))
-
-
-def _signed_volume(mesh: TriangleMesh) -> float:
-    """Volume by the divergence theorem, mm^3; negative when the triangles face inward."""
-    a, b, c = np.moveaxis(mesh.triangles - mesh.vertices[0], 1, 0)
-    return float(np.einsum("ij,ij", a, np.cross(b, c)) / 6.0)
 
 
 def _reader(path: Path) -> Callable[[bytes, str], RawMesh]:

@@ -8,22 +8,18 @@ turn is refused; one that does so before and after it is named in a warning.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
+from scipy.special import fdtri
 
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.checks.skin_fit import SkinFit, kept_skin_fit
-from puncture_twin.planning.registration.checks.touching import place_excluded, untouchable
-from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.checks.marker_list import MarkerList, Signs, marker_list
+from puncture_twin.planning.registration.checks.skin_fit import SkinFit
 from puncture_twin.planning.registration.registration import Registration
-
-Signs = tuple[float, float, float]
 
 HALF_TURNS: Mapping[str, Signs] = MappingProxyType(
     {
@@ -34,59 +30,17 @@ HALF_TURNS: Mapping[str, Signs] = MappingProxyType(
 )
 """The slips of axes that are proper rotations; a list with one or three axes negated is refused as mirrored."""
 
-
 REFUSING_DOUBT = 0.01
 """A list is refused at 99 %. Honest lists less often: the more symmetric a body, the more alike are both lists."""
 
+SCATTER_MM = 0.25
+"""No skin is known better: a third of a millimetre's voxel, and the marker's own reading."""
+
+USUAL_SCATTER_MM = 3.0
+"""Markers of one kind on the skin of their own CT scatter less."""
+
 EXCLUDING_DOUBT = 0.001
 """A half turn is no more mentioned at 99.9 %."""
-
-
-@dataclass(frozen=True, eq=False)
-class MarkerList:
-    """One reading of the CT markers.
-
-    Attributes:
-        fit: How it lies on the skin.
-        behind: Rows of markers that no needle can have touched, and the obstacle that is before each.
-        excluded: Why the robot cannot stand where this list puts it, or empty.
-        target_mm: How far this list puts the target from where the given one puts it.
-    """
-
-    fit: SkinFit
-    behind: tuple[tuple[int, str], ...]
-    excluded: str
-    target_mm: float
-
-    @property
-    def plausible(self) -> bool:
-        """Whether every marker is near the skin, was within a needle's reach, and the robot can stand there."""
-        return self.fit.on_skin and not self.behind and not self.excluded
-
-    def explains(self, given: MarkerList) -> bool:
-        """Whether the given list is likely this one, slipped."""
-        return self.plausible and (given.fit.worse_than(self.fit, doubt=REFUSING_DOUBT) or bool(given.behind))
-
-    def excluded_by(self, given: MarkerList) -> bool:
-        """Whether this list is implausible, or so much farther off the skin than the given one that it is not meant."""
-        worse = self.fit.worse_than(given.fit, doubt=EXCLUDING_DOUBT) or self.fit.unusual_beside(given.fit)
-        return worse or not self.plausible
-
-
-def marker_list(
-    case: Case,
-    skin: Skin,
-    registration: Registration,
-    signs: Signs = (1.0, 1.0, 1.0),
-    cache: Cache = NO_CACHE,
-) -> MarkerList:
-    """The CT markers with some axes negated, compared with skin, couch and the robot's place."""
-    points = registration.markers.points_ct * np.array(signs)
-    fit = kept_skin_fit(points, skin, cache)
-    T_base_ct = fit_rigid(points, registration.markers.points_base)
-    moved = apply(T_base_ct, case.target_ct) - apply(registration.T_base_ct, case.target_ct)
-    behind = untouchable(case, points, fit.normals_ct)
-    return MarkerList(fit, behind, place_excluded(case, skin.mesh, T_base_ct), float(np.linalg.norm(moved)))
 
 
 def check_axes(
@@ -98,7 +52,7 @@ def check_axes(
         InputError: The list lies on the skin, or where it can be touched, only after a half turn.
     """
     slips = {name: marker_list(case, skin, registration, signs, cache) for name, signs in HALF_TURNS.items()}
-    likely = {name: slip for name, slip in slips.items() if slip.explains(given)}
+    likely = {name: slip for name, slip in slips.items() if _explains(slip, given)}
     if likely:
         name = min(likely, key=lambda name: likely[name].fit.scatter_mm)
         raise InputError(
@@ -112,12 +66,36 @@ def check_axes(
         f"{given.fit.scatter_mm:.1f} mm: too alike to tell, and the target would be {slip.target_mm:.0f} mm away; "
         "check the axes of their file"
         for name, slip in slips.items()
-        if not slip.excluded_by(given)
+        if not _excluded(slip, given)
     )
 
 
+def _explains(slip: MarkerList, given: MarkerList) -> bool:
+    """Whether the given list is likely the other one, slipped."""
+    return slip.plausible and (_worse(given.fit, slip.fit, doubt=REFUSING_DOUBT) or bool(given.behind))
+
+
+def _excluded(slip: MarkerList, given: MarkerList) -> bool:
+    """Whether a list is implausible, or so much farther off the skin than the given one that it is not meant."""
+    unusual = slip.fit.scatter_mm > USUAL_SCATTER_MM >= given.fit.scatter_mm
+    return unusual or not slip.plausible or _worse(slip.fit, given.fit, doubt=EXCLUDING_DOUBT)
+
+
+def _worse(fit: SkinFit, other: SkinFit, *, doubt: float) -> bool:
+    """Whether the same markers scatter more in one list than in another beyond chance, by an F-test.
+
+    Args:
+        fit: Of one list.
+        other: Of the same markers, read in other axes.
+        doubt: How often two lists of one scatter would seem so different.
+    """
+    freedom = len(fit.gaps_mm) - 1
+    limit = float(np.sqrt(fdtri(freedom, freedom, 1 - doubt)))
+    return fit.scatter_mm > limit * max(other.scatter_mm, SCATTER_MM)
+
+
 def _as_given(registration: Registration, given: MarkerList, slip: MarkerList) -> str:
-    if given.fit.worse_than(slip.fit, doubt=REFUSING_DOUBT):
+    if _worse(given.fit, slip.fit, doubt=REFUSING_DOUBT):
         return f"to {given.fit.scatter_mm:.1f} mm"
     row, obstacle = given.behind[0]
     return f"{registration.markers.names[row]} lies behind obstacle '{obstacle}', where no needle touches it"

@@ -16,7 +16,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 
 MAX_NUMBERS = 20_000_000

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from puncture_twin.planning.anatomy.anatomy import load_skin
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.checks.axis_slips import MarkerList, check_axes, marker_list
+from puncture_twin.planning.registration.checks.axis_slips import check_axes
+from puncture_twin.planning.registration.checks.marker_list import marker_list
 from puncture_twin.planning.registration.checks.name_slips import check_names
-from puncture_twin.planning.registration.checks.skin_fit import MARKER_ON_SKIN_MM
+from puncture_twin.planning.registration.checks.off_the_skin import off_the_skin
 from puncture_twin.planning.registration.checks.stated_transform import check_transform
 from puncture_twin.planning.registration.placement import Placement, load_placement
 from puncture_twin.planning.registration.registration import Registration
 
 LOCAL_AXES = 'space "local": nothing tells whether the axes of markers_ct have slipped by a half turn'
+
 BASE_AXES = (
     "not checked: a half turn of markers_base (such as ROS base_link for the controller's base); residuals, skin and "
     "couch are blind to it"
@@ -73,19 +73,5 @@ def check_markers(case: Case, skin: Skin, registration: Registration, cache: Cac
     given = marker_list(case, skin, registration, cache=cache)
     local = case.space is Space.LOCAL
     axes = () if local else check_axes(case, skin, registration, given, cache)
-    warnings = (*names, *axes, *_off_the_skin(registration, given))
+    warnings = (*names, *axes, *off_the_skin(registration, given))
     return MarkerFindings(warnings, (LOCAL_AXES, BASE_AXES) if local else (BASE_AXES,))
-
-
-def _off_the_skin(registration: Registration, given: MarkerList) -> tuple[str, ...]:
-    names = registration.markers.names
-    gaps = zip(names, np.abs(given.fit.gaps_mm), strict=True)
-    far = [f"{name} ({gap:.0f} mm)" for name, gap in gaps if gap > MARKER_ON_SKIN_MM]
-    behind = tuple(
-        f"marker {names[row]} lies behind obstacle '{obstacle}': no needle can touch it there"
-        for row, obstacle in given.behind
-    )
-    if not far:
-        return behind
-    said = f"markers far from the skin: {', '.join(far)}; is their file in the case's space (LPS/RAS) and unit?"
-    return (said, *behind)

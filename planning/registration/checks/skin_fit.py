@@ -6,7 +6,6 @@ import hashlib
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import fdtri
 
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Floats
@@ -16,12 +15,6 @@ from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
 MARKER_ON_SKIN_MM = 30.0
 """A skin marker's centre lies within its own height of the skin; one farther off stands on a frame, or is misread."""
-
-SCATTER_MM = 0.25
-"""No skin is known better: a third of a millimetre's voxel, and the marker's own reading."""
-
-USUAL_SCATTER_MM = 3.0
-"""Markers of one kind on the skin of their own CT scatter less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,21 +39,6 @@ class SkinFit:
         """Root mean square of what is left of the gaps by the best common height of the markers, n - 1 degrees."""
         height = np.clip(self.gaps_mm.mean(), 0.0, MARKER_ON_SKIN_MM)
         return float(np.sqrt(np.sum((self.gaps_mm - height) ** 2) / (len(self.gaps_mm) - 1)))
-
-    def worse_than(self, other: SkinFit, *, doubt: float) -> bool:
-        """Whether the same markers scatter more here than chance explains, by an F-test.
-
-        Args:
-            other: The same markers, read in other axes.
-            doubt: How often two lists of one scatter would seem so different.
-        """
-        freedom = len(self.gaps_mm) - 1
-        limit = float(np.sqrt(fdtri(freedom, freedom, 1 - doubt)))
-        return self.scatter_mm > limit * max(other.scatter_mm, SCATTER_MM)
-
-    def unusual_beside(self, other: SkinFit) -> bool:
-        """Whether the markers scatter more here than markers do, and no more than that there."""
-        return self.scatter_mm > USUAL_SCATTER_MM >= other.scatter_mm
 
 
 def skin_fit(points_ct: Floats, skin: Skin) -> SkinFit:

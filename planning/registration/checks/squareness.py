@@ -100,7 +100,7 @@ class _Problem:
     def of(cls, registration: Registration) -> _Problem:
         T, markers, errors = registration.T_base_ct, registration.markers, registration.uncertainty
         fitted = apply(T, markers.points_ct)
-        cov = np.eye(fitted.size) if errors is None else errors.noise.whole(errors.R_base_ct)
+        cov = np.eye(fitted.size) if errors is None else errors.noise.covariance(errors.R_base_ct).whole
         root = np.linalg.inv(np.linalg.cholesky(cov))
         A = root @ design(fitted, fitted.mean(axis=0))
         return cls(T, markers.points_ct, root, root @ (markers.points_base - fitted).ravel(), A)

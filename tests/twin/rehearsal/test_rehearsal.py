@@ -18,10 +18,11 @@ from puncture_twin.planning.arm.kinematics import flange_pose, jacobian
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.case_file import RankingSection, RehearsalSection
 from puncture_twin.planning.case.case_volumes import CaseVolumes
 from puncture_twin.planning.case.entry import view_frame
 from puncture_twin.planning.case.settings import Needle, Obstacle, RobotSettings, SearchSettings
+from puncture_twin.planning.case.tables.ranking_section import RankingSection
+from puncture_twin.planning.case.tables.rehearsal_section import RehearsalSection
 from puncture_twin.planning.formats.labels.by_name import ByName
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply

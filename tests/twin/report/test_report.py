@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.reasons import REASON_COLOURS
-from puncture_twin.planning.case.case_file import EntryAxes
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
+from puncture_twin.planning.case.tables.search_section import EntryAxes
 from puncture_twin.planning.place.directions import ring_weights
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.twin.report import annotate

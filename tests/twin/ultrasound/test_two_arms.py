@@ -9,7 +9,7 @@ import pytest
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.links import visual_links
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.collision.shapes import surface, touch
+from puncture_twin.planning.collision.bodies.shapes import surface, touch
 from puncture_twin.planning.geometry.winding import winding_number
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import (
     configurations,

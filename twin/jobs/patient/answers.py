@@ -19,7 +19,7 @@ from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.case.case import Case, load_case
-from puncture_twin.planning.case.registration_section import NO_RESIDUALS
+from puncture_twin.planning.case.tables.registration_section import NO_RESIDUALS
 from puncture_twin.planning.certify.certificate import MAX_CERTIFICATE_BYTES, parse_certificate
 from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.formats.points.point_files import MAX_FILE_BYTES, parse_points
@@ -30,10 +30,11 @@ from puncture_twin.planning.registration.advice import OneMore, odd_branches, on
 from puncture_twin.planning.registration.checks.marker_check import checked_placement
 from puncture_twin.planning.registration.checks.squareness import Squareness, check_squareness
 from puncture_twin.planning.registration.checks.touching import touchable_points
-from puncture_twin.planning.registration.fits import rigid_fre
+from puncture_twin.planning.registration.fits.method import LEAST_FOUND_MM
+from puncture_twin.planning.registration.fits.residual_checks import rigid_fre
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
-from puncture_twin.planning.registration.registration import LEAST_FOUND_MM, Registration, register
+from puncture_twin.planning.registration.registration import Registration, register
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -10,9 +10,7 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.label_grids import label_grids
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM
-from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
-
-Headers = Mapping[str, VolumeGrid]
+from puncture_twin.planning.search.consistency.volume_headers import Headers
 
 STEP_SLACK = 1e-9
 """Steps by which a range may miss a whole number of them: rounding of radians."""

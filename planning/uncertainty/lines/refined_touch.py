@@ -8,7 +8,8 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.clearance.engine import ClearanceEngine
-from puncture_twin.planning.uncertainty.line_sampling import line_chance, needle_doubt
+from puncture_twin.planning.uncertainty.lines.line_sampling import line_chance
+from puncture_twin.planning.uncertainty.lines.needle_doubt import needle_doubt
 from puncture_twin.planning.uncertainty.touch import Proximity
 
 

@@ -1,0 +1,32 @@
+"""``[needle]``: lengths, stiffness and tip of the needle."""
+
+from __future__ import annotations
+
+from typing import Annotated, Self
+
+from pydantic import Field, Strict, model_validator
+
+from puncture_twin.planning.case.toml_types import Number, Section
+
+
+class NeedleSection(Section):
+    """The needle: lengths from the tip; the holder is what lies between shaft and flange."""
+
+    length_mm: Annotated[Number, Field(ge=20, le=1000)]
+    shaft_mm: Annotated[Number, Field(ge=10, le=1000)]
+    diameter_mm: Annotated[Number, Field(ge=0.1, le=20)]
+    standoff_mm: Annotated[Number, Field(ge=5, le=1000)] | None = None
+    skin_gap_mm: Annotated[Number, Field(ge=6, le=200)] = 10.0  # the least, along the needle; see standoff.py
+    holder_diameter_mm: Annotated[Number, Field(ge=1, le=200)] = 30.0
+    gauge: Annotated[int, Strict()] | None = None
+    solid: Annotated[bool, Strict()] | None = None
+    bevel_deg: Annotated[Number, Field(ge=0, le=10)] | None = None
+    modulus_gpa: Annotated[Number, Field(ge=1, le=1000)] | None = None
+
+    @model_validator(mode="after")
+    def _shaft_fits(self) -> Self:
+        if self.shaft_mm > self.length_mm:
+            raise ValueError(f"shaft_mm {self.shaft_mm:g} is longer than length_mm {self.length_mm:g}")
+        if self.solid is not None and self.gauge is None:
+            raise ValueError("solid belongs to gauge; without one the shaft is solid, of diameter_mm")
+        return self

@@ -1,0 +1,47 @@
+"""The robot's base must not stand in the patient."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from puncture_twin.planning.arm.links import collision_links, joined
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.collision.bodies.body import Body
+from puncture_twin.planning.collision.patient import FclPatient
+from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.winding import winding_number
+
+
+def refuse_base_in(
+    model: UrModel, base: Body, placed: FclPatient, patient: TriangleMesh, outside: TriangleMesh | None
+) -> None:
+    """Refuse a base that stands in the patient, or in what the CT shows outside of the body.
+
+    Args:
+        model: The arm.
+        base: Its first body.
+        placed: Both surfaces for FCL.
+        patient: The skin, base frame, mm.
+        outside: What the CT shows besides, likewise.
+
+    Raises:
+        InputError: It does.
+    """
+    centre = collision_links(model)[0].mesh.bounds.mean(axis=0)
+    if placed.skin.touches(base.bare.surface, base.box) or _encloses(patient, centre):
+        raise InputError("the robot's base stands in the patient", where="cell", allowed="a base outside the skin")
+    if outside is not None and _encloses(joined([patient, outside]), centre):
+        what = "the robot's base stands in what the CT shows outside of the body (its table?)"
+        raise InputError(what, where="cell", allowed="a base outside of it")
+
+
+def _encloses(mesh: TriangleMesh, point: Floats) -> bool:
+    """Whether a point lies inside a surface; more than half around an open one counts too."""
+    low, high = mesh.bounds
+    if not np.all((point >= low) & (point <= high)) and abs(winding_number(mesh, point)) <= 0.5:
+        return False  # outside, or an open surface that goes less than half around: whether it is open need not be told
+    side = side_of(mesh, point)
+    return side is Side.INSIDE or (side is Side.UNKNOWN and abs(winding_number(mesh, point)) > 0.5)
