@@ -93,7 +93,7 @@ class Anatomy:
 
 
 def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE) -> Anatomy:
-    """Read every structure of a case, and hold the target against them.
+    """Read every structure of a case, and check the target against them.
 
     Args:
         case: The validated case.

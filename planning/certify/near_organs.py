@@ -69,7 +69,7 @@ class OrganFacts:
 def organ_facts(
     organs: Organs, lists: Lists, parent: Ints, witness: Ints, cones: Cones, *, wide: float, pad: float
 ) -> OrganFacts:
-    """Judge cells against the triangles that matter to their parents.
+    """Evaluate cells against the triangles that matter to their parents.
 
     Args:
         organs: All triangles.

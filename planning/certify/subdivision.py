@@ -145,7 +145,7 @@ class _Verdicts:
 
 
 class _Evaluator:
-    """Judges the cells of one question, level by level."""
+    """Evaluates the cells of one question, level by level."""
 
     def __init__(self, question: Question, anatomy: Anatomy, needle: Needle) -> None:
         self.queries = 0
@@ -165,7 +165,7 @@ class _Evaluator:
         return _State(first, Lists.one(skin), Lists.one(organs), first - 1, no, no)
 
     def level(self, cells: Cells, cones: Cones, state: _State) -> _Verdicts:
-        """Judge the cells of one level."""
+        """Evaluate the cells of one level."""
         if any(self._inside) or not self._skin.odd:
             return self._all_rejected(state)
         if cones.radius.max() > TOO_WIDE:

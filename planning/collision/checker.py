@@ -75,7 +75,7 @@ class Check(NamedTuple):
     hulls: tuple[Floats | None, Floats] | None
     """Corners that enclose either, in the frames of their shapes; None for a box, and for the pair with the skin."""
 
-    def met(self) -> Contact | None:
+    def contact_found(self) -> Contact | None:
         """The contact, if the two shapes touch where they are: ``outside_body`` where that is all of the patient."""
         if not isinstance(self.first, FclPatient):
             return self.contact if touch(self.first, self.second) else None
@@ -161,7 +161,7 @@ class CellChecker:
         self._place(q)
         for check in self._checks:
             allowed = needle_may_touch_patient and check.contact == NEEDLE_IN_PATIENT
-            if not allowed and (contact := check.met()) is not None:
+            if not allowed and (contact := check.contact_found()) is not None:
                 return contact
         return None
 

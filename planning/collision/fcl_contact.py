@@ -13,4 +13,4 @@ def fcl_contact(check: Check, frames: Floats) -> Contact | None:
     if check.first_body is not None:
         assert not isinstance(check.first, FclPatient)  # it belongs to no body
         check.first.setTransform(check.first_body.pose(frames))
-    return check.met()
+    return check.contact_found()

@@ -39,7 +39,7 @@ def corner_rows(q: Floats) -> NDArray[np.intp]:
 
 
 def _turning_row(rows: Floats) -> int | None:
-    """The row farthest from the segment between the ends, or the first before a way back; None on a straight way."""
+    """The row farthest from the segment between the ends, or the last before the path reverses; None if straight."""
     if len(rows) < 3:
         return None
     away, chord = rows - rows[0], rows[-1] - rows[0]

@@ -130,7 +130,7 @@ def _check_insertion(program: Program, plan: Plan, model: UrModel, where: Path) 
 
 
 def _farthest_mm(points: Floats, line: Floats) -> float:
-    """The farthest that points (m, 3) stand from the straight line through the ends of another way (k, 3)."""
+    """The farthest that points (m, 3) lie from the straight line through the ends of another path (k, 3)."""
     unit = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
     worst = 0.0
     for path in (points, line):

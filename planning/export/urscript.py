@@ -150,7 +150,7 @@ def _insertion(program: Program) -> list[str]:
 
 
 def _guarded(acceleration: str, speed: str) -> list[str]:
-    """The insertion in a thread that a contact ends, then the way back along the same line, at the same speed."""
+    """The insertion in a thread that a contact ends, then the retraction along the same line, at the same speed."""
     return [
         "  global inserted = False",
         "  global touched = False",

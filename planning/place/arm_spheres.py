@@ -69,7 +69,7 @@ class ArmSpheres:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What the arm must not meet.
+    """What the arm must not touch.
 
     Attributes:
         skin: The patient, CT frame.
@@ -152,7 +152,7 @@ def skin_distance(origin, values, x, y, z):
 
 @nb.njit(cache=True)
 def _touches_box(boxes, x, y, z, radius):
-    """Whether a sphere meets one of the boxes."""
+    """Whether a sphere intersects one of the boxes."""
     poses, halves = boxes
     for k in range(len(halves)):
         squared = 0.0
@@ -166,7 +166,7 @@ def _touches_box(boxes, x, y, z, radius):
 
 @nb.njit(cache=True)
 def _touches(surroundings, T_ct_base, T_base_body, centre, radius):
-    """Whether one sphere meets anything."""
+    """Whether one sphere intersects anything."""
     skin, fixed, carried = surroundings
     x, y, z = _moved(T_base_body, centre[0], centre[1], centre[2])
     if _touches_box(carried, x, y, z, radius):

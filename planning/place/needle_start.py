@@ -18,7 +18,7 @@ from puncture_twin.planning.place.directions import WantedDirections
 def needle_can_start(
     tool: Tool, skin: TriangleMesh, target_ct: Floats, wanted: WantedDirections, padding_mm: float
 ) -> NDArray[np.bool_]:
-    """Whether the padded needle, at standoff, is clear of the skin: no placement can hold a direction where it is not.
+    """Whether the padded needle, at standoff, is clear of the skin: no placement can reach a direction where it is not.
 
     Args:
         tool: With the needle.

@@ -116,7 +116,7 @@ def search_placements(
     jobs: int = 1,
     progress: Progress = lambda stage, done, total: None,
 ) -> PlaceSearch:
-    """Look for the placements from which the arm can hold most of the organ-safe directions.
+    """Look for the placements from which the arm can reach most of the organ-safe directions.
 
     The answer does not depend on ``jobs``.
 
@@ -274,7 +274,7 @@ def _order(estimate: ReachEstimate) -> tuple[float, float]:
 def _best_apart(
     pairs: Sequence[tuple[Site, ReachEstimate]], distance_mm: float, count: int
 ) -> list[tuple[Site, ReachEstimate]]:
-    """Each mount's best, then the best of the others, as far as they hold anything.
+    """Each mount's best, then the best of the others, as far as they reach any direction.
 
     Args:
         pairs: Sites with their estimates.

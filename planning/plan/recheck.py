@@ -28,7 +28,7 @@ SAME_NUMBER_MM = 1e-4
 
 
 def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None = None) -> Candidates:
-    """Judge a loaded plan's direction and motion anew.
+    """Check a loaded plan's direction and motion anew.
 
     Args:
         plan: What was read.

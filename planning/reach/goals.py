@@ -20,7 +20,7 @@ NEAREST = 4
 
 
 def approach_goals(checker: StateChecker, request: ReachRequest, q_home: Floats) -> list[ReachAnswer]:
-    """The motions that may follow an approach, nearest to home first; empty if the arm does not hold the direction.
+    """The motions that may follow an approach, nearest to home first; empty if the arm does not reach the direction.
 
     Each answer of :func:`every_reach`, and the same with any joint turned by whole turns, as long as all of the
     insertion stays within the limits.

@@ -262,12 +262,12 @@ def _tried_all(checker: StateChecker, motions: Sequence[tuple[_Surveyed, _Insert
     return [
         _tried(checker, surveyed.request, insertion, surveyed.depths)
         if contact is None
-        else _held(surveyed, insertion, contact)
+        else _blocked_at_standoff(surveyed, insertion, contact)
         for (surveyed, insertion), contact in zip(motions, contacts, strict=True)
     ]
 
 
-def _held(surveyed: _Surveyed, insertion: _Insertion, contact: Contact) -> _Tried:
+def _blocked_at_standoff(surveyed: _Surveyed, insertion: _Insertion, contact: Contact) -> _Tried:
     """A motion whose standoff touches something."""
     detail = f"{contact.body} touches {contact.other} at standoff"
     block = _Blocked(0.0, detail, ROLL_BODIES.isdisjoint(contact), at_standoff=True, contact=contact)

@@ -1,4 +1,4 @@
-"""How well a set of markers holds a registration at a point: expected error, and the three flags of a weak set."""
+"""How well a set of markers determines a registration at a point: expected error, and the three flags of a weak set."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WEAK_LEVERAGE = 3.0
 
 @dataclass(frozen=True)
 class Conditioning:
-    """How well a marker set holds a rotation at the target.
+    """How well a marker set determines the pose at the target.
 
     Attributes:
         spread_ratio: s2/s1, singular values of the centred markers.

@@ -19,7 +19,7 @@ AZIMUTHS = 12
 
 
 def reached_insertion(case: Case, T_base_ct: Floats) -> Floats | None:
-    """Joints (6,), rad, that hold the tip on the target at the least puncture angle tried; None where none reach.
+    """Joints (6,), rad, that put the tip on the target at the least puncture angle tried; None where none reach.
 
     Only an arm's kinematics are looked at: organs and collisions are the search's.
     """

@@ -65,7 +65,7 @@ class Registration:
 
     @property
     def fle_interval_mm(self) -> Interval:
-        """The 95 % interval of that number: one value where it is declared and holds."""
+        """The 95 % interval of that number: one value where it is declared and agrees with the residuals."""
         if self.uncertainty is None:
             return self.residual_test.fle_interval_mm
         test, fle = self.uncertainty.test, self.uncertainty.fle_mm
@@ -126,7 +126,7 @@ def register(
     accept_residuals: bool = False,
     where: str | Path = "registration",
 ) -> Registration:
-    """Fit T_base_ct, and hold its residuals against the noise.
+    """Fit T_base_ct, and test its residuals against the noise.
 
     Args:
         markers: At least three, matched.

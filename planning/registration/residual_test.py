@@ -191,7 +191,7 @@ class OddMarker(NamedTuple):
     others_fre_mm: float
 
     def text(self) -> str:
-        """What is to be told."""
+        """Which marker does not fit, by how much, and what to check; one sentence."""
         return (
             f"marker {self.name} does not fit: the other {self.others} place it {self.miss_mm:.1f} mm from its "
             f"reading, and fit each other to {self.others_fre_mm:.1f} mm; check its name, touch and place in the CT"

@@ -22,7 +22,7 @@ LEAST_SINGULARITY = 0.05
 
 
 def touching_configuration(model: UrModel, tip_mm: float, point_base: Floats, needle_base: Floats) -> Floats:
-    """Joint angles that hold the tip on a point, shape (6,), rad: the least tilt, then the farthest from singular.
+    """Joint angles that put the tip on a point, shape (6,), rad: the least tilt, then the farthest from singular.
 
     Of equals the one with its elbow on the side from which the needle comes: mirrored branches are equal.
 

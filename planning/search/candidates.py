@@ -68,7 +68,7 @@ class Verdict(Columns):
 
 @dataclass(frozen=True, eq=False)
 class Path(Columns):
-    """The way from the skin to the target.
+    """The path from the skin to the target.
 
     Attributes:
         entry_ct: Shape (n, 3), where the path crosses the skin, mm; NaN without an entry.

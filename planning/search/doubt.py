@@ -42,7 +42,7 @@ class Remedy(NamedTuple):
 
 @dataclass(frozen=True)
 class Goal:
-    """What does not hold, and what would mend it.
+    """A limit that is not kept, and what would mend it.
 
     Attributes:
         structure: What is touched too likely; "" where the target is hit too unlikely.
@@ -270,7 +270,7 @@ def shrinkable(model: ChanceModel, near: Proximity, q: Floats) -> ShrinkableNeed
 
 
 def goals_of(needle: ShrinkableNeedle, p_hit: float, p_touch: Mapping[str, float]) -> list[Goal]:
-    """What does not hold, and what would mend it."""
+    """The limits that are not kept, each with what would mend it."""
     case, goals = needle.model.case, []
     least = WISHED_HIT if case.search.min_hit is None else case.search.min_hit
     if p_hit < least:

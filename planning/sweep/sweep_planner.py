@@ -150,7 +150,7 @@ def _farthest(context: CaseContext, point: Floats, directions: Floats, route: _S
 def _followed(
     checker: CellChecker, q_start: Floats, point: Floats, directions: Floats, reach_mm: float
 ) -> tuple[Floats, str]:
-    """The arm's way through directions (k, 3) with its flange so far from the point; where it ends, and why."""
+    """The arm's path through directions (k, 3) with its flange so far from the point; where it ends, and why."""
     rows = [q_start]
     R = flange_pose(checker.model, q_start)[:3, :3]
     for direction in directions[1:]:

@@ -118,7 +118,7 @@ def _up_base(context: CaseContext) -> Floats:
 
 
 def _free_poses(context: CaseContext, checkers: ApproachCheckers, place_base: Floats, count: int) -> Floats:
-    """Joints (n, 6), rad, with the tip on a place that nothing is in the way of, from above first."""
+    """Joints (n, 6), rad, with the tip on a place that nothing obstructs, from above first."""
     model, tip_mm = checkers.whole.model, context.case.needle.length_mm
     empty = np.empty((0, 6))
     for q in _from_above(model, tip_mm, place_base, _up_base(context), home_configuration(context.case)):

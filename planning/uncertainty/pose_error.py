@@ -30,7 +30,7 @@ from puncture_twin.planning.uncertainty.sources import reading_parts
 
 
 class Bend(NamedTuple):
-    """A needle that its bevel takes off, to any side alike: by how much at the tip, held how far behind it; mm."""
+    """How far the bevel deflects the tip, to any side alike, and how far behind the tip the shaft is clamped; mm."""
 
     tip_mm: float
     clamped_mm: float
@@ -140,7 +140,7 @@ class PoseError:
 
 
 def _bend_covariance(model: UrModel, q: Floats, bend: Bend) -> Floats:
-    """Of a tip off by d to a side drawn evenly, the shaft turned about where it is held, shape (n, 6, 6), base axes.
+    """Of a tip off by d to a side drawn evenly, the shaft rotated about its clamp, shape (n, 6, 6), base axes.
 
     For the sides x and y of the needle, whose z points to the tip: the tip by d x with the shaft about y by d / h, and
     by d y with the shaft about -x; each with half the variance.

@@ -73,7 +73,7 @@ def _first_order(depth, normal, outward, cov, surface_mm, gradient, deviation): 
 
 
 def touch_chance(near: Proximity, threshold_mm: Floats | float, freedom: int | None = None) -> Floats:
-    """P that each needle comes nearer to each structure than a threshold, shape (n, k); NaN where they meet already.
+    """P that each needle comes nearer to each structure than a threshold, shape (n, k); NaN where they intersect.
 
     Args:
         near: Of needles and structures.

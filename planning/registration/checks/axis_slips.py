@@ -46,7 +46,7 @@ EXCLUDING_DOUBT = 0.001
 def check_axes(
     case: Case, skin: Skin, registration: Registration, given: MarkerList, cache: Cache = NO_CACHE
 ) -> tuple[str, ...]:
-    """Hold the given list against its half turns; returns warnings, one sentence each.
+    """Compare the given list with its half turns; returns warnings, one sentence each.
 
     Raises:
         InputError: The list lies on the skin, or where it can be touched, only after a half turn.

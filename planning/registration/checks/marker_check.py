@@ -61,7 +61,7 @@ def _of_transform(case: Case, placement: Placement, cache: Cache) -> tuple[str, 
 
 
 def check_markers(case: Case, skin: Skin, registration: Registration, cache: Cache = NO_CACHE) -> MarkerFindings:
-    """Hold a registration's markers against permuted names, half turns, skin and couch.
+    """Check a registration's markers against permuted names, half turns, skin and couch.
 
     How the markers lie on the skin depends on no target: ``cache`` keeps it.
 

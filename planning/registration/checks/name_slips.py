@@ -23,7 +23,7 @@ ALLOWED_NAMES = (
 
 
 def check_names(case: Case, skin: Skin, registration: Registration) -> tuple[str, ...]:
-    """Hold the names against each other; returns warnings, one sentence each.
+    """Compare the names with their permutations; returns warnings, one sentence each.
 
     Raises:
         InputError: Permuted names fit much better; or they fit as well, nothing excludes them, and the case does not

@@ -42,7 +42,7 @@ class SkinFit:
 
 
 def skin_fit(points_ct: Floats, skin: Skin) -> SkinFit:
-    """Hold markers against the skin; where the body was cut there is none.
+    """Measure markers from the skin; where the body was cut there is none.
 
     Args:
         points_ct: Shape (n, 3), mm.

@@ -61,7 +61,7 @@ class Squareness:
 
     @property
     def doubted(self) -> bool:
-        """Whether it is to be told."""
+        """Whether axes that are square would seldom look so skewed: then it is reported."""
         return self.probability < DOUBTED
 
     def text(self) -> str:

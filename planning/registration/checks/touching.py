@@ -128,7 +128,7 @@ def _cones(axes: Floats) -> Floats:
 
 
 def _intersects(box: Obstacle, points: Floats, directions: Floats, length_mm: float) -> NDArray[np.bool_]:
-    """Which segments from points meet a box with axes parallel to the frame's (slabs).
+    """Which segments from points intersect a box with axes parallel to the frame's (slabs).
 
     Args:
         box: The box.

@@ -71,6 +71,6 @@ def path_layers(
 
 
 def _size(structure: Structure) -> float:
-    """Volume of the box that holds a structure."""
+    """Volume of a structure's bounding box, mm^3."""
     low, high = structure.mesh.bounds
     return float(np.prod(high - low))

@@ -12,7 +12,7 @@ MOST_AROUND = 0.5
 
 
 def refuse_open_around_target(case: Case, anatomy: Anatomy) -> None:
-    """Of an open surface the inside is not known; but one that goes more than half around the target is no way out.
+    """Of an open surface the inside is not known; but one that goes more than half around the target is refused.
 
     Two numbers tell: rays from the target say it however the triangles are wound, and the winding number says it of
     shells in shells, which a ray leaves an even number of times. Neither is the inside, so none is claimed.

@@ -39,7 +39,7 @@ def likeliest_slope(problem: Problem, doubt: NeedleDoubt, slope: Floats, slack: 
 
 @cache
 def _rays() -> Floats:
-    """Along each of five normals and between each two, both ways: shape (50, 5)."""
+    """Along each of five normals and between each two, with both signs: shape (50, 5)."""
     signs = (1.0, -1.0)
     ones = [sign * np.eye(5)[k] for k in range(5) for sign in signs]
     twos = [

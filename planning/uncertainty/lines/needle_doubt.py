@@ -57,7 +57,7 @@ class NeedleDoubt:
 
     @cached_property
     def _widths(self) -> Callable[[float], tuple[float, float, float]]:
-        """Of an axis as long as told: how far tip (mm), other end (mm) and direction (rad) may lie off, at most."""
+        """For an axis of a given length: how far tip (mm), other end (mm) and direction (rad) may lie off, at most."""
         shift, lean = self.root[:3], self.root[3:]
         tip, turn = float(np.linalg.norm(shift, 2)), float(np.linalg.norm(lean, 2))
 
