@@ -31,8 +31,9 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Reco
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, find_candidates
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
-from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth, draw_workcell, jog_into_slice
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth, jog_into_slice
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
+from puncture_twin.twin.jobs.selfcal.drawn_workcell import draw_workcell
 
 CASE = Path(__file__).resolve().parents[1] / "meshes" / "selfcal"
 IMAGE_MM, DIRECTION_RAD = 0.1, float(np.radians(0.3))

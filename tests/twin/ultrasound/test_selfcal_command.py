@@ -9,9 +9,9 @@ from scipy.stats import chi2, f
 from puncture_twin.run_twin import main
 from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording, write_recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import load_selfcal_case
-from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
 from puncture_twin.twin.guidance.ultrasound.simulate import PoseRanges, simulate_recording
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, OK
+from puncture_twin.twin.jobs.selfcal.drawn_workcell import draw_workcell
 
 CASE = """
 schema = 1

@@ -13,7 +13,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import N_PARAMETERS
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import drawing as belief_of
 from puncture_twin.twin.guidance.ultrasound.pose_choice import choose_poses, expected_tre_mm
-from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
 from puncture_twin.twin.guidance.ultrasound.simulate import (
     SPEC_NOISE,
     PoseRanges,
@@ -21,6 +20,7 @@ from puncture_twin.twin.guidance.ultrasound.simulate import (
     simulate_recording,
     with_noise,
 )
+from puncture_twin.twin.jobs.selfcal.drawn_workcell import draw_workcell
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from puncture_twin.twin.guidance.ultrasound.candidate_poses import (
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage
 from puncture_twin.twin.guidance.ultrasound.pose_choice import choose_poses, expected_tre_mm
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, SelfcalFile, load_selfcal_case
-from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell, jog_into_slice
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import jog_into_slice
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE
 from puncture_twin.twin.guidance.ultrasound.two_arms import (
     BetweenArms,
@@ -31,6 +31,7 @@ from puncture_twin.twin.guidance.ultrasound.two_arms import (
     phantom_mesh,
     probe_tool,
 )
+from puncture_twin.twin.jobs.selfcal.drawn_workcell import draw_workcell
 from puncture_twin.twin.report.scene.shapes import bar, box
 
 

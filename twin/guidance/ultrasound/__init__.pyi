@@ -20,7 +20,6 @@ from .recording_file import (
     write_recording as write_recording,
 )
 from .selfcal_case import SelfcalCase as SelfcalCase, load_selfcal_case as load_selfcal_case
-from .selfcal_truth import draw_workcell as draw_workcell
 from .simulate import (
     SPEC_NOISE as SPEC_NOISE,
     SimulatedTruth as SimulatedTruth,

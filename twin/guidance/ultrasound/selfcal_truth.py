@@ -1,30 +1,45 @@
-"""The true room: arms that are not their nominal models, mounts that are not the drawing, a bent needle."""
+"""The workcell in which a recording is made: two arms as they move, the mounts, the needle."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import exp_rotation
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import tangent_basis
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import needle_flange
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage
-from puncture_twin.twin.guidance.ultrasound.selfcal_case import ErrorsSection, SelfcalCase
-from puncture_twin.twin.plant.true_arm import ArmErrors, TrueArm, draw_true_arm
 
 JOG_STEPS = 4
 """Of the operator's correction: each leaves about the arms' relative error, 1e-3, of what was left before."""
 
 
-class WorkcellTruth(NamedTuple):
-    """What nobody knows."""
+class MovingArm(Protocol):
+    """An arm that is commanded by its nominal model and moves as it does; the plant has one, drawn."""
 
-    probe_arm: TrueArm
-    needle_arm: TrueArm
+    @property
+    def nominal(self) -> UrModel:
+        """What is believed of it."""
+
+    @property
+    def backlash_rad(self) -> float:
+        """Full width of the play of every joint."""
+
+    def flange_pose(self, q_true: Floats) -> Floats:
+        """T_base_flange, shape (..., 4, 4), mm, of true configurations (..., 6), rad."""
+
+    def settle(self, q_command: Floats, q_before: Floats, rng: np.random.Generator) -> Floats:
+        """Where the joints come to rest, shape (6,), rad, after those of the arrival before."""
+
+
+class WorkcellTruth(NamedTuple):
+    """The ground truth of one workcell: whoever calibrates must not look in here."""
+
+    probe_arm: MovingArm
+    needle_arm: MovingArm
     X: Floats
     """T_end1_image, shape (4, 4), mm."""
     Y: Floats
@@ -45,36 +60,10 @@ class WorkcellTruth(NamedTuple):
         return NeedleInImage(T[:3, :3] @ self.tip_end2 + T[:3, 3], direction / np.linalg.norm(direction))
 
 
-def draw_workcell(case: SelfcalCase, rng: np.random.Generator) -> WorkcellTruth:
-    """A room whose differences from the drawing are drawn from the case's standard deviations."""
-    content, off = case.content, case.content.truth
-    arms = [
-        draw_true_arm(model, _spread(arm.errors), rng)
-        for model, arm in zip(case.models, (content.probe_arm, content.needle_arm), strict=True)
-    ]
-    X, Y = (_shifted(T, off.mount_mm, np.radians(off.mount_deg), rng) for T in (case.T_end1_image, case.T_base1_base2))
-    V = np.array([0.0, 0.0, 1.0])
-    tip = case.tip_end2 + [*rng.normal(0.0, off.tip_mm, 2), rng.normal(0.0, off.length_mm)]
-    bent = V + tangent_basis(V) @ rng.normal(0.0, np.radians(off.needle_deg), 2)
-    return WorkcellTruth(arms[0], arms[1], X, Y, tip, bent / np.linalg.norm(bent))
-
-
-def _spread(stated: ErrorsSection) -> ArmErrors:
-    angles = np.radians([stated.twist_deg, stated.joint_deg, stated.backlash_deg, stated.repeatability_deg])
-    return ArmErrors(stated.link_mm, *(float(angle) for angle in angles))
-
-
-def _shifted(T: Floats, mm: float, rad: float, rng: np.random.Generator) -> Floats:
-    moved = np.array(T)
-    moved[:3, 3] += rng.normal(0.0, mm, 3)
-    moved[:3, :3] = T[:3, :3] @ exp_rotation(rng.normal(0.0, rad, 3))
-    return moved
-
-
 def jog_into_slice(
     truth: WorkcellTruth, q_probe: Floats, q_needle: Floats, wanted: NeedleInImage, roll: float
 ) -> Floats:
-    """Move the needle's arm until the *true* needle stands in the *true* image as wanted.
+    """Move the needle's arm until the true needle is in the true image as wanted.
 
     It stands for the operator, or a servo on the picture, that jogs until the needle shows: what is left is in
     ``wanted``. The commands follow from the nominal kinematics, corrected by what the true arm did before.
@@ -87,7 +76,7 @@ def jog_into_slice(
         roll: About the needle, rad.
 
     Returns:
-        What the arm is told, shape (6,), rad; NaN where no configuration holds it.
+        What the arm is commanded, shape (6,), rad; NaN where no configuration reaches it.
     """
     nominal = truth.needle_arm.nominal
     T_base2_image = (np.linalg.inv(truth.Y) @ truth.image_pose(q_probe))[None]
@@ -102,7 +91,7 @@ def jog_into_slice(
     return q
 
 
-def nearest_configuration(arm: TrueArm, T_base_flange: Floats, q_near: Floats) -> Floats:
+def nearest_configuration(arm: MovingArm, T_base_flange: Floats, q_near: Floats) -> Floats:
     """The nominal arm's configuration for a flange pose that is nearest to another, shape (6,), rad; NaN for none."""
     q = nearest_within_limits(arm.nominal, inverse(arm.nominal, T_base_flange)[0], q_near)
     away = np.linalg.norm(q - q_near, axis=1)

@@ -21,11 +21,11 @@ from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, punctures, unseen_errors_mm
 from puncture_twin.twin.guidance.ultrasound.recording_file import MAX_BYTES, parse_recording, recording_file
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.selfcal_truth import draw_workcell
 from puncture_twin.twin.guidance.ultrasound.slips import checked_calibration
 from puncture_twin.twin.guidance.ultrasound.trial import Choice, SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 from puncture_twin.twin.jobs.selfcal.calibrate_case import calibrate_case
+from puncture_twin.twin.jobs.selfcal.drawn_workcell import draw_workcell
 
 TARGETS = 6
 """Punctures per seed."""
