@@ -112,7 +112,7 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     _check_demands(case, structures)
     structures.extend(own_target(case))
     outside: tuple[Structure, ...] = ()
-    scan = loader.scan(case.skin_section, skin)
+    scan, left_out = loader.scan(case.skin_section, skin), loader.unnamed_warnings()
     if scan is None:
         loader.warnings.append(OUTSIDE_NOT_KNOWN)
     else:
@@ -128,7 +128,7 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     structures.extend(beyond.structures)
     _check_names(case, [*structures, *outside])
     _check_target(case, structures, skin)
-    warnings = [*loader.warnings, *beyond.warnings, *loader.unnamed_warnings(), *skin.warnings]
+    warnings = [*loader.warnings, *beyond.warnings, *left_out, *skin.warnings]
     for structure in structures:
         warnings.extend(kept_mesh_warnings(structure.mesh, structure.name, cache.memory))
     return Anatomy(tuple(structures), skin, tuple(warnings), outside, scan, tuple(loader.ignored))

@@ -9,7 +9,7 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.collision.checker import (
     NEEDLE_IN_PATIENT,
@@ -90,9 +90,7 @@ class FastChecker(CellChecker):
         """See :meth:`CellChecker.first_contact`."""
         path = np.asarray(q_path, dtype=np.float64)
         require_finite(path)
-        return self._first_contact(self.motion(path), self._masks[needle_may_touch_patient])
-
-    def _first_contact(self, motion: Motion, mask: Bools) -> FirstContact | None:
+        motion, mask = self.motion(path), self._masks[needle_may_touch_patient]
         open_at = self._proofs.first_unproven(motion, 0, mask)
         while open_at >= 0:
             index, check = divmod(open_at, len(self._tested))

@@ -69,9 +69,8 @@ class Proofs:
                 pair = (hulls.add(check.hulls[0], check.first_body), hulls.add(check.hulls[1], check.second_body))
                 row = (proof_kernels.PAIR, *pair, check.first_body.frame, frame)
             rows.append(row)
-        self.scene = ProofScene(
-            np.array(rows, dtype=np.int64), packed_skin(patient, cache), spheres, *hulls.packed(cache)
-        )
+        packed = hulls.packed(cache)
+        self.scene = ProofScene(np.array(rows, dtype=np.int64), packed_skin(patient, cache), spheres, *packed)
         self._levers = np.array([joint_levers(model, check) for check in checks])
         self.movers = packed_movers(checks)
         self._work = scratch(len(rows), len(self.scene.hulls.radii))
