@@ -65,11 +65,11 @@ PLAIN = MappingProxyType(
     {
         "puncture_twin.planning.case.entry": ("tests/case/test_entry.py",),
         **{
-            f"puncture_twin.planning.anatomy.{name}": (
+            f"puncture_twin.planning.{name}": (
                 "tests/anatomy/test_skin_entry.py",
                 "tests/search/test_constraints.py",
             )
-            for name in ("skin_entry", "settled_crossings", "skin_normals")
+            for name in ("anatomy.skin_entry", "geometry.settled_crossings", "geometry.smooth_normals")
         },
         "puncture_twin.planning.reach.standoff": tuple(f"tests/reach/test_standoff.py::{name}" for name in STANDOFF),
         "puncture_twin.planning.geometry.containment": ("tests/geometry/test_containment.py",),

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.settled_crossings import settled_crossings
 from puncture_twin.planning.anatomy.skin import Skin
-from puncture_twin.planning.anatomy.skin_normals import skin_normals
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.settled_crossings import settled_crossings
+from puncture_twin.planning.geometry.smooth_normals import smooth_normals
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ def skin_paths(
         unknown[~odd] = 0.0
     depth[cut] = np.nan
     entry = target_ct + depth[:, None] * outward_ct
-    cosine = np.abs(np.einsum("ij,ij->i", skin_normals(skin.mesh, face, entry), outward_ct))
+    cosine = np.abs(np.einsum("ij,ij->i", smooth_normals(skin.mesh, face, entry), outward_ct))
     angle = np.where(np.isnan(depth), np.nan, np.arccos(np.minimum(cosine, 1)))
     return SkinPaths(entry, depth, angle, reentry, unknown, view)
 

@@ -1,4 +1,4 @@
-"""Where rays cross the skin, also those through an edge."""
+"""Where rays from inside a surface cross it, also those through an edge."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Normals of a skin at points of its triangles."""
+"""Normals of a surface at points of its triangles, blended from those of their corners."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 
-def skin_normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) -> Floats:
+def smooth_normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) -> Floats:
     """Unit normals at points of triangles: the corners' normals (area weighted), blended; shape (n, 3)."""
     a, b, c = np.moveaxis(mesh.triangles, 1, 0)
     areas = np.cross(b - a, c - a)
