@@ -11,6 +11,7 @@ from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.tables.registration_section import other_readings
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, pose
 from puncture_twin.planning.registration.checks.stated_transform import check_transform
+from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
@@ -227,6 +228,22 @@ def test_the_readings_are_what_other_keys_say(tmp_path, keys):
         name = " and ".join(text for text, a, b in zip(texts, other, keys, strict=True) if a != b)
         again = load_case(stating(tmp_path, saved=keys, keys=other)).robot.T_base_ct_mount
         assert found[name] == pytest.approx(again)
+
+
+def test_honest_markers_hardly_ever_doubt_an_honest_transform(tmp_path, ball):
+    """Touches with the declared error, and a transform that other touches with that error gave; one exact: none."""
+    rng, skin = np.random.default_rng(20261125), ball(90.0)
+    fle_mm, base, doubted = 4.0, apply(T_BASE_CT, MARKERS), 0
+    for row in range(60):
+        first, second = base + rng.normal(0.0, fle_mm / np.sqrt(3.0), (2, *base.shape))
+        (tmp_path / "touched.csv").write_text(points_file(first))
+        T = T_BASE_CT if row % 2 else fit_rigid(MARKERS, second)
+        lists = f'markers_ct = "markers_ct.csv"\nmarkers_base = "touched.csv"\nfle_mm = {fle_mm}\n'
+        case = load_case(stating(tmp_path, T, more=lists))
+        (line,) = check_transform(case, skin, case.robot.T_base_ct_mount)
+        assert row % 2 == 0 or "more than" not in line
+        doubted += "more than" in line
+    assert doubted <= 3
 
 
 def test_honest_placements_are_never_refused_and_their_slips_are_told(tmp_path, ball):

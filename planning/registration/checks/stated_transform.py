@@ -25,9 +25,9 @@ from puncture_twin.planning.registration.registration import Registration
 UPRIGHT = np.radians(30.0)
 """An arm whose z axis lies so near to up stands on a floor, a rail or a cart, as most do."""
 
-EXPLAINED = 2.33
-"""Times the expected (rms) error of a point: exceeded once in 1,000 by three normal errors of one size,
-sqrt(chi-squared of 3 degrees at 99.9 % / 3)."""
+EXPLAINED = 3.29
+"""Times the expected (rms) error of a point: normal errors exceed it at most once in 1,000, in whatever directions they
+lie. It is the normal distribution's own bound, and errors along one line, of one size, reach it most often."""
 
 MAX_APART_MM = 5.0
 """Markers and a transform that differ by more, and by more than both errors explain, are of two patients or robots."""
