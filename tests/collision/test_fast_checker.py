@@ -129,8 +129,10 @@ def test_distance_to_a_surface_is_the_least_over_its_triangles(subdivisions: int
     stack = np.empty(STACK, np.int64)
     for point in rng.uniform(-250, 250, (60, 3)):
         least = np.sqrt(min(to_triangle(t, *point) for t in mesh.triangles))
-        assert to_surface(tree.lows, tree.highs, tree.corners, *point, 1e6, stack) == least
-        assert to_surface(tree.lows, tree.highs, tree.corners, *point, least / 2.0, stack) == pytest.approx(least / 2.0)
+        assert to_surface(tree.lows, tree.highs, tree.corners, *point, 1e6, stack, 0.0) == least
+        assert to_surface(tree.lows, tree.highs, tree.corners, *point, least / 2.0, stack, 0.0) == pytest.approx(
+            least / 2.0
+        )
         near = to_surface(tree.lows, tree.highs, tree.corners, *point, 1e6, stack, 2.0 * least)
         assert least <= near <= 2.0 * least
         assert to_surface(tree.lows, tree.highs, tree.corners, *point, 1e6, stack, 0.9 * least) == least

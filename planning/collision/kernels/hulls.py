@@ -36,6 +36,9 @@ FLAT = 1e-10
 """Volume of a tetrahedron over that of its edges' box below which it has no inside."""
 
 
+FIRST, SECOND, THIRD = np.int64(0), np.int64(1), np.int64(2)
+"""Of a simplex' corners; not plain numbers, see `numba_kernels`."""
+
 ONWARD = 1.0 - 1e-9
 """A step that brings the nearest points no nearer than by this fraction is the last."""
 
@@ -200,9 +203,9 @@ def distance_bounds(corners, starts, ends, M, axis, at, needed, S):
         S[count, 0], S[count, 1], S[count, 2] = wx, wy, wz
         p, q, r, vx, vy, vz = count, -1, -1, wx, wy, wz
         if count == 1:
-            p, q, vx, vy, vz = _nearest_of_segment(S, 0, 1)
+            p, q, vx, vy, vz = _nearest_of_segment(S, FIRST, SECOND)
         elif count == 2:
-            p, q, r, vx, vy, vz = _nearest_of_triangle(S, 0, 1, 2)
+            p, q, r, vx, vy, vz = _nearest_of_triangle(S, FIRST, SECOND, THIRD)
         elif count == 3:
             p, q, r, vx, vy, vz = _nearest_of_tetrahedron(S)
         before, squared = upper, vx * vx + vy * vy + vz * vz

@@ -33,7 +33,7 @@ def _to_box(low, high, x, y, z):
 
 
 @nb.njit(cache=True)
-def to_surface(lows, highs, corners, x, y, z, cutoff, stack, stop=0.0):
+def to_surface(lows, highs, corners, x, y, z, cutoff, stack, stop):
     """Distance of a point to a surface in a :class:`TriangleTree`, or ``cutoff`` where it is no nearer.
 
     Where it is no farther than ``stop`` any distance up to that may be returned. ``stack`` is scratch, of ``STACK``
@@ -86,7 +86,9 @@ def _field_distance(tree, field, origin, x, y, z, stack):
     if math.isnan(field[i, j, k]):
         lows, highs, corners = tree
         mx, my, mz = (i + 0.5) * CELL_MM, (j + 0.5) * CELL_MM, (k + 0.5) * CELL_MM
-        field[i, j, k] = to_surface(lows, highs, corners, origin[0] + mx, origin[1] + my, origin[2] + mz, 1e9, stack)
+        field[i, j, k] = to_surface(
+            lows, highs, corners, origin[0] + mx, origin[1] + my, origin[2] + mz, 1e9, stack, 0.0
+        )
     return field[i, j, k]
 
 
