@@ -11,7 +11,7 @@ from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.tables.registration_section import other_readings
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, pose
 from puncture_twin.planning.registration.checks.stated_transform import check_transform
-from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
