@@ -68,7 +68,7 @@ def test_the_second_time_nothing_is_made(cache):
     for name in first:
         np.testing.assert_array_equal(second[name], first[name])
         assert (second[name].dtype, second[name].shape) == (first[name].dtype, first[name].shape)
-        assert not second[name].flags.writeable
+        assert not first[name].flags.writeable and not second[name].flags.writeable
 
 
 @pytest.mark.parametrize("other", [{"file": "abd"}, {"what": "label 6"}, {"extra": 1}])

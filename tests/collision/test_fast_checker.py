@@ -10,11 +10,12 @@ import fcl
 import numpy as np
 import pytest
 import trimesh
+from numba import typeof
 from places import ROOT
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
 from puncture_twin.planning.collision.bodies.shapes import convex
@@ -457,6 +458,17 @@ def test_a_checker_from_the_cache_is_the_same(tmp_path: Path) -> None:
     other = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=31.0)
     FastChecker(UR3, other, padding_mm=5.0, cache=Cache(tmp_path))
     assert len(sorted(tmp_path.iterdir())) > len(files)
+
+
+def test_a_checker_from_the_cache_is_no_other_kind_to_its_kernels(tmp_path: Path) -> None:
+    """Numba compiles for read-only arrays once more: the second command of a new machine waited for that."""
+    ball = trimesh.creation.icosphere(2, 100.0)
+    patient = TriangleMesh(np.asarray(ball.vertices) + [600.0, 0.0, 0.0], np.asarray(ball.faces))
+    kinds = [
+        typeof(FastChecker(UR3, TOOL, [], patient, padding_mm=5.0, cache=cache)._proofs.scene)
+        for cache in (NO_CACHE, Cache(tmp_path), Cache(tmp_path))
+    ]
+    assert kinds[0] == kinds[1] == kinds[2]
 
 
 def test_next_nearer_never_passes_a_nearer_state() -> None:

@@ -64,7 +64,7 @@ class Cache:
         by: str,
         check: Callable[[Arrays], object] | None = None,
     ) -> Arrays:
-        """The arrays that ``make`` gives, from the folder if they are there and whole.
+        """The arrays that ``make`` gives, read-only, from the folder if they are there and whole.
 
         Args:
             made_from: Everything that decides the result: hashes of inputs, labels, options. Plain values.
@@ -73,18 +73,18 @@ class Cache:
             check: Raises ValueError, KeyError, TypeError or InputError for arrays that cannot be what ``make`` gives.
         """
         if self.memory is NO_MEMORY:
-            return make() if self.folder is None else self._from_folder(_entry(made_from, by), make, check)
+            return _frozen(make()) if self.folder is None else self._from_folder(_entry(made_from, by), make, check)
         entry = _entry(made_from, by)
-        return self.memory.get((__name__, entry), lambda: _frozen(self._from_folder(entry, make, check)), _size)
+        return self.memory.get((__name__, entry), lambda: self._from_folder(entry, make, check), _size)
 
     def _from_folder(
         self, entry: StoredFile, make: Callable[[], Arrays], check: Callable[[Arrays], object] | None
     ) -> Arrays:
         if self.folder is None:
-            return make()
+            return _frozen(make())
         found = _kept(self.folder / entry.file, entry.key, check)
         if found is None:
-            found = make()
+            found = _frozen(make())
             self._store(entry, found)
         return found
 
@@ -126,7 +126,7 @@ def _most_bytes() -> int:
 
 
 def _frozen(arrays: Arrays) -> Arrays:
-    """Arrays that several will hold: read-only, as those are that come from the folder."""
+    """Read-only, as arrays from the folder are: several will hold them, and kernels are compiled for one kind alone."""
     for array in arrays.values():
         array.setflags(write=False)
     return arrays
