@@ -1,4 +1,5 @@
-from .checks.marker_check import check_markers as check_markers, checked_placement as checked_placement
+from .checks.checked_placement import checked_placement as checked_placement
+from .checks.marker_check import check_markers as check_markers
 from .conditioning import Conditioning as Conditioning
 from .fits.affine import fit_affine as fit_affine
 from .fits.least_squares import fit_rigid as fit_rigid

@@ -22,6 +22,8 @@ from puncture_twin.meshes import folder as meshes_folder
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.formats.itk_transform import transform_text
+from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import BAD_INPUT
@@ -113,6 +115,16 @@ def test_of_the_embedded_cases_the_carton_alone_is_beyond_its_noise(name, capfd)
     assert (len(report["flags"]), len(told)) == ((0, 0) if name == "abdomen" else (1, 1))
 
 
+def beside_their_own_transform(here):
+    """Place the robot by a transform that was made from the case's two lists, with their slip in it."""
+    placement = load_placement(load_case(here / "case.toml"))
+    assert placement is not None
+    (here / "t.tfm").write_text(transform_text(placement.T_base_ct))
+    stated = '[registration]\ntransform = "t.tfm"\ntransform_maps = "ct_to_base"\nbase_axes = "LPS"\n'
+    path = here / "case.toml"
+    path.write_text(path.read_text().replace("[registration]\n", stated))
+
+
 def test_the_abdomens_markers_read_as_ras_are_refused(tmp_path, capfd):
     """x and y negated: FRE stays 0.3 mm; the skin says that they are turned by half a turn, in every command."""
     here = tmp_path / "abdomen"
@@ -126,6 +138,9 @@ def test_the_abdomens_markers_read_as_ras_are_refused(tmp_path, capfd):
     for command in (["register", here], ["search", here, "--no-arm", "--out", tmp_path / "out"]):
         line = refused(command, capfd)
         assert "markers_ct look like coordinates of other axes: with x and y negated, as LPS and RAS differ" in line
+    beside_their_own_transform(here)
+    for command in (["register", here], ["search", here, "--no-arm", "--out", tmp_path / "out"]):
+        assert "markers_ct look like coordinates of other axes: with x and y negated" in refused(command, capfd)
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="x and y negated"):
         Mirror.of(load_case(here))

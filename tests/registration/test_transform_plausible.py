@@ -72,6 +72,11 @@ def warnings_of(path):
     return [line for line in prepare(path, arm=False).anatomy.warnings if line.startswith("registration: ")]
 
 
+def compared(path):
+    """Of these the line that compares the transform with markers."""
+    return [line for line in warnings_of(path) if "from where the stated transform puts it" in line]
+
+
 @pytest.mark.parametrize("keys", KEYS[2:])
 def test_an_inverse_that_is_stated_the_wrong_way_is_named(tmp_path, keys):
     """It said only that there are no residuals. The robot's z axis would not point up."""
@@ -147,17 +152,34 @@ def test_a_base_in_the_patient_is_refused_with_its_causes(tmp_path):
 
 def test_markers_that_agree_are_named_with_their_distance(tmp_path):
     """In place of what nothing could be held against; whose error it is nobody knows."""
-    (line,) = warnings_of(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 0.2) + "fle_mm = 0.5\n"))
+    (line,) = compared(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 0.2) + "fle_mm = 0.5\n"))
     assert "no residuals" not in line and "0.2 mm from where the stated transform puts it" in line
     assert line.endswith("its own expected error is unknown") and "more than" not in line
 
 
 def test_markers_that_are_off_by_more_than_their_errors_are_doubted(tmp_path):
     """By declared errors 3 mm is much, by larger ones it is nothing."""
-    (line,) = warnings_of(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 3.0) + "fle_mm = 0.5\n"))
+    (line,) = compared(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 3.0) + "fle_mm = 0.5\n"))
     assert "3.0 mm from where the stated transform puts it" in line and "more than their errors explain" in line
-    (line,) = warnings_of(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 3.0) + "fle_mm = 4.0\n"))
+    (line,) = compared(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 3.0) + "fle_mm = 4.0\n"))
     assert "more than" not in line
+
+
+def test_markers_that_agree_do_not_silence_what_physics_doubts(tmp_path):
+    """Lists and transform may be of the same other image: the patient floats all the same."""
+    more = touched(tmp_path, T_BASE_CT) + "fle_mm = 0.5\n"
+    said = warnings_of(stating(tmp_path, more=more, boxes=[table(BELOW_MM - 150.0)]))
+    assert any("the patient would float 150 mm above obstacle 'table'" in line for line in said)
+
+
+def test_markers_beside_a_transform_are_checked_as_those_that_place_the_robot(tmp_path):
+    """Some lie far beside the body, in both lists."""
+    beside = MARKERS * np.array([[1.1], [1.4], [1.2], [1.7]])
+    more = touched(tmp_path, T_BASE_CT) + "fle_mm = 0.5\n"
+    path = stating(tmp_path, more=more)
+    (tmp_path / "markers_ct.csv").write_text(points_file(beside, "ABCD"))
+    (tmp_path / "touched.csv").write_text(points_file(apply(T_BASE_CT, beside), "ABCD"))
+    assert any("skin" in line for line in prepare(path, arm=False).anatomy.warnings)
 
 
 @pytest.mark.parametrize("keys", KEYS[1:])
@@ -184,14 +206,19 @@ def test_a_transform_of_another_image_is_refused_by_markers(tmp_path):
 def test_the_declared_errors_are_the_measure(tmp_path, deviation_mm, doubted):
     """4 mm apart, by what ``[errors]`` declares of the readings."""
     declared = f"[errors]\nct_pixel_mm = {deviation_mm}\nct_spacing_mm = 1.0\ntouch_mm = {deviation_mm}\n"
-    (line,) = warnings_of(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 4.0) + declared))
+    more = touched(tmp_path, T_BASE_CT, 4.0) + "accept_symmetry = true\n" + declared
+    (line,) = compared(stating(tmp_path, more=more))
     assert "4.0 mm from where" in line and ("more than their errors explain" in line) == doubted
 
 
 def test_large_declared_errors_allow_more(tmp_path):
     """12 mm apart is no contradiction where a marker errs by 10 mm."""
-    said = warnings_of(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 12.0) + "fle_mm = 10.0\n"))
-    assert "12.0 mm" in said[0]
+    more = touched(tmp_path, T_BASE_CT, 12.0) + "fle_mm = 10.0\n"
+    with pytest.raises(InputError, match="a slip in the marker names would pass unnoticed"):
+        prepare(stating(tmp_path, more=more), arm=False)
+    path = stating(tmp_path, more=more + "accept_symmetry = true\n")
+    assert "12.0 mm" in compared(path)[0]
+    assert any("accepted by accept_symmetry" in line for line in prepare(path, arm=False).anatomy.warnings)
 
 
 def test_the_warning_is_in_text_json_and_page(tmp_path, capfd):

@@ -15,8 +15,8 @@ RAS_OF_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Its own inverse."""
 NO_RESIDUALS = "stated transform {file}: no residuals, expected error unknown"
 
-_OF_MARKERS = ("method", "correct", "correct_joints_deg", "accept_residuals", "accept_symmetry")
-_OF_COMPARISON = ("use", "fle_mm")
+_OF_MARKERS = ("method", "correct", "correct_joints_deg")
+_OF_COMPARISON = ("use", "fle_mm", "accept_residuals", "accept_symmetry")
 
 
 class RegistrationSection(Section):

@@ -50,7 +50,8 @@ def check_names(case: Case, skin: Skin, registration: Registration) -> tuple[str
 
 
 def _accepted(case: Case) -> bool:
-    return case.registration is not None and case.registration.accept_symmetry
+    stated = case.registration or case.robot.stated
+    return stated is not None and stated.accept_symmetry
 
 
 def _worst(found: Sequence[Renaming]) -> str:

@@ -84,13 +84,25 @@ class Reading:
         return f"the patient lies {lies} and the robot's z axis {np.degrees(self.tilt):.0f} deg from up"
 
 
-def check_transform(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> tuple[str, ...]:
-    """Hold a stated transform against markers, where the case has them, and against what physics excludes.
+def markers_beside(case: Case, stated: RegistrationSection) -> Registration | None:
+    """What the markers beside a stated transform say; None without them.
+
+    Raises:
+        InputError: As `registered`.
+    """
+    return None if stated.markers_ct is None else registered(case, MarkerSection(**stated.model_dump()))
+
+
+def check_transform(
+    case: Case, skin: TriangleMesh, T_base_ct: Floats, registration: Registration | None = None
+) -> tuple[str, ...]:
+    """Compare a stated transform with the markers beside it, if any, and with what physics excludes.
 
     Args:
         case: Nothing is done where it states no transform.
         skin: CT frame.
         T_base_ct: Shape (4, 4), mm, as stated.
+        registration: Of `markers_beside`, whose own checks are `check_markers`.
 
     Returns:
         Warnings, one sentence each.
@@ -105,9 +117,11 @@ def check_transform(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> tuple[
     others = [_reading(case, skin, keys, T) for keys, T in other_readings(stated, T_base_ct).items()]
     if given.impossible:
         _refuse(case, f"{given.impossible}: {CAUSES}{_better(others)}")
-    if stated.markers_ct is not None:
-        return (_held_against_markers(case, stated, given, others),)
-    return tuple(_doubts(case, given, others))
+    if registration is None:
+        return tuple(_doubts(case, given, others))
+    compared = _held_against_markers(case, registration, given, others)
+    told_apart = [one for one in others if not _apart(case, registration, one.T_base_ct).contradicts]
+    return (compared, *_doubts(case, given, told_apart))
 
 
 def _reading(case: Case, skin: TriangleMesh, keys: str, T_base_ct: Floats) -> Reading:
@@ -158,13 +172,12 @@ def _doubts(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[s
         )
 
 
-def _held_against_markers(case: Case, stated: RegistrationSection, given: Reading, others: Sequence[Reading]) -> str:
+def _held_against_markers(case: Case, registration: Registration, given: Reading, others: Sequence[Reading]) -> str:
     """How far the transform is from what the markers say.
 
     Raises:
         InputError: Too far for both to be of one patient and robot.
     """
-    registration = registered(case, MarkerSection(**stated.model_dump()))
     found = _apart(case, registration, given.T_base_ct)
     said = (
         f"the markers put {found.where} {found.apart_mm:.1f} mm from where the stated transform puts it; expected of "
@@ -175,7 +188,7 @@ def _held_against_markers(case: Case, stated: RegistrationSection, given: Readin
         better = "".join(f"; with {one.keys} they agree" for one in fitting)
         _refuse(case, f"{said}: {CAUSES}{better}")
     doubt = ", more than their errors explain" if found.unexplained else ""
-    return f"registration: stated transform {stated.transform}: {said}{doubt}; its own expected error is unknown"
+    return f"registration: stated transform: {said}{doubt}; its own expected error is unknown"
 
 
 @dataclass(frozen=True)

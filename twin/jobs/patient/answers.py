@@ -27,7 +27,7 @@ from puncture_twin.planning.formats.points.raw_points import parse_coordinate
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.registration.advice import OneMore, odd_branches, one_more, without_each
-from puncture_twin.planning.registration.checks.marker_check import checked_placement
+from puncture_twin.planning.registration.checks.checked_placement import checked_placement
 from puncture_twin.planning.registration.checks.squareness import Squareness, check_squareness
 from puncture_twin.planning.registration.checks.touching import touchable_points
 from puncture_twin.planning.registration.fits.method import LEAST_FOUND_MM

@@ -22,7 +22,7 @@ from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.base.whole_lines import unfinished_warnings
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.raw_mesh import decode_text
-from puncture_twin.planning.registration.checks.marker_check import checked_placement
+from puncture_twin.planning.registration.checks.checked_placement import checked_placement
 from puncture_twin.twin.jobs.extras import require_extra
 
 JOINT_COLUMNS = tuple(f"q{joint}_rad" for joint in range(1, 7))
