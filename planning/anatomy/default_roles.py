@@ -382,6 +382,15 @@ NEVER_CROSSED = frozenset(
 )
 """Groups that no path crosses because they hold the target too: masks overlap, and a lesion may lie on a vessel."""
 
+OTHER_VESSELS = "other vessels"
+VESSEL_WORDS = frozenset(
+    (
+        *("artery", "arteries", "arteria", "arteriae", "vein", "veins", "vena", "venae", "vessel", "vessels"),
+        *("aorta", "aneurysm"),
+    )
+)
+"""Words of a vessel's name; ``tumor_artery`` is one, ``hypervascular_lesion`` is none."""
+
 
 def default_role(name: str, region: str) -> DefaultRole | None:
     """The line of the table that a name belongs to, or None.
@@ -406,7 +415,9 @@ def never_crossed(name: str) -> DefaultRole | None:
     Args:
         name: A structure's, in any spelling; in any region.
     """
-    lines = (default_role(name, region) for region in ("other", *BY_REGION))
+    lines = [default_role(name, region) for region in ("other", *BY_REGION)]
+    if not VESSEL_WORDS.isdisjoint(plain_name(name).split("_")):  # of a lesion, or of anything else
+        lines += [line for line in GENERAL if line.group == OTHER_VESSELS]
     return next((line for line in lines if line is not None and line.group in NEVER_CROSSED), None)
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from puncture_twin.planning.anatomy.crossed_names import named_as_crossed
 from puncture_twin.planning.anatomy.default_roles import (
     BODY,
     LESION,
@@ -32,7 +33,9 @@ CELLS = 64
 """Along the longest edge of a structure's box, to find its deepest point."""
 
 
-NOT_KNOWN = "; the table of default roles does not know the name, and every safe path ends in it: is it no vessel?"
+NOT_KNOWN = (
+    "; the table of default roles does not know the whole name, and every safe path ends in it: is it no vessel?"
+)
 """Of a target's structure."""
 
 
@@ -97,7 +100,8 @@ def typed_target(
     chosen = chosen_target(names)
     _refuse_in_danger(point_ct, chosen, space, _other_reading(point_ct, segmentations, space, names))
     holding = Holding(chosen, frozenset(names) - {chosen})
-    unsure = "" if default_role(chosen, "other") else NOT_KNOWN
+    line = default_role(chosen, "other")
+    unsure = NOT_KNOWN if line is None or (line == LESION and not named_as_crossed(chosen)) else ""
     return Target(point_ct, holding, (f"the target lies in '{chosen}', which is the target's structure{unsure}",))
 
 

@@ -11,6 +11,8 @@ DANGERS = {
     "German": ["Rückenmark", "Herz", "Darm", "Galle", "Lungenvene", "Nierenvene", "Pfortader", "Bauchschlagader"],
     "French": ["moelle épinière", "cœur", "intestin", "vésicule", "artère pulmonaire", "veine rénale", "vaisseau"],
     "of an organ": ["liver veins", "kidney_pelvis", "lung vessels", "thyroid cartilage", "pancreas duct"],
+    "of a lesion": ["Tumorvene", "Metastasenarterie", "hccvein", "GTVein", "Tumorgefäße", "tumor feeder"],
+    "of an adjective": ["left middle cerebral", "posterior_inferior_cerebellar", "lymph", "femoris", "spinae"],
     "no names": ["Segment_1", "label 7", "structure", "left"],
 }
 CROSSED = [
@@ -21,6 +23,10 @@ CROSSED = [
     "liver tumour 2",
     "lung_upper_lobe_left",
     "L_adrenal gland",
+    "left cerebral white matter",
+    "erector spinae",
+    "lymph node 3",
+    "GTV1",
 ]
 
 
@@ -54,6 +60,14 @@ def test_an_unknown_name_is_no_target_beside_an_organ():
     assert chosen_target(["AAA", "liver", "gtv 1"]) == "gtv 1"
     assert chosen_target(["aorta", "liver"]) == "aorta"
     assert chosen_target(["SMA", "qwerty"]) == "SMA"
+
+
+@pytest.mark.parametrize("name", ["tumor-artery", "lung_lesion_vessels", "peritumoralVessels", "aneurysm mass"])
+def test_a_vessel_of_a_lesion_is_a_vessel(name):
+    """As a target it was a lesion by its name, and nothing kept the needle out of it."""
+    line = never_crossed(name)
+    assert line is not None and line.group == "other vessels"
+    assert never_crossed("hypervascular lesion") is None and never_crossed("brainstem tumour") is None
 
 
 def test_a_foreign_word_beside_known_ones_is_never_crossed(rng):
