@@ -20,6 +20,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import check_writable
 from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.twin.jobs.batch.commands import batch_app
+from puncture_twin.twin.jobs.collector import late_collection
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, exit_code_of
 from puncture_twin.twin.jobs.extras import require_extra
 from puncture_twin.twin.jobs.first_use import compiling_beside
@@ -35,6 +36,7 @@ from puncture_twin.twin.jobs.options import (
     SourceArgument,
     with_choice,
 )
+from puncture_twin.twin.jobs.second_process import second_process
 from puncture_twin.twin.jobs.terminal import default_out, print_answer
 from puncture_twin.twin.report.progress import progress_display
 
@@ -77,11 +79,13 @@ def _without_command(context: typer.Context, version: VersionOption = False) -> 
 def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> None:
     """The main job on the embedded abdomen: search, plan, rehearse, report."""
     require_extra("twin", "demo")
-    from puncture_twin.planning.search.context import prepare
-    from puncture_twin.twin.jobs.patient import main_job, text
+    from puncture_twin.twin.jobs.rehearser import get_ready
 
-    with progress_display() as progress, compiling_beside():
-        run = main_job.demo_case(prepare(meshes_folder() / "abdomen", watcher=progress), out_dir)
+    with progress_display() as progress, compiling_beside(), second_process(get_ready) as beside:
+        from puncture_twin.planning.search.context import prepare
+        from puncture_twin.twin.jobs.patient import main_job, text
+
+        run = main_job.demo_case(prepare(meshes_folder() / "abdomen", watcher=progress), out_dir, beside)
     print_answer(run.summary(), text.rehearsal_text(run), as_json)
 
 
@@ -106,7 +110,7 @@ def init(
     as_json: JsonOption = False,
 ) -> None:
     """Write FOLDER/case.toml from what is in the folder: roles and margins from the table of default roles."""
-    from puncture_twin.planning.case.case_schema import Region
+    from puncture_twin.planning.case.case_file import Region
     from puncture_twin.planning.init.finder import Wanted
     from puncture_twin.planning.init.start import Request
     from puncture_twin.twin.jobs.patient.init_job import init_case, init_text
@@ -300,6 +304,7 @@ def rehearse(
     from puncture_twin.twin.jobs.patient import main_job, text
     from puncture_twin.twin.jobs.patient.case_or_plan import case_of, is_plan
     from puncture_twin.twin.jobs.patient.run import RoomCount
+    from puncture_twin.twin.jobs.rehearser import get_ready
 
     if physics > (seeds or 0):
         raise InputError("--physics runs some of the rooms", where="--physics", allowed="--seeds N --physics K, K <= N")
@@ -312,11 +317,11 @@ def rehearse(
     if planned_case is None:
         raise InputError("a plan needs its case", where=source, allowed="rehearse plan.json --case CASE")
     with progress_display() as progress, compiling_beside():
-        context = prepare(planned_case, watcher=progress)
         if is_plan(source):
-            run = main_job.rehearse_plan(context, source, folder, rooms)
+            run = main_job.rehearse_plan(prepare(planned_case, watcher=progress), source, folder, rooms)
         else:
-            run = main_job.rehearse_case(context, folder, rooms, choice)
+            with second_process(get_ready) as beside:
+                run = main_job.rehearse_case(prepare(planned_case, watcher=progress), folder, rooms, choice, beside)
     print_answer(run.summary(), text.rehearsal_text(run), as_json)
 
 
@@ -696,7 +701,8 @@ def _out(named: Path | None, source: Path, command: str) -> Path:
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: more threads only wait for one another
-    return exit_code_of(partial(app, arguments, standalone_mode=False), partial(print, file=sys.stderr))
+    with late_collection():
+        return exit_code_of(partial(app, arguments, standalone_mode=False), partial(print, file=sys.stderr))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,8 @@
     python -m benchmarks.approach_planners [--problems N]
 
 The problems are those of benchmarks/approach.py beside a gantry. Each planner gets one run of at most 4,000 samples
-(how often it asks whether to stop) within half a turn of home and goals, and the shortcuts; times are CPU seconds.
+(how often it asks whether to stop) within half a turn of home and goals, and the product's shortcuts, with their
+clearance; times are CPU seconds.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from benchmarks.approach import Scene, scenes
 from puncture_twin.planning.motion import joint_space, rrt_connect, shortest
 from puncture_twin.planning.motion.path_check import path_length
 from puncture_twin.planning.motion.rrt_connect import Limits, connect
+from puncture_twin.planning.motion.shortcuts import CLEARANCE_MM
 from puncture_twin.planning.motion.shortest import NEAR_RAD, Task
 
 SAMPLES = 4000
@@ -82,8 +84,9 @@ def one(scene: Scene, number: int) -> tuple[float, int, float]:
         return check(start, end)
 
     task = Task(scene.fast.model.joint_limits, contact_of, home, goals)
+    limits, clear_of = Limits(shortest._box(task, NEAR_RAD), SAMPLES), scene.fast.segment_checker(CLEARANCE_MM)
     begin = process_time()
-    found = connect(contact_of, home, goals, Limits(shortest._box(task, NEAR_RAD), SAMPLES), seed=50 * number)
+    found = connect(contact_of, home, goals, limits, seed=50 * number, clear_of=clear_of)
     spent = process_time() - begin
     return spent, count[0], float("nan") if found.waypoints is None else path_length(found.waypoints)
 

@@ -27,8 +27,7 @@ from puncture_twin.planning.base.cache.memory import Memory
 from puncture_twin.planning.base.progress import Silent
 from puncture_twin.planning.batch.plan import PlannedCase, read_plan_table
 from puncture_twin.planning.batch.run import Request, run_cohort
-from puncture_twin.planning.batch.run_case import CaseTask, run_case
-from puncture_twin.planning.batch.worker import MEMORY_BYTES
+from puncture_twin.planning.batch.run_case import MEMORY_BYTES, CaseTask, run_case
 from puncture_twin.planning.batch.workers import NO_LIMITS, run_tasks
 from puncture_twin.planning.case.options import case_options
 from puncture_twin.planning.search.context import prepare

@@ -56,8 +56,8 @@ RESIDUALS = tuple(
 """Without those that draw thousands of registrations."""
 
 REGISTRATION = (
-    "tests/registration/test_registration_limits.py",
-    "tests/registration/test_registration.py",
+    *(f"tests/registration/test_{name}.py" for name in ("registration_limits", "registration", "declared_errors")),
+    *(f"tests/registration/test_{name}.py" for name in ("register_command", "fits", "odd_marker")),
     *RESIDUALS,
 )
 
@@ -77,7 +77,7 @@ PLAIN = MappingProxyType(
         "puncture_twin.planning.registration.marker_pairs": REGISTRATION,
         **{
             f"puncture_twin.planning.registration.fits.{name}": REGISTRATION
-            for name in ("least_squares", "triad", "weighted", "affine", "method", "residual_checks")
+            for name in ("least_squares", "weighted", "method", "residual_checks")
         },
         "puncture_twin.planning.registration.registration": REGISTRATION,
     }
@@ -89,7 +89,10 @@ KERNELS = MappingProxyType(
         "puncture_twin.planning.clearance.kernels.segment_triangle": ("tests/clearance/test_plain_kernels.py",),
         "puncture_twin.planning.clearance.kernels.side_by_side": ("tests/clearance/test_plain_kernels.py",),
         "puncture_twin.planning.clearance.kernels.nearest_triangle": ("tests/clearance/test_plain_kernels.py",),
-        "puncture_twin.planning.geometry.crossings": ("tests/clearance/test_plain_kernels.py",),
+        "puncture_twin.planning.geometry.crossings": (
+            "tests/clearance/test_plain_kernels.py",
+            "tests/geometry/test_crossings.py",
+        ),
     }
 )
 """A sample of these."""

@@ -33,7 +33,7 @@ from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInIma
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth, jog_into_slice
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
-from puncture_twin.twin.jobs.selfcal.drawn_workcell import draw_workcell
+from puncture_twin.twin.jobs.selfcal.selfcal import draw_workcell
 
 CASE = Path(__file__).resolve().parents[1] / "meshes" / "selfcal"
 IMAGE_MM, DIRECTION_RAD = 0.1, float(np.radians(0.3))

@@ -48,8 +48,7 @@ from puncture_twin.planning.registration.touch_poses import touching_configurati
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.organs import organ_candidates
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
-from puncture_twin.planning.uncertainty.hit import hit_in_ball
-from puncture_twin.planning.uncertainty.hit_model import HitModel, hit_model
+from puncture_twin.planning.uncertainty.hit import HitModel, hit_in_ball, hit_model
 from puncture_twin.planning.uncertainty.limits import demanding
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -28,8 +29,8 @@ PROBE = Path(__file__).with_name("wait_probe.py")
 
 Seconds = dict[str, float]
 
-ALL, CLOCK = "all", "by the clock"
-"""The last rows: processor seconds of everything, and seconds of the clock."""
+END, ALL, CLOCK = "Python's end", "all", "by the clock"
+"""The last rows: processor seconds after the answer was there and of everything, and seconds of the clock."""
 
 
 @dataclass(frozen=True)
@@ -75,15 +76,15 @@ class Side:
         """Seconds of one run in a new process, by what was waited for."""
         answer = self.folder / "answer.json"
         words = [sys.executable, str(PROBE), str(self.checkout), str(answer), *command.words]
-        start = perf_counter()
+        start, before = perf_counter(), _used_by_others()
         done = subprocess.run(words, env=self._environment(), capture_output=True, text=True, check=False)
-        passed = perf_counter() - start
+        passed, used = perf_counter() - start, _used_by_others() - before
         if done.returncode:
             raise SystemExit(done.stderr)
         found = json.loads(answer.read_text())
         if found["exit_code"] > 1:
             raise SystemExit(f"{self.name}: {command.name} ended with {found['exit_code']}\n{done.stderr}")
-        return {**found["seconds"], CLOCK: passed}
+        return {**found["seconds"], END: used - found["seconds"][ALL], ALL: used, CLOCK: passed}
 
     def forget(self, *, compiled: bool) -> None:
         """Empty the cache folder, and that of compiled kernels too."""
@@ -95,6 +96,12 @@ class Side:
         environment = {key: value for key, value in os.environ.items() if key not in unset}
         kernels = {"NUMBA_CACHE_DIR": str(self.folder / "kernels")} if self.alone else {}
         return {**environment, "PUNCTURE_TWIN_CACHE": str(self.folder / "kept"), **kernels}
+
+
+def _used_by_others() -> float:
+    """Processor seconds of the processes that this one began and that ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def measured(command: Command, sides: list[Side], times: int, *, first_use: bool) -> dict[str, Seconds]:

@@ -31,15 +31,16 @@ FUNCTIONS = {
     "planning.search.consistency.consistency": {"check_consistency": "inputs compared"},
     "planning.clearance.fast_engine": {"FastEngine.__init__": "engine's blocks"},
     "planning.collision.workcell": {"case_checker": "workcell"},
-    "planning.search.organ_distances": {"organ_distances": "search"},
+    "planning.search.search": {"organ_distances": "search"},
     "planning.search.organs": {"organ_candidates": "search"},
     "planning.search.arm_reach": {"with_reach": "reach"},
     "planning.search.phases.arm_phases": {"with_breathing_reach": "reach"},
     "planning.search.chances.candidate_chances": {"with_chances": "chances"},
-    "planning.search.chances.best_refined": {"with_best_refined": "chances"},
+    "planning.search.chances.near_limits": {"with_best_refined": "chances"},
     "planning.search.chances.joint": {"with_joint_chances": "chances"},
     "planning.search.ranking": {"ranked": "ranking"},
     "planning.search.doubt": {"doubt_of": "chances"},
+    "twin.jobs.second_process": {"SecondProcess.end": "rehearsal and film, beside"},
 }
 """By module: what of it is timed under which name."""
 

@@ -5,7 +5,8 @@
 
 The reader follows the calls as they happen and opens each function once, when it is called first. A stay is a run of
 functions opened in one module; returns are stays minus modules. What every module knows (errors, files, progress:
-planning/base), room faces, properties, lambdas and what a decorator writes are not opened.
+planning/base), room faces, properties, lambdas and what a decorator writes are not opened, nor what is called only
+while a module is imported or a kernel compiled: the table is the same on a new machine.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ ROOT = Path(__file__).parents[1]
 KNOWN = "planning/base/"
 """What a reader of any module knows already."""
 
+OUTSIDE = ("<module>", "_compile_for_args")
+"""What Python runs as it imports a module, and numba as it compiles a kernel."""
+
 POSES = 30
 
 
@@ -40,14 +44,14 @@ class Opened:
     def __init__(self) -> None:
         self.functions: list[tuple[str, str]] = []
         self._seen: set[CodeType] = set()
-        self._importing = 0
+        self._outside = 0
 
     def __call__(self, frame: FrameType, event: str, _: object) -> None:
         """Python's profiler calls this."""
         code = frame.f_code
-        if code.co_name == "<module>":
-            self._importing += {"call": 1, "return": -1}.get(event, 0)
-        if event != "call" or self._importing or code in self._seen:
+        if code.co_name in OUTSIDE:
+            self._outside += {"call": 1, "return": -1}.get(event, 0)
+        if event != "call" or self._outside or code in self._seen:
             return
         self._seen.add(code)
         module = _module(code.co_filename)

@@ -19,8 +19,8 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.case.tables.ct_section import AIR_HU
-from puncture_twin.planning.collision.enclosures.sphere_tree import sphere_tree
+from puncture_twin.planning.case.tables.structures_section import AIR_HU
+from puncture_twin.planning.collision.bodies.sphere_tree import sphere_tree
 from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.planning.reach.standoff import skin_gaps
 from puncture_twin.planning.registration.checks.skin_fit import skin_fit

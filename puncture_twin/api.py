@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from puncture_twin.planning.search.explain import Explanation
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-    from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
+    from puncture_twin.twin.rehearsal.result import Rehearsal
 
     Points = NamedPoints | Mapping[str, ArrayLike]
     """Named points: read from a file, or name to (x, y, z) in mm."""

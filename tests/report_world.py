@@ -147,6 +147,7 @@ def make_plan(case, candidates):
         approach=Trajectory(np.linspace(0, 1, 20), home * (1 - share) + q[0] * share),
         insertion=Trajectory(np.linspace(0, 1, len(q)), q),
         clearance_mm={"approach": 12.0, "insertion": 9.0, "needle": 5.0},
+        warnings=(),
     )
 
 

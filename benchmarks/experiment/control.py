@@ -24,7 +24,7 @@ from benchmarks.experiment.workbench import (
     true_tip,
 )
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.plant.true_tissue import Felt
+from puncture_twin.twin.plant.felt import Felt
 from puncture_twin.twin.world.client import step
 from puncture_twin.twin.world.control.admittance import Admittance, VirtualMass
 from puncture_twin.twin.world.engine import pybullet

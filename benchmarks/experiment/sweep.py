@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.experiment.row import Row
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.case.tables.rehearsal_section import RehearsalSection
+from puncture_twin.planning.case.tables.errors_section import RehearsalSection
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.sweep.sweep_planner import plan_sweep
 from puncture_twin.twin.rehearsal.sweeping import execute_sweep

@@ -11,20 +11,22 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.beyond_labels import beyond_labels
 from puncture_twin.planning.anatomy.body.support import support_warnings
-from puncture_twin.planning.anatomy.own_target import own_target
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.sources import StructureSources
 from puncture_twin.planning.anatomy.structure import Role as Role, Structure as Structure
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.stated_count import count_difference
+from puncture_twin.planning.case.case_file import count_difference
+from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.meshes.mesh_warnings import kept_mesh_warnings
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
 OUTSIDE_BODY, ATTACHED_LIMB = "outside_body", "attached_limb"
@@ -52,6 +54,11 @@ LABELS_TRUSTED = "search.trust_labels: what the CT shows inside the body beside 
 
 ON_SURFACE_MM = 1e-3
 """A target this close to its structure's surface lies on it: meshes in single precision round to 1e-5 mm."""
+
+CELLS = 24
+"""Along the ball's diameter."""
+OWN_TARGET = "target.hit_radius_mm"
+"""Where the ball comes from."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,3 +240,27 @@ def _check_target(case: Case, structures: list[Structure], skin: Skin) -> None:
                 where=case.path,
                 allowed="a point inside target.structure",
             )
+
+
+def own_target(case: Case) -> Iterator[Structure]:
+    """The target as a structure of its own, where the case names none that holds it."""
+    if case.own_target and case.hit_radius_mm is not None:
+        mesh = ball(case.target_ct, case.hit_radius_mm)
+        yield Structure(case.target_structure, Role.TARGET, 0.0, mesh, OWN_TARGET)
+
+
+def ball(middle_ct: Floats, radius_mm: float) -> TriangleMesh:
+    """The surface of a ball, to a hundredth of its radius.
+
+    Args:
+        middle_ct: Shape (3,), mm.
+        radius_mm: Its radius.
+    """
+    cell = 2.0 * radius_mm / CELLS
+    count = CELLS + 3
+    offset = (np.arange(count) - (count - 1) / 2) * cell
+    x, y, z = np.meshgrid(offset, offset, offset, indexing="ij")
+    field = radius_mm - np.sqrt(x**2 + y**2 + z**2)
+    field[field == 0.0] = -np.finfo(np.float32).eps
+    T_ct_index = pose(np.eye(3) * cell, middle_ct + offset[0])
+    return field_surface(field / radius_mm, T_ct_index, where=OWN_TARGET)

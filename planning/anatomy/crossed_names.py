@@ -1,12 +1,15 @@
 """Names that say by every one of their words that a needle may cross what they name: an organ of solid tissue.
 
 A word that is not in these lists may be anything: "liver veins", ``A. pulmonalis`` and ``Lungenvene`` are named after
-organs that a needle crosses, and are none. So what is not told wholly is not crossed.
+organs that a needle crosses, and are none. So what is not told wholly is not crossed. And vessels and nerves are often
+named by adjectives alone: "superior thyroid" leaves out the artery, so a position needs a part or a noun of its own.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from types import MappingProxyType
 
 from puncture_twin.planning.anatomy.default_roles import plain_name
 
@@ -47,35 +50,48 @@ SOFT_TISSUES = frozenset(
 )
 """Muscles and fat, which needles pass."""
 
-QUALIFIERS = frozenset(
+WALLS = frozenset(("internal", "external", "internus", "externus"))
+"""Of muscles of a wall (``external_oblique``); beside a bone they are a vessel's: "internal iliac"."""
+
+LEVELS_OF_CORD = frozenset(("cervical", "thoracic", "lumbar"))
+
+POSITIONS = (
+    WALLS
+    | LEVELS_OF_CORD
+    | {
+        *("middle", "superior", "inferior", "anterior", "posterior", "medial", "lateral", "intermediate", "medius"),
+    }
+)
+"""Said of vessels and nerves, which are then named after an organ without a noun of their own: "superior thyroid"."""
+
+PARTS = frozenset(
     (
-        *("left", "right", "l", "r", "upper", "middle", "lower", "superior", "inferior", "anterior", "posterior"),
-        *("medial", "lateral", "internal", "external", "intermediate", "major", "minor", "maximus", "medius"),
-        *("minimus", "lobe", "lobes", "segment", "segments", "section", "cortex", "parenchyma", "tissue"),
-        *(
-            "cerebral",
-            "cerebellar",
-            "lymph",
-            "abdominis",
-            "femoris",
-            "spinae",
-            "ani",
-            "white",
-            "grey",
-            "gray",
-            "head",
-            "neck",
-            "body",
-            "tail",
-            "whole",
-            "of",
-            "the",
-        ),
-        *("and", "costal", "skeletal", "torso", "visceral", "intermuscular", "compartment", "dorsi", "scapulae"),
-        *("externus", "internus", "cervical", "thoracic", "lumbar"),
+        *("lobe", "lobes", "segment", "segments", "section", "cortex", "parenchyma", "tissue", "hemisphere"),
+        *("gland", "glands", "node", "nodes"),
     )
 )
+"""Parts of an organ: beside one of them a position is its own, as in ``lung_upper_lobe``."""
+
+QUALIFIERS = (
+    POSITIONS
+    | PARTS
+    | {
+        *("left", "right", "l", "r", "upper", "lower", "major", "minor", "maximus", "minimus"),
+        *("cerebral", "cerebellar", "lymph", "abdominis", "femoris", "spinae", "ani", "white", "grey", "gray"),
+        *("head", "neck", "body", "tail", "whole", "of", "the", "and"),
+        *("costal", "skeletal", "torso", "visceral", "intermuscular", "compartment", "dorsi", "scapulae"),
+    }
+) - ORGANS
 """What is said of an organ besides: a side, a part, a kind. Alone it may be said of a vessel: ``middle cerebral``."""
+
+NEEDS: Mapping[str, frozenset[str]] = MappingProxyType(
+    {
+        "rectus": frozenset(("abdominis", "femoris")),
+        "oblique": WALLS | {"abdominis"},
+        "levator": frozenset(("ani", "scapulae")),
+    }
+)
+"""Muscles of which some move the eye: which one it is must be said."""
 
 DIGITS = "0123456789"
 LEVEL = re.compile(r"[clst]?\d+")
@@ -92,8 +108,29 @@ def named_as_crossed(name: str) -> bool:
     (True, True, True)
     >>> named_as_crossed("liver veins"), named_as_crossed("Tumorvene"), named_as_crossed("left middle cerebral")
     (False, False, False)
+    >>> named_as_crossed("superior thyroid"), named_as_crossed("superior thyroid lobe")
+    (False, True)
     """
-    words = [word for word in plain_name(name).split("_") if word not in QUALIFIERS and not LEVEL.fullmatch(word)]
-    return bool(words) and all(
-        word in ORGANS | BONES | SOFT_TISSUES or word.rstrip(DIGITS) in LESIONS for word in words
-    )
+    words = frozenset(plain_name(name).split("_"))
+    nouns = [word for word in words if word not in QUALIFIERS and not LEVEL.fullmatch(word)]
+    lesion = any(_is_lesion(word) for word in nouns)
+    known = all(word in ORGANS | BONES | SOFT_TISSUES or _is_lesion(word) for word in nouns)
+    return bool(nouns) and known and (lesion or not _may_lack_its_noun(words))
+
+
+def named_as_lesion(name: str) -> bool:
+    """Whether every word of a name is known, and one of them is a lesion: a ``Tumorvene`` is none."""
+    return named_as_crossed(name) and any(_is_lesion(word) for word in plain_name(name).split("_"))
+
+
+def _is_lesion(word: str) -> bool:
+    return word.rstrip(DIGITS) in LESIONS
+
+
+def _may_lack_its_noun(words: frozenset[str]) -> bool:
+    """Whether known words may be said of a vessel, a nerve, the cord or a muscle of the eye."""
+    placed = words & POSITIONS
+    of_organ = bool(placed and words & ORGANS and not words & PARTS)
+    of_bone = bool(words & WALLS and words & BONES)
+    of_cord = "matter" in words and any(word in POSITIONS or LEVEL.fullmatch(word) for word in words)
+    return of_organ or of_bone or of_cord or any(noun in words and not words & NEEDS[noun] for noun in NEEDS)

@@ -11,8 +11,8 @@ import scipy
 from puncture_twin.planning.anatomy.skin import FieldOfView, Skin
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
+from puncture_twin.planning.geometry.crossings import settled_crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.settled_crossings import settled_crossings
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
 SAMPLES = 1000

@@ -19,18 +19,20 @@ class Organ(NamedTuple):
         name: What a person reads.
         words: What a structure's name may hold, in lower case without spaces and signs; one is enough.
         paired: Whether there is one on each side.
+        conduit: Whether it is itself a vessel or a nerve.
     """
 
     name: str
     words: tuple[str, ...]
     paired: bool = False
+    conduit: bool = False
 
 
-AORTA = Organ("aorta", ("aorta",))
+AORTA = Organ("aorta", ("aorta",), conduit=True)
 BOWEL = Organ("small bowel", ("smallbowel", "smallintestine", "intestinesmall", "jejunum", "ileum", "intestinumtenue"))
 BRAIN = Organ("brain", ("brain", "cerebrum", "cerebr", "encephalon"))
-CAROTID = Organ("carotid arteries", ("carotid", "carotis"), paired=True)
-CAVA_INFERIOR = Organ("inferior vena cava", ("inferiorvenacava", "venacavainferior", "cavainf", "ivc"))
+CAROTID = Organ("carotid arteries", ("carotid", "carotis"), paired=True, conduit=True)
+CAVA_INFERIOR = Organ("inferior vena cava", ("inferiorvenacava", "venacavainferior", "cavainf", "ivc"), conduit=True)
 COLON = Organ("colon", ("colon", "largebowel", "largeintestine", "intestinelarge"))
 CORD = Organ("spinal cord", ("spinalcord", "medullaspinalis", "myelon", "spinalcanal"))
 HEART = Organ("heart", ("heart", "cor", "cardi", "ventric", "atrium"))
@@ -56,7 +58,7 @@ USUAL: Mapping[str, tuple[Organ, ...]] = MappingProxyType(
             KIDNEYS,
             AORTA,
             CAVA_INFERIOR,
-            Organ("portal vein", ("portal", "portavein", "venaporta")),
+            Organ("portal vein", ("portal", "portavein", "venaporta"), conduit=True),
             LUNGS,
             RIBS,
             SPINE,
@@ -65,8 +67,12 @@ USUAL: Mapping[str, tuple[Organ, ...]] = MappingProxyType(
             LUNGS,
             HEART,
             AORTA,
-            Organ("pulmonary artery", ("pulmonaryartery", "pulmonarytrunk", "pulmonaryvein", "arteriapulmonalis")),
-            Organ("superior vena cava", ("superiorvenacava", "venacavasuperior", "cavasup", "svc")),
+            Organ(
+                "pulmonary artery",
+                ("pulmonaryartery", "pulmonarytrunk", "pulmonaryvein", "arteriapulmonalis"),
+                conduit=True,
+            ),
+            Organ("superior vena cava", ("superiorvenacava", "venacavasuperior", "cavasup", "svc"), conduit=True),
             OESOPHAGUS,
             TRACHEA,
             RIBS,
@@ -77,8 +83,8 @@ USUAL: Mapping[str, tuple[Organ, ...]] = MappingProxyType(
             Organ("urinary bladder", ("bladder", "vesicaurinaria")),
             Organ("rectum or colon", ("rectum", *COLON.words)),
             BOWEL,
-            Organ("iliac arteries", ("iliacartery", "arteriailiaca"), paired=True),
-            Organ("iliac veins", ("iliacvein", "iliacvena", "venailiaca"), paired=True),
+            Organ("iliac arteries", ("iliacartery", "arteriailiaca"), paired=True, conduit=True),
+            Organ("iliac veins", ("iliacvein", "iliacvena", "venailiaca"), paired=True, conduit=True),
             Organ("hip bones", ("hip", "ilium", "pelvis", "pelvicbone", "oscoxae"), paired=True),
             Organ("sacrum", ("sacrum",)),
             Organ("femurs", ("femur",), paired=True),
@@ -88,19 +94,19 @@ USUAL: Mapping[str, tuple[Organ, ...]] = MappingProxyType(
             SKULL,
             Organ("brainstem", ("brainstem", "truncusencephali", "pons")),
             Organ("ventricles", ("ventric",)),
-            Organ("vessels", ("arter", "vein", "vena", "vessel", "sinus", "willis")),
-            Organ("optic nerves", ("optic", "chiasm")),
+            Organ("vessels", ("arter", "vein", "vena", "vessel", "sinus", "willis"), conduit=True),
+            Organ("optic nerves", ("optic", "chiasm"), conduit=True),
         ),
         "head": (
             BRAIN,
             SKULL,
             Organ("eyes", ("eye", "orbit", "bulbus"), paired=True),
-            Organ("vessels", ("arter", "vein", "vena", "vessel", "sinus", "carotid")),
+            Organ("vessels", ("arter", "vein", "vena", "vessel", "sinus", "carotid"), conduit=True),
             Organ("airway", ("airway", "pharynx", "nasal", "trachea")),
         ),
         "neck": (
             CAROTID,
-            Organ("jugular veins", ("jugular",), paired=True),
+            Organ("jugular veins", ("jugular",), paired=True, conduit=True),
             Organ("thyroid gland", ("thyroid",)),
             TRACHEA,
             OESOPHAGUS,
@@ -111,15 +117,20 @@ USUAL: Mapping[str, tuple[Organ, ...]] = MappingProxyType(
         "spine": (SPINE, CORD, AORTA, CAVA_INFERIOR, KIDNEYS, LUNGS),
         "limb": (
             Organ("bone", ("bone", "femur", "tibia", "fibula", "humerus", "radius", "ulna", "patella")),
-            Organ("artery", ("arter",)),
-            Organ("vein", ("vein", "vena")),
-            Organ("nerve", ("nerv",)),
+            Organ("artery", ("arter",), conduit=True),
+            Organ("vein", ("vein", "vena"), conduit=True),
+            Organ("nerve", ("nerv",), conduit=True),
         ),
         "phantom": (),
         "other": (),
     }
 )
 """Region to its usual organs."""
+
+NOT_THE_ORGAN = re.compile(
+    r"arter(y|ies|ia|iae)|veins?|vena|venae|vessels?|nerves?|nervus|ducts?|cysts?|(tumou?r|lesion|nodule)s?"
+)
+"""A word that makes a name that of a vessel, a duct or a lesion of an organ: "liver vessels" are no liver."""
 
 _SIDES: Mapping[str, frozenset[str]] = MappingProxyType(
     {
@@ -154,6 +165,11 @@ class _Name(NamedTuple):
         sides = frozenset(side for side, said in _SIDES.items() if said & set(words))
         return cls("".join(words), words, sides or frozenset(_SIDES))
 
+    @property
+    def is_of_an_organ(self) -> bool:
+        """Whether it says of itself that it is a vessel, a nerve, a duct or a lesion."""
+        return any(NOT_THE_ORGAN.fullmatch(word) for word in self.words)
+
     def is_like(self, word: str) -> bool:
         """Long words may stand anywhere in the name; short ones begin one of its words, so that `ren` is no adrenal."""
         if len(word) > 5:
@@ -162,7 +178,8 @@ class _Name(NamedTuple):
 
 
 def _absent(organ: Organ, names: list[_Name]) -> Iterator[str]:
-    alike = [name for name in names if any(name.is_like(word) for word in organ.words)]
+    own = names if organ.conduit else [name for name in names if not name.is_of_an_organ]
+    alike = [name for name in own if any(name.is_like(word) for word in organ.words)]
     if not alike:
         yield organ.name
     elif organ.paired:

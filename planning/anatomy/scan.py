@@ -13,7 +13,7 @@ import scipy
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.attached_limbs import attached_limbs
-from puncture_twin.planning.anatomy.body.body_mask import BodyMask, body_mask
+from puncture_twin.planning.anatomy.body.body_mask import BodyMask, body_mask, outside_air_fraction
 from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
 from puncture_twin.planning.anatomy.body.flat_side import FlatSide
 from puncture_twin.planning.anatomy.body.outside_body import (
@@ -27,7 +27,6 @@ from puncture_twin.planning.anatomy.body.outside_body import (
     outside_mask,
     outside_surface,
 )
-from puncture_twin.planning.anatomy.body.room_air import outside_air_fraction
 from puncture_twin.planning.anatomy.body.support import FACES, find_support
 from puncture_twin.planning.anatomy.body.unscanned import measured_hu, unscanned_voxels
 from puncture_twin.planning.anatomy.second_witness import BodyImage, Named, Unnamed, unnamed_surfaces

@@ -15,8 +15,7 @@ from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Names
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.tables.structure_section import StructureSection
-from puncture_twin.planning.case.tables.structures_section import StructuresSection
+from puncture_twin.planning.case.tables.structures_section import StructureSection, StructuresSection
 from puncture_twin.planning.formats.labels.mask_folder import check_one_grid
 from puncture_twin.planning.formats.labels.naming import BUILT_IN, LabelRule, RuleKind, names_for, select
 from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh

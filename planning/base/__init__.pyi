@@ -13,7 +13,11 @@ from .files import (
     is_plain_file as is_plain_file,
 )
 from .html import Facts as Facts, card as card, escape as escape, never_raises as never_raises
-from .input_file import read_input as read_input
+from .input_file import (
+    decode_text as decode_text,
+    read_input as read_input,
+    unfinished_warnings as unfinished_warnings,
+)
 from .polar_map import Sectors as Sectors, polar_map as polar_map
 from .processes import map_all as map_all, process_pool as process_pool, worker_count as worker_count
 from .progress import Count as Count, Silent as Silent, Stages as Stages, Watcher as Watcher, uncounted as uncounted
@@ -41,4 +45,3 @@ from .toml_file import (
     parse_toml as parse_toml,
     read_toml_bytes as read_toml_bytes,
 )
-from .whole_lines import unfinished_warnings as unfinished_warnings

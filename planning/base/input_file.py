@@ -1,4 +1,4 @@
-"""The bytes of an input file: it must be there, be a file, and have a plausible size before anything is read."""
+"""The bytes of an input file: it must be there, be a file, have a plausible size, and end a list with a whole line."""
 
 from __future__ import annotations
 
@@ -58,3 +58,27 @@ def _other_case(path: Path) -> str:
         return ""
     names = sorted(one.name for one in path.parent.iterdir() if one.name.lower() == path.name.lower())
     return names[0] if names and names[0].isprintable() else ""
+
+
+def unfinished_warnings(content: bytes, name: str) -> tuple[str, ...]:
+    """What to say of a list whose last line does not end with a line break; spaces after it are no line.
+
+    Args:
+        content: The whole file.
+        name: What the warning calls it.
+    """
+    if content.rstrip(b" \t").endswith((b"\n", b"\r")):
+        return ()
+    return (f"{name}: its last line does not end with a line break; was the file cut?",)
+
+
+def decode_text(data: bytes, where: str) -> str:
+    """The text of a file in UTF-8.
+
+    Raises:
+        InputError: If it is anything else.
+    """
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"byte {error.start} is not text", where=where, allowed="text in UTF-8") from error

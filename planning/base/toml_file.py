@@ -1,7 +1,8 @@
-"""TOML files of a stated schema: found, read and validated, with one line for whatever is wrong."""
+"""TOML files of a stated schema: found, bounded, read and validated, with one line for whatever is wrong."""
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -10,12 +11,33 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, BeforeValidator, ValidationError
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.toml_bounds import check_toml_bounds
 
 MAX_BYTES = 1_000_000
 """Such a file is written by hand; a larger one is something else."""
 
 Model = TypeVar("Model", bound=BaseModel)
+
+MAX_DEPTH = 20
+"""Brackets inside brackets; a case has four."""
+
+MAX_KEY_PARTS = 8
+"""Parts of a dotted key or table name; a case has three."""
+
+MAX_WORD = 100
+"""Characters of a number, a bare key or any other word outside of strings."""
+
+MAX_LINE = 20_000
+"""Characters of a line: a rule for each of a thousand organs fits."""
+
+MAX_TABLES = 20_000
+"""Lines that begin with a bracket: each may be a table of eight levels."""
+
+_TOKEN = re.compile(
+    r'(?P<text>"""(?:[^\\]|\\.)*?(?:"""|\Z)|\'\'\'.*?(?:\'\'\'|\Z)|"(?:[^"\\\n]|\\.)*"?|\'[^\'\n]*\'?)'
+    r"|(?P<comment>#[^\n]*)|(?P<open>[\[{])|(?P<close>[\]}])|(?P<dot>\.)|(?P<word>[^\s\"'#\[\]{}.=,]+)"
+    r"|(?P<space>[ \t]+)|(?P<other>.)",
+    re.DOTALL,
+)
 
 
 def _one(value: object) -> object:
@@ -102,3 +124,53 @@ def _said(keys: tuple[str | int, ...], message: str, kind: str) -> tuple[str, st
     if kind == "missing" and keys and isinstance(keys[-1], int):
         return ".".join(map(str, keys[:-1])), f"number {keys[-1] + 1} of the list is missing"
     return ".".join(map(str, keys)) or "top level", message
+
+
+def check_toml_bounds(text: str, where: Path | str, allowed: str) -> None:
+    """Refuse a text that is nested too deep, or has a key, a number or a line too long; it need not be TOML.
+
+    Args:
+        text: The whole file.
+        where: The file, for the error.
+        allowed: What would have been accepted in its place, for the error.
+
+    Raises:
+        InputError: Says which line goes beyond which bound.
+    """
+    tables = 0
+    for number, line in enumerate(text.split("\n"), start=1):
+        tables += line.lstrip().startswith("[")
+        if len(line) > MAX_LINE:
+            _refuse(f"has {len(line)} characters, more than {MAX_LINE}", where, number, allowed)
+        if tables > MAX_TABLES:
+            _refuse(f"begins more than {MAX_TABLES} tables", where, number, allowed)
+    depth = parts = 0
+    for token in _TOKEN.finditer(text):
+        kind, found = str(token.lastgroup), token.group()
+        depth += (kind == "open") - (kind == "close")
+        parts = _parts(parts, kind)
+        wrong = _beyond(kind, found, depth, parts)
+        if wrong:
+            _refuse(wrong, where, text.count("\n", 0, token.start()) + 1, allowed)
+
+
+def _parts(parts: int, kind: str) -> int:
+    """Parts of the key that the text is in after a token: dots join, spaces do not part, all else ends it."""
+    if kind == "dot":
+        return parts + 1
+    return parts if kind in {"word", "text", "space"} else 0
+
+
+def _beyond(kind: str, found: str, depth: int, parts: int) -> str:
+    """Which bound a token breaks, in words; the empty string where none."""
+    if depth > MAX_DEPTH:
+        return f"is nested more than {MAX_DEPTH} deep"
+    if parts > MAX_KEY_PARTS:
+        return f"has a dotted key of more than {MAX_KEY_PARTS} parts"
+    if kind == "word" and len(found) > MAX_WORD:
+        return f"has a number or a key of {len(found)} characters, more than {MAX_WORD}"
+    return ""
+
+
+def _refuse(wrong: str, where: Path | str, line: int, allowed: str) -> None:
+    raise InputError(f"line {line} {wrong}", where=where, allowed=allowed)

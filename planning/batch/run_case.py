@@ -1,11 +1,15 @@
-"""One case as a pure function: its files in, its result's folder out."""
+"""One case as a pure function, its files in, its result's folder out; and the worker that runs one after the other."""
 
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
 import shutil
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,6 +38,12 @@ WritePage = Callable[[CaseContext, Candidates, Path], None]
 """Writes a case's page into a folder."""
 
 BAD_INPUT = 2
+
+READY = "ready"
+"""A worker's first word: its modules are loaded."""
+
+MEMORY_BYTES = 500_000_000
+"""What a worker keeps of patients: the meshes and trees of some ten whole bodies."""
 
 
 @dataclass(frozen=True)
@@ -155,3 +165,29 @@ def _committed(
     timings = {"seconds": {name: round(spent, 3) for name, spent in seconds.items()}, "attempt": task.attempt}
     commit(draft, task.out, task.planned.id, inputs, timings)
     return CaseEnd(task.planned.id, row["exit_code"], row["reason"])
+
+
+def work(connection: Connection, memory_bytes: int) -> None:
+    """Run what comes until nothing more does.
+
+    Args:
+        connection: Gives `CaseTask`, takes `READY` and then a `CaseEnd` for each.
+        memory_bytes: What is kept from one case to the next.
+    """
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    memory = Memory(memory_bytes)
+    connection.send(READY)
+    while True:
+        try:
+            task: CaseTask = connection.recv()
+        except EOFError:
+            return
+        connection.send(run_case(task, memory))
+
+
+def _leave_with_parent() -> None:
+    """A worker without its main process would write on while the next run begins."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)

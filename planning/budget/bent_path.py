@@ -11,7 +11,7 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.needle.bending import Bending
+from puncture_twin.planning.needle.deflection import Bending
 from puncture_twin.planning.needle.shaft import GAUGES, Shaft
 from puncture_twin.planning.search.bending.insertion import insertion_along
 from puncture_twin.planning.uncertainty.pose_error import Bend

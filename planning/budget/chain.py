@@ -1,4 +1,4 @@
-"""The chain from scan to needle as numbers that can be changed: errors, markers, touches, and one insertion."""
+"""The chain from scan to needle as numbers that can be changed: errors, markers, touches, breath, and one insertion."""
 
 from __future__ import annotations
 
@@ -8,20 +8,44 @@ import numpy as np
 
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.breathing.breathing import Breathing
+from puncture_twin.planning.breathing.lujan import mean_square_within
 from puncture_twin.planning.budget.bent_path import BentPath
-from puncture_twin.planning.budget.breath import Breath
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.aim_correction import aimed_uncertainty
 from puncture_twin.planning.registration.fit_uncertainty import fit_uncertainty
-from puncture_twin.planning.registration.fits.triad import fit_triad
+from puncture_twin.planning.registration.fits.least_squares import fit_triad
 from puncture_twin.planning.registration.marker_noise import touches
 from puncture_twin.planning.registration.placement import default_method
 from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.uncertainty.pose_error import PoseError
+
+GATES = (None, 0.5, 0.25, 0.1)
+"""Of the needle that waits, by s; None waits for nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Breath:
+    """The breathing of a case, in its base frame.
+
+    Attributes:
+        breathing: As declared.
+        R_base_ct: Shape (3, 3).
+    """
+
+    breathing: Breathing
+    R_base_ct: Floats
+
+    def mean_square_base(self) -> Floats:
+        """Shape (3, 3), mm^2, of the target against where the CT shows it, base axes."""
+        one = self.breathing
+        moved = self.R_base_ct @ (one.amplitude_mm * one.direction_ct)
+        gate = 1.0 if one.gate is None else one.gate
+        return np.asarray(mean_square_within(gate, one.exponent, one.scanned_at) * np.outer(moved, moved))
 
 
 @dataclass(frozen=True, eq=False)

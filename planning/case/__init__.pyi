@@ -1,5 +1,7 @@
 from .angle_grid import AngleGrid as AngleGrid
+from .bed import bed_frame as bed_frame
 from .case import Case as Case, load_case as load_case
+from .case_file import count_difference as count_difference
 from .entry import (
     ANATOMICAL_LPS as ANATOMICAL_LPS,
     Directions as Directions,
@@ -13,12 +15,10 @@ from .entry import (
 from .errors import ArmUncertainty as ArmUncertainty, ErrorModel as ErrorModel
 from .mount import Axis as Axis, axes_frame as axes_frame, mount_pose as mount_pose
 from .settings import Gantry as Gantry, Needle as Needle, Obstacle as Obstacle
-from .stated_count import count_difference as count_difference
 from .tables.place_section import MountBounds as MountBounds, MountName as MountName
-from .tables.ranking_section import RankingSection as RankingSection
 from .tables.robot_section import MountSection as MountSection
-from .tables.structure_section import StructureSection as StructureSection
-from .tables.structures_section import StructuresSection as StructuresSection
+from .tables.search_section import RankingSection as RankingSection
+from .tables.structures_section import StructureSection as StructureSection, StructuresSection as StructuresSection
 from .toml_types import (
     Coordinate as Coordinate,
     Degrees180 as Degrees180,

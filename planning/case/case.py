@@ -6,8 +6,11 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 
+import numpy as np
+
 from puncture_twin.planning.arm.tool_body import ToolBody
 from puncture_twin.planning.base.arrays import Floats, read_only
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
 from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.breathing.breathing import Breathing
@@ -21,23 +24,29 @@ from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOp
 from puncture_twin.planning.case.sections.bend import bending_of
 from puncture_twin.planning.case.sections.breath import breathing_of
 from puncture_twin.planning.case.sections.robot import robot_of
-from puncture_twin.planning.case.sections.robot_place import robot_warnings
-from puncture_twin.planning.case.sections.search import search_of
 from puncture_twin.planning.case.sections.stated_errors import errors_of
-from puncture_twin.planning.case.sections.surroundings import gantry_of, obstacle_of
-from puncture_twin.planning.case.sections.target import target_of
 from puncture_twin.planning.case.sections.tool_section import tool_of
-from puncture_twin.planning.case.settings import CtSettings, Gantry, Needle, Obstacle, RobotSettings, SearchSettings
+from puncture_twin.planning.case.settings import (
+    CtSettings,
+    Gantry,
+    Needle,
+    Obstacle,
+    RobotSettings,
+    SearchSettings,
+    gantry_of,
+    obstacle_of,
+    search_of,
+)
+from puncture_twin.planning.case.tables.errors_section import RehearsalSection
 from puncture_twin.planning.case.tables.place_section import PlaceSection
-from puncture_twin.planning.case.tables.ranking_section import RankingSection
 from puncture_twin.planning.case.tables.registration_section import MarkerSection
-from puncture_twin.planning.case.tables.rehearsal_section import RehearsalSection
-from puncture_twin.planning.case.tables.structure_section import StructureSection
-from puncture_twin.planning.case.tables.structures_section import StructuresSection
-from puncture_twin.planning.case.whole_case import wholeness_warnings
+from puncture_twin.planning.case.tables.search_section import RankingSection
+from puncture_twin.planning.case.tables.structures_section import StructureSection, StructuresSection
+from puncture_twin.planning.case.whole_case import robot_warnings, wholeness_warnings
 from puncture_twin.planning.formats.labels.mask_folder import structure_name
-from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.needle.bending import Bending
+from puncture_twin.planning.formats.points.point_files import parse_points
+from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.needle.deflection import Bending
 
 ALLOWED_CASE = "a TOML case file with schema = 1 or 2, or a folder with case.toml"
 
@@ -156,10 +165,14 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
     change = partial(options.applied, where=path)
     content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md", change=change)
     read_named_files(content, path, files, case_volumes)
+    return _case_of(content, path, files, case_volumes)
+
+
+def _case_of(content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes) -> Case:
+    """What a case file and the files that it names state, in LPS (or local) mm and radians."""
     space = Space(content.space)
     target = target_of(content, path, space, files)
     robot = robot_of(content, space, path, files)
-    of_robot = robot_warnings(content, robot)
     tool = tool_of(content.tool, files, path)
     settings, placed = content.search, content.registration
     return Case(
@@ -172,6 +185,7 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
         own_target=content.target.structure is None,
         needle=Needle(**content.needle.model_dump(include={*Needle.__dataclass_fields__})),
         search=search_of(settings),
+        obstacles=tuple(obstacle_of(one, space) for one in content.obstacle),
         ranking=content.ranking,
         T_ct_entry=view_frame(entry_frame(settings.frame, space, where=path), target),
         structure=content.structure,
@@ -179,7 +193,6 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
         registration=None if placed is None or placed.transform else MarkerSection(**placed.model_dump()),
         robot=robot,
         tool=tool,
-        obstacles=tuple(obstacle_of(one, space) for one in content.obstacle),
         rehearsal=content.rehearsal,
         files=files,
         volumes=case_volumes,
@@ -188,10 +201,33 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
         place=content.place,
         stated_structures=content.stated_structures,
         region=content.region,
-        warnings=(*wholeness_warnings(content, files, path), *of_robot),
+        warnings=(*wholeness_warnings(content, files, path), *robot_warnings(content, robot)),
         hit_radius_mm=content.target.hit_radius_mm,
         errors=errors_of(content, content.errors, case_volumes, path),
         truth_errors=errors_of(content, content.rehearsal.errors, case_volumes, path, truth=True),
         breathing=breathing_of(content.breathing, space, path),
         bending=bending_of(content.needle, content.tissue, path),
     )
+
+
+def target_of(content: CaseFile, path: Path, space: Space, files: InputFiles) -> Floats:
+    """The point to reach, shape (3,), LPS (or the case's local frame) mm, read-only.
+
+    Args:
+        content: The case file.
+        path: Where it is, for errors.
+        space: The case's.
+        files: What it names, read.
+
+    Raises:
+        InputError: A list of points that cannot be read, or that lacks the target's name.
+    """
+    target = content.target
+    if target.position_mm is not None:
+        return read_only(to_lps(np.asarray([target.position_mm]), space)[0])
+    assert target.points is not None  # held by the schema
+    listed = parse_points(files.content(target.points), path.parent / target.points, default_space=space)
+    if target.name not in listed.names:
+        names = ", ".join(listed.names)
+        raise InputError(f"target.name '{target.name}' is not in {target.points}", where=path, allowed=names)
+    return read_only(listed.points[listed.names.index(target.name)].copy())

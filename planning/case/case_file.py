@@ -1,32 +1,88 @@
-"""The whole case file: its tables, and what no single table can tell. See docs/reference/case.md for the keys."""
+"""The whole case file: its tables, and what no single table can tell. See docs/reference/case.md for the keys.
+
+A TOML file that was cut between two tables is whole TOML with fewer organs, and an organ that is not there counts as
+free. So schema 2 states the number of structures once: in the file's last table, ``[end]``, which every cut loses, or
+at the top, before the first table, where it tells lost structures but nothing that is lost after them.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import Field, Strict, model_validator
+from pydantic import BeforeValidator, Field, Strict, model_validator
 
 from puncture_twin.planning.base.text_names import unprintable_texts
-from puncture_twin.planning.case.case_schema import CaseSchema, Region
 from puncture_twin.planning.case.sections.tool_section import ToolSection
-from puncture_twin.planning.case.stated_count import check_statement, count_difference, with_count
 from puncture_twin.planning.case.tables.breathing_section import BreathingSection
-from puncture_twin.planning.case.tables.ct_section import CtSection
-from puncture_twin.planning.case.tables.errors_section import ErrorsSection
-from puncture_twin.planning.case.tables.needle_section import NeedleSection
+from puncture_twin.planning.case.tables.errors_section import ErrorsSection, RehearsalSection
+from puncture_twin.planning.case.tables.needle_section import NeedleSection, TissueSection
 from puncture_twin.planning.case.tables.place_section import PlaceSection
-from puncture_twin.planning.case.tables.ranking_section import RankingSection
 from puncture_twin.planning.case.tables.registration_section import RegistrationSection
-from puncture_twin.planning.case.tables.rehearsal_section import RehearsalSection
 from puncture_twin.planning.case.tables.robot_section import RobotSection
-from puncture_twin.planning.case.tables.search_section import SearchSection
-from puncture_twin.planning.case.tables.structure_section import MAX_STRUCTURES, StructureSection
-from puncture_twin.planning.case.tables.structures_section import MAX_LABEL_MAPS, StructuresSection
+from puncture_twin.planning.case.tables.search_section import RankingSection, SearchSection
+from puncture_twin.planning.case.tables.structures_section import (
+    MAX_LABEL_MAPS,
+    MAX_STRUCTURES,
+    CtSection,
+    StructureSection,
+    StructuresSection,
+)
 from puncture_twin.planning.case.tables.surroundings_section import GantrySection, ObstacleSection
 from puncture_twin.planning.case.tables.target_section import TargetSection
-from puncture_twin.planning.case.tables.tissue_section import TissueSection
 from puncture_twin.planning.case.toml_types import Name, Section, Text
+
+COUNT_KEY = "structures = N"
+"""The name under which the count at the top reaches the model: TOML knows ``structures`` as an array of tables too."""
+
+Region = Literal["abdomen", "chest", "pelvis", "brain", "head", "neck", "spine", "limb", "phantom", "other"]
+"""Which part of the body, or of what else, a case shows."""
+
+
+def with_count(data: Any) -> Any:
+    """The file's content with a count at the top under `COUNT_KEY`."""
+    if not isinstance(data, dict) or data.get("schema") != 2:
+        return data
+    count = data.get("structures")
+    if isinstance(count, int) and not isinstance(count, bool):
+        rest = {key: value for key, value in data.items() if key != "structures"}
+        return {**rest, COUNT_KEY: count}
+    return data
+
+
+def check_statement(schema: int, region: str | None, at_top: int | None, at_end: int | None) -> None:
+    """Whether what schema 2 demands is there, once; and none of it in schema 1.
+
+    Raises:
+        ValueError: It is missing, or stated twice with two numbers.
+    """
+    if schema == 1:
+        if region is not None or at_end is not None:
+            raise ValueError("region and [end] belong to schema = 2")
+        return
+    if at_top is None and at_end is None:
+        raise ValueError("schema = 2 needs its last table, [end] with structures = N; was the file cut?")
+    if at_top is not None and at_end is not None and at_top != at_end:
+        raise ValueError(f"structures = {at_top} at the top and {at_end} in [end]; keep one")
+    if region is None:
+        raise ValueError(f"schema = 2 needs region, one of {', '.join(get_args(Region))}")
+
+
+def count_difference(stated: int, found: int) -> str:
+    """What to say of a case that has another number of structures than it states; the empty string if it has not."""
+    if stated == found:
+        return ""
+    return f"structures = {stated} is stated, and the case has {found}, the skin among them; was the file cut?"
+
+
+def _known(value: object) -> object:
+    if isinstance(value, bool) or value not in (1, 2):
+        raise ValueError(f"schema {value!r} is not known; this version reads schema = 1 and schema = 2")
+    return value
+
+
+CaseSchema = Annotated[int, BeforeValidator(_known)]
+"""The key ``schema``: 1 or 2."""
 
 
 class EndSection(Section):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.tables.structures_section import StructuresSection
-from puncture_twin.planning.formats.dicom.magic import is_series
+from puncture_twin.planning.formats.dicom.storage import is_series
 from puncture_twin.planning.formats.labels.slicer_segments import SEGMENT_ENDING, parse_segments
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, data_file
 from puncture_twin.planning.formats.volumes.volume_source import VolumeFile, VolumeSource

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType
+
+import numpy as np
 
 from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.case.tables.ct_section import AIR_HU, DENSE_HU
+from puncture_twin.planning.base.arrays import Floats, read_only
+from puncture_twin.planning.case.mount import axes_frame
 from puncture_twin.planning.case.tables.registration_section import RegistrationSection
+from puncture_twin.planning.case.tables.search_section import SearchSection
+from puncture_twin.planning.case.tables.structures_section import AIR_HU, DENSE_HU
+from puncture_twin.planning.case.tables.surroundings_section import GantrySection, ObstacleSection
+from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 
 @dataclass(frozen=True)
@@ -117,3 +125,32 @@ class RobotSettings:
     def transform(self) -> str | None:
         """The file of the stated transform, or None."""
         return None if self.stated is None else self.stated.transform
+
+
+def search_of(section: SearchSection) -> SearchSettings:
+    """The grid and the limits in radians."""
+    return SearchSettings(
+        theta=(np.radians(section.theta_deg[0]), np.radians(section.theta_deg[1])),
+        beta=(np.radians(section.beta_deg[0]), np.radians(section.beta_deg[1])),
+        step=np.radians(section.step_deg),
+        max_skin_angle=np.radians(section.max_skin_angle_deg),
+        min_hit=section.min_hit,
+        max_touch=section.max_touch,
+        max_touch_of=MappingProxyType(dict(section.max_touch_of)),
+    )
+
+
+def obstacle_of(section: ObstacleSection, space: Space) -> Obstacle:
+    """A box; its centre is in the case's space where its frame is the CT's."""
+    center = np.asarray(section.center_mm)
+    center = center if section.frame == "base" else to_lps(center[None], space)[0]
+    return Obstacle(section.name, section.frame, center, np.asarray(section.size_mm))
+
+
+def gantry_of(gantry: GantrySection, space: Space, path: Path) -> Gantry:
+    """The bore's pose: z along the axis, x to the top, and turned so that a positive tilt leans the top against z."""
+    axes = axes_frame(gantry.axis or "head", gantry.up or "anterior", space, path, "gantry: axis and up")
+    T = pose(axes, to_lps(np.asarray([gantry.center_mm]), space)[0])
+    c, s = np.cos(np.radians(gantry.tilt_deg)), np.sin(np.radians(gantry.tilt_deg))
+    tilt = pose([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]], np.zeros(3))
+    return Gantry(read_only(T @ tilt), gantry.bore_diameter_mm, gantry.wall_mm, gantry.thickness_mm)

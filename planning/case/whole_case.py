@@ -1,4 +1,4 @@
-"""Whether a case and the lists that it names are whole, as far as their ends can tell."""
+"""What a case leaves open: whether it and the lists that it names are whole, by their ends, and where its robot is."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import re
 from pathlib import Path
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.input_file import unfinished_warnings
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.base.whole_lines import unfinished_warnings
 from puncture_twin.planning.case.case_file import CaseFile
+from puncture_twin.planning.case.settings import RobotSettings
 
 SCHEMA_ONE_NOTE = (
     "schema = 1 does not show whether the case file is whole: schema = 2 states its structures and its region "
@@ -21,6 +22,11 @@ TOP_COUNT_NOTE = (
 )
 
 NOT_LAST_NOTE = "[end] is not the last table of the case: what stands after it could be cut off unseen"
+
+ROBOT_NOWHERE = (
+    "the case names a robot ({robot}), but not where its base is: the arm is not checked "
+    "([registration] or [robot.mount] says it)"
+)
 
 _HEADER = re.compile(r"^[ \t]*\[{1,2}[ \t]*([^\[\]\n]+?)[ \t]*\]{1,2}[ \t]*(?:#.*)?$", re.MULTILINE)
 """The header of a table, on a line of its own."""
@@ -63,3 +69,10 @@ def ends_with_end(text: str) -> bool:
     """Whether the last table of a file is ``[end]``."""
     headers = _HEADER.findall(text)
     return bool(headers) and headers[-1] == "end"
+
+
+def robot_warnings(content: CaseFile, robot: RobotSettings) -> tuple[str, ...]:
+    """That nothing is said of where a robot is: no verdict is about it."""
+    located = content.registration is not None or content.robot.mount is not None
+    nowhere = not located and bool({"robot", "tool"} & content.model_fields_set)
+    return (ROBOT_NOWHERE.format(robot=robot.model.name),) if nowhere else ()

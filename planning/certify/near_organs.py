@@ -109,15 +109,14 @@ def _checked(  # type: ignore[no-untyped-def]  # numba infers
         if filled + last - first > len(kept):
             kept = _grown(kept, filled, 2 * (filled + last - first))
         if narrow and witness[i] >= 0:
-            length = lengths[group[witness[i]]]
-            more, limit = BULGES * length * bulge[i], limits[group[witness[i]]] - pad
-            hit, worst = _corners(corners[witness[i]], four, length, limit - more)
+            t = witness[i]
+            hit, worst = _corners(corners[t], four, lengths[group[t]], limits[group[t]] - pad, bulge[i])
             if hit == 4:
-                rejected[i], largest[i], found[i] = True, worst + more, witness[i]
+                rejected[i], largest[i], found[i] = True, worst, t
                 continue
             if hit > 0 and radius[i] <= SURELY_MIXED:
                 narrow = False
-                found[i] = witness[i]
+                found[i] = t
         best, looked = np.inf, False
         for k in range(first, last):
             t = items[k]
@@ -133,9 +132,9 @@ def _checked(  # type: ignore[no-untyped-def]  # numba infers
                 if _apart(corners[t], side, u, four, bulge[i], limit + pad, length):
                     continue
                 if width + HOPELESS * radius[i] * nearest[t] < limit or width <= 0.0:
-                    hit, worst = _corners(corners[t], four, length, limit - pad - BULGES * length * bulge[i])
+                    hit, worst = _corners(corners[t], four, length, limit - pad, bulge[i])
                     if hit == 4:
-                        rejected[i], largest[i], found[i] = True, worst + BULGES * length * bulge[i], t
+                        rejected[i], largest[i], found[i] = True, worst, t
                         break
                 if width - limit < best:
                     best, found[i] = width - limit, t
@@ -154,8 +153,13 @@ def _grown(kept, filled, size):  # type: ignore[no-untyped-def]  # numba infers
 
 
 @nb.njit(cache=True)
-def _corners(triangle, four, length, limit):  # type: ignore[no-untyped-def]  # numba infers
-    """How many of the axes at a cell's corners come nearer to a triangle than the limit, and their largest distance."""
+def _corners(triangle, four, length, limit, bulge):  # type: ignore[no-untyped-def]  # numba infers
+    """How many of a cell's corner axes come nearer to a triangle than the limit, and how far any axis of it may be.
+
+    Whatever bulges out of the corners is taken from the limit, and added to the largest distance at them.
+    """
+    more = BULGES * length * bulge
+    limit -= more
     a = (triangle[0], triangle[1], triangle[2])
     b = (triangle[3], triangle[4], triangle[5])
     c = (triangle[6], triangle[7], triangle[8])
@@ -164,7 +168,7 @@ def _corners(triangle, four, length, limit):  # type: ignore[no-untyped-def]  # 
         square, _ = axis_triangle((four[j, 0], four[j, 1], four[j, 2]), length, a, b, c)
         worst = max(worst, square)
         hit += limit > 0.0 and square < limit * limit
-    return hit, np.sqrt(worst)
+    return hit, np.sqrt(worst) + more
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)

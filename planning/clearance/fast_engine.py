@@ -1,9 +1,10 @@
-"""The fast engine: exact distances of all needle axes at once, from surfaces packed once per patient."""
+"""The fast engine: exact distances of all needle axes at once, from surfaces packed once and placed about a target."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,11 @@ from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import capsule_touches_any
 from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
 from puncture_twin.planning.clearance.kernels.lanes import LANES
+from puncture_twin.planning.clearance.kernels.nearest_triangle import nearest_triangle
 from puncture_twin.planning.clearance.kernels.scratch import Found, scratch_for
 from puncture_twin.planning.clearance.kernels.tile_search import COUNTED, search_tiles
 from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
 from puncture_twin.planning.clearance.normals import normals_of
-from puncture_twin.planning.clearance.placed_surface import PlacedSurface, placed_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 FCL_BEYOND_MM = 1.0
@@ -36,6 +37,9 @@ WORTH_THREADS = 20_000
 
 LONGEST_MM = 1e9
 """A needle that could reach the nodes that only fill a level up would be measured from them."""
+
+COORDINATE_SLACK = 1e-6
+"""Share of a coordinate by which float32 arithmetic of a few terms may err: 8 times its rounding."""
 
 
 class FastEngine:
@@ -160,3 +164,27 @@ def _one_structure(
         bundles, scratch_for(len(placed.nodes)), found, LANES,
     )  # fmt: skip
     distance[tiles.order], depth[tiles.order], nearest[tiles.order] = np.sqrt(found.square), found.depth, found.triangle
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedSurface:
+    """One surface as seen from one target: the nodes of `bounds.disc_bounds`, and the target's own distance."""
+
+    nodes: NDArray[np.float32]
+    slack: float
+    distance: float
+    nearest: int
+
+
+def placed_surface(blocks: Blocks, target: Floats) -> PlacedSurface:
+    """A surface as seen from a target."""
+    nodes = np.empty((10, len(blocks.center)), np.float32)
+    nodes[:3] = (blocks.center - target).T
+    nodes[3:8] = blocks.disc
+    nodes[8] = np.hypot(nodes[6], nodes[7]) * np.float32(1 + 1e-6)
+    away = np.sqrt(nodes[0] ** 2 + nodes[1] ** 2 + nodes[2] ** 2)
+    nodes[9] = (away + nodes[8]) * np.float32(1 + 1e-6)
+    slack = COORDINATE_SLACK * float(nodes[9][: len(blocks.local)].max())
+    grouped = np.ascontiguousarray(nodes.reshape(10, -1, LANES).transpose(1, 0, 2))
+    distance, nearest = nearest_triangle(blocks.triangles, grouped, blocks.base, target, slack)
+    return PlacedSurface(grouped, slack, distance, nearest)

@@ -56,6 +56,11 @@ class FclEngine:
                 depth[touching, column] = first_crossing(mesh, target_ct, outward_ct[touching], float(lengths[column]))
         return AxisDistances(distance, depth, nearest)
 
+    def distances(self, target_ct: Floats, outward_ct: Floats, length: float) -> Floats:
+        """Of one axis from all k structures, shape (k,), 0 on contact: `measure` without where it is nearest."""
+        found = self._one_direction(target_ct, outward_ct, np.full(len(self._objects), length))[0]
+        return np.maximum(np.array(found, dtype=np.float64), 0.0)
+
     def normals(self, target_ct: Floats, outward_ct: Floats, axes: AxisDistances) -> Floats:
         """From where measured axes are nearest; see `ClearanceEngine`."""
         triangles = [mesh.vertices[mesh.faces].reshape(-1, 9) for mesh in self._meshes]

@@ -1,19 +1,17 @@
 from .bodies.arm_bodies import arm_bodies as arm_bodies
 from .bodies.body import Body as Body, Shape as Shape
-from .bodies.shapes import surface as surface, touch as touch
+from .bodies.shapes import prism as prism, surface as surface, touch as touch
+from .bodies.sphere_tree import sphere_tree as sphere_tree
 from .checker import (
     DISTANCE_PAIRS as DISTANCE_PAIRS,
     CellChecker as CellChecker,
     Distances as Distances,
     Nearest as Nearest,
 )
-from .enclosures.prism import prism as prism
-from .enclosures.sphere_tree import sphere_tree as sphere_tree
 from .fast_checker import FastChecker as FastChecker
 from .patient import FclPatient as FclPatient, FclSkin as FclSkin
 from .segments import halving_order as halving_order
 from .state_checker import PATIENT as PATIENT
-from .surroundings import with_surroundings as with_surroundings
 from .workcell import (
     ARM_PADDING_MM as ARM_PADDING_MM,
     case_boxes as case_boxes,
@@ -22,4 +20,5 @@ from .workcell import (
     check_gantry as check_gantry,
     home_configuration as home_configuration,
     patient_surface as patient_surface,
+    with_surroundings as with_surroundings,
 )

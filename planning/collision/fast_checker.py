@@ -18,9 +18,8 @@ from puncture_twin.planning.collision.checker import (
     FirstContact,
     require_finite,
 )
-from puncture_twin.planning.collision.fcl_contact import fcl_contact
 from puncture_twin.planning.collision.never_touching import without_neighbours
-from puncture_twin.planning.collision.proofs import Motion, Proofs
+from puncture_twin.planning.collision.proofs import Motion, Proofs, fcl_contact
 from puncture_twin.planning.collision.segments import SegmentChecker
 from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.collision.sweep import SweptBodies

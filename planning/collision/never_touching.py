@@ -11,9 +11,8 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.collision.checker import Check
-from puncture_twin.planning.collision.fcl_contact import fcl_contact
-from puncture_twin.planning.collision.packed.made_from import made_from
-from puncture_twin.planning.collision.proofs import Proofs
+from puncture_twin.planning.collision.packed.hulls import made_from
+from puncture_twin.planning.collision.proofs import Proofs, fcl_contact
 
 Touches = Callable[[int, Floats], bool]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,13 +12,20 @@ from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.checker import Check, Contact, require_finite
-from puncture_twin.planning.collision.fcl_contact import fcl_contact
 from puncture_twin.planning.collision.kernels import segments as segment_kernels
-from puncture_twin.planning.collision.kernels.segments import CONTACT, NOT_FINITE, QUERY, Answer
-from puncture_twin.planning.collision.proofs import Proofs
+from puncture_twin.planning.collision.kernels.segment_parts import (
+    CONTACT,
+    HALVINGS,
+    NOT_FINITE,
+    QUERY,
+    Answer,
+    Room,
+    segment_room,
+)
+from puncture_twin.planning.collision.proofs import Proofs, fcl_contact
 
 LOOK_FIRST_RAD = 0.125
-"""States of a segment so far apart are looked at before it is proven: what it touches is found soonest so."""
+"""Down to parts of this length a segment is halved for all checks together: what it touches is found soonest so."""
 
 FINE_MM = 1.0
 """A state answers for a part of a segment within which no body moves farther from it. So states that were checked are
@@ -26,6 +33,13 @@ no more than 2 mm of motion apart, which with 1 mm of padding proves the path be
 
 QUESTIONS = 256
 """Room for what one segment leaves to FCL, at first."""
+
+
+class _Filled(NamedTuple):
+    """What the compiled code fills."""
+
+    room: Room
+    answer: Answer
 
 
 class SegmentChecker:
@@ -47,38 +61,44 @@ class SegmentChecker:
         self._model, self._checks, self._clear_mm = model, checks, clear_mm
         self._packed = (proofs.scene, proofs.movers, model.lengths)
         self._order = np.arange(len(checks), dtype=np.int64)
-        self._answer = _empty_answer(QUESTIONS)
+        self._filled = _Filled(segment_room(proofs.scene, proofs.movers), _empty_answer(QUESTIONS))
 
     def __call__(self, start: Floats, end: Floats) -> Contact | None:
         """A contact on the segment between two states (6,), rad, the needle being outside the patient; None if free.
 
-        The end, and states ``LOOK_FIRST_RAD`` apart from it on, are checked as they are; all of the segment is proven
-        clear but for parts within which no body moves farther than ``FINE_MM`` from a state where FCL finds nothing.
-        The start itself is not looked at beyond that.
+        The end is checked as it is, and then the middles of ever smaller parts; all of the segment is proven clear but
+        for parts within which no body moves farther than ``FINE_MM`` from a state where FCL finds nothing. The start
+        itself is not looked at beyond that.
 
         Raises:
             InputError: If a state is not finite.
         """
-        start, end = np.array(start, dtype=np.float64), np.array(end, dtype=np.float64)
-        fractions, begin = looks(math.ceil(_length(end - start) / LOOK_FIRST_RAD)), 0
+        start, end, answered = np.array(start, dtype=np.float64), np.array(end, dtype=np.float64), 0
+        halvings = _halvings(end - start)
         while True:
             segment_kernels.check_segment(
-                *self._packed, start, end, fractions, begin, FINE_MM, self._clear_mm, self._order, self._answer
+                *self._packed, start, end, answered, halvings, FINE_MM, self._clear_mm, self._order, *self._filled
             )
-            status, check, begin, count = self._answer.status.tolist()
+            status, check, answered, count = self._filled.answer.status.tolist()
             if status == NOT_FINITE:
                 require_finite(np.stack([start, end]))
             if status == CONTACT:
                 return self._contact(check)
-            if count > len(self._answer.fractions):
-                self._answer, begin = _empty_answer(2 * count), 0
+            if count > len(self._filled.answer.fractions):
+                self._filled = self._filled._replace(answer=_empty_answer(2 * count))
                 continue
-            questions = self._answer.fractions[:count].tolist(), self._answer.checks[:count].tolist()
-            for fraction, at in zip(*questions, strict=True):
-                if fcl_contact(self._checks[at], link_poses(self._model, start + fraction * (end - start))) is not None:
-                    return self._contact(at)
-            if status != QUERY:
-                return None
+            touching = self._touching(start, end, count)
+            if touching is not None or status != QUERY:
+                return touching
+
+    def _touching(self, start: Floats, end: Floats, queries: int) -> Contact | None:
+        """What FCL finds first where so many queries are left to it."""
+        answer = self._filled.answer
+        where = answer.fractions[:queries].tolist(), answer.checks[:queries].tolist()
+        for fraction, at in zip(*where, strict=True):
+            if fcl_contact(self._checks[at], link_poses(self._model, start + fraction * (end - start))) is not None:
+                return self._contact(at)
+        return None
 
     def _contact(self, check: int) -> Contact:
         """The contact of a check, which is tested first from now on."""
@@ -91,19 +111,13 @@ def _empty_answer(questions: int) -> Answer:
     return Answer(np.zeros(4, np.int64), np.empty(questions), np.empty(questions, np.int64))
 
 
-def _length(step: Floats) -> float:
-    """Of a step (6,), rad; that of one that is no number counts as 0."""
+def _halvings(step: Floats) -> int:
+    """How often a step (6,), rad, is halved for all checks together; one that is no number not at all."""
     length = math.sqrt(float(step @ step))
-    return length if math.isfinite(length) else 0.0
+    return min(HALVINGS, max(0, math.ceil(math.log2(length / LOOK_FIRST_RAD)))) if 0.0 < length < math.inf else 0
 
 
 def halving_order(count: int) -> Floats:
     """0, 1/n, 2/n ... (n - 1)/n in an order that spreads over the whole at once (van der Corput's), shape (n,)."""
     order = np.argsort([int(f"{n:032b}"[::-1], 2) for n in range(count)], kind="stable")
     return np.asarray(order / max(1, count))
-
-
-@lru_cache(maxsize=256)
-def looks(count: int) -> Floats:
-    """Where on a segment so many states stand, the end first: fractions of its path, shape (n,)."""
-    return np.asarray(1.0 - halving_order(count))

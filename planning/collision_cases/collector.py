@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision_cases.arm_notes import ARM_PROPERTY
 from puncture_twin.planning.collision_cases.checks_file import (
     CheckSection,
     ChecksFile,
@@ -22,13 +21,14 @@ from puncture_twin.planning.collision_cases.checks_file import (
 )
 from puncture_twin.planning.collision_cases.direction_finding import direction_finding
 from puncture_twin.planning.collision_cases.finding import Difference, Finding
-from puncture_twin.planning.collision_cases.plan_finding import plan_finding
+from puncture_twin.planning.collision_cases.pytest_run import ARM_PROPERTY, UPDATE, updating
 from puncture_twin.planning.collision_cases.rewrite import Change
 from puncture_twin.planning.collision_cases.session import Session, session_of
 from puncture_twin.planning.collision_cases.table_lines import table_lines
-from puncture_twin.planning.collision_cases.unique_names import unique_names
-from puncture_twin.planning.collision_cases.update_flag import UPDATE, updating
 from puncture_twin.planning.collision_cases.window_finding import window_finding
+from puncture_twin.planning.plan.plan_document import read_plan
+from puncture_twin.planning.plan.recheck import check_plan
+from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 
 ONLY_NUMBERS = f"{UPDATE} rewrites numbers alone: verdict, reason, structure and plans are for a person to change"
@@ -182,3 +182,29 @@ FINDERS: Mapping[str, Callable[[Session, Table, Path], Finding]] = {
     "plan": _plan,
 }
 """Kind of table to what checks it."""
+
+
+def unique_names(wanted: Iterable[str]) -> list[str]:
+    """Each name as it is wanted; one that is taken already gets the next free number, from 2 on."""
+    names: dict[str, None] = {}
+    for name in wanted:
+        free, number = name, 1
+        while free in names:
+            number += 1
+            free = f"{name}-{number}"
+        names[free] = None
+    return list(names)
+
+
+def plan_finding(path: Path, context: CaseContext) -> Finding:
+    """Whether a plan holds: same inputs, its direction safe, its motion free of contact, its numbers those of the case.
+
+    Args:
+        path: The plan's file.
+        context: Its case, with the arm.
+    """
+    try:
+        check_plan(read_plan(path), context, path)
+    except InputError as error:
+        return Finding((Difference(f"the plan does not hold: {error.what}"),), (f"{error.where}: {error.allowed}",))
+    return Finding()

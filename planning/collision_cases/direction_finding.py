@@ -9,8 +9,7 @@ from decimal import ROUND_CEILING, ROUND_FLOOR
 import numpy as np
 
 from puncture_twin.planning.collision_cases.checks_file import CheckSection
-from puncture_twin.planning.collision_cases.finding import Difference, Finding
-from puncture_twin.planning.collision_cases.new_number import NewNumber
+from puncture_twin.planning.collision_cases.finding import Difference, Finding, NewNumber
 from puncture_twin.planning.search.explain import Explanation
 
 DIGIT = 0.1

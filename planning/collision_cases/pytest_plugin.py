@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from puncture_twin.planning.collision_cases.arm_notes import arm_notes
-from puncture_twin.planning.collision_cases.update_flag import add_flag, updating
+from puncture_twin.planning.collision_cases.pytest_run import add_flag, arm_notes, updating
 
 if TYPE_CHECKING:
     from puncture_twin.planning.search.explain import Explanation

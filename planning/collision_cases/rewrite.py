@@ -12,7 +12,7 @@ import tomlkit
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.collision_cases.new_number import NewNumber
+from puncture_twin.planning.collision_cases.finding import NewNumber
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from decimal import ROUND_FLOOR
 
 from puncture_twin.planning.collision_cases.checks_file import WindowSection
-from puncture_twin.planning.collision_cases.finding import Difference, Finding
-from puncture_twin.planning.collision_cases.new_number import NewNumber
+from puncture_twin.planning.collision_cases.finding import Difference, Finding, NewNumber
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.explain import reason_text
 from puncture_twin.planning.search.selection.windows import Windows, find_windows, nearest_row

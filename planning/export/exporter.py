@@ -34,12 +34,14 @@ class Exported:
         format_name: One of ``FORMATS``.
         notes: What whoever runs it should know, one sentence each.
         inputs: Every file that decided it.
+        plan: What it holds.
     """
 
     path: Path
     format_name: str
     notes: tuple[str, ...]
     inputs: tuple[Input, ...]
+    plan: Plan
 
 
 class _Draft(NamedTuple):
@@ -73,7 +75,7 @@ def export_plan(
     checked = FORMATS[format_name][1](plan, source, checker)
     with atomic(path) as temporary:
         temporary.write_bytes(checked.text.encode("ascii"))
-    return Exported(path, format_name, checked.notes, plan.inputs)
+    return Exported(path, format_name, checked.notes, plan.inputs, plan)
 
 
 def export_name(source: Path, format_name: str) -> str:

@@ -10,6 +10,8 @@ as soon as that is whole, and a second piece would replace the first.
 from __future__ import annotations
 
 import re
+import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.export.program import STREAM_S, JointMove, Program
-from puncture_twin.planning.export.text import heading
+from puncture_twin.planning.export.text import counted, heading, plain_sentence
 from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation, pose
 from puncture_twin.planning.plan.plan import Plan
 
@@ -39,6 +41,9 @@ STANDOFF_TOLERANCE_M = 0.002
 ALIGN_M_S = 0.005
 """Tip speed of the correction by that distance."""
 
+FIRST_WORDS = 90
+"""Characters of the first warning that the popup before the insertion shows."""
+
 _NUMBER = r"-?\d+\.\d+"
 _LIST = rf"\[{_NUMBER}(?:, {_NUMBER}){{5}}\]"
 _MOVEJ = re.compile(rf"  movej\(({_LIST}), a=({_NUMBER}), v=({_NUMBER}), r=({_NUMBER})\)")
@@ -49,7 +54,8 @@ _INSERTION = re.compile(rf"    movel\(target_m, a=({_NUMBER}), v=({_NUMBER})\)")
 _RETRACTION = re.compile(rf"    movel\(standoff_m, a=({_NUMBER}), v=({_NUMBER})\)")
 _RUN = "  insertion = run insert()"
 _GUARD = "    if tool_contact(direction=get_target_tcp_speed()) > 0:"
-_WAIT = '  popup("Needle at standoff. Continue inserts it.", title="Insertion", blocking=True)'
+_WAIT = '  popup("Needle at standoff. {warnings}Continue inserts it.", title="Insertion", blocking=True)'
+_WAITS = re.compile(re.escape(_WAIT).replace(re.escape("{warnings}"), r"(?:[A-Za-z0-9 ._+:/(),-]+ )?"))
 
 _FUNCTIONS = """\
   def far_from(wanted_q, tolerance):
@@ -93,7 +99,7 @@ def urscript_text(program: Program, plan: Plan, *, case_checked: bool) -> str:
     ]
     lines = ["def puncture():", *(f"  {line}" for line in heading(plan, notes, case_checked=case_checked))]
     lines += [*_values(program), "", *_FUNCTIONS.splitlines(), ""]
-    lines += [*_checks(), "", *_approach(program), "", *_insertion(program), "end"]
+    lines += [*_checks(), "", *_approach(program), "", *_insertion(program, plan.warnings), "end"]
     return "\n".join(lines) + "\n"
 
 
@@ -130,7 +136,17 @@ def _approach(program: Program) -> list[str]:
     return [*lines, *(["  stopj(1.4)", _SETTLE] if len(program.stream_q) else [])]
 
 
-def _insertion(program: Program) -> list[str]:
+def _of_warnings(warnings: Sequence[str] | None) -> str:
+    """What the popup says of the plan's warnings: how many, and how the first begins."""
+    if warnings is None:
+        return "Its warnings are not known. "
+    if not warnings:
+        return ""
+    first = textwrap.shorten(plain_sentence(warnings[0]), FIRST_WORDS, placeholder=" ...")
+    return f"{counted(warnings)}: {first} See the program. "
+
+
+def _insertion(program: Program, warnings: Sequence[str] | None) -> list[str]:
     acceleration = _number(program.insertion_mm_s2 * M_PER_MM)
     return [
         f"  if far_from(standoff_q, {START_TOLERANCE_RAD}):",
@@ -141,7 +157,7 @@ def _insertion(program: Program) -> list[str]:
         "  end",
         f"  movel(standoff_m, a={acceleration}, v={_number(ALIGN_M_S)})",
         "  held_q = get_actual_joint_positions()",
-        _WAIT,
+        _WAIT.format(warnings=_of_warnings(warnings)),
         f"  if far_from(held_q, {START_TOLERANCE_RAD}):",
         '    refuse("The arm moved while it waited.")',
         "  end",
@@ -194,7 +210,7 @@ def read_urscript(text: str, *, where: Path) -> Program:
     insertions = [(at, match) for at, line in enumerate(lines) if (match := _INSERTION.fullmatch(line))]
     others = sum(line.lstrip().startswith(("movej", "movel", "movep", "movec", "servo", "speed")) for line in lines)
     settles = lines.count(_SETTLE) if streamed else 0
-    waits = [at for at, line in enumerate(lines) if line == _WAIT]
+    waits = [at for at, line in enumerate(lines) if _WAITS.fullmatch(line)]
     back = [match for line in lines if (match := _RETRACTION.fullmatch(line))]
     if len(values) != 6 or len(insertions) != 1 or others != len(moves) + len(streamed) + 3 + settles:
         raise InputError("the program does not read back", where=where, allowed="known moves and one insertion")

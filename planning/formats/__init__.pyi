@@ -11,7 +11,6 @@ from .guard import (
 from .raw_mesh import (
     MAX_VERTICES as MAX_VERTICES,
     RawMesh as RawMesh,
-    decode_text as decode_text,
     join as join,
     refuse as refuse,
     token_array as token_array,

@@ -13,10 +13,11 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.input_file import decode_text
 from puncture_twin.planning.formats.guard import guard_transform
 from puncture_twin.planning.formats.itk_hdf5 import hdf5_transforms
 from puncture_twin.planning.formats.itk_linear import ALLOWED, StatedTransform, linear_motion
-from puncture_twin.planning.formats.raw_mesh import decode_text, refuse
+from puncture_twin.planning.formats.raw_mesh import refuse
 
 TEXT_ENDINGS, HDF5_ENDINGS = (".tfm", ".txt"), (".h5", ".hdf5")
 MAX_TEXT_BYTES = 100_000

@@ -36,18 +36,6 @@ def refuse(what: str, where: str, allowed: str) -> NoReturn:
     raise InputError(what, where=where, allowed=allowed)
 
 
-def decode_text(data: bytes, where: str) -> str:
-    """The text of a file in UTF-8.
-
-    Raises:
-        InputError: If it is anything else.
-    """
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"byte {error.start} is not text", where=where, allowed="text in UTF-8") from error
-
-
 def token_array(tokens: list[str], where: str) -> NDArray[np.str_]:
     """Tokens as an array of their widest one's width, shape (n,), which one endless token must not blow up.
 

@@ -1,4 +1,4 @@
-"""Smooth where a surface is smooth, sharp where it is sharp: which corners of triangles share a normal."""
+"""Smooth where a surface is smooth, sharp where it is sharp: which corners of triangles share a normal, and which."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 CREASE = np.radians(60.0)
@@ -55,3 +56,27 @@ def _normals(mesh: TriangleMesh) -> NDArray[np.float64]:
     areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(areas, axis=1, keepdims=True)
     return np.asarray(areas / np.where(lengths > 0, lengths, 1.0))
+
+
+def smooth_normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) -> Floats:
+    """Unit normals at points of triangles: the corners' normals (area weighted), blended; shape (n, 3)."""
+    a, b, c = np.moveaxis(mesh.triangles, 1, 0)
+    areas = np.cross(b - a, c - a)
+    at_vertex = np.zeros_like(mesh.vertices)
+    for corner in mesh.faces.T:
+        np.add.at(at_vertex, corner, areas)
+    weights = _corner_weights(mesh.triangles[face], points)
+    return _unit(np.einsum("ij,ijk->ik", weights, _unit(at_vertex)[mesh.faces[face]]))
+
+
+def _corner_weights(triangles: Floats, points: Floats) -> Floats:
+    """How much corners count (n, 3) at points of triangles (n, 3, 3): as the areas opposite, in one measure per row."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    normal = np.cross(b - a, c - a)
+    parts = [np.cross(c - b, points - b), np.cross(a - c, points - c), np.cross(b - a, points - a)]
+    return np.stack([np.einsum("ij,ij->i", part, normal) for part in parts], axis=1)
+
+
+def _unit(vectors: Floats) -> Floats:
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)

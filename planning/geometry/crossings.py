@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -26,6 +26,9 @@ USUAL_CROSSINGS = 4
 
 CONE_SLACK = 1e-9
 """Radians by which a bounding cone is widened against rounding."""
+
+NUDGE = 1e-7
+"""Radians by which a ray through an edge or corner is turned when its crossings do not add up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +62,7 @@ def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: fl
     corners = mesh.triangles - origin
     order, starts = _binned(directions)
     directions = np.array(directions, order="C")
-    room, total = 0, USUAL_CROSSINGS * len(directions)
+    room, total = -1, USUAL_CROSSINGS * len(directions)  # of no ray there are none
     while total > room:
         room = total
         ray, depth, face = np.empty(room, np.int64), np.empty(room), np.empty(room, np.int64)
@@ -71,7 +74,7 @@ def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: fl
     fresh[1:] = (ray[1:] != ray[:-1]) | (depth[1:] - depth[:-1] > SAME_CROSSING_MM)
     ray, depth, face = ray[fresh], depth[fresh], face[fresh]
     count = np.bincount(ray, minlength=len(directions))
-    return Crossings(ray, depth, face, count, np.concatenate([[0], np.cumsum(count)[:-1]]))
+    return Crossings(ray, depth, face, count, np.cumsum(count) - count)
 
 
 def first_crossing(mesh: TriangleMesh, origin: Floats, directions: Floats, length: float) -> Floats:
@@ -166,3 +169,25 @@ def _cross(a, b, c, u):  # type: ignore[no-untyped-def]  # numba infers
 def _edge(p, q, u):  # type: ignore[no-untyped-def]  # numba infers
     """Triple product u . (p x q): on which side of the edge p-q the ray passes; swapping p and q negates it exactly."""
     return u[0] * (p[1] * q[2] - p[2] * q[1]) + u[1] * (p[2] * q[0] - p[0] * q[2]) + u[2] * (p[0] * q[1] - p[1] * q[0])
+
+
+def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) -> tuple[Crossings, Bools]:
+    """Crossings, and which rays leave the body an odd number of times, as a ray from inside a closed surface must.
+
+    A ray through an edge or corner may count twice or touch without crossing; it is turned by `NUDGE` and asked again.
+    """
+    found = crossings(mesh, origin, directions)
+    odd = found.count % 2 == 1
+    if mesh.closed and not odd.all():
+        rotated = directions.copy()
+        rotated[~odd] = _rotated(directions[~odd])
+        found = crossings(mesh, origin, rotated)
+        odd = found.count % 2 == 1
+    return found, odd
+
+
+def _rotated(directions: Floats) -> Floats:
+    helper = np.eye(3)[np.argmin(np.abs(directions), axis=1)]
+    aside = np.cross(directions, helper)
+    rotated = directions + NUDGE * aside / np.linalg.norm(aside, axis=1, keepdims=True)
+    return np.asarray(rotated / np.linalg.norm(rotated, axis=1, keepdims=True))

@@ -68,8 +68,24 @@ def odd_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
         mesh: The surface, mm.
         point: Shape (3,), mm, in the mesh's frame.
     """
-    z = 1.0 - (2.0 * np.arange(RAYS) + 1.0) / RAYS  # a spiral of equal steps in z and golden turns
-    turn, ring = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(RAYS), np.sqrt(1.0 - z * z)
-    rays = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
     surface = TriangleMesh(mesh.vertices, mesh.faces[mesh.distinct])
-    return float(np.mean(crossings(surface, point, rays).count % 2))
+    return float(np.mean(crossings(surface, point, _rays()).count % 2))
+
+
+def hit_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
+    """Of all directions from a point, the part in which a ray meets the surface at all.
+
+    1 inside a closed surface, and also in a hollow of it, of which `winding_number` is 0.
+
+    Args:
+        mesh: The surface, mm.
+        point: Shape (3,), mm, in the mesh's frame.
+    """
+    return float(np.mean(crossings(mesh, point, _rays()).count > 0))
+
+
+def _rays() -> NDArray[np.float64]:
+    """Unit vectors, shape (RAYS, 3), evenly about: a spiral of equal steps in z and golden turns."""
+    z = 1.0 - (2.0 * np.arange(RAYS) + 1.0) / RAYS
+    turn, ring = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(RAYS), np.sqrt(1.0 - z * z)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)

@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.default_roles import BODY, default_role
 from puncture_twin.planning.anatomy.skin import flat_ends
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
@@ -56,11 +55,6 @@ class MeshFolder:
             number: read_mesh(file, unit=self.unit, space=self.space, space_is_default=True)
             for number, file in files.items()
         }
-
-    @property
-    def skin(self) -> int | None:
-        """The mesh that is named like the body."""
-        return next((n for n, name in self.names.items() if default_role(name, "other") == BODY), None)
 
     def near(self, point_ct: Floats) -> tuple[int, ...]:
         """The meshes whose box holds a point (3,), LPS mm."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from puncture_twin.planning.anatomy.crossed_names import named_as_crossed
+from puncture_twin.planning.anatomy.crossed_names import named_as_crossed, named_as_lesion
 from puncture_twin.planning.anatomy.default_roles import (
     BODY,
     LESION,
@@ -33,19 +33,22 @@ class Holding(NamedTuple):
     others: frozenset[str]
 
 
-def assign(names: Mapping[int, str], region: str, holding: Holding) -> list[Assigned]:
+def assign(names: Mapping[int, str], region: str, holding: Holding, outlines: Collection[str] = ()) -> list[Assigned]:
     """What a case says of each structure, by label.
 
     Args:
         names: Label to name.
         region: As the case states it.
         holding: What holds the target.
+        outlines: Of those that are named like the body the ones that are its outline.
     """
-    return [_assigned(label, names[label], region, holding) for label in sorted(names)]
+    return [_assigned(label, names[label], region, holding, outlines) for label in sorted(names)]
 
 
-def _assigned(label: int, name: str, region: str, holding: Holding) -> Assigned:
+def _assigned(label: int, name: str, region: str, holding: Holding, outlines: Collection[str]) -> Assigned:
     line = default_role(name, region) or UNKNOWN_NAME
+    if line == BODY and name not in outlines:
+        line = UNKNOWN_NAME
     if name == holding.target:
         return Assigned(label, name, "target", 0.0, line)
     if name in holding.others and line != BODY and never_crossed(name) is None:
@@ -89,16 +92,17 @@ def _list(names: Sequence[str]) -> str:
 def chosen_target(names: Collection[str]) -> str:
     """Of the structures that hold the target the one that it is; never the body's outline.
 
-    A lesion, else what the table knows for certain (an organ that a needle crosses, or a vessel that none does), else
-    the first: beside a pancreas that holds the target too, an ``SMA`` is not taken for the target.
+    What is named as a lesion by all of its words, else one with such a word in it, else what the table knows for
+    certain (an organ that a needle crosses, or a vessel that none does), else the first: beside a pancreas that holds
+    the target too, an ``SMA`` is not taken for the target, nor a ``Tumorvene`` beside a tumour.
 
     Args:
         names: At least one, the smallest first.
     """
-    lines = {name: default_role(name, "other") for name in names}
-    lesions = [name for name, line in lines.items() if line == LESION]
+    sure = [name for name in names if named_as_lesion(name)]
+    lesions = [name for name in names if default_role(name, "other") == LESION]
     certain = [name for name in names if named_as_crossed(name) or never_crossed(name) is not None]
-    return next(iter([*lesions, *certain, *names]))
+    return next(iter([*sure, *lesions, *certain, *names]))
 
 
 def likely_region(names: Collection[str], target: str | None) -> str:

@@ -17,7 +17,7 @@ from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.formats.dicom.choose_series import choose_series
 from puncture_twin.planning.formats.dicom.ct_series import parse_series
-from puncture_twin.planning.formats.dicom.magic import is_series
+from puncture_twin.planning.formats.dicom.storage import is_series
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, data_file
 from puncture_twin.planning.formats.volumes.volume_source import Content, VolumeFile
 from puncture_twin.planning.geometry.mesh import TriangleMesh

@@ -20,9 +20,10 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.init.case_text import CaseParts, case_text
 from puncture_twin.planning.init.finder import Ct, Found, Markers, Wanted, find
-from puncture_twin.planning.init.mesh_folder import MeshFolder
+from puncture_twin.planning.init.outlines import Outlines
 from puncture_twin.planning.init.roles import assign, likely_region, role_notes
 from puncture_twin.planning.init.segmentation import Assigned, Place, Segmentation
+from puncture_twin.planning.init.skin_mesh import SkinMesh, skin_mesh, skin_problems
 from puncture_twin.planning.init.target import Target, label_target, parse_point, shown, typed_target
 
 ALLOWED = "a folder with a CT (NIfTI or NRRD) and a segmentation, see docs/how-to/your-own-ct.md"
@@ -78,15 +79,19 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     space = request.wanted.space
     point = None if request.target is None else parse_point(request.target, space)
     found = find(Place(request.folder, cache, progress), request.wanted)
-    ct = _checked(found, point, request)
+    body = _checked(found, point, request)
+    ct = body if isinstance(body, Ct) else None
     if point is not None and ct is not None:
         _refuse_outside(point, ct, space)
-    target = _target(request, point, found.segmentations)
+    skin = body.surfaces.skin_of_ct() if isinstance(body, Ct) else body.skin()
+    outlines = Outlines(found.segmentations, skin)
+    target = _target(request, point, outlines)
     names = [name for one in found.segmentations for name in one.names.values()]
     region = request.region or likely_region(names, target.holding.target)
-    rows = [assign(one.names, region, target.holding) for one in found.segmentations]
-    if ct is None:
-        rows = [_with_skin(one, some) for one, some in zip(found.segmentations, rows, strict=True)]
+    left_out = outlines.at(target.point_ct)
+    rows = [assign(one.names, region, target.holding, left_out) for one in found.segmentations]
+    if isinstance(body, SkinMesh):
+        rows = [_with_skin(some, body) for some in rows]
     parts = CaseParts(
         name=request.folder.resolve().name,
         space=space,
@@ -97,17 +102,18 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
         sources=tuple(zip(found.segmentations, rows, strict=True)),
         markers=tuple(_markers_of_ct(found.markers, ct)),
     )
-    return Start(case_text(parts), parts, tuple(_notes(request, found, target, parts)))
+    notes = (*_notes(request, found, target, parts), *outlines.notes(target.point_ct))
+    return Start(case_text(parts), parts, notes)
 
 
-def _target(request: Request, point: Floats | None, segmentations: Sequence[Segmentation]) -> Target:
+def _target(request: Request, point: Floats | None, outlines: Outlines) -> Target:
     if point is not None:
-        return typed_target(point, segmentations, request.wanted.space, space_stated=request.space_stated)
-    return label_target(str(request.target_label), segmentations, request.wanted.space)
+        return typed_target(point, outlines, request.wanted.space, space_stated=request.space_stated)
+    return label_target(str(request.target_label), outlines, request.wanted.space)
 
 
-def _checked(found: Found, point: Floats | None, request: Request) -> Ct | None:
-    """The one CT, or None where a mesh is the skin.
+def _checked(found: Found, point: Floats | None, request: Request) -> Ct | SkinMesh:
+    """The one CT, or the mesh that is the skin.
 
     Raises:
         InputError: Everything that is missing, doubled or could not be read.
@@ -118,13 +124,16 @@ def _checked(found: Found, point: Floats | None, request: Request) -> Ct | None:
         problems.append(f"several CTs: {', '.join(one.source for one in cts)} (--ct says which)")
     if not found.segmentations and not problems:
         problems.append("no segmentation: no label map, masks or meshes")
-    skins = [one for one in found.segmentations if isinstance(one, MeshFolder) and one.skin is not None]
-    if not cts and not skins and not found.problems:
+    mesh = None if cts else skin_mesh(found.segmentations)
+    if mesh is not None:
+        problems += skin_problems(mesh, found.segmentations)
+    elif not cts and not found.problems:
         problems.append("no CT in Hounsfield units (min below -200), and no mesh named like the skin")
     problems += _doubled(found.segmentations)
-    if problems:
+    body = cts[0] if cts else mesh
+    if problems or body is None:
         raise InputListError("; ".join(problems), where=request.folder, allowed=ALLOWED)
-    return cts[0] if cts else None
+    return body
 
 
 def _below(where: str, folder: Path) -> str:
@@ -167,10 +176,9 @@ def _refuse_outside(point: Floats, ct: Ct, space: Space) -> None:
     raise InputError(what, where="--target", allowed="a point in the body")
 
 
-def _with_skin(segmentation: Segmentation, rows: Sequence[Assigned]) -> list[Assigned]:
-    """The same rows, with the mesh that is named like the body as the skin."""
-    skin = segmentation.skin if isinstance(segmentation, MeshFolder) else None
-    return [row._replace(kind="skin", line=BODY) if row.label == skin else row for row in rows]
+def _with_skin(rows: Sequence[Assigned], skin: SkinMesh) -> list[Assigned]:
+    """The same rows, with the mesh that is the skin as such; names are told apart before."""
+    return [row._replace(kind="skin", line=BODY) if row.name == skin.name else row for row in rows]
 
 
 def _markers_of_ct(markers: Sequence[Markers], ct: Ct | None) -> list[Markers]:

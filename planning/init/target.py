@@ -10,7 +10,6 @@ import scipy
 
 from puncture_twin.planning.anatomy.crossed_names import named_as_crossed
 from puncture_twin.planning.anatomy.default_roles import (
-    BODY,
     LESION,
     NEVER_CROSSED,
     DefaultRole,
@@ -26,6 +25,7 @@ from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 from puncture_twin.planning.geometry.voxelize import voxels_inside
+from puncture_twin.planning.init.outlines import Outlines, named_like_body
 from puncture_twin.planning.init.roles import Holding, chosen_target
 from puncture_twin.planning.init.segmentation import Segmentation
 
@@ -71,14 +71,12 @@ def shown(point_ct: Floats, space: Space) -> str:
     return ", ".join(f"{one:.1f}" for one in to_lps(point_ct[None], space)[0]) + f" mm {space}"
 
 
-def typed_target(
-    point_ct: Floats, segmentations: Sequence[Segmentation], space: Space, *, space_stated: bool
-) -> Target:
+def typed_target(point_ct: Floats, outlines: Outlines, space: Space, *, space_stated: bool) -> Target:
     """A point that was typed, with the structures that hold it.
 
     Args:
         point_ct: Shape (3,), LPS mm.
-        segmentations: What may hold it.
+        outlines: The body's, with all segmentations that may hold the point.
         space: In which it was typed.
         space_stated: Whether the user said so.
 
@@ -86,10 +84,12 @@ def typed_target(
         InputError: It would lie in a structure, or a likelier one, if it was meant in the other space, and nobody said
             which; or it lies in a vessel or another structure that no path may cross, which a slip of numbers does.
     """
-    names = _holders(point_ct, segmentations)
-    other = "" if names and space_stated else _other_reading(point_ct, segmentations, space, names)
+    holders = _holders(point_ct, outlines)
+    names = [name for name in holders if not named_like_body(name)]
+    other = "" if names and space_stated else _other_reading(point_ct, outlines, space, names)
     if not names and (space_stated or not other):
-        return Target(point_ct, Holding(None, frozenset()), (_in_nothing(point_ct, segmentations, other),))
+        note = _in_nothing(point_ct, outlines.segmentations, holders, other)
+        return Target(point_ct, Holding(None, frozenset(holders)), (note,))
     if not names or other:
         place = f"in '{chosen_target(names)}'" if names else "in no structure"
         raise InputError(
@@ -98,8 +98,8 @@ def typed_target(
             allowed="--space LPS or --space RAS, whichever is meant",
         )
     chosen = chosen_target(names)
-    _refuse_in_danger(point_ct, chosen, space, _other_reading(point_ct, segmentations, space, names))
-    holding = Holding(chosen, frozenset(names) - {chosen})
+    _refuse_in_danger(point_ct, chosen, space, _other_reading(point_ct, outlines, space, names))
+    holding = Holding(chosen, frozenset(holders) - {chosen})
     line = default_role(chosen, "other")
     unsure = NOT_KNOWN if line is None or (line == LESION and not named_as_crossed(chosen)) else ""
     return Target(point_ct, holding, (f"the target lies in '{chosen}', which is the target's structure{unsure}",))
@@ -118,12 +118,13 @@ def _danger(line: DefaultRole) -> str:
     return f"of '{line.group}' ({line.reason}), which nothing keeps the needle out of where it holds the target"
 
 
-def label_target(name: str, segmentations: Sequence[Segmentation], space: Space) -> Target:
+def label_target(name: str, outlines: Outlines, space: Space) -> Target:
     """The deepest point of the largest part of a structure.
 
     Raises:
         InputError: No structure has this name.
     """
+    segmentations = outlines.segmentations
     known = {one: (seg, label) for seg in segmentations for label, one in seg.names.items()}
     if name not in known:
         near = ", ".join(sorted(known))
@@ -133,17 +134,18 @@ def label_target(name: str, segmentations: Sequence[Segmentation], space: Space)
     notes = [f"the target is the deepest point of '{name}': {shown(point, space)}"]
     if parts > 1:
         notes.append(f"'{name}' has {parts} parts; the largest was taken")
-    others = frozenset(_holders(point, segmentations)) - {name}
+    others = frozenset(_holders(point, outlines)) - {name}
     return Target(point, Holding(name, others), tuple(notes))
 
 
-def _holders(point_ct: Floats, segmentations: Sequence[Segmentation]) -> list[str]:
+def _holders(point_ct: Floats, outlines: Outlines) -> list[str]:
     """The names of the structures that hold a point, the smallest first; none that is the body's outline."""
     found: list[tuple[float, str]] = []
-    for segmentation in segmentations:
+    left_out = outlines.at(point_ct)
+    for segmentation in outlines.segmentations:
         for label in segmentation.near(point_ct):
             name = segmentation.names[label]
-            if default_role(name, "other") == BODY:
+            if name in left_out:
                 continue
             mesh = segmentation.surface(label)
             if side_of(mesh, point_ct) is Side.INSIDE:
@@ -151,12 +153,13 @@ def _holders(point_ct: Floats, segmentations: Sequence[Segmentation]) -> list[st
     return [name for _, name in sorted(found)]
 
 
-def _other_reading(point_ct: Floats, segmentations: Sequence[Segmentation], space: Space, here: Sequence[str]) -> str:
+def _other_reading(point_ct: Floats, outlines: Outlines, space: Space, here: Sequence[str]) -> str:
     """What the same numbers mean in the other space, where that is a likelier target than what holds them here."""
     if space is Space.LOCAL:
         return ""
     other = Space.RAS if space is Space.LPS else Space.LPS
-    names = _holders(to_lps(point_ct[None], Space.RAS)[0], segmentations)
+    holders = _holders(to_lps(point_ct[None], Space.RAS)[0], outlines)
+    names = [name for name in holders if not named_like_body(name)]
     if _likeliness(names) <= _likeliness(here):
         return ""
     return f" (read in {other} it lies in '{chosen_target(names)}': --space {other})"
@@ -170,9 +173,10 @@ def _likeliness(names: Sequence[str]) -> int:
     return 3 if line == LESION else 1 if line is not None and line.group in NEVER_CROSSED else 2
 
 
-def _in_nothing(point_ct: Floats, segmentations: Sequence[Segmentation], other: str) -> str:
+def _in_nothing(point_ct: Floats, segmentations: Sequence[Segmentation], unknown: Sequence[str], other: str) -> str:
     near = _nearest(point_ct, segmentations)
-    return f"the target lies in no structure{other}; the nearest is {near}; what is hit is a ball of 5 mm about it"
+    but = f" but {', '.join(unknown)}" if unknown else ""
+    return f"the target lies in no structure{but}{other}; the nearest is {near}; what is hit is a ball of 5 mm about it"
 
 
 def _nearest(point_ct: Floats, segmentations: Sequence[Segmentation]) -> str:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.formats.labels.by_name import ByName
 from puncture_twin.planning.needle.bevel_path import bevel_path, step_for
 from puncture_twin.planning.needle.shaft import Shaft
 from puncture_twin.planning.needle.tissue import Tissue
@@ -81,3 +82,22 @@ def shortest_bend(shaft: Shaft) -> float:
 def stiffest_resolved(shaft: Shaft) -> float:
     """Of tissues whose foundation bends a shaft over `shortest_bend` or more, the stiffest, N/mm^2."""
     return 4 * shaft.bending_stiffness / shortest_bend(shaft) ** 4
+
+
+@dataclass(frozen=True)
+class Bending:
+    """A needle with a bevel, and the tissues by the names of their structures.
+
+    Attributes:
+        shaft: From the holder to the tip.
+        alpha: By which the bevel's cut leaves the shaft's direction, rad.
+        tissues: The pattern ``*`` is all that no structure names.
+    """
+
+    shaft: Shaft
+    alpha: float
+    tissues: ByName[Tissue]
+
+    def bound(self, longest_mm: float) -> DeflectionBound:
+        """How far it may bend, on paths up to a length, mm."""
+        return deflection_bound(self.shaft, self.alpha, self.tissues.of_pattern.values(), longest_mm)

@@ -1,4 +1,3 @@
-from .bed import bed_frame as bed_frame
 from .directions import ring_weights as ring_weights
 from .document import (
     place_document as place_document,

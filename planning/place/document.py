@@ -12,7 +12,7 @@ import numpy as np
 
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.place.estimate import ReachEstimate
-from puncture_twin.planning.place.mount_lines import mount_lines
+from puncture_twin.planning.place.mounts import mount_lines
 from puncture_twin.planning.place.search import PlaceSearch, RatedPlacement
 
 PLACE_VERSION = 1

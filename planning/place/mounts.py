@@ -1,4 +1,4 @@
-"""The ways to mount an arm, where each may stand about the target, and the base's pose there."""
+"""The ways to mount an arm, where each may stand about the target, and the base's pose there as ``[robot.mount]``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.case.tables.place_section import MountBounds, MountName
+from puncture_twin.planning.case.tables.robot_section import MountSection
 from puncture_twin.planning.geometry.rigid import frame_xz, pose
+from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 Range = tuple[float, float]
 
@@ -39,6 +41,12 @@ FACINGS: Mapping[str, tuple[int, int, int]] = MappingProxyType(
     {"to +along": (1, 0, 0), "to -along": (-1, 0, 0), "to +across": (0, 1, 0), "to -across": (0, -1, 0)}
 )
 """A side mount's base axis, toward the target, in the bed frame."""
+
+POSITION_DIGITS = 1
+"""Positions are written to 0.1 mm: nobody stands a base more exactly."""
+
+AXIS_DIGITS = 6
+"""Axes are written to six digits: 1e-3 mm at a metre."""
 
 
 @dataclass(frozen=True)
@@ -170,3 +178,30 @@ def _rails(case: Case, table: Obstacle, T_ct_bed: Floats, reach: float) -> list[
         heights = MountBounds(along_mm=bounds.along_mm, height_mm=(top + height[0], top + height[1]))
         found.append(_region("rail", facing, (0, 0, 1), heights, defaults))
     return found
+
+
+def mount_section(T_ct_base: Floats, space: Space) -> MountSection:
+    """The section that states this pose in the case's space, rounded.
+
+    Args:
+        T_ct_base: Shape (4, 4), mm.
+        space: The case's.
+    """
+    # LPS to RAS is its own inverse.
+    position, x, z = to_lps(np.stack([T_ct_base[:3, 3], T_ct_base[:3, 0], T_ct_base[:3, 2]]), space)
+    return MountSection(
+        position_mm=_rounded(position, POSITION_DIGITS),
+        x_axis=_rounded(x, AXIS_DIGITS),
+        z_axis=_rounded(z, AXIS_DIGITS),
+    )
+
+
+def mount_lines(mount: MountSection) -> str:
+    """The lines to paste into a case."""
+    keys = ("position_mm", "x_axis", "z_axis")
+    return "\n".join(["[robot.mount]", *(f"{key} = {list(getattr(mount, key))}" for key in keys)])
+
+
+def _rounded(vector: Floats, digits: int) -> tuple[float, float, float]:
+    x, y, z = (float(value) + 0.0 for value in np.round(vector, digits))  # + 0.0 makes -0.0 a plain 0
+    return x, y, z

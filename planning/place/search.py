@@ -13,6 +13,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import map_all
 from puncture_twin.planning.base.progress import Count
+from puncture_twin.planning.case.bed import bed_frame
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.mount import mount_pose
 from puncture_twin.planning.case.tables.robot_section import MountSection
@@ -25,13 +26,11 @@ from puncture_twin.planning.collision.workcell import (
     outside_surface,
 )
 from puncture_twin.planning.place.arm_spheres import Surroundings
-from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.place.directions import wanted_directions
 from puncture_twin.planning.place.estimate import Estimator, ReachEstimate
 from puncture_twin.planning.place.evaluate import PlacementCheck, Verdict
 from puncture_twin.planning.place.expected_error import expected_tip_error_mm
-from puncture_twin.planning.place.mount_lines import mount_section
-from puncture_twin.planning.place.mounts import Site, regions
+from puncture_twin.planning.place.mounts import Site, mount_section, regions
 from puncture_twin.planning.place.needle_start import needle_can_start
 from puncture_twin.planning.place.obstacle_field import Boxes, SkinField
 from puncture_twin.planning.registration.placement import Placement

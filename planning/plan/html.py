@@ -33,6 +33,7 @@ def _facts(plan: Any) -> Facts:
     for what, millimetres in plan.clearance_mm.items():
         yield f"least distance, {what}", f"{millimetres:.1f} mm"
     yield "seed", str(plan.seed)
+    yield "warnings", "not known: an older file" if plan.warnings is None else "; ".join(plan.warnings) or "none"
 
 
 def _point(point: Any) -> str:

@@ -37,6 +37,7 @@ class Plan:
         clearance_mm: Per phase, the least distance that was found: ``approach`` and ``insertion`` of arm and holder
             to patient and workcell, ``needle`` to the nearest structure with a margin.
         speeds: What it keeps: the case's. A file that does not say so keeps the default.
+        warnings: Of its case when it was made, one sentence each; None of a file that is older than their statement.
     """
 
     case_name: str
@@ -57,6 +58,7 @@ class Plan:
     insertion: Trajectory
     clearance_mm: Mapping[str, float]
     speeds: SpeedLimits = DEFAULT_SPEEDS
+    warnings: tuple[str, ...] | None = None
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""

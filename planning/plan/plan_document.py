@@ -25,6 +25,7 @@ from puncture_twin.planning.base.strict_json import (
     parse_document,
     point,
     text,
+    texts,
     whole,
 )
 from puncture_twin.planning.formats.guard import guard_transform
@@ -35,7 +36,8 @@ from puncture_twin.planning.plan.plan_check import check_geometry, rate_limits
 
 PLAN_VERSION = 3
 """Version of the file's layout. 2: states the peaks of both phases beside the limits; the approach is smooth. 3: lists
-its inputs with their roles, files that a file names included."""
+its inputs with their roles, files that a file names included. What came later may be absent: `arm`, `speed_limits`,
+`warnings`."""
 
 PLAN_ALLOWED = f"a plan.json of version {PLAN_VERSION}; plan again"
 
@@ -53,7 +55,7 @@ NAMES = (
         "beta_deg",
     ),
     *("entry_ct_mm", "target_ct_mm", "outward_ct", "roll_deg", "standoff_mm", "needle_length_mm", "limits"),
-    *("speed_limits", "approach", "insertion", "clearance_mm"),
+    *("speed_limits", "approach", "insertion", "clearance_mm", "warnings"),
 )
 PHASE_NAMES = ("times_s", "q_rad", "peaks")
 CLEARANCE_NAMES = ("approach", "insertion", "needle")
@@ -94,6 +96,7 @@ def write_plan(plan: Plan, path: Path) -> None:
         "approach": _trajectory_document(plan.approach),
         "insertion": _trajectory_document(plan.insertion),
         "clearance_mm": {phase: or_null(value) for phase, value in plan.clearance_mm.items()},
+        **({} if plan.warnings is None else {"warnings": list(plan.warnings)}),
     }
     with atomic(path) as temporary:
         temporary.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -163,7 +166,7 @@ def _check_names(document: dict[str, Any], path: Path) -> None:
         *((f"inputs.{at}.", one, INPUT_NAMES) for at, one in enumerate(document["inputs"])),
     ):
         # a phase whose clearance is not stated is for whoever has the case to miss
-        optional = set(known) if part is document["clearance_mm"] else {"speed_limits", "arm"}
+        optional = set(known) if part is document["clearance_mm"] else {"speed_limits", "arm", "warnings"}
         for name in sorted(set(part) ^ set(known) - (optional - set(part))):
             what = "is not known" if name in part else "is missing"
             raise InputError(f"key '{where}{name}' {what}", where=path, allowed=", ".join(known))
@@ -194,6 +197,7 @@ def _plan(document: dict[str, Any], path: Path) -> Plan:
         insertion=field(document, "insertion", _trajectory),
         clearance_mm=field(document, "clearance_mm", _clearances),
         speeds=field({"speed_limits": None, **document}, "speed_limits", _speed_limits),
+        warnings=field(document, "warnings", texts) if "warnings" in document else None,
     )
 
 

@@ -117,6 +117,7 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
         ),
         clearance_mm={"needle": float(candidates.clearance.least[row])},
         speeds=speeds,
+        warnings=context.anatomy.warnings,
     )
     touched = motion_contact(plan, checker)
     if touched is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,7 @@ def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None
     if seed is not None:
         _check_same("seed", plan.seed, seed, path)
     _check_labels(plan, context, candidates, path)
+    _check_warnings(plan, context, path)
     check_angles(plan, path)
     touched = motion_contact(plan, context.reach.checker)
     if touched is not None:
@@ -63,6 +65,19 @@ def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None
     for phase, known in phase_clearances(plan, context.reach.checker).items():
         _check_same(f"clearance_mm.{phase}", plan.clearance_mm.get(phase, np.nan), known, path)
     return candidates
+
+
+def with_case_warnings(plan: Plan, context: CaseContext) -> Plan:
+    """A plan that was checked, with its case's warnings: an older file does not state them."""
+    return replace(plan, warnings=context.anatomy.warnings)
+
+
+def _check_warnings(plan: Plan, context: CaseContext, path: Path) -> None:
+    """Refuse a plan that states other warnings than its case has: people decide by them."""
+    if plan.warnings is not None and plan.warnings != context.anatomy.warnings:
+        apart = set(plan.warnings) ^ set(context.anatomy.warnings)
+        shown = f", such as '{min(apart)}'" if apart else ""
+        raise InputError(f"its warnings are not those of the case{shown}", where=path, allowed="plan again")
 
 
 def _check_limits(plan: Plan, context: CaseContext, path: Path) -> None:

@@ -25,8 +25,7 @@ from puncture_twin.planning.clearance.cross_check import CrossChecked, cross_che
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.collision.surroundings import with_surroundings
-from puncture_twin.planning.collision.workcell import case_checker
+from puncture_twin.planning.collision.workcell import case_checker, with_surroundings
 from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.registration.placement import Placement, load_placement
 from puncture_twin.planning.search.arm_reach import ArmReach
@@ -37,7 +36,7 @@ from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
 from puncture_twin.planning.search.consistency.consistency import check_consistency
 from puncture_twin.planning.search.doubt import Doubt, doubt_of
 from puncture_twin.planning.search.explain import Explanation
-from puncture_twin.planning.search.phases.breath_warnings import breath_warnings
+from puncture_twin.planning.search.phases.moving_weights import breath_warnings
 from puncture_twin.planning.search.search import search
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.tables.ranking_section import RankingSection
+from puncture_twin.planning.case.tables.search_section import RankingSection
 from puncture_twin.planning.search.candidates import Candidates, Ranking
 
 COMFORT_MM = 20.0

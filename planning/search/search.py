@@ -6,13 +6,13 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import Directions
-from puncture_twin.planning.clearance.engine import ClearanceEngine
+from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
+from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.chances.best_refined import with_best_refined
 from puncture_twin.planning.search.chances.candidate_chances import with_chances
 from puncture_twin.planning.search.chances.joint import with_joint_chances
-from puncture_twin.planning.search.organ_distances import organ_distances
+from puncture_twin.planning.search.chances.near_limits import with_best_refined
 from puncture_twin.planning.search.organs import organ_candidates
 from puncture_twin.planning.search.phases.arm_phases import with_breathing_reach
 from puncture_twin.planning.search.ranking import ranked
@@ -47,3 +47,8 @@ def search(
         found = with_breathing_reach(case, anatomy, with_reach(case, found, reach, progress), reach)
     found = ranked(case, with_chances(case, anatomy, found, chance, axes))
     return with_joint_chances(with_best_refined(found, chance), chance)
+
+
+def organ_distances(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> AxisDistances:
+    """How far the needle's axis is from every structure in every direction."""
+    return engine.measure(case.target_ct, directions.outward_ct, axis_lengths(case, anatomy.checked))

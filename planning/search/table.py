@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.base.output.columns import column, truths
 from puncture_twin.planning.search.candidates import ANGLE_DIGITS, Candidates
 from puncture_twin.planning.search.selection.windows import find_windows
 from puncture_twin.planning.uncertainty.chances import Chances
@@ -26,7 +26,25 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
         candidates: The search's result.
         provenance: Case name, input hashes, version, seed, step; stored under the key ``run`` as JSON.
     """
-    reachable = candidates.arm.reachable
+    columns = _path_columns(candidates) | _choice_columns(candidates)
+    if candidates.chances is not None:
+        columns |= chance_columns(candidates.chances)
+    if candidates.deflection is not None:
+        columns |= {"deflection_bound_mm": candidates.deflection}
+    if candidates.breathing is not None:
+        columns |= {
+            "safe_all_phases": candidates.breathing.safe_all_phases,
+            "worst_phase": candidates.breathing.worst_phase,
+            "breathing_clearance_mm": candidates.breathing.clearance,
+        }
+    run = {**provenance, "safe_cone_from": candidates.cone_source}
+    named = {name: one if isinstance(one, pa.Array) else column(np.asarray(one)) for name, one in columns.items()}
+    table = pa.table(named)
+    return table.replace_schema_metadata({"run": json.dumps(run, sort_keys=True)})
+
+
+def _path_columns(candidates: Candidates) -> dict[str, Any]:
+    """Direction, verdict, and the straight path with its clearances."""
     columns: dict[str, Any] = {
         "theta_deg": np.round(np.degrees(candidates.theta), ANGLE_DIGITS),
         "beta_deg": np.round(np.degrees(candidates.beta), ANGLE_DIGITS),
@@ -45,8 +63,13 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
     }
     for at, name in enumerate(candidates.clearance.structures):
         columns[f"clearance_{name}_mm"] = candidates.clearance.distance[:, at]
-    columns |= {
-        "tissue_mm": candidates.path.tissue,
+    return {**columns, "tissue_mm": candidates.path.tissue}
+
+
+def _choice_columns(candidates: Candidates) -> dict[str, Any]:
+    """What tells safe directions from one another: reach, the cone, cost and rank, and the window."""
+    reachable = candidates.arm.reachable
+    return {
         "reachable": truths(reachable > 0, reachable >= 0),
         "reach_margin": candidates.arm.margin,
         "safe_cone_deg": np.degrees(candidates.safe_cone),
@@ -55,20 +78,6 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
         "pareto": candidates.ranking.pareto,
         "window": find_windows(candidates).of_row,
     }
-    if candidates.chances is not None:
-        columns |= chance_columns(candidates.chances)
-    if candidates.deflection is not None:
-        columns |= {"deflection_bound_mm": candidates.deflection}
-    if candidates.breathing is not None:
-        columns |= {
-            "safe_all_phases": candidates.breathing.safe_all_phases,
-            "worst_phase": candidates.breathing.worst_phase,
-            "breathing_clearance_mm": candidates.breathing.clearance,
-        }
-    run = {**provenance, "safe_cone_from": candidates.cone_source}
-    named = {name: one if isinstance(one, pa.Array) else column(np.asarray(one)) for name, one in columns.items()}
-    table = pa.table(named)
-    return table.replace_schema_metadata({"run": json.dumps(run, sort_keys=True)})
 
 
 def chance_columns(chances: Chances) -> dict[str, Floats]:
@@ -92,3 +101,32 @@ def write_table(candidates: Candidates, provenance: Mapping[str, Any], path: Pat
     """Write the table as Parquet, whole or not at all."""
     with atomic(path) as temporary, temporary.open("wb") as stream:
         pq.write_table(to_table(candidates, provenance), stream)
+
+
+def column(values: NDArray[Any]) -> pa.Array:
+    """Numbers, truth values or texts, shape (n,); NaN becomes null: "no number" is not a number."""
+    if values.dtype.kind in "OU":
+        return _texts(values.tolist())
+    known = ~np.isnan(values) if values.dtype.kind == "f" else np.ones(len(values), bool)
+    data = _bits(values) if values.dtype.kind == "b" else pa.py_buffer(np.ascontiguousarray(values))
+    return _of(pa.from_numpy_dtype(values.dtype), known, data)
+
+
+def truths(values: NDArray[np.bool_], known: Bools) -> pa.Array:
+    """Truth values, shape (n,), null where they are not known."""
+    return _of(pa.bool_(), known, _bits(values & known))
+
+
+def _texts(values: list[str]) -> pa.Array:
+    encoded = [value.encode() for value in values]
+    ends = np.cumsum([0, *map(len, encoded)], dtype=np.int32)
+    return _of(pa.string(), np.ones(len(values), bool), pa.py_buffer(ends), pa.py_buffer(b"".join(encoded)))
+
+
+def _of(kind: pa.DataType, known: Bools, *data: pa.Buffer) -> pa.Array:
+    absent = int(len(known) - known.sum())
+    return pa.Array.from_buffers(kind, len(known), [_bits(known) if absent else None, *data], absent)
+
+
+def _bits(values: NDArray[np.bool_]) -> pa.Buffer:
+    return pa.py_buffer(np.packbits(values, bitorder="little"))

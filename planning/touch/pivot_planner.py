@@ -17,9 +17,9 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.progress import Count
+from puncture_twin.planning.case.bed import bed_frame
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.straight_approach import ApproachCheckers, why_not
 from puncture_twin.planning.touch.touch_plan import TouchTour

@@ -1,11 +1,12 @@
-"""The motions of a tour: from home through the standoffs of all touches by the shortest way, and back."""
+"""The motions of a tour: from home through the standoffs of all touches in the order of least cost, and back."""
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
@@ -13,9 +14,11 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.motion.approach import plan_approach
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.touch.order import shortest_tour
 from puncture_twin.planning.touch.straight_approach import STANDOFF_MM, line_to
 from puncture_twin.planning.touch.touch_plan import Touch, TouchTour
+
+RESOLUTION = 1e-9
+"""Of costs, in their unit: sums of whole multiples are exact."""
 
 
 class NoMotionError(NoAnswerError):
@@ -66,3 +69,32 @@ def tour_through(context: CaseContext, stops: Stops, *, seed: int, progress: Cou
     touched = zip(order, legs, strict=False)
     touches = (Touch(stops.names[at], stops.points_base[at], stops.q_touch[at], leg) for at, leg in touched)
     return TouchTour(case.robot.model, tip_mm, tuple(touches), legs[-1])
+
+
+def shortest_tour(cost: ArrayLike) -> tuple[int, ...]:
+    """The order of n places of least total cost, by dynamic programming over subsets; of equal ones the first in order.
+
+    Where costs are symmetric, a tour and its reverse cost the same: sums of rounded floats would choose between them.
+
+    Source: Held and Karp 1962, "A dynamic programming approach to sequencing problems". 2^n n^2 steps: n to a dozen.
+
+    Args:
+        cost: Shape (n + 1, n + 1), symmetric or not: from row to column; the last row and column are home.
+
+    Returns:
+        The places 0 to n - 1 in order.
+
+    >>> shortest_tour([[0, 9, 1, 9], [9, 0, 9, 1], [9, 1, 0, 9], [1, 9, 9, 0]])
+    (0, 2, 1)
+    """
+    of = np.rint(np.asarray(cost, dtype=np.float64) / RESOLUTION).astype(np.int64).tolist()
+    n = len(of) - 1
+    best: dict[tuple[int, int], tuple[int, tuple[int, ...]]] = {(1 << k, k): (of[n][k], (k,)) for k in range(n)}
+    for size in range(2, n + 1):
+        for places in combinations(range(n), size):
+            whole = sum(1 << k for k in places)
+            for last in places:
+                before = (best[whole & ~(1 << last), k] for k in places if k != last)
+                best[whole, last] = min((so_far + of[order[-1]][last], (*order, last)) for so_far, order in before)
+    whole = (1 << n) - 1
+    return min((best[whole, last][0] + of[last][n], best[whole, last][1]) for last in range(n))[1]

@@ -17,7 +17,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
 from puncture_twin.planning.reach.standoff import axis_lengths
 from puncture_twin.planning.uncertainty.chances import Chances
-from puncture_twin.planning.uncertainty.hit_model import HitModel, hit_model
+from puncture_twin.planning.uncertainty.hit import HitModel, hit_model
 from puncture_twin.planning.uncertainty.limits import demanding, touch_limit
 from puncture_twin.planning.uncertainty.lines.refined_touch import Needles, Surroundings, refined
 from puncture_twin.planning.uncertainty.pose_error import PoseError

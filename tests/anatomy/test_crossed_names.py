@@ -2,7 +2,15 @@
 
 import pytest
 
-from puncture_twin.planning.anatomy.crossed_names import BONES, ORGANS, QUALIFIERS, SOFT_TISSUES, named_as_crossed
+from puncture_twin.planning.anatomy.crossed_names import (
+    BONES,
+    NEEDS,
+    ORGANS,
+    POSITIONS,
+    QUALIFIERS,
+    SOFT_TISSUES,
+    named_as_crossed,
+)
 from puncture_twin.planning.anatomy.default_roles import UNKNOWN_NAME, never_crossed
 from puncture_twin.planning.init.roles import Holding, assign, chosen_target
 
@@ -13,7 +21,35 @@ DANGERS = {
     "of an organ": ["liver veins", "kidney_pelvis", "lung vessels", "thyroid cartilage", "pancreas duct"],
     "of a lesion": ["Tumorvene", "Metastasenarterie", "hccvein", "GTVein", "Tumorgefäße", "tumor feeder"],
     "of an adjective": ["left middle cerebral", "posterior_inferior_cerebellar", "lymph", "femoris", "spinae"],
-    "no names": ["Segment_1", "label 7", "structure", "left"],
+    "no names": ["Segment_1", "label 7", "structure", "left", "Segment_1 (copy)", "External", "patient"],
+    "an organ's adjective": [
+        *("superior thyroid", "Thyroid_Inferior_L", "SuperiorThyroid", "middle thyroid 1", "inferior adrenal"),
+        *("internal thoracic", "middle cerebral", "posterior cerebellum", "neck superior thyroid", "superior parotid"),
+        *("internal ilium", "external ilium 2", "internal maxilla", "lateral breast", "superior pancreas"),
+    ],
+    "the cord": ["cervical white matter", "grey matter c5", "lumbar gray matter", "anterior grey matter segment"],
+    "the eye": [
+        *("superior_oblique_muscle_right", "inferior_oblique_muscle_left", "superior_rectus_muscle_right"),
+        *("medial_rectus_muscle_left", "lateral rectus", "levator_muscle_left", "oblique", "M. rectus superior"),
+    ],
+    "whole nomenclatures": [
+        *("Lumen of liver", "Hilum of lung", "Capsule of kidney", "Branch of left lung", "Muscle of heart"),
+        *("Entire vertebral artery", "Structure of tail of spine", "Wall of uterus", "Duct of parotid gland"),
+    ],
+    "Spanish": ["vena del hígado", "mesentérica superior", "arteria tiroidea superior", "médula", "uréter", "vejiga"],
+    "Italian": ["vena porta", "arteria renale", "midollo", "tiroidea inferiore", "vena polmonare", "colecisti"],
+    "Latin": ["V. lienalis", "Aa. cerebri", "N. vagus", "ductus pancreaticus", "thyroidea superior", "arcus aortae"],
+    "compounds": ["Schilddrüsenarterie", "Schilddruesenvene", "Schilddrusenvene", "Nierenbecken", "Tumorgefass"],
+    "signs": [
+        "liver\u200bvein",
+        "lung\u00advein",
+        "liverV",
+        "lung.a",
+        "kidney(v)",
+        "LIVER-VEIN",
+        "Lùng vèin",
+        "liver+v",
+    ],
 }
 CROSSED = [
     "Left Lung",
@@ -27,6 +63,18 @@ CROSSED = [
     "erector spinae",
     "lymph node 3",
     "GTV1",
+    "Left-Cerebral-White-Matter",
+    "white_matter",
+    "superior thyroid lobe",
+    "thyroid left",
+    "right middle lobe of lung",
+    "superior thyroid tumour",
+    "External_Oblique_R",
+    "rectus_abdominis_left",
+    "serratus_anterior_1",
+    "levator_scapulae_right",
+    "thigh_medial_compartment_left",
+    "thoracic vertebra 7",
 ]
 
 
@@ -62,6 +110,23 @@ def test_an_unknown_name_is_no_target_beside_an_organ():
     assert chosen_target(["SMA", "qwerty"]) == "SMA"
 
 
+@pytest.mark.parametrize("name", ["Tumorvene", "tumor feeder", "lesion_a", "Metastasenarterie"])
+def test_what_is_named_after_a_lesion_is_no_target_beside_one(name):
+    """The smaller of the two was the target's structure, and nothing kept the needle out of the vein of a tumour."""
+    assert chosen_target([name, "tumor"]) == "tumor"
+    assert chosen_target([name, "liver"]) == name
+    (row, _) = assign({1: name, 2: "tumor"}, "abdomen", Holding("tumor", frozenset({name})))
+    assert row.kind == "unknown"
+
+
+@pytest.mark.parametrize("region", ["head", "brain", "other"])
+def test_muscles_of_the_eye_are_crossed_nowhere(region):
+    """Away from the target too: TotalSegmentator's obliques were muscles like those of the belly."""
+    for name in DANGERS["the eye"]:
+        (row,) = assign({1: name}, region, Holding(None, frozenset()))
+        assert row.kind == "avoid" and row.margin_mm > 0.0, name
+
+
 @pytest.mark.parametrize("name", ["tumor-artery", "lung_lesion_vessels", "peritumoralVessels", "aneurysm mass"])
 def test_a_vessel_of_a_lesion_is_a_vessel(name):
     """As a target it was a lesion by its name, and nothing kept the needle out of it."""
@@ -72,8 +137,8 @@ def test_a_vessel_of_a_lesion_is_a_vessel(name):
 
 def test_a_foreign_word_beside_known_ones_is_never_crossed(rng):
     """Drawn names: known words, one letter of one of them changed or one word more, and the whole is not known."""
-    words = sorted(ORGANS | BONES | SOFT_TISSUES | QUALIFIERS)
-    nouns = sorted(ORGANS | BONES | SOFT_TISSUES)
+    nouns = sorted((ORGANS | BONES | SOFT_TISSUES) - {"matter", *NEEDS})
+    words = sorted({*nouns, *QUALIFIERS} - POSITIONS)
     for _ in range(500):
         known = [str(rng.choice(nouns)), *map(str, rng.choice(words, rng.integers(0, 3)))]
         rng.shuffle(known)
@@ -89,3 +154,117 @@ def test_the_margin_is_the_tables():
     """Of a name that a line knows its margin, of others the largest."""
     rows = assign({1: "colon", 2: "AAA"}, "abdomen", Holding("tumor", frozenset({"colon", "AAA"})))
     assert [(row.kind, row.margin_mm) for row in rows] == [("unknown", 3.0), ("unknown", UNKNOWN_NAME.margin_mm)]
+
+
+SUBTASKS = [
+    "lung_vessels",
+    "lung_trachea_bronchia",
+    "intracerebral_hemorrhage",
+    "hip_implant",
+    "pleural_effusion",
+    "pericardial_effusion",
+    "eye_left",
+    "eye_lens_left",
+    "optic_nerve_left",
+    "parotid_gland_left",
+    "submandibular_gland_right",
+    "nasopharynx",
+    "oropharynx",
+    "hypopharynx",
+    "nasal_cavity_right",
+    "auditory_canal_right",
+    "soft_palate",
+    "hard_palate",
+    "larynx_air",
+    "thyroid_cartilage",
+    "hyoid",
+    "cricoid_cartilage",
+    "zygomatic_arch_right",
+    "styloid_process_right",
+    "internal_carotid_artery_right",
+    "internal_jugular_vein_right",
+    "superior_pharyngeal_constrictor",
+    "middle_pharyngeal_constrictor",
+    "inferior_pharyngeal_constrictor",
+    "sterno_thyroid_right",
+    "thyrohyoid_right",
+    "prevertebral_right",
+    "liver_vessels",
+    "eyeball_right",
+    "lateral_rectus_muscle_right",
+    "superior_oblique_muscle_right",
+    "levator_palpebrae_superioris_right",
+    "superior_rectus_muscle_right",
+    "medial_rectus_muscle_left",
+    "inferior_oblique_muscle_right",
+    "inferior_rectus_muscle_right",
+    "kidney_cyst_left",
+    "ventricle_frontal_horn_left",
+    "ventricle_body_left",
+    "third_ventricle",
+    "fourth_ventricle",
+    "heart_myocardium",
+    "subarachnoid_space",
+    "venous_sinuses",
+    "septum_pellucidum",
+    "caudate_nucleus",
+    "lentiform_nucleus",
+    "insular_cortex",
+    "internal_capsule",
+    "ventricle",
+    "central_sulcus",
+    "frontal_lobe",
+    "thalamus",
+    "brainstem",
+    "coronary_arteries",
+    "mandible",
+    "teeth_lower",
+    "sinus_maxillary",
+    "sinus_frontal",
+    "abdominal_cavity",
+    "thoracic_cavity",
+    "pericardium",
+    "mediastinum",
+    "aortic_sinuses",
+    "brain_aneurysm",
+    "spinal_cord_gray_matter",
+    "levator_scapulae_right",
+    "vertebrae_L5",
+    "rib_left_7",
+    "skull",
+]
+"""Classes of TotalSegmentator's further tasks: away from the target none of them is crossed outside of the brain."""
+CROSSED_SUBTASKS = [
+    "sternocleidomastoid_right",
+    "trapezius_left",
+    "platysma_right",
+    "anterior_scalene_right",
+    "middle_scalene_left",
+    "posterior_scalene_left",
+    "subcutaneous_fat",
+    "torso_fat",
+    "intermuscular_fat",
+    "skeletal_muscle",
+    "quadriceps_femoris_left",
+    "thigh_medial_compartment_left",
+    "thigh_posterior_compartment_right",
+    "sartorius_left",
+    "deltoid",
+    "pectoralis_minor",
+    "serratus_anterior",
+    "external_oblique_right",
+    "internal_oblique_left",
+    "erector_spinae",
+    "rectus_abdominis",
+    "latissimus_dorsi_left",
+    "psoas_major_right",
+    "breast",
+]
+
+
+@pytest.mark.parametrize("region", ["head", "neck", "abdomen", "limb"])
+def test_the_classes_of_further_tasks_are_crossed_where_they_are_muscle_or_fat(region):
+    """Names as facts; the same are crossed as before."""
+    rows = assign(dict(enumerate([*SUBTASKS, *CROSSED_SUBTASKS])), region, Holding(None, frozenset()))
+    assert {row.name for row in rows if row.kind == "traverse"} == set(CROSSED_SUBTASKS)
+    assert all(row.margin_mm > 0.0 for row in rows if row.kind == "avoid")

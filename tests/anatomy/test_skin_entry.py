@@ -1,14 +1,15 @@
 """The skin along a path: a body of boxes and tents whose crossings, angles and second looks are known by hand."""
 
+import importlib
+
 import numpy as np
 import pytest
 import trimesh
 
 from puncture_twin.planning.anatomy.skin import FieldOfView, Skin, skin_from_mesh
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
-from puncture_twin.planning.geometry.crossings import Crossings
+from puncture_twin.planning.geometry.crossings import NUDGE, Crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.settled_crossings import NUDGE
 
 UP = np.array([[0.0, 0.0, 1.0]])
 
@@ -59,7 +60,7 @@ def test_the_second_look_is_a_nudge_aside_and_only_for_rays_that_need_it(monkeyp
         ray, first = np.repeat(np.arange(4), count), np.concatenate([[0], np.cumsum(count)[:-1]])
         return Crossings(ray, 10.0 + np.arange(len(ray)), 0 * ray, count, first)
 
-    monkeypatch.setattr("puncture_twin.planning.geometry.settled_crossings.crossings", crossings)
+    monkeypatch.setattr("puncture_twin.planning.geometry.crossings.crossings", crossings)
     box = trimesh.creation.box([100, 100, 100])
     skin = skin_from_mesh(TriangleMesh(box.vertices, box.faces))
     directions = np.array([[0.0, 0, 1], [0.6, 0.8, 0.0], [1, 0, 0], np.array([-1, 1, 1]) / np.sqrt(3)])
@@ -76,10 +77,9 @@ def test_the_second_look_is_a_nudge_aside_and_only_for_rays_that_need_it(monkeyp
 
 def test_crossings_that_add_up_are_not_asked_again(monkeypatch, box):
     """One look suffices where every ray leaves the body an odd number of times; an open skin is never asked twice."""
-    from puncture_twin.planning.geometry import settled_crossings
-
-    looks, plain = [], settled_crossings.crossings
-    monkeypatch.setattr(settled_crossings, "crossings", lambda *a, **k: looks.append(1) or plain(*a, **k))
+    module = importlib.import_module("puncture_twin.planning.geometry.crossings")
+    looks, plain = [], module.crossings
+    monkeypatch.setattr(module, "crossings", lambda *a, **k: looks.append(1) or plain(*a, **k))
     mesh = box([100, 100, 100])
     skin_paths(skin_from_mesh(mesh), np.array([1.0, 2, 3]), np.array([[0.1, 0.2, 0.97]]), 200.0)
     assert len(looks) == 1

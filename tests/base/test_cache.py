@@ -23,7 +23,6 @@ MAKERS = (
     "puncture_twin.planning.anatomy.scan",
     "puncture_twin.planning.collision.packed.hulls",
     "puncture_twin.planning.collision.packed.skin",
-    "puncture_twin.planning.collision.packed.trees",
     "puncture_twin.planning.collision.never_touching",
     "puncture_twin.twin.report.scene.lighter_mesh",
 )

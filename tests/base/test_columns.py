@@ -5,7 +5,7 @@ import pyarrow as pa
 import pytest
 from hypothesis import given, strategies as st
 
-from puncture_twin.planning.base.output.columns import column, truths
+from puncture_twin.planning.search.table import column, truths
 
 KINDS = {
     "floats": st.one_of(st.floats(allow_infinity=True), st.just(float("nan"))).map(np.float64),

@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.base.output.lock import locked
 from puncture_twin.planning.base.output.manifest import (
     MANIFEST_NAME,
     TIMINGS_NAME,
@@ -21,7 +20,7 @@ from puncture_twin.planning.base.output.manifest import (
     read_manifest,
     read_output,
 )
-from puncture_twin.planning.base.output.output_set import withdraw, writing
+from puncture_twin.planning.base.output.output_set import locked, withdraw, writing
 from puncture_twin.planning.base.provenance import Input
 
 INPUTS = (Input("case", "case.toml", "ab"),)

@@ -9,8 +9,7 @@ from case_world import ball, registration_section, write_markers
 from cohort_world import plan_of, table_bytes, task_of, tiny_text, write_patient
 
 from puncture_twin.planning.base.cache.memory import Memory
-from puncture_twin.planning.batch.run_case import STALE, run_case
-from puncture_twin.planning.batch.worker import MEMORY_BYTES
+from puncture_twin.planning.batch.run_case import MEMORY_BYTES, STALE, run_case
 
 
 @pytest.fixture

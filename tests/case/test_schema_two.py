@@ -24,7 +24,8 @@ def test_a_case_that_states_its_structures_is_read_without_a_note(tmp_path):
     """The count includes the skin; region and count are the case's."""
     case = load_case(write_case(tmp_path, text=TWO))
     assert (case.stated_structures, case.region, case.warnings) == (4, "other", ())
-    assert prepare(tmp_path, arm=False).anatomy.warnings == (OUTSIDE_NOT_KNOWN,)
+    (outside, base) = prepare(tmp_path, arm=False).anatomy.warnings
+    assert outside == OUTSIDE_NOT_KNOWN and "the robot's base would stand in the patient" in base  # of equal lists
 
 
 @pytest.mark.parametrize(
@@ -176,6 +177,17 @@ def test_usual_organs_that_are_absent_are_listed_once(tmp_path):
 def test_organs_are_known_by_their_common_names(region, names, absent):
     """TotalSegmentator's names, other spellings, sides; an adrenal gland is no kidney."""
     assert absent_organs(region, names) == absent
+
+
+def test_the_vessels_of_an_organ_are_not_the_organ():
+    """A liver that nobody segmented was not told where its vessels were: it counts as free."""
+    names = ["liver_vessels", "kidney_cyst_left", "right renal artery", "lung vessels", "intercostal_artery"]
+    names += ["vertebral artery", "pancreatic duct", "Liver tumor", "splenic vein"]
+    assert absent_organs("abdomen", names) == absent_organs("abdomen", [])
+    assert absent_organs("neck", ["superior thyroid artery", "left carotid artery", "Right Carotid"]) == [
+        name for name in absent_organs("neck", []) if name != "carotid arteries"
+    ]
+    assert "portal vein" not in absent_organs("abdomen", ["portal_vein_and_splenic_vein"])
 
 
 def test_totalsegmentator_names_every_usual_organ_of_the_trunk():

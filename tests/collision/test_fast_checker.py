@@ -18,17 +18,15 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
-from puncture_twin.planning.collision.bodies.shapes import convex
+from puncture_twin.planning.collision.bodies.shapes import convex, inscribed_prism, prism
+from puncture_twin.planning.collision.bodies.sphere_tree import sphere_tree
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
-from puncture_twin.planning.collision.enclosures.coarse_hull import coarse_hull
-from puncture_twin.planning.collision.enclosures.hull_edges import neighbours
-from puncture_twin.planning.collision.enclosures.prism import inscribed_prism, prism
-from puncture_twin.planning.collision.enclosures.sphere_tree import sphere_tree
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.fcl_contact import fcl_contact
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING, hull_gap
 from puncture_twin.planning.collision.kernels.surfaces import STACK, to_surface
-from puncture_twin.planning.collision.triangle_tree import TriangleTree
+from puncture_twin.planning.collision.packed.hulls import coarse_hull, neighbours
+from puncture_twin.planning.collision.packed.skin import TriangleTree
+from puncture_twin.planning.collision.proofs import fcl_contact
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.triangle_distance import to_triangle
@@ -408,6 +406,20 @@ def test_what_a_judge_remembers_changes_no_verdict() -> None:
             names = [check for check in slow._checks if check.contact == contact]
             met = (fcl_contact(check, poses) is not None for poses in link_poses(UR3, states) for check in names)
             assert any(met)
+
+
+def test_the_end_of_a_segment_is_checked_as_it_is() -> None:
+    """A segment's verdict at its end is that of the state, whether it is reached from near or from far."""
+    fast, rng, verdicts = scene(FastChecker), np.random.default_rng(8), []
+    assert isinstance(fast, FastChecker)
+    judge = fast.segment_checker()
+    for start, end in segments(rng, 120):
+        if fast.contact(end, needle_may_touch_patient=False) is not None:
+            assert judge(start, end) is not None and judge(end + 1e-4 * (start - end), end) is not None
+            verdicts.append(False)
+        else:
+            verdicts.append(True)
+    assert any(verdicts) and not all(verdicts)
 
 
 def test_segments_of_no_length_and_no_number() -> None:

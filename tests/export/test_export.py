@@ -605,6 +605,49 @@ def test_a_name_stays_in_its_comment(plan, name, tmp_path):
         assert set("".join(comments)) <= PLAIN and max(map(len, comments)) < 600
 
 
+DOUBT = "markers_ct with x and y negated, as LPS and RAS differ, would lie on the skin; 'too alike' to tell \"; halt"
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_warnings_stand_whole_in_every_file(plan, name, tmp_path):
+    """Their words, in comments; an older plan says that they are not known, one without any that there are none."""
+    said = {
+        (DOUBT, "a\nb"): "2 warnings stood when this was planned:",
+        (): "warnings: none stood when this was planned",
+        None: "warnings: not known",
+    }
+    bodies = []
+    for number, (warnings, line) in enumerate(said.items()):
+        path = export_plan(replace(plan, warnings=warnings), name, tmp_path / str(number), source=SOURCE).path
+        lines = [one.strip() for one in path.read_text(encoding="ascii").splitlines()]
+        assert [one for one in lines if one.startswith(f"# {line}")]
+        bodies.append([one for one in lines if not one.startswith(("#", "popup("))])
+        if warnings:
+            comment = " ".join(one[2:] for one in lines if one.startswith("# "))
+            assert "would lie on the skin, too alike to tell" in comment and "warning: a_b" in comment
+    assert bodies[0] == bodies[1] == bodies[2]
+
+
+@pytest.mark.parametrize(
+    ("warnings", "words"),
+    [
+        (None, "Its warnings are not known. "),
+        ((), ""),
+        ((DOUBT, "another"), "2 warnings: markers_ct with x and y negated, as LPS and RAS differ, "),
+        (("x" * 500,), "1 warning: ... See the program. "),
+    ],
+)
+def test_the_operator_is_told_of_warnings_before_the_insertion(plan, warnings, words):
+    """In the popup that waits at the standoff: how many, and the first words; the program still reads back."""
+    doubted = replace(plan, warnings=warnings)
+    text = urscript_text(program_of(doubted), doubted, case_checked=True)
+    (popup,) = [line for line in text.splitlines() if line.startswith('  popup("Needle at standoff.')]
+    assert popup.startswith(f'  popup("Needle at standoff. {words}')
+    assert popup.endswith('Continue inserts it.", title="Insertion", blocking=True)')
+    assert popup.count('"') == 4 and len(popup) < 250
+    check_program(read_urscript(text, where=SOURCE), doubted, None, where=SOURCE)
+
+
 def test_the_program_is_one_function(plan):
     """Nothing before and nothing after: what a controller gets on its socket runs when it is whole."""
     lines = script(plan).splitlines()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.geometry import containment
-from puncture_twin.planning.geometry.containment import RAYS, SEED, Side, side_of
+from puncture_twin.planning.geometry.containment import RAYS, SEED, Side, inside_each, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 
@@ -80,6 +80,37 @@ def test_a_triangle_given_twice_closes_nothing_and_crosses_once(ball):
     assert side_of(doubled, np.array([30.0, 30, 45])) is Side.OUTSIDE
     opened = TriangleMesh(mesh.vertices, np.concatenate([mesh.faces[1:], mesh.faces[1:]]))
     assert side_of(opened, np.array([1.0, 2, 3])) is Side.UNKNOWN
+
+
+@pytest.mark.parametrize("winding", ["alike", "mixed"])
+def test_many_points_are_inside_where_each_of_them_is(rng, ball, winding):
+    """About a ball away from the origin: within its radius, in its box beyond that, and outside of the box."""
+    center = np.array([7.0, -3.0, 5.0])
+    mesh = ball(20, center=center) if winding == "alike" else mixed(ball(20, center=center), rng)
+    points = center + rng.uniform(-27, 27, (300, 3))
+    away = np.linalg.norm(points - center, axis=1)
+    points, away = points[abs(away - 20) > 0.5], away[abs(away - 20) > 0.5]
+    inside = inside_each(mesh, points)
+    assert inside.shape == away.shape and inside.dtype == bool
+    assert np.array_equal(inside, away < 20) and 30 < inside.sum() < len(inside) - 30
+    assert np.array_equal(inside, [side_of(mesh, point) is Side.INSIDE for point in points])
+    assert inside_each(mesh, points[:0]).shape == (0,)
+
+
+def test_beside_a_face_of_a_box_is_outside_however_near(box):
+    """Beyond one side alone, within the others."""
+    mesh = box([40.0, 20.0, 10.0])
+    beyond = np.array([[20.5, 0, 0], [0, -10.5, 0], [0, 0, 5.5], [-20.5, 9, 4], [0, 10.5, 0], [0, 0, -5.5]])
+    assert not inside_each(mesh, beyond).any()
+    assert inside_each(mesh, 0.9 * beyond).all()
+    assert all(side_of(mesh, point) is Side.OUTSIDE for point in beyond)
+
+
+def test_an_open_surface_has_no_inside_for_many_points_either(ball):
+    """It is refused where one point's side is not known."""
+    mesh = ball(50, subdivisions=1)
+    with pytest.raises(ValueError, match="open"):
+        inside_each(TriangleMesh(mesh.vertices, mesh.faces[1:]), np.zeros((2, 3)))
 
 
 def test_there_is_no_tie():

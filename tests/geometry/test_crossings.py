@@ -38,6 +38,12 @@ def test_crossings_equal_brute_force(rng, spread, size):
         np.testing.assert_allclose(depths, ray_crossings(origin, direction, mesh), atol=1e-8)
 
 
+def test_no_ray_has_no_crossings(ball):
+    """An empty answer, not an error."""
+    found = crossings(ball(10.0), np.zeros(3), np.zeros((0, 3)))
+    assert [len(one) for one in (found.ray, found.depth, found.face, found.count, found.first)] == [0] * 5
+
+
 def test_from_inside_a_ball_every_ray_leaves_once(ball):
     """From any point inside, each ray crosses the closed surface once, near the analytic sphere."""
     mesh = ball(50, subdivisions=4)

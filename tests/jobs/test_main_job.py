@@ -13,8 +13,10 @@ from PIL import Image
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.files import sha256
 from puncture_twin.planning.base.output.manifest import problems, read_manifest
+from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, INTERRUPTED, OK, PROGRAM_FAILED
+from puncture_twin.twin.jobs.patient.main_job import rehearse_case
 from puncture_twin.twin.report.progress import BarDisplay, LineDisplay, progress_display
 
 
@@ -68,6 +70,24 @@ def test_the_page_says_where_the_needle_enters_as_check_does(carton, rehearsed, 
     words = told["entry_from"]["text"]
     assert code == OK and "from marker " in words
     assert f"<td>{words}</td>" in (rehearsed / "report.html").read_text()
+
+
+@pytest.mark.parametrize("name", ["urscript", "ros2", "csv", "moveit"])
+def test_an_export_carries_the_warnings_of_its_plan(carton, rehearsed, name, tmp_path, capsys):
+    """Printed, in the answer, and in a file that is written; with the direction that it goes."""
+    plan = json.loads((rehearsed / "plan.json").read_text())
+    assert plan["warnings"]
+    case = ["--case", str(carton)] if name == "moveit" else []
+    export = ["export", str(rehearsed / "plan.json"), "--format", name, *case, "--out", str(tmp_path)]
+    assert main(export) == OK
+    printed = capsys.readouterr().out
+    assert all(f"warning: {warning}" in printed for warning in plan["warnings"])
+    assert f"direction: theta {plan['theta_deg']:g} deg, beta {plan['beta_deg']:g} deg" in printed
+    written = " ".join(path.read_text(encoding="ascii") for path in tmp_path.glob("plan.*"))
+    assert written.count("warning: ") == len(plan["warnings"])
+    assert main([*export, "--json"]) == OK
+    told = json.loads(capsys.readouterr().out)
+    assert (told["warnings"], told["theta_deg"]) == (plan["warnings"], plan["theta_deg"])
 
 
 def test_the_carton_errs_like_the_paper(rehearsed):
@@ -204,6 +224,28 @@ def test_ctrl_c_is_exit_code_130_and_leaves_the_old_set(carton, rehearsed, tmp_p
     monkeypatch.setattr("puncture_twin.twin.jobs.patient.main_job.write_table", interrupted)
     assert main(["search", str(carton), "--no-arm", "--out", str(copy)]) == INTERRUPTED
     assert capfd.readouterr().err.strip() == "interrupted"
+    assert {path.name for path in copy.iterdir()} == {path.name for path in rehearsed.iterdir()}
+    assert problems(copy) == ()
+
+
+def test_one_process_writes_what_two_write(carton, rehearsed, tmp_path):
+    """A plan executed and filmed here, after the pictures, gives the bytes of one that was so while they were drawn."""
+    rehearse_case(prepare(carton), tmp_path)
+    for path in rehearsed.iterdir():
+        assert path.name == "timings.json" or path.read_bytes() == (tmp_path / path.name).read_bytes(), path.name
+
+
+def test_ctrl_c_while_a_second_process_works(carton, rehearsed, tmp_path, monkeypatch, capfd):
+    """While a picture is drawn here and the plan executed there: one line, and nothing has changed."""
+
+    def interrupted(*arguments, **options):
+        raise KeyboardInterrupt
+
+    copy = tmp_path / "copy"
+    shutil.copytree(rehearsed, copy)
+    monkeypatch.setattr("puncture_twin.twin.jobs.patient.pictures.draw_map", interrupted)
+    assert main(["rehearse", str(carton), "--out", str(copy)]) == INTERRUPTED
+    assert capfd.readouterr().err.splitlines()[-1] == "interrupted"
     assert {path.name for path in copy.iterdir()} == {path.name for path in rehearsed.iterdir()}
     assert problems(copy) == ()
 

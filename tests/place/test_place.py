@@ -20,6 +20,7 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.processes import map_all
 from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.case.bed import bed_frame
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.mount import mount_pose
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
@@ -31,12 +32,10 @@ from puncture_twin.planning.place.arm_spheres import (
     clear_branches,
     skin_distance,
 )
-from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.place.directions import WantedDirections, ring_weights
 from puncture_twin.planning.place.estimate import Estimator, insertion_branches
 from puncture_twin.planning.place.evaluate import PlacementCheck
-from puncture_twin.planning.place.mount_lines import mount_lines, mount_section
-from puncture_twin.planning.place.mounts import Region, Site, regions
+from puncture_twin.planning.place.mounts import Region, Site, mount_lines, mount_section, regions
 from puncture_twin.planning.place.needle_start import needle_can_start
 from puncture_twin.planning.place.obstacle_field import Boxes, SkinField
 from puncture_twin.planning.place.search import search_placements

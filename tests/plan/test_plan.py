@@ -17,7 +17,7 @@ from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.plan.motion import motion_contact
 from puncture_twin.planning.plan.plan_document import read_plan, write_plan
 from puncture_twin.planning.plan.planner import make_plan
-from puncture_twin.planning.plan.recheck import _check_limits, check_plan
+from puncture_twin.planning.plan.recheck import _check_limits, check_plan, with_case_warnings
 from puncture_twin.planning.search.candidates import Ranking
 from puncture_twin.planning.search.context import prepare
 
@@ -296,6 +296,23 @@ def test_a_plan_that_flatters_itself_is_refused(carton, planned, key, value):
         check_plan(replace(planned.plan, **{key: value}), carton, "plan.json")
 
 
+def test_a_plan_states_the_warnings_of_its_case(carton, document):
+    """One that drops a warning, or adds one, is refused with its case; an older one that states none is read."""
+    content, write = document
+    stood = list(carton.anatomy.warnings)
+    assert stood and content["warnings"] == stood
+    for other in (stood[1:], [*stood, "another"]):
+        assert "its warnings are not those of the case" in refusal(write(warnings=other), carton)
+    for wrong in ("none", [1], None):
+        with pytest.raises(InputError, match="warnings"):
+            read_plan(write(warnings=wrong))
+    older = {name: value for name, value in content.items() if name != "warnings"}
+    path = write()
+    path.write_text(json.dumps(older))
+    assert read_plan(path).warnings is None
+    assert with_case_warnings(read_plan(path), carton).warnings == carton.anatomy.warnings
+
+
 def leaves(value, path=()):
     """Every leaf of a JSON document by its path; of the two motions' rows, the ends and a few between."""
     if isinstance(value, dict):
@@ -370,7 +387,7 @@ def test_keys_that_come_or_go_are_refused(carton, document):
             path = write()
             path.write_text(json.dumps(edited))
             line = refusal(path, carton)
-            if name == "speed_limits":  # plans from before it was stated keep the default, which is this case's
+            if name in ("speed_limits", "warnings"):  # older plans state neither: the default, and nothing known
                 assert line is None
                 continue
             assert line is not None, (table, name)

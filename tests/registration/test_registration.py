@@ -10,9 +10,7 @@ from puncture_twin.planning.formats.points.point_files import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.conditioning import conditioning, leverage
-from puncture_twin.planning.registration.fits.affine import fit_affine
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
-from puncture_twin.planning.registration.fits.triad import fit_triad
+from puncture_twin.planning.registration.fits.least_squares import fit_affine, fit_rigid, fit_triad
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_2, TABLE_4

@@ -15,13 +15,12 @@ from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.case.case_volumes import CaseVolumes
 from puncture_twin.planning.case.entry import view_frame
 from puncture_twin.planning.case.settings import Needle, RobotSettings, SearchSettings
-from puncture_twin.planning.case.tables.ranking_section import RankingSection
+from puncture_twin.planning.case.tables.errors_section import RehearsalSection
 from puncture_twin.planning.case.tables.registration_section import MarkerSection
-from puncture_twin.planning.case.tables.rehearsal_section import RehearsalSection
+from puncture_twin.planning.case.tables.search_section import RankingSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
-from puncture_twin.planning.registration.fits.triad import fit_triad
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid, fit_triad
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.registration import leverage
 from puncture_twin.twin.plant.truth import MarkerNoise, draw_truth, registration_error

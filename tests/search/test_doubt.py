@@ -12,8 +12,7 @@ from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.doubt import WISHED_HIT, chance_text, goals_of, shrinkable
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
-from puncture_twin.planning.uncertainty.hit import hit_in_ball
-from puncture_twin.planning.uncertainty.hit_model import HitModel
+from puncture_twin.planning.uncertainty.hit import HitModel, hit_in_ball
 from puncture_twin.planning.uncertainty.sources import SOURCES, deviation, reading_parts
 from puncture_twin.planning.uncertainty.touch import proximity
 

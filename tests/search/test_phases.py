@@ -14,8 +14,7 @@ from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.collision.surroundings import with_surroundings
-from puncture_twin.planning.collision.workcell import case_checker
+from puncture_twin.planning.collision.workcell import case_checker, with_surroundings
 from puncture_twin.planning.formats.labels.by_name import ByName
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
@@ -23,6 +22,7 @@ from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.organs import organ_candidates
 from puncture_twin.planning.search.phases.arm_phases import with_breathing_reach
 from puncture_twin.planning.search.table import to_table
+from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.patient.main_job import search_case
 
 SEARCH = "theta_deg = [0, 80]\nstep_deg = 10.0\nmax_skin_angle_deg = 25.0"
@@ -162,6 +162,21 @@ def test_a_breath_that_takes_the_target_out_of_the_skin_leaves_nothing_safe(pati
     """A skin that stays, and a target that leaves it, are a slip of weights: nothing is known then."""
     found = searched(patient, breathing(amplitude_mm=95.0, weights=ByName({"*": 0.0})))
     assert not found.safe.any()
+
+
+def test_where_nothing_is_safe_before_the_breath_nothing_is_safe_with_it(patient, tmp_path, capfd):
+    """It was a traceback, exit code 3: of no direction no crossings were made."""
+    strict = replace(patient.case, needle=replace(patient.case.needle, shaft_mm=30.0))
+    found = searched(patient, breathing(), case=strict)
+    assert not found.safe.any() and np.array_equal(found.verdict.reason, searched(patient, case=strict).verdict.reason)
+    assert np.isnan(found.breathing.clearance).all()
+    folder = patient.case.path.parent
+    weights = "".join(f'"{name}" = {weight}\n' for name, weight in WEIGHTS.items())
+    text = (folder / "case.toml").read_text().replace("shaft_mm = 150.0", "shaft_mm = 30.0")
+    path = folder / "strict.toml"
+    path.write_text(f"{text}[breathing]\namplitude_mm = 30.0\n[breathing.weights]\n{weights}")
+    assert main(["search", str(path), "--no-arm", "--no-pictures", "--out", str(tmp_path / "out")]) == 1
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_a_certificate_refuses_a_body_that_moves(patient):

@@ -13,7 +13,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.entry import outward
-from puncture_twin.planning.case.tables.ranking_section import RankingSection
+from puncture_twin.planning.case.tables.search_section import RankingSection
 from puncture_twin.planning.clearance.cross_check import CrossCheckError
 from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.context import prepare

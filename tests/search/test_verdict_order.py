@@ -1,6 +1,7 @@
 """Which reason is given, and with which numbers: paths and clearances made by hand, many rows at once."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.clearance.measure import Clearances
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.search.constraints import first_broken, longest_path, worst_violation
+from puncture_twin.planning.search.constraints import closest_miss, first_broken, longest_path, worst_violation
 
 NEEDLE = Needle(200.0, 150.0, 1.0, None, 10.0, 30.0)
 DOT = TriangleMesh([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
@@ -167,3 +168,29 @@ def test_the_worst_structure_decides_between_unknown_and_too_close():
         rated([(100, 10, NAN, NAN)] * 2, clearances, structures),
         [(Reason.UNKNOWN_REGION, "fog", 30, 0), (Reason.TOO_CLOSE, "vessel", 20, 0)],
     )
+
+
+def rejected(reasons, distance=(), margins=()):
+    """As much of candidates as says how each failed: reasons; clearances and the margins of the same structures."""
+    wanted = np.array([reason.value for reason in reasons], dtype=object)
+    clear = SimpleNamespace(distance=np.array(distance, float), margins=np.array(margins, float))
+    return SimpleNamespace(verdict=SimpleNamespace(reason=wanted), clearance=clear)
+
+
+def test_the_closest_miss_lacks_least_of_what_it_lacks_most():
+    """Of rows that lack only clearance; what has no margin is not asked, and other rows are not looked at."""
+    close, angle = Reason.TOO_CLOSE, Reason.SKIN_ANGLE
+    distance = [[1.9, -9, 9.0], [1.0, -9, 4.0], [4.0, -9, 3.5], [0.5, 9, 9.0]]
+    found = rejected([angle, close, close, close], distance, [2.0, NAN, 5.0])
+    assert closest_miss(found) == 1
+    assert closest_miss(rejected([close, close, close, close], distance, [2.0, NAN, 5.0])) == 0
+    assert closest_miss(rejected([angle, close, close, angle], [[0.0], [1.0], [1.5], [1.9]], [2.0])) == 2
+
+
+def test_without_one_that_lacks_clearance_it_is_the_one_that_passed_most():
+    """The first row of the latest reason; of no rows none."""
+    found = rejected([Reason.TOO_LONG, Reason.SKIN_ANGLE, Reason.UNREACHABLE, Reason.UNREACHABLE, Reason.TOO_LONG])
+    assert closest_miss(found) == 2
+    assert closest_miss(rejected([Reason.UNKNOWN_REGION, Reason.REENTERS_SKIN, Reason.TOO_LONG])) == 2
+    assert closest_miss(rejected([Reason.UNKNOWN_REGION])) == 0
+    assert closest_miss(rejected([])) is None

@@ -11,7 +11,7 @@ from places import ROOT
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.case.settings import Obstacle
-from puncture_twin.planning.case.tables.rehearsal_section import RehearsalSection
+from puncture_twin.planning.case.tables.errors_section import RehearsalSection
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.selection.choice import Choice
 from puncture_twin.planning.sweep.sweep_planner import plan_sweep

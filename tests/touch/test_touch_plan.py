@@ -16,8 +16,8 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.touch.order import shortest_tour
 from puncture_twin.planning.touch.straight_approach import TIP_MM, ApproachCheckers, line_to, why_not
+from puncture_twin.planning.touch.tour_motions import shortest_tour
 
 UR3, TIP = ur_model("ur3"), 210.0
 HOME = np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])

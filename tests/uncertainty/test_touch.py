@@ -9,7 +9,7 @@ from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import exp_rotation
-from puncture_twin.planning.uncertainty.joint_touch import joint_touch_chance
+from puncture_twin.planning.search.chances.joint import joint_touch_chance
 from puncture_twin.planning.uncertainty.touch import proximity, touch_chance
 
 LENGTH, RADIUS = 150.0, 0.6

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.registration.fits.affine import fit_affine
-from puncture_twin.planning.registration.fits.triad import fit_triad
+from puncture_twin.planning.registration.fits.least_squares import fit_affine, fit_triad
 from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_2, TABLE_4, Point
 
 NAMES = tuple(TABLE_1)

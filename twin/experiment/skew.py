@@ -9,8 +9,7 @@ from scipy.optimize import minimize_scalar
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
-from puncture_twin.planning.registration.fits.triad import fit_triad
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid, fit_triad
 from puncture_twin.twin.experiment.printed import READ, SETUPS, TRIADS, rows_of
 
 MARKERS, SETUP = "ABCDE", 1

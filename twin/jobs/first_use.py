@@ -54,7 +54,7 @@ def use_once() -> None:
     reached = [answer for answer in ask_arm(checker) if answer.reachable]
     _err_once()
     plan_approach(checker, np.radians([0.0, -90.0, 0.0, -90.0, 0.0, 0.0]), reached[0].insertion_q[0], seed=0)
-    _draw_once()
+    draw_once()
 
 
 def _err_once() -> None:
@@ -77,7 +77,7 @@ def _err_once() -> None:
     line_chance(near, doubt, length, threshold, np.array([-1.0, 0.0, 0.0, 0.0, -40.0, 0.0]))
 
 
-def _draw_once() -> None:
+def draw_once() -> None:
     """A body in another that is see-through, and one that moves."""
     import numpy as np
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.formats.meshes.ply_writer import ply_bytes
+from puncture_twin.planning.formats.meshes.ply import ply_bytes
 from puncture_twin.twin.phantoms import abdomen, carton, guidance, head
 
 __all__ = ["ply_bytes", "points_csv", "write_phantoms"]

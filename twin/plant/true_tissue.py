@@ -16,6 +16,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.search.bending.insertion import Insertion
+from puncture_twin.twin.plant.felt import Felt
 from puncture_twin.twin.world.control.run import Push
 from puncture_twin.twin.world.control.tip import Tip
 from puncture_twin.twin.world.units import to_m, to_mm
@@ -29,24 +30,6 @@ class StraightPath(NamedTuple):
 
     entry_base: Floats
     into_base: Floats
-
-
-class Felt(NamedTuple):
-    """The greatest forces of one insertion, N: along the needle, and across it as its holder bears them."""
-
-    along_n: float
-    across_n: float
-
-    @property
-    def text(self) -> str:
-        """For a person."""
-        if self.along_n == self.across_n == 0.0:
-            return "the tissue did not push: the needle met none"
-        return f"the tissue pushed with up to {self.along_n:.2f} N along the needle, {self.across_n:.2f} N across it"
-
-
-NOT_FELT = "no force of tissue: the case declares none ([tissue])"
-"""Of an insertion through tissue that nobody described."""
 
 
 class TrueTissue:

@@ -1,1 +1,2 @@
-from .rehearsal import Rehearsal as Rehearsal, rehearse as rehearse
+from .rehearsal import rehearse as rehearse
+from .result import Rehearsal as Rehearsal

@@ -14,14 +14,15 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.bed import bed_frame
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.workcell import case_boxes, case_tool
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.motion.trajectory import Trajectory
-from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.bending.insertion import insertion_along
-from puncture_twin.twin.plant.true_tissue import Felt, StraightPath, TrueTissue
+from puncture_twin.twin.plant.felt import Felt
+from puncture_twin.twin.plant.true_tissue import StraightPath, TrueTissue
 from puncture_twin.twin.plant.truth import Truth
 from puncture_twin.twin.world.client import TIME_STEP_S
 from puncture_twin.twin.world.control.insertion import Insertion, insert

@@ -33,10 +33,9 @@ from puncture_twin.twin.world.bodies import load_box, remove, soften
 from puncture_twin.twin.world.contacts import touches
 from puncture_twin.twin.world.control.gains import Stiffness, allowed_step
 from puncture_twin.twin.world.control.impedance import Impedance
-from puncture_twin.twin.world.control.motors import Motors
 from puncture_twin.twin.world.control.reference import reference_of
 from puncture_twin.twin.world.control.rigid_model import RigidModel
-from puncture_twin.twin.world.control.run import Controller, Measured, Run, Surroundings, run
+from puncture_twin.twin.world.control.run import Controller, Measured, Motors, Run, Surroundings, run
 from puncture_twin.twin.world.control.tip import tips
 from puncture_twin.twin.world.units import to_m
 from puncture_twin.twin.world.workcell import SimulatedWorkcell

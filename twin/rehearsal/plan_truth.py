@@ -21,13 +21,12 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.pose_error import pose_error
 from puncture_twin.twin.plant.true_needle import TrueNeedle
 from puncture_twin.twin.plant.truth import Truth, draw_truth
 from puncture_twin.twin.rehearsal.distribution import Distribution, bend_along, rehearse_rooms
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, bent
-from puncture_twin.twin.rehearsal.standing import Standing
+from puncture_twin.twin.rehearsal.standing import PredictedScale, RoomScale, Scale
 
 TRIED = 16
 """Rooms that are drawn for one: the arm may not reach the pose that a room's registration asks for."""
@@ -122,17 +121,14 @@ def _declared(found: Distribution) -> str:
     return "[rehearsal.errors], not from what is believed" if found.wrong_belief else "[errors]"
 
 
-def standing(
-    context: CaseContext, q_insertion: Floats, tip_error_mm: float, found: Distribution | None
-) -> Standing | None:
-    """Where a tip error stands among the rooms, or without rooms in the prediction; None without declared errors."""
+def standing_scale(context: CaseContext, q_insertion: Floats, found: Distribution | None) -> Scale | None:
+    """What a tip error is held against: the rooms, or without rooms the prediction; None without declared errors."""
     if found is not None:
-        below = np.mean(found.tip_error_mm < tip_error_mm) + np.mean(found.tip_error_mm <= tip_error_mm)
-        return Standing(float(50 * below), len(found) + found.unreached)
+        return RoomScale(found.tip_error_mm, len(found) + found.unreached)
     registration = None if context.placement is None else context.placement.registration
     error = pose_error(context.case, registration)
     if error is None:
         return None
     outward_ct = -error.fit.R_base_ct.T @ flange_pose(error.model, q_insertion)[:3, 2]
     cov = replace(error, bend=bend_along(context, outward_ct)).tip_covariance(q_insertion[None])
-    return Standing(100 * float(hit_in_ball(cov, tip_error_mm, error.freedom)[0]))
+    return PredictedScale(cov, error.freedom)

@@ -21,8 +21,7 @@ from puncture_twin.planning.geometry.rigid import apply, exp_rotation
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.aim_correction import aimed_fit
 from puncture_twin.planning.registration.fit_map import design, least_squares_map
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
-from puncture_twin.planning.registration.fits.triad import fit_triad
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid, fit_triad
 from puncture_twin.planning.registration.fits.weighted import fit_joint, fit_weighted
 from puncture_twin.planning.registration.reading_noise import ReadingNoise, parameter_variances
 from puncture_twin.planning.uncertainty.pose_error import Bend

@@ -5,6 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.uncertainty.hit import hit_in_ball
+
 
 @dataclass(frozen=True)
 class Standing:
@@ -42,6 +47,45 @@ class Standing:
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return {"percentile": self.percentile, "percentile_of": "rooms" if self.rooms else "prediction"}
+
+
+@dataclass(frozen=True, eq=False)
+class RoomScale:
+    """The tip errors of rooms, of which one is rehearsed.
+
+    Attributes:
+        errors_mm: Shape (n,), of those in which the arm reached the pose.
+        rooms: All.
+    """
+
+    errors_mm: Floats
+    rooms: int
+
+    def of(self, tip_error_mm: float) -> Standing:
+        """Where an error stands among them."""
+        below = np.mean(self.errors_mm < tip_error_mm) + np.mean(self.errors_mm <= tip_error_mm)
+        return Standing(float(50 * below), self.rooms)
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedScale:
+    """The predicted distribution of the tip's error.
+
+    Attributes:
+        cov: Shape (1, 3, 3), mm^2.
+        freedom: Of a spread that was found; None where it is stated.
+    """
+
+    cov: Floats
+    freedom: int | None
+
+    def of(self, tip_error_mm: float) -> Standing:
+        """Where an error stands in it."""
+        return Standing(100 * float(hit_in_ball(self.cov, tip_error_mm, self.freedom)[0]))
+
+
+Scale = RoomScale | PredictedScale
+"""What a tip error is held against."""
 
 
 def ordinal(number: int) -> str:

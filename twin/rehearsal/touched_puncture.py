@@ -16,7 +16,8 @@ from puncture_twin.twin.plant.touch_truth import AtTarget, TouchTruth
 from puncture_twin.twin.plant.true_needle import true_needle
 from puncture_twin.twin.plant.truth import Truth
 from puncture_twin.twin.rehearsal.plan_truth import bent_truth
-from puncture_twin.twin.rehearsal.rehearsal import Rehearsal, rehearse
+from puncture_twin.twin.rehearsal.rehearsal import rehearse
+from puncture_twin.twin.rehearsal.result import Rehearsal
 
 
 def rehearse_touched(context: CaseContext, plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Rehearsal:

@@ -18,8 +18,7 @@ from puncture_twin.planning.arm.tool_body import ToolBody
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.arm.urdf.arm_urdf import ArmUrdf
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.world.surface_file import write_obj
-from puncture_twin.twin.world.units import to_m
+from puncture_twin.twin.world.units import to_m, write_obj
 
 HOLDER_DENSITY_KG_M3 = 1200.0
 """A printed holder, solid ABS or similar."""

@@ -11,8 +11,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.world.engine import pybullet
-from puncture_twin.twin.world.surface_file import write_obj
-from puncture_twin.twin.world.units import pose_to_m, to_m
+from puncture_twin.twin.world.units import pose_to_m, to_m, write_obj
 
 Rgba = tuple[float, float, float, float]
 

@@ -1,8 +1,9 @@
-"""The one place where the project's millimetres become PyBullet's metres, and back."""
+"""The one place where the project's millimetres become PyBullet's metres, and back; surfaces as OBJ files in metres."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
 
 MM_PER_M = 1000.0
@@ -47,3 +49,10 @@ def pose_to_m(T_a_b: Floats) -> PoseM:
 def pose_to_mm(position_m: Sequence[float], quaternion: Sequence[float]) -> Floats:
     """T_a_b, shape (4, 4), mm, of a position in m and a quaternion x, y, z, w."""
     return pose(Rotation.from_quat(quaternion).as_matrix(), to_mm(position_m))
+
+
+def write_obj(mesh: TriangleMesh, path: Path) -> None:
+    """Write a surface, mm, as OBJ in metres, to a tenth of a micrometre."""
+    corners = [f"v {x:.7f} {y:.7f} {z:.7f}" for x, y, z in to_m(mesh.vertices).tolist()]
+    faces = [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
+    path.write_text("\n".join(corners + faces) + "\n")

@@ -1,4 +1,4 @@
-"""One mechanism for every command that writes: an output folder is one set, and no kill leaves a mix that passes.
+"""One mechanism for every command that writes: an output folder is one locked set; no kill leaves a mix that passes.
 
 New files are written into a draft (`draft`); when all of them are there they become the command's set (`publish`).
 """
@@ -6,6 +6,7 @@ New files are written into a draft (`draft`); when all of them are there they be
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -16,7 +17,6 @@ from pathlib import Path
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.output.draft import Draft, new_draft, sweep
 from puncture_twin.planning.base.output.legacy import files_of_older_versions
-from puncture_twin.planning.base.output.lock import locked
 from puncture_twin.planning.base.output.manifest import Manifest, read_manifest
 from puncture_twin.planning.base.output.publish import publish, refuse_foreign
 from puncture_twin.planning.base.provenance import Input
@@ -26,6 +26,9 @@ NO_SPACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errn
 
 LITTLE_SPACE_BYTES = 65_536
 """A library's failure without a number, on a disk with less than this, is the disk's."""
+
+LOCK_NAME = ".puncture-twin-lock"
+"""Lies in the folder while a command writes into it; without its process it locks nothing."""
 
 
 @contextmanager
@@ -152,3 +155,58 @@ def _sources(draft: Draft, made_from: Mapping[str, str]) -> tuple[str, ...]:
                 raise InputError(f"holds another {name}", where=draft.out, allowed=allowed)
             owners.append(owner)
     return tuple(owners)
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the lock of an existing folder.
+
+    Raises:
+        InputError: Another process holds it, or the file system knows no locks.
+        OSError: The lock file cannot be made.
+    """
+    path = folder / LOCK_NAME
+    handle = _locked(path)
+    try:
+        os.truncate(handle, 0)
+        os.write(handle, str(os.getpid()).encode())
+        yield
+    finally:
+        path.unlink(missing_ok=True)  # while the lock is held: nobody else's file stands under this name
+        os.close(handle)
+
+
+def _locked(path: Path) -> int:
+    """An open, locked handle on the file that stands under the name."""
+    while True:
+        handle = _opened(path)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _is_at(handle, path):
+                return handle
+        except BlockingIOError:
+            holder = os.pread(handle, 20, 0).decode(errors="replace")
+            os.close(handle)
+            what = f"another command is writing into this folder (process {holder or 'unknown'})"
+            raise InputError(what, where=path.parent, allowed="one at a time, or another folder") from None
+        except OSError as error:
+            os.close(handle)
+            what = f"the folder cannot be locked ({error.strerror})"
+            raise InputError(what, where=path.parent, allowed="a folder on a file system with locks") from error
+        os.close(handle)
+
+
+def _opened(path: Path) -> int:
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        what = f"cannot be written ({error.strerror})"
+        raise InputError(what, where=path.parent, allowed="a folder that may be written to") from error
+
+
+def _is_at(handle: int, path: Path) -> bool:
+    """Whether the file is still the one of that name: its last holder may have removed it meanwhile."""
+    try:
+        return os.path.samestat(os.fstat(handle), path.stat())
+    except FileNotFoundError:
+        return False

@@ -14,25 +14,28 @@ lists.
 
 from __future__ import annotations
 
+import json
 import signal
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.output.draft import Draft
 from puncture_twin.planning.base.output.manifest import (
     MANIFEST_NAME,
+    MAX_MANIFEST_BYTES,
     TIMINGS_NAME,
     Manifest,
     ManifestEntry,
     file_digest,
 )
-from puncture_twin.planning.base.output.timings import with_timings
+from puncture_twin.planning.base.strict_json import read_json
 
 
 def publish(draft: Draft, started: datetime) -> None:
@@ -151,3 +154,33 @@ def _uninterrupted() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
     if came and callable(before):
         before(*came[0])
+
+
+def with_timings(
+    folder: Path, kept: Iterable[str], command: str, started: datetime, seconds: Mapping[str, float]
+) -> str:
+    """The folder's timings with those of a command put in.
+
+    Args:
+        folder: The output folder.
+        kept: Commands whose entries stay, and so their timings.
+        command: The one that ran.
+        started: When, with its time zone.
+        seconds: How long each stage took.
+    """
+    before = _read(folder / TIMINGS_NAME)
+    timings = {name: before[name] for name in kept if name in before}
+    timings[command] = {
+        "started": started.isoformat(timespec="seconds"),
+        "seconds": {stage: round(float(spent), 3) for stage, spent in seconds.items()},
+    }
+    return json.dumps(timings, indent=1, allow_nan=False) + "\n"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """What is there; nothing where it cannot be read: no result depends on it."""
+    try:
+        document = read_json(path, max_bytes=MAX_MANIFEST_BYTES, allowed="timings")
+    except InputError:
+        return {}
+    return document if isinstance(document, dict) else {}

@@ -12,16 +12,15 @@ from puncture_twin.planning.arm.own_arm import own_arm
 from puncture_twin.planning.arm.speed_limits import SpeedLimits
 from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.arm.urdf.document import MOST_BYTES
-from puncture_twin.planning.arm.urdf.limits import JointLimits, narrowed
+from puncture_twin.planning.arm.urdf.limits import NOTHING_STATED, JointLimits, StatedLimits, narrowed
 from puncture_twin.planning.base.arrays import read_only
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.mount import mount_pose
 from puncture_twin.planning.case.settings import RobotSettings
-from puncture_twin.planning.case.tables.limits_section import stated_limits
 from puncture_twin.planning.case.tables.registration_section import stated_base_ct
-from puncture_twin.planning.case.tables.robot_section import RobotSection
+from puncture_twin.planning.case.tables.robot_section import LimitsSection, RobotSection
 from puncture_twin.planning.formats import itk_transform
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
 from puncture_twin.planning.geometry.spaces import Space
@@ -85,3 +84,15 @@ def _mesh(address: str, *, urdf: str, files: InputFiles, path: Path) -> bytes:
         raise InputError(what, where=path, allowed="paths relative to the URDF's folder, such as meshes/base.stl")
     name = str(PurePosixPath(urdf).parent / address)
     return files.read(MESH_ROLE, name, max_bytes=meshes.MAX_FILE_BYTES, key=f"robot.urdf: mesh '{address}'", where=path)
+
+
+def stated_limits(section: LimitsSection | None) -> StatedLimits:
+    """The limits in radians; nothing where the case states none."""
+    if section is None:
+        return NOTHING_STATED
+    angles = (
+        None
+        if section.lowest_deg is None
+        else np.radians(np.stack([section.lowest_deg, section.highest_deg or ()], axis=1))
+    )
+    return StatedLimits(angles, None if section.max_speed_deg_s is None else np.radians(section.max_speed_deg_s))

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import scipy
 from pydantic import Field
-from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.tool_body import ToolBody
 from puncture_twin.planning.base.provenance import InputFiles
@@ -47,7 +47,7 @@ def tool_of(section: ToolSection | None, files: InputFiles, path: Path) -> ToolB
         return None
     unit, file = parse_unit(section.unit, where=f"{path}: tool.unit"), path.parent / section.mesh
     data = files.read(TOOL_ROLE, section.mesh, max_bytes=meshes.MAX_FILE_BYTES, key="tool.mesh", where=path)
-    turn = Rotation.from_euler("xyz", section.rotation_deg, degrees=True).as_matrix()
+    turn = scipy.spatial.transform.Rotation.from_euler("xyz", section.rotation_deg, degrees=True).as_matrix()
     T = pose(turn, np.array(section.position_mm))
     mesh = meshes.parse_mesh(data, file, unit=unit, space=Space.LOCAL).transformed(T)
     return ToolBody(mesh, file, unit.mm, T, f"{path}: tool")

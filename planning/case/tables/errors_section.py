@@ -1,15 +1,12 @@
-"""The table ``[errors]`` of a case: what each reading, touch and joint may be off by. See docs/concepts/uncertainty.md.
-
-All numbers are standard deviations per axis of normal errors with mean zero; 0 switches a source off.
-"""
+"""``[errors]`` and ``[rehearsal]``: what is declared to err, and the truth that a rehearsal draws instead."""
 
 from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, Strict, model_validator
 
-from puncture_twin.planning.case.toml_types import Anatomical, Number, Section, Vector
+from puncture_twin.planning.case.toml_types import Anatomical, NotNegative, Number, Section, Vector
 
 Millimetres = Annotated[Number, Field(ge=0, le=100)]
 Degrees = Annotated[Number, Field(ge=0, le=10)]
@@ -43,3 +40,15 @@ class ErrorsSection(Section):
             if getattr(self, cell) is not None and getattr(self, deviation) is not None:
                 raise ValueError(f"{cell} and {deviation} state the same error; keep one")
         return self
+
+
+class RehearsalSection(Section):
+    """What the twin's truth is drawn from; the planner never reads it."""
+
+    seed: Annotated[int, Strict(), Field(ge=0, lt=2**31)] = 0
+    truth_base: str | None = None
+    fle_ct_mm: NotNegative = 0.5
+    fle_touch_mm: NotNegative = 0.1
+    joint_offset_deg: NotNegative = 0.02
+    control: Literal["impedance", "admittance", "position"] = "impedance"
+    errors: ErrorsSection | None = None

@@ -1,4 +1,4 @@
-"""``[needle]``: lengths, stiffness and tip of the needle."""
+"""``[needle]`` and ``[tissue.NAME]``: the needle, and what it bends in."""
 
 from __future__ import annotations
 
@@ -7,6 +7,10 @@ from typing import Annotated, Self
 from pydantic import Field, Strict, model_validator
 
 from puncture_twin.planning.case.toml_types import Number, Section
+
+Force = Annotated[Number, Field(ge=0, le=50)]
+Stiffness = Annotated[Number, Field(ge=0, le=100)]
+"""Soft tissue has 0.01 to 1, rubber some 10."""
 
 
 class NeedleSection(Section):
@@ -29,4 +33,20 @@ class NeedleSection(Section):
             raise ValueError(f"shaft_mm {self.shaft_mm:g} is longer than length_mm {self.length_mm:g}")
         if self.solid is not None and self.gauge is None:
             raise ValueError("solid belongs to gauge; without one the shaft is solid, of diameter_mm")
+        return self
+
+
+class TissueSection(Section):
+    """One tissue."""
+
+    stiffness_n_mm2: Stiffness
+    cutting_n: Force = 0.0
+    friction_n_mm: Annotated[Number, Field(ge=0, le=1)] = 0.0
+    capsule_n: Force = 0.0
+    capsule_mm: Annotated[Number, Field(ge=0, le=50)] = 0.0
+
+    @model_validator(mode="after")
+    def _capsule_is_whole(self) -> Self:
+        if (self.capsule_n > 0) != (self.capsule_mm > 0):
+            raise ValueError("capsule_n and capsule_mm go together: force at the rupture, and how far in it is")
         return self

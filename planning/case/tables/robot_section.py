@@ -8,8 +8,29 @@ from pydantic import Field, model_validator
 
 from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, HIGHEST
 from puncture_twin.planning.arm.urdf.arm_urdf import FLANGE
-from puncture_twin.planning.case.tables.limits_section import LimitsSection
 from puncture_twin.planning.case.toml_types import Number, Section, Sextuple, Text, Vector
+
+Turn = Annotated[Number, Field(ge=-720, le=720)]
+Turns = tuple[Turn, Turn, Turn, Turn, Turn, Turn]
+Speed = Annotated[Number, Field(gt=0, le=720)]
+Speeds = tuple[Speed, Speed, Speed, Speed, Speed, Speed]
+
+
+class LimitsSection(Section):
+    """The angles and speeds of six joints, from the base on; degrees."""
+
+    lowest_deg: Turns | None = None
+    highest_deg: Turns | None = None
+    max_speed_deg_s: Speeds | None = None
+
+    @model_validator(mode="after")
+    def _ranges_ascend(self) -> Self:
+        if (self.lowest_deg is None) != (self.highest_deg is None):
+            raise ValueError("lowest_deg and highest_deg go together")
+        for joint, (low, high) in enumerate(zip(self.lowest_deg or (), self.highest_deg or (), strict=True)):
+            if not low < high:
+                raise ValueError(f"joint {joint + 1}: lowest_deg {low:g} is not below highest_deg {high:g}")
+        return self
 
 
 class MountSection(Section):

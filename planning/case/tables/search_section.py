@@ -1,4 +1,4 @@
-"""``[search]``: the grid of directions, its entry frame, and the limits."""
+"""``[search]`` and ``[ranking]``: which directions are searched, their limits, and what a good one is."""
 
 from __future__ import annotations
 
@@ -6,8 +6,17 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, Strict, model_validator
 
-from puncture_twin.planning.case.tables.structure_section import MAX_STRUCTURES
-from puncture_twin.planning.case.toml_types import Anatomical, Degrees180, Degrees360, Number, Section, Text, Vector
+from puncture_twin.planning.case.tables.structures_section import MAX_STRUCTURES
+from puncture_twin.planning.case.toml_types import (
+    Anatomical,
+    Degrees180,
+    Degrees360,
+    Number,
+    Section,
+    Text,
+    Vector,
+    Weight,
+)
 
 Chance = Annotated[Number, Field(ge=0, le=1)]
 
@@ -52,4 +61,21 @@ class SearchSection(Section):
                 raise ValueError(f"{key} [{low:g}, {high:g}] descends; it is [lowest, highest]")
             if 0 < high - low < self.step_deg:
                 raise ValueError(f"step_deg {self.step_deg:g} is larger than the range {key} [{low:g}, {high:g}]")
+        return self
+
+
+class RankingSection(Section):
+    """Weights of the cost terms; each term lies in 0..1, see planning/search/ranking.py."""
+
+    clearance: Weight = 1.0
+    path_length: Weight = 0.5
+    skin_angle: Weight = 0.3
+    tissue: Weight = 0.5
+    reach: Weight = 0.5
+    safe_cone: Weight = 0.5
+
+    @model_validator(mode="after")
+    def _one_counts(self) -> Self:
+        if not any(getattr(self, name) > 0 for name in type(self).model_fields):
+            raise ValueError("every weight is 0; one at least is above")
         return self

@@ -1,1 +1,1 @@
-"""The bodies of an arm with its tool, as FCL objects that move with the joints."""
+"""The bodies of an arm with its tool, as FCL objects that move with the joints, and what is proven to enclose them."""

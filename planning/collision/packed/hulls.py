@@ -1,27 +1,50 @@
-"""The convex hulls of boxes and bodies as compiled code takes them, each once."""
+"""Boxes and bodies as compiled code takes them: convex hulls, each once, with their edges, and trees of spheres.
+
+Of a hull with many corners a coarse one of few takes its place, with how far the others stand out.
+"""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
+from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.tool import Box
-from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.collision.bodies.body import Body
-from puncture_twin.planning.collision.enclosures.prism import inscribed_prism
+from puncture_twin.planning.collision.bodies.shapes import PRISM_SIDES, inscribed_prism
+from puncture_twin.planning.collision.bodies.sphere_tree import (
+    CENTRE_STEPS,
+    LEAF_RADIUS_MM,
+    SLACK_MM,
+    SphereTree,
+    enclosing_sphere,
+    sphere_tree,
+)
 from puncture_twin.planning.collision.kernels.hulls import Hulls
-from puncture_twin.planning.collision.packed.enclosed import enclosed
-from puncture_twin.planning.collision.packed.frames import WORKCELL_FRAME, in_frame
-from puncture_twin.planning.collision.packed.made_from import made_from
-from puncture_twin.planning.collision.packed.ragged import by_axes, row_starts
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.triangle_distance import farthest_from
 
 NO_BOX = -1.0
 """Half sizes of what is no box."""
 
 ROUND = ("holder", "needle")
 """Bodies that are cylinders: their hulls are prisms about them."""
+
+Axes = tuple[Floats, Floats, Floats]
+
+
+COARSE_DIRECTIONS = 60
+"""In which a coarse hull is as wide as the hull: 26 degrees apart, so a round body of 45 mm bulges out by 1.5 mm."""
+
+WORKCELL_FRAME = 0
+"""The frame of what does not move: the base's."""
 
 
 class PackedHulls:
@@ -69,3 +92,122 @@ class PackedHulls:
             by_axes(corners), starts, *few_axes, slack, corners, inner, around, *links, centres, radii, frames
         )
         return hulls, poses, halves
+
+
+def row_starts(sizes: Sequence[int] | Ints) -> Ints:
+    """Where each row begins, and where the last ends, shape (n + 1,), of rows of given lengths."""
+    return np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)]).astype(np.int64)
+
+
+def by_axes(points: Floats) -> Axes:
+    """The coordinates of points (n, 3), an array each."""
+    x, y, z = (np.ascontiguousarray(axis) for axis in points.T)
+    return x, y, z
+
+
+def enclosed(hulls: Sequence[Floats]) -> Arrays:
+    """Of each convex hull a sphere about it and a coarse hull: their numbers, one array each."""
+    spheres, coarse = [enclosing_sphere(corners) for corners in hulls], [coarse_hull(corners) for corners in hulls]
+    edges, first = [neighbours(corners) for corners in hulls], row_starts([len(corners) for corners in hulls])
+    rows = [hull.rows + start for hull, start in zip(edges, first[:-1], strict=True)]
+    return {
+        "centres": np.array([sphere.centre for sphere in spheres]).reshape(-1, 3),
+        "radii": np.array([sphere.radius for sphere in spheres]),
+        "slack": np.array([hull.slack_mm for hull in coarse]),
+        "sizes": np.array([len(hull.corners) for hull in coarse], dtype=np.int64),
+        "few": np.concatenate([np.empty((0, 3)), *(hull.corners for hull in coarse)]),
+        "degrees": np.concatenate([np.empty(0, np.int64), *(hull.degrees for hull in edges)]),
+        "neighbours": np.concatenate([np.empty(0, np.int64), *rows]),
+    }
+
+
+def _tree_arrays(pieces: Sequence[Floats]) -> Arrays:
+    return dict(vars(sphere_tree(pieces)))
+
+
+def packed_trees(bodies: Sequence[Body], cache: Cache) -> tuple[dict[str, int], tuple[Floats, Floats, Ints]]:
+    """The spheres of the bodies' full shapes, each in the body's frame, and the row of each body's root."""
+    roots: dict[str, int] = {}
+    centres, radii, children = [np.empty((0, 3))], [np.empty(0)], [np.empty((0, 2), np.int64)]
+    for body in bodies:
+        pieces = [in_frame(hull, body) for hull in body.full.hulls]
+        tree = SphereTree(**cache.arrays(made_from("balls", pieces), partial(_tree_arrays, pieces), by=__name__))
+        start = sum(len(part) for part in radii)
+        roots[body.name] = start
+        centres.append(tree.centres)
+        radii.append(tree.radii)
+        children.append(np.where(tree.children < 0, -1, tree.children + start))
+    return roots, (np.concatenate(centres), np.concatenate(radii), np.concatenate(children))
+
+
+def settings() -> dict[str, float]:
+    """The numbers of this folder that decide what it makes."""
+    return {
+        "leaf": LEAF_RADIUS_MM,
+        "slack": SLACK_MM,
+        "steps": CENTRE_STEPS,
+        "sides": PRISM_SIDES,
+        "few": COARSE_DIRECTIONS,
+    }
+
+
+def made_from(what: str, pieces: Sequence[NDArray[Any]]) -> dict[str, object]:
+    """What decides a result about some convex pieces, for the cache: their corners and how they are enclosed."""
+    digest = hashlib.sha256()
+    for corners in pieces:
+        digest.update(f"{corners.shape}".encode())
+        digest.update(np.ascontiguousarray(corners).tobytes())
+    return {"what": what, "pieces": digest.hexdigest(), **settings()}
+
+
+class Coarse(NamedTuple):
+    """A few corners of a convex hull."""
+
+    corners: Floats
+    """Shape (n, 3), mm."""
+    slack_mm: float
+    """No point of the whole hull lies farther outside the hull of these."""
+
+
+def coarse_hull(corners: Floats) -> Coarse:
+    """The corners (n, 3) that are outermost in some of many directions, mm, and how far the others stand out.
+
+    Distance to a convex set is a convex function, so over the whole hull it is largest at a corner.
+    """
+    if len(corners) <= COARSE_DIRECTIONS:
+        return Coarse(corners, 0.0)
+    few = corners[np.unique(np.argmax(_directions(COARSE_DIRECTIONS) @ corners.T, axis=1))]
+    hull = scipy.spatial.ConvexHull(few)
+    outside = (corners @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1) > -SLACK_MM
+    triangles = np.ascontiguousarray(few[hull.simplices])
+    return Coarse(few, float(farthest_from(triangles, corners[outside])) + SLACK_MM)
+
+
+def _directions(count: int) -> Floats:
+    """Unit vectors (count, 3) spread evenly: a spiral of equal steps in z and golden turns."""
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
+    ring = np.sqrt(1.0 - z * z)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+
+
+class Neighbours(NamedTuple):
+    """The edges of a convex hull of n corners."""
+
+    degrees: NDArray[np.int64]
+    """Shape (n,): how many neighbours each corner has."""
+    rows: NDArray[np.int64]
+    """The neighbours of the first corner, of the second, and so on."""
+
+
+def neighbours(corners: Floats) -> Neighbours:
+    """Which corners (n, 3) of a convex hull share an edge of its triangles; a corner within the hull has none."""
+    faces = scipy.spatial.ConvexHull(corners).simplices
+    edges = np.concatenate([np.roll(faces, turn, axis=1)[:, :2] for turn in range(3)])
+    pairs = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0).astype(np.int64)
+    return Neighbours(np.bincount(pairs[:, 0], minlength=len(corners)), pairs[:, 1])
+
+
+def in_frame(corners: Floats, body: Body) -> Floats:
+    """Corners (n, 3) of a body's shapes in the frame that it moves with."""
+    return np.asarray(apply(body.T_frame_body, corners))

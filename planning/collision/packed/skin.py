@@ -1,14 +1,58 @@
-"""The skin's tree and its field of distances."""
+"""The skin as compiled code takes it: its triangles in a balanced tree of boxes, and its field of distances."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.collision.kernels.proofs import SkinTree
 from puncture_twin.planning.collision.kernels.surfaces import CELL_MM
-from puncture_twin.planning.collision.triangle_tree import TriangleTree
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+LEAF_TRIANGLES = 4
+"""At most so many triangles in a leaf."""
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleTree:
+    """A heap of boxes: the children of node i are 2 i + 1 and 2 i + 2; the last level's nodes are the leaves.
+
+    Attributes:
+        lows: Shape (nodes, 3), mm: lowest corner of each node's box.
+        highs: Shape (nodes, 3), mm.
+        corners: Shape (leaves, k, 3, 3), mm: the triangles of each leaf; some stand in two, so that all have k.
+    """
+
+    lows: Floats
+    highs: Floats
+    corners: Floats
+
+    @classmethod
+    def of(cls, mesh: TriangleMesh) -> TriangleTree:
+        """The tree of a mesh that has been checked: finite, not empty.
+
+        Each level halves every node's triangles at the median of their centres along its longest side.
+        """
+        triangles = mesh.triangles
+        levels = max(0, int(np.ceil(np.log2(len(triangles) / LEAF_TRIANGLES))))
+        size = -(-len(triangles) // 2**levels)
+        order = np.minimum(np.arange(size * 2**levels), len(triangles) - 1)[None, :]
+        centres = triangles.mean(axis=1)
+        for _ in range(levels):
+            inside = centres[order]
+            axis = np.ptp(inside, axis=1).argmax(axis=1)
+            keys = np.take_along_axis(inside, axis[:, None, None], axis=2)[:, :, 0]
+            order = np.take_along_axis(order, np.argsort(keys, axis=1), axis=1).reshape(2 * len(order), -1)
+        corners = triangles[order]
+        lows, highs = [corners.min(axis=(1, 2))], [corners.max(axis=(1, 2))]
+        for _ in range(levels):
+            lows.insert(0, lows[0].reshape(-1, 2, 3).min(axis=1))
+            highs.insert(0, highs[0].reshape(-1, 2, 3).max(axis=1))
+        return cls(np.concatenate(lows), np.concatenate(highs), np.ascontiguousarray(corners))
+
 
 FIELD_MARGIN_MM = 500.0
 """How far around the skin distances are kept: beyond, they are seldom needed."""

@@ -14,6 +14,7 @@ from puncture_twin.planning.collision.workcell import case_tool
 from puncture_twin.planning.export.moveit.goal_messages import check_goals, goal_messages
 from puncture_twin.planning.export.moveit.scene_message import scene_message
 from puncture_twin.planning.export.moveit.urdf import urdf_with_needle
+from puncture_twin.planning.export.text import warning_lines
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_geometry
 
@@ -31,7 +32,7 @@ from rosidl_runtime_py import set_message_fields
 
 scene, goals = (json.loads(pathlib.Path(__file__).with_name(name).read_text()) for name in ("{scene}", "{goals}"))
 rclpy.init(); node = rclpy.create_node("puncture"); wait = lambda future: rclpy.spin_until_future_complete(node, future)
-request, goal = ApplyPlanningScene.Request(), FollowJointTrajectory.Goal()
+request, goal = ApplyPlanningScene.Request(), FollowJointTrajectory.Goal(); print(*goals["warnings"], sep="\\n")
 set_message_fields(request.scene, scene); set_message_fields(goal, goals[sys.argv[1]])
 apply = node.create_client(ApplyPlanningScene, "/apply_planning_scene"); apply.wait_for_service()
 wait(applied := apply.call_async(request)); assert applied.result().success, "MoveIt refused the scene"
@@ -61,7 +62,7 @@ def moveit_files(plan: Plan, case: Case, anatomy: Anatomy, *, source: Path) -> M
     """
     check_geometry(plan, source)
     names = moveit_names(source.stem)
-    goals = _json(goal_messages(plan))
+    goals = _json({**goal_messages(plan), "warnings": warning_lines(plan.warnings)})
     check_goals(json.loads(goals), plan, where=source)
     urdf = urdf_with_needle(plan.model, case_tool(case))
     if not ElementTree.fromstring(urdf).findall("link"):

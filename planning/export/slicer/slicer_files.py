@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -12,7 +14,6 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.export.slicer.entry_area import EntryArea, area_scalars, area_vtp
-from puncture_twin.planning.export.slicer.markups import markups_text
 from puncture_twin.planning.export.slicer.scene import SceneNode, scene_references, scene_text
 from puncture_twin.planning.formats.itk_transform import parse_transform, transform_text
 from puncture_twin.planning.formats.meshes.vtp import read_vtp
@@ -26,6 +27,12 @@ SLICER = "slicer"
 PATH, MARKERS, AREA = "path.mrk.json", "markers.mrk.json", "safe_entry.vtp"
 TRANSFORM, SCENE = "ct_to_robot.tfm", "scene.mrml"
 NAMES = (PATH, MARKERS, AREA, TRANSFORM, SCENE)
+
+SCHEMA = (
+    "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
+    "markups-schema-v1.0.3.json#"
+)
+_AXES = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,3 +122,38 @@ def _read_points(text: str, name: str, labels: tuple[str, ...], points_ct: Float
 def _same(read: object, written: object, name: str) -> None:
     if not np.array_equal(np.asarray(read), np.asarray(written)):
         raise RuntimeError(f"{name} does not read back as it was written")
+
+
+def markups_text(kind: Literal["Fiducial", "Line"], name: str, labels: Sequence[str], points_ct: Floats) -> str:
+    """The file of one markup.
+
+    Args:
+        kind: ``Line`` has two points.
+        name: Of the markup.
+        labels: Of its points.
+        points_ct: Shape (n, 3), LPS mm.
+    """
+    points = [
+        {
+            "id": str(number),
+            "label": label,
+            "position": position,
+            "orientation": _AXES,
+            "selected": True,
+            "locked": True,
+            "visibility": True,
+            "positionStatus": "defined",
+        }
+        for number, (label, position) in enumerate(zip(labels, points_ct.tolist(), strict=True), start=1)
+    ]
+    markup = {
+        "type": kind,
+        "name": name,
+        "coordinateSystem": "LPS",
+        "coordinateUnits": "mm",
+        "locked": True,
+        "fixedNumberOfControlPoints": True,
+        "labelFormat": "%N-%d",
+        "controlPoints": points,
+    }
+    return json.dumps({"@schema": SCHEMA, "markups": [markup]}, indent=1, ensure_ascii=False) + "\n"

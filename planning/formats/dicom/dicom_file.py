@@ -17,8 +17,7 @@ from pydicom.uid import UID
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.dicom.encoding_check import whole_length
-from puncture_twin.planning.formats.dicom.magic import META_START, is_dicom
-from puncture_twin.planning.formats.dicom.storage import BIG_ENDIAN, DEFLATED, IMPLICIT
+from puncture_twin.planning.formats.dicom.storage import BIG_ENDIAN, DEFLATED, IMPLICIT, META_START, is_dicom
 
 MAX_INFLATED_BYTES = 1 << 26
 """Of one deflated file: two slices of the largest size, or 128 of the usual one; a bomb ends here."""

@@ -16,8 +16,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.formats.dicom.attributes import has, text, texts
 from puncture_twin.planning.formats.dicom.dicom_file import parse_dicom, read_meta, refused_if_damaged
-from puncture_twin.planning.formats.dicom.magic import META_START, is_dicom
-from puncture_twin.planning.formats.dicom.storage import DEFLATED, IMPLICIT, Kind, kind_of
+from puncture_twin.planning.formats.dicom.storage import DEFLATED, IMPLICIT, META_START, Kind, is_dicom, kind_of
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES
 
 MAX_FILES = 50_000

@@ -1,4 +1,4 @@
-"""What a DICOM file is, by its SOP class: never by its name, and not by its modality.
+"""Which bytes are DICOM, and what such a file is by its SOP class: never by its name, and not by its modality.
 
 Unique identifiers from DICOM PS3.4 (2024), table B.5-1, and PS3.6, table A-1.
 """
@@ -6,6 +6,13 @@ Unique identifiers from DICOM PS3.4 (2024), table B.5-1, and PS3.6, table A-1.
 from __future__ import annotations
 
 from enum import StrEnum
+from pathlib import Path
+
+from puncture_twin.planning.base.files import is_folder, is_plain_file
+from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS
+
+PREAMBLE_BYTES, MAGIC = 128, b"DICM"
+META_START = PREAMBLE_BYTES + len(MAGIC)
 
 
 class Kind(StrEnum):
@@ -41,3 +48,21 @@ PLAIN = (IMPLICIT, EXPLICIT, DEFLATED)
 def kind_of(sop_class: str) -> Kind:
     """What a file of this SOP class is."""
     return _KINDS.get(sop_class, Kind.OTHER)
+
+
+def is_dicom(start: bytes) -> bool:
+    """Whether a file that begins so is DICOM: ``DICM`` stands behind a preamble of 128 bytes."""
+    return start[PREAMBLE_BYTES:META_START] == MAGIC
+
+
+def is_series(path: Path) -> bool:
+    """Whether a path is to be read as a CT series: a folder, or a DICOM file of any name but a volume's."""
+    if is_folder(path):
+        return True
+    if not is_plain_file(path) or path.name.lower().endswith(NIFTI_ENDINGS + NRRD_ENDINGS):
+        return False
+    try:
+        with path.open("rb") as stream:
+            return is_dicom(stream.read(META_START))
+    except OSError:  # whoever reads it says why
+        return False

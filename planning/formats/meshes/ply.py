@@ -1,4 +1,4 @@
-"""PLY, ASCII and binary of both byte orders: as many vertices and faces as the header states, or an error.
+"""PLY, ASCII and binary of both byte orders: as many vertices and faces as the header states, or an error; and written.
 
 The numbers of an ASCII file are turned into a binary body of doubles, so that one reader serves both forms.
 Source: G. Turk, "The PLY Polygon File Format", 1994.
@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.raw_mesh import RawMesh, decode_text, refuse, token_array, triangulate
+from puncture_twin.planning.base.input_file import decode_text
+from puncture_twin.planning.formats.raw_mesh import RawMesh, refuse, token_array, triangulate
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -244,3 +246,15 @@ def _faces(columns: dict[str, NDArray[Any] | _Lists], where: str) -> _Lists:
     if not (np.isfinite(values) & (values == np.trunc(values)) & (np.abs(values) < _MAX_ROWS)).all():
         refuse("a vertex index is not a whole number", where, "indices from 0")
     return lists[0]
+
+
+def ply_bytes(mesh: TriangleMesh) -> bytes:
+    """A mesh as a little-endian binary PLY: float32 vertices, int32 faces."""
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(mesh.vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    faces["count"], faces["index"] = 3, mesh.faces
+    return header.encode("ascii") + mesh.vertices.astype("<f4").tobytes() + faces.tobytes()

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.raw_mesh import RawMesh, decode_text, refuse
+from puncture_twin.planning.base.input_file import decode_text
+from puncture_twin.planning.formats.raw_mesh import RawMesh, refuse
 
 _HEADER_BYTES = 84
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

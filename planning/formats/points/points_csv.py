@@ -9,8 +9,9 @@ from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.input_file import decode_text
 from puncture_twin.planning.formats.points.raw_points import RawPoints, parse_coordinate
-from puncture_twin.planning.formats.raw_mesh import decode_text, refuse
+from puncture_twin.planning.formats.raw_mesh import refuse
 from puncture_twin.planning.geometry.spaces import Unit, parse_unit
 
 _ALLOWED = (

@@ -10,9 +10,10 @@ import csv
 from typing import Any
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.input_file import decode_text
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.formats.points.raw_points import RawPoints, parse_coordinate
-from puncture_twin.planning.formats.raw_mesh import decode_text, refuse
+from puncture_twin.planning.formats.raw_mesh import refuse
 from puncture_twin.planning.geometry.spaces import Space, Unit, parse_unit
 
 _MARKUPS_ALLOWED = "one Slicer markup of type Fiducial or Line with labelled, defined control points"

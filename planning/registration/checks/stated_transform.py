@@ -14,11 +14,17 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.tables.registration_section import MarkerSection, RegistrationSection, other_readings
+from puncture_twin.planning.case.tables.registration_section import (
+    NO_RESIDUALS,
+    MarkerSection,
+    RegistrationSection,
+    other_readings,
+)
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.checks.patient_place import ALLOWANCE_MM, in_box, lying, off_upright
-from puncture_twin.planning.registration.checks.touching import out_of_reach, shoulder_within, stands_in_patient
+from puncture_twin.planning.registration.checks.base_place import base_place
+from puncture_twin.planning.registration.checks.marker_check import MarkerFindings
+from puncture_twin.planning.registration.checks.patient_place import off_upright
 from puncture_twin.planning.registration.placement import registered
 from puncture_twin.planning.registration.registration import Registration
 
@@ -36,6 +42,10 @@ CAUSES = (
     "the usual causes are a transform that goes the other way (transform_maps), other axes at the robot (base_axes; a "
     "URDF's base_link is turned likewise), and a transform of another image"
 )
+MARKERS_TELL = " (markers_ct and markers_base beside it measure it)"
+BOX_TELLS = " (so does what the patient lies on, as an obstacle of frame base)"
+"""What makes a warning needless."""
+
 ALLOWED = "a transform between this CT and this robot's base, with transform_maps and base_axes as it was saved"
 
 
@@ -95,7 +105,7 @@ def markers_beside(case: Case, stated: RegistrationSection) -> Registration | No
 
 def check_transform(
     case: Case, skin: TriangleMesh, T_base_ct: Floats, registration: Registration | None = None
-) -> tuple[str, ...]:
+) -> MarkerFindings:
     """Compare a stated transform with the markers beside it, if any, and with what physics excludes.
 
     Args:
@@ -105,37 +115,30 @@ def check_transform(
         registration: Of `markers_beside`, whose own checks are `check_markers`.
 
     Returns:
-        Warnings, one sentence each.
+        Warnings, one sentence each; how far markers that agree are from it is a note.
 
     Raises:
         InputError: Base or a box of the robot's frame would be in the patient; or markers are elsewhere.
     """
     stated = case.robot.stated
     if stated is None:
-        return ()
+        return MarkerFindings((), ())
     given = _reading(case, skin, "", T_base_ct)
     others = [_reading(case, skin, keys, T) for keys, T in other_readings(stated, T_base_ct).items()]
     if given.impossible:
         _refuse(case, f"{given.impossible}: {CAUSES}{_better(others)}")
     if registration is None:
-        return tuple(_doubts(case, given, others))
-    compared = _held_against_markers(case, registration, given, others)
+        return MarkerFindings(tuple(_unmeasured(case, given, others)), ())
     told_apart = [one for one in others if not _apart(case, registration, one.T_base_ct).contradicts]
-    return (compared, *_doubts(case, given, told_apart))
+    doubts = (*_doubts(case, given, told_apart), *_alike(case, given, told_apart))
+    compared = _held_against_markers(case, registration, given, others)
+    if _apart(case, registration, given.T_base_ct).unexplained:
+        return MarkerFindings((compared, *doubts), ())
+    return MarkerFindings(doubts, (compared,))
 
 
 def _reading(case: Case, skin: TriangleMesh, keys: str, T_base_ct: Floats) -> Reading:
-    impossible = ""
-    if stands_in_patient(case, skin, T_base_ct):
-        impossible = "the robot's base would stand in the patient"
-    elif box := in_box(case, skin, T_base_ct):
-        impossible = f"the patient would lie more than {ALLOWANCE_MM:g} mm deep in obstacle '{box}' or through it"
-    bed = lying(case, skin, T_base_ct)
-    far = "the target would be out of the arm's reach" if out_of_reach(case, T_base_ct) else ""
-    within = shoulder_within(case, T_base_ct)
-    shoulder = f"the robot's shoulder would be in obstacle '{within}'" if within else ""
-    unlikely = " and ".join(filter(None, (far, shoulder, bed.off)))
-    return Reading(keys, T_base_ct, impossible, unlikely, bed.on, off_upright(case, T_base_ct))
+    return Reading(keys, T_base_ct, *base_place(case, skin, T_base_ct), off_upright(case, T_base_ct))
 
 
 def _better(others: Sequence[Reading]) -> str:
@@ -150,26 +153,41 @@ def _named(readings: Sequence[Reading]) -> str:
     return ", or ".join(f"{one.keys} ({one.text()})" for one in usual_first)
 
 
+def _unmeasured(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[str]:
+    """Without markers: that nothing measures it, and what it cannot be told from, in one line; then what is doubted."""
+    alike = "".join(f"; {one.removeprefix('registration: ')}" for one in _alike(case, given, others))
+    yield f"registration: {NO_RESIDUALS.format(file=case.robot.transform)}{MARKERS_TELL}{alike}"
+    yield from _doubts(case, given, others)
+
+
 def _doubts(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[str]:
-    """What hardly is so as stated; else the other readings that are as plausible, or more so."""
+    """What hardly is so as stated; else the other readings that are more usual."""
     if given.unlikely:
         yield f"registration: by the stated transform {given.unlikely}: {CAUSES}{_better(others)}"
-        return
-    rivals = [one for one in others if one.plausible and not np.allclose(one.T_base_ct, given.T_base_ct, atol=1e-6)]
-    better = [one for one in rivals if one.better_than(given) and not given.better_than(one)]
-    if better:
+    elif better := [one for one in _rivals(given, others) if one.better_than(given) and not given.better_than(one)]:
         yield (
             f"registration: more usual than what is stated ({given.text()}; place.up says which way is up) would be "
             f"{_named(better)}: {CAUSES}"
         )
+
+
+def _alike(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[str]:
+    """The other readings that are as plausible as what is stated, where no other is more so."""
+    rivals = _rivals(given, others)
+    if given.unlikely or any(one.better_than(given) and not given.better_than(one) for one in rivals):
         return
     if alike := [one for one in rivals if one.better_than(given) == given.better_than(one)]:
         away = [np.linalg.norm(apply(one.T_base_ct - given.T_base_ct, case.target_ct)) for one in alike]
         named = ", ".join(f"{one.keys} ({mm:.0f} mm away)" for one, mm in zip(alike, away, strict=True))
         yield (
             f"registration: nothing tells the stated transform from other readings, by which the target is elsewhere: "
-            f"{named}; check how the file was saved"
+            f"{named}{BOX_TELLS}"
         )
+
+
+def _rivals(given: Reading, others: Sequence[Reading]) -> list[Reading]:
+    """Other readings that nothing speaks against, and that put the base elsewhere."""
+    return [one for one in others if one.plausible and not np.allclose(one.T_base_ct, given.T_base_ct, atol=1e-6)]
 
 
 def _held_against_markers(case: Case, registration: Registration, given: Reading, others: Sequence[Reading]) -> str:

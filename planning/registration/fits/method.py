@@ -10,8 +10,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
-from puncture_twin.planning.registration.fits.triad import fit_triad
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid, fit_triad
 from puncture_twin.planning.registration.fits.weighted import fit_joint, fit_weighted
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.reading_noise import ReadingNoise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,12 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.search.bedside.entry_place import EntryPlace, Landmark, entry_place
-from puncture_twin.planning.search.bedside.needle_planes import NeedlePlanes, needle_planes
+
+LEAST_IN_PLANE = 1e-6
+"""Of a unit vector: a needle that runs along the patient has no angle within the slice."""
+
+MOST_TILT = np.radians(30.0)
+"""To which gantries of CT scanners tilt at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,3 +77,50 @@ def entry_facts(case: Case, markers: Sequence[Landmark], entry_ct: Floats, outwa
     planes = None if case.space is Space.LOCAL else needle_planes(outward_ct)
     entry_mm = to_lps(entry_ct[None], case.space)[0]  # the change of signs undoes itself
     return EntryFacts(case.space, entry_mm, entry_place(entry_ct, landmarks), planes)
+
+
+class NeedlePlanes(NamedTuple):
+    """Angles of one needle, rad.
+
+    Attributes:
+        in_plane: Between the patient's front and the needle as it is seen in the axial slice, -π..π; positive: the hub
+            is on the patient's left. NaN for a needle along the patient.
+        out_of_plane: Between the axial slice and the needle, -π/2..π/2; positive: the hub leans toward the head.
+        gantry_tilt: At which the needle lies in the slice, -π/2..π/2; positive: the top leans toward the feet.
+    """
+
+    in_plane: float
+    out_of_plane: float
+    gantry_tilt: float
+
+    def rows(self) -> tuple[tuple[str, str], ...]:
+        """What it is, and how a person reads it."""
+        beyond = f", more than the usual {np.degrees(MOST_TILT):.0f}" if abs(self.gantry_tilt) > MOST_TILT else ""
+        seen = _angle(self.in_plane, " from the front", ", hub to the left", ", hub to the right")
+        along = _angle(self.out_of_plane, "", ", hub toward the head", ", hub toward the feet")
+        tilt = _angle(self.gantry_tilt, "", ", top toward the feet", ", top toward the head")
+        return (
+            ("in-plane angle", seen if np.isfinite(self.in_plane) else "none: the needle runs along the patient"),
+            ("out-of-plane angle", along),
+            ("gantry tilt", tilt + beyond),
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values: degrees; null where there is no angle."""
+        angles = {f"{name}_deg": float(np.degrees(angle)) for name, angle in self._asdict().items()}
+        return {name: angle if np.isfinite(angle) else None for name, angle in angles.items()}
+
+
+def _angle(angle: float, of: str, positive: str, negative: str) -> str:
+    """An angle with its side; none for what is shown as 0."""
+    size = f"{abs(np.degrees(angle)):.1f}"
+    side = "" if float(size) == 0.0 else positive if angle > 0 else negative
+    return f"{size} deg{of}{side}"
+
+
+def needle_planes(outward_ct: Floats) -> NeedlePlanes:
+    """The angles of a direction from the target outward, shape (3,), unit, LPS."""
+    left, front, head = float(outward_ct[0]), -float(outward_ct[1]), float(outward_ct[2])
+    in_plane = np.arctan2(left, front) if np.hypot(left, front) > LEAST_IN_PLANE else np.nan
+    tilt = np.arctan2(-head * np.copysign(1.0, front), abs(front))
+    return NeedlePlanes(float(in_plane), float(np.arcsin(np.clip(head, -1.0, 1.0))), float(tilt) + 0.0)

@@ -8,8 +8,8 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.needle.bending import Bending
 from puncture_twin.planning.needle.bevel_path import BevelPath, bevel_path, step_for
+from puncture_twin.planning.needle.deflection import Bending
 from puncture_twin.planning.needle.insertion_force import InsertionForce, insertion_force
 from puncture_twin.planning.search.bending.path_layers import path_layers
 

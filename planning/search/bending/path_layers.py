@@ -12,8 +12,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.labels.naming import REST
-from puncture_twin.planning.needle.bending import Bending
-from puncture_twin.planning.needle.deflection import shortest_bend, stiffest_resolved
+from puncture_twin.planning.needle.deflection import Bending, shortest_bend, stiffest_resolved
 from puncture_twin.planning.needle.tissue import Layer
 from puncture_twin.planning.search.along_path import inside_at
 

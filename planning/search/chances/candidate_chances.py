@@ -13,8 +13,7 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.chances.limited import limited
-from puncture_twin.planning.search.chances.near_limits import ROWS_AT_ONCE, refined_near_limits
+from puncture_twin.planning.search.chances.near_limits import ROWS_AT_ONCE, limited, refined_near_limits
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.limits import check_limits, demanding

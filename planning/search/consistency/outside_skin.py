@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
+from puncture_twin.planning.anatomy.anatomy import OWN_TARGET, Anatomy, Role, Structure
 from puncture_twin.planning.anatomy.inside_skin import LEAST_TOLERANCE_MM, kept_inside_skin
-from puncture_twin.planning.anatomy.own_target import OWN_TARGET
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError

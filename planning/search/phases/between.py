@@ -15,8 +15,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Texts
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.search.candidates import Candidates, Verdict
-from puncture_twin.planning.search.phases.one_phase import BreathingBody, Phase
-from puncture_twin.planning.search.phases.rejection import rejected_at
+from puncture_twin.planning.search.phases.one_phase import BreathingBody, Phase, rejected_at
 
 LEAST_MM = 0.1
 """Positions this near to each other are not parted: what is not shown to be clear there counts as too close."""

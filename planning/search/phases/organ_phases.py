@@ -14,8 +14,7 @@ from puncture_twin.planning.needle.deflection import DeflectionBound
 from puncture_twin.planning.search.candidates import BreathingColumns, Candidates
 from puncture_twin.planning.search.phases.between import checked_between
 from puncture_twin.planning.search.phases.moving_weights import moving_weights
-from puncture_twin.planning.search.phases.one_phase import BreathingBody
-from puncture_twin.planning.search.phases.rejection import rejected_at
+from puncture_twin.planning.search.phases.one_phase import BreathingBody, rejected_at
 
 
 def with_breathing(

@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.input_file import decode_text, read_input, unfinished_warnings
 from puncture_twin.planning.base.provenance import Input, content_input
-from puncture_twin.planning.base.whole_lines import unfinished_warnings
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.points.point_files import MAX_FILE_BYTES, parse_points
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
-from puncture_twin.planning.formats.raw_mesh import decode_text
 from puncture_twin.planning.geometry.spaces import to_lps
 from puncture_twin.planning.search.selection.choice import Choice, parse_choice
 

@@ -10,6 +10,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import report_world as world
+import trimesh
 from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
@@ -17,6 +18,7 @@ from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.reasons import REASON_COLOURS
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.case.tables.search_section import EntryAxes
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.directions import ring_weights
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.twin.report import annotate
@@ -34,7 +36,7 @@ from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
 from puncture_twin.twin.report.raster.compositing import RasterShot, Shells, compose
 from puncture_twin.twin.report.raster.moving import MovingPicture
 from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, shells_of
-from puncture_twin.twin.report.scene import film, lighter_mesh, scene_picture
+from puncture_twin.twin.report.scene import film, film_file, lighter_mesh, scene_picture
 from puncture_twin.twin.report.scene.film import draw_film
 from puncture_twin.twin.report.scene.film_text import model_note
 from puncture_twin.twin.report.scene.scene_parts import SceneBody, needle_bodies, patient
@@ -452,10 +454,43 @@ def test_a_film_has_the_same_bytes_on_any_number_of_cores(rng, tmp_path):
     try:
         for count in (1, len(cores)):
             os.sched_setaffinity(0, sorted(cores)[:count])
-            film._write_mp4(frames, tmp_path / f"{count}.mp4")
+            whole = ((film_file.Part(0, 0, frame),) for frame in frames)
+            film_file.write_mp4(frames[0], whole, tmp_path / f"{count}.mp4", film.FRAMES_PER_SECOND)
     finally:
         os.sched_setaffinity(0, cores)
     assert (tmp_path / "1.mp4").read_bytes() == (tmp_path / f"{len(cores)}.mp4").read_bytes()
+
+
+def test_a_frame_is_its_ground_with_the_parts_put_on(rng):
+    """As a picture, and as the encoder takes it: parts converted alone are those of the whole, converted."""
+    ground = rng.integers(0, 256, (32, 48, 3), dtype=np.uint8)
+    parts = [film_file.Part(4, 6, ground[:10, :20] ^ 255), film_file.Part(40, 0, ground[:32, :8] // 2)]
+    whole = film_file.put_on(ground, parts)
+    assert np.array_equal(whole[6:16, 4:24], parts[0].pixels) and np.array_equal(whole[:, 40:], parts[1].pixels)
+    (sent,) = film_file.encoded(ground, [parts])
+    assert sent == b"".join(plane.tobytes() for plane in film_file.planes_of(whole))
+
+
+def test_planes_are_those_of_bt_601(rng):
+    """Brightness and colour differences by the standard's real numbers, within rounding; black, white and grey too."""
+    pixels = np.repeat(np.repeat(rng.integers(0, 256, (8, 8, 3), dtype=np.uint8), 2, axis=0), 2, axis=1)
+    pixels[:2, :2], pixels[:2, 2:4], pixels[:2, 4:6] = 0, 255, 119
+    r, g, b = np.moveaxis(pixels / 255.0, 2, 0)
+    light = 0.299 * r + 0.587 * g + 0.114 * b
+    wanted = 16 + 219 * light, (128 + 112 * (b - light) / 0.886)[::2, ::2], (128 + 112 * (r - light) / 0.701)[::2, ::2]
+    for plane, exact in zip(film_file.planes_of(pixels), wanted, strict=True):
+        assert np.abs(plane - exact).max() <= 1.5
+    assert film_file.planes_of(pixels).blue[0, :3].tolist() == [128, 128, 128]
+
+
+def test_frames_of_a_film_cut_off_are_not_counted(tmp_path, rng):
+    """An encoder on a full disk ends without a word: what it left must not pass for the film."""
+    ground, path = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8), tmp_path / "film.mp4"
+    film_file.write_mp4(ground, [()] * 7, path, 15)
+    written = path.read_bytes()
+    assert film_file.frames_in(written) == 7 == imageio_ffmpeg.count_frames_and_secs(str(path))[0]
+    assert [film_file.frames_in(written[:n]) for n in (0, 7, 100, len(written) // 2, len(written) - 1)] == [0] * 5
+    assert film_file.frames_in(b"no film " * 100) == 0
 
 
 @pytest.mark.parametrize(
@@ -520,7 +555,7 @@ def test_without_an_encoder_there_is_a_gif(anatomy, case, plan, tmp_path, monkey
     def no_encoder(*args, **options):
         raise RuntimeError("no ffmpeg")
 
-    monkeypatch.setattr(film.imageio_ffmpeg, "write_frames", no_encoder)
+    monkeypatch.setattr(film_file.imageio_ffmpeg, "write_frames", no_encoder)
     monkeypatch.setattr(film, "film_times", lambda total: film.FilmTimes((0.0, total), 1.0, 1))
     written = draw_film(world.make_rehearsal(plan), plan, case, anatomy, tmp_path / "film.mp4")
     assert [p.name for p in tmp_path.iterdir()] == ["film.gif"] == [written.name]
@@ -705,3 +740,22 @@ def stand_in_room(anatomy):
     """Something to stand for a gantry and a table."""
     mesh = anatomy.skin.mesh
     return (SceneBody("gantry", "room", mesh, (1, 2, 3), 0.15), SceneBody("table", "room", mesh, (1, 2, 3)))
+
+
+@pytest.mark.parametrize("role", ["avoid", "traverse"])
+@pytest.mark.parametrize("hollow", [False, True])
+def test_what_holds_the_target_is_see_through_whatever_its_role(anatomy, case, role, hollow):
+    """Whatever its role, and also where the lesion is left out of its label; what the target is beside is not."""
+    ball = trimesh.creation.icosphere(3, 40.0)
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    if hollow:
+        faces = np.concatenate([faces, faces[:, ::-1] + len(vertices)])
+        vertices = np.concatenate([vertices, vertices / 4])
+    around, beside = (TriangleMesh(vertices + place, faces) for place in (case.target_ct, case.target_ct + 60.0))
+    structures = [
+        SimpleNamespace(name="holder", role=role, mesh=around),
+        SimpleNamespace(name="beside", role=role, mesh=beside),
+    ]
+    body = SimpleNamespace(structures=structures, surroundings=(), skin=anatomy.skin)
+    alpha = {one.name: one.alpha for one in patient(body, case)}
+    assert alpha["holder"] < 0.5 and alpha["beside"] == 1.0

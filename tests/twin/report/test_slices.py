@@ -11,7 +11,7 @@ from PIL import Image
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.selection.choice import Pick
-from puncture_twin.twin.report.slices.cuts import ellipse, outline
+from puncture_twin.twin.report.slices.cuts import capsule, ellipse, outline
 from puncture_twin.twin.report.slices.panel import PIXELS, draw_panel
 from puncture_twin.twin.report.slices.planes import letters, needle_planes
 from puncture_twin.twin.report.slices.sheet import NO_CT, draw_slices, write_sheet
@@ -176,3 +176,26 @@ def test_unknown_structures_are_beads_and_a_refused_direction_is_drawn_too():
     one.pick.candidates.path.length.setflags(write=True)
     one.pick.candidates.path.length[:] = np.nan
     assert draw_slices(one).units is None
+
+
+@given(UNITS, st.floats(5, 200), st.floats(0.3, 20), st.integers(0, 3))
+def test_the_needles_cut_ends_at_its_tip(direction, length, radius, which):
+    """A cut's points lie on the capsule about the axis, so none is beyond the target by more than the radius."""
+    target, outward = np.array([3.0, -4.0, 5.0]), np.array(direction) / np.linalg.norm(direction)
+    plane = needle_planes(target, outward, length)[which]
+    cut = capsule(outward, length, radius, plane)
+    points = cut[:, :1] * plane.right + cut[:, 1:] * plane.up
+    along = points @ outward
+    assert along.min() >= -radius * (1 + 1e-9) and along.max() <= length + radius * (1 + 1e-9)
+    axis = np.clip(along, 0, length)[:, None] * outward
+    assert np.allclose(np.linalg.norm(points - axis, axis=1), radius, atol=1e-6 * (length + radius))
+    assert np.isfinite(cut).all() and np.allclose(cut[0], cut[-1], atol=1e-6 * (length + radius))
+
+
+def test_a_needle_near_the_slice_is_cut_long_but_not_beyond_its_tip():
+    """A needle 5 degrees out of an axial slice: a half circle beyond the target, a long half ellipse before it."""
+    tilt = np.radians(5.0)
+    outward = np.array([0.0, -np.cos(tilt), np.sin(tilt)])
+    cut = capsule(outward, 100.0, 0.6, needle_planes(np.zeros(3), outward, 60.0)[0])
+    assert cut[:, 1].max() == pytest.approx(0.6 / np.sin(tilt)) and cut[:, 1].min() == pytest.approx(-0.6)
+    assert np.abs(cut[:, 0]).max() == pytest.approx(0.6, rel=1e-3)

@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.conditioning import leverage
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
-from puncture_twin.planning.registration.fits.triad import fit_triad
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid, fit_triad
 from puncture_twin.twin.guidance.stereo.mapping import SeenMarkers, map_head
 
 NAMES = ("M1", "M2", "M3", "M4", "M5")

@@ -29,7 +29,7 @@ from puncture_twin.twin.guidance.ultrasound.candidate_poses import drawing
 from puncture_twin.twin.guidance.ultrasound.puncture import aim
 from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording, write_recording
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording
-from puncture_twin.twin.jobs.selfcal.drawn_workcell import draw_workcell
+from puncture_twin.twin.jobs.selfcal.selfcal import draw_workcell
 
 ROOMS = 30
 PICTURED = 12

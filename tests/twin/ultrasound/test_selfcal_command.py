@@ -11,7 +11,7 @@ from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import load_selfcal_case
 from puncture_twin.twin.guidance.ultrasound.simulate import PoseRanges, simulate_recording
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, OK
-from puncture_twin.twin.jobs.selfcal.drawn_workcell import draw_workcell
+from puncture_twin.twin.jobs.selfcal.selfcal import draw_workcell
 
 CASE = """
 schema = 1

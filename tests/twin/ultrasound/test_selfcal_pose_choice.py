@@ -20,7 +20,7 @@ from puncture_twin.twin.guidance.ultrasound.simulate import (
     simulate_recording,
     with_noise,
 )
-from puncture_twin.twin.jobs.selfcal.drawn_workcell import draw_workcell
+from puncture_twin.twin.jobs.selfcal.selfcal import draw_workcell
 
 
 @pytest.fixture

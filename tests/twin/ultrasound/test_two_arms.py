@@ -31,7 +31,7 @@ from puncture_twin.twin.guidance.ultrasound.two_arms import (
     phantom_mesh,
     probe_tool,
 )
-from puncture_twin.twin.jobs.selfcal.drawn_workcell import draw_workcell
+from puncture_twin.twin.jobs.selfcal.selfcal import draw_workcell
 from puncture_twin.twin.report.scene.shapes import bar, box
 
 

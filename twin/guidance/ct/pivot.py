@@ -11,12 +11,24 @@ the found tip's covariance is that of A^+ C A^+'.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
+from puncture_twin.planning.arm.error_jacobian import PARAMETERS
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.registration.reading_noise import reading_noise
+
+MOST_OFF_MM = 50.0
+"""By which a stated tip may be wrong: more is another needle."""
+
+SLACK_MM = 5.0
+"""By which an arm that nobody calibrated may miss one place."""
 
 LEAST_POSES = 3
 """Two leave the tip free along a line."""
@@ -26,6 +38,38 @@ LARGE = 2.0
 
 WORST_FACTOR = 30.0
 """Of the noise in the worst direction of the tip: poses that turn too little magnify it so."""
+
+
+def check_one_place(names: Sequence[str], tips_base: Floats, axes_base: Floats, *, where: str) -> None:
+    """Refuse touches that no tip near the stated one brings to one place.
+
+    A tip that is wrong by d parts two touches of one place by 2 sin(angle / 2) d at most, with the angle between the
+    two needles, and by twice d where the flange turns about them.
+
+    Args:
+        names: Of the n touches.
+        tips_base: Shape (n, 3), mm: where the stated tip was.
+        axes_base: Shape (n, 3, 3): the flange's axes as columns.
+        where: What the error names.
+
+    Raises:
+        InputError: Two of them are farther apart.
+    """
+    worst, two = 0.0, (0, 0)
+    for i, j in combinations(range(len(names)), 2):
+        cosine = (np.trace(axes_base[i].T @ axes_base[j]) - 1) / 2
+        turned = float(np.sqrt(max(2 - 2 * min(cosine, 1.0), 0.0)))  # 2 sin(angle / 2)
+        beyond = float(np.linalg.norm(tips_base[i] - tips_base[j])) - turned * MOST_OFF_MM - SLACK_MM
+        if beyond > worst:
+            worst, two = beyond, (i, j)
+    if worst > 0:
+        i, j = two
+        apart = float(np.linalg.norm(tips_base[i] - tips_base[j]))
+        what = (
+            f"touches of different places: {names[i]} and {names[j]} are {apart:.0f} mm apart, more than a tip "
+            f"{MOST_OFF_MM:g} mm off explains"
+        )
+        raise InputError(what, where=where, allowed="touches of one place, the needle tilted to several sides")
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,3 +134,25 @@ def pivot_calibration(
     expected_whole = float(np.sqrt(np.trace(off @ whole @ off) / count))
     cov = (back @ whole @ back.T)[:3, :3]
     return Pivot(found[:3], found[3:], cov, np.linalg.norm(left, axis=1), expected, expected_whole)
+
+
+def arm_covariance(errors: ErrorModel, model: UrModel, tip_mm: float, q: Floats) -> Floats:
+    """Of n touches of one place, all that is declared but touch noise and the tip itself.
+
+    Args:
+        errors: As declared.
+        model: The arm.
+        tip_mm: Flange to tip.
+        q: Shape (n, 6), rad.
+
+    Returns:
+        Shape (3 n, 3 n), mm^2.
+    """
+    noise = reading_noise(errors, model, tip_mm, q, known=True)
+    variances = noise.eta_variances.copy()
+    variances[PARAMETERS["tip_offset"]] = variances[PARAMETERS["needle_direction"]] = 0.0
+    anew = noise.cov_base - errors.touch_mm**2 * np.eye(3)
+    found = (noise.arm_jacobian * variances) @ noise.arm_jacobian.T
+    for row, block in enumerate(anew):
+        found[3 * row : 3 * row + 3, 3 * row : 3 * row + 3] += block
+    return np.asarray(found)

@@ -21,8 +21,12 @@ from puncture_twin.planning.formats.points.point_files import NamedPoints, parse
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
-from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors, declared_errors
-from puncture_twin.twin.guidance.stereo.errors_section import ServoErrorsSection, ServoRehearsalSection
+from puncture_twin.twin.guidance.stereo.declared_errors import (
+    ServoErrors,
+    ServoErrorsSection,
+    ServoRehearsalSection,
+    declared_errors,
+)
 
 CASE_NAME = "servo.toml"
 ALLOWED_CASE = "a TOML servo case with schema = 1, or a folder with servo.toml"

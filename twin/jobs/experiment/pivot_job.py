@@ -15,9 +15,7 @@ from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.base.provenance import Input, content_input, inputs_document
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.points.point_files import MAX_FILE_BYTES, parse_points
-from puncture_twin.twin.guidance.ct.one_place import check_one_place
-from puncture_twin.twin.guidance.ct.pivot import LARGE, Pivot, pivot_calibration
-from puncture_twin.twin.guidance.ct.pivot_arm import arm_covariance
+from puncture_twin.twin.guidance.ct.pivot import LARGE, Pivot, arm_covariance, check_one_place, pivot_calibration
 
 STANDS_OUT = 2.0
 """A touch that misses by so many times the others' root mean square is named."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.meshes.ply_writer import ply_bytes
+from puncture_twin.planning.formats.meshes.ply import ply_bytes
 from puncture_twin.twin.plant.beside.arms import Arms
 from puncture_twin.twin.plant.beside.bed import Bed
 from puncture_twin.twin.plant.beside.beside import Beside

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -16,8 +17,7 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.entry import needle_pose, outward
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits.affine import fit_affine
-from puncture_twin.planning.registration.fits.triad import fit_triad
+from puncture_twin.planning.registration.fits.least_squares import fit_affine, fit_triad
 from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_2, TABLE_4, Point
 
 TOLERANCE_MM = 0.01
@@ -180,3 +180,38 @@ def _error(T: Floats, name: str, touched: Mapping[str, Point]) -> float:
 def _triple(point: Floats) -> Point:
     x, y, z = (float(value) for value in point)
     return x, y, z
+
+
+def reproduction_text(result: Chen2019Tables) -> str:
+    """The paper's numbers beside ours."""
+    lines = [
+        "table  what                                    paper                       ours                   differs"
+    ]
+    for row in result.rows:
+        paper, ours = (" ".join(f"{x:8.2f}" for x in values) for values in (row.paper, row.ours))
+        mark = "" if row.passed else "  DOES NOT HOLD"
+        lines.append(f"{row.table:5s}  {row.what:36.36s} {paper:>27s} {ours:>27s} {row.difference_mm:8.4f}{mark}")
+    reach = result.reach
+    lines += [
+        "",
+        f"The worked pose puts the flange {reach.flange_from_shoulder_mm:.1f} mm from the shoulder of a UR3, "
+        f"whose links span {reach.longest_span_mm:.1f} mm at most: "
+        + ("it is out of reach." if reach.out_of_reach else "it is within reach."),
+        "every number holds" if result.passed else "NOT every number holds",
+    ]
+    return "\n".join(lines)
+
+
+def reproduction_summary(result: Chen2019Tables) -> dict[str, Any]:
+    """A reproduction as plain values, mm, for ``--json``."""
+    rows = [
+        {"table": r.table, "what": r.what, "paper_mm": r.paper, "ours_mm": r.ours, "holds": r.passed}
+        for r in result.rows
+    ]
+    return {
+        "rows": rows,
+        "flange_from_shoulder_mm": result.reach.flange_from_shoulder_mm,
+        "longest_span_mm": result.reach.longest_span_mm,
+        "out_of_reach": result.reach.out_of_reach,
+        "holds": result.passed,
+    }

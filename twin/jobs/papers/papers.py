@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.twin.jobs.papers import axp_ybq, chen2019
+from puncture_twin.twin.jobs.papers.chen2019 import reproduction_summary, reproduction_text
 from puncture_twin.twin.jobs.papers.chen2019_experiment import (
     DRAWS,
     experiment_summary,
     experiment_text,
     reproduce_experiment,
 )
-from puncture_twin.twin.jobs.papers.chen2019_text import reproduction_summary, reproduction_text
 from puncture_twin.twin.jobs.servo.job import reproduce_paper
 
 

@@ -14,12 +14,11 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import load_anatomy, load_skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, InputListError
 from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.case.case import Case, load_case
-from puncture_twin.planning.case.tables.registration_section import NO_RESIDUALS
 from puncture_twin.planning.certify.certificate import MAX_CERTIFICATE_BYTES, parse_certificate
 from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.formats.points.point_files import MAX_FILE_BYTES, parse_points
@@ -87,9 +86,9 @@ def registration_report(path: Path) -> dict[str, Any]:
     checked = checked_placement(case, user_cache())
     if checked is None or checked.placement.registration is None:
         file = case.robot.transform
-        what = "no [registration] with markers" if file is None else NO_RESIDUALS.format(file=file)
-        compared = () if checked is None else checked.findings.warnings
-        raise InputError("; ".join((what, *compared)), where=case.path, allowed="markers_ct and markers_base alone")
+        what = "no [registration] with markers" if file is None else f"the base is placed by the transform {file}"
+        compared = () if checked is None else (*checked.findings.warnings, *checked.findings.notes)
+        raise InputListError("; ".join((what, *compared)), where=case.path, allowed="markers_ct and markers_base alone")
     placement, registration = checked.placement, checked.placement.registration
     report = registration_summary(registration)
     pose = case.target_ct + case.needle.shaft_mm * case.T_ct_entry[:3, 2]

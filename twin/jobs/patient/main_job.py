@@ -24,11 +24,12 @@ from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.selection.choice import BEST, Choice, Pick, choose, choose_stated, with_file_read
 from puncture_twin.planning.search.table import write_table
-from puncture_twin.twin.jobs.patient.names import FILM, PAGE, PICTURES, ROOMS
-from puncture_twin.twin.jobs.patient.run import RoomCount, Run
+from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run
+from puncture_twin.twin.jobs.second_process import Beside, Here
 
 if TYPE_CHECKING:
     from puncture_twin.planning.export.exporter import Exported
+    from puncture_twin.twin.jobs.patient.rehearsed import Begun
 
 CERTIFICATE = "certificate.json"
 
@@ -81,32 +82,53 @@ def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
     return _answered(_final(run, draft), out)
 
 
-def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = None, choice: Choice = BEST) -> Run:
+def rehearse_case(
+    context: CaseContext, out: Path, rooms: RoomCount | None = None, choice: Choice = BEST, beside: Beside | None = None
+) -> Run:
     """Plan, rehearse the plan, in many rooms too where a number is given, and write everything.
+
+    Args:
+        context: The case.
+        out: The folder of the files.
+        rooms: How many, beside the one that is filmed.
+        choice: What is planned.
+        beside: Who executes and films the plan while the pictures are drawn; None does one after the other.
 
     Raises:
         InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
         NoAnswerError: No plan; the search's files are written all the same.
     """
-    from puncture_twin.twin.jobs.patient.rehearsed import rehearsed
+    from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal
+    from puncture_twin.twin.jobs.rehearser import Rehearser
 
     _refuse_without_arm(context)
+    beside = beside or Here()
+    beside.keep(Rehearser, context.case, context.anatomy)
     choice = _stated(context, out, choice)
     names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
     with _writing(out, "plan", context, names, read=choice.read) as draft:
         run = _searched_and_planned(context, draft.folder, choice)
         planned = run.files
-        run = run if run.plan is None else rehearsed(run, draft.folder, rooms)
-        run = _with_pictures(run, draft.folder)
+        begun = None if run.plan is None else begin_rehearsal(run, draft.folder, rooms, beside)
+        run = _pictured_and_rehearsed(run, draft.folder, begun)
         if run.rehearsal is not None:  # the page shows it: it goes with it
             shown = {draft.folder / name for name in PICTURES if name != PAGE}
             draft.split("rehearse", *(path for path in run.files if path not in {*planned, *shown}))
     return _answered(_final(run, draft), out)
 
 
-def demo_case(context: CaseContext, out: Path) -> Run:
+def _pictured_and_rehearsed(run: Run, out: Path, begun: Begun | None) -> Run:
+    """The run with the pictures of its plan, drawn while that is rehearsed, and then with the page of all."""
+    from puncture_twin.twin.jobs.patient.pictures import draw_pictures, with_page
+
+    drawn = draw_pictures(run, out)
+    return with_page(run if begun is None else begun.ended(out), out, drawn)
+
+
+def demo_case(context: CaseContext, out: Path, beside: Beside | None = None) -> Run:
     """`rehearse_case`, in `DEMO_ROOMS` rooms where the case declares errors and has markers."""
-    return rehearse_case(context, out, None if context.chance is None else RoomCount(DEMO_ROOMS))
+    rooms = None if context.chance is None else RoomCount(DEMO_ROOMS)
+    return rehearse_case(context, out, rooms, beside=beside)
 
 
 def _refuse_without_arm(context: CaseContext) -> None:
@@ -187,7 +209,8 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     """
     from puncture_twin.planning.plan.plan_check import with_case_arm
     from puncture_twin.planning.plan.recheck import check_plan
-    from puncture_twin.twin.jobs.patient.rehearsed import rehearsed
+    from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal
+    from puncture_twin.twin.jobs.rehearser import Rehearser
     from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
     source, plan = _read_plan(plan_path, context.watcher.note)
@@ -195,7 +218,10 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
         candidates = check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
     plan = with_case_arm(plan, context.case)
     with _writing(out, "rehearse", context, ("rehearsal.json", FILM, ROOMS), source) as draft:
-        run = rehearsed(Run(context, candidates, (), plan, read=(source,)), draft.folder, rooms)
+        beside = Here()
+        beside.keep(Rehearser, context.case, context.anatomy)
+        begun = begin_rehearsal(Run(context, candidates, (), plan, read=(source,)), draft.folder, rooms, beside)
+        run = begun.ended(draft.folder)
         if not draft.source_has("scene.png"):
             with context.stages.time("scene"):
                 draw_scene(context.case, context.anatomy, candidates, plan, draft.folder / "scene.png")
@@ -232,11 +258,12 @@ def export(
         InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
     """
     from puncture_twin.planning.export.exporter import export_name, export_plan
-    from puncture_twin.planning.plan.recheck import check_plan
+    from puncture_twin.planning.plan.recheck import check_plan, with_case_warnings
 
     source, plan = _read_plan(plan_path, note)
     if context is not None:
         check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
+        plan = with_case_warnings(plan, context)
     checker = None if context is None or context.reach is None else context.reach.checker
     name = export_name(plan_path, format_name)
     inputs, made_from = (source, *plan.inputs), {source.path: source.sha256}

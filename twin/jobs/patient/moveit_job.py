@@ -11,7 +11,7 @@ from puncture_twin.planning.export.exporter import Exported
 from puncture_twin.planning.export.moveit import MOVEIT, moveit_files, moveit_names
 from puncture_twin.planning.plan.plan_check import with_case_arm
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
-from puncture_twin.planning.plan.recheck import check_plan
+from puncture_twin.planning.plan.recheck import check_plan, with_case_warnings
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.selection.choice import Choice
 from puncture_twin.twin.jobs.patient.main_job import plan_case
@@ -46,7 +46,7 @@ def export_to_moveit(context: CaseContext, plan_path: Path | None, out: Path, ch
         note(f"warning: {found.note}")
     source, plan = found.input("plan"), parse_plan(found.data, plan_path)
     check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
-    plan = with_case_arm(plan, context.case)
+    plan = with_case_warnings(with_case_arm(plan, context.case), context)
     names, inputs = moveit_names(plan_path.stem), (source, *plan.inputs)
     texts = moveit_files(plan, context.case, context.anatomy, source=plan_path)
     made_from = {source.path: source.sha256}
@@ -55,4 +55,4 @@ def export_to_moveit(context: CaseContext, plan_path: Path | None, out: Path, ch
             with atomic(draft.folder / name) as temporary:
                 temporary.write_text(text, encoding="ascii")
     path = draft.final(tuple(draft.folder / name for name in names))[0]
-    return Exported(path, MOVEIT, NOTES, inputs)
+    return Exported(path, MOVEIT, NOTES, inputs, plan)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,8 +19,7 @@ from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.jobs.patient.budget import budget_facts
-from puncture_twin.twin.jobs.patient.names import FILM, PAGE, ROOMS, SLICES
-from puncture_twin.twin.jobs.patient.run import Run
+from puncture_twin.twin.jobs.patient.run import FILM, PAGE, ROOMS, SLICES, Run
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
 from puncture_twin.twin.report.budget_picture import draw_budget
 from puncture_twin.twin.report.map.map_picture import draw_map
@@ -30,8 +29,20 @@ from puncture_twin.twin.report.slices.sheet import Slices, draw_slices, write_sh
 from puncture_twin.twin.report.slices.subject import Subject
 
 
+class Drawn(NamedTuple):
+    """The pictures of a search and its plan: their files, and the slices that the page shows too."""
+
+    files: tuple[Path, ...]
+    slices: tuple[Slices, ...]
+
+
 def with_pictures(run: Run, out: Path) -> Run:
     """Draw the map, the scene, the slices and the page of what is known."""
+    return with_page(run, out, draw_pictures(run, out))
+
+
+def draw_pictures(run: Run, out: Path) -> Drawn:
+    """Draw the map, the scene and the slices, which show what was searched and planned."""
     context, found = run.context, run.candidates
     case, anatomy, stages = context.case, context.anatomy, context.stages
     with stages.time("map"):
@@ -42,7 +53,14 @@ def with_pictures(run: Run, out: Path) -> Run:
         slices = _slices(run)
         if slices:
             write_sheet(slices[0], out / SLICES)
-            run = run.with_files(out / SLICES)
+    sheet = (out / SLICES,) if slices else ()
+    return Drawn((*sheet, out / "map.png", out / "scene.png"), slices)
+
+
+def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
+    """The run with its pictures, and with the page of all that is known."""
+    context, found = run.context, run.candidates
+    case, anatomy, stages = context.case, context.anatomy, context.stages
     registration = context.placement.registration if context.placement is not None else None
     shown = None if registration is None else registration_summary(registration)
     film = next((path.name for path in run.files if path.stem == Path(FILM).stem and path.suffix != ".json"), None)
@@ -59,10 +77,10 @@ def with_pictures(run: Run, out: Path) -> Run:
             film=film,
             uncertainty=uncertainty,
             pick=run.pick,
-            slices=slices,
+            slices=drawn.slices,
             facts=run.facts,
         )
-    return run.with_files(out / "map.png", out / "scene.png", out / PAGE)
+    return run.with_files(*drawn.files, out / PAGE)
 
 
 def write_budget_picture(report: Mapping[str, Any], path: Path) -> Path:

@@ -1,4 +1,4 @@
-"""What a command about a patient has done so far, and the files that it wrote."""
+"""What a command about a patient has done so far, and the files that it wrote, by their names."""
 
 from __future__ import annotations
 
@@ -18,9 +18,16 @@ from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.jobs.patient.summaries import plan_summary, rehearsal_summary, window_summary
 
-if TYPE_CHECKING:  # they bring the simulator with them
+if TYPE_CHECKING:
     from puncture_twin.twin.rehearsal.distribution import Distribution
-    from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
+    from puncture_twin.twin.rehearsal.result import Rehearsal
+
+
+PAGE, SLICES = "report.html", "slices.png"
+PICTURES = ("map.png", "scene.png", SLICES, PAGE)
+"""What a search writes beside its table; slices only where there is a direction to show."""
+
+FILM, ROOMS = "rehearsal.mp4", "rooms.png"
 
 
 class RoomCount(NamedTuple):

@@ -15,7 +15,7 @@ from puncture_twin.planning.search.selection.windows import Window
 
 if TYPE_CHECKING:  # they bring export and simulator with them
     from puncture_twin.planning.export.exporter import Exported
-    from puncture_twin.twin.rehearsal.rehearsal import Rehearsal
+    from puncture_twin.twin.rehearsal.result import Rehearsal
 
 
 def registration_summary(registration: Registration) -> dict[str, Any]:
@@ -118,7 +118,10 @@ def export_summary(done: Exported, case_checked: bool) -> dict[str, Any]:
     """A plan that was written for a robot, as plain values; and whether its case was checked again."""
     return {
         "format": done.format_name,
+        "theta_deg": float(np.degrees(done.plan.theta)),
+        "beta_deg": float(np.degrees(done.plan.beta)),
         "notes": list(done.notes),
+        "warnings": None if done.plan.warnings is None else list(done.plan.warnings),
         "case_checked": case_checked,
         "inputs": inputs_document(done.inputs),
         "files": [str(done.path)],

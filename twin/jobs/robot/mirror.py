@@ -17,11 +17,9 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.input_file import decode_text, read_input, unfinished_warnings
 from puncture_twin.planning.base.provenance import Input, content_input
-from puncture_twin.planning.base.whole_lines import unfinished_warnings
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.formats.raw_mesh import decode_text
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
 from puncture_twin.twin.jobs.extras import require_extra
 

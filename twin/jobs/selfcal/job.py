@@ -1,17 +1,21 @@
-"""The command ``selfcal``: run, then write every file that shows it."""
+"""The command ``selfcal``: run, then write ``calibration.json`` and every file that shows it."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from puncture_twin.planning.base.errors import PlanningError
+from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.draft import Draft
 from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.progress import Watcher
-from puncture_twin.twin.guidance.ultrasound.recording_file import FILE_NAME
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.twin.guidance.ultrasound.recording_file import FILE_NAME, write_recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
-from puncture_twin.twin.jobs.selfcal.calibration_file import write_run
+from puncture_twin.twin.guidance.ultrasound.summaries import calibration_summary
 from puncture_twin.twin.jobs.selfcal.page import write_page
 from puncture_twin.twin.jobs.selfcal.pictures import detection_sheet, workcell_picture
 from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun, selfcal_recording, selfcal_twin
@@ -19,6 +23,9 @@ from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun, selfcal_recordin
 COMMAND = "selfcal"
 ANSWERS = ("calibration.json", "report.html")
 PICTURES = ("bmode.png", "room.png")
+
+VERSION = 2
+"""Of ``calibration.json``. 2: ``inputs`` lists each file with its role."""
 
 
 def run_selfcal(case_path: Path | None, recording: Path | None, seeds: int, out: Path, watcher: Watcher) -> SelfcalRun:
@@ -67,3 +74,34 @@ def _simulated(case: SelfcalCase, seeds: int, draft: Draft, watcher: Watcher) ->
         shot = trial.acquisition.shots[0]
         picture = workcell_picture(case, shot.q_probe, shot.q_needle, draft.folder / "room.png")
     return run.with_files(sheet, picture, write_page(run, sheet, picture, draft.folder / "report.html"))
+
+
+def write_run(run: SelfcalRun, out: Path) -> SelfcalRun:
+    """Write ``calibration.json`` and, in the twin, the first seed's ``recording.csv``."""
+    written = [_write_json(calibration_file(run), out / "calibration.json")]
+    if run.trials:
+        write_recording(run.recording, out / FILE_NAME)
+        written.append(out / FILE_NAME)
+    return run.with_files(*written)
+
+
+def calibration_file(run: SelfcalRun) -> dict[str, Any]:
+    """What ``calibration.json`` holds."""
+    found = run.calibration
+    return {
+        "version": VERSION,
+        "name": run.name,
+        "seed": run.trials[0].seed if run.trials else None,
+        "inputs": inputs_document(run.inputs),
+        **calibration_summary(found, run.recording),
+        "residuals_mm": dict(zip(run.recording.names, found.residuals.tolist(), strict=True)),
+        "parameters": list(found.parameters),
+        "covariance": found.covariance_counts.tolist(),
+        "region_limit_95": found.region_limit(),
+    }
+
+
+def _write_json(content: dict[str, Any], path: Path) -> Path:
+    with atomic(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return path

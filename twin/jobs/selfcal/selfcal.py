@@ -9,23 +9,26 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.input_file import read_input, unfinished_warnings
 from puncture_twin.planning.base.progress import Stages, Watcher
 from puncture_twin.planning.base.provenance import Input, content_input
-from puncture_twin.planning.base.whole_lines import unfinished_warnings
+from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, acquire, choice_noise
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import tangent_basis
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, drawing, find_candidates
 from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, punctures, unseen_errors_mm
 from puncture_twin.twin.guidance.ultrasound.recording_file import MAX_BYTES, parse_recording, recording_file
-from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import ErrorsSection, SelfcalCase
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth
 from puncture_twin.twin.guidance.ultrasound.slips import checked_calibration
 from puncture_twin.twin.guidance.ultrasound.trial import Choice, SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
-from puncture_twin.twin.jobs.selfcal.calibrate_case import calibrate_case
-from puncture_twin.twin.jobs.selfcal.drawn_workcell import draw_workcell
+from puncture_twin.twin.plant.true_arm import ArmErrors, draw_true_arm
 
 TARGETS = 6
 """Punctures per seed."""
@@ -166,3 +169,37 @@ def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisi
 
     sets = [rng.choice(len(poses), len(rows), replace=False) for _ in range(RANDOM_SETS)]
     return Choice(expected(rows), tuple(expected(some) for some in sets))
+
+
+def calibrate_case(recording: Recording, case: SelfcalCase | None) -> Calibration:
+    """Calibrate with what the case says of noise and needle; pixels are solved for where the recording has them."""
+    noise = None if case is None or case.content.noise is None else case.content.noise.noise()
+    length = case.content.needle.length_mm if case is not None and case.content.hold_needle_length else None
+    arms = None if case is None or recording.q_probe is None else case.declared_arms
+    return calibrate(recording, noise=noise, needle_length_mm=length, scale=recording.pixels, arms=arms)
+
+
+def draw_workcell(case: SelfcalCase, rng: np.random.Generator) -> WorkcellTruth:
+    """A room whose differences from the drawing are drawn from the case's standard deviations."""
+    content, off = case.content, case.content.truth
+    arms = [
+        draw_true_arm(model, _spread(arm.errors), rng)
+        for model, arm in zip(case.models, (content.probe_arm, content.needle_arm), strict=True)
+    ]
+    X, Y = (_shifted(T, off.mount_mm, np.radians(off.mount_deg), rng) for T in (case.T_end1_image, case.T_base1_base2))
+    V = np.array([0.0, 0.0, 1.0])
+    tip = case.tip_end2 + [*rng.normal(0.0, off.tip_mm, 2), rng.normal(0.0, off.length_mm)]
+    bent = V + tangent_basis(V) @ rng.normal(0.0, np.radians(off.needle_deg), 2)
+    return WorkcellTruth(arms[0], arms[1], X, Y, tip, bent / np.linalg.norm(bent))
+
+
+def _spread(stated: ErrorsSection) -> ArmErrors:
+    angles = np.radians([stated.twist_deg, stated.joint_deg, stated.backlash_deg, stated.repeatability_deg])
+    return ArmErrors(stated.link_mm, *(float(angle) for angle in angles))
+
+
+def _shifted(T: Floats, mm: float, rad: float, rng: np.random.Generator) -> Floats:
+    moved = np.array(T)
+    moved[:3, 3] += rng.normal(0.0, mm, 3)
+    moved[:3, :3] = T[:3, :3] @ exp_rotation(rng.normal(0.0, rad, 3))
+    return moved

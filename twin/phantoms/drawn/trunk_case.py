@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from puncture_twin.planning.formats.meshes.ply_writer import ply_bytes
+from puncture_twin.planning.formats.meshes.ply import ply_bytes
 from puncture_twin.twin.phantoms.drawn.trunk import Trunk
 
 HU = {"spine": 350.0, "rib": 500.0}

@@ -12,12 +12,12 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.beyond_labels import BEYOND_LABELS
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.case.bed import bed_frame
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.place.bed import bed_frame
 from puncture_twin.planning.registration.checks.skin_fit import skin_fit
 from puncture_twin.twin.plant.beside.beside import Beside, lay_beside
 from puncture_twin.twin.plant.beside.tubes import Part

@@ -86,14 +86,7 @@ def write_page(
         facts: How the planned or shown path is found at the patient.
     """
     pick = pick or best_pick(candidates)
-    data = {
-        "map": map_data(case, candidates, pick),
-        "scene": scene_figure(case, anatomy, candidates, plan, user_cache(), pick),
-        "charts": None if rehearsal is None else rehearsal_charts(rehearsal, demanding(anatomy)),
-        "slices": slices_data(slices),
-        "target": [float(v) for v in case.target_ct],
-        "probe_mm": float(case.needle.length_mm),
-    }
+    doubt = None if uncertainty is None else uncertainty.doubt
     seed = case.rehearsal.seed if plan is None else plan.seed
     write_html(
         "report.html",
@@ -107,10 +100,7 @@ def write_page(
         methods=methods_text(case, anatomy, candidates),
         notice=TRUTH_IS_BELIEF if rehearsal is not None and rehearsal.truth_is_belief else "",
         refused=_refused(candidates),
-        cards=_cards(candidates, pick, plan, rehearsal, None if uncertainty is None else uncertainty.doubt),
-        chances=None if uncertainty is None else chances_section(uncertainty.doubt, registration),
-        budget=None if uncertainty is None or uncertainty.budget is None else budget_section(uncertainty.budget),
-        rooms=None if uncertainty is None else rooms_section(uncertainty.rooms, uncertainty.picture),
+        cards=_cards(candidates, pick, plan, rehearsal, doubt),
         counts=tables.counts_table(candidates),
         best=tables.best_table(candidates),
         plan=tables.plan_section(plan, () if facts is None else facts.rows()),
@@ -119,9 +109,41 @@ def write_page(
         warnings=tables.warnings_section(anatomy.warnings),
         inputs=tables.inputs_table(case.inputs),
         origin=tables.origin_section(seed),
-        data=script_json(data),
+        data=script_json(_drawn(case, anatomy, candidates, plan, rehearsal, pick, slices)),
         plotly=plotly_script(),
+        **_uncertain_sections(uncertainty, registration),
     )
+
+
+def _drawn(
+    case: Any,
+    anatomy: Any,
+    candidates: Candidates,
+    plan: Any | None,
+    rehearsal: Any | None,
+    pick: Pick | None,
+    slices: Sequence[Slices],
+) -> dict[str, Any]:
+    """What the page's script draws: map, scene, the rehearsal's charts and slices; arguments as of `write_page`."""
+    return {
+        "map": map_data(case, candidates, pick),
+        "scene": scene_figure(case, anatomy, candidates, plan, user_cache(), pick),
+        "charts": None if rehearsal is None else rehearsal_charts(rehearsal, demanding(anatomy)),
+        "slices": slices_data(slices),
+        "target": [float(v) for v in case.target_ct],
+        "probe_mm": float(case.needle.length_mm),
+    }
+
+
+def _uncertain_sections(uncertainty: Uncertainty | None, registration: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What the page says of chances, budget and rooms; nothing where the case declares no errors."""
+    if uncertainty is None:
+        return {"chances": None, "budget": None, "rooms": None}
+    return {
+        "chances": chances_section(uncertainty.doubt, registration),
+        "budget": None if uncertainty.budget is None else budget_section(uncertainty.budget),
+        "rooms": rooms_section(uncertainty.rooms, uncertainty.picture),
+    }
 
 
 def _refused(candidates: Candidates) -> str:

@@ -41,6 +41,17 @@ class MovingPicture:
         self._hidden = depth_before(self._still.depth, (fine.scale, fine.height, fine.width), (0, 0))
         self._with_own_arrays()
 
+    @property
+    def still(self) -> NDArray[np.uint8]:
+        """The picture without what moves, shape (h, w, 3)."""
+        return self._picture
+
+    @property
+    def changed_pixels(self) -> PixelBox:
+        """Where the last picture may differ from `still`."""
+        left, top, right, bottom = self.changed
+        return PixelBox(left // SAMPLES, top // SAMPLES, -(-right // SAMPLES), -(-bottom // SAMPLES))
+
     def another(self) -> MovingPicture:
         """The same picture for another thread: what stands still is shared."""
         made = copy(self)

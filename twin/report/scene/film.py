@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import repeat
@@ -16,21 +16,19 @@ from pathlib import Path
 from queue import Queue
 from typing import Any, NamedTuple
 
-import imageio_ffmpeg
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.numbers import demanding
 from puncture_twin.twin.report.raster.camera import ViewCamera
+from puncture_twin.twin.report.raster.compositing import PixelBox
 from puncture_twin.twin.report.raster.moving import MovingPicture
 from puncture_twin.twin.report.raster.render import Layer, Surface
-from puncture_twin.twin.report.scene.film_text import FrameText, draw_frame_text, draw_still_text, model_note
+from puncture_twin.twin.report.scene.film_file import Frame, Part, Pixels, write_gif, write_mp4
+from puncture_twin.twin.report.scene.film_text import BELOW, FrameText, FrameWords, model_note
 from puncture_twin.twin.report.scene.scene_parts import ArmPicture, SceneBody, needle_bodies, patient, room
 from puncture_twin.twin.report.scene.shapes import bar
 from puncture_twin.twin.report.scene.views import close_up, overview
@@ -38,22 +36,18 @@ from puncture_twin.twin.report.scene.views import close_up, overview
 MOST_THREADS = 4
 """Of those that draw: each takes 40 MB, and the encoder and the words do not keep up with more."""
 
-Frame = NDArray[np.uint8]
-"""Shape (HEIGHT, WIDTH, 3)."""
-
 WIDTH, HEIGHT = 832, 608
 """Pixels; multiples of 16, as H.264 likes them."""
 
-VIEW_WIDTH, VIEW_HEIGHT = 592, 528
+VIEW_WIDTH, VIEW_HEIGHT = 592, HEIGHT - BELOW
 """The overview, upper left. Below it stand the numbers."""
-
-SAME_BYTES = ("-threads", "4", "-filter_threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact")
-"""x264 writes other bytes for another number of threads, and left alone it takes as many as there are cores."""
 
 INSET = 240
 """Side of the close-up, upper right; below it stand the names and the body's directions."""
 
-FRAMES_PER_SECOND = 25
+FRAMES_PER_SECOND = 15
+"""Enough for an arm that takes seconds from pose to pose; each frame costs its drawing and its encoding."""
+
 LONGEST_S = 8.0
 """Playback is sped up until the motion fits into this time; then the last frame stands still."""
 
@@ -113,16 +107,17 @@ def draw_film(
         The file that was written.
     """
     times = film_times(float(rehearsal.times_s[-1]))
+    scene = _scene(rehearsal, plan, case, anatomy, times.speed)
 
     def frames() -> Iterator[Frame]:
-        return _with_still(_frames(rehearsal, plan, case, anatomy, times, progress), times.still_frames)
+        return _with_still(_frames(scene, times, progress), times.still_frames)
 
     path = Path(path)
     try:
-        _write_mp4(frames(), path)
+        write_mp4(scene.ground, frames(), path, FRAMES_PER_SECOND)
     except (OSError, RuntimeError):  # no encoder on this machine, or one without H.264
         path = path.with_suffix(".gif")
-        _write_gif(frames(), path)
+        write_gif(scene.ground, frames(), path, FRAMES_PER_SECOND)
     return path
 
 
@@ -133,14 +128,17 @@ def _with_still(frames: Iterable[Frame], count: int) -> Iterator[Frame]:
     yield from repeat(frame, count)
 
 
-def _frames(
-    rehearsal: Any,
-    plan: Any,
-    case: Any,
-    anatomy: Any,
-    times: FilmTimes,
-    progress: Count | None,
-) -> Iterator[Frame]:
+class _Scene(NamedTuple):
+    """What a film is drawn from: a frame without what moves (HEIGHT, WIDTH, 3), and what is drawn over it."""
+
+    ground: Pixels
+    views: _Views
+    words: FrameWords
+    poses: Callable[[int], list[Floats]]
+    """Of the links after the base, and the tool, T_ct_body, at a record of the rehearsal."""
+
+
+def _scene(rehearsal: Any, plan: Any, case: Any, anatomy: Any, speed: float) -> _Scene:
     T_base_ct = rehearsal.T_base_ct_true
     arm = ArmPicture(plan.model, T_base_ct)
     base = arm.bodies(rehearsal.q[0])[0]
@@ -151,30 +149,44 @@ def _frames(
         _moving_picture([*still, base], cameras[0], [*arm.layers[1:], tool]),
         _moving_picture([b for b in still if b.group != "room"], cameras[1], [tool]),
     )
-    text = FrameText(rehearsal, plan, times.speed, demanding(anatomy), model_note(case))
-    ground = Image.new("RGB", (WIDTH, HEIGHT), (255, 255, 255))
-    draw_still_text(ground, text, cameras, case)
-    rows = np.searchsorted(rehearsal.times_s, times.moments, side="right") - 1
+    words = FrameWords(FrameText(rehearsal, plan, speed, demanding(anatomy), model_note(case)), cameras, case)
+    ground = np.array(words.still((WIDTH, HEIGHT)))
+    ground[:VIEW_HEIGHT, :VIEW_WIDTH] = views.wide.still
 
     def poses(row: int) -> list[Floats]:
         T_ct_flange = np.linalg.inv(T_base_ct) @ rehearsal.T_base_flange_true[row]
         return [*arm.poses_ct(rehearsal.q[row])[1:], T_ct_flange]
 
-    for number, pictures in enumerate(_drawn_ahead(views, [poses(row) for row in rows])):
-        frame = ground.copy()
-        frame.paste(Image.fromarray(pictures.wide), (0, 0))
-        frame.paste(Image.fromarray(pictures.near), (VIEW_WIDTH, 0))
-        draw_frame_text(frame, text, int(rows[number]), times.moments[number], cameras, case)
+    return _Scene(ground, views, words, poses)
+
+
+def _frames(scene: _Scene, times: FilmTimes, progress: Count | None) -> Iterator[Frame]:
+    """The frames that move; pictures are drawn on threads, words here."""
+    rows = scene.words.rows(times.moments)
+    for number, pictures in enumerate(_drawn_ahead(scene.views, [scene.poses(row) for row in rows])):
+        row, moment = rows[number], times.moments[number]
+        wide = scene.words.over_wide(pictures.wide, moment)
+        yield (
+            pictures.changed(wide) if wide is pictures.wide else Part(0, 0, wide),
+            Part(VIEW_WIDTH, 0, scene.words.over_near(pictures.near)),
+            Part(0, VIEW_HEIGHT, scene.words.below(row, moment)),
+        )
         if progress is not None:
             progress(number + 1, len(times.moments))
-        yield np.asarray(frame)
 
 
 class _Pictures(NamedTuple):
-    """The two views of a frame, each (h, w, 3)."""
+    """The two views of a frame, each (h, w, 3), and where the overview may differ from what stands still."""
 
-    wide: Frame
-    near: Frame
+    wide: Pixels
+    near: Pixels
+    box: PixelBox
+
+    def changed(self, wide: Pixels) -> Part:
+        """That part of the overview, from even column and row to even column and row."""
+        left, top, right, bottom = self.box
+        left, top = left // 2 * 2, top // 2 * 2
+        return Part(left, top, wide[top : bottom + bottom % 2, left : right + right % 2])
 
 
 class _Views(NamedTuple):
@@ -185,7 +197,8 @@ class _Views(NamedTuple):
 
     def at(self, poses: Sequence[Floats]) -> _Pictures:
         """Both, with the links and at last the tool at their poses T_ct_body."""
-        return _Pictures(self.wide.at(poses), self.near.at(poses[-1:]))
+        wide, near = self.wide.at(poses), self.near.at(poses[-1:])
+        return _Pictures(wide, near, self.wide.changed_pixels)
 
     def another(self) -> _Views:
         """For another thread."""
@@ -252,35 +265,3 @@ def _near_camera(case: Any, still: list[SceneBody], plan: Any) -> ViewCamera:
     blockers = Layer([b.surface for b in still if b.alpha >= 1 and b.group in {"organ", "target"}])
     path_ct = np.stack([plan.target_ct, plan.entry_ct])
     return close_up(case, path_ct, INSET_RADIUS_MM, blockers, (INSET, INSET))
-
-
-def _write_mp4(frames: Iterable[Frame], path: Path) -> None:
-    with atomic(path) as temporary:
-        writer = imageio_ffmpeg.write_frames(
-            str(temporary),
-            (WIDTH, HEIGHT),
-            fps=FRAMES_PER_SECOND,
-            codec="libx264",
-            quality=None,
-            output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart", *SAME_BYTES],
-            ffmpeg_log_level="quiet",
-        )
-        writer.send(None)
-        sent = 0
-        try:
-            for frame in frames:  # drawn while the encoder works on those before
-                writer.send(np.ascontiguousarray(frame))
-                sent += 1
-        finally:
-            writer.close()
-        written, _ = imageio_ffmpeg.count_frames_and_secs(str(temporary))  # an encoder on a full disk says nothing
-        if written != sent:
-            raise RuntimeError(f"the encoder wrote {written} of {sent} frames")
-
-
-def _write_gif(frames: Iterable[Frame], path: Path) -> None:
-    images = [Image.fromarray(frame).quantize(128) for frame in frames]
-    with atomic(path) as temporary:
-        images[0].save(
-            temporary, format="GIF", save_all=True, append_images=images[1:], loop=0, duration=1000 // FRAMES_PER_SECOND
-        )

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
 
+from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report import annotate
 from puncture_twin.twin.report.numbers import number
 from puncture_twin.twin.report.raster.camera import ViewCamera
+from puncture_twin.twin.report.scene.film_file import Pixels
 
 PHASES = {
     "approach": "approach to standoff",
@@ -22,6 +25,13 @@ CONTACT_SHOWN_S = 3.0
 """How long (time of the rehearsal) a contact stays in large letters."""
 
 LABEL, VALUE = 13, 17
+
+BELOW = 80
+"""Pixels: height of the numbers below the views."""
+
+FRAME: Rgb = (150, 156, 164)
+RULE: Rgb = (190, 194, 200)
+"""The lines about the close-up, and between views and words."""
 
 CELLS = (
     (12, "time"),
@@ -62,52 +72,84 @@ class FrameText:
         return [c for c in self.rehearsal.contacts if c.time_s <= moment]
 
 
-def draw_still_text(frame: Image.Image, source: FrameText, cameras: tuple[ViewCamera, ViewCamera], case: Any) -> None:
-    """Write the words beside the views that every frame has.
+class FrameWords:
+    """What is written into frames whose overview is upper left, with the close-up beside it and numbers below.
 
     Args:
-        frame: What the views are put on: the overview upper left, the close-up beside it.
         source: Where the words come from.
         cameras: Of the overview and of the close-up.
-        case: For names and the space.
+        case: For names, space and target.
     """
-    draw = ImageDraw.Draw(frame)
-    wide, near = cameras
-    left, below = wide.width, near.height
-    speed = "real time" if source.speed == 1 else f"playback × {source.speed:g}"
-    annotate.write(draw, (left + 10, below + 12), str(case.name)[:26], size=17, bold=True)
-    standing = source.rehearsal.standing
-    shown = "rehearsal in the twin" if standing is None else standing.short
-    for line, text in enumerate((shown, f"{speed}; green: planned path")):
-        annotate.write(draw, (left + 10, below + 37 + 19 * line), text, size=13)
-    annotate.body_axes(draw, wide, case.space, (left + near.width / 2, wide.height - 96), 42, size=14)
-    annotate.write(draw, (left + 24, wide.height - 204), "directions in the large view", size=11, colour=annotate.FAINT)
-    for x, label in CELLS:
-        annotate.write(draw, (x, wide.height + 6), label, size=LABEL, colour=annotate.FAINT)
+
+    def __init__(self, source: FrameText, cameras: tuple[ViewCamera, ViewCamera], case: Any) -> None:
+        self._source, self._cameras, self._case = source, cameras, case
+        wide, near = cameras
+        self._over_near = _over_near(near, case)
+        self._below = Image.new("RGB", (wide.width + near.width, BELOW), annotate.WHITE)
+        draw = ImageDraw.Draw(self._below)
+        draw.line([(0, 0), (wide.width, 0)], fill=RULE, width=1)
+        for x, label in CELLS:
+            annotate.write(draw, (x, 6), label, size=LABEL, colour=annotate.FAINT)
+
+    def rows(self, moments: Sequence[float]) -> list[int]:
+        """The records that are shown at some moments."""
+        found = np.searchsorted(self._source.rehearsal.times_s, moments, side="right") - 1
+        return [int(row) for row in found]
+
+    def still(self, size: tuple[int, int]) -> Image.Image:
+        """A frame of that width and height with the words that every frame has, and no view."""
+        frame, (wide, near), source = Image.new("RGB", size, annotate.WHITE), self._cameras, self._source
+        draw = ImageDraw.Draw(frame)
+        left, below = wide.width, near.height
+        speed = "real time" if source.speed == 1 else f"playback × {source.speed:g}"
+        annotate.write(draw, (left + 10, below + 12), str(self._case.name)[:26], size=17, bold=True)
+        standing = source.rehearsal.standing
+        shown = "rehearsal in the twin" if standing is None else standing.short
+        for line, text in enumerate((shown, f"{speed}; green: planned path")):
+            annotate.write(draw, (left + 10, below + 37 + 19 * line), text, size=13)
+        annotate.body_axes(draw, wide, self._case.space, (left + near.width / 2, wide.height - 96), 42, size=14)
+        about = "directions in the large view"
+        annotate.write(draw, (left + 24, wide.height - 204), about, size=11, colour=annotate.FAINT)
+        draw.line([(left, below), (size[0], below)], fill=FRAME, width=1)
+        draw.line([(left, below), (left, wide.height)], fill=RULE, width=1)
+        frame.paste(self._below, (0, wide.height))
+        return frame
+
+    def over_wide(self, view: Pixels, moment: float) -> Pixels:
+        """The overview, with what touches written into it while that is news; itself where nothing does."""
+        fresh = [c for c in self._source.contacts(moment) if moment - c.time_s <= CONTACT_SHOWN_S]
+        if not fresh:
+            return view
+        image = Image.fromarray(view)
+        _alarm(ImageDraw.Draw(image), fresh)
+        return np.asarray(image)
+
+    def over_near(self, view: Pixels) -> Pixels:
+        """The close-up with its name, its scale and its frame."""
+        image = Image.fromarray(view)
+        image.paste(self._over_near, (0, 0), self._over_near)
+        return np.asarray(image)
+
+    def below(self, row: int, moment: float) -> Pixels:
+        """The numbers below the views.
+
+        Args:
+            row: The rehearsal's record shown.
+            moment: Its time, s.
+        """
+        image = self._below.copy()
+        _strip(ImageDraw.Draw(image), self._source, row, moment)
+        return np.asarray(image)
 
 
-def draw_frame_text(
-    frame: Image.Image, source: FrameText, row: int, moment: float, cameras: tuple[ViewCamera, ViewCamera], case: Any
-) -> None:
-    """Write what changes from frame to frame, and what stands in the views.
-
-    Args:
-        frame: The picture, with `draw_still_text` and its views.
-        source: Where the numbers come from.
-        row: The rehearsal's record shown.
-        moment: Its time, s.
-        cameras: Of the overview and of the close-up.
-        case: For the target.
-    """
-    draw = ImageDraw.Draw(frame)
-    wide, near = cameras
-    left, below = wide.width, near.height
-    draw.rectangle([left, 0, frame.width, below], outline=(150, 156, 164), width=1)
-    draw.line([(left, below), (left, wide.height), (0, wide.height)], fill=(190, 194, 200), width=1)
-    annotate.write(draw, (left + 8, 7), "close-up", size=13, bold=True, halo=2)
-    annotate.scale_bar(draw, near, case.target_ct, left + 12, below - 12, 90, note="")
-    _strip(draw, source, row, moment, wide.height)
-    _alarm(draw, source, moment)
+def _over_near(near: ViewCamera, case: Any) -> Image.Image:
+    """RGBA of the close-up's size, see-through where nothing is written."""
+    image = Image.new("RGBA", (near.width, near.height), (*annotate.WHITE, 0))
+    draw = ImageDraw.Draw(image)
+    draw.line([(0, near.height), (0, 0), (near.width, 0)], fill=FRAME, width=1)
+    annotate.write(draw, (8, 7), "close-up", size=13, bold=True, halo=2)
+    annotate.scale_bar(draw, near, case.target_ct, 12, near.height - 12, 90, note="")
+    return image
 
 
 def model_note(case: Any) -> str:
@@ -121,7 +163,7 @@ def model_note(case: Any) -> str:
     return f"{needle}; {breath}; research software, not a medical device"
 
 
-def _strip(draw: ImageDraw.ImageDraw, source: FrameText, row: int, moment: float, top: int) -> None:
+def _strip(draw: ImageDraw.ImageDraw, source: FrameText, row: int, moment: float) -> None:
     phase = str(source.rehearsal.phase[row])
     nearest = source.clearance(moment)
     contacts = len(source.contacts(moment))
@@ -134,20 +176,19 @@ def _strip(draw: ImageDraw.ImageDraw, source: FrameText, row: int, moment: float
         (near, annotate.INK),
     )
     for (x, _), (value, ink) in zip(CELLS, values, strict=True):
-        annotate.write(draw, (x, top + 22), value, size=VALUE, bold=True, colour=ink)
+        annotate.write(draw, (x, 22), value, size=VALUE, bold=True, colour=ink)
     r = source.rehearsal
     if row == len(r.times_s) - 1:
         deeper = "deep" if r.depth_mm >= 0 else "shallow"
         parts = f"lateral {number(r.lateral_mm, 2)}, {number(abs(r.depth_mm), 2)} too {deeper}"
         place = "" if r.standing is None else f"; {r.standing.place}"
         result = f"tip error at the end {number(r.tip_error_mm, 2, 'mm')}: {parts}{place}"
-        annotate.write(draw, (12, top + 51), result, size=VALUE, bold=True)
+        annotate.write(draw, (12, 51), result, size=VALUE, bold=True)
     else:
-        annotate.write(draw, (12, top + 54), source.note, size=11, colour=annotate.FAINT)
+        annotate.write(draw, (12, 54), source.note, size=11, colour=annotate.FAINT)
 
 
-def _alarm(draw: ImageDraw.ImageDraw, source: FrameText, moment: float) -> None:
-    fresh = [c for c in source.contacts(moment) if moment - c.time_s <= CONTACT_SHOWN_S]
+def _alarm(draw: ImageDraw.ImageDraw, fresh: Sequence[Any]) -> None:
     for line, contact in enumerate(fresh[-3:]):
         text = f"CONTACT: {_short(contact.link)} touches {_short(contact.body)}"
         annotate.write(draw, (12, 12 + 24 * line), text, size=17, bold=True, colour=annotate.RED, halo=3)

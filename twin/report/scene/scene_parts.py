@@ -15,7 +15,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import SAFE, Rgb
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.geometry.winding import winding_number
+from puncture_twin.planning.geometry.winding import hit_fraction
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.selection.choice import Pick
 from puncture_twin.twin.report import palette
@@ -24,6 +24,10 @@ from puncture_twin.twin.report.scene.shapes import ball, bar, box, corridor_mout
 
 ORGAN_OPACITY = 0.38
 """Opacity of the organ that holds the target, so that the lesion and its vessels show."""
+
+MOST_AROUND = 0.7
+"""A structure that hides the target from more than so much of all directions holds it: also an organ from whose label
+the lesion is left out, and one with an opening, as of a vessel."""
 
 UNKNOWN_OPACITY = 0.30
 OUTSIDE_SHOWN_MM = np.array([150.0, 150.0, 0.0])
@@ -112,7 +116,7 @@ def _opacity(structure: Any, case: Any) -> float:
         return ORGAN_OPACITY
     low, high = structure.mesh.bounds
     near = bool(np.all((low <= case.target_ct) & (case.target_ct <= high)))
-    return ORGAN_OPACITY if near and abs(winding_number(structure.mesh, case.target_ct)) > 0.5 else 1.0
+    return ORGAN_OPACITY if near and hit_fraction(structure.mesh, case.target_ct) > MOST_AROUND else 1.0
 
 
 def safe_region(candidates: Candidates, case: Any) -> tuple[SceneBody, ...]:

@@ -1,4 +1,4 @@
-"""Where a plane cuts surfaces, and where it cuts the ellipsoid of the tip."""
+"""Where a plane cuts surfaces, the needle, and the ellipsoid of the tip."""
 
 from __future__ import annotations
 
@@ -24,6 +24,37 @@ def outline(mesh: TriangleMesh, plane: Plane) -> Floats:
     along = (height[tip] / (height[tip] - height[others].T)).T[:, :, None]
     ends = mesh.vertices[tip][:, None] * (1 - along) + mesh.vertices[others] * along
     return plane.place(ends)
+
+
+def capsule(outward_ct: Floats, length_mm: float, radius_mm: float, plane: Plane, points: int = 181) -> Floats:
+    """The cut of all that lies within a radius of a piece of the needle's axis, a closed line, shape (2 * points, 2).
+
+    With a along the axis' shadow in the plane and b across it, the axis' nearest point to (a, b) is s = a sin(phi),
+    kept within 0..length; phi is the angle between axis and normal, and b^2 = radius^2 - (a^2 - 2 a s sin(phi) + s^2).
+
+    Args:
+        outward_ct: From the target along the needle, unit, shape (3,).
+        length_mm: The piece's length; it begins at the target.
+        radius_mm: Greater than 0.
+        plane: A plane through the target.
+        points: On each of the line's two sides.
+
+    Returns:
+        In the plane, mm to the right and up of the target.
+    """
+    shadow = np.array([outward_ct @ plane.right, outward_ct @ plane.up])
+    sine, cosine = min(1.0, float(np.linalg.norm(shadow))), abs(float(outward_ct @ plane.normal))
+    along = shadow / sine if sine > 0 else np.array([1.0, 0.0])
+    if radius_mm * sine <= length_mm * cosine:  # the plane leaves the piece through its side
+        far = radius_mm / cosine
+    else:
+        far = length_mm * sine + np.sqrt(max(0.0, radius_mm**2 - (length_mm * cosine) ** 2))
+    turns = np.linspace(0.0, np.pi, points)
+    a = (far - radius_mm) / 2 - (far + radius_mm) / 2 * np.cos(turns)
+    s = np.clip(a * sine, 0.0, length_mm)
+    b = np.sqrt(np.maximum(0.0, radius_mm**2 - (a**2 - 2 * a * s * sine + s**2)))
+    a, b = np.concatenate([a, a[::-1]]), np.concatenate([b, -b[::-1]])
+    return np.asarray(a[:, None] * along + b[:, None] * np.array([-along[1], along[0]]))
 
 
 def ellipse(region_ct: Floats, plane: Plane, points: int = 121) -> Floats:

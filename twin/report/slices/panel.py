@@ -10,7 +10,7 @@ from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Ellipse, Patch, PathPatch, Polygon
+from matplotlib.patches import Patch, PathPatch, Polygon
 from matplotlib.path import Path
 from matplotlib.text import Text
 from matplotlib.transforms import Affine2D, Transform
@@ -20,7 +20,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import css
 from puncture_twin.twin.report.annotate import SCALE_BARS_MM
 from puncture_twin.twin.report.palette import SKIN, TARGET_POINT
-from puncture_twin.twin.report.slices.cuts import ellipse, outline
+from puncture_twin.twin.report.slices.cuts import capsule, ellipse, outline
 from puncture_twin.twin.report.slices.planes import Plane, letters
 from puncture_twin.twin.report.slices.subject import Subject
 
@@ -33,9 +33,6 @@ HALO = (patheffects.withStroke(linewidth=2.4, foreground="black"),)
 
 IN_PLANE = 1e-3
 """A needle whose direction has less than this along a plane's normal lies in it."""
-
-STEEP = 0.05
-"""A cut is drawn at most twenty times as long as it is wide."""
 
 DASHED: Any = {"edgecolor": NEEDLE_COLOUR, "lw": 1.0, "ls": "--"}
 """The needle with the greatest margin."""
@@ -147,42 +144,31 @@ def _beads(segments: Floats, plane: Plane) -> Floats:
 
 def _needle(sheet: _Sheet, subject: Subject, plane: Plane) -> None:
     """The needle as thick as it is where the plane holds it, else its cut and, dotted, its shadow."""
-    outward = subject.outward_ct
-    along = float(outward @ plane.normal)
-    if abs(along) > 1 - IN_PLANE:
-        return _cut(sheet, subject, 1.0, 0.0)
-    end = plane.place(plane.at_ct + subject.case.needle.shaft_mm * outward)
-    if abs(along) > IN_PLANE:
+    outward, radius = subject.outward_ct, subject.needle_radius_mm
+    shaft = subject.case.needle.shaft_mm
+    end, across = plane.place(plane.at_ct + shaft * outward), abs(float(outward @ plane.normal))
+    if IN_PLANE < across < 1 - IN_PLANE:
         sheet.line(np.stack([np.zeros(2), end]), color=NEEDLE_COLOUR, lw=1.1, ls=":", path_effects=HALO)
-        return _cut(sheet, subject, abs(along), float(np.degrees(np.arctan2(end[1], end[0]))))
-    aside = np.array([-end[1], end[0]]) / np.linalg.norm(end)
-    body = subject.needle_radius_mm * aside
-    corners = np.array([-body, end - body, end + body, body])
-    sheet.patch(Polygon(corners, facecolor=NEEDLE_COLOUR, lw=0, zorder=3))
+    body = capsule(outward, shaft, radius, plane)
+    sheet.patch(Polygon(body, facecolor=NEEDLE_COLOUR, lw=0, zorder=3))
+    path = subject.path_mm if np.isfinite(subject.path_mm) else shaft
     if subject.margin_mm > 0:
-        wide = (subject.needle_radius_mm + subject.margin_mm) * aside
-        sheet.segments(np.array([(wide, end + wide), (-wide, end - wide)]), **DASHED)
+        wide = capsule(outward, path, radius + subject.margin_mm, plane)
+        sheet.patch(Polygon(wide, fill=False, **DASHED))
     if subject.bent_mm is not None:
-        along_end = end / np.linalg.norm(end)
-        sides = [subject.bent_mm @ np.stack([along_end, sign * aside]) for sign in (1, -1)]
-        for side in sides:
-            sheet.line(side, color=BENT_COLOUR, lw=1.3, zorder=4, solid_capstyle="butt")
-    return None
+        _bent(sheet, subject, plane, subject.bent_mm)
 
 
-def _cut(sheet: _Sheet, subject: Subject, cosine: float, turn_deg: float) -> None:
-    """The needle's cut at the target, an ellipse, and dashed the same with the greatest margin."""
-    radius = subject.needle_radius_mm
-    style: Any = {"angle": turn_deg, "lw": 1.0}
-    long = 1 / max(cosine, STEEP)
-    sheet.patch(Ellipse((0, 0), 2 * radius * long, 2 * radius, color=NEEDLE_COLOUR, zorder=3, **style))
-    if subject.bent_mm is not None:
-        off = 2 * float(subject.bent_mm[-1, 1])
-        sheet.patch(Ellipse((0, 0), off * long, off, fill=False, edgecolor=BENT_COLOUR, **style))
-    if subject.margin_mm > 0:
-        wide = 2 * (radius + subject.margin_mm)
-        look: Any = {"fill": False, "linestyle": "--", "edgecolor": NEEDLE_COLOUR}
-        sheet.patch(Ellipse((0, 0), wide * long, wide, **style, **look))
+def _bent(sheet: _Sheet, subject: Subject, plane: Plane, bent_mm: Floats) -> None:
+    """Where the bevel may take the needle: its line to both sides, or how far off the axis it may be at the plane."""
+    outward, off = subject.outward_ct, abs(float(bent_mm[-1, 1]))
+    if abs(float(outward @ plane.normal)) > IN_PLANE:
+        if off > 0:
+            sheet.patch(Polygon(capsule(outward, subject.path_mm, off, plane), fill=False, edgecolor=BENT_COLOUR))
+        return
+    along = plane.place(plane.at_ct + outward)
+    for aside in (np.array([-along[1], along[0]]), np.array([along[1], -along[0]])):
+        sheet.line(bent_mm @ np.stack([along, aside]), color=BENT_COLOUR, lw=1.3, zorder=4, solid_capstyle="butt")
 
 
 def _target(sheet: _Sheet, subject: Subject, plane: Plane) -> None:

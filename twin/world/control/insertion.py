@@ -15,10 +15,9 @@ from puncture_twin.twin.world.client import TIME_STEP_S
 from puncture_twin.twin.world.control.admittance import Admittance, VirtualMass
 from puncture_twin.twin.world.control.gains import Stiffness, allowed_step
 from puncture_twin.twin.world.control.impedance import Impedance
-from puncture_twin.twin.world.control.motors import Motors
 from puncture_twin.twin.world.control.reference import reference_of
 from puncture_twin.twin.world.control.rigid_model import RigidModel, rigid_model
-from puncture_twin.twin.world.control.run import Controller, Resistance, Surroundings, run
+from puncture_twin.twin.world.control.run import Controller, Motors, Resistance, Surroundings, run
 from puncture_twin.twin.world.control.tip import tips
 from puncture_twin.twin.world.execution import Execution, Recorder
 from puncture_twin.twin.world.units import to_m, to_mm

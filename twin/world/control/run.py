@@ -1,4 +1,4 @@
-"""The arm under a controller, step by step: what it felt and where its tip went."""
+"""The arm under a controller or its own motors, step by step: what it felt and where its tip went."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.world.arm import Arm
-from puncture_twin.twin.world.client import set_time_step, step
+from puncture_twin.twin.world.client import TIME_STEP_S, set_time_step, step
 from puncture_twin.twin.world.contacts import felt_force
 from puncture_twin.twin.world.control.reference import Reference
 from puncture_twin.twin.world.control.tip import Tip
@@ -146,3 +146,14 @@ def _give(arm: Arm, action: Torques | Goals, joint_offsets: Floats) -> None:
         arm.torque(action.torque_nm)
     else:
         arm.command(action.q + joint_offsets, action.speed)
+
+
+class Motors:
+    """The reference's joints are the motors' goals, whatever is measured."""
+
+    dt = TIME_STEP_S
+
+    def act(self, measured: Measured, reference: Reference, row: int) -> Goals:
+        """Goals of the next step."""
+        del measured
+        return Goals(reference.q[row], reference.speed[row])

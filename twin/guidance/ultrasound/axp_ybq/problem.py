@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.geometry.rigid import skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import ArmErrors
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import HALF_NORMAL
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.direction_residuals import (
@@ -30,6 +31,9 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.tip_residuals impo
 )
 
 Weights = Floats | Bools
+
+LEAST_MM = 1e-9
+"""Below this there is no noise, only rounding."""
 
 
 class Spread(NamedTuple):
@@ -205,3 +209,11 @@ def residuals(problem: Problem, estimate: Estimate) -> Floats:
         return tip
     v_image = directions_image(problem.recording, estimate)
     return np.concatenate([tip, direction_residuals(estimate, problem.recording, v_image)], axis=1)
+
+
+def median_spread(problem: Problem, estimate: Estimate) -> Spread:
+    """The tip's spread inside and across the image, from medians: outliers hardly move it."""
+    to_image = (problem.recording.A[:, :3, :3] @ estimate.R_X).transpose(0, 2, 1)
+    r = np.abs(to_image @ linearise(problem, estimate).residuals[:, :3, None])[:, :, 0]
+    inside, across = (max(float(np.median(part)) / HALF_NORMAL, LEAST_MM) for part in (r[:, :2], r[:, 2]))
+    return Spread(max(inside, across / 3), max(across, inside / 3), 1.0)

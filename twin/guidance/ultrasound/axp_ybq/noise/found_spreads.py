@@ -10,9 +10,8 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import Fitted, RobustFit, weighed
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.likelihood import by_likelihood
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.parts import WIDEST_RATIO, ResidualSpreads
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers.median_spread import LEAST_MM
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers.settled import settled
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, Spread
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import LEAST_MM, Problem, Spread
 
 SPREAD_ROUNDS = 2
 """How often the residuals' spread is found and the fit repeated with it; it settles to a few percent in two."""

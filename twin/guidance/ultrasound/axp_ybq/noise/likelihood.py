@@ -13,8 +13,7 @@ import numpy as np
 
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import Fitted, RobustFit, weighed
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.parts import WIDEST_RATIO, ResidualSpreads, structures
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers.median_spread import LEAST_MM
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem, Spread
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import LEAST_MM, UNWEIGHTED, Problem, Spread
 
 STEPS = 12
 """Of the parts' sizes between two fits, by likelihood; each comes within a few percent in half as many."""

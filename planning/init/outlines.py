@@ -1,0 +1,122 @@
+"""Is what is named like the body its outline?
+
+A path crosses the skin anyway, so an outline is left out; a ball in the body that somebody called ``External`` or
+``patient`` is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from puncture_twin.planning.anatomy.default_roles import BODY, default_role
+from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.init.segmentation import Segmentation
+
+NEAR_MM, NEAR = 8.0, 0.02
+"""An outline follows the skin to 8 mm: the coarsest voxels in use are 6 mm wide. In a small body, such as an animal's,
+an organ is so near to it too: there to 2 % of the box's diagonal."""
+
+MOST_OF_SKIN = 0.7
+"""Of the skin, which a shell or the whole body covers; what covers it is crossed by every path."""
+
+PART_OF_SKIN, MOST_OF_OUTLINE = 0.25, 0.6
+"""A body that was cropped, or cut at its limbs, covers a part of the skin, and is bounded by it but for the cuts."""
+
+POINTS, PLACES, SEED = 4_000, 200_000, 3
+"""Points that are asked about, and places of the other surface that they are compared with: on 2 square metres these
+lie 3 mm apart, so that what is within 8 mm is found."""
+
+
+class Agreement(NamedTuple):
+    """How far a structure is the body's outline."""
+
+    skin_covered: float
+    """Of the skin, the fraction that it is near to; faces where the scan cut the body do not count."""
+    on_skin: float
+    """Of its own surface, the fraction that is near to the skin."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """The structures that are named like the body, held against its skin.
+
+    Attributes:
+        segmentations: Of a folder.
+        skin: Of the body.
+    """
+
+    segmentations: Sequence[Segmentation]
+    skin: Skin
+
+    @cached_property
+    def _named(self) -> dict[str, tuple[TriangleMesh, Agreement]]:
+        meshes = {
+            name: one.surface(label)
+            for one in self.segmentations
+            for label, name in one.names.items()
+            if named_like_body(name)
+        }
+        return {name: (mesh, agreement(mesh, self.skin)) for name, mesh in meshes.items()}
+
+    def at(self, point_ct: Floats) -> frozenset[str]:
+        """The names of those that are outlines of the body about a point (3,), LPS mm."""
+        return frozenset(name for name, (mesh, found) in self._named.items() if _is_one(found, mesh, point_ct))
+
+    def notes(self, point_ct: Floats) -> Iterator[str]:
+        """What a person should know of those that are none, one sentence each."""
+        for name in sorted(self._named.keys() - self.at(point_ct)):
+            _, found = self._named[name]
+            yield (
+                f"'{name}' is named like the outline of the body, but covers {found.skin_covered:.0%} of the skin, and "
+                f"{found.on_skin:.0%} of it lie there: taken for a structure like others (if it is the outline: ignore)"
+            )
+
+
+def named_like_body(name: str) -> bool:
+    """Whether a structure is called as outlines of the body are."""
+    return default_role(name, "other") == BODY
+
+
+def _is_one(found: Agreement, mesh: TriangleMesh, point_ct: Floats) -> bool:
+    """Whether a surface is the outline of the body, or of the part of it that holds a point (3,), LPS mm."""
+    part = found.skin_covered >= PART_OF_SKIN and found.on_skin >= MOST_OF_OUTLINE
+    return found.skin_covered >= MOST_OF_SKIN or (part and side_of(mesh, point_ct) is Side.INSIDE)
+
+
+def agreement(mesh: TriangleMesh, skin: Skin) -> Agreement:
+    """How far a surface and the skin are near to each other, by random points of both."""
+    within_mm = min(NEAR_MM, NEAR * float(np.linalg.norm(np.ptp(skin.mesh.bounds, axis=0))))
+    whole = np.ones(len(mesh.faces), bool)
+    open_skin = ~skin.cut_faces if not skin.cut_faces.all() else skin.cut_faces
+    covered = _near(_points(skin.mesh, open_skin, POINTS), _points(mesh, whole, PLACES), within_mm)
+    everywhere = np.ones(len(skin.mesh.faces), bool)
+    on_skin = _near(_points(mesh, whole, POINTS), _points(skin.mesh, everywhere, PLACES), within_mm)
+    return Agreement(float(covered.mean()), float(on_skin.mean()))
+
+
+def _near(points: Floats, places: Floats, within_mm: float) -> NDArray[np.bool_]:
+    """Which points have one of the places so near, shape (n,)."""
+    distance, _ = scipy.spatial.cKDTree(places).query(points, distance_upper_bound=within_mm)
+    return np.asarray(np.isfinite(distance))
+
+
+def _points(mesh: TriangleMesh, faces: Bools, count: int) -> Floats:
+    """Random points, evenly spread over some triangles of a surface, shape (count, 3)."""
+    rng, corners = np.random.default_rng(SEED), mesh.triangles[faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    total = np.cumsum(areas)
+    rows = np.minimum(np.searchsorted(total, rng.uniform(0.0, total[-1], count)), len(total) - 1)
+    a, b = rng.uniform(size=(2, count, 1))
+    a, b = np.where(a + b > 1.0, 1.0 - a, a), np.where(a + b > 1.0, 1.0 - b, b)
+    first, second, third = np.moveaxis(corners[rows], 1, 0)
+    return np.asarray(first + a * (second - first) + b * (third - first))

@@ -1,0 +1,143 @@
+"""What is named like the outline of the body is left out by `init` only if it is one; else it is not crossed."""
+
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813
+from case_world import ball, image_of
+
+from puncture_twin.planning.anatomy.skin import skin_from_mesh
+from puncture_twin.planning.init.outlines import MOST_OF_SKIN, PART_OF_SKIN, agreement
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.run_twin import main
+
+SPACING = (4.0, 4.0, 4.0)
+AT = np.arange(50) * 4.0 - 98.0
+Z, Y, X = np.meshgrid(AT, AT, AT, indexing="ij")
+TARGET = (-40.0, 0.0, 10.0)
+BODY_MM = 90.0
+NAMES = ["External", "patient", "Body", "skin", "Outline", "body_trunc", "body envelope"]
+
+
+def inside(middle, radius):
+    """Voxels (z, y, x) of a ball."""
+    return (X - middle[0]) ** 2 + (Y - middle[1]) ** 2 + (Z - middle[2]) ** 2 < radius**2
+
+
+BODY = inside((0.0, 0.0, 0.0), BODY_MM)
+
+
+def write_case(folder, **masks):
+    """A CT of a round body, with a tumour about the target, an aorta, and further masks."""
+    noise = np.random.default_rng(5).normal(0.0, 12.0, X.shape)
+    hu = np.where(BODY, 40.0, -1000.0) + noise
+    sitk.WriteImage(image_of(hu.astype(np.int16), SPACING), str(folder / "scan.nii.gz"))
+    (folder / "seg").mkdir()
+    named = {"tumor": inside(TARGET, 6.0), "aorta": inside((36.0, 36.0, 0.0), 8.0), **masks}
+    for name, voxels in named.items():
+        sitk.WriteImage(image_of(voxels.astype(np.uint8), SPACING), str(folder / "seg" / f"{name}.nii.gz"))
+
+
+def init(capfd, folder, *words):
+    """Run it; returns exit code and stderr's lines."""
+    code = main(["init", str(folder), *(words or ("--target", ",".join(map(str, TARGET))))])
+    return code, capfd.readouterr().err.splitlines()
+
+
+def roles(folder):
+    """Name to role and margin of the case's structures, as a search reads them."""
+    return {one.name: (str(one.role), one.margin_mm) for one in prepare(folder, arm=False).anatomy.structures}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_ball_that_is_named_like_the_body_is_an_obstacle(tmp_path, capfd, name):
+    """It was left out (ignore), and paths through a carotid that somebody called External were safe."""
+    write_case(tmp_path, **{name: inside((-40.0, -40.0, 10.0), 10.0)})
+    code, said = init(capfd, tmp_path)
+    assert code == 0, said
+    assert roles(tmp_path)[name] == ("avoid", 5.0)
+    (line,) = [one for one in said if "named like the outline of the body" in one]
+    assert f"'{name}'" in line and "of the skin" in line and "ignore" in line
+    context = prepare(tmp_path, arm=False)
+    found = context.search()
+    through = found.outward_ct @ [0.0, -1.0, 0.0] > np.cos(np.arctan2(10.0, 40.0))
+    assert through.any() and not found.safe[through].any()
+
+
+@pytest.mark.parametrize("name", NAMES[:3])
+def test_around_the_lesion_it_is_unknown(tmp_path, capfd, name):
+    """Nobody knows whether a path may cross it; and it is not taken for the target."""
+    write_case(tmp_path, **{name: inside(TARGET, 16.0)})
+    code, said = init(capfd, tmp_path)
+    assert code == 0, said
+    assert roles(tmp_path)[name] == ("unknown", 5.0) and roles(tmp_path)["tumor"][0] == "target"
+    assert not prepare(tmp_path, arm=False).search().safe.any()
+    assert init(capfd, tmp_path, "--target", "-40,12,10", "--force")[0] == 0
+    assert roles(tmp_path)[name] == ("unknown", 5.0) and roles(tmp_path)["target"][0] == "target"
+
+
+OUTLINES = {
+    "whole": BODY,
+    "5 mm less": inside((0.0, 0.0, 0.0), BODY_MM - 5.0),
+    "a shell": BODY & ~inside((0.0, 0.0, 0.0), BODY_MM - 10.0),
+    "with holes": BODY & ~inside((40.0, 0.0, 0.0), 35.0) & ~inside((-40.0, 0.0, -20.0), 25.0),
+    "without its head": BODY & (Z < 60.0),
+    "the half with the target": BODY & (X < 0.0),
+}
+
+
+@pytest.mark.parametrize("kind", sorted(OUTLINES))
+@pytest.mark.parametrize("name", ["External", "skin"])
+def test_the_outline_itself_is_left_out(tmp_path, capfd, name, kind):
+    """Whole, as a shell, with holes for the lungs, cropped: paths cross it as they did."""
+    write_case(tmp_path, **{name: OUTLINES[kind]})
+    code, said = init(capfd, tmp_path)
+    assert code == 0, said
+    assert name not in roles(tmp_path) and prepare(tmp_path, arm=False).search().safe.any()
+    assert any(f"taken for the outline of the body, so not checked (ignore): {name}" in line for line in said)
+
+
+def test_a_limb_beside_the_target_is_no_outline(tmp_path, capfd):
+    """It lies on the skin all over, but does not hold the target: TotalSegmentator's body_extremities."""
+    write_case(tmp_path, body_extremities=BODY & (X > 20.0))
+    code, said = init(capfd, tmp_path)
+    assert code == 0, said
+    assert roles(tmp_path)["body_extremities"] == ("avoid", 5.0)
+
+
+def meshes(folder, **balls):
+    """A folder of balls: name to radius and middle."""
+    (folder / "meshes").mkdir()
+    for name, (radius, middle) in balls.items():
+        ball(folder / "meshes" / f"{name}.stl", radius, np.array(middle))
+
+
+def test_of_meshes_the_one_that_holds_the_others_is_the_skin(tmp_path, capfd):
+    """The first by its name was taken: a ball in the body, and what lay outside of it was air."""
+    meshes(tmp_path, External=(12.0, (-40, -40, 10)), skin=(90.0, (0, 0, 0)), liver=(20.0, TARGET))
+    assert init(capfd, tmp_path)[0] == 0
+    context = prepare(tmp_path, arm=False)
+    assert np.ptp(context.anatomy.skin.mesh.bounds[:, 0]) == pytest.approx(180.0, abs=2.0)
+    assert roles(tmp_path)["External"] == ("avoid", 5.0)
+
+
+def test_of_two_skins_one_is_the_skin_and_the_other_left_out(tmp_path, capfd):
+    """Both cover the body."""
+    meshes(tmp_path, External=(89.0, (0, 0, 0)), skin=(90.0, (0, 0, 0)), liver=(20.0, TARGET), aorta=(8.0, (36, 36, 0)))
+    assert init(capfd, tmp_path)[0] == 0
+    assert set(roles(tmp_path)) == {"liver", "aorta"}
+
+
+def test_a_mesh_that_holds_nothing_is_no_skin(tmp_path, capfd):
+    """Without a CT: the path would begin at its surface, and what lies about it would be air."""
+    meshes(
+        tmp_path, patient=(30.0, (-40, 0, 10)), tumor=(10.0, TARGET), aorta=(20.0, (60, 60, 0)), lung=(20.0, (0, 60, 0))
+    )
+    code, said = init(capfd, tmp_path, "--target", "-40,0,10", "--unit", "mm")
+    assert code == 2 and "'patient' is named like the skin, but holds 1 of the 3 other meshes" in said[-1]
+
+
+def test_small_bodies_have_small_bounds(ball):
+    """A mouse's liver lies within 8 mm of its skin everywhere: what counts is its size."""
+    skin = skin_from_mesh(ball(15.0))
+    assert agreement(ball(12.0), skin) == (0.0, 0.0) and agreement(ball(14.9), skin).skin_covered > MOST_OF_SKIN
+    assert agreement(ball(5.0, (9.5, 0.0, 0.0)), skin).skin_covered < PART_OF_SKIN

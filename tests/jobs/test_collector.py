@@ -1,0 +1,71 @@
+"""When Python looks for circles of objects: late, then as usual, and as it was before once a command is over."""
+
+import gc
+import subprocess
+import sys
+import weakref
+
+from puncture_twin.twin.jobs import collector
+from puncture_twin.twin.jobs.collector import late_collection
+
+
+class Holder:
+    """Holds itself."""
+
+    def __init__(self):
+        self.me = self
+
+
+def test_what_was_in_force_is_so_again_afterwards():
+    """Thresholds, callbacks, and what is looked through."""
+    before = gc.get_threshold(), list(gc.callbacks), gc.get_freeze_count()
+    with late_collection():
+        assert gc.get_threshold()[0] == collector.FIRST_AT
+    assert (gc.get_threshold(), list(gc.callbacks), gc.get_freeze_count()) == before
+
+
+def test_after_the_first_look_circles_are_looked_for_as_usual():
+    """A command that runs for hours holds no more garbage than it did."""
+    usual = gc.get_threshold()
+    with late_collection():
+        gc.collect()
+        assert gc.get_threshold() == usual
+        assert gc.get_freeze_count() > 0
+        gone = weakref.ref(Holder())
+        kept = [[] for _ in range(20 * usual[0])]
+        assert gone() is None
+    assert len(kept) == 20 * usual[0]
+
+
+def test_the_first_look_comes_by_itself(monkeypatch):
+    """As soon as so many objects are there."""
+    monkeypatch.setattr(collector, "FIRST_AT", 5_000)
+    usual = gc.get_threshold()
+    with late_collection():
+        gone = weakref.ref(Holder())
+        kept = [[] for _ in range(6_000)]
+        assert gc.get_threshold() == usual
+        assert gone() is None
+    assert len(kept) == 6_000
+
+
+AT_EXIT = """
+import atexit, gc
+from puncture_twin.run_twin import main
+atexit.register(lambda: print(gc.get_freeze_count() > len(gc.get_objects())))
+main(["--version"])
+main(["--version"])
+"""
+
+
+def test_at_the_end_nothing_that_a_command_loaded_is_looked_through():
+    """It is set aside, after however many commands."""
+    done = subprocess.run([sys.executable, "-c", AT_EXIT], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "True"
+
+
+def test_a_library_that_counts_what_is_left_of_it_has_nothing_to_say():
+    """OMPL prints a list of its functions where Python does not look for them at the end."""
+    code = "import ompl.base; from puncture_twin.run_twin import main; main(['--version'])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == ""

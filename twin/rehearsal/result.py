@@ -1,0 +1,111 @@
+"""What a rehearsal measured: values alone, which pictures and pages read without the simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.twin.plant.felt import NOT_FELT, Felt
+from puncture_twin.twin.rehearsal.standing import Standing
+
+CONTROLS = MappingProxyType(
+    {
+        "impedance": "by a spring at the tip (impedance)",
+        "admittance": "by moved goals of the motors (admittance)",
+        "position": "by the position motors",
+    }
+)
+"""How an insertion is followed, in words."""
+
+
+@dataclass(frozen=True)
+class RehearsalContact:
+    """A body of the arm that touched something.
+
+    Attributes:
+        time_s: When it was first seen.
+        link: The arm's body.
+        body: What it touched: ``patient``, a box, or another body of the arm.
+        depth_mm: Deepest overlap in the physics; NaN where only FCL saw it (it says whether, not how deep).
+    """
+
+    time_s: float
+    link: str
+    body: str
+    depth_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Rehearsal:
+    """What was measured; m records in time, k samples of clearance. Angles in rad, lengths in mm.
+
+    Attributes:
+        seed: What the truth was drawn from.
+        truth_source: How the truth was found.
+        T_base_ct_true: Shape (4, 4), where the patient truly lay.
+        times_s: Shape (m,), from the start of the approach.
+        q: Shape (m, 6), what the encoders said.
+        q_command: Shape (m, 6), what was asked.
+        phase: Shape (m,), "approach", "settle", "insertion" or "hold".
+        T_base_flange_true: Shape (m, 4, 4), where the flange truly was.
+        tip_true_ct: Shape (m, 3), the needle's true tip in the patient.
+        clearance_times_s: Shape (k,), moments of the insertion and its end.
+        clearance_mm: Structure to shape (k,): true needle's axis to true structure, minus the needle's radius.
+        contacts: One for each pair of bodies that touched, in the order of time.
+        max_joint_speed: Shape (6,), rad/s.
+        speed_limits: Shape (6,), rad/s.
+        tip_error_mm: True tip to true target at the end.
+        lateral_mm: Its part across the needle.
+        depth_mm: Its part along the needle, positive when too deep.
+        predicted_error_mm: What the plan expected (rms), NaN without markers.
+        target_true_ct: Shape (3,), where the target truly was in the CT.
+        truth_is_belief: Whether the patient lay exactly where it was believed, so that the error says little.
+        control: How the insertion was followed: "impedance", "admittance" or "position".
+        off_path_mm: The tip from its commanded path, by the encoders, at most from the insertion on.
+        felt: The greatest forces of the tissue on the needle; None where the case declares none.
+        standing: Where the error stands among others; None where the case declares no errors.
+    """
+
+    seed: int
+    truth_source: str
+    T_base_ct_true: Floats
+    times_s: Floats
+    q: Floats
+    q_command: Floats
+    phase: NDArray[np.str_]
+    T_base_flange_true: Floats
+    tip_true_ct: Floats
+    clearance_times_s: Floats
+    clearance_mm: MappingProxyType[str, Floats]
+    contacts: tuple[RehearsalContact, ...]
+    max_joint_speed: Floats
+    speed_limits: Floats
+    tip_error_mm: float
+    lateral_mm: float
+    depth_mm: float
+    predicted_error_mm: float
+    target_true_ct: Floats
+    truth_is_belief: bool
+    control: str
+    off_path_mm: float
+    felt: Felt | None
+    standing: Standing | None = None
+
+    @property
+    def followed_text(self) -> str:
+        """How the insertion was followed, for a person."""
+        return f"{CONTROLS[self.control]}, at most {self.off_path_mm:.3f} mm off its commanded path"
+
+    @property
+    def force_text(self) -> str:
+        """What the tissue did, for a person."""
+        return NOT_FELT if self.felt is None else self.felt.text
+
+    def __post_init__(self) -> None:
+        for value in (*vars(self).values(), *self.clearance_mm.values()):
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
