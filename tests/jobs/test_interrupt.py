@@ -5,11 +5,13 @@ import signal
 import sys
 import threading
 import time
+from contextlib import suppress
 
 import pytest
 
 from puncture_twin.twin.jobs.exit_codes import INTERRUPTED, exit_code_of
 from puncture_twin.twin.jobs.interrupt import ended_by_ctrl_c, insistent_ctrl_c
+from puncture_twin.twin.jobs.terminal import print_answer
 
 
 @pytest.fixture(autouse=True)
@@ -56,6 +58,31 @@ def test_an_interruption_that_was_dropped_comes_again(place, capfd):
     started = time.monotonic()
     assert exit_code_of(command, told.append) == INTERRUPTED and came == [1]
     assert told == ["interrupted"] and time.monotonic() - started < 10
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("prints", [True, False])
+def test_an_interruption_that_was_dropped_at_the_end_leaves_no_answer(prints, capfd):
+    """The command ends before it comes again."""
+
+    def command():
+        in_a_callback(lambda: signal.raise_signal(signal.SIGINT))
+        if prints:
+            print_answer({}, "the answer", False)
+
+    assert exit_code_of(command, lambda _: None) == INTERRUPTED
+    assert capfd.readouterr() == ("", "")
+
+
+def test_an_error_that_a_library_makes_of_an_interruption_is_no_error(capfd):
+    """As pydantic does while it builds a class."""
+
+    def command():
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        raise ValueError
+
+    assert exit_code_of(command, lambda _: None) == INTERRUPTED
     assert capfd.readouterr() == ("", "")
 
 

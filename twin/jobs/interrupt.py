@@ -1,7 +1,8 @@
 """Ctrl-C that arrives: raised again where compiled code has swallowed it.
 
 Python raises ``KeyboardInterrupt`` at whatever line runs when the signal comes. Where that line is called from a
-library's callback, a destructor or a lookup in C, the exception is dropped there, and the command would run to its end.
+library's callback, a destructor or a lookup in C, or where a library catches whatever the import of another raises, the
+exception is dropped there, and the command would run to its end.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-AGAIN_S = 0.2
+AGAIN_S = 0.02
 """How soon an interruption that was swallowed comes again."""
 
 
@@ -32,6 +33,11 @@ def insistent_ctrl_c() -> Iterator[None]:
     signal.signal(signal.SIGINT, _first)
     try:
         yield
+        raise_dropped()
+    except Exception as error:
+        if _is_on_its_way():  # a library made its own error of it
+            raise KeyboardInterrupt from error
+        raise
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGINT, heard)
@@ -46,6 +52,17 @@ def ended_by_ctrl_c() -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+def raise_dropped() -> None:
+    """Raise an interruption that was dropped and has not come again yet: what was interrupted gives no answer."""
+    if _is_on_its_way() and not _is_handled():
+        raise KeyboardInterrupt
+
+
+def _is_on_its_way() -> bool:
+    """Whether an interruption has come that no block ended with."""
+    return signal.getitimer(signal.ITIMER_REAL)[1] > 0.0
 
 
 def _first(*_: object) -> None:

@@ -9,6 +9,8 @@ import sys
 from pathlib import Path
 from typing import Any, TextIO
 
+from puncture_twin.twin.jobs.interrupt import raise_dropped
+
 UNNAMED_CASES = frozenset({"case.toml", "servo.toml", "selfcal.toml", "plan.json"})
 """Files that are named by their folder."""
 
@@ -31,7 +33,8 @@ def default_out(source: Path, command: str) -> Path:
 
 
 def print_answer(summary: dict[str, Any], text: str, as_json: bool) -> None:
-    """Print what a command found: one JSON object, or the text for a person."""
+    """Print what a command found: one JSON object, or the text for a person; nothing, where it was interrupted."""
+    raise_dropped()
     sys.stdout.write((json.dumps(summary, allow_nan=False) if as_json else text) + "\n")
 
 
