@@ -64,13 +64,10 @@ REGISTRATION = (
 PLAIN = MappingProxyType(
     {
         "puncture_twin.planning.case.entry": ("tests/case/test_entry.py",),
-        **{
-            f"puncture_twin.planning.{name}": (
-                "tests/anatomy/test_skin_entry.py",
-                "tests/search/test_constraints.py",
-            )
-            for name in ("anatomy.skin_entry", "geometry.settled_crossings", "geometry.smooth_normals")
-        },
+        "puncture_twin.planning.anatomy.skin_entry": (
+            "tests/anatomy/test_skin_entry.py",
+            "tests/search/test_constraints.py",
+        ),
         "puncture_twin.planning.reach.standoff": tuple(f"tests/reach/test_standoff.py::{name}" for name in STANDOFF),
         "puncture_twin.planning.geometry.containment": ("tests/geometry/test_containment.py",),
         "puncture_twin.planning.search.constraints": ("tests/search/test_verdict_order.py",),
@@ -92,6 +89,7 @@ KERNELS = MappingProxyType(
         "puncture_twin.planning.geometry.crossings": (
             "tests/clearance/test_plain_kernels.py",
             "tests/geometry/test_crossings.py",
+            "tests/anatomy/test_skin_entry.py",
         ),
     }
 )

@@ -1,6 +1,7 @@
 """The mutator itself, on a few faults: `make mutants` runs them all."""
 
 import ast
+import importlib.util
 import inspect
 import sys
 
@@ -15,6 +16,7 @@ from puncture_twin.planning.reach.standoff import skin_gaps
 sys.path.insert(0, str(ROOT))
 
 from benchmarks.mutant_patch import mutated
+from benchmarks.mutants import KERNELS, PLAIN
 from benchmarks.mutation import mutants
 
 SOURCE = inspect.getsource(puncture_twin.planning.reach.standoff)
@@ -88,3 +90,11 @@ def test_what_a_mutant_raises_when_it_is_loaded_leaves_the_module_alone():
     ):
         pass
     assert skin_gaps(NEEDLE, 0.7) == before
+
+
+def test_what_is_hunted_is_there():
+    """Every module that is mutated, and every file of tests that is to notice: a name that has moved hunts nothing."""
+    for module, tests in {**PLAIN, **KERNELS}.items():
+        assert importlib.util.find_spec(module) is not None, module
+        missing = [test for test in tests if not (ROOT / test.partition("::")[0]).is_file()]
+        assert not missing, missing
