@@ -94,6 +94,10 @@ def init(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="With a CT and a segmentation.")],
     target: Annotated[str | None, typer.Option("--target", help="X,Y,Z in mm.")] = None,
     target_label: Annotated[str | None, typer.Option("--target-label", help="Or the deepest point of this.")] = None,
+    hit_radius: Annotated[
+        float | None,
+        typer.Option("--hit-radius", metavar="MM", help="The target is a ball of its own, in no structure."),
+    ] = None,
     space: Annotated[
         Space | None, typer.Option("--space", help="Of the target, of the case, and of meshes.", show_default="LPS")
     ] = None,
@@ -119,9 +123,11 @@ def init(
         raise InputError(f"region '{region[:40]}' is not known", where="--region", allowed=", ".join(get_args(Region)))
     if space is Space.LOCAL:
         raise InputError("a patient's space", where="--space", allowed="LPS or RAS")
+    if hit_radius is not None and (target is None or not 0 < hit_radius <= 100):
+        raise InputError(f"{hit_radius:g}", where="--hit-radius", allowed="mm, above 0, at most 100, beside --target")
     wanted = Wanted(space or Space.LPS, naming, unit, ct, segmentation)
     with progress_display() as progress:
-        request = Request(folder, target, target_label, region, wanted, space_stated=space is not None)
+        request = Request(folder, target, target_label, region, wanted, space is not None, hit_radius)
         run = init_case(request, force=force, watcher=progress)
     for warning in run.warnings:
         print(f"warning: {warning}", file=sys.stderr)

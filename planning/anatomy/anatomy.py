@@ -16,6 +16,7 @@ from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.sources import StructureSources
 from puncture_twin.planning.anatomy.structure import Role as Role, Structure as Structure
+from puncture_twin.planning.anatomy.target_readings import readings_inside
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
@@ -27,6 +28,7 @@ from puncture_twin.planning.formats.meshes.mesh_warnings import kept_mesh_warnin
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.geometry.spaces import point_text
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
 OUTSIDE_BODY, ATTACHED_LIMB = "outside_body", "attached_limb"
@@ -136,7 +138,7 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     _check_names(case, [*structures, *outside])
     _check_target(case, structures, skin)
     warnings = [*loader.warnings, *beyond.warnings, *left_out, *skin.warnings]
-    for structure in structures:
+    for structure in (one for one in structures if one.source != OWN_TARGET):  # the ball is ours
         warnings.extend(kept_mesh_warnings(structure.mesh, structure.name, cache.memory))
     return Anatomy(tuple(structures), skin, tuple(warnings), outside, scan, tuple(loader.ignored))
 
@@ -213,9 +215,11 @@ def _check_target(case: Case, structures: list[Structure], skin: Skin) -> None:
     """A target must lie inside the skin and its own structure, and inside nothing that is to be avoided."""
     low, high = (np.array([structure.mesh.bounds[end] for structure in structures]) for end in (0, 1))
     in_box = np.all((low <= case.target_ct) & (case.target_ct <= high), axis=1)
-    point = ", ".join(f"{x:.1f}" for x in case.target_ct)
+    point = point_text(case.target_ct, case.space)
     if side_of(skin.mesh, case.target_ct) is Side.OUTSIDE:
-        raise InputError(f"target ({point}) lies outside the skin", where=case.path, allowed="a point in the body")
+        hint = readings_inside(case.target_ct, case.space, lambda one: side_of(skin.mesh, one) is Side.INSIDE)
+        what = f"target ({point}) lies outside the skin{hint}"
+        raise InputError(what, where=case.path, allowed="a point in the body, in mm, in the case's space")
     for structure, near in zip(structures, in_box, strict=True):
         if structure.name != case.target_structure and not near:
             continue

@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from puncture_twin.planning.anatomy.default_roles import plain_name
+from puncture_twin.planning.anatomy.default_roles import LATERAL_MASS, plain_name
 
 ORGANS = frozenset(
     (
@@ -111,7 +111,7 @@ def named_as_crossed(name: str) -> bool:
     >>> named_as_crossed("superior thyroid"), named_as_crossed("superior thyroid lobe")
     (False, True)
     """
-    words = frozenset(plain_name(name).split("_"))
+    words = _words(name)
     nouns = [word for word in words if word not in QUALIFIERS and not LEVEL.fullmatch(word)]
     lesion = any(_is_lesion(word) for word in nouns)
     known = all(word in ORGANS | BONES | SOFT_TISSUES or _is_lesion(word) for word in nouns)
@@ -120,7 +120,12 @@ def named_as_crossed(name: str) -> bool:
 
 def named_as_lesion(name: str) -> bool:
     """Whether every word of a name is known, and one of them is a lesion: a ``Tumorvene`` is none."""
-    return named_as_crossed(name) and any(_is_lesion(word) for word in plain_name(name).split("_"))
+    return named_as_crossed(name) and any(_is_lesion(word) for word in _words(name))
+
+
+def _words(name: str) -> frozenset[str]:
+    """A name's words; a vertebra's lateral mass is one of its own, which is not known."""
+    return frozenset(plain_name(name).replace(LATERAL_MASS, LATERAL_MASS.replace("_", "")).split("_"))
 
 
 def _is_lesion(word: str) -> bool:

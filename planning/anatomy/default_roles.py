@@ -71,11 +71,14 @@ LESION = _line(
 )
 """What a target usually is; this line comes before all others."""
 
+LATERAL_MASS = "lateral_mass"
+"""Of a vertebra: a mass that is no lesion."""
+
 GENERAL: tuple[DefaultRole, ...] = (
     BODY,
     _line(
         "vertebrae, spine",
-        "*vertebra* spine *spinal_column* *intervertebral* *disc *disk",
+        "*vertebra* spine *spinal_column* *intervertebral* *disc *disk *lateral_mass* *massa_lateralis*",
         "avoid",
         2.0,
         "bone deflects a needle; nerve roots leave beside it",
@@ -401,7 +404,8 @@ def default_role(name: str, region: str) -> DefaultRole | None:
     """
     plain = plain_name(name)
     own, general = (list(_matching(plain, lines)) for lines in (BY_REGION.get(region, ()), GENERAL))
-    found = list(_matching(plain, (LESION,))) or own or general
+    lesion = list(_matching(plain.replace(LATERAL_MASS, ""), (LESION,)))
+    found = lesion or own or general
     closest = max(found, key=lambda one: one[0], default=(0.0, None))[1]
     if closest is None or closest.kind == "avoid":
         return closest

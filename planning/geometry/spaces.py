@@ -53,6 +53,11 @@ def to_lps(points: Floats, space: Space) -> Floats:
     return points.astype(float)
 
 
+def point_text(point_ct: Floats, space: Space) -> str:
+    """A point (3,), LPS (or local) mm, in the user's space, as text with its space."""
+    return ", ".join(f"{one:.1f}" for one in to_lps(point_ct[None], space)[0]) + f" mm {space}"
+
+
 def parse_space(text: str, *, where: str) -> Space:
     """The space that a text names; upper and lower case are the same.
 

@@ -33,7 +33,7 @@ step_deg = 2.0
 max_skin_angle_deg = 60.0
 
 """
-OWN_TARGET = "hit_radius_mm = 5.0  # it lies in no structure: what is hit is this ball about it"
+OWN_TARGET = "hit_radius_mm = {radius!r}  # it lies in no structure: what is hit is this ball about it"
 SKIN_OF_CT = """[[structure]]
 name = "skin"
 ct = {ct}  # the body is found in the CT
@@ -62,6 +62,7 @@ class CaseParts:
         region: Which part of the body it shows.
         target_ct: Shape (3,), LPS mm.
         structure: Which holds the target, or None.
+        hit_radius_mm: Of the ball that is hit, where none does.
         ct: The CT whose body is the skin, or None where a mesh is.
         sources: Each segmentation with what the case says of its structures.
         markers: Lists of points.
@@ -72,6 +73,7 @@ class CaseParts:
     region: str
     target_ct: Floats
     structure: str | None
+    hit_radius_mm: float
     ct: str | None
     sources: tuple[tuple[Segmentation, Sequence[Assigned]], ...]
     markers: tuple[Markers, ...]
@@ -85,12 +87,13 @@ class CaseParts:
 def case_text(parts: CaseParts) -> str:
     """The whole file."""
     position = to_lps(parts.target_ct[None], parts.space)[0]
+    own = OWN_TARGET.format(radius=parts.hit_radius_mm)
     head = HEAD.format(
         region=parts.region,
         name=quoted(case_name(parts.name)),
         space=parts.space,
         position=", ".join(repr(float(one)) for one in position),
-        structure=OWN_TARGET if parts.structure is None else f"structure = {quoted(parts.structure)}",
+        structure=own if parts.structure is None else f"structure = {quoted(parts.structure)}",
     )
     skin = "" if parts.ct is None else SKIN_OF_CT.format(ct=quoted(parts.ct))
     count = sum(row.kind != "ignore" for row in parts.rows) + (parts.ct is not None)

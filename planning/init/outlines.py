@@ -104,6 +104,13 @@ def agreement(mesh: TriangleMesh, skin: Skin) -> Agreement:
     return Agreement(float(covered.mean()), float(on_skin.mean()))
 
 
+def fraction_near(mesh: TriangleMesh, other: TriangleMesh, within_mm: float) -> float:
+    """The fraction of a surface's area that lies so near to another surface, by random points of both."""
+    points = _points(mesh, np.ones(len(mesh.faces), bool), POINTS)
+    places = _points(other, np.ones(len(other.faces), bool), PLACES)
+    return float(_near(points, places, within_mm).mean())
+
+
 def _near(points: Floats, places: Floats, within_mm: float) -> NDArray[np.bool_]:
     """Which points have one of the places so near, shape (n,)."""
     distance, _ = scipy.spatial.cKDTree(places).query(points, distance_upper_bound=within_mm)

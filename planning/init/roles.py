@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 from puncture_twin.planning.anatomy.crossed_names import named_as_crossed, named_as_lesion
@@ -19,6 +20,19 @@ from puncture_twin.planning.init.segmentation import Assigned
 
 LEAST_SHOWN = 0.3
 """Of a region's usual organs; with fewer the region is found by nothing."""
+
+LEAST_ORGANS = 3
+"""So many are enough, however long a region's list is."""
+
+OWN_ORGANS: Mapping[str, frozenset[str]] = MappingProxyType(
+    {
+        "spine": frozenset(("spine", "spinal cord")),
+        "limb": frozenset(("bone",)),
+        "brain": frozenset(("brain", "skull")),
+        "head": frozenset(("brain", "skull", "eyes")),
+    }
+)
+"""Of regions whose other organs are vessels or neighbours, which other regions have too: one of these is there."""
 
 
 class Holding(NamedTuple):
@@ -106,20 +120,37 @@ def chosen_target(names: Collection[str]) -> str:
 
 
 def likely_region(names: Collection[str], target: str | None) -> str:
-    """The region of which most usual organs are there, the target's own among them; ``other`` where few are."""
+    """The region of which most usual organs are there, the target's own among them; ``other`` where few are.
+
+    Not a region whose own organs are missing, such as a spine without vertebrae and cord, and not one whose organs are
+    all another's that has more of those which are there: liver, aorta and kidneys are no spine.
+    """
     own = [] if target is None else [target]
-    shown = {region: _shown(region, names) + _owns(region, own) for region, organs in USUAL.items() if organs}
-    region = max(shown, key=lambda one: shown[one])
-    return region if _shown(region, names) >= LEAST_SHOWN else "other"
+    told = {region: _explained(region, names) for region, organs in USUAL.items() if organs and _has_own(region, names)}
+    whole = [region for region, some in told.items() if not any(some < others for others in told.values())]
+    if not whole:
+        return "other"
+    region = max(whole, key=lambda one: len(_shown(one, names)) / len(USUAL[one]) + _owns(one, own))
+    shown = len(_shown(region, names))
+    return region if shown >= min(LEAST_SHOWN * len(USUAL[region]), LEAST_ORGANS) else "other"
 
 
-def _shown(region: str, names: Collection[str]) -> float:
+def _has_own(region: str, names: Collection[str]) -> bool:
+    own = OWN_ORGANS.get(region)
+    return own is None or not own.isdisjoint(_shown(region, names))
+
+
+def _explained(region: str, names: Collection[str]) -> frozenset[str]:
+    """The names that are those of a region's usual organs."""
+    return frozenset(name for name in names if _shown(region, [name]))
+
+
+def _shown(region: str, names: Collection[str]) -> list[str]:
+    """The usual organs of a region that some name is like; of a pair one is enough."""
     absent = absent_organs(region, names)
-    wholly = [organ for organ in USUAL[region] if organ.name in absent]
-    return 1.0 - len(wholly) / len(USUAL[region])
+    return [organ.name for organ in USUAL[region] if organ.name not in absent]
 
 
 def _owns(region: str, target: Collection[str]) -> float:
     """A tenth for a region among whose usual organs the target is, if it is any."""
-    names = {organ.name for organ in USUAL[region]}
-    return 0.1 if len(names.intersection(absent_organs(region, target))) < len(names) else 0.0
+    return 0.1 if _shown(region, target) else 0.0

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from puncture_twin.planning.anatomy.default_roles import BODY
+from puncture_twin.planning.anatomy.target_readings import readings_inside
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError, InputListError
@@ -17,16 +18,17 @@ from puncture_twin.planning.base.progress import Names
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.geometry.spaces import Space, point_text
+from puncture_twin.planning.init.carved import carved_notes
 from puncture_twin.planning.init.case_text import CaseParts, case_text
 from puncture_twin.planning.init.finder import Ct, Found, Markers, Wanted, find
 from puncture_twin.planning.init.outlines import Outlines
 from puncture_twin.planning.init.roles import assign, likely_region, role_notes
 from puncture_twin.planning.init.segmentation import Assigned, Place, Segmentation
 from puncture_twin.planning.init.skin_mesh import SkinMesh, skin_mesh, skin_problems
-from puncture_twin.planning.init.target import Target, label_target, parse_point, shown, typed_target
+from puncture_twin.planning.init.target import Target, label_target, parse_point, typed_target
 
-ALLOWED = "a folder with a CT (NIfTI or NRRD) and a segmentation, see docs/how-to/your-own-ct.md"
+ALLOWED = "a folder with a CT (NIfTI, NRRD or a DICOM series) and a segmentation, see docs/how-to/your-own-ct.md"
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,7 @@ class Request:
         target_label: The name of a structure.
         region: As a case states it, or None to be told by the structures.
         space_stated: Whether the user said in which space the target is.
+        hit_radius_mm: Of the ball that the target is, if the user says that it lies in no structure; else None.
         wanted: What the user says of the files.
     """
 
@@ -48,6 +51,7 @@ class Request:
     region: str | None
     wanted: Wanted
     space_stated: bool = True
+    hit_radius_mm: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +102,7 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
         region=region,
         target_ct=target.point_ct,
         structure=target.holding.target,
+        hit_radius_mm=target.hit_radius_mm,
         ct=None if ct is None else ct.source,
         sources=tuple(zip(found.segmentations, rows, strict=True)),
         markers=tuple(_markers_of_ct(found.markers, ct)),
@@ -108,7 +113,8 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
 
 def _target(request: Request, point: Floats | None, outlines: Outlines) -> Target:
     if point is not None:
-        return typed_target(point, outlines, request.wanted.space, space_stated=request.space_stated)
+        space, radius = request.wanted.space, request.hit_radius_mm
+        return typed_target(point, outlines, space, space_stated=request.space_stated, hit_radius_mm=radius)
     return label_target(str(request.target_label), outlines, request.wanted.space)
 
 
@@ -162,18 +168,16 @@ def _doubled(segmentations: Sequence[Segmentation]) -> Iterator[str]:
 
 def _refuse_outside(point: Floats, ct: Ct, space: Space) -> None:
     """A target outside of the CT or of the body in it."""
-    other = Space.RAS if space is Space.LPS else Space.LPS
-    mirrored = to_lps(point[None], Space.RAS)[0]
-    inside = _contains(ct.surfaces.source.grid, point)
-    if inside and side_of(ct.surfaces.skin_of_ct().mesh, point) is not Side.OUTSIDE:
-        return
-    hint = ""
-    if _contains(ct.surfaces.source.grid, mirrored):
-        in_body = side_of(ct.surfaces.skin_of_ct().mesh, mirrored) is not Side.OUTSIDE
-        hint = f" (read in {other} it lies in the body: --space {other})" if in_body else ""
-    place = "the body in" if inside else "the CT"
-    what = f"target ({shown(point, space)}) lies outside {place} {ct.source}{hint}"
-    raise InputError(what, where="--target", allowed="a point in the body")
+    grid = ct.surfaces.source.grid
+
+    def in_body(one: Floats) -> bool:
+        return _contains(grid, one) and side_of(ct.surfaces.skin_of_ct().mesh, one) is not Side.OUTSIDE
+
+    if not in_body(point):
+        place = "the body in" if _contains(grid, point) else "the CT"
+        hint = readings_inside(point, space, in_body)
+        what = f"target ({point_text(point, space)}) lies outside {place} {ct.source}{hint}"
+        raise InputError(what, where="--target", allowed="a point in the body, in mm, in the space that --space states")
 
 
 def _with_skin(rows: Sequence[Assigned], skin: SkinMesh) -> list[Assigned]:
@@ -198,6 +202,7 @@ def _notes(request: Request, found: Found, target: Target, parts: CaseParts) -> 
         yield from one.notes
     yield from target.notes
     yield from role_notes(parts.rows, target.holding)
+    yield from carved_notes(parts.sources)
     if request.region is None:
         yield f'region = "{parts.region}" is told by the structures; --region says otherwise'
     if parts.markers:

@@ -8,21 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from puncture_twin.planning.anatomy.crossed_names import named_as_crossed
 from puncture_twin.planning.anatomy.default_roles import (
-    LESION,
-    NEVER_CROSSED,
     DefaultRole,
-    default_role,
     never_crossed,
 )
+from puncture_twin.planning.anatomy.likely_target import Likely, likely_target
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.geometry.spaces import Space, point_text, to_lps
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 from puncture_twin.planning.geometry.voxelize import voxels_inside
 from puncture_twin.planning.init.outlines import Outlines, named_like_body
@@ -32,11 +29,8 @@ from puncture_twin.planning.init.segmentation import Segmentation
 CELLS = 64
 """Along the longest edge of a structure's box, to find its deepest point."""
 
-
-NOT_KNOWN = (
-    "; the table of default roles does not know the whole name, and every safe path ends in it: is it no vessel?"
-)
-"""Of a target's structure."""
+USUAL_HIT_MM = 5.0
+"""Radius of the ball that is hit where the target lies in no structure and nobody states it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +41,13 @@ class Target:
         point_ct: Shape (3,), LPS mm.
         holding: The structures that hold it.
         notes: How it was found.
+        hit_radius_mm: Of the ball that is hit where the target has no structure.
     """
 
     point_ct: Floats
     holding: Holding
     notes: tuple[str, ...]
+    hit_radius_mm: float = USUAL_HIT_MM
 
 
 def parse_point(text: str, space: Space) -> Floats:
@@ -66,12 +62,9 @@ def parse_point(text: str, space: Space) -> Floats:
     return np.asarray(to_lps(np.array([numbers]), space)[0])
 
 
-def shown(point_ct: Floats, space: Space) -> str:
-    """A point in the user's space, as text."""
-    return ", ".join(f"{one:.1f}" for one in to_lps(point_ct[None], space)[0]) + f" mm {space}"
-
-
-def typed_target(point_ct: Floats, outlines: Outlines, space: Space, *, space_stated: bool) -> Target:
+def typed_target(
+    point_ct: Floats, outlines: Outlines, space: Space, *, space_stated: bool, hit_radius_mm: float | None = None
+) -> Target:
     """A point that was typed, with the structures that hold it.
 
     Args:
@@ -79,37 +72,63 @@ def typed_target(point_ct: Floats, outlines: Outlines, space: Space, *, space_st
         outlines: The body's, with all segmentations that may hold the point.
         space: In which it was typed.
         space_stated: Whether the user said so.
+        hit_radius_mm: Stated where the target is a ball of its own, whatever holds it; else None.
 
     Raises:
         InputError: It would lie in a structure, or a likelier one, if it was meant in the other space, and nobody said
-            which; or it lies in a vessel or another structure that no path may cross, which a slip of numbers does.
+            which; it lies in no structure, but in a lesion in the space that was not stated, and nobody said that no
+            structure is meant; or it lies in a vessel or another structure that no path may cross, which a slip of
+            numbers does.
     """
     holders = _holders(point_ct, outlines)
     names = [name for name in holders if not named_like_body(name)]
-    other = "" if names and space_stated else _other_reading(point_ct, outlines, space, names)
-    if not names and (space_stated or not other):
-        note = _in_nothing(point_ct, outlines.segmentations, holders, other)
-        return Target(point_ct, Holding(None, frozenset(holders)), (note,))
-    if not names or other:
-        place = f"in '{chosen_target(names)}'" if names else "in no structure"
-        raise InputError(
-            f"target ({shown(point_ct, space)}) lies {place}{other}",
-            where="--target",
-            allowed="--space LPS or --space RAS, whichever is meant",
-        )
+    if not space_stated:
+        _refuse_likelier(point_ct, outlines, space, names)
+    if hit_radius_mm is not None:
+        return _own_target(point_ct, outlines, holders, hit_radius_mm)
+    if not names:
+        _refuse_lesion_elsewhere(point_ct, outlines, space)
+        return _own_target(point_ct, outlines, holders, USUAL_HIT_MM)
     chosen = chosen_target(names)
     _refuse_in_danger(point_ct, chosen, space, _other_reading(point_ct, outlines, space, names))
     holding = Holding(chosen, frozenset(holders) - {chosen})
-    line = default_role(chosen, "other")
-    unsure = NOT_KNOWN if line is None or (line == LESION and not named_as_crossed(chosen)) else ""
-    return Target(point_ct, holding, (f"the target lies in '{chosen}', which is the target's structure{unsure}",))
+    return Target(point_ct, holding, (f"the target lies in '{chosen}', which is the target's structure",))
+
+
+def _refuse_likelier(point_ct: Floats, outlines: Outlines, space: Space, names: Sequence[str]) -> None:
+    """A point that is a likelier target in the other space, where nobody said in which it was typed."""
+    if other := _other_reading(point_ct, outlines, space, names):
+        place = f"in '{chosen_target(names)}'" if names else "in no structure"
+        raise InputError(
+            f"target ({point_text(point_ct, space)}) lies {place}{other}",
+            where="--target",
+            allowed="--space LPS or --space RAS, whichever is meant",
+        )
+
+
+def _refuse_lesion_elsewhere(point_ct: Floats, outlines: Outlines, space: Space) -> None:
+    """A point in no structure is a slip, whatever space was stated, where the other space puts it into a lesion."""
+    holders = _other_holders(point_ct, outlines)
+    if space is not Space.LOCAL and likely_target(holders) is Likely.LESION:
+        raise InputError(
+            f"target ({point_text(point_ct, space)}) lies in no structure"
+            f"{_other_reading(point_ct, outlines, space, ())}",
+            where="--target",
+            allowed="the other --space; or --hit-radius MM, where a target in no structure is meant",
+        )
+
+
+def _own_target(point_ct: Floats, outlines: Outlines, holders: Sequence[str], radius_mm: float) -> Target:
+    """A ball about the point as the target's own structure."""
+    note = _in_nothing(point_ct, outlines.segmentations, holders, radius_mm)
+    return Target(point_ct, Holding(None, frozenset(holders)), (note,), radius_mm)
 
 
 def _refuse_in_danger(point_ct: Floats, chosen: str, space: Space, other: str) -> None:
     """A point in the aorta is a slip of numbers: as the target's structure nothing would keep the needle out of it."""
     line = never_crossed(chosen)
     if line is not None:
-        what = f"target ({shown(point_ct, space)}) lies in '{chosen}'{other}: {_danger(line)}"
+        what = f"target ({point_text(point_ct, space)}) lies in '{chosen}'{other}: {_danger(line)}"
         allowed = f"a point outside of it, or --target-label '{chosen}' where it is itself the target"
         raise InputError(what, where="--target", allowed=allowed)
 
@@ -131,7 +150,7 @@ def label_target(name: str, outlines: Outlines, space: Space) -> Target:
         raise InputError(f"no structure is named '{name}'", where="--target-label", allowed=near or "none is there")
     segmentation, label = known[name]
     point, parts = deepest_point(segmentation.surface(label))
-    notes = [f"the target is the deepest point of '{name}': {shown(point, space)}"]
+    notes = [f"the target is the deepest point of '{name}': {point_text(point, space)}"]
     if parts > 1:
         notes.append(f"'{name}' has {parts} parts; the largest was taken")
     others = frozenset(_holders(point, outlines)) - {name}
@@ -158,25 +177,23 @@ def _other_reading(point_ct: Floats, outlines: Outlines, space: Space, here: Seq
     if space is Space.LOCAL:
         return ""
     other = Space.RAS if space is Space.LPS else Space.LPS
-    holders = _holders(to_lps(point_ct[None], Space.RAS)[0], outlines)
-    names = [name for name in holders if not named_like_body(name)]
-    if _likeliness(names) <= _likeliness(here):
+    names = _other_holders(point_ct, outlines)
+    if likely_target(names) <= likely_target(here):
         return ""
     return f" (read in {other} it lies in '{chosen_target(names)}': --space {other})"
 
 
-def _likeliness(names: Sequence[str]) -> int:
-    """Of structures that hold a point to be a target: a lesion, an organ, something never crossed, nothing."""
-    if not names:
-        return 0
-    line = default_role(chosen_target(names), "other")
-    return 3 if line == LESION else 1 if line is not None and line.group in NEVER_CROSSED else 2
+def _other_holders(point_ct: Floats, outlines: Outlines) -> list[str]:
+    """What would hold a point if its numbers were meant in the other space; without outlines of the body."""
+    return [name for name in _holders(to_lps(point_ct[None], Space.RAS)[0], outlines) if not named_like_body(name)]
 
 
-def _in_nothing(point_ct: Floats, segmentations: Sequence[Segmentation], unknown: Sequence[str], other: str) -> str:
-    near = _nearest(point_ct, segmentations)
-    but = f" but {', '.join(unknown)}" if unknown else ""
-    return f"the target lies in no structure{but}{other}; the nearest is {near}; what is hit is a ball of 5 mm about it"
+def _in_nothing(
+    point_ct: Floats, segmentations: Sequence[Segmentation], holders: Sequence[str], radius_mm: float
+) -> str:
+    near = "" if holders else f"; the nearest is {_nearest(point_ct, segmentations)}"
+    but = f" but {', '.join(holders)}" if holders else ""
+    return f"the target lies in no structure{but}{near}; what is hit is a ball of {radius_mm:g} mm about it"
 
 
 def _nearest(point_ct: Floats, segmentations: Sequence[Segmentation]) -> str:

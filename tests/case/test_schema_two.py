@@ -24,7 +24,8 @@ def test_a_case_that_states_its_structures_is_read_without_a_note(tmp_path):
     """The count includes the skin; region and count are the case's."""
     case = load_case(write_case(tmp_path, text=TWO))
     assert (case.stated_structures, case.region, case.warnings) == (4, "other", ())
-    (outside, base) = prepare(tmp_path, arm=False).anatomy.warnings
+    (outside, unknown, base) = prepare(tmp_path, arm=False).anatomy.warnings
+    assert "'organ', a name that the table of default roles does not know" in unknown
     assert outside == OUTSIDE_NOT_KNOWN and "the robot's base would stand in the patient" in base  # of equal lists
 
 

@@ -33,6 +33,7 @@ OPTIONS = {
     "--certify-size": "number",
     "--target": "word",
     "--target-label": "word",
+    "--hit-radius": "number",
     "--space": "word",
     "--force": None,
     "--cross-check": "number",

@@ -11,6 +11,7 @@ from puncture_twin.planning.search.consistency.markers import marker_warnings
 from puncture_twin.planning.search.consistency.needle_length import needle_warnings
 from puncture_twin.planning.search.consistency.outside_skin import outside_warnings
 from puncture_twin.planning.search.consistency.resolution import resolution_warnings
+from puncture_twin.planning.search.consistency.target_space import space_warnings
 from puncture_twin.planning.search.consistency.target_vessel import target_warnings
 from puncture_twin.planning.search.consistency.usual_organs import region_warnings
 from puncture_twin.planning.search.consistency.volume_headers import volume_headers
@@ -33,6 +34,7 @@ def check_consistency(
     refuse_open_around_target(case, anatomy)
     return (
         *target_warnings(case),
+        *space_warnings(case, anatomy),
         *outside,
         *marker_warnings(case, anatomy, placement, cache),
         *needle_warnings(case, anatomy.skin),

@@ -1,0 +1,198 @@
+"""What `init` and every result say of a target that may be a slip: its space, its unit, its name, its surroundings."""
+
+import json
+
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813
+from case_world import SKIN, ball, case_text, image_of, structure
+
+from puncture_twin.planning.anatomy.default_roles import default_role
+from puncture_twin.planning.init.roles import likely_region
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.run_twin import main
+
+SPACING = (4.0, 4.0, 4.0)
+AT = np.arange(50) * 4.0 - 98.0
+Z, Y, X = np.meshgrid(AT, AT, AT, indexing="ij")
+HERE, THERE = (-40.0, 0.0, 10.0), (40.0, 0.0, 10.0)
+"""A place of the body and what the same numbers, read in the other space, mean; LPS, mm."""
+
+
+def inside(middle, radius):
+    """Voxels (z, y, x) of a ball."""
+    return (X - middle[0]) ** 2 + (Y - middle[1]) ** 2 + (Z - middle[2]) ** 2 < radius**2
+
+
+def patient(folder, *organs):
+    """A round body with an aorta, and a mask for each organ (name, voxels)."""
+    hu = np.where(inside((0, 0, 0), 90.0), 40.0, -1000.0) + np.random.default_rng(5).normal(0.0, 12.0, X.shape)
+    sitk.WriteImage(image_of(hu.astype(np.int16), SPACING), str(folder / "scan.nii.gz"))
+    for name, voxels in (("aorta", inside((36, 36, 0), 8.0)), *organs):
+        sitk.WriteImage(image_of(voxels.astype(np.uint8), SPACING), str(folder / f"{name}.nii.gz"))
+
+
+def init(capfd, folder, *words):
+    """Run it; returns exit code and stderr's lines that are no progress."""
+    code = main(["init", str(folder), *words, "--force"])
+    return code, [line for line in capfd.readouterr().err.splitlines() if not line.startswith("stage")]
+
+
+def results_warn(capfd, case, text):
+    """Whether check says so as text and as JSON, as every other result does with the same list."""
+    assert any(text in one for one in prepare(case, arm=False).anatomy.warnings)
+    main(["check", str(case), "--theta", "10", "--beta", "0", "--no-arm", "--json"])
+    assert any(text in one for one in json.loads(capfd.readouterr().out)["warnings"])
+    main(["check", str(case), "--theta", "10", "--beta", "0", "--no-arm"])
+    out, err = capfd.readouterr()
+    return text in out + err
+
+
+@pytest.mark.parametrize(("words", "other"), [(("40,0,10", "LPS"), "RAS"), (("40,0,10", "RAS"), "LPS")])
+def test_a_target_in_nothing_is_refused_where_the_other_space_has_a_lesion(tmp_path, capfd, words, other):
+    """It was taken, with a remark that no result repeated: the needle would miss the lesion by 80 mm."""
+    patient(tmp_path, ("lung_tumor", inside(HERE if other == "RAS" else THERE, 8.0)))
+    code, said = init(capfd, tmp_path, "--target", words[0], "--space", words[1])
+    assert code == 2 and len(said) == 1 and not (tmp_path / "case.toml").exists()
+    assert f"mm {words[1]}) lies in no structure (read in {other} it lies in 'lung_tumor': --space {other})" in said[0]
+    assert said[0].endswith("allowed: the other --space; or --hit-radius MM, where a target in no structure is meant")
+    assert init(capfd, tmp_path, "--target", words[0], "--space", other)[0] == 0
+    code, said = init(capfd, tmp_path, "--target", words[0], "--space", words[1], "--hit-radius", "3")
+    assert code == 0 and "hit_radius_mm = 3.0" in (tmp_path / "case.toml").read_text()
+    warning = f"lies in no structure; read in {other} the same numbers lie in 'lung_tumor'"
+    assert any(warning in one for one in said) and results_warn(capfd, tmp_path, warning)
+
+
+def test_a_target_in_an_organ_is_doubted_where_the_other_space_has_a_lesion(tmp_path, capfd):
+    """As stated it may be so; but every result says it."""
+    patient(tmp_path, ("right lung", inside(HERE, 18.0)), ("liver_lesion", inside(THERE, 8.0)))
+    assert init(capfd, tmp_path, "--target", "-40,0,10", "--space", "LPS")[0] == 0
+    assert results_warn(capfd, tmp_path, "lies in right lung; read in RAS the same numbers lie in 'liver_lesion'")
+
+
+def test_a_target_in_nothing_is_doubted_where_the_other_space_has_an_organ(tmp_path, capfd):
+    """Also in a case that a person wrote; not where what holds it there is muscle, a vessel, or nothing."""
+    for one in ("skin", "organ"):
+        ball(tmp_path / f"{one}.stl", *((90.0,) if one == "skin" else (12.0, np.array(THERE))))
+    target = "position_mm = [{}, 0.0, 10.0]\nhit_radius_mm = 5.0"
+    case = tmp_path / "case.toml"
+    for name, space, doubted in (
+        ("liver", "LPS", True),
+        ("liver", "RAS", True),
+        ("psoas", "LPS", False),
+        ("aorta", "LPS", False),
+        ("liver", "local", False),
+    ):
+        organ = structure(name, "avoid", {"mesh": "organ.stl", "unit": "mm"}, margin_mm=3.0)
+        text = case_text(SKIN, organ, space=space, target=target.format(40.0 if space == "RAS" else -40.0))
+        case.write_text(text.replace('unit = "mm"', 'unit = "mm"\nspace = "LPS"') if space == "RAS" else text)
+        other = "RAS" if space == "LPS" else "LPS"
+        said = [one for one in prepare(case, arm=False).anatomy.warnings if "same numbers" in one]
+        assert len(said) == doubted, (name, space, said)
+        assert not doubted or f"read in {other} the same numbers lie in 'liver'" in said[0]
+
+
+def test_a_target_outside_names_its_space_and_the_readings_that_fit(tmp_path, capfd):
+    """LPS numbers without a word of it, for someone who had typed RAS; and 0.15 was outside without saying why."""
+    ball(tmp_path / "skin.stl", 60.0, np.array((150.0, 150.0, 900.0)))
+    ball(tmp_path / "rib.stl", 5.0, np.array((150.0, 150.0, 930.0)))
+    rib = structure("rib", "avoid", margin_mm=3.0)
+    places = {
+        "[0.15, 0.15, 0.9]": "(0.1, 0.1, 0.9 mm LPS) lies outside the skin (read in m it lies in the body)",
+        "[15, 15, 90]": "(15.0, 15.0, 90.0 mm LPS) lies outside the skin (read in cm it lies in the body)",
+        "[-150, -150, 900]": "lies outside the skin (read in RAS it lies in the body)",
+        "[-0.15, -0.15, 0.9]": "lies outside the skin (read in RAS and m it lies in the body)",
+        "[0, 150, 900]": "(0.0, 150.0, 900.0 mm LPS) lies outside the skin: allowed",
+    }
+    for place, text in places.items():
+        target = f"position_mm = {place}\nhit_radius_mm = 5.0"
+        (tmp_path / "case.toml").write_text(case_text(SKIN, rib, target=target))
+        assert main(["check", str(tmp_path), "--theta", "0", "--beta", "0", "--no-arm"]) == 2
+        (line,) = capfd.readouterr().err.strip().splitlines()[-1:]
+        assert text.removesuffix(": allowed") in line and ("read in" in line) == ("read in" in text), line
+
+
+def test_init_tells_a_target_in_metres(tmp_path, capfd):
+    """The body lies away from the origin, as in most scanners."""
+    patient(tmp_path, ("right lung", inside(HERE, 18.0)))
+    image = sitk.ReadImage(str(tmp_path / "scan.nii.gz"))
+    image.SetOrigin((100.0, 100.0, 700.0))
+    sitk.WriteImage(image, str(tmp_path / "scan.nii.gz"))
+    code, said = init(capfd, tmp_path, "--target", "-0.198,-0.198,0.798", "--space", "RAS")
+    assert code == 2 and "(-0.2, -0.2, 0.8 mm RAS) lies outside the CT" in said[0]
+    assert "(read in m it lies in the body)" in said[0] and "in mm, in the space" in said[0]
+
+
+@pytest.mark.parametrize("name", ["Tumorvene", "tumor feeder", "AAA", "Segment_1"])
+def test_a_target_whose_name_is_not_wholly_known_is_told_by_every_result(tmp_path, capfd, name):
+    """Only `init` said so; a search called paths into a tumour's vein safe without a word."""
+    patient(tmp_path, (name, inside(HERE, 10.0)))
+    code, said = init(capfd, tmp_path, "--target", "-40,0,10", "--space", "LPS")
+    text = f"the target lies in '{name}', a name that "
+    assert code == 0 and sum(text in one for one in said) == 1
+    assert results_warn(capfd, tmp_path, text)
+
+
+def test_a_lesion_or_an_organ_as_target_has_no_such_warning(tmp_path, capfd):
+    """Nor has any name in a phantom."""
+    patient(tmp_path, ("liver tumour 2", inside(HERE, 10.0)))
+    init(capfd, tmp_path, "--target", "-40,0,10", "--space", "LPS")
+    assert not any("a name that" in one for one in prepare(tmp_path, arm=False).anatomy.warnings)
+    patient(tmp_path, ("bolt", inside(HERE, 10.0)))
+    (tmp_path / "liver tumour 2.nii.gz").unlink()
+    init(capfd, tmp_path, "--target", "-40,0,10", "--space", "LPS", "--region", "phantom")
+    assert not any("a name that" in one for one in prepare(tmp_path, arm=False).anatomy.warnings)
+
+
+@pytest.mark.parametrize("name", ["C1 lateral mass", "lateral_mass_left", "LateralMass_C1"])
+def test_a_lateral_mass_is_a_vertebra(name):
+    """It was a lesion, crossed where it held the target."""
+    line = default_role(name, "other")
+    assert line is not None and line.group == "vertebrae, spine"
+    assert default_role("lateral lung mass", "other").group == "lesion"
+
+
+@pytest.mark.parametrize(
+    ("names", "region"),
+    [
+        (("liver", "aorta", "kidney"), "abdomen"),
+        (("liver", "aorta", "kidney_left", "vertebrae_L1"), "abdomen"),
+        (("liver", "portal vein", "hepatic artery"), "other"),
+        (("right lung", "aorta"), "other"),
+        (("heart", "lung_left", "aorta"), "chest"),
+        (("vertebrae_L1", "spinal_cord", "aorta"), "spine"),
+        (("femur", "artery", "vein"), "limb"),
+        (("brain", "skull", "ventricle"), "brain"),
+    ],
+)
+def test_a_region_is_told_by_organs_of_its_own(names, region):
+    """Liver, aorta and kidney were a spine, whose list is short; two vessels were a limb."""
+    assert likely_region(names, None) == region
+
+
+def test_an_organ_that_the_lesion_was_carved_out_of_is_named(tmp_path, capfd):
+    """A label map has one label a voxel: the liver did not hold its lesion, and nothing said why no path was safe."""
+    lesion, liver = inside(HERE, 8.0), inside((-36, 0, 10), 24.0)
+    patient(tmp_path, ("liver_lesion", lesion), ("liver", liver & ~lesion), ("spleen", inside((40, 0, 10), 12.0)))
+    code, said = init(capfd, tmp_path, "--target", "-40,0,10", "--space", "LPS", "--region", "abdomen")
+    told = [one for one in said if "goes round" in one]
+    assert code == 0 and len(told) == 1
+    assert "'liver' goes round 'liver_lesion' without holding it" in told[0] and "make it traverse" in told[0]
+    patient(tmp_path, ("liver", liver))
+    _, said = init(capfd, tmp_path, "--target", "-40,0,10", "--space", "LPS", "--region", "abdomen")
+    assert not any("goes round" in one for one in said) and any("(traverse): liver" in one for one in said)
+
+
+def test_the_ball_of_a_target_is_not_warned_of(tmp_path, capfd):
+    """A warning about triangles of a shape that is ours is of no use."""
+    patient(tmp_path, ("right lung", inside(HERE, 18.0)))
+    for radius in ("0.5", "5", "37"):
+        code, said = init(capfd, tmp_path, "--target", "0,0,-40", "--space", "LPS", "--hit-radius", radius)
+        assert code == 0 and not any("'target'" in one or "target: " in one for one in said), said
+
+
+@pytest.mark.parametrize("radius", ["0", "-1", "101", "nan"])
+def test_a_hit_radius_that_is_none_is_refused(tmp_path, capfd, radius):
+    """In one line, before anything is read."""
+    code, said = init(capfd, tmp_path, "--target", "0,0,-40", "--hit-radius", radius)
+    assert code == 2 and "--hit-radius" in said[0] and "above 0, at most 100" in said[0]
