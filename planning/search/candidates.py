@@ -21,6 +21,9 @@ ARM_CHECKED = "checked"
 CONE_OF_GRID, CONE_CERTIFIED = "grid", "certificate"
 """Where a safe cone comes from: the directions of the search, or the proof of all between them."""
 
+NOT_SEEN = "not seen: image or mesh ends"
+"""In place of the skin, by whose end it is found, what is said of a path into what nobody scanned."""
+
 
 ANGLE_DIGITS = 9
 """Of an angle in degrees: a grid's 59.99999999999999 is 60; 1e-9 degrees move no needle by a nanometre."""
@@ -54,6 +57,16 @@ class Verdict(Columns):
     depth: Floats
     amount: Floats
     detail: Texts
+
+    @property
+    def not_seen(self) -> Bools:
+        """Shape (n,), whether the reason is that nobody scanned the body there, and no structure's clearance."""
+        return (self.reason == Reason.UNKNOWN_REGION.value) & np.isnan(self.amount)
+
+    @property
+    def named(self) -> Texts:
+        """Shape (n,), what the reason names, for people: `structure`, and `NOT_SEEN` where nothing was scanned."""
+        return np.where(self.not_seen, NOT_SEEN, self.structure)
 
     def of(self, rows: Ints) -> Verdict:
         """Those of some rows."""

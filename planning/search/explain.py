@@ -306,8 +306,8 @@ def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
 def reason_text(candidates: Candidates, row: int) -> str:
     """Reason, structure, depth and number of a rejected candidate, in one line."""
     parts = [str(candidates.verdict.reason[row])]
-    if candidates.verdict.structure[row]:
-        parts.append(f"({candidates.verdict.structure[row]})")
+    if candidates.verdict.named[row]:
+        parts.append(f"({candidates.verdict.named[row]})")
     if np.isfinite(candidates.verdict.depth[row]):
         parts.append(f"at {candidates.verdict.depth[row]:.1f} mm from the target")
     if np.isfinite(candidates.verdict.amount[row]):

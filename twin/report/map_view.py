@@ -31,6 +31,9 @@ NAMES_LPS = {
 IN_PLANE = 0.5
 """Least sine of the angle to the view axis at which a body direction gets a place at the rim (30 degrees)."""
 
+BEYOND = np.radians(92.0)
+"""A map whose rim lies beyond this shows directions from the far side, and says so."""
+
 SAME_PLACE = np.radians(20.0)
 """Rim labels nearer than this share one line."""
 

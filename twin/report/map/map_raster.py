@@ -6,10 +6,12 @@ A pixel with other colours around it is the mean of a few samples; all others ha
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import REASON_COLOURS, Reason, Rgb
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import MapCells, MapView
@@ -18,6 +20,11 @@ from puncture_twin.twin.report.palette import reason_of, safe_shades
 OVERSAMPLING = 2
 """Samples per pixel side at the cells' borders, which they smooth."""
 
+SCALE_DIGITS = 1
+"""Of the scale's ends, mm; where both print as one number, shades between them would show nothing."""
+
+EVEN_SHADE = 0.5
+"""The shade of such a map, 0..1: neither that of the least clearance nor that of the greatest."""
 
 HATCH: Rgb = (235, 235, 235)
 HATCHES, HATCH_LEAST = 80, 5
@@ -37,14 +44,36 @@ class MapRaster:
     rows: NDArray[np.int64]
 
 
-def clearance_range(candidates: Candidates) -> tuple[float, float]:
-    """Least and greatest clearance among the safe directions, mm; (0, 1) when there is none to speak of."""
+class ClearanceScale(NamedTuple):
+    """The clearances that the shades of safe stand for, mm.
+
+    Attributes:
+        low: Of the lightest shade.
+        high: Of the darkest; infinite, as ``low`` is, where no structure has a margin.
+    """
+
+    low: float
+    high: float
+
+    @property
+    def even(self) -> bool:
+        """Whether all are one to whoever reads them: then there is one shade, and no scale."""
+        return round(self.low, SCALE_DIGITS) == round(self.high, SCALE_DIGITS)
+
+    def shades(self, clearance: Floats) -> NDArray[np.uint8]:
+        """The colour of each clearance, mm, shape (n,) to (n, 3)."""
+        if self.even:
+            return safe_shades(np.full(np.shape(clearance), EVEN_SHADE))
+        return safe_shades((clearance - self.low) / (self.high - self.low))
+
+
+def clearance_scale(candidates: Candidates) -> ClearanceScale:
+    """From the least to the greatest clearance among the safe directions; infinite where there is none to speak of."""
     values = candidates.least_clearance[candidates.safe]
     values = values[np.isfinite(values)]
     if len(values) == 0:
-        return 0.0, 1.0
-    low, high = float(values.min()), float(values.max())
-    return low, max(high, low + 1e-3)
+        return ClearanceScale(np.inf, np.inf)
+    return ClearanceScale(float(values.min()), float(values.max()))
 
 
 def row_colours(candidates: Candidates) -> NDArray[np.uint8]:
@@ -54,9 +83,8 @@ def row_colours(candidates: Candidates) -> NDArray[np.uint8]:
         reason = reason_of(str(value))
         if reason in REASON_COLOURS:
             colours[candidates.verdict.reason == value] = REASON_COLOURS[reason]
-    low, high = clearance_range(candidates)
     safe = candidates.safe
-    colours[safe] = safe_shades((candidates.least_clearance[safe] - low) / (high - low))
+    colours[safe] = clearance_scale(candidates).shades(candidates.least_clearance[safe])
     return colours
 
 

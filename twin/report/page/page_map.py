@@ -11,9 +11,10 @@ import numpy as np
 from PIL import Image
 
 from puncture_twin.planning.base.reasons import REASON_TEXT, Reason
-from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.candidates import NOT_SEEN, Candidates
 from puncture_twin.planning.search.selection.choice import Pick
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
+from puncture_twin.twin.report.map.front import shown_front
 from puncture_twin.twin.report.map.map_raster import map_raster
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.palette import PNG_LEVEL, reason_of
@@ -43,9 +44,10 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None) -> dict[str, 
     view, windows = map_view(case, candidates), find_windows(candidates)
     raster = map_raster(candidates, view, 2 * PIXELS)
     rows = map_raster_rows(raster.rows[::2, ::2])
-    structures = sorted({*map(str, candidates.verdict.structure), *candidates.clearance.structures})
+    structures = sorted({*map(str, candidates.verdict.named), *candidates.clearance.structures})
     index = {name: i for i, name in enumerate(structures)}
     nearest, amounts = _nearest(candidates)
+    front = shown_front(candidates, view)
     reasons = [str(r) for r in np.unique(candidates.verdict.reason)]
     sentences, sentence = np.unique(candidates.verdict.detail, return_inverse=True)
     return {
@@ -65,7 +67,7 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None) -> dict[str, 
         "theta": _rounded(np.degrees(candidates.theta), 3),
         "beta": _rounded(np.degrees(candidates.beta), 3),
         "reason": [reasons.index(str(r)) for r in candidates.verdict.reason],
-        "structure": [index[str(s)] for s in candidates.verdict.structure],
+        "structure": [index[str(s)] for s in candidates.verdict.named],
         "sentences": [str(s) for s in sentences],
         "sentence": sentence.tolist(),
         "depth": _rounded(candidates.verdict.depth, 1),
@@ -84,7 +86,9 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None) -> dict[str, 
         "window": windows.of_row.tolist(),
         "safe_cone": _rounded(np.degrees(candidates.safe_cone), 1),
         "chosen": None if pick is None else pick.candidates.at(pick.row),
-        "pareto": np.flatnonzero(candidates.ranking.pareto & candidates.safe).tolist(),
+        "pareto": front.rows.tolist(),
+        "front": front.text,
+        "not_seen": NOT_SEEN,
         **_chances(candidates),
     }
 

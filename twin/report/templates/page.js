@@ -52,6 +52,7 @@
     const turn = side ? { transform: `rotate(${c < 0 ? -90 : 90} ${x} ${y})` } : {};
     label(x, y, rim.text, { "font-size": 16, "font-weight": 700, ...turn });
   }
+  document.getElementById("front").textContent = map.front;
   for (const row of map.pareto) {
     const [x, y] = place(row);
     draw("circle", { cx: x, cy: y, r: 1.8, fill: "#fff", stroke: "#000", "stroke-width": 0.6 });
@@ -98,7 +99,7 @@
     if (!safe) {
       const structure = map.structures[map.structure[row]], [what, unit] = map.details[map.reason[row]];
       const parts = [`reason ${code}`];
-      if (structure) parts.push(`structure: ${words(structure)}`);
+      if (structure) parts.push(structure === map.not_seen ? structure : `structure: ${words(structure)}`);
       if (map.depth[row] !== null) parts.push(`${shown(map.depth[row], 1, "mm")} from the target`);
       if (map.amount[row] !== null) parts.push(`${what || "amount"} ${shown(map.amount[row], 1, unit || "mm")}`);
       add("div", parts.join("; "));

@@ -1,0 +1,118 @@
+"""What the map of directions writes: nobody reads what is unknown as an organ, nor a scale where there is none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import report_world as world
+from matplotlib.axes import Axes
+from PIL import Image
+
+from puncture_twin.planning.search.explain import reason_text
+from puncture_twin.planning.search.selection.choice import best_pick
+from puncture_twin.twin.report.map.front import MOST_DOTS, shown_front
+from puncture_twin.twin.report.map.map_picture import draw_map
+from puncture_twin.twin.report.map.map_raster import row_colours
+from puncture_twin.twin.report.map_view import map_view
+from puncture_twin.twin.report.page.page_map import map_data
+
+
+@pytest.fixture(scope="module")
+def case():
+    """The small patient."""
+    return world.make_case()
+
+
+@pytest.fixture(scope="module")
+def candidates(case):
+    """Its verdicts: the far ring leaves the image, and a rib is in the path of a sector."""
+    found = world.make_candidates(case)
+    far = found.verdict.reason == "too_long"
+    verdict = replace(
+        found.verdict,
+        reason=np.where(far, "unknown_region", found.verdict.reason),
+        structure=np.where(far, "skin", found.verdict.structure).astype(object),
+        detail=np.full(len(far), ""),
+    )
+    return replace(found, verdict=verdict)
+
+
+def with_clearance(found, mm):
+    """The same directions, each with this least clearance."""
+    distance = np.full_like(found.clearance.distance, mm)
+    return replace(found, clearance=replace(found.clearance, distance=distance, least=distance.min(axis=1)))
+
+
+def written(monkeypatch, found, case, path):
+    """All that the picture of these directions says."""
+    said, write = [], Axes.text
+    monkeypatch.setattr(Axes, "text", lambda axes, x, y, s, **look: said.append(s) or write(axes, x, y, s, **look))
+    draw_map(found, case, path)
+    assert Image.open(path).size[0] > 1000
+    return said
+
+
+def test_where_nobody_looked_is_not_the_skin(monkeypatch, case, candidates, tmp_path):
+    """The region says that it is unknown and not seen; the rib beside it is named as it was."""
+    said = written(monkeypatch, candidates, case, tmp_path / "map.png")
+    assert "unknown:\nnot seen" in said and "rib right 9" in said and "skin" not in said
+
+
+def test_an_unknown_structure_says_that_it_is_unknown(monkeypatch, case, candidates, tmp_path):
+    """One that nobody named is written as unknown, not as an organ that forbids."""
+    rib = candidates.verdict.reason == "too_close"
+    verdict = replace(candidates.verdict, reason=np.where(rib, "unknown_region", candidates.verdict.reason))
+    said = written(monkeypatch, replace(candidates, verdict=verdict), case, tmp_path / "map.png")
+    assert "unknown:\nrib right 9" in said and "rib right 9" not in said
+
+
+def test_text_and_page_say_that_it_was_not_seen(case, candidates):
+    """As the map does; the table of candidates keeps the word that programs read."""
+    row = int(np.flatnonzero(candidates.verdict.reason == "unknown_region")[0])
+    assert reason_text(candidates, row) == "unknown_region (not seen: image or mesh ends)"
+    data = map_data(case, candidates, best_pick(candidates))
+    assert data["structures"][data["structure"][row]] == data["not_seen"] == "not seen: image or mesh ends"
+    assert candidates.verdict.structure[row] == "skin"
+
+
+@pytest.mark.parametrize(
+    ("clearance", "said"),
+    [(68.5, "safe, least clearance 68.5 mm everywhere"), (np.inf, "safe, no structure has a margin")],
+)
+def test_one_clearance_is_one_shade_and_no_scale(monkeypatch, case, candidates, tmp_path, clearance, said):
+    """No bar from 68.5 to 68.5 mm, and none from 0 to 1 where nothing has a margin."""
+    even = with_clearance(candidates, clearance)
+    assert len(np.unique(row_colours(even)[even.safe], axis=0)) == 1
+    texts = written(monkeypatch, even, case, tmp_path / "map.png")
+    assert said in texts and not [text for text in texts if text.endswith("by least clearance")]
+    texts = written(monkeypatch, candidates, case, tmp_path / "map.png")
+    assert {"5.0 mm", "11.5 mm", "safe, by least clearance"} <= set(texts)
+
+
+def front_of(found, rows):
+    """The same directions with this front."""
+    pareto = np.zeros(len(found), dtype=bool)
+    pareto[rows] = True
+    return replace(found, ranking=replace(found.ranking, pareto=pareto))
+
+
+def test_a_large_front_is_thinned_and_says_so(case, candidates):
+    """The best-ranked of those that keep apart, everywhere where the front is; a small one is whole."""
+    view, safe = map_view(case, candidates), np.flatnonzero(candidates.safe & (candidates.theta > 0.01))
+    many, few = front_of(candidates, safe), front_of(candidates, safe[:MOST_DOTS])
+    shown = shown_front(many, view)
+    assert MOST_DOTS / 3 < len(shown.rows) <= MOST_DOTS
+    assert shown.text == f"Pareto front ({len(shown.rows)} of {len(safe)})"
+    assert shown.rows[0] == safe[np.argmin(candidates.ranking.rank[safe])]
+    places, dots = (view.place(candidates.theta[rows], candidates.beta[rows]) for rows in (safe, shown.rows))
+    assert np.linalg.norm(places[:, None] - dots, axis=2).min(axis=1).max() < 0.35
+    whole = shown_front(few, view)
+    assert whole.text == "Pareto front" and sorted(whole.rows) == sorted(safe[:MOST_DOTS])
+
+
+def test_one_direction_is_one_dot(case, candidates):
+    """At θ = 0 every β is the same direction."""
+    pole = np.flatnonzero(candidates.safe & (candidates.theta < 1e-9))
+    assert len(pole) > MOST_DOTS
+    shown = shown_front(front_of(candidates, pole), map_view(case, candidates))
+    assert len(shown.rows) == 1 and shown.text == "Pareto front"
