@@ -87,7 +87,10 @@ class FastEngine:
         counts = np.zeros((len(self._blocks), len(COUNTED)), np.int64)
         seen, tiles = self._seen_from(target), bundle(outward)
 
-        def search(row: int) -> None:
+        largest_first = sorted(range(len(self._blocks)), key=lambda row: -len(self._blocks[row].triangles))
+
+        def search(piece: int) -> None:
+            row = largest_first[piece]  # so that no thread ends long after the others
             answer = AxisDistances(distance[row], depth[row], nearest[row])
             _one_structure(self._blocks[row], seen[row], tiles, target, lengths[row], answer, counts[row])
 
