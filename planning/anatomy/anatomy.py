@@ -20,6 +20,7 @@ from puncture_twin.planning.anatomy.target_readings import readings_inside
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.near_names import did_you_mean
 from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import count_difference
@@ -98,7 +99,8 @@ class Anatomy:
             if structure.name == name:
                 return structure
         names = ", ".join(s.name for s in self.structures)
-        raise InputError(f"no structure '{name}'", where="anatomy", allowed=names)
+        near = did_you_mean(name, (structure.name for structure in self.structures))
+        raise InputError(f"no structure '{name}'{near}", where="anatomy", allowed=names)
 
 
 def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE) -> Anatomy:
@@ -190,7 +192,8 @@ def _check_names(case: Case, structures: list[Structure]) -> None:
         raise InputError(f"structure '{twice[0]}' stands twice", where=case.path, allowed="unique names")
     if case.target_structure not in names:
         raise InputError(
-            f"target.structure '{case.target_structure}' is no structure of the case",
+            f"target.structure '{case.target_structure}' is no structure of the case"
+            f"{did_you_mean(case.target_structure, names)}",
             where=case.path,
             allowed=", ".join(names),
         )

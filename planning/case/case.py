@@ -11,6 +11,7 @@ import numpy as np
 from puncture_twin.planning.arm.tool_body import ToolBody
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.near_names import did_you_mean
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
 from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.breathing.breathing import Breathing
@@ -229,5 +230,6 @@ def target_of(content: CaseFile, path: Path, space: Space, files: InputFiles) ->
     listed = parse_points(files.content(target.points), path.parent / target.points, default_space=space)
     if target.name not in listed.names:
         names = ", ".join(listed.names)
-        raise InputError(f"target.name '{target.name}' is not in {target.points}", where=path, allowed=names)
+        what = f"target.name '{target.name}' is not in {target.points}{did_you_mean(target.name, listed.names)}"
+        raise InputError(what, where=path, allowed=names)
     return read_only(listed.points[listed.names.index(target.name)].copy())

@@ -15,6 +15,7 @@ from puncture_twin.planning.anatomy.default_roles import (
 from puncture_twin.planning.anatomy.likely_target import Likely, likely_target
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.near_names import did_you_mean
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -146,8 +147,8 @@ def label_target(name: str, outlines: Outlines, space: Space) -> Target:
     segmentations = outlines.segmentations
     known = {one: (seg, label) for seg in segmentations for label, one in seg.names.items()}
     if name not in known:
-        near = ", ".join(sorted(known))
-        raise InputError(f"no structure is named '{name}'", where="--target-label", allowed=near or "none is there")
+        what = f"no structure is named '{name}'{did_you_mean(name, known)}"
+        raise InputError(what, where="--target-label", allowed=", ".join(sorted(known)) or "none is there")
     segmentation, label = known[name]
     point, parts = deepest_point(segmentation.surface(label))
     notes = [f"the target is the deepest point of '{name}': {point_text(point, space)}"]

@@ -7,6 +7,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
 from puncture_twin.planning.base.arrays import Ints
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.near_names import did_you_mean
 from puncture_twin.planning.case.case import Case
 
 
@@ -36,6 +37,7 @@ def check_limits(case: Case, anatomy: Anatomy, error_known: bool) -> None:
     unknown = sorted(set(settings.max_touch_of) - set(names))
     if unknown:
         message = f"search.max_touch_of '{unknown[0]}' is no structure that must not be touched"
+        message += did_you_mean(unknown[0], names)
         raise InputError(message, where=case.path, allowed=", ".join(names))
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.near_names import did_you_mean
 from puncture_twin.planning.formats.labels.naming import specificity
 
 SHOWN = 8
@@ -55,7 +56,8 @@ class ByName(Generic[T]):
             raise InputError(message, where=where, allowed='a pattern for each; "*" is the rest')
         for pattern in self.of_pattern:
             if not any(fnmatchcase(name, pattern) for name in known):
-                message = f"{key}: pattern '{pattern}' matches no structure"
+                near = did_you_mean(pattern.strip("*?"), known)
+                message = f"{key}: pattern '{pattern}' matches no structure{near}"
                 raise InputError(message, where=where, allowed=_listed(known))
         for name in names:
             _refuse_contradiction(self.of_pattern, name, key, where)
