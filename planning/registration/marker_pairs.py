@@ -9,6 +9,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.near_names import did_you_mean
 from puncture_twin.planning.formats.points.point_files import NamedPoints
 
 MIN_MARKERS = 3
@@ -16,6 +17,9 @@ MIN_MARKERS = 3
 
 COLLINEAR = 0.01
 """Second over first singular value of the centred markers below which they count as one line."""
+
+LEAST_SPAN_MM = 5.0
+"""A needle's tip tells no two places of the skin apart that are nearer: markers in metres or cm, read as mm."""
 
 UNIT_SLIP = 5.0
 """Ratio of the two marker sets' spreads from which on a unit (mm, cm, m) is wrong, not a measurement."""
@@ -63,8 +67,9 @@ def match(
         wanted = set(names) if use is not None else set(other.names)
         missing = sorted(wanted - set(points.names))
         if missing:
+            near = "".join(did_you_mean(name, set(points.names) - set(other.names)) for name in missing[:1])
             raise InputError(
-                f"{', '.join(missing)} missing on the {side} side",
+                f"{', '.join(missing)} missing on the {side} side{near}",
                 where=where,
                 allowed="the same names on both sides, or registration.use = [names]",
             )
@@ -80,7 +85,7 @@ def check_pairs(markers: MarkerPairs, where: str | Path) -> None:
     """Whether markers can be fitted at all.
 
     Raises:
-        InputError: Fewer than three, not finite, on a line, or of two sizes.
+        InputError: Fewer than three, not finite, on a line, of two sizes, or all at one place.
     """
     if len(markers) < MIN_MARKERS:
         raise InputError(f"{len(markers)} markers", where=where, allowed="3 or more, by the same names")
@@ -104,6 +109,19 @@ def check_pairs(markers: MarkerPairs, where: str | Path) -> None:
             where=where,
             allowed="both sides in mm",
         )
+    span = max(_span(markers.points_ct), _span(markers.points_base))
+    if span < LEAST_SPAN_MM:
+        raise InputError(
+            f"markers {', '.join(markers.names)} span {span:.2g} mm, no more than a needle tells apart: a likely slip "
+            "of unit (m or cm as mm) on both sides",
+            where=where,
+            allowed=f"both sides in mm, markers that span {LEAST_SPAN_MM:g} mm at least",
+        )
+
+
+def _span(points: Floats) -> float:
+    """The greatest distance between two of the points (n, 3)."""
+    return float(np.linalg.norm(points[:, None] - points[None], axis=2).max())
 
 
 def _singular_values(points: Floats) -> Floats:

@@ -13,6 +13,7 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.conditioning import Conditioning, conditioning, leverage
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, fit_uncertainty
+from puncture_twin.planning.registration.fits.better_names import better_names
 from puncture_twin.planning.registration.fits.method import Method, checked_fit
 from puncture_twin.planning.registration.fits.residual_checks import check_residuals, rigid_fre
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, check_pairs
@@ -150,7 +151,7 @@ def register(
         raise InputError(f"triad takes 3 markers, not {len(markers)}", where=where, allowed="3 names in use")
     T_base_ct = fit(markers.points_ct, markers.points_base)
     residuals = apply(T_base_ct, markers.points_ct) - markers.points_base
-    check_residuals(markers, residuals, where)
+    check_residuals(markers, residuals, target_ct, where)
     uncertainty = None
     if noise is not None:
         points = markers.points_ct, markers.points_base
@@ -161,6 +162,7 @@ def register(
     if not (noise_test.explained or accept_residuals):
         odd = odd_marker_of(markers, fle_mm)
         what = noise_test.text() if odd is None else f"{noise_test.text()}; {odd.text()}"
+        what += better_names(markers, target_ct, fre_mm)
         raise InputError(what, where=where, allowed=ALLOWED_RESIDUALS)
     weak = conditioning(markers.points_ct, target_ct)
     return Registration(method, T_base_ct, markers, residuals, test, weak, uncertainty)

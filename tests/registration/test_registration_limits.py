@@ -55,7 +55,7 @@ def test_the_expected_error_is_the_noise_times_the_leverage():
 
 
 @pytest.mark.parametrize("side", ["CT", "base"])
-@pytest.mark.parametrize("size", [1.0, 100.0])
+@pytest.mark.parametrize("size", [5.0, 100.0])
 def test_a_hundredth_of_its_length_is_the_least_width_of_a_set(side, size):
     """Narrower is a line, at any size, on either side."""
     thin, wide = cross(size, 0.0098 * size), cross(size, 0.0102 * size)
@@ -72,6 +72,17 @@ def test_five_times_as_wide_is_a_slip_of_unit(ct, base, refused):
             registered(cross(ct), cross(base))
     else:
         assert registered(cross(ct), cross(base)).fre_mm == pytest.approx(3.9)
+
+
+@pytest.mark.parametrize(("size", "refused"), [(0.05, 1), (2.49, 1), (2.51, 0)])
+def test_markers_that_span_less_than_5_mm_are_in_another_unit(size, refused):
+    """Both lists in metres fit each other, with an exit code of 0 and a patient of half a millimetre."""
+    if refused:
+        text = rf"markers a, b, c, d span {2 * size:.2g} mm, .* slip of unit \(m or cm as mm\) on both sides"
+        with pytest.raises(InputError, match=text):
+            registered(cross(size), cross(size))
+    else:
+        assert registered(cross(size), cross(size)).fre_mm == pytest.approx(0, abs=1e-9)
 
 
 def test_a_marker_that_misses_by_more_than_15_mm_is_named():

@@ -7,8 +7,8 @@ from scipy.stats import chi2
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.checks.marker_ambiguity import rigid_rss
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits.marker_ambiguity import rigid_rss
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.registration.residual_test import DOUBT, MIN_FLE_MM, ResidualTest

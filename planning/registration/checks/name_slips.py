@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.registration.checks.marker_ambiguity import Renaming, renamings
 from puncture_twin.planning.registration.checks.touching import place_excluded
+from puncture_twin.planning.registration.fits.marker_ambiguity import Renaming, renamings
 from puncture_twin.planning.registration.registration import Registration
 
 ALLOWED_NAMES = (

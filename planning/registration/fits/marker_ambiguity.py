@@ -46,14 +46,17 @@ class Renaming:
     target_mm: float
     turn: float
 
+    @property
+    def slip(self) -> str:
+        """Which names, in words."""
+        if len(self.names) == 2:
+            return f"{self.names[0]} and {self.names[1]} swapped"
+        return f"{', '.join(self.names)} touched as {', '.join(self.touched_as)}"
+
     def text(self) -> str:
         """Which names, how well they fit, and what would follow."""
-        if len(self.names) == 2:
-            slip = f"{self.names[0]} and {self.names[1]} swapped"
-        else:
-            slip = f"{', '.join(self.names)} touched as {', '.join(self.touched_as)}"
         return (
-            f"{slip} fit with FRE {self.fre_mm:.2f} mm and put the target {self.target_mm:.1f} mm away, "
+            f"{self.slip} fit with FRE {self.fre_mm:.2f} mm and put the target {self.target_mm:.1f} mm away, "
             f"the patient turned by {np.degrees(self.turn):.0f} deg"
         )
 
@@ -67,13 +70,14 @@ class Renamings(NamedTuple):
     """Whether all permutations were tested, or only swaps of two names."""
 
 
-def renamings(markers: MarkerPairs, target_ct: Floats, alike_mm: float) -> Renamings:
+def renamings(markers: MarkerPairs, target_ct: Floats, alike_mm: float, *, moving_mm: float = HARMLESS_MM) -> Renamings:
     """Permutations of the names whose rigid fit has an FRE of at most ``alike_mm``.
 
     Args:
         markers: At least three, matched as the user named them.
         target_ct: Shape (3,), mm.
         alike_mm: The bound, mm.
+        moving_mm: Those that move neither target nor a marker by more, against the fit as named, are left out.
     """
     x, y = (points - points.mean(axis=0) for points in (markers.points_ct, markers.points_base))
     bound = len(markers) * alike_mm**2
@@ -82,7 +86,7 @@ def renamings(markers: MarkerPairs, target_ct: Floats, alike_mm: float) -> Renam
     fitting = _fitting_swaps(x, y, bound) if orders is None else orders[rigid_rss(x, y[orders]) <= bound]
     T_given = fit_rigid(markers.points_ct, markers.points_base)
     found = [_renaming(markers, order, T_given, target_ct) for order in fitting if np.any(order != np.arange(len(x)))]
-    harmful = [renaming for renaming, moved_mm in found if moved_mm > HARMLESS_MM]
+    harmful = [renaming for renaming, moved_mm in found if moved_mm > moving_mm]
     return Renamings(tuple(sorted(harmful, key=lambda one: (-one.target_mm, one.touched_as))), complete)
 
 
