@@ -263,6 +263,7 @@ def test_nothing_safe_is_exit_code_1_with_the_closest_miss(carton, tmp_path, cap
     assert (tmp_path / "out" / "map.png").is_file()
     assert main(["plan", str(other / "case_m.toml"), "--out", str(tmp_path / "plan")]) == ANSWER_IS_NO
     assert "no plan: no candidate is safe" in capfd.readouterr().err
+    assert "Planning failed: no candidate is safe" in (tmp_path / "plan" / "report.html").read_text(encoding="utf-8")
     assert not (tmp_path / "plan" / "plan.json").exists()
 
 

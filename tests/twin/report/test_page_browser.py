@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -205,7 +206,7 @@ def test_choosing_moves_everything(browser, case, candidates):
     """Table, sliders and map all set panel, sliders, command and slices, which say whose they are."""
     point_at(browser, case, candidates, 30, 200, click=True)
     assert browser.evaluate("document.getElementById('command').textContent") == (
-        "run-twin plan ball.toml --theta 30 --beta 200"
+        f"run-twin plan {Path.cwd().resolve()}/ball.toml --theta 30 --beta 200"
     )
     assert browser.evaluate("[document.getElementById('theta').value, document.getElementById('beta').value]") == [
         "30",
@@ -219,7 +220,7 @@ def test_choosing_moves_everything(browser, case, candidates):
         "(() => { const s = document.getElementById('theta'); s.value = 80; s.dispatchEvent(new Event('input')); })()"
     )
     browser.evaluate(slide)
-    assert browser.evaluate("document.getElementById('command').textContent").startswith("run-twin check ball.toml")
+    assert browser.evaluate("document.getElementById('command').textContent").startswith("run-twin check /")
     assert "rejected" in browser.evaluate("document.getElementById('hover').innerText")
 
 

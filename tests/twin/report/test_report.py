@@ -3,7 +3,9 @@
 import json
 import os
 import re
+import shlex
 from dataclasses import replace
+from pathlib import Path as FilePath
 from types import SimpleNamespace
 
 import imageio_ffmpeg
@@ -645,7 +647,26 @@ def test_nothing_safe_is_said_first(anatomy, case, tmp_path):
     write_page(case, anatomy, nothing, None, None, None, tmp_path / "page.html")
     text = visible((tmp_path / "page.html").read_text(encoding="utf-8"))
     assert text.index("Nothing is safe") < text.index("Which directions are safe")
-    assert "skin angle" in text and "No plan was made" in text
+    assert "skin angle" in text and "No plan was requested" in text
+
+
+def test_a_failed_plan_is_none_that_nobody_wanted(anatomy, case, candidates, tmp_path, monkeypatch):
+    """Page and scene tell them apart: the one is red and says why, the other says which command plans."""
+    said = []
+    monkeypatch.setattr(scene_picture.annotate, "write", lambda draw, place, text, **look: said.append(text))
+    pages = {}
+    for name, refusal in (("searched", ""), ("failed", "no approach was found to any of 12 candidates")):
+        parts = (case, anatomy, candidates, None)
+        write_page(*parts, None, None, tmp_path / f"{name}.html", refusal=refusal)
+        draw_scene(*parts, tmp_path / f"{name}.png", failed=bool(refusal))
+        pages[name] = (tmp_path / f"{name}.html").read_text(encoding="utf-8")
+    assert 'class="card bad"' in pages["failed"] and 'class="card bad"' not in pages["searched"]
+    failed, searched = visible(pages["failed"]), visible(pages["searched"])
+    assert failed.count("no approach was found to any of 12 candidates") == 2 and "Planning failed" in failed
+    assert "not requested" not in failed and "searched only" not in failed
+    assert "not requested" in searched and "No plan was requested" in searched and "Planning failed" not in searched
+    told = [text for text in said if "no arm is shown" in text]
+    assert ["no plan was requested" in text for text in told] == [True, False] and "PLANNING FAILED" in told[1]
 
 
 def test_names_from_files_cannot_become_markup(case, candidates, tmp_path):
@@ -676,6 +697,17 @@ def test_the_page_s_map_knows_its_rows(case, candidates):
     rib = int(np.flatnonzero(candidates.verdict.reason == "too_close")[0])
     assert data["structures"][data["structure"][rib]] == "rib_right_9"
     assert data["depth"][rib] == 55.5 and data["details"][data["reason"][rib]] == ("clearance", "mm")
+
+
+def test_the_copied_command_works_from_any_folder(case, candidates, tmp_path, monkeypatch):
+    """The page gives the case's whole path, as a shell takes it, also of a case that was named within its folder."""
+    (tmp_path / "my cases").mkdir()
+    (tmp_path / "my cases" / "ball.toml").write_text("schema = 1")
+    monkeypatch.chdir(tmp_path / "my cases")
+    typed = map_data(case, candidates, best_pick(candidates))["file"]
+    monkeypatch.chdir("/")
+    (word,) = shlex.split(typed)
+    assert FilePath(word).read_text() == "schema = 1"
 
 
 def test_meshes_are_lightened_but_none_is_lost(ball):

@@ -191,7 +191,7 @@ def _answered(run: Run, out: Path) -> Run:
         NoAnswerError: It has none.
     """
     if run.plan is None:
-        raise NoAnswerError(f"{run.refusal}; see {out / 'report.html'}", counts=run.candidates.counts())
+        raise NoAnswerError(f"{NO_PLAN}{run.refusal}; see {out / 'report.html'}", counts=run.candidates.counts())
     return run
 
 
@@ -298,7 +298,7 @@ def _planned(run: Run, out: Path, choice: Choice) -> Run:
             chosen = choose(context, run.candidates, choice)
             plan, found, row = make_plan(context, chosen.candidates, seed=context.case.rehearsal.seed, rows=chosen.rows)
     except NoAnswerError as error:
-        return replace(run, refusal=f"{NO_PLAN}{str(error).removeprefix(NO_PLAN)}")
+        return replace(run, refusal=str(error).removeprefix(NO_PLAN))
     write_plan(plan, out / "plan.json")
     run = replace(run, plan=plan, pick=Pick(found, row), candidates=found if choice.of_grid else run.candidates)
     return run.with_files(out / "plan.json")

@@ -48,7 +48,7 @@ def draw_pictures(run: Run, out: Path) -> Drawn:
     with stages.time("map"):
         draw_map(found, case, out / "map.png", run.pick)
     with stages.time("scene"):
-        draw_scene(case, anatomy, found, run.plan, out / "scene.png", run.pick)
+        draw_scene(case, anatomy, found, run.plan, out / "scene.png", run.pick, failed=bool(run.refusal))
     with stages.time("slices"):
         slices = _slices(run)
         if slices:
@@ -79,6 +79,7 @@ def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
             pick=run.pick,
             slices=drawn.slices,
             facts=run.facts,
+            refusal=run.refusal,
         )
     return run.with_files(*drawn.files, out / PAGE)
 

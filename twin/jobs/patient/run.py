@@ -39,7 +39,11 @@ class RoomCount(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What a command has done so far, and the files that it wrote."""
+    """What a command has done so far, and the files that it wrote.
+
+    Attributes:
+        refusal: Why there is no plan although the command makes one; "" where it makes none.
+    """
 
     context: CaseContext
     candidates: Candidates

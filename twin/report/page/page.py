@@ -68,6 +68,7 @@ def write_page(
     pick: Pick | None = None,
     slices: Sequence[Slices] = (),
     facts: EntryFacts | None = None,
+    refusal: str = "",
 ) -> None:
     """Write the page.
 
@@ -84,6 +85,7 @@ def write_page(
         pick: The planned candidate, or the one to be shown; None shows the best.
         slices: What is shown in the CT, the first at once, the others where they are chosen.
         facts: How the planned or shown path is found at the patient.
+        refusal: Why there is no plan although one was requested; "" where none was.
     """
     pick = pick or best_pick(candidates)
     doubt = None if uncertainty is None else uncertainty.doubt
@@ -100,10 +102,10 @@ def write_page(
         methods=methods_text(case, anatomy, candidates),
         notice=TRUTH_IS_BELIEF if rehearsal is not None and rehearsal.truth_is_belief else "",
         refused=_refused(candidates),
-        cards=_cards(candidates, pick, plan, rehearsal, doubt),
+        cards=_cards(candidates, pick, plan, rehearsal, doubt, refusal),
         counts=tables.counts_table(candidates),
         best=tables.best_table(candidates),
-        plan=tables.plan_section(plan, () if facts is None else facts.rows()),
+        plan=tables.plan_section(plan, () if facts is None else facts.rows(), refusal),
         registration=tables.registration_section(registration, plan),
         rehearsal=tables.rehearsal_section(rehearsal, demanding(anatomy), film),
         warnings=tables.warnings_section(anatomy.warnings),
@@ -155,7 +157,12 @@ def _refused(candidates: Candidates) -> str:
 
 
 def _cards(
-    candidates: Candidates, pick: Pick | None, plan: Any | None, rehearsal: Any | None, doubt: Doubt | None
+    candidates: Candidates,
+    pick: Pick | None,
+    plan: Any | None,
+    rehearsal: Any | None,
+    doubt: Doubt | None,
+    refusal: str,
 ) -> list[Card]:
     safe = int(candidates.safe.sum())
     if safe == 0:
@@ -173,7 +180,11 @@ def _cards(
     if not candidates.arm_checked:
         cards.append(Card("arm", "not checked", candidates.arm_note.removeprefix("not checked: ")))
     if plan is None:
-        cards.append(Card("plan", "none", "the arm's motion was not planned or not found"))
+        cards.append(
+            Card("plan", "failed", refusal, bad=True)
+            if refusal
+            else Card("plan", "not requested", tables.NOT_REQUESTED)
+        )
     if rehearsal is not None:
         touched = len(rehearsal.contacts)
         detail = f"{touched} contact{'s' if touched != 1 else ''}" if touched else "no contact"

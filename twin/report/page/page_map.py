@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import shlex
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -80,7 +81,7 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None) -> dict[str, 
         "reachable": candidates.arm.reachable.tolist(),
         "outward": _rounded(candidates.outward_ct.ravel(), 5),
         "outcome": "plan" if candidates.arm_checked else "check",
-        "file": shlex.quote(case.path.name),
+        "file": _typed(case.path),
         "picked": -1 if pick is None or pick.candidates is not candidates else pick.row,
         "best": [window.best for window in windows.windows[:MOST_WINDOWS]],
         "window": windows.of_row.tolist(),
@@ -91,6 +92,11 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None) -> dict[str, 
         "not_seen": NOT_SEEN,
         **_chances(candidates),
     }
+
+
+def _typed(path: Path) -> str:
+    """A file as a shell takes it, from whatever folder; a link keeps its name, for its folder is what counts."""
+    return shlex.quote(str(path.parent.resolve() / path.name))
 
 
 def _chances(candidates: Candidates) -> dict[str, Any]:

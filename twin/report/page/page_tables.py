@@ -182,11 +182,22 @@ def _value(value: Any, unit: str, digits: int) -> str:
     return str(value)
 
 
-def plan_section(plan: Any | None, at_patient: Iterable[tuple[str, str]] = ()) -> Markup:
-    """The plan's numbers, and how its path, or that of the best direction, is found at the patient."""
+NOT_REQUESTED = "this run searched only; the plan command plans the arm's motion"
+"""Where no plan was made because nobody wanted one."""
+
+
+def plan_section(plan: Any | None, at_patient: Iterable[tuple[str, str]] = (), refusal: str = "") -> Markup:
+    """The plan's numbers, or why there is none, and how its path, or that of the best direction, is found.
+
+    Args:
+        plan: The plan, or None.
+        at_patient: Names and values for whoever stands at the patient.
+        refusal: Why there is no plan although one was requested; "" where none was.
+    """
     if plan is None:
         best = (("path of the best direction", ""), *at_patient)
-        return Markup("<p>No plan was made.</p>{}").format(pairs(best) if len(best) > 1 else "")
+        why = listed([f"Planning failed: {refusal}"]) if refusal else faint(f"No plan was requested: {NOT_REQUESTED}.")
+        return why + (pairs(best) if len(best) > 1 else "")
     rows = [
         ("direction", f"θ {np.degrees(plan.theta):g}°, β {np.degrees(plan.beta):g}°"),
         ("arm", str(plan.model.name)),

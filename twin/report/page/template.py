@@ -28,11 +28,12 @@ PACKED = 6
 
 
 class Card(NamedTuple):
-    """One of the boxes below a page's title: plain texts."""
+    """One of the boxes below a page's title: plain texts, and whether it tells of a failure."""
 
     name: str
     value: str
     detail: str
+    bad: bool = False
 
 
 def write_html(template: str, path: Path, **parts: object) -> None:

@@ -53,7 +53,14 @@ NOTHING_RADIUS_MM = 90.0
 
 
 def draw_scene(
-    case: Any, anatomy: Any, candidates: Candidates, plan: Any | None, path: Path, pick: Pick | None = None
+    case: Any,
+    anatomy: Any,
+    candidates: Candidates,
+    plan: Any | None,
+    path: Path,
+    pick: Pick | None = None,
+    *,
+    failed: bool = False,
 ) -> None:
     """Write the picture of the scene.
 
@@ -64,6 +71,7 @@ def draw_scene(
         plan: The plan, or None: then there is no arm, and the needle is that of the best candidate.
         path: The PNG to write; it appears whole or not at all.
         pick: The planned candidate, or the one to be shown; None shows the best.
+        failed: Whether a plan was requested, and there is none.
     """
     pick = pick or best_pick(candidates)
     T_base_ct = None if plan is None else plan.T_base_ct
@@ -83,7 +91,7 @@ def draw_scene(
     near = _close_camera(case, bodies, path_ct)
     few = [body for body in bodies if body.name != "needle holder" and body.group not in HIDDEN_NEARBY]
     _view(image, draw, few, near, RIGHT_BOX, case, "Close-up of the path", needle)
-    bottom = _text(draw, case, candidates, plan, bool(arm), bodies, pick)
+    bottom = _text(draw, case, candidates, plan, bool(arm), bodies, pick, failed)
     image = image.crop((0, 0, WIDTH, min(HEIGHT, round(bottom) + 8)))
     with atomic(Path(path)) as temporary:
         image.save(temporary, format="PNG", compress_level=palette.PNG_LEVEL)
@@ -176,6 +184,7 @@ def _text(
     arm: bool,
     bodies: Sequence[SceneBody],
     pick: Pick | None,
+    failed: bool,
 ) -> float:
     """Everything around the views; returns the row below the legend."""
     annotate.write(draw, (18, 12), f"{case.name}: needle path to {target_text(case)}", size=28, bold=True)
@@ -183,7 +192,7 @@ def _text(
     if nothing:
         text, colour = "NOTHING IS SAFE: every direction is refused; no needle is shown", annotate.RED
     else:
-        text, colour = _path_text(plan, pick), annotate.FAINT
+        text, colour = _path_text(plan, pick, failed), annotate.RED if failed else annotate.FAINT
     annotate.write(draw, (18, 50), text, size=18, bold=nothing, colour=colour)
     items = [("target", palette.TARGET_POINT), (needle_text(case.needle), palette.NEEDLE)]
     if candidates.safe.any():
@@ -207,7 +216,7 @@ def _see_through(body: SceneBody) -> str:
     return body.name + (" (see-through)" if body.alpha < 1 else "")
 
 
-def _path_text(plan: Any | None, pick: Pick | None) -> str:
+def _path_text(plan: Any | None, pick: Pick | None, failed: bool) -> str:
     if plan is not None:
         theta, beta = np.degrees(plan.theta), np.degrees(plan.beta)
         length = float(np.linalg.norm(plan.entry_ct - plan.target_ct))
@@ -219,7 +228,9 @@ def _path_text(plan: Any | None, pick: Pick | None) -> str:
     if pick is not None:
         name, clearance = nearest_structure(*pick)
         text += f", nearest {name.replace('_', ' ')} {number(clearance, 1, 'mm')}" if name else ""
-    return text + ("" if plan is not None else "  (no plan: the arm is not shown)")
+    if plan is not None:
+        return text
+    return text + ("  PLANNING FAILED: no arm is shown" if failed else "  (no plan was requested: no arm is shown)")
 
 
 MOST_ENTRIES = 26
