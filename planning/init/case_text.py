@@ -43,7 +43,7 @@ role = "skin"
 REGISTRATION = """
 # Markers, for the arm: the same names as the robot touched them go into markers_base.
 # [registration]
-# markers_ct = {ct}
+# markers_ct = {ct}  # {space}
 # markers_base = {base}
 """
 END = """
@@ -98,7 +98,7 @@ def case_text(parts: CaseParts) -> str:
     skin = "" if parts.ct is None else SKIN_OF_CT.format(ct=quoted(parts.ct))
     count = sum(row.kind != "ignore" for row in parts.rows) + (parts.ct is not None)
     sections = "\n".join(segmentation.section(rows) for segmentation, rows in parts.sources)
-    return head + skin + sections + _markers_text(parts.markers) + END.format(count=count)
+    return head + skin + sections + _markers_text(parts.markers, parts.space) + END.format(count=count)
 
 
 def case_name(folder: str) -> str:
@@ -107,10 +107,11 @@ def case_name(folder: str) -> str:
     return plain or "case"
 
 
-def _markers_text(markers: Sequence[Markers]) -> str:
+def _markers_text(markers: Sequence[Markers], space: Space) -> str:
     if not markers:
         return ""
     base = next(
         (one.source for one in markers[1:] if set(one.points.names) == set(markers[0].points.names)), "touch.csv"
     )
-    return REGISTRATION.format(ct=quoted(markers[0].source), base=quoted(base))
+    own = "its file says its space" if markers[0].source.endswith(".json") else f"read in {space}, the case's space"
+    return REGISTRATION.format(ct=quoted(markers[0].source), base=quoted(base), space=own)

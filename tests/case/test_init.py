@@ -529,7 +529,7 @@ def test_the_unit_of_meshes_is_guessed_and_told(tmp_path, capfd, unit, scale):
     mesh = prepare(tmp_path, arm=False).anatomy.structure("aorta").mesh
     assert np.ptp(mesh.bounds[:, 0]) == pytest.approx(16.0, abs=0.3)
     text = (tmp_path / "case.toml").read_text()
-    assert '# markers_ct = "points.csv"' in text
+    assert '# markers_ct = "points.csv"  # read in LPS, the case\'s space' in text
     assert not re.search(r"^\[registration\]", text, re.MULTILINE)
     stated = init(capfd, tmp_path, "--target", TARGET, "--force", "--unit", unit)
     assert stated[0] == 0 and any("as stated" in line for line in stated[2])
