@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.beyond_labels import beyond_labels
 from puncture_twin.planning.anatomy.body.support import support_warnings
-from puncture_twin.planning.anatomy.scan import Scan
+from puncture_twin.planning.anatomy.scan import Outside, Scan
 from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.sources import StructureSources
@@ -75,6 +75,7 @@ class Anatomy:
         surroundings: Solids outside of the body: what the CT shows there, obstacles, the gantry.
         scan: The CT of the case, or None.
         ignored: Names of labels that the case leaves out on purpose.
+        couch: What lies beyond what the body lies on in the CT, or None where no CT shows it.
     """
 
     structures: tuple[Structure, ...]
@@ -83,6 +84,7 @@ class Anatomy:
     surroundings: tuple[Structure, ...] = ()
     scan: Scan | None = None
     ignored: tuple[str, ...] = ()
+    couch: TriangleMesh | None = None
 
     @property
     def checked(self) -> tuple[Structure, ...]:
@@ -123,11 +125,13 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     _check_demands(case, structures)
     structures.extend(own_target(case))
     outside: tuple[Structure, ...] = ()
+    couch: TriangleMesh | None = None
     scan, left_out = loader.scan(case.skin_section, skin), loader.unnamed_warnings()
     if scan is None:
         loader.warnings.append(OUTSIDE_NOT_KNOWN)
     else:
-        outside = _outside(case, scan, loader.warnings)
+        shown = scan.outside(case.ct.air_hu)
+        outside, couch = _outside(case, scan, shown, loader.warnings), shown.couch
         if (fraction := scan.air_in_skin()) > MOST_AIR:
             loader.warnings.append(CT_SHIFTED.format(name=scan.name, fraction=fraction))
         if any(structure.name == ATTACHED_LIMB for structure in outside):
@@ -142,12 +146,11 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     warnings = [*loader.warnings, *beyond.warnings, *left_out, *skin.warnings]
     for structure in (one for one in structures if one.source != OWN_TARGET):  # the ball is ours
         warnings.extend(kept_mesh_warnings(structure.mesh, structure.name, cache.memory))
-    return Anatomy(tuple(structures), skin, tuple(warnings), outside, scan, tuple(loader.ignored))
+    return Anatomy(tuple(structures), skin, tuple(warnings), outside, scan, tuple(loader.ignored), couch)
 
 
-def _outside(case: Case, scan: Scan, warnings: list[str]) -> tuple[Structure, ...]:
+def _outside(case: Case, scan: Scan, outside: Outside, warnings: list[str]) -> tuple[Structure, ...]:
     """What the CT shows outside of the body that is not air, and limbs that are pressed against it."""
-    outside = scan.outside(case.ct.air_hu)
     warnings.extend(support_warnings(outside.supported, outside.open_faces))
     found = ((OUTSIDE_BODY, outside.mesh), (ATTACHED_LIMB, scan.attached_limbs(case.target_ct)))
     return tuple(
@@ -176,6 +179,16 @@ def load_skin(case: Case, cache: Cache = NO_CACHE) -> Skin:
         InputError: A file that cannot be trusted.
     """
     return StructureSources(case, lambda _: None, cache).skin(case.skin_section)
+
+
+def load_couch(case: Case, skin: Skin, cache: Cache = NO_CACHE) -> TriangleMesh | None:
+    """What lies beyond what the body lies on in the case's CT, as `Anatomy.couch`.
+
+    Raises:
+        InputError: A CT that cannot be trusted, or does not show the target.
+    """
+    scan = StructureSources(case, lambda _: None, cache).scan(case.skin_section, skin)
+    return None if scan is None else scan.outside(case.ct.air_hu).couch
 
 
 def _check_count(case: Case, structures: list[Structure]) -> None:

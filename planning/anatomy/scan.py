@@ -51,13 +51,18 @@ class Outside(NamedTuple):
 
     Attributes:
         mesh: The surface of what is not known to be free, LPS mm; None for air alone.
-        supported: Whether the image shows what the body lies on.
+        couch: What lies beyond the far side of what the body lies on, where the image shows that; else None. Closed.
         open_faces: Faces of the image near the body, beyond which nothing is known.
     """
 
     mesh: TriangleMesh | None
-    supported: bool
+    couch: TriangleMesh | None
     open_faces: tuple[tuple[int, int], ...]
+
+    @property
+    def supported(self) -> bool:
+        """Whether the image shows what the body lies on."""
+        return self.couch is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +93,7 @@ class Scan:
 
         solids, supports, *faces = self._kept({"what": "outside", "air_hu": air_hu}, make)
         open_faces = tuple(face for face, box in zip(FACES, faces, strict=True) if box is not None)
-        return Outside(_joined([solids, supports, *faces]), supports is not None, open_faces)
+        return Outside(_joined([solids, supports, *faces]), supports, open_faces)
 
     def _outside_meshes(self, image: OutsideImage, mask: Bools) -> list[TriangleMesh | None]:
         """What is outside of the body, what lies beyond tables, and what beyond each open face."""

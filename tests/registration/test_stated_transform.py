@@ -10,6 +10,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.geometry.rigid import apply, exp_twist, inverse
 from puncture_twin.planning.registration.checks.checked_placement import placement_findings
+from puncture_twin.planning.registration.checks.marker_list import Surroundings
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.jobs.patient.answers import registration_report
 
@@ -69,7 +70,7 @@ def test_it_is_an_input_and_says_that_nothing_is_known_of_its_error(tmp_path):
     case = load_case(stating(tmp_path))
     assert ("transform", "ct_to_robot.tfm") in [(one.role, one.path) for one in case.inputs]
     said = "stated transform ct_to_robot.tfm: no residuals, expected error unknown"
-    (line,) = placement_findings(case, load_skin(case), load_placement(case)).warnings
+    (line,) = placement_findings(case, Surroundings(load_skin(case), None), load_placement(case)).warnings
     assert line.startswith(f"registration: {said} (markers_ct and markers_base beside it measure it)")
     placement = load_placement(case)
     assert placement.registration is None and np.isnan(placement.target_error_mm)

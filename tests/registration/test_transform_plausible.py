@@ -12,6 +12,7 @@ from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.tables.registration_section import other_readings
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, pose
 from puncture_twin.planning.registration.checks.checked_placement import placement_findings
+from puncture_twin.planning.registration.checks.marker_list import Surroundings
 from puncture_twin.planning.registration.checks.stated_transform import check_transform, markers_beside
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.placement import load_placement
@@ -166,7 +167,7 @@ def test_markers_that_agree_are_named_with_their_distance(tmp_path):
     path = stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 0.2) + "fle_mm = 0.5\n")
     assert warnings_of(path) == []
     case = load_case(path)
-    (line, *_) = placement_findings(case, load_skin(case), load_placement(case)).notes
+    (line, *_) = placement_findings(case, Surroundings(load_skin(case), None), load_placement(case)).notes
     assert "no residuals" not in line and "0.2 mm from where the stated transform puts it" in line
     assert line.endswith("its own expected error is unknown") and "more than" not in line
     with pytest.raises(InputError, match=r"placed by the transform t\.tfm; .*0\.2 mm from where the stated transform"):

@@ -13,11 +13,10 @@ from types import MappingProxyType
 import numpy as np
 from scipy.special import fdtri
 
-from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.registration.checks.marker_list import MarkerList, Signs, marker_list
+from puncture_twin.planning.registration.checks.marker_list import MarkerList, Signs, Surroundings, marker_list
 from puncture_twin.planning.registration.checks.skin_fit import SkinFit
 from puncture_twin.planning.registration.registration import Registration
 
@@ -44,20 +43,23 @@ EXCLUDING_DOUBT = 0.001
 
 
 def check_axes(
-    case: Case, skin: Skin, registration: Registration, given: MarkerList, cache: Cache = NO_CACHE
+    case: Case, around: Surroundings, registration: Registration, given: MarkerList, cache: Cache = NO_CACHE
 ) -> tuple[str, ...]:
     """Compare the given list with its half turns; returns warnings, one sentence each.
 
     Raises:
         InputError: The list lies on the skin, or where it can be touched, only after a half turn.
     """
-    slips = {name: marker_list(case, skin, registration, signs, cache) for name, signs in HALF_TURNS.items()}
+    slips = {name: marker_list(case, around, registration, signs, cache) for name, signs in HALF_TURNS.items()}
     likely = {name: slip for name, slip in slips.items() if _explains(slip, given)}
     if likely:
-        name = min(likely, key=lambda name: likely[name].fit.scatter_mm)
+        best = min(likely.values(), key=lambda slip: slip.fit.scatter_mm)
+        alike = {name: one for name, one in likely.items() if not _excluded(one, best)}
+        fits = ", or ".join(
+            f"with {name} they lie on the skin to {one.fit.scatter_mm:.1f} mm (rms)" for name, one in alike.items()
+        )
         raise InputError(
-            f"markers_ct look like coordinates of other axes: with {name} they lie on the skin to "
-            f"{likely[name].fit.scatter_mm:.1f} mm (rms), as given {_as_given(registration, given, likely[name])}",
+            f"markers_ct look like coordinates of other axes: {fits}, as given {_as_given(registration, given, best)}",
             where=f"{case.path}: registration",
             allowed="markers_ct in the axes (LPS, RAS) that the case or their file states",
         )
@@ -71,8 +73,11 @@ def check_axes(
 
 
 def _explains(slip: MarkerList, given: MarkerList) -> bool:
-    """Whether the given list is likely the other one, slipped."""
-    return slip.plausible and (_worse(given.fit, slip.fit, doubt=REFUSING_DOUBT) or bool(given.behind))
+    """Whether the given list is likely the other one, slipped: off the skin, or on it where no needle touches it."""
+    if not slip.plausible:
+        return False
+    hidden = bool(given.behind) and not _worse(slip.fit, given.fit, doubt=REFUSING_DOUBT)
+    return hidden or _worse(given.fit, slip.fit, doubt=REFUSING_DOUBT)
 
 
 def _excluded(slip: MarkerList, given: MarkerList) -> bool:
@@ -97,5 +102,5 @@ def _worse(fit: SkinFit, other: SkinFit, *, doubt: float) -> bool:
 def _as_given(registration: Registration, given: MarkerList, slip: MarkerList) -> str:
     if _worse(given.fit, slip.fit, doubt=REFUSING_DOUBT):
         return f"to {given.fit.scatter_mm:.1f} mm"
-    row, obstacle = given.behind[0]
-    return f"{registration.markers.names[row]} lies behind obstacle '{obstacle}', where no needle touches it"
+    row, before = given.behind[0]
+    return f"{registration.markers.names[row]} lies behind {before}, where no needle touches it"

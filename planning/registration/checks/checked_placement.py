@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from puncture_twin.planning.anatomy.anatomy import load_skin
-from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.anatomy.anatomy import load_couch, load_skin
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.registration.checks.base_place import OF_MARKERS, OF_MOUNT, place_warnings
 from puncture_twin.planning.registration.checks.marker_check import MarkerFindings, check_markers
+from puncture_twin.planning.registration.checks.marker_list import Surroundings
 from puncture_twin.planning.registration.checks.stated_transform import check_transform, markers_beside
 from puncture_twin.planning.registration.placement import Placement, load_placement
 
@@ -25,15 +25,19 @@ def checked_placement(case: Case, cache: Cache) -> CheckedPlacement | None:
     """Where the patient lies for the robot, with its markers checked; None where the case does not say it.
 
     Raises:
-        InputError: As `load_placement` and `placement_findings`, or a skin that cannot be read.
+        InputError: As `load_placement` and `placement_findings`, or a skin or CT that cannot be read.
     """
     placement = load_placement(case)
     if placement is None:
         return None
-    return CheckedPlacement(placement, placement_findings(case, load_skin(case, cache), placement, cache))
+    skin = load_skin(case, cache)
+    around = Surroundings(skin, load_couch(case, skin, cache))
+    return CheckedPlacement(placement, placement_findings(case, around, placement, cache))
 
 
-def placement_findings(case: Case, skin: Skin, placement: Placement, cache: Cache = NO_CACHE) -> MarkerFindings:
+def placement_findings(
+    case: Case, around: Surroundings, placement: Placement, cache: Cache = NO_CACHE
+) -> MarkerFindings:
     """Check what places the robot: the markers, a mount, or a stated transform and the markers beside it.
 
     However it is stated, what physics says of the place of the base is told (`base_place`).
@@ -44,8 +48,9 @@ def placement_findings(case: Case, skin: Skin, placement: Placement, cache: Cach
     Raises:
         InputError: As `check_markers` and `check_transform`.
     """
+    skin = around.skin
     if placement.registration is not None:
-        found = check_markers(case, skin, placement.registration, cache)
+        found = check_markers(case, around, placement.registration, cache)
         place = place_warnings(case, skin.mesh, placement.T_base_ct, OF_MARKERS)
         return MarkerFindings((*place, *found.warnings), found.notes)
     if case.robot.stated is None:
@@ -55,5 +60,5 @@ def placement_findings(case: Case, skin: Skin, placement: Placement, cache: Cach
     if registration is None:
         return said
     weak = tuple(f"registration: {flag}" for flag in registration.flags)
-    own = check_markers(case, skin, registration, cache)
+    own = check_markers(case, around, registration, cache)
     return MarkerFindings((*said.warnings, *weak, *own.warnings), (*said.notes, *own.notes))

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.checks.axis_slips import check_axes
-from puncture_twin.planning.registration.checks.marker_list import marker_list
+from puncture_twin.planning.registration.checks.marker_list import Surroundings, marker_list
 from puncture_twin.planning.registration.checks.name_slips import check_names
 from puncture_twin.planning.registration.checks.off_the_skin import off_the_skin
 from puncture_twin.planning.registration.registration import Registration
@@ -31,7 +30,9 @@ class MarkerFindings(NamedTuple):
     """What no markers can show."""
 
 
-def check_markers(case: Case, skin: Skin, registration: Registration, cache: Cache = NO_CACHE) -> MarkerFindings:
+def check_markers(
+    case: Case, around: Surroundings, registration: Registration, cache: Cache = NO_CACHE
+) -> MarkerFindings:
     """Check a registration's markers against permuted names, half turns, skin and couch.
 
     How the markers lie on the skin depends on no target: ``cache`` keeps it.
@@ -40,9 +41,9 @@ def check_markers(case: Case, skin: Skin, registration: Registration, cache: Cac
         InputError: Names that fit much better permuted, or as well where nothing tells them apart; a list that lies on
             the skin only after a half turn.
     """
-    names = check_names(case, skin, registration)
-    given = marker_list(case, skin, registration, cache=cache)
+    names = check_names(case, around.skin, registration)
+    given = marker_list(case, around, registration, cache=cache)
     local = case.space is Space.LOCAL
-    axes = () if local else check_axes(case, skin, registration, given, cache)
+    axes = () if local else check_axes(case, around, registration, given, cache)
     warnings = (*names, *axes, *off_the_skin(registration, given))
     return MarkerFindings(warnings, (LOCAL_AXES, BASE_AXES) if local else (BASE_AXES,))

@@ -15,8 +15,7 @@ def off_the_skin(registration: Registration, given: MarkerList) -> tuple[str, ..
     gaps = zip(names, np.abs(given.fit.gaps_mm), strict=True)
     far = [f"{name} ({gap:.0f} mm)" for name, gap in gaps if gap > MARKER_ON_SKIN_MM]
     behind = tuple(
-        f"marker {names[row]} lies behind obstacle '{obstacle}': no needle can touch it there"
-        for row, obstacle in given.behind
+        f"marker {names[row]} lies behind {before}: no needle can touch it there" for row, before in given.behind
     )
     if not far:
         return behind

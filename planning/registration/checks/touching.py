@@ -11,6 +11,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.crossings import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 
@@ -68,25 +69,40 @@ def _column_ct(case: Case, T_base_ct: Floats) -> Floats:
     return apply(np.linalg.inv(T_base_ct), np.stack([np.zeros(3), case.robot.model.shoulder_base]))
 
 
-def untouchable(case: Case, points_ct: Floats, normals_ct: Floats) -> tuple[tuple[int, str], ...]:
-    """Which points no needle can have touched, because a box of the CT frame lies before them on all sides.
+COUCH = "the couch that the CT shows"
+
+
+def untouchable(
+    case: Case, points_ct: Floats, normals_ct: Floats, couch: TriangleMesh | None = None
+) -> tuple[tuple[int, str], ...]:
+    """Which points no needle can have touched: a box of the CT frame, or its couch, lies before them on all sides.
 
     Args:
         case: For needle and obstacles.
         points_ct: Shape (n, 3), mm.
         normals_ct: Shape (n, 3), unit vectors out of the skin there.
+        couch: What lies beyond what the patient lies on, closed, or None.
 
     Returns:
-        Row and name of the obstacle that is before it.
+        Row, and in words what is before it.
     """
-    boxes = _boxes_ct(case)
-    if not boxes or not len(points_ct):
+    boxes, length = _boxes_ct(case), case.needle.length_mm
+    if (not boxes and couch is None) or not len(points_ct):
         return ()
     directions = _cones(normals_ct)
-    blocked = np.stack([_intersects(box, points_ct[:, None], directions, case.needle.length_mm) for box in boxes])
+    blocks = {f"obstacle '{box.name}'": _intersects(box, points_ct[:, None], directions, length) for box in boxes}
+    if couch is not None:
+        blocks[COUCH] = _crosses(couch, points_ct, directions, length)
+    blocked, names = np.stack([*blocks.values()]), [*blocks]
     before_most = blocked.sum(axis=2).argmax(axis=0)
     rows = np.flatnonzero(np.all(np.any(blocked, axis=0), axis=1))
-    return tuple((int(row), boxes[before_most[row]].name) for row in rows)
+    return tuple((int(row), names[before_most[row]]) for row in rows)
+
+
+def _crosses(mesh: TriangleMesh, points: Floats, directions: Floats, length_mm: float) -> NDArray[np.bool_]:
+    """Which segments from points (n, 3) along directions (n, k, 3) cross a surface, shape (n, k)."""
+    rays = [crossings(mesh, point, some, length_mm).count > 0 for point, some in zip(points, directions, strict=True)]
+    return np.stack(rays)
 
 
 def touchable_points(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> Floats:

@@ -6,6 +6,7 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.registration.checks.checked_placement import placement_findings
+from puncture_twin.planning.registration.checks.marker_list import Surroundings
 from puncture_twin.planning.registration.placement import Placement
 
 
@@ -18,5 +19,5 @@ def marker_warnings(case: Case, anatomy: Anatomy, placement: Placement | None, c
     if placement is None:
         return ()
     weak = () if placement.registration is None else placement.registration.flags
-    found = placement_findings(case, anatomy.skin, placement, cache)
+    found = placement_findings(case, Surroundings(anatomy.skin, anatomy.couch), placement, cache)
     return (*(f"registration: {flag}" for flag in weak), *found.warnings)
