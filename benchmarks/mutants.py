@@ -68,7 +68,12 @@ PLAIN = MappingProxyType(
             "tests/anatomy/test_skin_entry.py",
             "tests/search/test_constraints.py",
         ),
-        "puncture_twin.planning.reach.standoff": tuple(f"tests/reach/test_standoff.py::{name}" for name in STANDOFF),
+        **{
+            f"puncture_twin.planning.reach.{module}": tuple(
+                f"tests/reach/test_standoff.py::{test}" for test in STANDOFF
+            )
+            for module in ("standoff", "skin_gap", "axis_lengths")
+        },
         "puncture_twin.planning.geometry.containment": ("tests/geometry/test_containment.py",),
         "puncture_twin.planning.search.constraints": ("tests/search/test_verdict_order.py",),
         "puncture_twin.planning.registration.marker_pairs": REGISTRATION,

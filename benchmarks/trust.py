@@ -27,13 +27,13 @@ from scipy.special import chdtri, fdtri
 
 from benchmarks.scenes import DATA
 from puncture_twin.meshes import folder
-from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.kinematics import farthest_from_singular
+from puncture_twin.planning.arm.needle_line import flange_poses
+from puncture_twin.planning.arm.singularity import farthest_from_singular
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.reach.standoff import axis_lengths
+from puncture_twin.planning.reach.axis_lengths import axis_lengths
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty

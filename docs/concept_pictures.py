@@ -22,7 +22,7 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.tables.structures_section import AIR_HU
 from puncture_twin.planning.collision.bodies.sphere_tree import sphere_tree
 from puncture_twin.planning.plan.plan_document import read_plan
-from puncture_twin.planning.reach.standoff import skin_gaps
+from puncture_twin.planning.reach.skin_gap import skin_gaps
 from puncture_twin.planning.registration.checks.skin_fit import skin_fit
 from puncture_twin.twin.phantoms import supine
 from puncture_twin.twin.phantoms.ct_image import rendered

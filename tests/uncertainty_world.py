@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from places import ROOT
 
-from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.kinematics import farthest_from_singular
+from puncture_twin.planning.arm.needle_line import flange_poses
+from puncture_twin.planning.arm.singularity import farthest_from_singular
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.tables.errors_section import ErrorsSection

@@ -1,18 +1,5 @@
 from .gantry import gantry_boxes as gantry_boxes
-from .insertion import (
-    MIN_SINGULARITY as MIN_SINGULARITY,
-    NeedleLine as NeedleLine,
-    away_from_singularities as away_from_singularities,
-    every_branch as every_branch,
-    fill_branch_path as fill_branch_path,
-    first_stop as first_stop,
-    flange_at as flange_at,
-    flange_poses as flange_poses,
-    needle_lines as needle_lines,
-    reach_margin as reach_margin,
-    survey as survey,
-    why_unreachable as why_unreachable,
-)
+from .insertion import first_stop as first_stop, reach_margin as reach_margin
 from .inverse_kinematics import (
     N_BRANCHES as N_BRANCHES,
     inverse as inverse,
@@ -25,7 +12,6 @@ from .kinematics import (
     jacobian as jacobian,
     link_frames as link_frames,
     link_poses as link_poses,
-    singularity as singularity,
 )
 from .links import (
     LINK_NAMES as LINK_NAMES,
@@ -37,6 +23,12 @@ from .links import (
 from .model_urdf import (
     T_BASE_URDFBASE as T_BASE_URDFBASE,
     model_urdf as model_urdf,
+)
+from .needle_line import NeedleLine as NeedleLine, flange_poses as flange_poses, needle_lines as needle_lines
+from .singularity import (
+    MIN_SINGULARITY as MIN_SINGULARITY,
+    away_from_singularities as away_from_singularities,
+    singularity as singularity,
 )
 from .tool import Box as Box, Tool as Tool
 from .ur import JOINT_NAMES as JOINT_NAMES, UrModel as UrModel, ur_model as ur_model

@@ -1,4 +1,4 @@
-"""Forward kinematics of the UR arms: frames of the links, the Jacobian, and the distance from singularities.
+"""Forward kinematics of the UR arms: frames of the links, and the Jacobian.
 
 The base frame is the controller's (a URDF's ``base_link`` is rotated by 180 deg about z against it). Frames follow
 Denavit and Hartenberg: T_{i-1}_{i} = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i). Compiled loops take an arm as its lengths
@@ -8,22 +8,12 @@ Denavit and Hartenberg: T_{i-1}_{i} = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i). Compi
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
-
-TIE_DIGITS = 9
-"""Distances from singular that agree to so many digits are equal: mirrored branches and rolls are, but for rounding."""
-
-ELBOW = 2
-"""The row of `link_poses` whose origin is the elbow: where the upper arm ends."""
-
-ELBOW_DIGITS = 6
-"""The same of its place, mm: it does not move with the roll."""
 
 
 def _rows(q: Floats) -> Floats:
@@ -113,75 +103,3 @@ def jacobians(frames, J):  # type: ignore[no-untyped-def]  # numba infers
                 lever_j, lever_k = flange[j, 3] - frame[j, 3], flange[k, 3] - frame[k, 3]
                 J[row, i, joint] = frame[j, 2] * lever_k - frame[k, 2] * lever_j
                 J[row, 3 + i, joint] = frame[i, 2]
-
-
-class Singularity(NamedTuple):
-    """How far a configuration is from the three singularities of a UR arm; each 0 (singular) to 1. Shapes (...)."""
-
-    shoulder: Floats
-    """In-plane distance of the wrist centre from axis 1, over the longest possible."""
-    elbow: Floats
-    """|sin q3|."""
-    wrist: Floats
-    """|sin q5|."""
-
-    def least(self) -> Floats:
-        """The smallest of the three, shape (...)."""
-        return np.minimum(np.minimum(self.shoulder, self.elbow), self.wrist)
-
-    @property
-    def nearest(self) -> str:
-        """Name of the nearest one, for a single configuration."""
-        return min(self._fields, key=lambda name: float(getattr(self, name)))
-
-
-def singularity(model: UrModel, q: Floats) -> Singularity:
-    """Distance from the three singularities.
-
-    The Jacobian's determinant is, up to sign and constant lengths, the product of sin q3, sin q5 and the shoulder
-    term a2 cos q2 + a3 cos q23 + d5 sin q234 (tests hold this).
-
-    Args:
-        model: The arm.
-        q: Shape (..., 6), rad.
-    """
-    rows = _rows(q)
-    terms = np.empty((3, len(rows)))
-    _singularities(model.lengths, rows, terms)
-    return Singularity(*terms.reshape(3, *np.shape(q)[:-1]))
-
-
-def farthest_from_singular(model: UrModel, q: Floats, elbow_towards: Floats) -> Floats:
-    """Of configurations the one farthest from singular; of equals the one whose elbow lies farthest along a direction.
-
-    A branch and its mirror image, and all rolls about the flange's axis, are equally far but for rounding: a choice
-    among them by the last bit differs between machines.
-
-    Args:
-        model: The arm.
-        q: Shape (n, 6), rad; rows may be NaN, not all of them.
-        elbow_towards: Shape (3,), base frame: where there is room for the elbow.
-
-    Returns:
-        Shape (6,), rad.
-    """
-    least = np.round(singularity(model, q).least(), TIE_DIGITS)
-    equal = q[least == np.nanmax(least)]
-    elbow = link_poses(model, equal)[:, ELBOW, :3, 3] @ elbow_towards
-    return np.asarray(equal[int(np.argmax(np.round(elbow, ELBOW_DIGITS)))])
-
-
-@nb.njit(cache=True)
-def _singularities(lengths, q, terms):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``terms`` (3, n) from ``q`` (n, 6)."""
-    for row in range(len(q)):
-        shoulder, elbow, wrist = singular_terms(lengths, q[row, 1], q[row, 2], q[row, 3], q[row, 4])
-        terms[0, row], terms[1, row], terms[2, row] = shoulder, elbow, wrist
-
-
-@nb.njit(cache=True)
-def singular_terms(lengths, q2, q3, q4, q5):  # type: ignore[no-untyped-def]  # numba infers
-    """Shoulder, elbow and wrist term, each 0 (singular) to 1."""
-    a2, a3, d5 = lengths[1], lengths[2], lengths[4]
-    in_plane = a2 * math.cos(q2) + a3 * math.cos(q2 + q3) + d5 * math.sin(q2 + q3 + q4)
-    return abs(in_plane) / (abs(a2) + abs(a3) + d5), abs(math.sin(q3)), abs(math.sin(q5))

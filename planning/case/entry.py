@@ -12,7 +12,8 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.angle_grid import AngleGrid
 from puncture_twin.planning.case.tables.search_section import EntryAxes
-from puncture_twin.planning.geometry.rigid import frame_of_axes, pose
+from puncture_twin.planning.geometry.frames import frame_of_axes
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 ANATOMICAL_LPS = MappingProxyType(

@@ -12,7 +12,8 @@ from puncture_twin.planning.case.entry import entry_frame
 from puncture_twin.planning.case.tables.robot_section import MountSection
 from puncture_twin.planning.case.tables.search_section import EntryAxes
 from puncture_twin.planning.case.toml_types import Anatomical
-from puncture_twin.planning.geometry.rigid import frame_of_axes, pose
+from puncture_twin.planning.geometry.frames import frame_of_axes
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 AXES_PARALLEL = 0.999

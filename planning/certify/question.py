@@ -12,7 +12,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.certify.cells import Cells
-from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange
+from puncture_twin.planning.reach.axis_lengths import axis_lengths, farthest_flange
 from puncture_twin.planning.search.constraints import longest_path
 from puncture_twin.planning.uncertainty.any_pose import any_pose
 from puncture_twin.planning.uncertainty.pose_error import PoseError

@@ -4,26 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.processes import on_threads
 from puncture_twin.planning.base.progress import Count
-from puncture_twin.planning.clearance.direction_tiles import Tiles, bundle
+from puncture_twin.planning.clearance.direction_tiles import bundle
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import capsule_touches_any
 from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
-from puncture_twin.planning.clearance.kernels.lanes import LANES
-from puncture_twin.planning.clearance.kernels.nearest_triangle import nearest_triangle
-from puncture_twin.planning.clearance.kernels.scratch import Found, scratch_for
-from puncture_twin.planning.clearance.kernels.tile_search import COUNTED, search_tiles
+from puncture_twin.planning.clearance.kernels.tile_search import COUNTED
 from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
 from puncture_twin.planning.clearance.normals import normals_of
+from puncture_twin.planning.clearance.one_structure import measure_structure
+from puncture_twin.planning.clearance.placed_surface import PlacedSurface, placed_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 FCL_BEYOND_MM = 1.0
@@ -37,9 +34,6 @@ WORTH_THREADS = 20_000
 
 LONGEST_MM = 1e9
 """A needle that could reach the nodes that only fill a level up would be measured from them."""
-
-COORDINATE_SLACK = 1e-6
-"""Share of a coordinate by which float32 arithmetic of a few terms may err: 8 times its rounding."""
 
 
 class FastEngine:
@@ -87,15 +81,11 @@ class FastEngine:
         counts = np.zeros((len(self._blocks), len(COUNTED)), np.int64)
         seen, tiles = self._seen_from(target), bundle(outward)
 
-        largest_first = sorted(range(len(self._blocks)), key=lambda row: -len(self._blocks[row].triangles))
-
-        def search(piece: int) -> None:
-            row = largest_first[piece]  # so that no thread ends long after the others
-            answer = AxisDistances(distance[row], depth[row], nearest[row])
-            _one_structure(self._blocks[row], seen[row], tiles, target, lengths[row], answer, counts[row])
-
-        many = np.prod(shape) >= WORTH_THREADS
-        for done in on_threads(search, len(self._blocks), self._threads if many else 1):
+        answers = [AxisDistances(distance[row], depth[row], nearest[row]) for row in range(len(self._blocks))]
+        pieces = list(zip(self._blocks, seen, lengths, answers, counts, strict=True))
+        pieces.sort(key=lambda piece: -len(piece[0].triangles))  # so that no thread ends long after the others
+        threads = self._threads if np.prod(shape) >= WORTH_THREADS else 1
+        for done in on_threads(lambda k: measure_structure(target, tiles, *pieces[k]), len(pieces), threads):
             if shown and self._progress is not None:
                 self._progress(done * len(outward), len(self._blocks) * len(outward))
         self.counts += counts.sum(axis=0)
@@ -143,51 +133,3 @@ def _packed(mesh: TriangleMesh, memory: Memory) -> Blocks:
     if memory is NO_MEMORY:
         return pack(mesh)
     return memory.get((__name__, mesh.digest), lambda: pack(mesh), lambda blocks: blocks.nbytes)
-
-
-def _one_structure(
-    blocks: Blocks,
-    placed: PlacedSurface,
-    tiles: Tiles,
-    target: Floats,
-    length: float,
-    answer: AxisDistances,
-    counts: NDArray[np.int64],
-) -> None:
-    """Fill one structure's answer, arrays of shape (n,) in the caller's order."""
-    distance, depth, nearest = answer.distance, answer.depth, answer.nearest
-    if placed.distance == 0.0:
-        distance[:], depth[:], nearest[:] = 0.0, 0.0, placed.nearest
-        return
-    found = Found(np.empty(len(distance)), np.empty(len(distance)), np.empty(len(distance), np.int64), counts)
-    surface = (blocks.triangles, blocks.local, blocks.base)
-    bundles = (tiles.outward, tiles.starts, tiles.middle, tiles.chord)
-    search_tiles(
-        surface, placed.nodes, placed.slack, target, float(length), placed.distance, placed.nearest,
-        bundles, scratch_for(len(placed.nodes)), found, LANES,
-    )  # fmt: skip
-    distance[tiles.order], depth[tiles.order], nearest[tiles.order] = np.sqrt(found.square), found.depth, found.triangle
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedSurface:
-    """One surface as seen from one target: the nodes of `bounds.disc_bounds`, and the target's own distance."""
-
-    nodes: NDArray[np.float32]
-    slack: float
-    distance: float
-    nearest: int
-
-
-def placed_surface(blocks: Blocks, target: Floats) -> PlacedSurface:
-    """A surface as seen from a target."""
-    nodes = np.empty((10, len(blocks.center)), np.float32)
-    nodes[:3] = (blocks.center - target).T
-    nodes[3:8] = blocks.disc
-    nodes[8] = np.hypot(nodes[6], nodes[7]) * np.float32(1 + 1e-6)
-    away = np.sqrt(nodes[0] ** 2 + nodes[1] ** 2 + nodes[2] ** 2)
-    nodes[9] = (away + nodes[8]) * np.float32(1 + 1e-6)
-    slack = COORDINATE_SLACK * float(nodes[9][: len(blocks.local)].max())
-    grouped = np.ascontiguousarray(nodes.reshape(10, -1, LANES).transpose(1, 0, 2))
-    distance, nearest = nearest_triangle(blocks.triangles, grouped, blocks.base, target, slack)
-    return PlacedSurface(grouped, slack, distance, nearest)

@@ -15,8 +15,8 @@ from puncture_twin.planning.clearance.kernels.blocks import pack
 from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
 from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.geometry.crossings import first_crossing
+from puncture_twin.planning.geometry.frames import frame_about
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import frame_about
 
 _SEGMENT_FACE = np.array([[0, 1, 1]])
 """A triangle with two corners at the needle's top is the axis itself: FCL's triangle distance is exact for it."""

@@ -8,8 +8,9 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.clearance.kernels.blocks import Blocks
-from puncture_twin.planning.clearance.kernels.displaced_axis import blocks_near, displaced_distances, spheres_around
+from puncture_twin.planning.clearance.kernels.displaced_axis import displaced_distances
 from puncture_twin.planning.clearance.kernels.lanes import LANES
+from puncture_twin.planning.clearance.kernels.near_blocks import blocks_near, spheres_around
 
 
 @dataclass(frozen=True, eq=False)

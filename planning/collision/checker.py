@@ -12,12 +12,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence, Set
 from functools import cached_property
 from itertools import combinations, product
-from typing import NamedTuple
 
 import fcl
 import numpy as np
 
-from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import joined
 from puncture_twin.planning.arm.tool import Box, Tool
@@ -27,7 +25,8 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.base_place import refuse_base_in
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
 from puncture_twin.planning.collision.bodies.body import BODY_NAMES, NEVER_TESTED, Body
-from puncture_twin.planning.collision.bodies.shapes import surface, touch
+from puncture_twin.planning.collision.bodies.shapes import surface
+from puncture_twin.planning.collision.check import Check
 from puncture_twin.planning.collision.hanging import check_hanging
 from puncture_twin.planning.collision.neighbours import joined_pieces
 from puncture_twin.planning.collision.patient import FclPatient
@@ -40,6 +39,7 @@ from puncture_twin.planning.collision.state_checker import (
     FirstContact,
     Nearest,
     StateChecker,
+    require_finite,
 )
 from puncture_twin.planning.collision.sweep import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -51,7 +51,6 @@ __all__ = [
     "NEEDLE_IN_PATIENT",
     "Box",
     "CellChecker",
-    "Check",
     "Contact",
     "Distances",
     "FirstContact",
@@ -59,32 +58,6 @@ __all__ = [
     "StateChecker",
     "Tool",
 ]
-
-
-class Check(NamedTuple):
-    """One question to FCL: do two shapes touch."""
-
-    contact: Contact
-    """What it means if they do."""
-    first: fcl.CollisionObject | FclPatient
-    """The patient, a box, or a piece of a body."""
-    second: fcl.CollisionObject
-    first_body: Body | None
-    """The body that ``first`` moves with; None for skin and boxes."""
-    second_body: Body
-    hulls: tuple[Floats | None, Floats] | None
-    """Corners that enclose either, in the frames of their shapes; None for a box, and for the pair with the skin."""
-
-    def contact_found(self) -> Contact | None:
-        """The contact, if the two shapes touch where they are: ``outside_body`` where that is all of the patient."""
-        if not isinstance(self.first, FclPatient):
-            return self.contact if touch(self.first, self.second) else None
-        if self.first.skin.touches(self.second, self.second_body.box):
-            return self.contact
-        outside = self.first.outside
-        if outside is not None and outside.touches(self.second, self.second_body.box):
-            return self.contact._replace(other=OUTSIDE_BODY)
-        return None
 
 
 class CellChecker:
@@ -158,10 +131,11 @@ class CellChecker:
         Raises:
             InputError: If ``q`` is not finite: FCL would call it free.
         """
-        self._place(q)
+        require_finite(q)
+        frames = link_poses(self.model, q)
         for check in self._checks:
             allowed = needle_may_touch_patient and check.contact == NEEDLE_IN_PATIENT
-            if not allowed and (contact := check.contact_found()) is not None:
+            if not allowed and (contact := check.contact_at(frames)) is not None:
                 return contact
         return None
 
@@ -268,16 +242,6 @@ class CellChecker:
         poses = link_poses(self.model, q)
         for body in self._bodies[1:]:
             body.place(poses)
-
-
-def require_finite(q: Floats) -> None:
-    """Refuse joint angles that are not finite: FCL would call them free.
-
-    Raises:
-        InputError: If one is not.
-    """
-    if not np.isfinite(q).all():
-        raise InputError(f"joint angles {q} are not finite", where="collision check", allowed="six angles in rad")
 
 
 def _nearest(

@@ -11,17 +11,11 @@ from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.collision.checker import (
-    NEEDLE_IN_PATIENT,
-    CellChecker,
-    Contact,
-    FirstContact,
-    require_finite,
-)
+from puncture_twin.planning.collision.checker import NEEDLE_IN_PATIENT, CellChecker, Contact, FirstContact
 from puncture_twin.planning.collision.never_touching import without_neighbours
-from puncture_twin.planning.collision.proofs import Motion, Proofs, fcl_contact
+from puncture_twin.planning.collision.proofs import Motion, Proofs
 from puncture_twin.planning.collision.segments import SegmentChecker
-from puncture_twin.planning.collision.state_checker import PATIENT
+from puncture_twin.planning.collision.state_checker import PATIENT, require_finite
 from puncture_twin.planning.collision.sweep import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -80,7 +74,7 @@ class FastChecker(CellChecker):
         while (open_at := self._proofs.unproven_at_each(frames, begins, mask)).max(initial=-1) >= 0:
             begins = np.where(open_at < 0, len(self._tested), open_at + 1)
             for row in np.flatnonzero(open_at >= 0).tolist():
-                found[row] = fcl_contact(self._tested[open_at[row]], frames[row])
+                found[row] = self._tested[open_at[row]].contact_at(frames[row])
                 if found[row] is not None:
                     begins[row] = len(self._tested)
         return found
@@ -93,7 +87,7 @@ class FastChecker(CellChecker):
         open_at = self._proofs.first_unproven(motion, 0, mask)
         while open_at >= 0:
             index, check = divmod(open_at, len(self._tested))
-            contact = fcl_contact(self._tested[check], motion.frames[index])
+            contact = self._tested[check].contact_at(motion.frames[index])
             if contact is not None:
                 return FirstContact(index, contact)
             open_at = self._proofs.first_unproven(motion, open_at + 1, mask)

@@ -10,9 +10,9 @@ from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
-from puncture_twin.planning.collision.checker import Check
+from puncture_twin.planning.collision.check import Check
 from puncture_twin.planning.collision.packed.hulls import made_from
-from puncture_twin.planning.collision.proofs import Proofs, fcl_contact
+from puncture_twin.planning.collision.proofs import Proofs
 
 Touches = Callable[[int, Floats], bool]
 
@@ -40,7 +40,7 @@ def without_neighbours(model: UrModel, checks: Sequence[Check], proofs: Proofs, 
     pieces = [hull for pair in pairs for hull in pair if hull is not None]
 
     def touches(check: int, frames: Floats) -> bool:
-        return fcl_contact(checks[check], frames) is not None
+        return checks[check].contact_at(frames) is not None
 
     stored = cache.arrays(
         made_from("never touching", [model.lengths, proofs.joint_spans[between], *pieces]),

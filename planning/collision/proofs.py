@@ -11,13 +11,12 @@ from puncture_twin.planning.arm.tool import Box
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import Cache
-from puncture_twin.planning.collision.checker import Check, Contact
+from puncture_twin.planning.collision.check import Check
 from puncture_twin.planning.collision.kernels import proofs as proof_kernels
 from puncture_twin.planning.collision.kernels.proofs import ProofScene, scratch
 from puncture_twin.planning.collision.packed.hulls import WORKCELL_FRAME, PackedHulls, packed_trees
 from puncture_twin.planning.collision.packed.movers import joint_levers, packed_movers
 from puncture_twin.planning.collision.packed.skin import packed_skin
-from puncture_twin.planning.collision.patient import FclPatient
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 
@@ -127,12 +126,3 @@ class Proofs:
         unproven, gaps = tested.copy(), np.full(tested.shape, np.inf)
         proof_kernels.clear_about(self.scene, self.movers, frames, turns, self._work, gaps, unproven)
         return Around(gaps <= 0.0, unproven)
-
-
-def fcl_contact(check: Check, frames: Floats) -> Contact | None:
-    """The contact, if the shapes of a check touch where ``link_poses`` (7, 4, 4) has them."""
-    check.second.setTransform(check.second_body.pose(frames))
-    if check.first_body is not None:
-        assert not isinstance(check.first, FclPatient)  # it belongs to no body
-        check.first.setTransform(check.first_body.pose(frames))
-    return check.contact_found()

@@ -11,7 +11,8 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.collision.checker import Check, Contact, require_finite
+from puncture_twin.planning.collision.check import Check
+from puncture_twin.planning.collision.checker import Contact
 from puncture_twin.planning.collision.kernels import segments as segment_kernels
 from puncture_twin.planning.collision.kernels.segment_parts import (
     CONTACT,
@@ -22,7 +23,8 @@ from puncture_twin.planning.collision.kernels.segment_parts import (
     Room,
     segment_room,
 )
-from puncture_twin.planning.collision.proofs import Proofs, fcl_contact
+from puncture_twin.planning.collision.proofs import Proofs
+from puncture_twin.planning.collision.state_checker import require_finite
 
 LOOK_FIRST_RAD = 0.125
 """Down to parts of this length a segment is halved for all checks together: what it touches is found soonest so."""
@@ -96,7 +98,7 @@ class SegmentChecker:
         answer = self._filled.answer
         where = answer.fractions[:queries].tolist(), answer.checks[:queries].tolist()
         for fraction, at in zip(*where, strict=True):
-            if fcl_contact(self._checks[at], link_poses(self._model, start + fraction * (end - start))) is not None:
+            if self._checks[at].contact_at(link_poses(self._model, start + fraction * (end - start))) is not None:
                 return self._contact(at)
         return None
 

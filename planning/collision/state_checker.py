@@ -6,9 +6,12 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
+import numpy as np
+
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.body import BODY_NAMES
 from puncture_twin.planning.collision.sweep import SweptBodies
 
@@ -94,3 +97,13 @@ class StateChecker(Protocol):
 
     def body_sweeps_mm(self, q_path: Floats) -> dict[str, Floats]:
         """Bound on each moving body's motion along each segment, by name."""
+
+
+def require_finite(q: Floats) -> None:
+    """Refuse joint angles that are not finite: FCL would call them free.
+
+    Raises:
+        InputError: If one is not.
+    """
+    if not np.isfinite(q).all():
+        raise InputError(f"joint angles {q} are not finite", where="collision check", allowed="six angles in rad")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -25,11 +24,13 @@ class SweptBodies:
         model: The arm.
         tool: What its flange carries.
         corners: Shape (6, 8, 3), mm: a box about each moving link in its frame, the last with all on the flange.
+        longest_lever_mm: No body point is ever farther from a joint's axis than this.
     """
 
     model: UrModel
     tool: Tool
     corners: Floats
+    longest_lever_mm: float
 
     @classmethod
     def of(cls, model: UrModel, tool: Tool, padding_mm: float = 0.0) -> SweptBodies:
@@ -42,7 +43,9 @@ class SweptBodies:
             low, high = tool.body.mesh.bounds
             boxes[-1] = np.stack([np.minimum(boxes[-1][0], low), np.maximum(boxes[-1][1], high)])
         grown = [box + [[-padding_mm], [padding_mm]] for box in boxes]
-        return cls(model, tool, np.stack([np.array(list(product(*box.T))) for box in grown]))
+        corners = np.stack([np.array(list(product(*box.T))) for box in grown])
+        chain = abs(model.a2) + abs(model.a3) + model.d4 + model.d5 + model.d6
+        return cls(model, tool, corners, float(chain + np.linalg.norm(corners, axis=-1).max()))
 
     def bounds_mm(self, q_path: Floats) -> Floats:
         """A bound on the motion of every point of each link along each straight joint segment of a path.
@@ -77,13 +80,6 @@ class SweptBodies:
         frames, moved, rotated = np.empty((len(path), 7, 4, 4)), np.empty((len(path), 7)), np.empty((len(path), 6))
         _moving(self.model.lengths, path, self.corners, self.longest_lever_mm, frames, moved, rotated)
         return frames, moved, rotated
-
-    @cached_property
-    def longest_lever_mm(self) -> float:
-        """No body point is ever farther from a joint's axis than this, mm."""
-        m = self.model
-        chain = abs(m.a2) + abs(m.a3) + m.d4 + m.d5 + m.d6
-        return float(chain + np.linalg.norm(self.corners, axis=-1).max())
 
 
 @nb.njit(cache=True)

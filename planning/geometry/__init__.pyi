@@ -2,17 +2,19 @@ from .containment import Side as Side, side_of as side_of
 from .creases import split_at_creases as split_at_creases
 from .crossings import Crossings as Crossings, first_crossing as first_crossing
 from .decimation import decimated as decimated
-from .mesh import TriangleMesh as TriangleMesh
-from .rigid import (
-    apply as apply,
-    exp_rotation as exp_rotation,
-    exp_twist as exp_twist,
+from .frames import (
     frame_about as frame_about,
     frame_along as frame_along,
     frame_of_axes as frame_of_axes,
     frame_of_points as frame_of_points,
     frame_xz as frame_xz,
     frame_yz as frame_yz,
+)
+from .mesh import TriangleMesh as TriangleMesh
+from .rigid import (
+    apply as apply,
+    exp_rotation as exp_rotation,
+    exp_twist as exp_twist,
     inverse as inverse,
     left_jacobian as left_jacobian,
     log_rotation as log_rotation,

@@ -17,7 +17,8 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.case.tables.place_section import MountBounds, MountName
 from puncture_twin.planning.case.tables.robot_section import MountSection
-from puncture_twin.planning.geometry.rigid import frame_xz, pose
+from puncture_twin.planning.geometry.frames import frame_xz
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 Range = tuple[float, float]

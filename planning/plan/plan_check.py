@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from puncture_twin.planning.arm.insertion import flange_at, needle_lines
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.needle_line import needle_lines
 from puncture_twin.planning.arm.speed_limits import slowed
 from puncture_twin.planning.arm.tip_speed import tip_speeds
 from puncture_twin.planning.arm.ur import UrModel
@@ -118,8 +118,7 @@ def roll_of(plan: Plan) -> float:
     """About the needle, rad, 0 to 2 pi: what the joint angles at standoff give, whatever the plan states."""
     R, t = plan.T_base_ct[:3, :3], plan.T_base_ct[:3, 3]
     line = needle_lines((R @ plan.target_ct + t)[None], (R @ plan.outward_ct)[None])[0]
-    unrolled = flange_at(line, plan.needle_length_mm + plan.standoff_mm)[:3, :3]
-    x_axis = unrolled.T @ flange_pose(plan.model, plan.insertion.q[0])[:3, 0]
+    x_axis = line.R_base_flange.T @ flange_pose(plan.model, plan.insertion.q[0])[:3, 0]
     return float(np.arctan2(x_axis[1], x_axis[0])) % (2 * np.pi)
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from puncture_twin.planning.arm.insertion import away_from_singularities, flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
+from puncture_twin.planning.arm.needle_line import flange_poses
+from puncture_twin.planning.arm.singularity import away_from_singularities
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import outward

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.kinematics import farthest_from_singular, singularity
+from puncture_twin.planning.arm.singularity import farthest_from_singular, singularity
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.geometry.rigid import frame_about, pose
+from puncture_twin.planning.geometry.frames import frame_about
+from puncture_twin.planning.geometry.rigid import pose
 
 TILTS_DEG = (0.0, 15.0, 30.0, 45.0, 60.0)
 """How far the needle may lean from the wished direction, tried in this order."""

@@ -31,7 +31,7 @@ def with_reach(case: Case, found: Candidates, reach: ArmReach, progress: Count |
     answers = assess_reach_all(reach.checker, requests, progress)
     verdict = {field.name: getattr(found.verdict, field.name).copy() for field in fields(found.verdict)}
     reachable, margin, q_insertion = (getattr(found.arm, field.name).copy() for field in fields(found.arm))
-    for row, answer in zip(rows, answers, strict=True):
+    for row, request, answer in zip(rows, requests, answers, strict=True):
         reachable[row] = int(answer.reachable)
         margin[row] = answer.margin
         if answer.reachable:
@@ -39,8 +39,8 @@ def with_reach(case: Case, found: Candidates, reach: ArmReach, progress: Count |
         else:
             verdict["reason"][row], verdict["detail"][row] = answer.reason.value, answer.detail
             verdict["structure"][row] = "" if answer.contact is None else "/".join(answer.contact)
-            depth = answer.depth_mm
-            verdict["depth"][row] = np.nan if depth is None else reach_depth(case, found, int(row), depth)
+            inserted = answer.depth_mm  # the tip's distance from the target is what is left of the standoff
+            verdict["depth"][row] = np.nan if inserted is None else request.standoff_mm - inserted
     return replace(
         found, verdict=Verdict(**verdict), arm=ArmColumns(reachable, margin, q_insertion), arm_note=ARM_CHECKED
     )
@@ -57,8 +57,3 @@ def reach_requests(case: Case, candidates: Candidates, rows: Ints, T_base_ct: Fl
     lengths = standoffs(case.needle, candidates.path.length[rows], candidates.path.skin_angle[rows]).tolist()
     outward = [R @ candidates.outward_ct[row] for row in rows]
     return [ReachRequest(target, *of_row) for of_row in zip(outward, repeat(case.needle.length_mm), lengths)]
-
-
-def reach_depth(case: Case, found: Candidates, row: int, inserted_mm: float) -> float:
-    """Where the tip is after so many mm of insertion: its distance from the target along the needle, mm."""
-    return float(standoffs(case.needle, found.path.length[row], found.path.skin_angle[row])) - inserted_mm

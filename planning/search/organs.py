@@ -10,7 +10,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
 from puncture_twin.planning.clearance.measure import measure
-from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange
+from puncture_twin.planning.reach.axis_lengths import axis_lengths, farthest_flange
 from puncture_twin.planning.search.bending.bent_needle import with_bending
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking
 from puncture_twin.planning.search.constraints import first_broken, longest_path

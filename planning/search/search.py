@@ -7,7 +7,7 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
-from puncture_twin.planning.reach.standoff import axis_lengths
+from puncture_twin.planning.reach.axis_lengths import axis_lengths
 from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.chances.candidate_chances import with_chances

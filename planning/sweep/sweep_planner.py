@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.insertion import away_from_singularities
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.singularity import away_from_singularities
 from puncture_twin.planning.arm.speed_limits import slowed
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError

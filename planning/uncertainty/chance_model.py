@@ -15,7 +15,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
-from puncture_twin.planning.reach.standoff import axis_lengths
+from puncture_twin.planning.reach.axis_lengths import axis_lengths
 from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.hit import HitModel, hit_model
 from puncture_twin.planning.uncertainty.limits import demanding, touch_limit

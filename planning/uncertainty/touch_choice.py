@@ -14,7 +14,8 @@ import numpy as np
 
 from puncture_twin.planning.arm.error_jacobian import PARAMETERS, error_jacobian
 from puncture_twin.planning.arm.inverse_kinematics import branch_of, inverse, nearest_within_limits
-from puncture_twin.planning.arm.kinematics import flange_pose, singularity
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.singularity import singularity
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError

@@ -5,22 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from puncture_twin.planning.arm.insertion import (
-    FULL_MARGIN_RAD,
-    every_branch,
-    fill_branch_path,
-    first_stop,
-    flange_at,
-    flange_poses,
-    needle_lines,
-    reach_margin,
-    survey,
-)
+from puncture_twin.planning.arm.insertion import FULL_MARGIN_RAD, first_stop, reach_margin
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits, wrap_to_pi
-from puncture_twin.planning.arm.kinematics import flange_pose, singularity
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.needle_line import flange_poses, needle_lines
+from puncture_twin.planning.arm.singularity import singularity
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
 from puncture_twin.planning.collision.sweep import SweptBodies
+from puncture_twin.planning.reach.branch_paths import every_branch, fill_branch_path
+from puncture_twin.planning.reach.survey import survey
 
 DEPTHS = np.linspace(0.0, 120.0, 61)
 DISTANCES = 320.0 - DEPTHS
@@ -65,12 +59,6 @@ def test_one_branch_alone_and_all_eight_agree() -> None:
             alone = np.empty((len(DISTANCES), 6))
             fill_branch_path(model.lengths, *line, DISTANCES, branch, turn, alone)
             assert np.allclose(alone, every[branch] + turn, rtol=0.0, atol=1e-12, equal_nan=True)
-
-
-def test_a_line_and_a_pose_agree() -> None:
-    """Two ways to say where the flange is."""
-    for line in lines(20, seed=3):
-        assert np.allclose(flange_at(line, 320.0), flange_poses(line.target, line.outward, 320.0)[0], atol=1e-12)
 
 
 def test_the_survey_is_what_its_parts_say() -> None:

@@ -26,7 +26,6 @@ from puncture_twin.planning.collision.kernels.hulls import TOUCHING, hull_gap
 from puncture_twin.planning.collision.kernels.surfaces import STACK, to_surface
 from puncture_twin.planning.collision.packed.hulls import coarse_hull, neighbours
 from puncture_twin.planning.collision.packed.skin import TriangleTree
-from puncture_twin.planning.collision.proofs import fcl_contact
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.triangle_distance import to_triangle
@@ -404,7 +403,7 @@ def test_what_a_judge_remembers_changes_no_verdict() -> None:
         if contact is not None:
             states = ends[0] + np.linspace(0.0, 1.0, 400)[:, None] * (ends[1] - ends[0])
             names = [check for check in slow._checks if check.contact == contact]
-            met = (fcl_contact(check, poses) is not None for poses in link_poses(UR3, states) for check in names)
+            met = (check.contact_at(poses) is not None for poses in link_poses(UR3, states) for check in names)
             assert any(met)
 
 

@@ -13,9 +13,9 @@ from hypothesis import given, settings, strategies as st
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.arm.insertion import every_branch, needle_lines
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import flange_pose, jacobian
+from puncture_twin.planning.arm.needle_line import needle_lines
 from puncture_twin.planning.arm.speed_limits import SpeedLimits
 from puncture_twin.planning.arm.ur import JOINT_NAMES, UR_MODELS, ur_model
 from puncture_twin.planning.base.errors import InputError
@@ -36,6 +36,7 @@ from puncture_twin.planning.motion.follow import follow, follow_smoothly
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import read_plan, write_plan
+from puncture_twin.planning.reach.branch_paths import every_branch
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)

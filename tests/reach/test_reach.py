@@ -9,23 +9,19 @@ import pytest
 import trimesh
 
 from benchmarks.chen2019_reach import SHARES, WINDOWS, PublishedShare, cap, runs
-from puncture_twin.planning.arm.insertion import (
-    MIN_SINGULARITY,
-    every_branch,
-    fill_branch_path,
-    flange_poses,
-    needle_lines,
-    reach_margin,
-)
+from puncture_twin.planning.arm.insertion import reach_margin
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.kinematics import flange_pose, link_poses, singularity
+from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.links import collision_links
+from puncture_twin.planning.arm.needle_line import flange_poses, needle_lines
+from puncture_twin.planning.arm.singularity import MIN_SINGULARITY, singularity
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.collision.sweep import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.reach.branch_paths import every_branch, fill_branch_path
 from puncture_twin.planning.reach.reach import MAX_SWEEP_MM, ReachRequest, assess_reach_all
 from puncture_twin.planning.reach.sampling import sampled
 

@@ -10,8 +10,8 @@ import pytest
 import trimesh
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
+from puncture_twin.planning.arm.needle_line import flange_poses
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.collision.checker import CellChecker, Tool
@@ -19,15 +19,9 @@ from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.directions import wanted_directions
 from puncture_twin.planning.place.needle_start import needle_can_start
-from puncture_twin.planning.reach.standoff import (
-    MAX_GAP_MM,
-    UNEVEN_SKIN_MM,
-    axis_lengths,
-    farthest_flange,
-    skin_gaps,
-    standoffs,
-    waiting_flange,
-)
+from puncture_twin.planning.reach.axis_lengths import axis_lengths, farthest_flange
+from puncture_twin.planning.reach.skin_gap import MAX_GAP_MM, UNEVEN_SKIN_MM, skin_gaps
+from puncture_twin.planning.reach.standoff import standoffs, waiting_flange
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.organs import organ_candidates
 

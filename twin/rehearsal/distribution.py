@@ -13,7 +13,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.containment import inside_each
-from puncture_twin.planning.reach.standoff import axis_lengths
+from puncture_twin.planning.reach.axis_lengths import axis_lengths
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
 from puncture_twin.planning.registration.marker_noise import touches
 from puncture_twin.planning.registration.noise_test import NoiseTest

@@ -16,7 +16,8 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.geometry.rigid import frame_about, pose
+from puncture_twin.planning.geometry.frames import frame_about
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.motion.follow import follow_smoothly
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.touch.straight_approach import (

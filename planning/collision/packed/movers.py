@@ -9,7 +9,7 @@ import numpy as np
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.bodies.sphere_tree import enclosing_sphere
-from puncture_twin.planning.collision.checker import Check
+from puncture_twin.planning.collision.check import Check
 from puncture_twin.planning.collision.kernels.proofs import Movers
 from puncture_twin.planning.collision.packed.hulls import in_frame
 from puncture_twin.planning.geometry.rigid import apply

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import frame_of_points, pose
+from puncture_twin.planning.geometry.frames import frame_of_points
+from puncture_twin.planning.geometry.rigid import pose
 
 
 def fit_rigid(points_ct: Floats, points_base: Floats) -> Floats:

@@ -22,7 +22,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.clearance.measure import Clearances, measure
 from puncture_twin.planning.needle.deflection import DeflectionBound
-from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange
+from puncture_twin.planning.reach.axis_lengths import axis_lengths, farthest_flange
 from puncture_twin.planning.search.bending.bent_needle import bent_verdict
 from puncture_twin.planning.search.candidates import Candidates, Verdict
 from puncture_twin.planning.search.constraints import first_broken

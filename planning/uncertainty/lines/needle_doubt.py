@@ -11,7 +11,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import frame_about, skew
+from puncture_twin.planning.geometry.frames import frame_about
+from puncture_twin.planning.geometry.rigid import skew
 from puncture_twin.planning.uncertainty.needle_lines import FARTHEST
 
 Problem = tuple[Floats, Floats, Floats, Floats, Floats, float, float]

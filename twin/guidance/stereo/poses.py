@@ -7,11 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
-from puncture_twin.planning.arm.kinematics import ELBOW, ELBOW_DIGITS, TIE_DIGITS, link_poses, singularity
+from puncture_twin.planning.arm.kinematics import link_poses
+from puncture_twin.planning.arm.singularity import ELBOW, ELBOW_DIGITS, TIE_DIGITS, singularity
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
-from puncture_twin.planning.geometry.rigid import frame_yz, pose
+from puncture_twin.planning.geometry.frames import frame_yz
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod
 
 LEAST_SINGULARITY = 0.05

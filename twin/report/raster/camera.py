@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import frame_along
+from puncture_twin.planning.geometry.frames import frame_along
 
 
 @dataclass(frozen=True, eq=False)

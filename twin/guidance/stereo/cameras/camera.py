@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import apply, frame_about, frame_along, pose
+from puncture_twin.planning.geometry.frames import frame_about, frame_along
+from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.twin.guidance.stereo.cameras.lens import distort, distortion_slope, fold, undistort
 
 ROTATION_TOLERANCE = 1e-6

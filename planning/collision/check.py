@@ -1,0 +1,48 @@
+"""One question to FCL, and its answer."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import fcl
+
+from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.collision.bodies.body import Body
+from puncture_twin.planning.collision.bodies.shapes import touch
+from puncture_twin.planning.collision.patient import FclPatient
+from puncture_twin.planning.collision.state_checker import (
+    Contact,
+)
+
+
+class Check(NamedTuple):
+    """One question to FCL: do two shapes touch."""
+
+    contact: Contact
+    """What it means if they do."""
+    first: fcl.CollisionObject | FclPatient
+    """The patient, a box, or a piece of a body."""
+    second: fcl.CollisionObject
+    first_body: Body | None
+    """The body that ``first`` moves with; None for skin and boxes."""
+    second_body: Body
+    hulls: tuple[Floats | None, Floats] | None
+    """Corners that enclose either, in the frames of their shapes; None for a box, and for the pair with the skin."""
+
+    def contact_at(self, frames: Floats) -> Contact | None:
+        """The contact, if the two shapes touch where ``link_poses`` (7, 4, 4) has them.
+
+        It is ``outside_body`` where that is all of the patient that is touched.
+        """
+        self.second.setTransform(self.second_body.pose(frames))
+        if not isinstance(self.first, FclPatient):
+            if self.first_body is not None:
+                self.first.setTransform(self.first_body.pose(frames))
+            return self.contact if touch(self.first, self.second) else None
+        if self.first.skin.touches(self.second, self.second_body.box):
+            return self.contact
+        outside = self.first.outside
+        if outside is not None and outside.touches(self.second, self.second_body.box):
+            return self.contact._replace(other=OUTSIDE_BODY)
+        return None

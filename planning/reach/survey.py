@@ -1,0 +1,228 @@
+"""What kinematics alone says of many directions: every branch and roll."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Container, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.insertion import FULL_MARGIN_RAD, MAX_JOINT_STEP_RAD_PER_MM
+from puncture_twin.planning.arm.inverse_kinematics import (
+    N_BRANCHES,
+    TURN,
+    fill_branches,
+    wrapped_angle,
+)
+from puncture_twin.planning.arm.needle_line import NeedleLine
+from puncture_twin.planning.arm.singularity import MIN_SINGULARITY, least_term
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.reach.answer import ReachRequest
+
+MAX_SWEEP_MM = 2.0
+"""Between two collision checks no body point moves farther, so that it is never more than half of this from where it
+was checked."""
+
+MARGIN_DIGITS = 9
+"""Margins that agree to this many digits are equal, so that rounding does not choose between mirrored branches."""
+
+
+class Insertion(NamedTuple):
+    """A motion from standoff to target on one branch at one roll."""
+
+    line: NeedleLine
+    branch: int
+    roll: float
+    turn: Floats
+    """Shape (6,), rad: what to add to the branch's path at roll 0, the roll and whole turns."""
+    standoff: Floats
+    """Shape (6,), rad: where the motion begins."""
+
+
+class Surveyed(NamedTuple):
+    """What kinematics alone says of one request; see :class:`Survey`."""
+
+    request: ReachRequest
+    line: NeedleLine
+    depths: Floats
+    distances: Floats
+    rolls: Floats
+    stop_at: NDArray[np.int64]
+    starts: Floats
+    margins: Floats
+    turns: Floats
+
+    def insertions(self, without: Container[int] = ()) -> Iterator[Insertion]:
+        """The motions that kinematics allows, the best margin first; of equals the first branch, then the first roll.
+
+        Branches that ``without`` has come to hold are passed over.
+        """
+        branches, rolled = np.nonzero(~np.isnan(self.margins))
+        order = np.argsort(-np.round(self.margins[branches, rolled], MARGIN_DIGITS), kind="stable")
+        for branch, roll in zip(branches[order].tolist(), rolled[order].tolist(), strict=True):
+            if branch not in without:
+                turn = self.turns[branch, roll]
+                yield Insertion(self.line, branch, float(self.rolls[roll]), turn, self.starts[branch] + turn)
+
+
+def surveyed(
+    model: UrModel, requests: Sequence[ReachRequest], lines: Sequence[NeedleLine], rolls: Floats
+) -> list[Surveyed]:
+    """What kinematics says of each request.
+
+    Args:
+        model: The arm.
+        requests: The n directions.
+        lines: The needle's line of each.
+        rolls: Shape (r,), rad.
+    """
+    depths = [_depths(request.standoff_mm) for request in requests]
+    starts = [request.needle_length_mm + request.standoff_mm for request in requests]
+    distances = [start - depth for start, depth in zip(starts, depths, strict=True)]
+    found = survey(model, lines, distances, depths, rolls)
+    sampled = zip(requests, lines, depths, distances, strict=True)
+    return [Surveyed(*path, rolls, *allowed) for path, *allowed in zip(sampled, *found, strict=True)]
+
+
+def _depths(standoff_mm: float) -> Floats:
+    """Samples of a path, mm from the standoff, evenly spaced."""
+    return np.linspace(0.0, standoff_mm, math.ceil(standoff_mm / MAX_SWEEP_MM) + 1)
+
+
+class Survey(NamedTuple):
+    """What kinematics alone says of many directions, every branch and roll."""
+
+    stop_at: NDArray[np.int64]
+    """Shape (n, 8): index of the sample at which the path ends, -1 where it reaches the target."""
+    starts: Floats
+    """Shape (n, 8, 6), rad: each path's first configuration at roll 0; NaN where there is none."""
+    margins: Floats
+    """Shape (n, 8, r): see :func:`reach_margin`; NaN where the path ends early or leaves the joint limits."""
+    turns: Floats
+    """Shape (n, 8, r, 6), rad: what to add to the path at roll 0, the roll and whole turns."""
+
+
+def survey(
+    model: UrModel,
+    lines: Sequence[NeedleLine],
+    distances_mm: Sequence[Floats],
+    depths_mm: Sequence[Floats],
+    rolls: Floats,
+) -> Survey:
+    """Every branch and roll of many straight insertions, each turned as far from the joint limits as whole turns allow.
+
+    Args:
+        model: The arm.
+        lines: The n directions.
+        distances_mm: For each direction, shape (m,): target to flange at the samples of the path.
+        depths_mm: The same as depths, rising, shape (m,).
+        rolls: Shape (r,), rad.
+    """
+    count = len(lines)
+    found = Survey(
+        np.empty((count, N_BRANCHES), np.int64),
+        np.empty((count, N_BRANCHES, 6)),
+        np.empty((count, N_BRANCHES, len(rolls))),
+        np.empty((count, N_BRANCHES, len(rolls), 6)),
+    )
+    bounds = (MIN_SINGULARITY, MAX_JOINT_STEP_RAD_PER_MM, FULL_MARGIN_RAD)
+    for i in range(count):
+        filled = (found.stop_at[i], found.starts[i], found.margins[i], found.turns[i])
+        path = (*lines[i], distances_mm[i], depths_mm[i])
+        _survey_line(model.lengths, model.joint_limits, *path, rolls, bounds, *filled)
+    return found
+
+
+@nb.njit(cache=True)
+def _survey_line(lengths, limits, R, target, outward, distances, depths, rolls, bounds, stops, starts, margins, turns):  # type: ignore[no-untyped-def]  # numba infers
+    """Every branch and roll of one direction, by kinematics alone.
+
+    Args:
+        lengths: The arm.
+        limits: Shape (6, 2), rad.
+        R: Shape (3, 3): the flange's rotation at roll 0.
+        target: Shape (3,), mm.
+        outward: Shape (3,), unit.
+        distances: Shape (m,), mm: target to flange.
+        depths: Shape (m,), mm, rising.
+        rolls: Shape (r,), rad.
+        bounds: Least of the singular terms; most that a joint may turn, rad/mm; distance from a limit that counts as 1,
+            rad.
+        stops: Shape (8,), filled: the index of the sample at which the path ends, -1: nowhere.
+        starts: Shape (8, 6), filled: the configuration at the first distance, roll 0, rad.
+        margins: Shape (8, r), filled: see :func:`reach_margin`; NaN where the path stops or leaves the limits.
+        turns: Shape (8, r, 6), filled: what to add to the path at roll 0, rad: roll and whole turns.
+    """
+    at_least, fastest, full = bounds
+    p, here, least = np.empty(3), np.empty((8, 6)), np.ones(8)
+    before, lowest, highest, middle = np.empty((8, 6)), np.empty((8, 6)), np.empty((8, 6)), np.empty((8, 6))
+    stops[:] = -1
+    for k in range(len(distances)):
+        for i in range(3):
+            p[i] = target[i] + distances[k] * outward[i]
+        fill_branches(lengths, R, p, here, np.int64(-1))
+        if k == 0:
+            starts[:], before[:], lowest[:], highest[:] = here, here, here, here
+        for branch in range(8):
+            if stops[branch] >= 0:
+                continue
+            q = here[branch]
+            for joint in range(6):
+                last = before[branch, joint]
+                q[joint] = q[joint] if k == 0 else last + wrapped_angle(q[joint] - last)
+            if k > 0 and _fast_joint(before[branch], q, depths[k] - depths[k - 1], fastest):
+                stops[branch] = k - 1
+                continue
+            term = least_term(lengths, q)
+            if not term > at_least:
+                stops[branch] = k
+                continue
+            least[branch] = min(least[branch], term)
+            for joint in range(6):
+                before[branch, joint] = q[joint]
+                lowest[branch, joint] = min(lowest[branch, joint], q[joint])
+                highest[branch, joint] = max(highest[branch, joint], q[joint])
+                if k == len(distances) // 2:
+                    middle[branch, joint] = q[joint]
+    margins[:] = math.nan
+    turns[:] = 0.0
+    for branch in range(8):
+        if stops[branch] < 0:
+            reached = least[branch], lowest[branch], highest[branch], middle[branch]
+            _rolled(limits, rolls, full, reached, margins[branch], turns[branch])
+
+
+@nb.njit(cache=True)
+def _fast_joint(before, after, mm, fastest):  # type: ignore[no-untyped-def]  # numba infers
+    """Whether a joint turns more than ``fastest``, rad/mm, between two configurations (6,) that lie so far apart."""
+    fast = False
+    for joint in range(6):
+        fast |= abs(after[joint] - before[joint]) / mm > fastest
+    return fast
+
+
+@nb.njit(cache=True)
+def _rolled(limits, rolls, full, reached, margins, turns):  # type: ignore[no-untyped-def]  # numba infers
+    """Fill ``margins`` (r,) and ``turns`` (r, 6) of one branch.
+
+    ``reached`` holds the least singular term of its path at roll 0, each joint's lowest and highest angle and those at
+    its middle (6,), rad.
+    """
+    least, lowest, highest, middle = reached
+    for i in range(len(rolls)):
+        margin = least
+        for joint in range(6):
+            roll = rolls[i] if joint == 5 else 0.0
+            low, high = limits[joint]
+            at = middle[joint] + roll
+            fewest, most = math.ceil((low - at) / TURN), math.floor((high - at) / TURN)
+            turn = TURN * min(max(round(((low + high) / 2.0 - at) / TURN), fewest), most)
+            turns[i, joint] = roll + turn
+            below, above = lowest[joint] + (roll + turn) - low, high - (highest[joint] + (roll + turn))
+            margin = min(margin, below / full, above / full)
+        if margin >= 0.0:
+            margins[i] = margin
