@@ -30,7 +30,7 @@ from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_
 from puncture_twin.planning.uncertainty.limits import demanding
 from puncture_twin.planning.uncertainty.lines.line_sampling import line_chance
 from puncture_twin.planning.uncertainty.lines.needle_doubt import NeedleDoubt, needle_doubt
-from puncture_twin.planning.uncertainty.needle_lines import walked
+from puncture_twin.planning.uncertainty.lines.walks import walked
 from puncture_twin.planning.uncertainty.touch import touch_chance
 
 SEED, MARKERS = 20191104, 4

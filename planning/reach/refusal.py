@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
-import numpy as np
-
 from puncture_twin.planning.arm.insertion import first_stop
-from puncture_twin.planning.arm.inverse_kinematics import inverse, missing_reach_mm
 from puncture_twin.planning.arm.needle_line import flange_poses
-from puncture_twin.planning.arm.singularity import MIN_SINGULARITY, away_from_singularities, singularity
+from puncture_twin.planning.arm.singularity import away_from_singularities
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.reach.answer import ReachAnswer
 from puncture_twin.planning.reach.branch_paths import every_branch
 from puncture_twin.planning.reach.survey import Surveyed
 from puncture_twin.planning.reach.trial import Blocked
+from puncture_twin.planning.reach.unreachable import why_unreachable
 
 
 def refusal(model: UrModel, found: Surveyed, blocks: Sequence[Blocked]) -> ReachAnswer:
@@ -44,22 +40,7 @@ def _refusal_of_kinematics(model: UrModel, found: Surveyed) -> ReachAnswer:
     reached = away_from_singularities(model, paths[:, 0])
     if not reached.any():
         T_base_flange = flange_poses(found.line.target, found.line.outward, found.distances[0])[0]
-        return ReachAnswer.refused(Reason.UNREACHABLE, None, _why_unreachable(model, T_base_flange))
+        return ReachAnswer.refused(Reason.UNREACHABLE, None, why_unreachable(model, T_base_flange))
     stops = [first_stop(model, path, found.depths) for path in paths[reached]]
     deepest = max((stop for stop in stops if stop), key=lambda stop: stop.depth_mm)
     return ReachAnswer.refused(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail)
-
-
-def _why_unreachable(model: UrModel, T_base_flange: Floats) -> str:
-    """What keeps every branch from one flange pose (4, 4), in mm: one sentence for people."""
-    place = (
-        f"the flange would stand {np.linalg.norm(T_base_flange[:3, 3] - model.shoulder_base):.1f} mm from the shoulder"
-    )
-    missing = float(missing_reach_mm(model, T_base_flange)[0])
-    if math.isinf(missing):
-        return f"{place}, its wrist too close to the base's axis for any shoulder angle"
-    if missing > 0.0:
-        return f"{place}, {missing:.1f} mm out of the arm's reach in this direction"
-    solutions = inverse(model, T_base_flange)[0]
-    best = singularity(model, solutions[np.nanargmax(singularity(model, solutions).least())])
-    return f"{place}, too near the {best.nearest} singularity ({best.least():.3f}, at least {MIN_SINGULARITY})"

@@ -63,11 +63,12 @@ class PoseError:
 
     def covariance(self, q: Floats) -> Floats:
         """Sigma6 of configurations (n, 6), rad: shape (n, 6, 6), tip (mm) then rotation (rad), base axes."""
+        readings = self.fit.cov_at(self.target_base)
         J, arm = error_jacobian(self.model, q, self.tip_mm), self.errors.arm
         lasting = self._lasting(J) * np.sqrt(self.fit.noise.eta_variances)
         anew = J[..., PARAMETERS["joint"]] * np.hypot(arm.drift, arm.repeatability)
         root = self.fit.test.scale * np.concatenate([lasting, anew], axis=-1)
-        straight = self.fit.cov_at(self.target_base) + root @ np.swapaxes(root, -1, -2)
+        straight = readings + root @ np.swapaxes(root, -1, -2)
         return straight if self.bend is None else straight + _bend_covariance(self.model, q, self.bend)
 
     def tip_covariance(self, q: Floats) -> Floats:

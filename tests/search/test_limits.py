@@ -10,7 +10,7 @@ from case_world import points_file
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.search.chances import joint, near_limits
-from puncture_twin.planning.search.chances.near_limits import limited
+from puncture_twin.planning.search.chances.limited import limited
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.touch import proximity, touch_bound, touch_chance

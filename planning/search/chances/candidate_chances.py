@@ -13,7 +13,8 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.chances.near_limits import ROWS_AT_ONCE, limited, refined_near_limits
+from puncture_twin.planning.search.chances.limited import limited
+from puncture_twin.planning.search.chances.near_limits import ROWS_AT_ONCE, refined_near_limits
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.limits import check_limits, demanding
@@ -43,11 +44,15 @@ def with_chances(
     check_limits(case, anatomy, model is not None)
     limits = None if model is None else model.limits
     names = tuple(anatomy.checked[column].name for column in demanding(anatomy.checked))
-    chances = Chances.unknown(names, len(found))
     rows = np.flatnonzero(found.safe & np.isfinite(found.arm.q_insertion).all(axis=1))
     if model is None or limits is None or not len(rows):
-        return replace(found, chances=chances)
-    for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
-        known = None if axes is None else axes.at(part)
-        chances = chances.put(part, model.chances(found.outward_ct[part], found.arm.q_insertion[part], known))
+        return replace(found, chances=Chances.unknown(names, len(found)))
+    parts = [rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)]
+    computed = [
+        model.chances(found.outward_ct[part], found.arm.q_insertion[part], None if axes is None else axes.at(part))
+        for part in parts
+    ]
+    chances = Chances.unknown(names, len(found))
+    for part, of_part in zip(parts, computed, strict=True):
+        chances = chances.put(part, of_part)
     return limited(case, refined_near_limits(replace(found, chances=chances), model, limits))

@@ -8,7 +8,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.chances.near_limits import BEST
+from puncture_twin.planning.search.chances.refined import BEST
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.touch import Proximity
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.uncertainty.lines.needle_doubt import NeedleDoubt, Problem
-from puncture_twin.planning.uncertainty.needle_lines import first_touches
+from puncture_twin.planning.uncertainty.lines.rays import first_touches
 
 PREFERRED, SOONER, NO_MATTER = 0.1, 0.8, 3.8
 """Standard deviations by which another direction must be better than first order's; how much sooner than a plane

@@ -1,0 +1,40 @@
+"""Chances refined by line sampling: of some rows, and of the best until no new one is among them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Bools, Ints
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.chances.limited import limited
+from puncture_twin.planning.search.ranking import ranked
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel
+
+BEST = 200
+"""Of the ranked candidates: how many get the dearer chances."""
+
+
+def with_refined(found: Candidates, model: ChanceModel, rows: Ints, wanted: Bools | None = None) -> Candidates:
+    """Refine some rows; ``wanted`` as in `ChanceModel.refined`."""
+    chances = found.chances
+    assert chances is not None
+    better = model.refined(found.outward_ct[rows], found.arm.q_insertion[rows], chances.at(rows), wanted)
+    return replace(found, chances=chances.put(rows, better))
+
+
+def with_best_refined(found: Candidates, model: ChanceModel | None) -> Candidates:
+    """Refine the best candidates, reject those that break a limit then, and rank again until no new one is among them.
+
+    Args:
+        found: Ranked, with chances.
+        model: As in `with_chances`.
+    """
+    if model is None or found.chances is None:
+        return found
+    done, case = np.zeros(len(found), bool), model.case
+    while len(rows := (best := found.ranked[:BEST])[~done[best]]):
+        found = ranked(case, limited(case, with_refined(found, model, rows)))
+        done[rows] = True
+    return found
