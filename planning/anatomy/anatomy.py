@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -233,7 +234,7 @@ def _check_target(case: Case, structures: list[Structure], skin: Skin) -> None:
     in_box = np.all((low <= case.target_ct) & (case.target_ct <= high), axis=1)
     point = point_text(case.target_ct, case.space)
     if side_of(skin.mesh, case.target_ct) is Side.OUTSIDE:
-        hint = readings_inside(case.target_ct, case.space, lambda one: side_of(skin.mesh, one) is Side.INSIDE)
+        hint = readings_inside(case.target_ct, case.space, partial(_holds, skin.mesh))
         what = f"target ({point}) lies outside the skin{hint}"
         raise InputError(what, where=case.path, allowed="a point in the body, in mm, in the case's space")
     for structure, near in zip(structures, in_box, strict=True):
@@ -255,11 +256,17 @@ def _check_target(case: Case, structures: list[Structure], skin: Skin) -> None:
                 allowed='role "target" for the structure that holds the target',
             )
         if side is Side.OUTSIDE and (gap := surface_distance(structure.mesh, case.target_ct)) > ON_SURFACE_MM:
+            hint = readings_inside(case.target_ct, case.space, partial(_holds, structure.mesh), "inside")
             raise InputError(
-                f"target ({point}) lies {gap:.1f} mm outside its structure '{structure.name}'",
+                f"target ({point}) lies {gap:.1f} mm outside its structure '{structure.name}'{hint}",
                 where=case.path,
                 allowed="a point inside target.structure",
             )
+
+
+def _holds(mesh: TriangleMesh, point_ct: Floats) -> bool:
+    """Whether a point (3,) lies inside a closed surface."""
+    return side_of(mesh, point_ct) is Side.INSIDE
 
 
 def own_target(case: Case) -> Iterator[Structure]:

@@ -1,4 +1,4 @@
-"""How else a point may have been meant that lies outside of the body: in the other space, in cm or in m."""
+"""How else a point may have been meant that lies where it cannot: in the other space, in cm or in m."""
 
 from __future__ import annotations
 
@@ -8,16 +8,19 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.spaces import Space, Unit, to_lps
 
 
-def readings_inside(point_ct: Floats, space: Space, inside: Callable[[Floats], bool]) -> str:
-    """The readings of a point under which it would lie in the body, as a hint in brackets; empty for none.
+def readings_inside(
+    point_ct: Floats, space: Space, inside: Callable[[Floats], bool], place: str = "in the body"
+) -> str:
+    """The readings of a point under which it would lie where it belongs, as a hint in brackets; empty for none.
 
     Args:
         point_ct: Shape (3,), LPS (or local) mm, as it was read.
         space: In which it was stated.
-        inside: Whether a point (3,) lies in the body.
+        inside: Whether a point (3,) lies there.
+        place: In words.
     """
     found = [text for text, point in _readings(point_ct, space) if inside(point)]
-    return f" (read {' or '.join(found)} it lies in the body)" if found else ""
+    return f" (read {' or '.join(found)} it lies {place})" if found else ""
 
 
 def _readings(point_ct: Floats, space: Space) -> Iterator[tuple[str, Floats]]:

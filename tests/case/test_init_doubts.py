@@ -112,6 +112,20 @@ def test_a_target_outside_names_its_space_and_the_readings_that_fit(tmp_path, ca
         assert text.removesuffix(": allowed") in line and ("read in" in line) == ("read in" in text), line
 
 
+@pytest.mark.parametrize(("place", "reading"), [("[40, 0, 10]", "RAS"), ("[-4, 0, 1]", "cm"), ("[0, 0, 60]", "")])
+def test_a_target_outside_its_structure_names_the_reading_that_lies_inside(tmp_path, capfd, place, reading):
+    """A hand-written case: how far outside was said, not that the signs of x and y were those of the other space."""
+    for name, radius, center in (("skin", 90.0, (0, 0, 0)), ("organ", 12.0, HERE), ("rib", 5.0, (0, 0, 40))):
+        ball(tmp_path / f"{name}.stl", radius, np.array(center))
+    target = f'position_mm = {place}\nstructure = "organ"'
+    sections = SKIN, structure("organ", "target"), structure("rib", "avoid", margin_mm=3.0)
+    (tmp_path / "case.toml").write_text(case_text(*sections, target=target))
+    assert main(["check", str(tmp_path), "--theta", "0", "--beta", "0", "--no-arm"]) == 2
+    line = capfd.readouterr().err.strip().splitlines()[-1]
+    assert "mm outside its structure 'organ'" in line
+    assert f"(read in {reading} it lies inside)" in line if reading else "read in" not in line
+
+
 def test_init_tells_a_target_in_metres(tmp_path, capfd):
     """The body lies away from the origin, as in most scanners."""
     patient(tmp_path, ("right lung", inside(HERE, 18.0)))
