@@ -1,5 +1,7 @@
 """Colours that a reader with deuteranopia tells apart, and that look as they do in the field."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from skimage.color import deltaE_ciede2000, rgb2lab
@@ -11,20 +13,62 @@ from puncture_twin.twin.report.palette import CUSTOM_COLOURS, ORGAN_COLOURS, SAF
 DEUTERANOPIA = np.array(
     [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
 )
+PROTANOPIA = np.array(
+    [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+)
 """Of linear RGB, severity 1 (Machado et al. 2009, table 1)."""
 
+READERS = {"any": np.eye(3), "deuteranopia": DEUTERANOPIA, "protanopia": PROTANOPIA}
 
-def as_seen(colour):
-    """A colour in Lab as a reader with deuteranopia sees it."""
+TRUNK = (
+    "lesion", "aorta", "hepatic_veins", "portal_vein", "ribs_right", "costal_cartilages", "psoas_muscle", "liver",
+    "kidney_left", "spleen", "pancreas", "gallbladder", "stomach", "duodenum", "small_bowel", "colon", "oesophagus",
+    "lung_right", "heart", "adrenal_gland_left",
+)  # fmt: skip
+"""What lies side by side in one picture."""
+
+AIM_AND_VESSELS = TRUNK[:4]
+
+
+def as_seen(colour, reader=DEUTERANOPIA):
+    """A colour in Lab as a reader with deuteranopia, or another, sees it."""
     rgb = np.asarray(colour) / 255
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    seen = np.clip(DEUTERANOPIA @ linear, 0, 1)
+    seen = np.clip(reader @ linear, 0, 1)
     return rgb2lab(np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055))
 
 
-def difference(first, second):
+def difference(first, second, reader=DEUTERANOPIA):
     """CIEDE2000 between two colours as that reader sees them."""
-    return float(deltaE_ciede2000(as_seen(first), as_seen(second)))
+    return float(deltaE_ciede2000(as_seen(first, reader), as_seen(second, reader)))
+
+
+@pytest.mark.parametrize(
+    ("reader", "vessel", "organ"), [("any", 18, 11.5), ("deuteranopia", 10, 5), ("protanopia", 10, 5)]
+)
+def test_organs_of_one_picture_are_told_apart(reader, vessel, organ):
+    """Lesion and vessels from everything at a glance; other organs from each other."""
+    colours = organ_colours(TRUNK)
+    for first, second in combinations(TRUNK, 2):
+        least = vessel if {first, second} & set(AIM_AND_VESSELS) else organ
+        found = difference(colours[first], colours[second], READERS[reader])
+        assert found > least, f"{first} and {second} differ by {found:.1f}"
+
+
+def test_structures_without_a_custom_are_no_vessels():
+    """To every reader, and each is told from the next."""
+    aimed = organ_colours(AIM_AND_VESSELS).values()
+    for colour in ORGAN_COLOURS:
+        assert min(difference(colour, one, READERS["any"]) for one in aimed) > 15
+    assert min(difference(a, b, READERS["any"]) for a, b in combinations(ORGAN_COLOURS, 2)) > 10
+
+
+def test_a_structure_keeps_its_colour_in_any_company():
+    """One of custom looks alike beside whatever else a case names; vessels in the liver are no liver."""
+    alone = {name: organ_colours((name,))[name] for name in TRUNK}
+    assert organ_colours(("spare", *reversed(TRUNK), "other")).items() >= alone.items()
+    vessels = organ_colours(("liver_vessels", "lung_vessels"))
+    assert len({*vessels.values()}) == 1 and not {*vessels.values()} & {alone["liver"], alone["lung_right"]}
 
 
 def test_the_difference_is_that_of_equal_and_of_opposite_colours():
