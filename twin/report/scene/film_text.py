@@ -35,7 +35,7 @@ RULE: Rgb = (190, 194, 200)
 
 CELLS = (
     (12, "time"),
-    (95, "phase"),
+    (128, "phase"),
     (320, "true tip to target"),
     (470, "contacts"),
     (560, "needle to nearest structure"),
@@ -169,7 +169,7 @@ def _strip(draw: ImageDraw.ImageDraw, source: FrameText, row: int, moment: float
     contacts = len(source.contacts(moment))
     near = "– (not yet)" if nearest is None else f"{number(nearest[1], 1, 'mm')}  {_short(nearest[0])}"
     values = (
-        (f"{moment:.1f} s", annotate.INK),
+        (f"{moment:.1f}/{source.rehearsal.times_s[-1]:.1f} s", annotate.INK),
         (PHASES.get(phase, phase), annotate.INK),
         (number(source.distance(row), 1, "mm"), annotate.INK),
         (str(contacts), annotate.RED if contacts else annotate.INK),
