@@ -1,6 +1,7 @@
 from .bodies.arm_bodies import arm_bodies as arm_bodies
 from .bodies.body import Body as Body, Shape as Shape
-from .bodies.shapes import prism as prism, surface as surface, touch as touch
+from .bodies.prisms import prism as prism
+from .bodies.shapes import surface as surface, touch as touch
 from .bodies.sphere_tree import sphere_tree as sphere_tree
 from .checker import (
     DISTANCE_PAIRS as DISTANCE_PAIRS,

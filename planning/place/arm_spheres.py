@@ -18,7 +18,7 @@ from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.collision.bodies.shapes import prism
+from puncture_twin.planning.collision.bodies.prisms import prism
 from puncture_twin.planning.collision.bodies.sphere_tree import sphere_tree
 from puncture_twin.planning.place.obstacle_field import CELL_MM, Boxes, SkinField
 

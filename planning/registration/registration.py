@@ -14,8 +14,9 @@ from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.conditioning import Conditioning, conditioning, leverage
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, fit_uncertainty
 from puncture_twin.planning.registration.fits.better_names import better_names
+from puncture_twin.planning.registration.fits.least_squares import rigid_fre_mm
 from puncture_twin.planning.registration.fits.method import Method, checked_fit
-from puncture_twin.planning.registration.fits.residual_checks import check_residuals, rigid_fre
+from puncture_twin.planning.registration.fits.residual_checks import check_residuals
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, check_pairs
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.registration.residual_test import Interval, ResidualTest
@@ -145,7 +146,7 @@ def register(
             ``weighted`` or ``joint`` without noise, noise that is none, or residuals that the noise does not explain.
     """
     check_pairs(markers, where)
-    fre_mm = rigid_fre(markers)
+    fre_mm = rigid_fre_mm(markers.points_ct, markers.points_base)
     fit = checked_fit(markers, method, noise, fre_mm if noise_found else None, where=where)
     if method == "triad" and len(markers) != MIN_MARKERS:
         raise InputError(f"triad takes 3 markers, not {len(markers)}", where=where, allowed="3 names in use")

@@ -18,7 +18,8 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
-from puncture_twin.planning.collision.bodies.shapes import convex, inscribed_prism, prism
+from puncture_twin.planning.collision.bodies.prisms import inscribed_prism, prism
+from puncture_twin.planning.collision.bodies.shapes import convex
 from puncture_twin.planning.collision.bodies.sphere_tree import sphere_tree
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker

@@ -1,4 +1,4 @@
-"""Meshes as FCL sees them: surfaces, solids, and whether two of them touch; and prisms about and within cylinders."""
+"""Meshes as FCL sees them: surfaces, solids, and whether two of them touch."""
 
 from __future__ import annotations
 
@@ -7,15 +7,7 @@ from itertools import product
 import fcl
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.collision.bodies.sphere_tree import SLACK_MM
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-INSIDE = 1e-5
-"""By this fraction a prism within a cylinder is smaller still: more than the slack of any cylinder of 1 mm or more."""
-
-PRISM_SIDES = 24
-"""Of the prism about a cylinder: 0.9 % fuller than it."""
 
 
 def touch(a: fcl.CollisionObject, b: fcl.CollisionObject) -> bool:
@@ -47,18 +39,3 @@ def padded(mesh: TriangleMesh, padding_mm: float) -> TriangleMesh:
     corners = padding_mm * np.array(list(product((-1.0, 1.0), repeat=3)))
     hull = trimesh.convex.convex_hull((mesh.vertices[:, None] + corners).reshape(-1, 3))
     return TriangleMesh(np.asarray(hull.vertices), np.asarray(hull.faces))
-
-
-def prism(radius_mm: float, length_mm: float) -> Floats:
-    """Corners of a prism about a cylinder along z, centred: shape (2 ``PRISM_SIDES``, 3), mm."""
-    turn = 2.0 * np.pi * np.arange(PRISM_SIDES) / PRISM_SIDES
-    outer = (radius_mm + SLACK_MM) / np.cos(np.pi / PRISM_SIDES)
-    ring = outer * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    half = length_mm / 2.0 + SLACK_MM
-    return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
-
-
-def inscribed_prism(corners: Floats) -> Floats:
-    """Corners of a prism inside the cylinder that :func:`prism` gave the corners about, along z of any frame."""
-    middle, inside = corners.mean(axis=0), 1.0 - INSIDE
-    return np.asarray(middle + (corners - middle) * (2 * [inside * np.cos(np.pi / PRISM_SIDES)] + [inside]))

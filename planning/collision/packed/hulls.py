@@ -18,7 +18,7 @@ from puncture_twin.planning.arm.tool import Box
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.collision.bodies.body import Body
-from puncture_twin.planning.collision.bodies.shapes import PRISM_SIDES, inscribed_prism
+from puncture_twin.planning.collision.bodies.prisms import PRISM_SIDES, inscribed_prism
 from puncture_twin.planning.collision.bodies.sphere_tree import (
     CENTRE_STEPS,
     LEAF_RADIUS_MM,

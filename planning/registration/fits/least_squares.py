@@ -6,7 +6,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.frames import frame_of_points
-from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.geometry.rigid import apply, pose
 
 
 def fit_rigid(points_ct: Floats, points_base: Floats) -> Floats:
@@ -17,6 +17,17 @@ def fit_rigid(points_ct: Floats, points_base: Floats) -> Floats:
         points_base: Shape (..., n, 3), the same markers.
     """
     return _least_squares(points_ct, points_base, mirrored=False)
+
+
+def rigid_fre_mm(points_ct: Floats, points_base: Floats) -> float:
+    """The fiducial registration error (rms residual) of `fit_rigid`, mm: the chi-squared test is about that.
+
+    Args:
+        points_ct: Shape (n, 3), n >= 3, not collinear, mm.
+        points_base: Shape (n, 3), the same markers.
+    """
+    residuals = apply(fit_rigid(points_ct, points_base), points_ct) - points_base
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
 
 
 def _least_squares(points_ct: Floats, points_base: Floats, *, mirrored: bool) -> Floats:

@@ -10,7 +10,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits.better_names import better_names
-from puncture_twin.planning.registration.fits.least_squares import _least_squares, fit_rigid
+from puncture_twin.planning.registration.fits.least_squares import _least_squares
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 
 MAX_RESIDUAL_MM = 15.0
@@ -18,12 +18,6 @@ MAX_RESIDUAL_MM = 15.0
 
 MIRROR_GAIN = 2.0
 """A mirrored fit that is better than the proper one by this factor (and 1 mm) says that one side is mirrored."""
-
-
-def rigid_fre(markers: MarkerPairs) -> float:
-    """FRE of the least-squares fit, whatever the method: the chi-squared test is about that."""
-    fitted = apply(fit_rigid(markers.points_ct, markers.points_base), markers.points_ct)
-    return _rms(fitted - markers.points_base)
 
 
 def _rms(residuals: Floats) -> float:

@@ -29,8 +29,8 @@ from puncture_twin.planning.registration.advice import OneMore, odd_branches, on
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
 from puncture_twin.planning.registration.checks.squareness import Squareness, check_squareness
 from puncture_twin.planning.registration.checks.touching import touchable_points
+from puncture_twin.planning.registration.fits.least_squares import rigid_fre_mm
 from puncture_twin.planning.registration.fits.method import LEAST_FOUND_MM
-from puncture_twin.planning.registration.fits.residual_checks import rigid_fre
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.registration.registration import Registration, register
@@ -144,10 +144,12 @@ def lists_report(
 
 def _noise_of_lists(pairs: MarkerPairs, fle_mm: float | None) -> ReadingNoise | None:
     """Equal in all axes, of both lists together, stated or to be found; None where they agree to rounding."""
-    if fle_mm is None and rigid_fre(pairs) < LEAST_FOUND_MM:
+    if fle_mm is None and rigid_fre_mm(pairs.points_ct, pairs.points_base) < LEAST_FOUND_MM:
         return None
     count = len(pairs)
-    found_mm = rigid_fre(pairs) * np.sqrt(count / (count - 2))  # Fitzpatrick 1998: FRE^2 = (1 - 2 / N) FLE^2
+    found_mm = rigid_fre_mm(pairs.points_ct, pairs.points_base) * np.sqrt(
+        count / (count - 2)
+    )  # Fitzpatrick 1998: FRE^2 = (1 - 2 / N) FLE^2
     each = np.eye(3) * (found_mm if fle_mm is None else fle_mm) ** 2 / 6.0
     return ReadingNoise(
         cov_ct=each,

@@ -1,0 +1,29 @@
+"""Prisms about cylinders and within them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.collision.bodies.sphere_tree import SLACK_MM
+
+INSIDE = 1e-5
+"""By this fraction a prism within a cylinder is smaller still: more than the slack of any cylinder of 1 mm or more."""
+
+PRISM_SIDES = 24
+"""Of the prism about a cylinder: 0.9 % fuller than it."""
+
+
+def prism(radius_mm: float, length_mm: float) -> Floats:
+    """Corners of a prism about a cylinder along z, centred: shape (2 ``PRISM_SIDES``, 3), mm."""
+    turn = 2.0 * np.pi * np.arange(PRISM_SIDES) / PRISM_SIDES
+    outer = (radius_mm + SLACK_MM) / np.cos(np.pi / PRISM_SIDES)
+    ring = outer * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    half = length_mm / 2.0 + SLACK_MM
+    return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
+
+
+def inscribed_prism(corners: Floats) -> Floats:
+    """Corners of a prism inside the cylinder that :func:`prism` gave the corners about, along z of any frame."""
+    middle, inside = corners.mean(axis=0), 1.0 - INSIDE
+    return np.asarray(middle + (corners - middle) * (2 * [inside * np.cos(np.pi / PRISM_SIDES)] + [inside]))
