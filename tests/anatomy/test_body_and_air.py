@@ -366,6 +366,22 @@ def test_a_table_that_touches_the_back_is_no_body(scene):
     assert any("flat at its back side" in warning for warning in context.anatomy.warnings)
 
 
+def test_a_board_under_a_third_of_the_image_is_no_body(tmp_path):
+    """A solid board that touches the back along 60 of 160 mm: no path through it is safe, the front stays free."""
+    field = supine.slab((-250, supine.BACK_MM - 6, -30), (250, supine.BACK_MM + 30, 30))
+    board = ScannedPart("board", field, 60.0)
+    parts = [*supine.trunk_parts(), board]
+    write_scene(tmp_path, parts, supine.grid())
+    prepared = prepare(write_case(tmp_path), arm=False)
+    found = prepared.search()
+
+    rows = through(found, prepared.case, board)
+    assert rows.sum() > 100
+    assert not found.safe[rows].any()
+    assert found.safe.sum() > 40
+    assert any("flat at its back side" in warning for warning in prepared.anatomy.warnings)
+
+
 @pytest.mark.parametrize(
     "cradle",
     [supine.cradle_parts(), supine.cradle_parts(radius_mm=180.0, thick_mm=10.0, half_width_mm=150.0, slope=0.04)],

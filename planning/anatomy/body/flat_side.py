@@ -18,7 +18,9 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 FLAT_MM = 1.0
 """A side is flat where it keeps within this of one plane; noise moves the surface of a 5 mm voxel by some 0.2 mm."""
 FLAT_WIDTH_MM = 100.0
-"""Over so much of its width, in at least half of the slices. A round back with a radius of 1.2 m is as flat."""
+"""Over so much of its width, in enough slices. A round back with a radius of 1.2 m is as flat."""
+FLAT_LENGTH_MM = 50.0
+"""Enough are half of the slices, or all along so much of the bed: a board may be shorter than the image."""
 BEYOND_FRACTION = 0.01
 """Of a side's surface: more of it beyond the plane, and the plane is a step, such as a table's top beside the body."""
 SIDES = {(0, 0): "right", (0, -1): "left", (1, 0): "front", (1, -1): "back"}
@@ -32,7 +34,7 @@ class FlatSide(NamedTuple):
         axis: 0 or 1, running to the left or to the back.
         end: 0 or -1, the side of the body: at the axis' low or high end.
         plane: Where it crosses the axis, in voxels.
-        width_mm: How wide the flat part is, in the middle slice by width.
+        width_mm: How wide the flat part is: in the middle slice by width, or along a whole board, if that is wider.
     """
 
     axis: int
@@ -66,7 +68,7 @@ def _flat_sides(above: NDArray[np.floating], body: Bools, spacing_mm: Floats) ->
         ends = surface_ends(above, body, axis, end)
         plane = _commonest(ends[np.isfinite(ends)], FLAT_MM / step_mm)
         outward_mm = (ends - plane) * (step_mm if end else -step_mm)
-        width_mm = float(np.median((np.abs(outward_mm) <= FLAT_MM / 2).sum(axis=0))) * across_mm
+        width_mm = _flat_width((np.abs(outward_mm) <= FLAT_MM / 2).sum(axis=0), float(spacing_mm[2])) * across_mm
         if width_mm >= FLAT_WIDTH_MM and np.mean(outward_mm[np.isfinite(ends)] > FLAT_MM) < BEYOND_FRACTION:
             yield FlatSide(axis, end, plane, width_mm)
 
@@ -95,6 +97,18 @@ def surface_ends(above: NDArray[np.floating], body: Bools, axis: int, end: int) 
     at = first - np.divide(within, within - beside, out=np.full(within.shape, 0.5), where=crossed)
     at = np.where(known, at, np.nan)
     return np.asarray(len(inside) - 1 - at if end else at)
+
+
+def _flat_width(flat: NDArray[np.integer], step_mm: float) -> float:
+    """How many lines are flat in half of the slices, or along `FLAT_LENGTH_MM` without a gap, whichever is more.
+
+    Args:
+        flat: Shape (nz,), the flat lines of each slice.
+        step_mm: From slice to slice.
+    """
+    run = min(len(flat), int(np.ceil(FLAT_LENGTH_MM / step_mm)))
+    least = np.lib.stride_tricks.sliding_window_view(flat, run).min(axis=1)
+    return max(float(np.median(flat)), float(least.max()))
 
 
 def _commonest(values: Floats, window: float) -> float:
