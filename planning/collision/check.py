@@ -31,14 +31,16 @@ class Check(NamedTuple):
     """Corners that enclose either, in the frames of their shapes; None for a box, and for the pair with the skin."""
 
     def contact_at(self, frames: Floats) -> Contact | None:
-        """The contact, if the two shapes touch where ``link_poses`` (7, 4, 4) has them.
-
-        It is ``outside_body`` where that is all of the patient that is touched.
-        """
+        """The contact, if the two shapes touch where ``link_poses`` (7, 4, 4) has them; see `contact_found`."""
         self.second.setTransform(self.second_body.pose(frames))
+        if self.first_body is not None:
+            assert not isinstance(self.first, FclPatient)  # it belongs to no body
+            self.first.setTransform(self.first_body.pose(frames))
+        return self.contact_found()
+
+    def contact_found(self) -> Contact | None:
+        """The contact, if the two shapes touch where they are: ``outside_body`` where that is all of the patient."""
         if not isinstance(self.first, FclPatient):
-            if self.first_body is not None:
-                self.first.setTransform(self.first_body.pose(frames))
             return self.contact if touch(self.first, self.second) else None
         if self.first.skin.touches(self.second, self.second_body.box):
             return self.contact

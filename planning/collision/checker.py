@@ -131,11 +131,10 @@ class CellChecker:
         Raises:
             InputError: If ``q`` is not finite: FCL would call it free.
         """
-        require_finite(q)
-        frames = link_poses(self.model, q)
+        self._place(q)
         for check in self._checks:
             allowed = needle_may_touch_patient and check.contact == NEEDLE_IN_PATIENT
-            if not allowed and (contact := check.contact_at(frames)) is not None:
+            if not allowed and (contact := check.contact_found()) is not None:
                 return contact
         return None
 
