@@ -78,7 +78,7 @@ def test_a_fault_acts_where_the_function_was_imported_and_is_gone_afterwards():
             puncture_twin.planning.reach.skin_gap.UNEVEN_SKIN_MM,
         )
     np.testing.assert_array_equal(skin_gaps(NEEDLE, angles), before)
-    assert loaded > 12 and caught > 6
+    assert loaded >= 10 and caught >= 6
 
 
 def test_what_a_mutant_raises_when_it_is_loaded_leaves_the_module_alone():

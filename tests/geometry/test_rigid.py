@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from puncture_twin.planning.geometry import rigid
+from puncture_twin.planning.geometry import frames, rigid
 
 SEED = 20260122
 ANGLES = (0.0, 1e-12, 1e-8, 0.99e-6, 1.01e-6, 1e-4, 0.1, 1.0, 3.0, np.pi - 1e-4, np.pi - 1e-8)
@@ -125,7 +125,7 @@ def test_a_turn_about_a_point_leaves_it():
 def test_frames_from_axes_keep_the_first_and_lean_to_the_second():
     """Each is a rotation whose z axis is the one that was given."""
     for z, other in zip(units(), np.roll(units(), 1, axis=0) * 3.0, strict=True):
-        of_axes, along, about = rigid.frame_of_axes(5 * z, other), rigid.frame_along(z, other), rigid.frame_about(z)
+        of_axes, along, about = frames.frame_of_axes(5 * z, other), frames.frame_along(z, other), frames.frame_about(z)
         for R in (of_axes, along, about):
             assert_rotation(R)
             np.testing.assert_allclose(R[:, 2], z, atol=1e-15)
@@ -133,14 +133,14 @@ def test_frames_from_axes_keep_the_first_and_lean_to_the_second():
         assert abs(of_axes[:, 1] @ other) < 1e-14
         assert along[:, 1] @ other > 0
         assert abs(along[:, 0] @ other) < 1e-14
-        np.testing.assert_allclose(rigid.frame_xz(about[:, 0], z), about, atol=1e-15)
-        np.testing.assert_allclose(rigid.frame_yz(about[:, 1], z), about, atol=1e-15)
+        np.testing.assert_allclose(frames.frame_xz(about[:, 0], z), about, atol=1e-15)
+        np.testing.assert_allclose(frames.frame_yz(about[:, 1], z), about, atol=1e-15)
 
 
 def test_the_frame_of_three_points_moves_with_them():
     """Its x axis leads from the first to the second, the third lies on the side of +y in the xy plane."""
     points = np.random.default_rng(SEED).normal(0.0, 100.0, (3, 3))
-    R = rigid.frame_of_points(points)
+    R = frames.frame_of_points(points)
     assert_rotation(R)
     in_frame = (points - points[0]) @ R
     np.testing.assert_allclose(in_frame[:, 2], 0.0, atol=1e-12)
@@ -148,5 +148,5 @@ def test_the_frame_of_three_points_moves_with_them():
     assert abs(in_frame[1, 1]) < 1e-12
     assert in_frame[2, 1] > 0
     for T in poses():
-        moved = rigid.frame_of_points(rigid.apply(T, points))
+        moved = frames.frame_of_points(rigid.apply(T, points))
         np.testing.assert_allclose(moved, T[:3, :3] @ R, atol=1e-12)

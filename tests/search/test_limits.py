@@ -9,7 +9,7 @@ import trimesh
 from case_world import points_file
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.search.chances import joint, near_limits
+from puncture_twin.planning.search.chances import joint, refined
 from puncture_twin.planning.search.chances.limited import limited
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.uncertainty.chances import Chances
@@ -199,7 +199,7 @@ def test_a_needle_that_leans_is_refined_where_it_is_most_doubtful(tmp_path, monk
     trimesh.util.concatenate([slat, ring]).export(tmp_path / "rib.ply")
     path.write_text(path.read_text().replace("theta_deg = [20, 20]", "theta_deg = [0, 0]"))
     context = prepare(path)
-    monkeypatch.setattr(near_limits, "BEST", 0)  # as of the many candidates that are not among the best
+    monkeypatch.setattr(refined, "BEST", 0)  # as of the many candidates that are not among the best
     monkeypatch.setattr(joint, "BEST", 0)
     found = context.search()
     assert (found.verdict.reason == "touch_likely").any() and not found.safe.any()
@@ -213,7 +213,7 @@ def test_what_may_decide_is_line_sampled(tmp_path, monkeypatch, limited):
     path.write_text(
         path.read_text().replace("theta_deg = [20, 20]", "theta_deg = [10, 50]").replace("[0, 80]", "[0, 40]")
     )
-    monkeypatch.setattr(near_limits, "BEST", 2)
+    monkeypatch.setattr(refined, "BEST", 2)
     monkeypatch.setattr(joint, "BEST", 2)
     context = prepare(path)
     found = context.search()

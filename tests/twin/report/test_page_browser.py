@@ -266,15 +266,16 @@ def test_the_scene_is_drawn_and_answers_the_map(browser, case, candidates):
     browser.until("document.querySelector('#scene canvas') !== null")
     names = browser.evaluate("document.getElementById('scene').data.map(t => t.name)")
     assert {"liver", "aorta", "skin", "target", "safe region", "needle", "arm"} <= set(names)
-    point_at(browser, case, candidates, 30, 200, click=True)
-    last = "document.getElementById('scene').data.at(-1)"
-    browser.until(f"{last}.x.length === 2 && {last}.x[0] !== null")
-    line = np.array(browser.evaluate(f"[{last}.x, {last}.y, {last}.z]")).T
     row = int(
         np.flatnonzero(np.isclose(candidates.theta, np.radians(30)) & np.isclose(candidates.beta, np.radians(200)))[0]
     )
+    end = world.TARGET + 210 * candidates.outward_ct[row]
+    point_at(browser, case, candidates, 30, 200, click=True)
+    last = "document.getElementById('scene').data.at(-1)"
+    browser.until(f"{last}.x.length === 2 && Math.abs({last}.x[1] - {end[0]}) < 0.01")  # not the line before it
+    line = np.array(browser.evaluate(f"[{last}.x, {last}.y, {last}.z]")).T
     assert np.allclose(line[0], world.TARGET)
-    assert np.allclose(line[1], world.TARGET + 210 * candidates.outward_ct[row], atol=0.01)
+    assert np.allclose(line[1], end, atol=0.01)
     visible = (
         "document.getElementById('scene').data.filter(t => t.meta && t.meta.pose === '{}' && (!{} || t.meta.arm))"
         ".every(t => t.visible === {})"
