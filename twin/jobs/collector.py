@@ -15,13 +15,17 @@ from contextlib import contextmanager
 FIRST_AT = 300_000
 """Objects after which circles are first looked for: a little more than a command loads."""
 
+LATER_EVERY = 20_000
+"""New objects between looks from then on: numba makes millions as it compiles, and at Python's 700 a fifth of the time
+that a first command takes would go into looking."""
+
 COUNTS_ITS_OWN = "ompl"
 """This library prints a list of what of it is still there at the very end: it is to find nothing."""
 
 
 @contextmanager
 def late_collection() -> Iterator[None]:
-    """Begin to look for circles after ``FIRST_AT`` objects, from then on as usual among those that come later.
+    """Begin to look for circles after ``FIRST_AT`` objects, from then on every ``LATER_EVERY`` among those that follow.
 
     At the end of the program nothing is looked through, where ``COUNTS_ITS_OWN`` is not loaded.
     """
@@ -31,7 +35,7 @@ def late_collection() -> Iterator[None]:
         if phase == "stop":
             gc.callbacks.remove(resume)
             gc.freeze()
-            gc.set_threshold(*usual)
+            gc.set_threshold(LATER_EVERY, *usual[1:])
 
     gc.callbacks.append(resume)
     gc.set_threshold(FIRST_AT, *usual[1:])

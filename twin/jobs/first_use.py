@@ -8,11 +8,14 @@ the same at once lose time, not more: files are written whole, and what does not
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+from puncture_twin.twin.jobs.collector import LATER_EVERY
 
 
 @contextmanager
@@ -50,6 +53,7 @@ def use_once() -> None:
     from puncture_twin.planning.motion.approach import plan_approach
     from puncture_twin.planning.reach.small_workcell import ask_arm, small_workcell
 
+    gc.set_threshold(LATER_EVERY)
     checker = small_workcell()
     reached = [answer for answer in ask_arm(checker) if answer.reachable]
     _err_once()
