@@ -166,7 +166,11 @@ def _survey_line(lengths, limits, R, target, outward, distances, depths, rolls, 
             p[i] = target[i] + distances[k] * outward[i]
         fill_branches(lengths, R, p, here, np.int64(-1))
         if k == 0:
-            starts[:], before[:], lowest[:], highest[:] = here, here, here, here
+            for branch in range(8):
+                for joint in range(6):
+                    angle = here[branch, joint]
+                    starts[branch, joint] = before[branch, joint] = angle
+                    lowest[branch, joint] = highest[branch, joint] = angle
         for branch in range(8):
             if stops[branch] >= 0:
                 continue
