@@ -51,8 +51,13 @@ def inverse(model: UrModel, T_base_flange: Floats) -> Floats:
 @nb.njit(cache=True)
 def _inverse_all(lengths, T, q):  # type: ignore[no-untyped-def]  # numba infers
     """Fill ``q`` (n, 8, 6) from flange poses ``T`` (n, 4, 4)."""
+    R, p = np.empty((3, 3)), np.empty(3)
     for row in range(len(T)):
-        fill_branches(lengths, T[row, :3, :3], T[row, :3, 3], q[row], np.int64(-1))
+        for i in range(3):
+            for j in range(3):
+                R[i, j] = T[row, i, j]
+            p[i] = T[row, i, 3]
+        fill_branches(lengths, R, p, q[row], np.int64(-1))
 
 
 @nb.njit(cache=True)

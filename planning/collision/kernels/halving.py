@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING
 from puncture_twin.planning.collision.kernels.proofs import (
@@ -124,12 +126,12 @@ def divide(scene, movers, segment, halvings, order, room, answered, answer):
         How many parts there are, and which list of ``room`` holds the checks left in each; (0, 0) for none, and
         (-1, 0) where the search has ended.
     """
-    lists, spans, parts, here = room.lists, room.spans, 1, 0
+    lists, spans, parts, here = room.lists, room.spans, 1, np.int64(0)
     for row in range(len(order)):
         lists[0, row] = order[row]
     spans[0, 0, 0], spans[0, 0, 1] = 0, len(order)
     for _ in range(halvings + 1):
-        top, half = 0, 0.5 / parts
+        top, half = np.int64(0), 0.5 / parts
         for part in range(parts):
             begin = top
             if spans[here, part, 0] < spans[here, part, 1]:

@@ -152,7 +152,8 @@ def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_m
         _keep(scene, segment, clear_mm, room)
     for row in range(len(order)):
         room.lists[0, row] = order[row]
-    if left_of(scene, movers, segment, (1.0, 0.0), (0, 0, len(order)), 0, room, answered, answer) < 0:
+    none = np.int64(0)
+    if left_of(scene, movers, segment, (1.0, 0.0), (none, none, len(order)), none, room, answered, answer) < 0:
         return
     parts, here = divide(scene, movers, segment, halvings, order, room, answered, answer)
     for part in range(parts):
