@@ -5,14 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.entry import outward
+from puncture_twin.planning.geometry.frames import frame_about
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import step_of
+from puncture_twin.twin.report.scene.revolved import revolved
 
 SECTIONS = 24
 """Sides of a round bar."""
@@ -20,32 +22,45 @@ SECTIONS = 24
 LIFT_MM = 1.0
 """How far the corridor's mouth is drawn outside the skin, so that the two surfaces do not flicker."""
 
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+"""Of the unit cube about the origin, shape (8, 3)."""
+
+QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+"""Its sides: corners in order, seen from outside to the left."""
+
+SIDES = np.array([triangle for a, b, c, d in QUADS for triangle in ((a, b, c), (a, c, d))])
+"""Its sides as triangles, shape (12, 3)."""
+
 KEY = 1e-6
 """rad; corners of cells nearer than this are one corner."""
 
 
 def bar(start_ct: Floats, end_ct: Floats, radius: float) -> TriangleMesh:
     """A closed round bar between two points, mm."""
-    mesh = trimesh.creation.cylinder(radius, segment=np.stack([start_ct, end_ct]), sections=SECTIONS)
-    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    along = np.asarray(end_ct, float) - start_ct
+    length = float(np.linalg.norm(along))
+    outline = np.array([[0.0, 0.0], [radius, 0.0], [radius, length], [0.0, length]])
+    return revolved(outline, SECTIONS).transformed(pose(frame_about(along / length), start_ct))
 
 
 def ball(centre_ct: Floats, radius: float) -> TriangleMesh:
     """A sphere, mm."""
-    mesh = trimesh.creation.icosphere(2, radius)
-    return TriangleMesh(np.asarray(mesh.vertices) + centre_ct, np.asarray(mesh.faces))
+    latitude = np.linspace(-np.pi / 2.0, np.pi / 2.0, SECTIONS // 2 + 1)
+    outline = radius * np.stack([np.cos(latitude), np.sin(latitude)], axis=1)
+    outline[[0, -1], 0] = 0.0  # the poles
+    return revolved(outline, SECTIONS).transformed(pose(np.eye(3), centre_ct))
 
 
 def box(T_ct_box: Floats, size: Any) -> TriangleMesh:
     """A cuboid about the origin of its frame, with full edge lengths ``size``, mm."""
-    mesh = trimesh.creation.box(np.asarray(size, dtype=float))
-    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)).transformed(T_ct_box)
+    return TriangleMesh(CORNERS * np.asarray(size, dtype=float), SIDES).transformed(T_ct_box)
 
 
 def ring(T_ct_ring: Floats, inner: float, outer: float, thickness: float) -> TriangleMesh:
     """A flat ring about the z axis of its frame, two radii and the extent along z, mm."""
-    mesh = trimesh.creation.annulus(inner, outer, thickness, sections=2 * SECTIONS)
-    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)).transformed(np.asarray(T_ct_ring))
+    half = thickness / 2.0
+    outline = np.array([[inner, -half], [outer, -half], [outer, half], [inner, half]])
+    return revolved(outline, 2 * SECTIONS).transformed(np.asarray(T_ct_ring))
 
 
 def corridor_mouth(candidates: Candidates, case: Any) -> TriangleMesh | None:
