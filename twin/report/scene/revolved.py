@@ -34,4 +34,4 @@ def revolved(outline: Floats, sections: int) -> TriangleMesh:
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     used, number = np.unique(faces, return_inverse=True)
-    return TriangleMesh(points.reshape(-1, 3)[used], number.reshape(-1, 3))
+    return TriangleMesh(points.reshape(-1, 3)[used], number.reshape(-1, 3).astype(np.int32))
