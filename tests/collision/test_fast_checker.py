@@ -24,7 +24,7 @@ from puncture_twin.planning.collision.bodies.sphere_tree import sphere_tree
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING, hull_gap
-from puncture_twin.planning.collision.kernels.surfaces import STACK, to_surface
+from puncture_twin.planning.collision.kernels.surfaces import ROUGH, STACK, to_surface
 from puncture_twin.planning.collision.packed.hulls import coarse_hull, neighbours
 from puncture_twin.planning.collision.packed.skin import TriangleTree
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool
@@ -117,7 +117,8 @@ def test_no_corner_stands_out_of_the_coarse_hull_by_more_than_its_slack(name: st
 
 @pytest.mark.parametrize("subdivisions", [0, 1, 4])
 def test_distance_to_a_surface_is_the_least_over_its_triangles(subdivisions: int) -> None:
-    """Whatever the number of triangles; where nothing is nearer than a cutoff, that; any distance where near enough."""
+    """Whatever the number of triangles; where nothing is nearer than a cutoff, that; any distance where near enough;
+    a rough one is never farther above it than it says."""
     rng = np.random.default_rng(5)
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=80.0)
     mesh = TriangleMesh(
@@ -128,13 +129,15 @@ def test_distance_to_a_surface_is_the_least_over_its_triangles(subdivisions: int
     stack = np.empty(STACK, np.int64)
     for point in rng.uniform(-250, 250, (60, 3)):
         least = np.sqrt(min(to_triangle(t, *point) for t in mesh.triangles))
-        assert to_surface(tree.lows, tree.highs, tree.corners, *point, 1e6, stack, 0.0) == least
-        assert to_surface(tree.lows, tree.highs, tree.corners, *point, least / 2.0, stack, 0.0) == pytest.approx(
+        assert to_surface(tree.lows, tree.highs, tree.corners, *point, 1e6, stack, 0.0, 1.0) == least
+        assert to_surface(tree.lows, tree.highs, tree.corners, *point, least / 2.0, stack, 0.0, 1.0) == pytest.approx(
             least / 2.0
         )
-        near = to_surface(tree.lows, tree.highs, tree.corners, *point, 1e6, stack, 2.0 * least)
+        rough = to_surface(tree.lows, tree.highs, tree.corners, *point, 1e6, stack, 0.0, ROUGH)
+        assert ROUGH * rough <= least <= rough
+        near = to_surface(tree.lows, tree.highs, tree.corners, *point, 1e6, stack, 2.0 * least, 1.0)
         assert least <= near <= 2.0 * least
-        assert to_surface(tree.lows, tree.highs, tree.corners, *point, 1e6, stack, 0.9 * least) == least
+        assert to_surface(tree.lows, tree.highs, tree.corners, *point, 1e6, stack, 0.9 * least, 1.0) == least
 
 
 def hull_shapes(checker: FastChecker) -> tuple[list[fcl.CollisionGeometry], list[np.ndarray]]:

@@ -19,6 +19,10 @@ CELL_MM = 16.0
 HALF_CELL_MM = CELL_MM * math.sqrt(3.0) / 2.0 + 1e-3
 """No point of a cell is farther from its middle; the rounding of float32 included."""
 
+ROUGH = 0.9
+"""How much nearer to the skin the middle of a cell may be than the field has it, as a fraction: far from a surface most
+of the time goes into which of many triangles is the nearest by a hair, and a cell is no smaller than that."""
+
 STACK = 64
 """Of the descents: deeper than any tree here (a balanced one of 2^40 triangles needs 41)."""
 
@@ -33,20 +37,21 @@ def _to_box(low, high, x, y, z):
 
 
 @nb.njit(cache=True)
-def to_surface(lows, highs, corners, x, y, z, cutoff, stack, stop):
+def to_surface(lows, highs, corners, x, y, z, cutoff, stack, stop, fraction):
     """Distance of a point to a surface in a :class:`TriangleTree`, or ``cutoff`` where it is no nearer.
 
-    Where it is no farther than ``stop`` any distance up to that may be returned. ``stack`` is scratch, of ``STACK``
-    integers.
+    Where it is no farther than ``stop`` any distance up to that may be returned. The distance is no less than a
+    ``fraction``, 0 to 1, of what is returned, and no more; 1 for the distance itself. ``stack`` is scratch, of
+    ``STACK`` integers.
     """
-    best = cutoff * cutoff
+    best, squared = cutoff * cutoff, fraction * fraction
     inner = len(lows) - len(corners)
     stack[0] = 0
-    top = 1 if _to_box(lows[0], highs[0], x, y, z) < best else 0
+    top = 1 if _to_box(lows[0], highs[0], x, y, z) < squared * best else 0
     while top > 0 and best > stop * stop:
         top -= 1
         node = stack[top]
-        if _to_box(lows[node], highs[node], x, y, z) >= best:
+        if _to_box(lows[node], highs[node], x, y, z) >= squared * best:
             continue
         if node >= inner:
             for k in range(corners.shape[1]):
@@ -58,10 +63,10 @@ def to_surface(lows, highs, corners, x, y, z, cutoff, stack, stop):
         near, far, to_near, to_far = left, right, to_left, to_right
         if to_right < to_left:
             near, far, to_near, to_far = right, left, to_right, to_left
-        if to_far < best:
+        if to_far < squared * best:
             stack[top] = far
             top += 1
-        if to_near < best:
+        if to_near < squared * best:
             stack[top] = near
             top += 1
     return math.sqrt(best)
@@ -78,7 +83,7 @@ def moved(T, c):
 
 @nb.njit(cache=True)
 def _field_distance(tree, field, origin, x, y, z, stack):
-    """Distance to the skin of the middle of the cell that a point lies in: kept in ``field`` once known; -1 outside."""
+    """Distance to the skin, ``ROUGH``, of the middle of the cell that a point lies in: kept in ``field``; -1 outside."""
     i, j, k = (x - origin[0]) / CELL_MM, (y - origin[1]) / CELL_MM, (z - origin[2]) / CELL_MM
     if not (0.0 <= i < field.shape[0] and 0.0 <= j < field.shape[1] and 0.0 <= k < field.shape[2]):
         return -1.0
@@ -87,7 +92,7 @@ def _field_distance(tree, field, origin, x, y, z, stack):
         lows, highs, corners = tree
         mx, my, mz = (i + 0.5) * CELL_MM, (j + 0.5) * CELL_MM, (k + 0.5) * CELL_MM
         field[i, j, k] = to_surface(
-            lows, highs, corners, origin[0] + mx, origin[1] + my, origin[2] + mz, 1e9, stack, 0.0
+            lows, highs, corners, origin[0] + mx, origin[1] + my, origin[2] + mz, 1e9, stack, 0.0, ROUGH
         )
     return field[i, j, k]
 
@@ -112,13 +117,13 @@ def skin_gap(skin, spheres, root, T, enough, far, needed, stack, inner_stack):
         x, y, z = moved(T, c)
         about, cutoff = _field_distance(tree, field, origin, x, y, z, inner_stack), best + r
         if about >= 0.0:
-            if about - HALF_CELL_MM - r >= best:
+            if ROUGH * about - HALF_CELL_MM - r >= best:
                 continue
             if about + HALF_CELL_MM + r <= needed:  # no part of the body in this sphere is clear by as much
                 return 0.0
             cutoff = min(cutoff, about + HALF_CELL_MM)
         stop = max(0.0, needed + r)
-        gap = to_surface(tree[0], tree[1], tree[2], x, y, z, cutoff, inner_stack, stop) - r
+        gap = to_surface(tree[0], tree[1], tree[2], x, y, z, cutoff, inner_stack, stop, 1.0) - r
         if gap >= best:
             continue
         if gap > enough or children[node, 0] < 0:
