@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.collision.checker import NEEDLE_IN_PATIENT, CellChecker, Contact, FirstContact
+from puncture_twin.planning.collision.kernels.segment_parts import Room, segment_room
 from puncture_twin.planning.collision.never_touching import without_neighbours
 from puncture_twin.planning.collision.proofs import Motion, Proofs
 from puncture_twin.planning.collision.segments import SegmentChecker
@@ -103,7 +105,12 @@ class FastChecker(CellChecker):
 
     def segment_checker(self, clear_mm: float = 0.0) -> SegmentChecker:
         """A check of many segments, which remembers what touched last; with a clearance where their ends have it."""
-        return SegmentChecker(self.model, self._tested, self._proofs, clear_mm)
+        return SegmentChecker(self.model, self._tested, self._proofs, self._segment_room, clear_mm)
+
+    @cached_property
+    def _segment_room(self) -> Room:
+        """Where segments are checked, one after the other."""
+        return segment_room(self._proofs.scene, self._proofs.movers)
 
     def open_checks(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact]:
         """The questions at ``q`` (6,) that are left to FCL."""

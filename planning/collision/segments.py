@@ -21,7 +21,6 @@ from puncture_twin.planning.collision.kernels.segment_parts import (
     QUERY,
     Answer,
     Room,
-    segment_room,
 )
 from puncture_twin.planning.collision.proofs import Proofs
 from puncture_twin.planning.collision.state_checker import require_finite
@@ -54,16 +53,19 @@ class SegmentChecker:
         model: The arm.
         checks: The questions that may find a contact.
         proofs: The same, packed.
+        room: For them; several may share it, one after the other.
         clear_mm: What the padded arm is to keep from patient and boxes besides; of each body and obstacle that are
             nearer to one another at an end of the segment, most of their distance there. What is not proven to be kept
             counts as a contact.
     """
 
-    def __init__(self, model: UrModel, checks: Sequence[Check], proofs: Proofs, clear_mm: float = 0.0) -> None:
+    def __init__(
+        self, model: UrModel, checks: Sequence[Check], proofs: Proofs, room: Room, clear_mm: float = 0.0
+    ) -> None:
         self._model, self._checks, self._clear_mm = model, checks, clear_mm
         self._packed = (proofs.scene, proofs.movers, model.lengths)
         self._order = np.arange(len(checks), dtype=np.int64)
-        self._filled = _Filled(segment_room(proofs.scene, proofs.movers), _empty_answer(QUESTIONS))
+        self._filled = _Filled(room, _empty_answer(QUESTIONS))
 
     def __call__(self, start: Floats, end: Floats) -> Contact | None:
         """A contact on the segment between two states (6,), rad, the needle being outside the patient; None if free.

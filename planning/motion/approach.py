@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -33,7 +34,7 @@ from puncture_twin.planning.motion.path_check import (
 )
 from puncture_twin.planning.motion.rrt_connect import Connected
 from puncture_twin.planning.motion.shortcuts import CLEARANCE_MM
-from puncture_twin.planning.motion.shortest import MAX_SAMPLES, RUNS, Task, shortest_path
+from puncture_twin.planning.motion.shortest import MAX_SAMPLES, RUNS, Path, Task, direct_path, shortest_path
 from puncture_twin.planning.motion.trajectory import Trajectory
 
 __all__ = [
@@ -123,33 +124,56 @@ def plan_approach(
     """
     home = _within_limits(checker, q_home, "home")[0]
     goals = _within_limits(checker, q_goals, "goal")
-    open_goals = _free_goals(checker, home, goals)
-    refused, cut = "", _cut(checker, home, goals[open_goals])
+    _require_free(checker, home)
+    refused, ends = "", _Ends(checker, home, goals)
     for attempt in range(ATTEMPTS):
         contact_of = _segment_check(checker, RESOLUTION_RAD / 2**attempt)
-        limits, clear_of = checker.model.joint_limits, _shortcut_check(checker)
-        task = Task(limits, contact_of, home, goals[open_goals], cut, clear_of)
-        path = shortest_path(task, seed=seed + RUNS * attempt, max_samples=max_samples)
+        path = _path(ends, contact_of, seed + RUNS * attempt, max_samples)
         if isinstance(path, Connected):
-            raise NoAnswerError(_why_none(path, cut, len(goals), len(open_goals), seed) + refused)
+            raise NoAnswerError(_why_none(path, ends, seed) + refused)
         cuts = _cuts(contact_of, path.waypoints)
         for rounding in (cuts, np.zeros_like(cuts)) if cuts.any() else (cuts,):
             trajectory = _timed(checker, path.waypoints, rounding, speeds)
             checked = dense_states(checker, trajectory.q, RESOLUTION_RAD / FINER)
             contact = first_contact(checker, checked)
             if contact is None:
-                goal = int(open_goals[path.goal_index])
-                return Approach(path.waypoints, rounding, trajectory, goal, checked, seed, attempt + 1)
+                return Approach(path.waypoints, rounding, trajectory, path.goal_index, checked, seed, attempt + 1)
         assert contact is not None
         refused = f"; before that, on a closer look {contact.body} touched {contact.other} on the way"
     raise NoAnswerError(f"approach unknown: {ATTEMPTS} paths were refused (seed {seed}){refused}")
 
 
-def _cut(checker: StateChecker, home: Floats, goals: Floats) -> Cut | None:
-    """What tells which goals are cut off from home; None for a checker whose boxes are not known."""
-    if not isinstance(checker, CellChecker):
-        return None
-    return Cut(checker.model, checker.boxes, checker.points_of(UPPER_ARM), home, goals)
+class _Ends:
+    """Home and goals; what a search has to know of them is found when it is first wanted."""
+
+    def __init__(self, checker: StateChecker, home: Floats, goals: Floats) -> None:
+        self.checker, self.home, self.goals = checker, home, goals
+
+    @cached_property
+    def open_goals(self) -> NDArray[np.int64]:
+        """Which goals are free."""
+        return _free_goals(self.checker, self.goals)
+
+    @cached_property
+    def cut(self) -> Cut | None:
+        """What tells which of the free goals are cut off from home; None for a checker whose boxes are not known."""
+        if not isinstance(self.checker, CellChecker):
+            return None
+        points, goals = self.checker.points_of(UPPER_ARM), self.goals[self.open_goals]
+        return Cut(self.checker.model, self.checker.boxes, points, self.home, goals)
+
+
+def _path(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: int) -> Path | Connected:
+    """The direct path, else what a search finds."""
+    return direct_path(contact_of, ends.home, ends.goals) or _searched(ends, contact_of, seed, max_samples)
+
+
+def _searched(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: int) -> Path | Connected:
+    """The shortest path that a search finds, its goal counted among all of them."""
+    limits, clear_of = ends.checker.model.joint_limits, _shortcut_check(ends.checker)
+    task = Task(limits, contact_of, ends.home, ends.goals[ends.open_goals], ends.cut, clear_of)
+    path = shortest_path(task, seed=seed, max_samples=max_samples)
+    return path if isinstance(path, Connected) else path._replace(goal_index=int(ends.open_goals[path.goal_index]))
 
 
 def _timed(checker: StateChecker, waypoints: Floats, cuts: Floats, speeds: SpeedLimits) -> Trajectory:
@@ -178,6 +202,8 @@ def _shortcut_check(checker: StateChecker) -> SegmentContact | None:
 
 def _cuts(contact_of: SegmentContact, waypoints: Floats) -> Floats:
     """How far from each waypoint between the ends its rounding may begin, shape (k - 2,), rad; 0 where none is free."""
+    if len(waypoints) == 2:
+        return np.zeros(0)
     steps = np.diff(waypoints, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     if not lengths.all():
@@ -203,19 +229,25 @@ def _within_limits(checker: StateChecker, q: Floats, name: str) -> Floats:
     return rows
 
 
-def _free_goals(checker: StateChecker, home: Floats, goals: Floats) -> NDArray[np.int64]:
-    """Which goals are free, home being free."""
-    contact, *contacts = checker.contacts(np.concatenate([home[None], goals]), needle_may_touch_patient=False)
+def _require_free(checker: StateChecker, home: Floats) -> None:
+    """Refuse a home in collision: no segment's check looks at where it begins."""
+    contact = checker.contact(home, needle_may_touch_patient=False)
     if contact is not None:
         raise NoAnswerError(f"home is in collision: {contact.body} touches {contact.other}")
+
+
+def _free_goals(checker: StateChecker, goals: Floats) -> NDArray[np.int64]:
+    """Which goals are free."""
+    contacts = checker.contacts(goals, needle_may_touch_patient=False)
     if all(contacts):
         named = sorted({f"{contact.body} touches {contact.other}" for contact in contacts if contact})
         raise NoAnswerError(f"every goal is in collision: {', '.join(named)}")
     return np.array([row for row, contact in enumerate(contacts) if contact is None], dtype=np.int64)
 
 
-def _why_none(found: Connected, cut: Cut | None, n_goals: int, n_free: int, seed: int) -> str:
+def _why_none(found: Connected, ends: _Ends, seed: int) -> str:
     """Why there is no path, where that is proven; else how far the search came, and what was in the way."""
+    cut, n_goals, n_free = ends.cut, len(ends.goals), len(ends.open_goals)
     busy = "" if n_free == n_goals else f"; {n_goals - n_free} of {n_goals} goals are in collision themselves"
     n_off = 0 if cut is None else int(cut.off.sum())
     if cut is not None and n_off == n_free:

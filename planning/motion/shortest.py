@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise, starmap
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,6 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.motion.cut import Cut
 from puncture_twin.planning.motion.joint_space import SegmentContact
-from puncture_twin.planning.motion.path_check import path_length
 from puncture_twin.planning.motion.rrt_connect import Connected, Limits, connect
 
 MAX_SAMPLES = 8000
@@ -40,7 +40,7 @@ class Path(NamedTuple):
     @property
     def length(self) -> float:
         """Of the joints' travel, rad."""
-        return path_length(self.waypoints)
+        return math.fsum(starmap(math.dist, pairwise(self.waypoints.tolist())))
 
 
 class Task(NamedTuple):
@@ -60,6 +60,21 @@ class Task(NamedTuple):
     """Checks a shortcut; None for the check of a segment."""
 
 
+def direct_path(contact_of: SegmentContact, home: Floats, goals: Floats) -> Path | None:
+    """The straight path to the nearest goal that has a free one, where no other goal is worth a search; else None.
+
+    It ends where its check has found no contact: whether goals are free need not be known.
+
+    Args:
+        contact_of: Checks a segment.
+        home: Shape (6,), rad, free.
+        goals: Shape (g, 6), rad.
+    """
+    away = _distances(home, goals)
+    found = _straight(contact_of, home, goals, away)
+    return found if found is not None and min(away) * SHORT_ENOUGH >= found.length else None
+
+
 def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> Path | Connected:
     """The shortest path found to any goal, or what the run came to that found none.
 
@@ -71,29 +86,34 @@ def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> P
         seed: Of OMPL's generator.
         max_samples: Of the planner, in each of its runs.
     """
-    away = np.linalg.norm(task.goals - task.home, axis=1)
-    nearest_first = np.argsort(away, kind="stable")
-    best = _straight(task, nearest_first.tolist())
+    away = _distances(task.home, task.goals)
+    best = _straight(task.contact_of, task.home, task.goals, away)
     for run in range(RUNS):
-        sought = nearest_first if best is None else nearest_first[away[nearest_first] * SHORT_ENOUGH < best.length]
-        if len(sought) == 0:
+        enough = math.inf if best is None else best.length
+        sought = [goal for goal, straight in enumerate(away) if straight * SHORT_ENOUGH < enough]
+        if not sought:
             break
-        sought = np.sort(sought)  # without a path yet, all of them: as the cut has them
         found = _run(task._replace(goals=task.goals[sought]), best, seed + run, max_samples)
         if found.waypoints is None:
             return found if best is None else best
         max_samples = min(max_samples, max(LEAST_SAMPLES, PATIENCE * found.samples))
-        path = Path(found.waypoints, int(sought[found.goal_index]))
+        path = Path(found.waypoints, sought[found.goal_index])
         best = path if best is None or path.length < best.length else best
     assert best is not None  # the first run has returned without one
     return best
 
 
-def _straight(task: Task, nearest_first: list[int]) -> Path | None:
+def _distances(home: Floats, goals: Floats) -> list[float]:
+    """From home to each goal, rad."""
+    start = home.tolist()
+    return [math.dist(start, goal) for goal in goals.tolist()]
+
+
+def _straight(contact_of: SegmentContact, home: Floats, goals: Floats, away: list[float]) -> Path | None:
     """The straight path to the nearest goal that has a free one."""
-    for goal in nearest_first:
-        if task.contact_of(task.home, task.goals[goal]) is None:
-            return Path(np.stack([task.home, task.goals[goal]]), goal)
+    for goal in sorted(range(len(away)), key=away.__getitem__):
+        if contact_of(home, goals[goal]) is None:
+            return Path(np.array([home, goals[goal]]), goal)
     return None
 
 

@@ -117,8 +117,10 @@ def test_no_corner_stands_out_of_the_coarse_hull_by_more_than_its_slack(name: st
 
 @pytest.mark.parametrize("subdivisions", [0, 1, 4])
 def test_distance_to_a_surface_is_the_least_over_its_triangles(subdivisions: int) -> None:
-    """Whatever the number of triangles; where nothing is nearer than a cutoff, that; any distance where near enough;
-    a rough one is never farther above it than it says."""
+    """Whatever the number of triangles; where nothing is nearer than a cutoff, that; any distance where near enough.
+
+    A rough one is never farther above it than it says.
+    """
     rng = np.random.default_rng(5)
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=80.0)
     mesh = TriangleMesh(

@@ -92,6 +92,20 @@ def test_a_free_way_is_straight(kind: type[CellChecker]) -> None:
 
 
 @KINDS
+def test_the_straight_way_leads_to_the_nearest_goal_that_is_free(kind: type[CellChecker]) -> None:
+    """A nearer goal where the needle touches the arm is passed over; where no goal or home is free, that is said."""
+    folded, near = LEFT + [0.0, 0.0, 0.0, 0.7, 0.0, 0.0], LEFT + [0.8, 0.0, 0.0, 0.0, 0.0, 0.0]
+    checker = kind(UR3, TOOL, [floor()])
+    path = plan_approach(checker, LEFT, np.stack([RIGHT, folded, near]), seed=1)
+    assert path.goal_index == 2 and len(path.waypoints) == 2
+    assert_sound(checker, path, LEFT, np.stack([RIGHT, folded, near]))
+    with pytest.raises(NoAnswerError, match="home is in collision: needle touches upper_arm"):
+        plan_approach(checker, folded, near, seed=1)
+    with pytest.raises(NoAnswerError, match="every goal is in collision: needle touches upper_arm"):
+        plan_approach(checker, LEFT, folded, seed=1)
+
+
+@KINDS
 def test_a_wall_is_gone_around(kind: type[CellChecker]) -> None:
     """The straight way collides; the planned one does not, is longer, and does not stop at its corners."""
     checker = kind(UR3, TOOL, [floor(), wall()])
@@ -380,6 +394,17 @@ def test_a_speed_is_reached_where_it_can_be() -> None:
         less = reachable_speed(start, end, length / 2.0, rates)
         assert start < less < end
         assert speed_change_length(start, less, rates) == pytest.approx(length / 2.0, rel=1e-5)
+
+
+@pytest.mark.parametrize(("start", "end"), [(0.0, 0.0), (0.4, 0.9), (1.0, 0.0), (1.3, 0.0)])
+def test_many_times_at_once_are_as_ruckig_has_them(start: float, end: float) -> None:
+    """Each of the positions that ``travelled`` gives is ``at_time``'s, braking from above the speed limit included."""
+    law = time_law(3.0, Rates(1.0, 1.4, 14.0), start, end)
+    assert law.profile is not None
+    assert (law.profile.profiles[0][0].brake.duration > 0.0) == (start > 1.0)
+    times = np.linspace(0.0, law.duration_s, 500)
+    expected = [law.profile.at_time(time)[0][0] for time in times.tolist()]
+    assert law.travelled(times) == pytest.approx(np.array(expected), abs=1e-14)
 
 
 @pytest.mark.parametrize("tip_speed", [2.0, 20.0, 2000.0])

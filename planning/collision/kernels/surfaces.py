@@ -83,7 +83,7 @@ def moved(T, c):
 
 @nb.njit(cache=True)
 def _field_distance(tree, field, origin, x, y, z, stack):
-    """Distance to the skin, ``ROUGH``, of the middle of the cell that a point lies in: kept in ``field``; -1 outside."""
+    """Distance to the skin, ``ROUGH``, of the middle of a point's cell: kept in ``field`` once known; -1 outside."""
     i, j, k = (x - origin[0]) / CELL_MM, (y - origin[1]) / CELL_MM, (z - origin[2]) / CELL_MM
     if not (0.0 <= i < field.shape[0] and 0.0 <= j < field.shape[1] and 0.0 <= k < field.shape[2]):
         return -1.0
