@@ -11,7 +11,7 @@ import os
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, NoReturn, get_args
 
 import typer
 
@@ -24,6 +24,7 @@ from puncture_twin.twin.jobs.collector import late_collection
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, exit_code_of
 from puncture_twin.twin.jobs.extras import require_extra
 from puncture_twin.twin.jobs.first_use import compiling_beside
+from puncture_twin.twin.jobs.leave import leave
 from puncture_twin.twin.jobs.options import (
     ArmOption,
     CaseArgument,
@@ -711,5 +712,10 @@ def main(arguments: list[str] | None = None) -> int:
         return exit_code_of(partial(app, arguments, standalone_mode=False), partial(print, file=sys.stderr))
 
 
+def program() -> NoReturn:
+    """Run a command as all that this process is for, and end it with the command's exit code."""
+    leave(main())
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

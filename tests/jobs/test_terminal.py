@@ -30,7 +30,7 @@ def test_without_a_command_the_help_is_printed(capsys):
 def test_a_narrow_terminal_gets_the_whole_help(command):
     """Every option is there, in 40 columns too; without colours where nobody wants them."""
     narrow = {**os.environ, "COLUMNS": "40", "NO_COLOR": "1"}
-    arguments = [sys.executable, "-c", MAIN, *command, "--help"]
+    arguments = [sys.executable, "-c", PROGRAM, *command, "--help"]
     done = subprocess.run(arguments, env=narrow, capture_output=True, check=True, text=True, cwd=ROOT)
     wide = subprocess.run(
         arguments, env={**narrow, "COLUMNS": "200"}, capture_output=True, check=True, text=True, cwd=ROOT
@@ -54,13 +54,13 @@ def run_unread(code, *arguments):
     return done.returncode, done.stderr
 
 
-MAIN = "import sys\nfrom puncture_twin.run_twin import main\nsys.exit(main(sys.argv[1:]))"
+PROGRAM = "from puncture_twin.run_twin import program\nprogram()"
 
 
 @pytest.mark.parametrize("arguments", [[], ["search", "--help"], ["--version"], ONE, [*ONE, "--json"]])
 def test_an_output_that_nobody_reads_ends_as_the_shell_has_it(arguments):
     """141, never 1 (which is an answer), and no traceback."""
-    code, said = run_unread(MAIN, *arguments)
+    code, said = run_unread(PROGRAM, *arguments)
     assert (code, "Traceback" in said, "BrokenPipe" in said) == (141, False, False)
 
 
@@ -110,7 +110,7 @@ def test_neither_width_nor_colour_changes_what_is_printed(command):
     """A narrow terminal wraps; no line and no table is broken by us, and nothing is coloured."""
     shown = [
         subprocess.run(
-            [sys.executable, "-c", MAIN, *command],
+            [sys.executable, "-c", PROGRAM, *command],
             env={**os.environ, **extra},
             capture_output=True,
             check=True,

@@ -18,12 +18,13 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from types import MappingProxyType
-from typing import IO, Any, NamedTuple, Protocol
+from typing import IO, Any, NamedTuple, NoReturn, Protocol
 
 from puncture_twin.planning.base.errors import CacheWarning, PlanningError
+from puncture_twin.twin.jobs.leave import leave
 
 ENDS_WITHIN_S = 5.0
 """A process that was told to end and has not is ended."""
@@ -200,13 +201,19 @@ class _Reply(NamedTuple):
     made_anew: tuple[str, ...]
 
 
-def serve(module: str, get_ready: str) -> None:
+def serve(module: str, get_ready: str) -> NoReturn:
     """Answer requests until nobody asks; what a library prints to standard output goes to standard error."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # by way of what must be closed, such as the encoder
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     requests, replies = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    getattr(__import__(module, fromlist=[get_ready]), get_ready)()
+    with suppress(SystemExit):
+        getattr(__import__(module, fromlist=[get_ready]), get_ready)()
+        _answer_all(requests, replies)
+    leave(0)
+
+
+def _answer_all(requests: IO[bytes], replies: IO[bytes]) -> None:
     kept = None
     while True:
         try:
