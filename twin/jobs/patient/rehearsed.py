@@ -34,17 +34,16 @@ class Begun:
         """
         from puncture_twin.twin.report.rooms_picture import draw_rooms_picture
 
-        run = self.run
+        run, shown = self.run, {}
+        if run.distribution is not None:  # while the film is made
+            shown = {"distribution": run.distribution.summary()}
+            with run.context.stages.time("rooms.png"):
+                draw_rooms_picture(run.distribution, out / ROOMS)
         rehearsal = _awaited(run, "rehearsal", self.rehearsal)
-        shown = {} if run.distribution is None else {"distribution": run.distribution.summary()}
         document = {**rehearsal_summary(rehearsal), **shown, "inputs": inputs_document(run.inputs)}
         run = replace(run, rehearsal=rehearsal).with_files(_write_json(document, out / "rehearsal.json"))
         run = run.with_files(_awaited(run, "film", self.film))
-        if run.distribution is None:
-            return run
-        with run.context.stages.time("rooms.png"):
-            draw_rooms_picture(run.distribution, out / ROOMS)
-        return run.with_files(out / ROOMS)
+        return run if run.distribution is None else run.with_files(out / ROOMS)
 
 
 def begin_rehearsal(run: Run, out: Path, rooms: RoomCount | None, beside: Beside) -> Begun:
