@@ -18,6 +18,7 @@ from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, INTERRUPTED, OK, PROGRAM_FAILED
 from puncture_twin.twin.jobs.patient.main_job import rehearse_case
 from puncture_twin.twin.report.progress import BarDisplay, LineDisplay, progress_display
+from puncture_twin.twin.report.scene.film import FilmTimes
 
 
 @pytest.fixture(scope="module")
@@ -233,6 +234,27 @@ def test_one_process_writes_what_two_write(carton, rehearsed, tmp_path):
     rehearse_case(prepare(carton), tmp_path)
     for path in rehearsed.iterdir():
         assert path.name == "timings.json" or path.read_bytes() == (tmp_path / path.name).read_bytes(), path.name
+
+
+def test_the_page_links_the_film_that_there_is(carton, rehearsed, tmp_path, monkeypatch):
+    """The page is drawn while the film is made; where that is a GIF, for want of an encoder, again."""
+
+    def no_encoder(*arguments, **options):
+        raise RuntimeError("no ffmpeg")
+
+    monkeypatch.setattr("puncture_twin.twin.report.scene.film_file.imageio_ffmpeg.write_frames", no_encoder)
+    monkeypatch.setattr(
+        "puncture_twin.twin.report.scene.film.film_times", lambda total: FilmTimes((0.0, total), 1.0, 1)
+    )
+    run = rehearse_case(prepare(carton), tmp_path)
+    page = (tmp_path / "report.html").read_text()
+    assert 'href="rehearsal.gif"' in page and "rehearsal.mp4" not in page
+    assert 'href="rehearsal.mp4"' in (rehearsed / "report.html").read_text()
+    assert {path.name for path in run.files} == {path.name for path in tmp_path.iterdir()} - {
+        "manifest.json",
+        "timings.json",
+    }
+    assert problems(tmp_path) == ()
 
 
 def test_ctrl_c_while_a_second_process_works(carton, rehearsed, tmp_path, monkeypatch, capfd):

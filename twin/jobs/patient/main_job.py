@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -122,7 +123,8 @@ def _pictured_and_rehearsed(run: Run, out: Path, begun: Begun | None) -> Run:
     from puncture_twin.twin.jobs.patient.pictures import draw_pictures, with_page
 
     drawn = draw_pictures(run, out)
-    return with_page(run if begun is None else begun.ended(out), out, drawn)
+    paged = partial(with_page, out=out, drawn=drawn)
+    return paged(run) if begun is None else begun.ended(out, paged)
 
 
 def demo_case(context: CaseContext, out: Path, beside: Beside | None = None) -> Run:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,24 +27,40 @@ class Begun:
     rehearsal: Asked
     film: Asked
 
-    def ended(self, out: Path) -> Run:
+    def ended(self, out: Path, with_page: Callable[[Run], Run] | None = None) -> Run:
         """The run with what was measured and the film, once they are there; the numbers and the rooms are written.
+
+        Args:
+            out: The folder of the files.
+            with_page: Adds the page that shows them all to a run; while the film is made, which has the usual name
+                but where no encoder can be started.
 
         Raises:
             InputError: See `rehearse`.
         """
+        shown = self._rooms_drawn(out)
+        rehearsal = _awaited(self.run, "rehearsal", self.rehearsal)
+        document = {**rehearsal_summary(rehearsal), **shown, "inputs": inputs_document(self.run.inputs)}
+        measured = replace(self.run, rehearsal=rehearsal).with_files(_write_json(document, out / "rehearsal.json"))
+        rooms = (out / ROOMS,) if shown else ()
+        run = measured.with_files(out / FILM, *rooms)
+        run = run if with_page is None else with_page(run)
+        film = _awaited(run, "film", self.film)
+        if film == out / FILM:
+            return run
+        run = measured.with_files(film, *rooms)
+        return run if with_page is None else with_page(run)
+
+    def _rooms_drawn(self, out: Path) -> dict[str, Any]:
+        """What the rehearsal's file says of many rooms, their picture being drawn; nothing where there are none."""
         from puncture_twin.twin.report.rooms_picture import draw_rooms_picture
 
-        run, shown = self.run, {}
-        if run.distribution is not None:  # while the film is made
-            shown = {"distribution": run.distribution.summary()}
-            with run.context.stages.time("rooms.png"):
-                draw_rooms_picture(run.distribution, out / ROOMS)
-        rehearsal = _awaited(run, "rehearsal", self.rehearsal)
-        document = {**rehearsal_summary(rehearsal), **shown, "inputs": inputs_document(run.inputs)}
-        run = replace(run, rehearsal=rehearsal).with_files(_write_json(document, out / "rehearsal.json"))
-        run = run.with_files(_awaited(run, "film", self.film))
-        return run if run.distribution is None else run.with_files(out / ROOMS)
+        found = self.run.distribution
+        if found is None:
+            return {}
+        with self.run.context.stages.time("rooms.png"):
+            draw_rooms_picture(found, out / ROOMS)
+        return {"distribution": found.summary()}
 
 
 def begin_rehearsal(run: Run, out: Path, rooms: RoomCount | None, beside: Beside) -> Begun:
